@@ -1,0 +1,1 @@
+"""The wire: CAN frames to samples in SI units and limited commands back; arm file and recordings."""

@@ -1,0 +1,80 @@
+"""The console command: finds its sub-commands through entry points and imports one only when it is called."""
+
+import ast
+import importlib.util
+import sys
+from importlib.metadata import EntryPoint, entry_points, version
+from pathlib import Path
+
+PURPOSE = "Calibrates a robot arm's joint torque sensors over CAN, learns its gravity model, explains the sim-to-real gap."
+USAGE_STATUS = 2
+INTERRUPTED_STATUS = 130
+
+
+def main() -> None:
+    """Run `armlink` on the command line's arguments and exit with the status of the contract (0, 1, 2, 3 or 130)."""
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: list[str]) -> int:
+    """Run one command line (without the program's name) and return its exit status."""
+    points = {point.name: point for point in entry_points(group="armlink.commands")}
+    if not arguments or arguments[0] in ("--help", "-h"):
+        sys.stdout.write(_help(points))
+        return 0 if arguments else USAGE_STATUS
+    name, rest = arguments[0], arguments[1:]
+    if name == "--version":
+        sys.stdout.write(f"armlink {version('armlink')}\n")
+        return 0
+    if name not in points:
+        return _fail(f"no command {name!r}; there are {', '.join(sorted(points))}", USAGE_STATUS)
+    return _call(points[name], rest)
+
+
+def _call(point: EntryPoint, arguments: list[str]) -> int:
+    import typer
+
+    try:
+        target = point.load()
+        if isinstance(target, typer.Typer):
+            app = target
+        else:
+            app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+            app.command(name=point.name)(target)
+        outcome = app(args=arguments, prog_name=f"armlink {point.name}", standalone_mode=False)
+    except (KeyboardInterrupt, typer.Abort):
+        return _fail("interrupted", INTERRUPTED_STATUS)
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 0
+    except Exception as error:
+        if hasattr(error, "format_message"):  # a usage error: unknown option, missing argument, bad value
+            return _fail(f"{point.name}: {error.format_message()} (see armlink {point.name} --help)", USAGE_STATUS)
+        status = getattr(error, "exit_status", None)  # every package's own error tree carries one
+        if status is None:
+            raise
+        return _fail(str(error), int(status))
+    return outcome if isinstance(outcome, int) else 0
+
+
+def _fail(message: str, status: int) -> int:
+    sys.stderr.write(f"armlink: {' '.join(message.split())}\n")
+    return status
+
+
+def _help(points: dict[str, EntryPoint]) -> str:
+    width = max(map(len, points), default=0)
+    rows = "\n".join(f"  {name:<{width}}  {_summary(points[name])}" for name in sorted(points))
+    return (
+        f"Usage: armlink COMMAND [OPTIONS]\n\n{PURPOSE}\n\nCommands:\n{rows}\n\n"
+        "armlink COMMAND --help says more. Example: armlink demo --seed 1\n"
+    )
+
+
+def _summary(point: EntryPoint) -> str:
+    """First line of the docstring of a command's module, read without importing it."""
+    spec = importlib.util.find_spec(point.module)
+    if spec is None or spec.origin is None:
+        return ""
+    docstring = ast.get_docstring(ast.parse(Path(spec.origin).read_text(encoding="utf-8"))) or ""
+    return docstring.partition("\n")[0]

@@ -1,0 +1,1 @@
+"""Sub-commands of `armlink` that armlink contributes."""

@@ -1,0 +1,1 @@
+"""Sweeps, sensor calibration, records and the gravity-torque observer."""

@@ -1,0 +1,1 @@
+"""Gravity model of a serial revolute arm: pure math on arrays."""

@@ -1,0 +1,1 @@
+"""Bundled arm files, found by name through the entry-point group `armlink.arms`."""
