@@ -1,0 +1,220 @@
+"""The arm file: one YAML file that says what the arm is, one section per package (contract 1)."""
+
+import hashlib
+import json
+from functools import cached_property
+from importlib.metadata import entry_points
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, ValidationError, model_validator
+
+from armlink.errors import BadInput
+
+STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
+
+
+class Section(BaseModel):
+    """Base of every part of the arm file: unknown keys are errors, values do not change after loading."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+S = TypeVar("S", bound=Section)
+
+
+class DhJoint(Section):
+    """One revolute joint in standard Denavit-Hartenberg form; `lower` and `upper` are its mechanical stops."""
+
+    name: str
+    a: FiniteFloat = 0.0
+    """Link length [m]."""
+    alpha: FiniteFloat = 0.0
+    """Link twist [rad]."""
+    d: FiniteFloat = 0.0
+    """Link offset [m]."""
+    theta_offset: FiniteFloat = 0.0
+    """Denavit-Hartenberg angle at joint position zero [rad]."""
+    lower: FiniteFloat
+    """Lower mechanical stop [rad]."""
+    upper: FiniteFloat
+    """Upper mechanical stop [rad]."""
+
+    @model_validator(mode="after")
+    def _range_is_not_empty(self) -> "DhJoint":
+        if self.lower >= self.upper:
+            raise ValueError(f"joint {self.name}: lower {self.lower} must be less than upper {self.upper} [rad]")
+        return self
+
+
+class Kinematics(Section):
+    """Where the joints are: Denavit-Hartenberg rows from base to tip, or a URDF or MJCF model."""
+
+    gravity: Annotated[tuple[FiniteFloat, ...], Field(min_length=3, max_length=3)] = STANDARD_GRAVITY
+    """Acceleration of gravity in the base frame [m/s²]."""
+    joints: tuple[DhJoint, ...] = ()
+    model: Path | None = None
+    """URDF or MJCF file instead of `joints`, relative to the arm file."""
+    tip: str | None = None
+    """Body of the model that the chain ends in; by default its last."""
+
+    @model_validator(mode="after")
+    def _one_description(self) -> "Kinematics":
+        if bool(self.joints) == (self.model is not None):
+            raise ValueError("give either joints (Denavit-Hartenberg rows) or model (URDF or MJCF), and not both")
+        _no_twins([joint.name for joint in self.joints])
+        return self
+
+
+class Bus(Section):
+    """The CAN bus as python-can opens it."""
+
+    interface: str = "socketcan"
+    channel: str = "can0"
+    bitrate: Annotated[int, Field(gt=0)] = 1_000_000
+
+
+class LinkJoint(Section):
+    """One joint controller: its node and the limits that no frame may exceed."""
+
+    name: str
+    node: Annotated[int, Field(ge=1, le=127)]
+    rated_torque: PositiveFloat
+    """Torque that 1000 ‰ stands for (6076h) [N·m]."""
+    max_torque: PositiveFloat
+    """No command exceeds it [N·m]."""
+    max_torque_rate: PositiveFloat = 200.0
+    """[N·m/s]."""
+    max_velocity: PositiveFloat = 1.0
+    """[rad/s]."""
+
+
+class LinkSection(Section):
+    """The link: bus, rate and joint controllers in joint order."""
+
+    bus: Bus = Bus()
+    rate: Annotated[FiniteFloat, Field(gt=0, le=1000)] = 250.0
+    """SYNC rate [Hz]."""
+    joints: tuple[LinkJoint, ...]
+
+    @model_validator(mode="after")
+    def _nodes_are_unique(self) -> "LinkSection":
+        _no_twins([joint.name for joint in self.joints])
+        _no_twins([joint.node for joint in self.joints])
+        return self
+
+
+class ArmFile(Section):
+    """A whole arm file. `sweep` and `sim` hold the models that their packages registered in `armlink.sections`."""
+
+    name: str
+    serial: str = "unknown"
+    kinematics: Kinematics
+    link: LinkSection | None = None
+    sweep: Any = None
+    sim: Any = None
+    path: Path
+
+    @model_validator(mode="after")
+    def _same_joints_everywhere(self) -> "ArmFile":
+        described = [joint.name for joint in self.kinematics.joints]
+        linked = [joint.name for joint in self.link.joints] if self.link else described
+        if described and linked != described:
+            raise ValueError(f"link.joints are {linked}, but kinematics.joints are {described}: same names, same order")
+        return self
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Joint names from base to tip; empty where only a model file would tell."""
+        return tuple(joint.name for joint in self.kinematics.joints or (self.link.joints if self.link else ()))
+
+    @property
+    def model_path(self) -> Path | None:
+        """Absolute path of the URDF or MJCF file, or None."""
+        return None if self.kinematics.model is None else (self.path.parent / self.kinematics.model).resolve()
+
+    @cached_property
+    def description_hash(self) -> str:
+        """SHA-256 (hex) of the kinematics, model file included: results of another description are refused."""
+        content = json.dumps(self.kinematics.model_dump(mode="json"), sort_keys=True).encode()
+        if self.model_path is not None:
+            content += self.model_path.read_bytes()
+        return hashlib.sha256(content).hexdigest()
+
+    def require_link(self) -> LinkSection:
+        """The link section; raises BadInput where the file has none."""
+        if self.link is None:
+            raise BadInput(f"{self.path}: key link is missing: this command needs the bus and its joint controllers")
+        return self.link
+
+    def require(self, kind: type[S], name: Literal["sweep", "sim"]) -> S:
+        """The section `name`, typed; raises BadInput where the file has none."""
+        section = getattr(self, name)
+        if not isinstance(section, kind):
+            raise BadInput(f"{self.path}: key {name} is missing: this command needs it")
+        return section
+
+
+def bundled_arms() -> dict[str, Path]:
+    """Names and paths of the arm files that installed packages carry (entry-point group `armlink.arms`)."""
+    folders = [files(point.value) for point in entry_points(group="armlink.arms")]
+    return {
+        Path(str(entry)).stem: Path(str(entry))
+        for folder in folders
+        for entry in folder.iterdir()
+        if str(entry).endswith(".yaml")
+    }
+
+
+def load_arm(arm: str | Path) -> ArmFile:
+    """Load and validate the arm file at a path, or the bundled one of that name.
+
+    Raises BadInput with one line that names the key, the value and what was expected.
+    """
+    path = bundled_arms().get(str(arm), Path(arm))
+    if not path.is_file():
+        raise BadInput(f"no arm file {arm}: give a path, or a bundled arm ({', '.join(sorted(bundled_arms()))})")
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise BadInput(f"{path}: not YAML: {error}") from None
+    if not isinstance(content, dict):
+        raise BadInput(f"{path}: expected a mapping with keys name, kinematics, link, not {type(content).__name__}")
+    return parse_arm(content, path)
+
+
+def parse_arm(content: dict[str, Any], path: Path) -> ArmFile:
+    """Validate an arm file's content; `path` is where it (would have) stood. Raises BadInput."""
+    if "path" in content:
+        raise BadInput(f"{path}: key path: not a key of the arm file; remove it")
+    content, section = dict(content), ""
+    try:
+        for point in entry_points(group="armlink.sections"):
+            section = point.name
+            if content.get(section) is not None:
+                content[section] = point.load().model_validate(content[section])
+        section = ""
+        return ArmFile.model_validate({**content, "path": path.resolve()})
+    except ValidationError as error:
+        raise BadInput(f"{path}: {describe(error, section)}") from None
+
+
+def describe(error: ValidationError, within: str = "") -> str:
+    """The first of pydantic's findings as one line: key, what is wrong, the value, how many more there are."""
+    findings = error.errors(include_url=False)
+    first = findings[0]
+    key = ".".join([within] * bool(within) + [str(part) for part in first["loc"]]) or "file"
+    message = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "extra_forbidden":
+        message = "unknown key; remove it or correct its spelling"
+    value = "" if isinstance(first["input"], dict | list | tuple | Section) else f" (value {first['input']!r})"
+    more = f"; {len(findings) - 1} more" if len(findings) > 1 else ""
+    return f"key {key}: {message}{value}{more}"
+
+
+def _no_twins(values: list[Any]) -> None:
+    twins = sorted({value for value in values if values.count(value) > 1})
+    if twins:
+        raise ValueError(f"{twins[0]!r} stands twice; names and nodes must be unique")
