@@ -1,0 +1,79 @@
+"""The arm as gravity sees it: Denavit-Hartenberg rows, gravity in the base frame, joint range."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gcomp.arrays import Array, as_array, frozen
+from gcomp.errors import BadArray
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """A serial arm of n revolute joints in standard Denavit-Hartenberg form (theory note, section 1).
+
+    Joint i turns about z_{i-1} by θ_i = q_i + theta_offset_i. Raises BadArray on wrong shapes or an empty range.
+    """
+
+    names: tuple[str, ...]
+    alpha: Array
+    """Link twists (n,) [rad]."""
+    a: Array
+    """Link lengths (n,) [m]."""
+    d: Array
+    """Link offsets (n,) [m]."""
+    theta_offset: Array
+    """Denavit-Hartenberg angle at joint position zero (n,) [rad]."""
+    gravity: Array
+    """Acceleration of gravity (3,) in the base frame [m/s²]."""
+    lower: Array
+    """Lower joint limit (n,) [rad]; -inf where there is none."""
+    upper: Array
+    """Upper joint limit (n,) [rad]; +inf where there is none."""
+
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        if n == 0 or len(set(self.names)) != n:
+            raise BadArray(f"joint names are {list(self.names)}, expected at least one, each different")
+        for key in ("alpha", "a", "d", "theta_offset"):
+            frozen(self, **{key: as_array(key, getattr(self, key), (n,))})
+        frozen(self, names=tuple(self.names), gravity=as_array("gravity", self.gravity, (3,)))
+        for key in ("lower", "upper"):
+            frozen(self, **{key: as_array(key, getattr(self, key), (n,), finite=False)})
+        for name, low, high in zip(self.names, self.lower, self.upper, strict=True):
+            if not low < high:
+                raise BadArray(f"joint {name}: lower {low} must be less than upper {high} [rad]")
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return len(self.names)
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Bar frames of K poses in the base frame: frame i is fixed to link i and turns with joint i about its z axis."""
+
+    rotation: Array
+    """B (K, n, 3, 3): columns x̄_i, ȳ_i and the joint axis z_{i-1}."""
+    lever: Array
+    """w_i = z_{i-1} × g (K, n, 3) [m/s²]; its length is Γ_i."""
+
+
+def bar_frames(arm: Arm, q: Array) -> Frames:
+    """Bar frames at poses q (K, n) [rad]: B_1 = Rz(θ_1), B_{i+1} = B_i Rx(α_i) Rz(θ_{i+1})."""
+    cos, sin = np.cos(q + arm.theta_offset), np.sin(q + arm.theta_offset)
+    rotation = np.empty((len(q), arm.n, 3, 3))
+    x, y, z = np.eye(3)[:, None, :]
+    for i in range(arm.n):
+        c, s = cos[:, i, None], sin[:, i, None]
+        rotation[:, i, :, 0] = c * x + s * y
+        rotation[:, i, :, 1] = c * y - s * x
+        rotation[:, i, :, 2] = z
+        ca, sa = np.cos(arm.alpha[i]), np.sin(arm.alpha[i])
+        x = rotation[:, i, :, 0]
+        y, z = (
+            ca * rotation[:, i, :, 1] + sa * rotation[:, i, :, 2],
+            ca * rotation[:, i, :, 2] - sa * rotation[:, i, :, 1],
+        )
+    return Frames(rotation, np.cross(rotation[..., 2], arm.gravity))

@@ -1,0 +1,44 @@
+"""Array types and the checks that public functions make on what they are given."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gcomp.errors import BadArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+def as_array(name: str, value: ArrayLike, shape: tuple[int | None, ...], finite: bool = True) -> Array:
+    """`value` as float64 of that shape (None stands for any length); raises BadArray naming `name` otherwise."""
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise BadArray(f"{name} must be an array of numbers") from None
+    fits = array.ndim == len(shape) and all(w is None or w == g for w, g in zip(shape, array.shape, strict=True))
+    if not fits:
+        wanted = ", ".join("K" if w is None else str(w) for w in shape)
+        raise BadArray(f"{name} has shape {array.shape}, expected ({wanted})")
+    if finite and not np.isfinite(array).all():
+        where = tuple(int(index) for index in np.argwhere(~np.isfinite(array))[0])
+        raise BadArray(f"{name}{list(where)} is {array[where]}, expected finite numbers")
+    return array
+
+
+def as_poses(name: str, value: ArrayLike, n: int) -> tuple[Array, tuple[int, ...]]:
+    """Joint positions (…, n) as (K, n) and the leading shape; raises BadArray where the last axis is not n."""
+    array = np.asarray(value, dtype=np.float64)
+    if array.ndim == 0 or array.shape[-1] != n:
+        raise BadArray(f"{name} has shape {array.shape}, expected (…, {n}): one position per joint")
+    return array.reshape(-1, n), array.shape[:-1]
+
+
+def frozen(instance: Any, **fields: Any) -> None:
+    """Set fields of a frozen dataclass from its __post_init__; arrays become read-only."""
+    for name, value in fields.items():
+        if isinstance(value, np.ndarray):
+            value = value.copy()
+            value.setflags(write=False)
+        object.__setattr__(instance, name, value)

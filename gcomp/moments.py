@@ -1,0 +1,47 @@
+"""Mass moments of an arm: from its links' inertials, and what a payload adds (theory note, equations (R) and (P))."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gcomp.arm import Arm
+from gcomp.arrays import Array, as_array
+
+
+def base_parameters(arm: Arm, mass: ArrayLike, first_moment: ArrayLike) -> Array:
+    """Mass moments β = (n_1x, n_1y, …, n_nx, n_ny) (2n,) [kg·m] that gravity torque depends on; equation (R).
+
+    mass (n,) [kg]; first_moment (n, 3) [kg·m], mass times centre of mass in each link's bar frame (origin on the
+    joint axis at o_{i-1}, turning with the joint, z along the axis).
+    """
+    masses = as_array("mass", mass, (arm.n,))
+    moments = as_array("first_moment", first_moment, (arm.n, 3))
+    beta = np.empty((arm.n, 2))
+    distal_mass = along_axis = 0.0
+    for i in reversed(range(arm.n)):
+        beta[i, 0] = moments[i, 0] + distal_mass * arm.a[i]
+        beta[i, 1] = moments[i, 1] - np.sin(arm.alpha[i]) * along_axis
+        along_axis = moments[i, 2] + np.cos(arm.alpha[i]) * along_axis + distal_mass * arm.d[i]
+        distal_mass += masses[i]
+    return beta.ravel()
+
+
+def bar_moments(arm: Arm, first_moment: ArrayLike) -> Array:
+    """First moments (n, 3) given in Denavit-Hartenberg frames' axes, from o_{i-1}, turned into bar frames by Rx(α_i)."""
+    moments = as_array("first_moment", first_moment, (arm.n, 3))
+    ca, sa = np.cos(arm.alpha), np.sin(arm.alpha)
+    x, y, z = moments.T
+    return np.stack([x, ca * y - sa * z, sa * y + ca * z], axis=1)
+
+
+def payload_columns(arm: Arm) -> tuple[Array, Array]:
+    """(E_0 (2n,), E_ρ (2n, 3)): mass μ at point ρ of bar frame n adds Δβ = μ (E_0 + E_ρ ρ); equation (P)."""
+    none = np.zeros((arm.n, 3))
+    mass = np.zeros(arm.n)
+    mass[-1] = 1.0
+    at_origin = base_parameters(arm, mass, none)
+    by_point = np.empty((2 * arm.n, 3))
+    for axis in range(3):
+        moment = none.copy()
+        moment[-1, axis] = 1.0
+        by_point[:, axis] = base_parameters(arm, np.zeros(arm.n), moment)
+    return at_origin, by_point
