@@ -35,6 +35,12 @@ def as_poses(name: str, value: ArrayLike, n: int) -> tuple[Array, tuple[int, ...
     return array.reshape(-1, n), array.shape[:-1]
 
 
+def as_batch(array: Array, leading: tuple[int, ...]) -> Array:
+    """(K, …) with the leading shape that the poses came with."""
+    batch: Array = array.reshape(*leading, *array.shape[1:])
+    return batch
+
+
 def frozen(instance: Any, **fields: Any) -> None:
     """Set fields of a frozen dataclass from its __post_init__; arrays become read-only."""
     for name, value in fields.items():

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gcomp.arm import Arm, bar_frames
-from gcomp.arrays import Array, as_array, as_poses
+from gcomp.arrays import Array, as_array, as_batch, as_poses
 
 
 def gravity_torque(arm: Arm, beta: ArrayLike, q: ArrayLike) -> Array:
@@ -16,7 +16,7 @@ def gravity_torque(arm: Arm, beta: ArrayLike, q: ArrayLike) -> Array:
     moments = as_array("beta", beta, (2 * arm.n,), finite=False).reshape(arm.n, 2)
     frames = bar_frames(arm, poses)
     torque = np.einsum("kid,kid->ki", frames.lever, composite_moments(frames.rotation, moments))
-    return torque.reshape(*leading, arm.n)
+    return as_batch(torque, leading)
 
 
 def gravity_regressor(arm: Arm, q: ArrayLike) -> Array:
@@ -25,7 +25,7 @@ def gravity_regressor(arm: Arm, q: ArrayLike) -> Array:
     frames = bar_frames(arm, poses)
     regressor = np.einsum("kid,kjdc->kijc", frames.lever, frames.rotation[..., :2], optimize=True)
     regressor *= np.triu(np.ones((arm.n, arm.n)))[:, :, None]
-    return regressor.reshape(*leading, arm.n, 2 * arm.n)
+    return as_batch(regressor.reshape(len(poses), arm.n, 2 * arm.n), leading)
 
 
 def gravity_stiffness(arm: Arm, beta: ArrayLike, q: ArrayLike) -> Array:
@@ -36,23 +36,25 @@ def gravity_stiffness(arm: Arm, beta: ArrayLike, q: ArrayLike) -> Array:
     turned = np.cross(frames.rotation[..., 2], composite_moments(frames.rotation, moments))
     lower = np.einsum("kid,kld->kil", turned, frames.lever)
     stiffness = np.tril(lower) + np.swapaxes(np.tril(lower, -1), -1, -2)
-    return stiffness.reshape(*leading, arm.n, arm.n)
+    return as_batch(stiffness, leading)
 
 
 def composite_moments(rotation: Array, moments: Array) -> Array:
     """S_i = Σ_{j≥i} B_j n̄_j (K, n, 3) [kg·m] in the base frame; moments (n, 2) or (K, n, 2)."""
     each = rotation[..., 0] * moments[..., 0, None] + rotation[..., 1] * moments[..., 1, None]
-    return np.cumsum(each[:, ::-1], axis=1)[:, ::-1]
+    composite: Array = np.cumsum(each[:, ::-1], axis=1)[:, ::-1]
+    return composite
 
 
 def gravity_levers(arm: Arm, q: ArrayLike) -> Array:
     """Γ_i = |z_{i-1} × g| (…, n) [m/s²] at poses q (…, n): how much of gravity joint i can feel."""
     poses, leading = as_poses("q", q, arm.n)
-    return np.linalg.norm(bar_frames(arm, poses).lever, axis=-1).reshape(*leading, arm.n)
+    return as_batch(np.linalg.norm(bar_frames(arm, poses).lever, axis=-1), leading)
 
 
 def torque_covariance(arm: Arm, covariance: ArrayLike, q: ArrayLike) -> Array:
     """Covariance of τ (…, n, n) [N²·m²] at poses q (…, n) from that of β (2n, 2n): Y Cov(β) Yᵀ."""
     of_beta = as_array("covariance", covariance, (2 * arm.n, 2 * arm.n), finite=False)
     regressor = gravity_regressor(arm, q)
-    return regressor @ of_beta @ np.swapaxes(regressor, -1, -2)
+    covariance_of_torque: Array = regressor @ of_beta @ np.swapaxes(regressor, -1, -2)
+    return covariance_of_torque

@@ -26,7 +26,7 @@ def base_parameters(arm: Arm, mass: ArrayLike, first_moment: ArrayLike) -> Array
 
 
 def bar_moments(arm: Arm, first_moment: ArrayLike) -> Array:
-    """First moments (n, 3) given in Denavit-Hartenberg frames' axes, from o_{i-1}, turned into bar frames by Rx(α_i)."""
+    """First moments (n, 3) given in Denavit-Hartenberg frames' axes, from o_{i-1}, in bar frames' axes: Rx(α_i)."""
     moments = as_array("first_moment", first_moment, (arm.n, 3))
     ca, sa = np.cos(arm.alpha), np.sin(arm.alpha)
     x, y, z = moments.T

@@ -12,7 +12,7 @@ from gcomp.errors import BadArray
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """K static readings of an arm of n joints. Raises BadArray on shapes, infinities or a sigma that is not positive."""
+    """K static readings of an arm of n joints. Raises BadArray on shapes, infinities, sigma ≤ 0."""
 
     position: Array
     """Raw position readings φ (K, n) [rad]."""
@@ -23,7 +23,7 @@ class Readings:
     load: Array
     """Reference mass attached in that row (K,) [kg]; 0 where there is none."""
 
-    def __post_init__(self) -> None:
+    def __post_init__(self) -> None:  # noqa: D105
         position = as_array("position", self.position, (None, None))
         count, n = position.shape
         torque = as_array("torque", self.torque, (count, n), finite=False)
