@@ -91,7 +91,7 @@ def fit_sinusoid(
 def _linear_fit(gain: float, phi: Array, v: Array, weight: Array, extra: list[Array]) -> tuple[Array, float]:
     """The best (sin, cos, 1, …) coefficients at a position gain, and their weighted sum of squares."""
     columns = np.stack([np.sin(gain * phi), np.cos(gain * phi), np.ones_like(phi), *extra], axis=1) * weight[:, None]
-    solution: Array = np.linalg.lstsq(columns, v * weight, rcond=None)[0]
+    solution: Array = np.linalg.lstsq(columns, v * weight, rcond=None)[0].astype(np.float64)
     return solution, float(np.sum((columns @ solution - v * weight) ** 2))
 
 
