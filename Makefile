@@ -1,0 +1,49 @@
+# What can be done here: make help
+PYTHON ?= python3
+BIN := .venv/bin
+export PYTHON
+
+.DEFAULT_GOAL := help
+.PHONY: help venv demo test lint format bench docs constraints clean
+
+help: ## Say what can be done
+	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
+
+.venv/.runtime: pyproject.toml constraints.txt scripts/make-venv
+	@scripts/make-venv runtime
+
+.venv/.dev: .venv/.runtime
+	@scripts/make-venv dev
+
+venv: .venv/.dev ## Make .venv with the package and everything needed to work on it
+
+demo: .venv/.runtime ## The whole job on a simulated arm; writes armlink-demo/report.html (ARGS="--seed 3" goes to armlink demo)
+	$(BIN)/armlink demo $(ARGS)
+
+test: .venv/.dev ## Run every test, those on real SocketCAN included (ARGS goes to pytest)
+	@scripts/install-system
+	scripts/run-tests $(ARGS)
+
+lint: .venv/.dev ## Check style, types and the import rules
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: .venv/.dev ## Put the code in shape
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+bench: .venv/.dev ## Measure side by side with peers; writes benchmarks/latest.json
+	$(BIN)/python benchmarks/run.py
+
+docs: .venv/.dev ## Check the documentation: links, and that its commands run
+	$(BIN)/python -m pytest -q tests/house/test_docs.py
+
+constraints: .venv/.dev ## Write constraints.txt anew from what .venv holds
+	@sed -n '/^#/p' constraints.txt > constraints.new
+	@$(BIN)/python -m pip freeze --exclude-editable | grep -E '^[A-Za-z0-9._-]+==' >> constraints.new
+	@mv constraints.new constraints.txt
+
+clean: ## Remove what was made, .venv included
+	rm -rf .venv .venv.log armlink-demo .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
