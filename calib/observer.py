@@ -1,0 +1,227 @@
+"""The observer: watches ordinary motion and says when a joint's torque sensor has drifted, and by how much.
+
+Pure: samples in, events out; no bus, clock, file or thread. Readings are those of the installed calibration, so that
+every estimate is relative to it: reading = gain·τ + offset with gain 1 and offset 0 while nothing has drifted.
+"""
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from calib.belief import ModelBelief
+from calib.causes import CauseTest, Verdict, Window
+from calib.cusum import Cusum
+from calib.decision import Finding, agreed, decide
+from calib.observer_config import ObserverConfig
+from calib.records import Array
+from calib.rest import RestDetector, Row
+from calib.sensor_filter import SensorFilter
+from gcomp.arm import Arm
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that the observer has to say. `kind`: alarm, outliers, verdict, proposal or undecided."""
+
+    t: float
+    kind: str
+    joint: str | None
+    evidence: dict[str, Any] = field(default_factory=dict)
+    finding: Finding | None = None
+    """What to write, for a proposal."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Gain and offset of every joint against the installed calibration, with standard deviations; (n,) each."""
+
+    gain: Array
+    gain_std: Array
+    offset: Array
+    """[N·m]"""
+    offset_std: Array
+    accepted: Array
+    """Rows that went into each."""
+
+
+class Observer:
+    """`handle(sample)` → events; `estimate()`; `install(joint)` after a new calibration was written."""
+
+    def __init__(
+        self,
+        arm: Arm,
+        beta: Array,
+        beta_covariance: Array,
+        sigma: Array,
+        config: ObserverConfig | None = None,
+        position_gain: Array | None = None,
+        position_offset: Array | None = None,
+    ) -> None:
+        """Watch an arm.
+
+        beta (2n,) [kg·m] and its covariance (2n, 2n) as the gravity record has them; sigma (n,) [N·m], standard
+        deviation of one averaged torque reading; position gains and offsets (n,) of the calibration record.
+        """
+        self.arm, self.config = arm, config or ObserverConfig()
+        self.belief = ModelBelief(arm, beta, beta_covariance)
+        self.sigma: Array = np.asarray(sigma, dtype=float)
+        self._position_gain = np.ones(arm.n) if position_gain is None else position_gain
+        self._position_offset = np.zeros(arm.n) if position_offset is None else position_offset
+        self.rows = 0
+        self.held = False
+        """Whether an alarm stands: estimates are held until a verdict."""
+        self._rest = RestDetector(arm.n, self.config)
+        self._filter = SensorFilter(arm.n, self.config)
+        self._cusum = Cusum(arm.n, self.config)
+        self._places: deque[Array] = deque(maxlen=self.config.excitation_rows)
+        self._window: list[Row] = []
+        self._fresh = 0
+        self._first: tuple[list[Row], CauseTest, int] | None = None
+        self._said: tuple[str, int | None] | None = None
+        self._learnt = 0
+        self._proposed = np.full(arm.n, -np.inf)
+
+    def handle(self, t: float, position: Array, velocity: Array | None, torque: Array) -> list[Event]:
+        """Take one sample: readings (n,) in SI units, NaN where missing; returns what there is to say, if anything."""
+        row = self._rest.handle(t, position, velocity, torque)
+        return [] if row is None else self.handle_row(row)
+
+    def handle_row(self, row: Row) -> list[Event]:
+        """Take one row: what `handle` makes of a stop."""
+        self.rows += 1
+        angle = self._position_gain * row.position + self._position_offset
+        row = replace(row, position=angle)
+        events = [] if self.held else self._watch(row)
+        if events:
+            self._start_test()
+        elif self._is_new_place(row, [kept.position for kept in self._window]):
+            self._window.append(row)
+            self._fresh += 1
+            if self._fresh >= self.config.window:
+                self._fresh = 0
+                events = self._test(row.t) if self.held else self._audit(row.t)
+        return events
+
+    def estimate(self) -> Estimate:
+        """Gain and offset of every joint against the installed calibration, as known now."""
+        gain_std, offset_std = np.sqrt(np.diagonal(self._filter.covariance, axis1=1, axis2=2)).T
+        gain, offset = self._filter.state.T.copy()
+        return Estimate(gain, gain_std, offset, offset_std, self._filter.accepted.copy())
+
+    def install(self, finding: Finding) -> None:
+        """The finding was written to the controller: from now on readings are right again, as far as it was known."""
+        floor = np.diag([self.config.drift_gain**2, self.config.drift_offset**2])
+        self._filter.restart(finding.joint, covariance=finding.covariance + floor)
+        self._resume()
+
+    def _watch(self, row: Row) -> list[Event]:
+        """Filter and change detection; returns alarms."""
+        torque = self.belief.torque(row.position[None])[0]
+        variance = self.sigma**2 + self.belief.torque_variance(row.position, self.config.position_std)
+        alarms = self._cusum.handle(row.torque - torque, torque, variance)
+        events = [self._event(row.t, "alarm", joint, channel=channel) for joint, channel in alarms]
+        if not events and self._is_new_place(row, self._places):
+            self._places.append(row.position)
+            self._filter.handle(row.torque, torque, variance)
+            over = np.flatnonzero(self._filter.rejected >= self.config.outliers_in_a_row)
+            events = [self._event(row.t, "outliers", int(joint), rows=self.config.outliers_in_a_row) for joint in over]
+        return events
+
+    def _audit(self, t: float) -> list[Event]:
+        """No alarm stands: test the last rows all the same, for what is too small or too slow for an alarm."""
+        del self._window[: -self.config.longest_window]
+        verdict = self._cause_test(self._window).verdict()
+        if verdict.cause == "none":
+            if self._learnt < self.config.baseline_rows:
+                window = _window(self._window[-self.config.window :])
+                self.belief.learn(window.position, window.torque, self.sigma)
+                self._learnt += self.config.window
+            return []
+        if verdict.cause in ("unknown", "ambiguous"):
+            return []  # an alarm will come if it lasts
+        self._start_test()
+        return [self._verdict_event(t, verdict)]
+
+    def _test(self, t: float) -> list[Event]:
+        """An alarm stands and its window is full: say what it was, and propose where two windows agree on a drift."""
+        test = self._cause_test(self._window)
+        verdict = test.verdict()
+        undecided = verdict.cause in ("unknown", "ambiguous")
+        if undecided and len(self._window) < self.config.longest_window:
+            return []  # more rows may tell
+        window, self._window = self._window, []
+        if verdict.cause == "none":
+            self._resume()
+            return [self._verdict_event(t, verdict)]
+        if not verdict.is_drift:
+            self._first = None
+            return self._say(t, verdict)
+        assert verdict.joint is not None
+        first, self._first = self._first, (window, test, verdict.joint)
+        events = self._say(t, verdict)
+        change, covariance = test.drift(verdict.joint, verdict.cause)
+        self._filter.restart(verdict.joint, 1 + change[0], change[1], covariance)
+        if first is None or first[2] != verdict.joint:
+            return events
+        if not agreed(first[1], test, verdict.joint, self.config.agreement):
+            return [
+                *events,
+                self._event(t, "undecided", verdict.joint, reasons=["two windows disagree: still drifting"]),
+            ]
+        return events + self._decide(t, first[0] + window, verdict.joint)
+
+    def _decide(self, t: float, rows: list[Row], joint: int) -> list[Event]:
+        """Two windows agree: the estimate from both together, as proposal or with what forbids it."""
+        test = self._cause_test(rows)
+        verdict = test.verdict()
+        if not verdict.is_drift or verdict.joint != joint:
+            return [self._event(t, "undecided", joint, reasons=["both windows together say something else"])]
+        finding = decide(test, verdict, self.config)
+        self._filter.restart(joint, finding.gain, finding.offset, test.drift(joint, finding.cause)[1])
+        if t - self._proposed[joint] < self.config.rest_between_writes:
+            return []
+        if finding.refused:
+            return [self._event(t, "undecided", joint, reasons=list(finding.refused))]
+        self._proposed[joint] = t
+        std = dict(zip(("gain_std", "offset_std"), finding.std, strict=True))
+        evidence = {"gain": finding.gain, "offset": finding.offset, **std, "rows": finding.rows}
+        return [replace(self._event(t, "proposal", joint, **evidence), finding=finding)]
+
+    def _cause_test(self, rows: list[Row]) -> CauseTest:
+        return CauseTest(self.belief, _window(rows), self.sigma, self.config)
+
+    def _start_test(self) -> None:
+        self.held, self._said, self._first = True, None, None
+        self._window, self._fresh = [], 0
+
+    def _resume(self) -> None:
+        self.held, self._said, self._first = False, None, None
+        self._window, self._fresh = [], 0
+        self._cusum.reset()
+
+    def _is_new_place(self, row: Row, places: Iterable[Array]) -> bool:
+        """Whether this place is not among the rows so often already that one more would only wind the estimate up."""
+        near = sum(bool(np.abs(place - row.position).max() < self.config.bucket_size) for place in places)
+        return near < self.config.bucket_rows
+
+    def _say(self, t: float, verdict: Verdict) -> list[Event]:
+        """The verdict's event, once as long as it stays the same."""
+        said, self._said = self._said, (verdict.cause, verdict.joint)
+        return [] if said == self._said else [self._verdict_event(t, verdict)]
+
+    def _verdict_event(self, t: float, verdict: Verdict) -> Event:
+        std = np.sqrt(np.diag(verdict.covariance))
+        evidence = {"cause": verdict.cause, "confidence": verdict.confidence, "bic": verdict.evidence}
+        values = {"values": verdict.values.tolist(), "std": std.tolist(), "rivals": list(verdict.rivals)}
+        return self._event(t, "verdict", verdict.joint, **evidence, **values)
+
+    def _event(self, t: float, kind: str, joint: int | None, **evidence: Any) -> Event:
+        return Event(t, kind, None if joint is None else self.arm.names[joint], evidence)
+
+
+def _window(rows: list[Row]) -> Window:
+    columns = ([getattr(row, name) for row in rows] for name in ("position", "torque", "direction"))
+    return Window(*map(np.array, columns))
