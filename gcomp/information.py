@@ -1,0 +1,88 @@
+"""What a weighted Jacobian determines: covariance, parameters that cannot be identified, and why, in words."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gcomp.arrays import Array, Mask
+
+NULL_RATIO = 1e-7
+"""Singular values below this share of the largest are zero. Structural zeros come out below 1e-8 (angles are written
+with eight digits), and the smallest true ones seen above 1e-4: the bound stands in the gap."""
+NULL_STD = 30.0
+"""A direction known to no better than thirty natural units is held fixed: its linearisation would mean nothing."""
+PARTICIPATION = 1e-4
+"""Share of a null direction from which on a parameter counts as taking part in it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """What the rows say about p parameters."""
+
+    covariance: Array
+    """Covariance (p, p); NaN rows and columns for parameters that take part in a null direction."""
+    determined: Mask
+    """Parameters that take part in no null direction (p,)."""
+    null_basis: Array
+    """Null directions (p, m) in natural units, each made as sparse as elimination makes it."""
+    rank: int
+    """Rank of the Jacobian."""
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Singular value decomposition of a triangular factor in natural units, split into range and null space."""
+
+    left: Array
+    values: Array
+    right: Array
+    null: Array
+
+    @classmethod
+    def of(cls, triangle: Array, unit: Array) -> "Spectrum":
+        """Of a factor R (p, p) with RᵀR = JᵀJ, columns in units `unit` (p,)."""
+        left, values, right = np.linalg.svd(triangle * unit)
+        keep = values > max(1 / NULL_STD, NULL_RATIO * values[0])
+        return cls(left[:, : len(values)][:, keep], values[keep], right[: len(values)][keep], right[~keep])
+
+
+def analyse(triangle: Array, unit: Array) -> Information:
+    """Covariance and identifiability from a factor R (p, p) with RᵀR = JᵀJ and natural units (p,)."""
+    spectrum = Spectrum.of(triangle, unit)
+    spread = (spectrum.right.T / spectrum.values) * unit[:, None]
+    determined = np.linalg.norm(spectrum.null, axis=0) < PARTICIPATION
+    covariance = spread @ spread.T
+    covariance[~determined] = covariance[:, ~determined] = np.nan
+    return Information(covariance, determined, _sparse_basis(spectrum.null).T, len(spectrum.values))
+
+
+def _sparse_basis(null: Array) -> Array:
+    """The same null space (m, p) in reduced echelon form, largest pivots first; small entries become zero."""
+    basis = null.copy()
+    for step in range(len(basis)):
+        at = np.unravel_index(np.argmax(np.abs(basis[step:])), basis[step:].shape)
+        pivot_row, pivot = step + int(at[0]), int(at[1])
+        basis[[step, pivot_row]] = basis[[pivot_row, step]]
+        basis[step] /= basis[step, pivot]
+        others = np.arange(len(basis)) != step
+        basis[others] -= np.outer(basis[others, pivot], basis[step])
+    basis[np.abs(basis) < PARTICIPATION] = 0.0
+    return basis
+
+
+def describe_null_space(basis: Array, names: tuple[str, ...]) -> tuple[str, ...]:
+    """One sentence per null direction (columns of `basis` (p, m)), naming the parameters that change together."""
+    sentences = []
+    for direction in basis.T:
+        taking_part = [name for name, share in zip(names, direction, strict=True) if share]
+        moments = [name for name in taking_part if name.startswith("mass_moment")]
+        gains = [name for name in taking_part if name.startswith("gain")]
+        if len(taking_part) == 1:
+            sentences.append(f"{taking_part[0]} changes no reading: gravity does not act on it in these poses")
+        elif len(gains) > 1 and moments and len(gains) + len(moments) == len(taking_part):
+            sentences.append(
+                f"common factor of {', '.join(gains)} against all mass moments: readings with a reference mass fix it"
+            )
+        else:
+            sentences.append(f"{', '.join(taking_part)} can change together without changing any reading")
+    return tuple(sentences)

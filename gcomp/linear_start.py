@@ -1,0 +1,81 @@
+"""Start of the global fit: the model solved in the reciprocal gains, in which it is linear (theory note, (L))."""
+
+import numpy as np
+
+from gcomp.arm import Arm
+from gcomp.arrays import Array, Mask
+from gcomp.gravity import gravity_regressor
+from gcomp.moments import payload_columns
+from gcomp.parameters import Parameters, family_slices
+from gcomp.readings import Readings
+from gcomp.sensor_model import joint_positions
+
+SANE_GAIN_RATIO = 5.0
+"""A gain that comes out further than this factor from its start was not determined by its rows."""
+
+
+def linear_start(arm: Arm, readings: Readings, start: Parameters, free: Mask) -> Parameters:
+    """Gains, offsets, mass moments and load point that solve (L) at the start's position gains and offsets.
+
+    κ_i v − ω_i − Y_i (β + μ E_ρ ρ) = μ Y_i E_0 with κ = 1/gain, ω = offset/gain; what `free` (6n + 3,) holds fixed
+    stays as in `start`. Without any reference mass and with β unknown the equation has no scale: then the gain of the
+    joint whose torque varies most stays. So do gains that their rows do not determine.
+    """
+    places = family_slices(arm.n)
+    free_gain = free[places["gain"]].copy()
+    if free[places["beta"]].any() and not np.any(readings.load != 0):
+        free_gain[_strongest(readings)] = False
+    while True:
+        kappa, omega, beta, rho = _solve(arm, readings, start, free, free_gain)
+        ratio = np.abs(kappa * start.gain)
+        lost = free_gain & ~((ratio > 1 / SANE_GAIN_RATIO) & (ratio < SANE_GAIN_RATIO))
+        if not lost.any():
+            break
+        free_gain &= ~lost
+    gain = np.where(free_gain, 1 / np.where(free_gain, kappa, 1.0), start.gain)
+    found = {"gain": gain, "offset": omega * gain, "beta": beta, "rho": rho}
+    vector = start.vector.copy()
+    for family, value in found.items():
+        vector[places[family]] = np.where(free[places[family]], value, getattr(start, family))
+    return Parameters.from_vector(vector, arm.n)
+
+
+def _solve(arm: Arm, readings: Readings, start: Parameters, free: Mask, free_gain: Mask) -> tuple[Array, ...]:
+    """(κ (n,), ω (n,), β (2n,), ρ (3,)) of least norm; zero where not free."""
+    n, (row, joint) = arm.n, np.nonzero(readings.counted)
+    columns, target = _linear_rows(arm, readings, start, free, free_gain)
+    weight = np.abs(start.gain[joint]) / readings.sigma[row, joint]
+    columns *= weight[:, None]
+    scale = np.linalg.norm(columns, axis=0)
+    scale[scale == 0] = 1.0
+    solution = np.linalg.lstsq(columns / scale, target * weight, rcond=1e-9)[0] / scale
+    return tuple(np.split(solution, [n, 2 * n, 4 * n]))
+
+
+def _linear_rows(arm: Arm, readings: Readings, start: Parameters, free: Mask, free_gain: Mask) -> tuple[Array, Array]:
+    """Columns (P, 4n + 3) of (κ, ω, β, ρ) and right-hand side (P,); columns that are not free are zero."""
+    n, places = arm.n, family_slices(arm.n)
+    row, joint = np.nonzero(readings.counted)
+    v, load = readings.torque[row, joint], readings.load[row]
+    regressor = gravity_regressor(arm, joint_positions(start, readings))[row, joint]
+    fixed, by_point = payload_columns(arm)
+    columns = np.zeros((len(row), 4 * n + 3))
+    pairs = np.arange(len(row))
+    columns[pairs, joint] = v
+    columns[pairs, n + joint] = -1.0
+    columns[:, 2 * n : 4 * n] = -regressor
+    columns[:, 4 * n :] = -load[:, None] * (regressor @ by_point)
+    target = load * (regressor @ fixed)
+    offset_known = ~free[places["offset"]]
+    columns[pairs, joint] -= np.where(offset_known, start.offset, 0.0)[joint]
+    is_free = np.concatenate([free_gain, ~offset_known, free[places["beta"]], free[places["rho"]]])
+    known = np.concatenate([1 / start.gain, np.zeros(n), start.beta, start.rho])
+    target -= columns[:, ~is_free] @ known[~is_free]
+    columns[:, ~is_free] = 0.0
+    return columns, target
+
+
+def _strongest(readings: Readings) -> int:
+    """The joint whose counted torque varies most against its noise."""
+    scaled = np.ma.masked_invalid(readings.torque / readings.sigma)
+    return int(np.argmax(scaled.std(axis=0).filled(0.0)))
