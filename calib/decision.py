@@ -65,7 +65,7 @@ def decide(test: CauseTest, verdict: Verdict, config: ObserverConfig) -> Finding
         refused.append(f"{alike} joints changed by the same factor: gravity, payload or supply voltage")
     rows = len(test.window.position)
     return Finding(
-        joint, cause, 1.0 + change[0], float(change[1]), covariance, rows, verdict.confidence, tuple(refused)
+        joint, cause, 1.0 + float(change[0]), float(change[1]), covariance, rows, verdict.confidence, tuple(refused)
     )
 
 

@@ -1,0 +1,199 @@
+"""Recalibration: from a finding of the observer to a new record, and from a record to the controllers."""
+
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+
+from armlink.armfile import ArmFile
+from armlink.errors import Refused
+from armlink.sample import Calibration
+from calib.decision import Finding
+from calib.records import Array, CalibrationRecord, matrix, provenance
+from calib.store import RecordStore
+
+Policy = Literal["observe", "propose", "apply"]
+APPLIED_BY = "observer, policy apply"
+SAME_REAL32 = 1e-6
+"""Relative difference that REAL32 in the controller may make to a value of a record."""
+
+
+class Controllers(Protocol):
+    """What recalibration needs of the link (`armlink.link.Link`)."""
+
+    def read_calibration(self, j: int) -> Calibration:
+        """Active gain and offset [N·m] of joint j."""
+        ...
+
+    def write_calibration(self, j: int, gain: float, offset: float, record_id: int) -> Calibration:
+        """Stage, read back and make active gain and offset [N·m] of joint j; raises BusFault."""
+        ...
+
+
+@dataclass(frozen=True)
+class Plausibility:
+    """What a recalibration in the field may change; beyond, the sensor is broken and not drifting."""
+
+    gain: float = 0.1
+    """Largest change of a gain against the reference record, as a ratio: 10 % (theory.md section 6)."""
+    offset: float = 0.1
+    """Largest offset against the reference record's, as a share of rated torque."""
+
+
+@dataclass(frozen=True)
+class Recalibration:
+    """What became of a finding."""
+
+    joint: str
+    record: CalibrationRecord
+    gain: float
+    """New gain of the joint."""
+    offset: float
+    """New offset [N·m]."""
+    applied: bool
+
+
+def compose(gain: float, offset: float, finding: Finding) -> tuple[float, float]:
+    """Gain and offset [N·m] that make a joint right again whose controller holds `gain` and `offset`.
+
+    The sensor gives v = K τ + O and the controller sends u = (v − offset)/gain = g τ + b, where the finding has g and
+    b: hence K = gain·g and O = offset + gain·b.
+    """
+    return gain * finding.gain, offset + gain * finding.offset
+
+
+def recalibrated(
+    record: CalibrationRecord, arm: ArmFile, finding: Finding, installed_gain: float, by: str | None
+) -> CalibrationRecord:
+    """The record that follows from `record`, installed, and a finding; its covariance is that of both.
+
+    `installed_gain` is what the controller holds where the record has no gain for the joint; the offset alone can then
+    be followed. Raises Refused where the record lacks what the finding changes.
+    """
+    joint = record.joints[finding.joint]
+    if joint.offset is None or (joint.gain is None and finding.cause != "offset"):
+        raise Refused(f"{joint.name}: record {record.id} has no torque gain and offset to recalibrate: sweep first")
+    gain, offset = compose(installed_gain if joint.gain is None else joint.gain, joint.offset, finding)
+    joints = list(record.joints)
+    joints[finding.joint] = joint.model_copy(update={"gain": None if joint.gain is None else gain, "offset": offset})
+    return CalibrationRecord(
+        **provenance(arm, record.sources),
+        joints=tuple(joints),
+        covariance_of=record.covariance_of,
+        covariance=matrix(_propagated(record, finding, installed_gain)),
+        confirmed_by=by,
+        parent=record.id,
+        note=f"{joint.name}: {finding.cause} drift found in {finding.rows} poses, confidence {finding.confidence:.3f}",
+    )
+
+
+def check_plausible(
+    new: CalibrationRecord, reference: CalibrationRecord, j: int, rated: float, bounds: Plausibility
+) -> None:
+    """Raise Refused where joint j's new pair is further from the reference record than a drift can be."""
+    ours, theirs = new.joints[j], reference.joints[j]
+    if ours.gain is not None and theirs.gain is not None and abs(ours.gain / theirs.gain - 1) > bounds.gain:
+        raise Refused(
+            f"{ours.name}: gain {ours.gain:.4f} is {ours.gain / theirs.gain - 1:+.1%} from record {reference.id},"
+            f" at most {bounds.gain:.0%} is drift: check the sensor, then sweep"
+        )
+    limit = bounds.offset * rated
+    if ours.offset is not None and theirs.offset is not None and abs(ours.offset - theirs.offset) > limit:
+        raise Refused(
+            f"{ours.name}: offset {ours.offset:.3f} N·m is {ours.offset - theirs.offset:+.3f} N·m from record"
+            f" {reference.id}, at most {limit:.3f} N·m is drift: check the sensor, then sweep"
+        )
+
+
+class Recalibrator:
+    """Turns findings into records under a policy: observe keeps nothing, propose keeps, apply also writes."""
+
+    def __init__(
+        self,
+        arm: ArmFile,
+        controllers: Controllers,
+        store: RecordStore,
+        policy: Policy,
+        bounds: Plausibility | None = None,
+    ) -> None:
+        """Start from the arm's current calibration record; raises Refused where there is none."""
+        current = store.current(CalibrationRecord, arm)
+        if current is None:
+            raise Refused(f"{arm.name} {arm.serial} has no calibration record yet: run armlink sweep and calibrate")
+        self.record = current
+        self._arm, self._controllers, self._store, self._policy = arm, controllers, store, policy
+        self._bounds = bounds or Plausibility()
+        self._reference = self._swept(current)
+
+    def handle(self, finding: Finding) -> Recalibration | None:
+        """Make of a finding what the policy says; None under observe.
+
+        Under apply the record is kept first, then written to the controller, then made current: a crash in between
+        leaves a record that was never current, never a controller that holds an unknown pair. Raises Refused where
+        the change is implausible or the controller does not hold what the current record says.
+        """
+        if self._policy == "observe":
+            return None
+        j = finding.joint
+        held = require_installed(self.record, self._controllers, j)
+        apply = self._policy == "apply"
+        new = recalibrated(self.record, self._arm, finding, held.gain, APPLIED_BY if apply else None)
+        check_plausible(new, self._reference, j, self._arm.require_link().joints[j].rated_torque, self._bounds)
+        gain = float(new.values("gain", missing=held.gain)[j])
+        offset = float(new.values("offset")[j])
+        self._store.add(new)
+        if apply:
+            self._controllers.write_calibration(j, gain, offset, new.number)
+            self._store.activate(new.id, self._arm, by=APPLIED_BY, reason=new.note)
+            self.record = new
+        return Recalibration(new.joints[j].name, new, gain, offset, apply)
+
+    def _swept(self, record: CalibrationRecord) -> CalibrationRecord:
+        """The last record of this line that the observer did not make: what drift is bounded against."""
+        while record.parent is not None and record.confirmed_by == APPLIED_BY:
+            parent = self._store.get(record.parent)
+            assert isinstance(parent, CalibrationRecord)
+            record = parent
+        return record
+
+
+def require_installed(record: CalibrationRecord, controllers: Controllers, j: int) -> Calibration:
+    """What joint j's controller holds; raises Refused where that is another pair than the record's."""
+    joint, held = record.joints[j], controllers.read_calibration(j)
+    for what, wanted, found in (("gain", joint.gain, held.gain), ("offset", joint.offset, held.offset)):
+        if wanted is not None and abs(found - wanted) > SAME_REAL32 * max(1.0, abs(wanted)):
+            raise Refused(
+                f"{joint.name}: the controller holds {what} {found:.6g}, record {record.id} has {wanted:.6g}:"
+                " write the record first (armlink calibrate --apply)"
+            )
+    return held
+
+
+def write_record(record: CalibrationRecord, controllers: Controllers) -> tuple[str, ...]:
+    """Write every joint's gain and offset of a record to its controller; returns the joints that were written.
+
+    A gain that is not identifiable stays what the controller holds. Raises BusFault.
+    """
+    written = []
+    for j, joint in enumerate(record.joints):
+        held = controllers.read_calibration(j)
+        gain = held.gain if joint.gain is None else joint.gain
+        offset = held.offset if joint.offset is None else joint.offset
+        controllers.write_calibration(j, gain, offset, record.number)
+        written.append(joint.name)
+    return tuple(written)
+
+
+def _propagated(record: CalibrationRecord, finding: Finding, installed_gain: float) -> Array:
+    """Covariance of K = k g, O = o + k b, the old pair (k, o) and the finding (g, b) being independent."""
+    joint = record.joints[finding.joint]
+    gain = installed_gain if joint.gain is None else joint.gain
+    names = [f"{joint.name}.gain", f"{joint.name}.offset"]
+    at = [record.covariance_of.index(name) for name in names if name in record.covariance_of]
+    kept = [index for index, name in enumerate(names) if name in record.covariance_of]
+    carried = np.eye(len(record.covariance_of))
+    of_old = np.array([[finding.gain, 0.0], [finding.offset, 1.0]])
+    carried[np.ix_(at, at)] = of_old[np.ix_(kept, kept)]
+    covariance: Array = carried @ np.array(record.covariance).reshape(carried.shape) @ carried.T
+    covariance[np.ix_(at, at)] += (gain**2 * finding.covariance)[np.ix_(kept, kept)]
+    return covariance
