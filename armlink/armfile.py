@@ -97,6 +97,8 @@ class LinkSection(Section):
     bus: Bus = Bus()
     rate: Annotated[FiniteFloat, Field(gt=0, le=1000)] = 250.0
     """SYNC rate [Hz]."""
+    deadline: Annotated[FiniteFloat, Field(ge=0.01, le=10)] = 0.1
+    """A joint that hears no command for so long goes to quick stop; a reading this old is a fault [s]."""
     joints: tuple[LinkJoint, ...]
 
     @model_validator(mode="after")

@@ -2,17 +2,23 @@
 
 import ast
 import importlib.util
+import os
+import signal
 import sys
 from importlib.metadata import EntryPoint, entry_points, version
 from pathlib import Path
 
-PURPOSE = "Calibrates a robot arm's joint torque sensors over CAN, learns its gravity model, explains the sim-to-real gap."
+PURPOSE = (
+    "Calibrates a robot arm's joint torque sensors over CAN, learns its gravity model, explains the sim-to-real gap."
+)
 USAGE_STATUS = 2
 INTERRUPTED_STATUS = 130
+TERMINATED_STATUS = 143
 
 
 def main() -> None:
     """Run `armlink` on the command line's arguments and exit with the status of the contract (0, 1, 2, 3 or 130)."""
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(TERMINATED_STATUS))  # leaves through every `with`
     sys.exit(run(sys.argv[1:]))
 
 
@@ -32,28 +38,38 @@ def run(arguments: list[str]) -> int:
 
 
 def _call(point: EntryPoint, arguments: list[str]) -> int:
-    import typer
-
     try:
-        target = point.load()
-        if isinstance(target, typer.Typer):
-            app = target
-        else:
-            app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-            app.command(name=point.name)(target)
-        outcome = app(args=arguments, prog_name=f"armlink {point.name}", standalone_mode=False)
-    except (KeyboardInterrupt, typer.Abort):
+        return _invoke(point, arguments)
+    except KeyboardInterrupt:
         return _fail("interrupted", INTERRUPTED_STATUS)
-    except BrokenPipeError:
-        sys.stderr.close()
+    except BrokenPipeError:  # whoever read our output has gone; Python's own flush at exit must not complain
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:
         if hasattr(error, "format_message"):  # a usage error: unknown option, missing argument, bad value
             return _fail(f"{point.name}: {error.format_message()} (see armlink {point.name} --help)", USAGE_STATUS)
+        if isinstance(error, OSError) and error.filename is not None:
+            return _fail(f"{error.filename}: {error.strerror}", USAGE_STATUS)
         status = getattr(error, "exit_status", None)  # every package's own error tree carries one
         if status is None:
             raise
         return _fail(str(error), int(status))
+
+
+def _invoke(point: EntryPoint, arguments: list[str]) -> int:
+    import typer
+
+    target = point.load()
+    if isinstance(target, typer.Typer):
+        app = target
+        arguments = arguments or ["--help"]
+    else:
+        app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+        app.command(name=point.name)(target)
+    try:
+        outcome = app(args=arguments, prog_name=f"armlink {point.name}", standalone_mode=False)
+    except typer.Abort:
+        raise KeyboardInterrupt from None
     return outcome if isinstance(outcome, int) else 0
 
 
@@ -78,3 +94,7 @@ def _summary(point: EntryPoint) -> str:
         return ""
     docstring = ast.get_docstring(ast.parse(Path(spec.origin).read_text(encoding="utf-8"))) or ""
     return docstring.partition("\n")[0]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,87 @@
+"""The CiA 402 power state machine as a pure table: status word → state; state and target → next control word."""
+
+from enum import Enum, IntEnum
+
+
+class State(Enum):
+    """States of the power drive system (CiA 402, 6041h)."""
+
+    NOT_READY = "not ready to switch on"
+    SWITCH_ON_DISABLED = "switch on disabled"
+    READY = "ready to switch on"
+    SWITCHED_ON = "switched on"
+    ENABLED = "operation enabled"
+    QUICK_STOP = "quick stop active"
+    FAULT_REACTION = "fault reaction active"
+    FAULT = "fault"
+    UNKNOWN = "unknown"
+
+
+class Mode(IntEnum):
+    """Modes of operation (6060h) that the link uses."""
+
+    OFF = 0
+    POSITION = 8  # cyclic synchronous position
+    TORQUE = 10  # cyclic synchronous torque
+
+
+class Control(IntEnum):
+    """Commands of the control word (6040h)."""
+
+    DISABLE_VOLTAGE = 0x00
+    QUICK_STOP = 0x02
+    SHUTDOWN = 0x06
+    SWITCH_ON = 0x07
+    ENABLE = 0x0F
+    FAULT_RESET = 0x80
+
+
+SUPPORTED_BITS = {Mode.POSITION: 1 << 7, Mode.TORQUE: 1 << 9}
+"""Bits of 6502h."""
+
+_BY_4F = {
+    0x00: State.NOT_READY,
+    0x40: State.SWITCH_ON_DISABLED,
+    0x0F: State.FAULT_REACTION,
+    0x08: State.FAULT,
+}
+_BY_6F = {0x21: State.READY, 0x23: State.SWITCHED_ON, 0x27: State.ENABLED, 0x07: State.QUICK_STOP}
+
+# One step towards ENABLED, DISABLED (switch on disabled) or QUICK_STOP from each state; None where there is nothing to
+# command: the state is reached or the drive moves on by itself. Quick stop to enabled is transition 16: power stays on.
+_TO_ENABLED = {
+    State.SWITCH_ON_DISABLED: Control.SHUTDOWN,
+    State.READY: Control.SWITCH_ON,
+    State.SWITCHED_ON: Control.ENABLE,
+    State.ENABLED: Control.ENABLE,
+    State.QUICK_STOP: Control.ENABLE,
+    State.FAULT: Control.FAULT_RESET,
+}
+_TO_DISABLED = {
+    State.SWITCH_ON_DISABLED: Control.DISABLE_VOLTAGE,
+    State.READY: Control.DISABLE_VOLTAGE,
+    State.SWITCHED_ON: Control.DISABLE_VOLTAGE,
+    State.ENABLED: Control.DISABLE_VOLTAGE,
+    State.QUICK_STOP: Control.DISABLE_VOLTAGE,
+    State.FAULT: Control.FAULT_RESET,
+}
+
+
+def state_of(status_word: int) -> State:
+    """State that a status word (6041h) encodes; UNKNOWN where the standard gives the pattern no meaning."""
+    return _BY_4F.get(status_word & 0x4F) or _BY_6F.get(status_word & 0x6F, State.UNKNOWN)
+
+
+def next_control(state: State, target: State) -> int:
+    """Control word for the next step from `state` towards `target` (ENABLED, QUICK_STOP or SWITCH_ON_DISABLED).
+
+    Where the drive moves on by itself (not ready, fault reaction) or the state is unknown the word commands nothing:
+    disable voltage, which is also the low level that the fault reset's rising edge needs.
+    """
+    if target is State.ENABLED:
+        return int(_TO_ENABLED.get(state, Control.DISABLE_VOLTAGE))
+    if target is State.SWITCH_ON_DISABLED:
+        return int(_TO_DISABLED.get(state, Control.DISABLE_VOLTAGE))
+    if target is State.QUICK_STOP:
+        return int(Control.QUICK_STOP)
+    raise ValueError(f"no way to {target.value} is defined: targets are enabled, quick stop, switch on disabled")

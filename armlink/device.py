@@ -1,0 +1,129 @@
+"""What the link reads from and sets on one joint's controller before the cycle starts."""
+
+import math
+from dataclasses import dataclass
+
+from armlink import objects, pdo
+from armlink.armfile import LinkJoint
+from armlink.cia402 import SUPPORTED_BITS, state_of
+from armlink.errors import BadInput, BusFault
+from armlink.objects import Entry
+from armlink.sample import Identity
+from armlink.services import NodeServices
+from armlink.units import Units, units_from
+
+QUICK_STOP_AND_HOLD = 6
+"""605Ah: quick stop ramp, then stay in quick stop, power on: the joint holds."""
+ABORT_IS_QUICK_STOP = 3
+"""6007h: what a lost host leads to."""
+RATED_TORQUE_TOLERANCE = 1e-3
+_INTERPOLATION_VALUE = Entry(0x60C2, 1, "B", "interpolation time period value")
+_INTERPOLATION_INDEX = Entry(0x60C2, 2, "b", "interpolation time index")
+
+
+@dataclass(frozen=True)
+class Protection:
+    """What the controller itself watches over."""
+
+    host: int
+    """Node id of the host, whose heartbeat the joints watch."""
+    deadline_ms: int
+    """A joint that hears no RPDO1 for so long goes to quick stop."""
+    heartbeat_ms: int
+    """A joint that hears no heartbeat of the host for so long goes to quick stop."""
+    producer_ms: int
+    """Period of the joint's own heartbeat."""
+
+
+def identify(services: NodeServices) -> Identity:
+    """Identity (1000h, 1008h, 1018h) and CiA 402 state of a node that is there."""
+    read = services.read
+    return Identity(
+        joint=services.joint,
+        node=services.node,
+        present=True,
+        name=services.read_text(objects.DEVICE_NAME_INDEX),
+        device_type=int(read(objects.DEVICE_TYPE)),
+        vendor=int(read(objects.VENDOR)),
+        product=int(read(objects.PRODUCT)),
+        revision=int(read(objects.REVISION)),
+        serial=int(read(objects.SERIAL)),
+        state=state_of(int(read(objects.STATUS_WORD))),
+    )
+
+
+def read_units(services: NodeServices, joint: LinkJoint) -> Units:
+    """Scales of a joint from its controller; raises BadInput where its rated torque is not the arm file's."""
+    read = services.read
+    rated_mnm = int(read(objects.RATED_TORQUE))
+    if abs(rated_mnm * 1e-3 - joint.rated_torque) > RATED_TORQUE_TOLERANCE * joint.rated_torque:
+        raise BadInput(
+            f"{joint.name} (node {joint.node}): rated torque 6076h is {rated_mnm * 1e-3} N·m, the arm file says "
+            f"{joint.rated_torque}: correct link.joints or connect the right arm"
+        )
+    encoder = int(read(objects.ENCODER_INCREMENTS)), int(read(objects.ENCODER_REVOLUTIONS))
+    gear = int(read(objects.GEAR_MOTOR)), int(read(objects.GEAR_SHAFT))
+    feed = int(read(objects.FEED)), int(read(objects.FEED_SHAFT))
+    try:
+        return units_from(rated_mnm, encoder, gear, feed)
+    except ValueError as error:
+        raise BusFault(f"{joint.name} (node {joint.node}): no units: {error}") from None
+
+
+def check_modes(services: NodeServices) -> None:
+    """Raise BusFault where the controller has no cyclic synchronous position or torque mode (6502h)."""
+    supported = int(services.read(objects.SUPPORTED_MODES))
+    for mode, bit in SUPPORTED_BITS.items():
+        if not supported & bit:
+            raise BusFault(
+                f"{services.joint} (node {services.node}): mode {int(mode)} (cyclic synchronous {mode.name.lower()}) "
+                f"is not supported: 6502h is {supported:#x}"
+            )
+
+
+def configure_pdos(services: NodeServices, deadline_ms: int) -> None:
+    """Map every PDO of the link and read the mapping back; raises BusFault naming the joint."""
+
+    def write(entry: Entry, value: int) -> None:
+        services.write(entry, value)
+
+    def read(entry: Entry) -> int:
+        return int(services.read(entry))
+
+    for each in pdo.LINK_PDOS:
+        try:
+            pdo.configure(each, services.node, write, read, deadline_ms if each is pdo.RPDO1 else 0)
+        except pdo.MappingRefused as error:
+            raise BusFault(f"{services.joint} (node {services.node}): {error}") from None
+
+
+def protect(
+    services: NodeServices,
+    joint: LinkJoint,
+    units: Units,
+    window: tuple[float, float],
+    period: float,
+    protection: Protection,
+) -> None:
+    """Set the limits that hold even without this host: torque, position window [rad], quick stop, who is watched."""
+    check = services.write_checked
+    check(objects.MAX_TORQUE, math.floor(joint.max_torque / units.torque + 1e-9))
+    check(objects.POSITION_LOWER, math.ceil(window[0] / units.position))
+    check(objects.POSITION_UPPER, math.floor(window[1] / units.position))
+    check(objects.QUICK_STOP_OPTION, QUICK_STOP_AND_HOLD)
+    check(objects.ABORT_OPTION, ABORT_IS_QUICK_STOP)
+    value, exponent = interpolation(period)
+    check(_INTERPOLATION_VALUE, value)
+    check(_INTERPOLATION_INDEX, exponent)
+    check(objects.HEARTBEAT_PRODUCER, protection.producer_ms)
+    check(objects.HEARTBEAT_CONSUMER, protection.host << 16 | protection.heartbeat_ms)
+
+
+def interpolation(period: float) -> tuple[int, int]:
+    """Interpolation time 60C2h of a cycle of `period` seconds: value and power of ten, as exact as a byte allows."""
+    for exponent in (-3, -4, -5):
+        value = round(period / 10.0**exponent)
+        if 1 <= value <= 255 and math.isclose(value * 10.0**exponent, period, rel_tol=1e-9):
+            return value, exponent
+    exponent = math.ceil(math.log10(period / 255))
+    return round(period / 10.0**exponent), exponent

@@ -1,0 +1,171 @@
+"""The cyclic path: RPDOs, SYNC, TPDOs decoded through a compiled table. One loop owns the port."""
+
+import math
+import struct
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armlink import emcy, objects
+from armlink.clock import Clock
+from armlink.pdo import RPDO1, RPDO2, TPDO1, TPDO2, decoding_table
+from armlink.port import Port
+from armlink.sample import Array, Sample, Stats
+from armlink.units import TORQUE_PER_MICRO, Units
+
+FRAME_BITS = 47
+"""Bits of a frame without data, interframe space and nominal stuffing included; 8 more a byte."""
+COLLECT_SHARE = 0.8
+"""Share of a period after SYNC in which TPDOs of this cycle are waited for."""
+
+_NOTHING = b""
+_OPERATIONAL = bytes([objects.OPERATIONAL])
+
+
+class Loop:
+    """Frames of one cycle out and in, for n joints; knows no states, no limits and no faults, only keeps them."""
+
+    def __init__(
+        self, port: Port, clock: Clock, nodes: tuple[int, ...], host: int, period: float, lock_step: bool
+    ) -> None:
+        self.nodes, self.n = nodes, len(nodes)
+        self.period, self.heartbeat_cycles = period, 1
+        self.stats = Stats()
+        self.emergencies: list[tuple[int, int, int]] = []
+        """(joint index, code, error register) in the order of arrival."""
+        self.node_states: dict[int, int] = {}
+        """Joint index → NMT state of its newest heartbeat, 0 for boot-up; only those received while cycling."""
+        self.on_other: Callable[[int, bytes], None] = lambda can_id, data: None
+        """Takes frames that are no process data: SDO responses."""
+        self._port, self._clock = port, clock
+        self._patience = 0.0 if lock_step else COLLECT_SHARE * period
+        self._table = {
+            can_id: (joint, {TPDO1: 0, TPDO2: 1}.get(pdo, 2), layout.unpack, layout.size)
+            for can_id, (joint, pdo, layout) in decoding_table(nodes).items()
+        }
+        self._joint_of = {node: joint for joint, node in enumerate(nodes)}
+        self._command = RPDO1.layout.pack
+        self._command_ids = tuple(RPDO1.cob_base + node for node in nodes)
+        self._heartbeat_id = objects.HEARTBEAT_ID + host
+        self._position: list[float] = [math.nan] * self.n
+        self._torque: list[float] = [math.nan] * self.n
+        self._motor: list[float] = [math.nan] * self.n
+        self._velocity: list[float] = [math.nan] * self.n
+        self._status: list[int] = [0] * self.n
+        self._awaited = 0
+        self._bits = 0
+        self._seen = np.full(self.n, -math.inf)
+        self._first: float | None = None
+        self.latest_position = np.full(self.n, math.nan)
+        """Newest position of each joint whenever it came [rad]; for the gate, never for a sample."""
+        self.latest_motor_torque = np.full(self.n, math.nan)
+        """Newest torque actual value of each joint whenever it came [N·m]; for the gate, never for a sample."""
+        self.set_units((Units(1.0, 1.0, 1.0),) * self.n)
+
+    def set_units(self, units: tuple[Units, ...]) -> None:
+        """Scales of the joints."""
+        self._torque_unit = np.array([unit.torque for unit in units])
+        self._position_unit = np.array([unit.position for unit in units])
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Send one frame and count it."""
+        self._port.send(can_id, data)
+        self.stats.frames += 1
+        self._bits += FRAME_BITS + 8 * len(data)
+
+    def send_mode(self, joint: int, mode: int) -> None:
+        """RPDO2: the mode of one joint."""
+        self.send(RPDO2.cob_base + self.nodes[joint], struct.pack("<b", mode))
+
+    def receive(self, timeout: float) -> bool:
+        """Take one frame in, waiting for it at most `timeout` seconds; False where none came."""
+        frame = self._port.receive(timeout)
+        if frame is None:
+            return False
+        self._take(*frame)
+        return True
+
+    def drain(self) -> None:
+        """Take in all that came between cycles; sensor frames among it missed their cycle and are dropped."""
+        self._awaited = 0
+        while self.receive(0.0):
+            pass
+        self._position = [math.nan] * self.n
+        self._torque = [math.nan] * self.n
+
+    def exchange(self, control: list[int], torque_wire: list[int], position_wire: list[int]) -> Sample:
+        """One cycle: RPDO1 of every joint, heartbeat when due, SYNC, then the TPDOs that it brings."""
+        send, command = self.send, self._command
+        for joint, can_id in enumerate(self._command_ids):
+            send(can_id, command(control[joint], torque_wire[joint], position_wire[joint]))
+        if self.stats.cycles % self.heartbeat_cycles == 0:
+            send(self._heartbeat_id, _OPERATIONAL)
+        now = self._clock.now()
+        if self._first is None:
+            self._first = now
+        self._awaited = self.n
+        send(objects.SYNC_ID, _NOTHING)
+        end = now + self._patience
+        while self._awaited > 0:
+            remaining = end - self._clock.now()
+            if not self.receive(max(remaining, 0.0)) and remaining <= 0:
+                break
+        while self.receive(0.0):
+            pass
+        return self._sample(now)
+
+    def age(self, now: float) -> Array:
+        """Time since each joint's position and torque last came [s], (n,); inf before the first."""
+        return now - self._seen
+
+    def measure(self, elapsed: float, bitrate: int) -> None:
+        """Bring rate and load of the stats up to date for `elapsed` seconds."""
+        if elapsed > 0:
+            self.stats.rate_hz = self.stats.cycles / elapsed
+            self.stats.load = self._bits / (bitrate * elapsed)
+
+    def _take(self, can_id: int, data: bytes) -> None:
+        self.stats.frames += 1
+        self._bits += FRAME_BITS + 8 * len(data)
+        entry = self._table.get(can_id)
+        if entry is None:
+            self._take_other(can_id, data)
+            return
+        joint, kind, unpack, size = entry
+        if len(data) != size:
+            self.stats.errors += 1
+        elif kind == 0:
+            self._awaited -= self._position[joint] != self._position[joint]
+            self._position[joint], self._torque[joint] = unpack(data)
+        elif kind == 1:
+            self._status[joint], self._motor[joint], self._velocity[joint] = unpack(data)
+        else:
+            (self._status[joint],) = unpack(data)
+
+    def _take_other(self, can_id: int, data: bytes) -> None:
+        joint = self._joint_of.get(can_id & 0x7F)
+        service = can_id & 0x780
+        if joint is not None and service == objects.EMCY_ID:
+            self.emergencies.append((joint, *emcy.parse(data)))
+        elif joint is not None and service == objects.HEARTBEAT_ID:
+            self.node_states[joint] = data[0] & 0x7F if data else 0
+        else:
+            self.on_other(can_id, data)
+
+    def _sample(self, now: float) -> Sample:
+        position = np.array(self._position) * self._position_unit
+        torque = np.array(self._torque) * TORQUE_PER_MICRO
+        motor = np.array(self._motor) * self._torque_unit
+        velocity = np.array(self._velocity) * self._position_unit
+        self._motor = [math.nan] * self.n
+        self._velocity = [math.nan] * self.n
+        came = np.isfinite(position)
+        self._seen[came] = now
+        np.copyto(self.latest_position, position, where=came)
+        np.copyto(self.latest_motor_torque, motor, where=np.isfinite(motor))
+        self.stats.cycles += 1
+        self.stats.missed += self.n - int(came.sum())
+        status: NDArray[np.int64] = np.array(self._status, np.int64)
+        age: Array = now - self._seen
+        return Sample(now - (self._first or 0.0), position, velocity, torque, motor, status, age)

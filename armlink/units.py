@@ -1,0 +1,40 @@
+"""Units of a joint controller to SI and back: per mille of rated torque, user position units, micronewton-metres."""
+
+import math
+from dataclasses import dataclass
+
+TORQUE_PER_MICRO = 1e-6
+"""2100h:01 is in µN·m."""
+
+
+@dataclass(frozen=True)
+class Units:
+    """Scales of one joint; a wire value times the scale is SI."""
+
+    torque: float
+    """One per mille of the rated torque (6076h) [N·m]."""
+    position: float
+    """One user unit [rad]; velocities are in user units a second."""
+    encoder_step: float
+    """What one encoder increment is at the joint [rad]: finer readings are not to be had."""
+
+
+def units_from(
+    rated_torque_mnm: int,
+    encoder: tuple[int, int],
+    gear: tuple[int, int],
+    feed: tuple[int, int],
+) -> Units:
+    """Scales from 6076h [mN·m], 608Fh (increments, motor revolutions), 6091h (motor, shaft revolutions), 6092h (feed,
+    shaft revolutions), by CiA 402: user units = increments · 6092 / (608F · 6091), so 6092 is user units a joint turn.
+
+    Raises ValueError on a zero.
+    """
+    if not all((rated_torque_mnm, *encoder, *gear, *feed)):
+        raise ValueError(f"a zero in 6076h {rated_torque_mnm}, 608Fh {encoder}, 6091h {gear} or 6092h {feed}")
+    increments_a_turn = encoder[0] / encoder[1] * gear[0] / gear[1]
+    return Units(
+        torque=rated_torque_mnm * 1e-6,
+        position=2 * math.pi * feed[1] / feed[0],
+        encoder_step=2 * math.pi / increments_a_turn,
+    )
