@@ -31,7 +31,7 @@ class Arm:
     upper: Array
     """Upper joint limit (n,) [rad]; +inf where there is none."""
 
-    def __post_init__(self) -> None:  # noqa: D105
+    def __post_init__(self) -> None:
         n = len(self.names)
         if n == 0 or len(set(self.names)) != n:
             raise BadArray(f"joint names are {list(self.names)}, expected at least one, each different")

@@ -72,7 +72,7 @@ class Parameters:
         """The parameter vector (6n + 3,)."""
         return np.concatenate([getattr(self, family) for family in FAMILIES])
 
-    def __post_init__(self) -> None:  # noqa: D105
+    def __post_init__(self) -> None:
         frozen(self, **{family: np.asarray(getattr(self, family), dtype=np.float64) for family in FAMILIES})
 
 

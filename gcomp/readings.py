@@ -23,7 +23,7 @@ class Readings:
     load: Array
     """Reference mass attached in that row (K,) [kg]; 0 where there is none."""
 
-    def __post_init__(self) -> None:  # noqa: D105
+    def __post_init__(self) -> None:
         position = as_array("position", self.position, (None, None))
         count, n = position.shape
         torque = as_array("torque", self.torque, (count, n), finite=False)
