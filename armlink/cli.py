@@ -70,6 +70,8 @@ def _invoke(point: EntryPoint, arguments: list[str]) -> int:
         outcome = app(args=arguments, prog_name=f"armlink {point.name}", standalone_mode=False)
     except typer.Abort:
         raise KeyboardInterrupt from None
+    if outcome == INTERRUPTED_STATUS:  # what newer typers make of Ctrl-C
+        raise KeyboardInterrupt
     return outcome if isinstance(outcome, int) else 0
 
 
