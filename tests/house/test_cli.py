@@ -1,0 +1,207 @@
+"""The console command: usage, errors as one line, exit statuses. The commands here are made up."""
+
+import os
+import signal
+import subprocess
+import sys
+import types
+from importlib.metadata import EntryPoint
+
+import pytest
+import typer
+
+from armlink import cli
+from armlink.errors import BadInput, BusFault, Refused
+
+
+@pytest.fixture
+def command(monkeypatch):
+    """Registers one function (or typer app) as the only command, `work`."""
+
+    def register(target):
+        module = types.ModuleType("made_up_command")
+        module.target = target
+        monkeypatch.setitem(sys.modules, "made_up_command", module)
+        point = EntryPoint(name="work", value="made_up_command:target", group="armlink.commands")
+        monkeypatch.setattr(cli, "entry_points", lambda group: [point])
+
+    return register
+
+
+def raising(error):
+    def work():
+        raise error
+
+    return work
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "line"),
+    [
+        (BadInput("arm.yaml: key link.rate: too big (value 9000)"), 2, "key link.rate: too big (value 9000)"),
+        (Refused("joint_3: RMS 0.4 N·m exceeds 0.1 N·m"), 1, "joint_3: RMS 0.4 N·m exceeds 0.1 N·m"),
+        (BusFault("node 4 does not answer"), 3, "node 4 does not answer"),
+        (BadInput("two\nlines"), 2, "two lines"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (typer.Abort(), 130, "interrupted"),
+        (FileNotFoundError(2, "No such file or directory", "gone.csv"), 2, "gone.csv: No such file or directory"),
+        (PermissionError(13, "Permission denied", "/out"), 2, "/out: Permission denied"),
+    ],
+)
+def test_an_error_is_one_line_and_its_exit_status(command, capsys, error, status, line):
+    command(raising(error))
+    assert cli.run(["work"]) == status
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("armlink: ")
+    assert err.splitlines() == [err.strip()]
+    assert line in err
+
+
+def test_an_error_of_another_package_s_own_tree_counts_too(command, capsys):
+    class WrongShape(ValueError):
+        exit_status = 2
+
+    command(raising(WrongShape("q has 6 columns; expected 7")))
+    assert cli.run(["work"]) == 2
+    assert capsys.readouterr().err == "armlink: q has 6 columns; expected 7\n"
+
+
+def test_a_bug_is_not_dressed_up_as_bad_input(command):
+    command(raising(ZeroDivisionError("ours")))
+    with pytest.raises(ZeroDivisionError):
+        cli.run(["work"])
+
+
+@pytest.mark.parametrize("outcome", [0, 1])
+def test_a_command_may_return_its_exit_status(command, outcome):
+    command(lambda: outcome)
+    assert cli.run(["work"]) == outcome
+
+
+def test_an_exit_that_typer_raises_keeps_its_code(command):
+    command(raising(typer.Exit(1)))
+    assert cli.run(["work"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["work", "--nope"], "--nope"),
+        (["work", "--count", "many"], "'--count': Input should be a valid integer"),
+        (["work", "--count"], "--count"),
+        (["work", "surplus"], "surplus"),
+        (["wrok"], "no command 'wrok'"),
+        (["--nope"], "no command '--nope'"),
+    ],
+)
+def test_bad_usage_is_one_line_and_status_2(command, capsys, arguments, words):
+    def work(count: int = 1) -> None: ...
+
+    command(work)
+    assert cli.run(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("armlink: ")
+    assert err.count("\n") == 1
+    assert words in err
+
+
+def test_a_group_of_commands_without_one_shows_its_help(command, capsys):
+    app = typer.Typer(help="Groups.")
+    app.command(name="one")(lambda: None)
+    app.command(name="two")(lambda: None)
+    command(app)
+    assert cli.run(["work"]) == 0
+    assert "one" in capsys.readouterr().out
+
+
+def test_a_sub_command_s_error_names_its_status(command, capsys):
+    app = typer.Typer()
+    app.command(name="one")(raising(BadInput("no such recording")))
+    app.command(name="two")(lambda: None)
+    command(app)
+    assert cli.run(["work", "one"]) == 2
+    assert capsys.readouterr().err == "armlink: no such recording\n"
+    assert cli.run(["work", "three"]) == 2
+    assert "three" in capsys.readouterr().err
+
+
+def test_no_command_shows_what_there_is_and_is_bad_usage(capsys):
+    assert cli.run([]) == 2
+    assert "demo" in capsys.readouterr().out
+
+
+def test_help_and_version_say_what_it_is(capsys):
+    assert cli.run(["--help"]) == 0
+    assert "Usage: armlink COMMAND" in capsys.readouterr().out
+    assert cli.run(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("armlink 0.")
+
+
+WAITING = """
+import sys, types
+from importlib.metadata import EntryPoint
+from armlink import cli
+def work():
+    try:
+        print("working", flush=True)
+        sys.stdin.read()
+    finally:
+        print("joints safe", flush=True)
+module = types.ModuleType("made_up"); module.work = work; sys.modules["made_up"] = module
+cli.entry_points = lambda group: [EntryPoint("work", "made_up:work", group)]
+sys.argv = ["armlink", "work"]
+cli.main()
+"""
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_the_work_in_order(number, status):
+    with subprocess.Popen(
+        [sys.executable, "-c", WAITING],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout.readline() == "working\n"
+        process.send_signal(number)
+        assert process.stdout.read() == "joints safe\n"
+        assert process.wait() == status
+        assert "Traceback" not in process.stderr.read()
+
+
+def test_a_reader_that_goes_away_is_no_error():
+    source = WAITING.replace("sys.stdin.read()", "[print('x' * 1000, flush=True) for _ in range(1000)]").replace(
+        'print("joints safe", flush=True)', "pass"
+    )
+    with subprocess.Popen([sys.executable, "-c", source], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        assert b"Traceback" not in process.stderr.read()
+
+
+def test_help_takes_less_than_0_3_s_of_cpu_and_loads_no_heavy_package():
+    read, write = os.pipe()
+    child = subprocess.Popen(
+        [
+            sys.executable,
+            "-X",
+            "importtime",
+            "-c",
+            "import sys; from armlink.cli import main; sys.argv[1:] = ['--help']; main()",
+        ],
+        stdout=subprocess.DEVNULL,
+        stderr=write,
+    )
+    os.close(write)
+    with os.fdopen(read) as report:
+        loaded = {
+            line.rpartition("|")[2].strip().partition(".")[0] for line in report if line.startswith("import time:")
+        }
+    _, status, usage = os.wait4(child.pid, 0)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    assert child.returncode == 0
+    assert "armlink" in loaded
+    assert not loaded & {"numpy", "scipy", "pydantic", "typer", "rich", "can", "canopen", "mujoco", "pyarrow", "plotly"}
+    assert usage.ru_utime + usage.ru_stime < 0.3
