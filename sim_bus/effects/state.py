@@ -1,0 +1,128 @@
+"""All imperfections of a simulated arm as arrays: effects fold into it, plant, drives and sensors read it."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_bus.effects.registry import check_entry, effects
+
+Array = NDArray[np.float64]
+
+
+class Entry(Protocol):
+    """One effect as the arm file gives it."""
+
+    @property
+    def effect(self) -> str: ...  # noqa: D102
+    @property
+    def joint(self) -> str | None: ...  # noqa: D102
+    @property
+    def parameters(self) -> dict[str, Any]: ...  # noqa: D102
+
+
+@dataclass
+class Imperfections:
+    """What is wrong with an arm, per joint (n,) unless said otherwise; as built, nothing is."""
+
+    names: tuple[str, ...]
+    coulomb: Array = field(init=False)
+    """Coulomb friction [N·m]."""
+    viscous: Array = field(init=False)
+    """[N·m·s/rad]."""
+    breakaway: Array = field(init=False)
+    """Static friction above Coulomb's [N·m]."""
+    stribeck_velocity: Array = field(init=False)
+    """[rad/s]."""
+    asymmetry: Array = field(init=False)
+    """Friction is (1 + a) times as large for positive motion and (1 − a) for negative."""
+    load_friction: Array = field(init=False)
+    """Friction per transmitted torque."""
+    ripple: Array = field(init=False)
+    """Amplitude, cycles per rad, phase (n, 3)."""
+    spring: Array = field(init=False)
+    """Stiffness [N·m/rad] and rest angle [rad] (n, 2)."""
+    elasticity: Array = field(init=False)
+    """Stiffness of the transmission [N·m/rad]; 0 is rigid."""
+    backlash: Array = field(init=False)
+    """Play of the transmission [rad]."""
+    coupling: Array = field(init=False)
+    """Rad of motor i per rad of joint j (n, n)."""
+    rotor_inertia: Array = field(init=False)
+    """At the joint [kg·m²]."""
+    actuator_gain: Array = field(init=False)
+    actuator_lag: Array = field(init=False)
+    """[s]."""
+    actuator_delay: Array = field(init=False)
+    """[s]."""
+    actuator_saturation: Array = field(init=False)
+    """[N·m]; infinite without."""
+    torque_gain: Array = field(init=False)
+    torque_offset: Array = field(init=False)
+    """[N·m]."""
+    torque_drift: Array = field(init=False)
+    """[N·m/s]."""
+    crosstalk: Array = field(init=False)
+    """Torque reading of i per torque of j (n, n)."""
+    hysteresis: Array = field(init=False)
+    """Half width [N·m]."""
+    deadband: Array = field(init=False)
+    """Half width [N·m]."""
+    torque_saturation: Array = field(init=False)
+    """[N·m]; infinite without."""
+    position_gain: Array = field(init=False)
+    position_offset: Array = field(init=False)
+    """[rad]."""
+    eccentricity: Array = field(init=False)
+    """Amplitude [rad] and phase [rad] (n, 2)."""
+    torque_delay: Array = field(init=False)
+    """[s]."""
+    mass_moment: Array = field(init=False)
+    """Added m·s of each link in its bar frame [kg·m] (n, 3)."""
+    inertia: Array = field(init=False)
+    """Added inertia of each link about its centre of mass: xx, yy, zz, xy, xz, yz [kg·m²] (n, 6)."""
+    payload: Array = field(init=False)
+    """Mass [kg] and centre of mass in the last bar frame [m] (4,)."""
+    tilt: Array = field(init=False)
+    """Rotation of the base about its x and y axes [rad] (2,)."""
+
+    def __post_init__(self) -> None:
+        """Start from a perfect arm."""
+        n = len(self.names)
+        shapes = {"ripple": (n, 3), "spring": (n, 2), "coupling": (n, n), "crosstalk": (n, n), "eccentricity": (n, 2)}
+        shapes |= {"mass_moment": (n, 3), "inertia": (n, 6), "payload": (4,), "tilt": (2,)}
+        initial = {"stribeck_velocity": 0.01, "actuator_gain": 1.0, "torque_gain": 1.0, "position_gain": 1.0}
+        initial |= {"actuator_saturation": np.inf, "torque_saturation": np.inf}
+        for item in fields(self):
+            if item.name != "names":
+                setattr(self, item.name, np.full(shapes.get(item.name, (n,)), initial.get(item.name, 0.0)))
+
+    @property
+    def static(self) -> bool:
+        """Whether friction keeps one level whatever the velocity, direction and load."""
+        return not (self.breakaway.any() or self.asymmetry.any() or self.load_friction.any())
+
+
+def imperfections(names: Sequence[str], entries: Iterable[Entry]) -> Imperfections:
+    """Fold the entries, in order, into one state for the joints `names`. Raises ValueError."""
+    state, known = Imperfections(tuple(names)), effects()
+    for entry in entries:
+        check_entry(entry.effect, entry.joint, entry.parameters)
+        effect = known[entry.effect]
+        values: Mapping[str, Any] = {
+            p.name: _value(names, p.joint, entry.parameters.get(p.name, p.default)) for p in effect.parameters
+        }
+        effect.apply(state, _index(names, entry.joint) if effect.per_joint else -1, values)
+    return state
+
+
+def _value(names: Sequence[str], joint: bool, value: Any) -> Any:
+    return _index(names, value) if joint else np.asarray(value, float)
+
+
+def _index(names: Sequence[str], joint: Any) -> int:
+    if joint not in names:
+        raise ValueError(f"no joint {joint!r}; there are {', '.join(names)}")
+    return list(names).index(joint)

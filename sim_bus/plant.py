@@ -1,0 +1,231 @@
+"""The physics: MuJoCo steps the arm with its stops and friction; torque is measured on the link side.
+
+A joint's sensor reads what the transmission passes on to the link: motor torque less friction, ripple and rotor
+acceleration. The stops push on the link, beyond the sensor, so a joint pressed on its stop reads the pressing torque.
+"""
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from armlink.armfile import ArmFile
+from sim_bus.effects.state import Imperfections
+from sim_bus.mjcf import TINY_INERTIA, build_model
+from sim_bus.section import sim_section
+
+Array = NDArray[np.float64]
+BRAKE_SHARE = 3.0
+"""What the holding brake holds, in maximal torques."""
+
+
+class Plant:
+    """The arm as a physical thing. All arrays (n,) in joint order, true angles [rad], torques [N·m]."""
+
+    def __init__(self, arm: ArmFile, imperfections: Imperfections) -> None:
+        """Build it at rest in its start position (mid-range by default). Raises BadInput."""
+        section, link = sim_section(arm), arm.require_link()
+        built = build_model(arm)
+        self.model, self.n = built.model, len(built.bodies)
+        self.data = mujoco.MjData(self.model)
+        self._bodies, self._payload = list(built.bodies), built.payload_body
+        joints = [self.model.joint(name).id for name in arm.joint_names]
+        self._qpos = self.model.jnt_qposadr[joints]
+        self._dof = self.model.jnt_dofadr[joints]
+        self.lower, self.upper = self.model.jnt_range[joints].T.copy()
+        self._nominal = (self.model.body_mass.copy(), self.model.body_ipos.copy(), self.model.opt.gravity.copy())
+        self._nominal_inertia = _full_inertia(self.model)
+        self._armature = self.model.dof_armature[self._dof].copy()
+        self._damping = self.model.dof_damping[self._dof].copy()
+        self._attached = np.zeros(4)
+        self._brake_torque = BRAKE_SHARE * np.array([joint.max_torque for joint in link.joints])
+        self._braked = np.zeros(self.n, bool)
+        self._servo = (np.zeros(self.n), np.zeros(self.n), np.zeros(self.n))
+        self.step_time = section.step
+        start = (self.lower + self.upper) / 2 if section.start is None else np.array(section.start)
+        self.data.qpos[self._qpos] = start
+        self.set_imperfections(imperfections)
+
+    # ---- what it is
+
+    def set_imperfections(self, imperfections: Imperfections) -> None:
+        """Take over masses, base and friction of `imperfections`; state and motion stay."""
+        self._imperfections = imperfections
+        self._viscous = self._damping + imperfections.viscous
+        self.model.dof_armature[self._dof] = self._armature + imperfections.rotor_inertia
+        self.model.dof_damping[self._dof] = self._viscous
+        self.model.opt.gravity[:] = _tilt(imperfections.tilt).T @ self._nominal[2]
+        self.model.jnt_stiffness[:] = 0.0
+        self._set_inertias()
+        self._set_friction()
+        self.set_servo(*self._servo)
+        mujoco.mj_forward(self.model, self.data)
+
+    def attach_mass(self, mass: float, point: Array) -> None:
+        """Bolt a point mass [kg] on at `point` of the last link's bar frame [m]; it replaces an earlier one."""
+        self._attached = np.array([mass, *np.asarray(point, float)])
+        self._set_inertias()
+        mujoco.mj_forward(self.model, self.data)
+
+    def detach_mass(self) -> None:
+        """Take off what attach_mass put on."""
+        self.attach_mass(0.0, np.zeros(3))
+
+    def gravity_torque(self, q: Array) -> Array:
+        """True holding torque ∂V/∂q at the angles `q` (K, n) → (K, n), everything attached included."""
+        scratch, q = mujoco.MjData(self.model), np.atleast_2d(np.asarray(q, float))
+        torque = np.empty_like(q)
+        for row, angles in enumerate(q):
+            scratch.qpos[self._qpos] = angles
+            mujoco.mj_kinematics(self.model, scratch)
+            mujoco.mj_comPos(self.model, scratch)
+            mujoco.mj_rne(self.model, scratch, 0, scratch.qfrc_bias)
+            torque[row] = scratch.qfrc_bias[self._dof]
+        return torque
+
+    def inertia(self, q: Array) -> Array:
+        """Joint-space inertia matrix at the angles `q` (n,) → (n, n) [kg·m²]."""
+        scratch, full = mujoco.MjData(self.model), np.empty((self.model.nv, self.model.nv))
+        scratch.qpos[self._qpos] = q
+        mujoco.mj_forward(self.model, scratch)
+        mujoco.mj_fullM(self.model, scratch, full)
+        return full[np.ix_(self._dof, self._dof)]
+
+    # ---- what it does
+
+    @property
+    def position(self) -> Array:
+        """True joint angles [rad]."""
+        return self.data.qpos[self._qpos]
+
+    @property
+    def velocity(self) -> Array:
+        """True joint velocities [rad/s]."""
+        return self.data.qvel[self._dof]
+
+    @property
+    def motor_torque(self) -> Array:
+        """Torque that each motor makes."""
+        return self.data.qfrc_actuator[self._dof]
+
+    @property
+    def drive_torque(self) -> Array:
+        """Torque that the drive believes its motor makes: current times nominal torque constant."""
+        return self.motor_torque / self._imperfections.actuator_gain
+
+    @property
+    def link_torque(self) -> Array:
+        """Torque that each transmission passes on to its link: what an ideal joint torque sensor reads."""
+        data, dof = self.data, self._dof
+        transmitted = data.qfrc_actuator[dof] - self._viscous * data.qvel[dof]
+        transmitted -= self.model.dof_armature[dof] * data.qacc[dof]
+        friction = data.efc_force[data.ne : data.ne + data.nf]
+        if data.nf == self.n:
+            return transmitted + friction
+        transmitted[np.searchsorted(dof, data.efc_id[data.ne : data.ne + data.nf])] += friction
+        return transmitted
+
+    def set_servo(self, stiffness: Array, damping: Array, limit: Array) -> None:
+        """Motor torque = clamp(drive − stiffness·q − damping·q̇, ±limit), at every step of the physics."""
+        self._servo = (stiffness, damping, limit)
+        gain = self._imperfections.actuator_gain
+        limit = gain * np.minimum(limit, self._imperfections.actuator_saturation)
+        self.model.actuator_biasprm[:, 1] = -gain * stiffness
+        self.model.actuator_biasprm[:, 2] = -gain * damping
+        self.model.actuator_gainprm[:, 0] = gain
+        self.model.actuator_forcerange[:, 0] = -limit
+        self.model.actuator_forcerange[:, 1] = limit
+
+    def set_brakes(self, closed: NDArray[np.bool_]) -> None:
+        """Close or open the holding brakes; they act before the torque sensor, as friction does."""
+        self._braked = np.array(closed, bool)
+        self._set_friction()
+
+    def step(self, start: Array, end: Array, duration: float) -> None:
+        """Run for `duration` [s] while the motors' `drive` torque goes linearly from `start` to `end`."""
+        count = max(1, int(np.ceil(duration / self.step_time - 1e-9)))
+        model, data = self.model, self.data
+        model.opt.timestep = duration / count
+        if start is end and self._imperfections.static:
+            data.ctrl[:] = end
+            mujoco.mj_step(model, data, count)
+            return
+        slope = (end - start) / count
+        level = start + 0.5 * slope
+        for _ in range(count):
+            data.ctrl[:] = level
+            if not self._imperfections.static:
+                self._set_friction()
+            mujoco.mj_step(model, data)
+            level = level + slope
+
+    # ---- inside
+
+    def _set_friction(self) -> None:
+        """Level of dry friction at the present velocity and load, or the brake's."""
+        state = self._imperfections
+        level = state.coulomb
+        if not state.static:
+            velocity, load = self.velocity, self.link_torque
+            level = level + state.breakaway * np.exp(-((velocity / state.stribeck_velocity) ** 2))
+            level = level + state.load_friction * np.abs(load)
+            resting = np.abs(velocity) < 1e-4
+            heading = np.where(resting, np.sign(self.motor_torque - load), np.sign(velocity))
+            level = level * (1.0 + state.asymmetry * heading)
+        self.model.dof_frictionloss[self._dof] = np.where(self._braked, self._brake_torque, np.maximum(level, 0.0))
+
+    def _set_inertias(self) -> None:
+        """Masses, centres of mass and inertias from nominal, effects and what is attached."""
+        state, model = self._imperfections, self.model
+        mass, com, inertia = self._nominal[0].copy(), self._nominal[1].copy(), self._nominal_inertia.copy()
+        bodies = self._bodies
+        com[bodies] += state.mass_moment / mass[bodies, None]
+        inertia[bodies] += state.inertia
+        load, moment = TINY_INERTIA, np.zeros(3)
+        points = [item for item in (state.payload, self._attached) if item[0] != 0.0]
+        for item in points:
+            load, moment = load + item[0], moment + item[0] * item[1:]
+        mass[self._payload], com[self._payload] = load, moment / load
+        inertia[self._payload] = np.array([1, 1, 1, 0, 0, 0]) * TINY_INERTIA
+        for item in points:
+            inertia[self._payload] += item[0] * _point_inertia(item[1:] - com[self._payload])
+        model.body_mass[:], model.body_ipos[:] = mass, com
+        for body in (*bodies, self._payload):
+            model.body_inertia[body], model.body_iquat[body] = _principal(inertia[body])
+        position = self.data.qpos.copy()
+        mujoco.mj_setConst(model, self.data)
+        self.data.qpos[:] = position
+
+
+def _full_inertia(model: mujoco.MjModel) -> Array:
+    """Inertias about the centres of mass along the bodies' axes (bodies, 6): xx, yy, zz, xy, xz, yz."""
+    full, turn = np.empty((model.nbody, 6)), np.empty(9)
+    for body in range(model.nbody):
+        mujoco.mju_quat2Mat(turn, model.body_iquat[body])
+        axes = turn.reshape(3, 3)
+        matrix = axes @ np.diag(model.body_inertia[body]) @ axes.T
+        full[body] = matrix[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    return full
+
+
+def _principal(inertia: Array) -> tuple[Array, Array]:
+    """Principal moments and the quaternion of the principal axes."""
+    xx, yy, zz, xy, xz, yz = inertia
+    moments, axes = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, axes.ravel())
+    return moments, quaternion
+
+
+def _point_inertia(arm: Array) -> Array:
+    x, y, z = arm
+    return np.array([y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z])
+
+
+def _tilt(angles: Array) -> Array:
+    """Rotation of the base: about its x axis, then about its y axis (3, 3)."""
+    (cx, cy), (sx, sy) = np.cos(angles), np.sin(angles)
+    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    return about_x @ about_y

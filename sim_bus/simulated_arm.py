@@ -1,0 +1,251 @@
+"""The whole simulated arm behind its frames: plant, sensors, drives and one CANopen node a joint."""
+
+import struct
+from collections import deque
+from collections.abc import Iterable
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armlink.armfile import ArmFile
+from armlink.errors import BadInput
+from sim_bus.cia402 import State
+from sim_bus.drives import FEED, SUPPORTED_MODES, Drives
+from sim_bus.effects.state import Entry, imperfections
+from sim_bus.node import OPERATIONAL, PRE_OPERATIONAL, STOPPED, Node
+from sim_bus.pdo import Frame, PdoTable
+from sim_bus.plant import Plant
+from sim_bus.section import sim_section
+from sim_bus.sensors import Sensors
+from sim_bus.signals import Key, Signals
+from sim_bus.supervision import Supervision
+from sim_bus.truth import Truth
+
+Array = NDArray[np.float64]
+SYNC_ID = 0x80
+TARGETS = {(0x6071, 0): "new_torque", (0x607A, 0): "new_position", (0x60FF, 0): "new_velocity"}
+
+
+class SimulatedArm:
+    """Frames in by on_frame(), frames out in `outbox`, time by advance(). Deterministic given truth and seed."""
+
+    def __init__(self, arm: ArmFile, truth: Truth, seed: int = 0) -> None:
+        """Power the arm on: every node boots. Raises BadInput where the arm file lacks what a simulation needs."""
+        section, link = sim_section(arm), arm.require_link()
+        self.arm, self.truth, self.names, self.n = arm, truth, arm.joint_names, len(arm.joint_names)
+        self.time = 0.0
+        self.outbox: deque[Frame] = deque()
+        self.default_period = 1.0 / link.rate
+        self._entries: tuple[Entry, ...] = section.effects
+        state = self._imperfections(self._entries)
+        self.plant = Plant(arm, state)
+        self.sensors = Sensors(arm, truth, state, seed)
+        self._signals = Signals(self.n)
+        self.drives = Drives(arm, self.plant, self.sensors, self._signals)
+        self._operational = bytearray(self.n)
+        self._pdos = PdoTable(self._signals, self._operational, self.outbox.append)
+        self._sampled = 0.0
+        self._synchronous = False
+        self.nodes = [Node(j, joint.node, self._signals, self.outbox.append) for j, joint in enumerate(link.joints)]
+        self._sdo = {0x600 + node.node_id: node for node in self.nodes}
+        self.supervision = Supervision(self.nodes, self.drives, self.outbox.append)
+        for node, joint in zip(self.nodes, link.joints, strict=True):
+            node.identity = self._identity(node, joint.rated_torque, joint.max_torque)
+            node.reset()
+            node.on_write = lambda key, node=node: self._written(node, key)  # type: ignore[misc]
+            node.on_pdo_change = self._compile
+            self._apply(node)
+        self._compile()
+        self.drives.take_commands()
+        self.drives.sample(0.0, 0.0)
+
+    # ---- the bus's side
+
+    def on_frame(self, can_id: int, data: bytes) -> None:
+        """A frame from the bus: SYNC samples and applies; PDO, SDO, NMT and heartbeat as CiA 301 has them."""
+        slot = self._pdos.receive.get(can_id)
+        if slot is not None:
+            self._receive_pdo(slot, data)
+        elif can_id == SYNC_ID:
+            self._sync()
+        elif can_id in self._sdo:
+            self._sdo[can_id].on_sdo(data)
+            self._asynchronous()
+        elif can_id == 0:
+            self._nmt(data)
+        elif 0x700 < can_id < 0x780 and data:
+            self.supervision.heartbeat(can_id - 0x700, self.time)
+
+    def advance(self, duration: float) -> None:
+        """Let simulated time pass [s], in pieces of at most one SYNC period."""
+        remaining = duration
+        while remaining > 1e-9:
+            piece = min(remaining, self.period)
+            self.drives.advance(piece, self._synchronous)
+            self._synchronous = False
+            self.time += piece
+            remaining -= piece
+            if self.supervision.due <= self.time:
+                self.supervision.check(self.time)
+            if remaining > 1e-9:
+                self._sample()
+            self._pdos.send_events()
+
+    @property
+    def period(self) -> float:
+        """What one SYNC stands for: 1006h where it is set, else the arm file's rate [s]."""
+        return self._period
+
+    # ---- the plant's side: what a fit must not see
+
+    def gravity_torque(self, q: Array) -> Array:
+        """True holding torque at the true angles `q` (K, n) → (K, n) [N·m], by MuJoCo."""
+        return self.plant.gravity_torque(q)
+
+    def attach_mass(self, mass: float, point: Array | None = None) -> None:
+        """Bolt `mass` [kg] on, at `point` of the last bar frame [m] or where the truth says."""
+        self.plant.attach_mass(mass, self.truth.attachment if point is None else point)
+
+    def detach_mass(self) -> None:
+        """Take the attached mass off."""
+        self.plant.detach_mass()
+
+    def drift(self, joint: int | str, gain: float, offset: float) -> None:
+        """Change a torque sensor from now on: its gain `gain` times as large, its offset `offset` [N·m] larger."""
+        self.sensors.drift(self._place(joint), gain, offset)
+
+    def set_effects(self, entries: Iterable[Entry]) -> None:
+        """Replace the arm's imperfections while it runs. Raises BadInput."""
+        self._entries = tuple(entries)
+        state = self._imperfections(self._entries)
+        self.plant.set_imperfections(state)
+        self.sensors.set_imperfections(state)
+
+    @property
+    def effects(self) -> tuple[Entry, ...]:
+        """The imperfections in force."""
+        return self._entries
+
+    @property
+    def true_sensors(self) -> Truth:
+        """The sensors as they are now, drifts and effects included."""
+        sensors, truth = self.sensors, self.truth
+        return Truth(
+            sensors.gain, sensors.offset, sensors.position_gain, sensors.position_offset, attachment=truth.attachment
+        )
+
+    # ---- inside
+
+    def _imperfections(self, entries: tuple[Entry, ...]):  # type: ignore[no-untyped-def]
+        try:
+            return imperfections(self.names, entries)
+        except ValueError as error:
+            raise BadInput(f"{self.arm.path}: sim.effects: {error}") from None
+
+    def _place(self, joint: int | str) -> int:
+        if isinstance(joint, int):
+            return joint
+        if joint not in self.names:
+            raise BadInput(f"no joint {joint!r}; there are {', '.join(self.names)}")
+        return self.names.index(joint)
+
+    def _identity(self, node: Node, rated: float, greatest: float) -> dict[Key, int | str]:
+        increments = int(self.sensors.increments[node.place])
+        serial = crc32(f"{self.arm.name} {self.arm.serial} {self.names[node.place]}".encode())
+        return {
+            (0x1018, 4): serial,
+            (0x6076, 0): round(rated * 1000),
+            (0x6072, 0): min(round(greatest * 1000 / rated), 0xFFFF),
+            (0x6092, 1): FEED,
+            (0x608F, 1): increments,
+            (0x6502, 0): SUPPORTED_MODES,
+            (0x6085, 0): round(self.drives.deceleration[node.place] / (2 * np.pi) * FEED),
+        }
+
+    def _receive_pdo(self, slot, data: bytes) -> None:  # type: ignore[no-untyped-def]
+        group, place = slot
+        joint, size = group.nodes[place], group.size
+        if not self._operational[joint]:
+            return
+        if len(data) < size:
+            self.nodes[joint].emergency(0x8210, 0x10, struct.pack("<BB", len(data), size))
+            return
+        group.buffer[place * size : (place + 1) * size] = data[:size]
+        group.fresh[place] = 1
+        if self.supervision.watches_rpdos:
+            self.supervision.rpdo(joint, group.number, self.time)
+        if group.kind > 240:
+            self._take(group)
+            self.drives.take_commands()
+            self._pdos.send_events()
+
+    def _sync(self) -> None:
+        if not any(self._operational):
+            self._synchronous = False
+            return
+        self._sample()
+        self._pdos.send_sync()
+        for group in self._pdos.sync_receive:
+            self._take(group)
+        self.drives.take_commands()
+        self._pdos.send_events()
+        self._synchronous = True
+        self.supervision.sync(self.time)
+
+    def _take(self, group) -> None:  # type: ignore[no-untyped-def]
+        rows = group.take()
+        if rows is not None:
+            for key in TARGETS.keys() & group.keys:
+                getattr(self.drives, TARGETS[key])[rows] = True
+
+    def _sample(self) -> None:
+        self.drives.sample(self.time, self.time - self._sampled)
+        self._sampled = self.time
+
+    def _asynchronous(self) -> None:
+        self.drives.take_commands()
+        self._pdos.send_events()
+
+    def _written(self, node: Node, key: Key) -> None:
+        if key in TARGETS:
+            getattr(self.drives, TARGETS[key])[node.place] = True
+        elif key[0] < 0x6000 or key[0] in (0x6007, 0x605A, 0x6085):
+            self._apply(node)
+
+    def _apply(self, node: Node) -> None:
+        """Bring objects that were written into force."""
+        joint, record = node.place, node.record.active
+        self.drives.gain[joint], self.drives.offset[joint] = record.gain, record.offset
+        self.drives.quick_stop_option[joint] = node.value(0x605A)
+        self.drives.deceleration[joint] = max(node.value(0x6085), 1) * 2 * np.pi / FEED
+        self.supervision.configure(node, self.time)
+        given = self.nodes[0].value(0x1006)
+        self._period = given * 1e-6 if given else self.default_period
+
+    def _compile(self) -> None:
+        self._pdos.compile(
+            [pdo for node in self.nodes for pdo in node.pdos(receive=True)],
+            [pdo for node in self.nodes for pdo in node.pdos(receive=False)],
+        )
+
+    def _nmt(self, data: bytes) -> None:
+        if len(data) < 2:
+            return
+        for node in self.nodes:
+            if data[1] in (0, node.node_id):
+                self._nmt_command(node, data[0])
+        self._pdos.send_events()
+
+    def _nmt_command(self, node: Node, asked: int) -> None:
+        if asked in (0x81, 0x82):
+            if asked == 0x81:
+                self.drives.enter(node.place, State.SWITCH_ON_DISABLED)
+            node.reset(communication_only=asked == 0x82)
+            self._apply(node)
+            self.drives.take_commands()
+        elif asked in (0x01, 0x02, 0x80):
+            node.nmt = {0x01: OPERATIONAL, 0x02: STOPPED, 0x80: PRE_OPERATIONAL}[asked]
+        self._operational[node.place] = node.nmt == OPERATIONAL
+        if node.nmt != OPERATIONAL:
+            self.supervision.left_operational(node, self.time)

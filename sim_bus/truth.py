@@ -1,0 +1,80 @@
+"""The hidden truth of one simulated arm: what its sensors really do, which the fit must find and never sees."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armlink.armfile import ArmFile
+from sim_bus.section import sim_section
+
+Array = NDArray[np.float64]
+GAIN_RANGE = (0.9, 1.1)
+OFFSET_SHARE = 0.05
+"""Largest torque offset as a share of rated torque."""
+POSITION_GAIN_RANGE = (0.99, 1.01)
+ATTACHMENT_RANGE = 0.15
+"""Largest lateral distance of the reference mass from the last axis [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Sensors `v = gain·τ + offset`, `θ = position_gain·φ + position_offset`, (n,) each; arrays are read-only."""
+
+    gain: Array
+    offset: Array
+    """[N·m]."""
+    position_gain: Array
+    position_offset: Array
+    """[rad]."""
+    attachment: Array
+    """Where a reference mass is bolted on, in the last link's bar frame [m] (3,)."""
+
+    def __post_init__(self) -> None:
+        """Freeze the arrays."""
+        for name in self.__dataclass_fields__:
+            array = np.array(getattr(self, name), float)
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+    @classmethod
+    def of(cls, arm: ArmFile) -> "Truth":
+        """The truth that the arm file's `sim.sensors` states. Raises BadInput."""
+        n, sensors = len(arm.joint_names), sim_section(arm).sensors
+
+        def values(given: tuple[float, ...] | None, default: float) -> Array:
+            return np.full(n, default) if given is None else np.array(given)
+
+        return cls(
+            gain=values(sensors.gain, 1.0),
+            offset=values(sensors.offset, 0.0),
+            position_gain=values(sensors.position_gain, 1.0),
+            position_offset=values(sensors.position_offset, 0.0),
+            attachment=flange(arm),
+        )
+
+    @classmethod
+    def draw(cls, arm: ArmFile, seed: int) -> "Truth":
+        """A truth drawn uniformly: gains 0.9 to 1.1, offsets ±5 % of rated torque, position gains 0.99 to 1.01.
+
+        The reference mass sits up to 0.15 m to the side of the flange. Raises BadInput.
+        """
+        random, stated = np.random.default_rng(seed), cls.of(arm)
+        rated = np.array([joint.rated_torque for joint in arm.require_link().joints])
+        n = len(rated)
+        lateral = random.uniform(-ATTACHMENT_RANGE, ATTACHMENT_RANGE, 2)
+        return cls(
+            gain=random.uniform(*GAIN_RANGE, n),
+            offset=random.uniform(-OFFSET_SHARE, OFFSET_SHARE, n) * rated,
+            position_gain=random.uniform(*POSITION_GAIN_RANGE, n),
+            position_offset=stated.position_offset,
+            attachment=stated.attachment + np.array([*lateral, 0.0]),
+        )
+
+
+def flange(arm: ArmFile) -> Array:
+    """Origin of the arm's last frame in the last link's bar frame, `(a, 0, d)`; a model's tip body origin is 0 [m]."""
+    if not arm.kinematics.joints:
+        return np.zeros(3)
+    last = arm.kinematics.joints[-1]
+    return np.array([last.a, 0.0, last.d])
