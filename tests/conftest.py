@@ -1,6 +1,11 @@
 """What holds for every test: where the real data lies, where vcan0 is needed, and that CI skips nothing."""
 
 import os
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -23,6 +28,46 @@ def _vcan(request: pytest.FixtureRequest) -> None:
     if request.node.get_closest_marker("vcan") and not Path("/sys/class/net/vcan0").exists():
         why = os.environ.get("ARMLINK_NO_VCAN", "run it with scripts/with-vcan .venv/bin/pytest -m vcan")
         pytest.skip(f"needs a SocketCAN interface vcan0: {why}")
+
+
+@dataclass(frozen=True)
+class Look:
+    """A page as Chromium showed it: picture file, document after its scripts ran, what they wrote to the console."""
+
+    picture: Path
+    document: str
+    console: tuple[str, ...]
+
+    def colours(self) -> int:
+        """How many different colours the picture has; a blank page has one."""
+        from PIL import Image
+
+        with Image.open(self.picture) as image:
+            return len(image.convert("RGB").getcolors(maxcolors=image.width * image.height) or ())
+
+
+@pytest.fixture
+def look(tmp_path: Path) -> Callable[..., Look]:
+    """Opens an HTML file in a real headless Chromium and says what it looked like."""
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if chromium is None:
+        pytest.skip("no Chromium: scripts/install-system installs it where that is allowed")
+    quiet = "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking"
+    command = [chromium, *quiet.split(), "--disable-component-update", "--disable-sync", "--hide-scrollbars"]
+    command += ["--virtual-time-budget=10000", "--enable-logging=stderr"]
+
+    def run(page: Path, *options: str) -> subprocess.CompletedProcess[str]:
+        profile = tmp_path / f"profile{len(list(tmp_path.glob('profile*')))}"
+        complete = [*command, f"--user-data-dir={profile}", *options, page.resolve().as_uri()]
+        return subprocess.run(complete, capture_output=True, text=True, timeout=120, check=True)
+
+    def open_page(page: Path, width: int = 1200, height: int = 2000) -> Look:
+        picture = tmp_path / f"{page.stem}-{width}.png"
+        log = run(page, f"--window-size={width},{height}", f"--screenshot={picture}").stderr
+        document = run(page, "--dump-dom").stdout
+        return Look(picture, document, tuple(re.findall(r"CONSOLE[^\]]*\] (.*)", log)))
+
+    return open_page
 
 
 @pytest.hookimpl(wrapper=True)
