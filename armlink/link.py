@@ -52,7 +52,7 @@ class Link:
             milliseconds(2 * section.deadline),
             milliseconds(section.deadline / 2),
         )
-        self._port = open_port(bus, self.clock)
+        self._port = open_port(bus)
         self._loop = Loop(self._port, self.clock, self.nodes, host, self.period, self._lock_step)
         self._loop.heartbeat_cycles = max(1, int(section.deadline / 2 * self.rate))
         self._modes = [int(Mode.OFF)] * self.n
@@ -128,6 +128,7 @@ class Link:
         for node in self.nodes:
             self._loop.send(objects.NMT_ID, bytes([objects.NMT_START, node]))
         self._loop.node_states.clear()
+        self._loop.reset_counters()
         self._since = self._due = self.clock.now()
         self._cycling = True
 

@@ -63,6 +63,10 @@ class Loop:
         """Newest torque actual value of each joint whenever it came [N·m]; for the gate, never for a sample."""
         self.set_units((Units(1.0, 1.0, 1.0),) * self.n)
 
+    def reset_counters(self) -> None:
+        """Begin to count anew."""
+        self.stats, self._bits, self._first = Stats(), 0, None
+
     def set_units(self, units: tuple[Units, ...]) -> None:
         """Scales of the joints."""
         self._torque_unit = np.array([unit.torque for unit in units])

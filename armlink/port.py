@@ -8,7 +8,6 @@ from typing import Any, Protocol
 
 import can
 
-from armlink.clock import Clock
 from armlink.errors import BusFault
 
 Frame = tuple[int, bytes]
@@ -19,8 +18,6 @@ _ERROR_FLAG, _BUS_OFF = 0x20000000, 0x40
 _RECEIVE_BUFFER = 1 << 20
 _RETRY = 0.002  # [s] between tries while the transmit queue is full
 _TRIES = 25
-SIMULATED_WAIT = 1e-3
-"""Step by which simulated time goes on while the link waits for an answer [s]."""
 
 
 class Port(Protocol):
@@ -28,52 +25,33 @@ class Port(Protocol):
 
     errors: int
 
-    def send(self, can_id: int, data: bytes) -> None:
-        """Send one frame; raises BusFault where the interface cannot take it."""
+    @property
+    def send(self) -> Callable[[int, bytes], None]:
+        """Sends one frame; raises BusFault where the interface cannot take it."""
         ...
 
-    def receive(self, timeout: float) -> Frame | None:
-        """The next frame, or None after `timeout` seconds without one (0: what is there already)."""
+    @property
+    def receive(self) -> Callable[[float], Frame | None]:
+        """The next frame, or None after so many seconds without one (0: what is there already)."""
         ...
 
 
-def open_port(bus: Any, clock: Clock) -> Port:
-    """Wrap a python-can bus: lock-step bus (`send_raw`, `recv_raw`), SocketCAN's own socket, or python-can messages."""
-    if hasattr(bus, "recv_raw"):
-        return LockStepPort(bus, clock)
+def open_port(bus: Any) -> Port:
+    """Wrap a python-can bus: lock-step bus (`put`, `take`), SocketCAN's own socket, or python-can messages."""
+    if hasattr(bus, "take"):
+        return LockStepPort(bus)
     if type(bus).__name__ == "SocketcanBus":
         return SocketPort(bus)
     return MessagePort(bus)
 
 
 class LockStepPort:
-    """In-process bus that never blocks; waiting lets simulated time go on."""
+    """In-process bus that never blocks (`put`, `take`); waiting lets simulated time go on."""
 
-    def __init__(self, bus: Any, clock: Clock) -> None:
+    def __init__(self, bus: Any) -> None:
         self.errors = 0
-        self._send_raw: Callable[[int, bytes], None] = bus.send_raw
-        self._receive_raw: Callable[[], Frame | None] = bus.recv_raw
-        self._clock = clock
-
-    def send(self, can_id: int, data: bytes) -> None:
-        """Send one frame."""
-        self._send_raw(can_id, data)
-
-    def receive(self, timeout: float) -> Frame | None:
-        """The next frame, or None after `timeout` seconds of simulated time."""
-        frame = self._receive_raw()
-        if frame is not None or timeout <= 0:
-            return frame
-        end = self._clock.now() + timeout
-        while frame is None:
-            before = self._clock.now()
-            if before >= end:
-                return None
-            self._clock.sleep_until(min(end, before + SIMULATED_WAIT))
-            frame = self._receive_raw()
-            if frame is None and self._clock.now() <= before:
-                return None
-        return frame
+        self.send: Callable[[int, bytes], None] = bus.put
+        self.receive: Callable[[float], Frame | None] = bus.take
 
 
 class SocketPort:

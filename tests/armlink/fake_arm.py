@@ -107,7 +107,7 @@ class FakeNode:
 
 
 class FakeBus:
-    """Duck-typed lock-step bus: `send_raw`, `recv_raw`, `clock`."""
+    """Duck-typed lock-step bus: `put`, `take`, `clock`."""
 
     channel_info = "fake"
 
@@ -117,7 +117,7 @@ class FakeBus:
         self.out, self.sent = deque(), []
         self.closed = False
 
-    def send_raw(self, can_id, data):
+    def put(self, can_id, data):
         self.sent.append((can_id, bytes(data)))
         node = self.nodes.get(can_id & 0x7F)
         if can_id == objects.NMT_ID:
@@ -152,7 +152,9 @@ class FakeBus:
         if changed:
             self.out.append((0x380 + node.node, struct.pack("<H", node.status)))
 
-    def recv_raw(self):
+    def take(self, timeout=0.0):
+        if not self.out and timeout > 0:
+            self.clock.time += timeout
         return self.out.popleft() if self.out else None
 
     def shutdown(self):

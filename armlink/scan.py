@@ -1,0 +1,64 @@
+"""Which nodes are on a bus, who they are and in which state; nothing is written to them."""
+
+from collections.abc import Callable, Mapping
+
+from armlink import device
+from armlink.clock import Clock
+from armlink.port import Port
+from armlink.sample import Identity
+from armlink.services import NodeServices, PumpedNetwork, load_dictionary
+
+SEARCH_SECONDS = 0.3
+"""How long answers to the search are waited for after the last request."""
+_READ_DEVICE_TYPE = b"\x40\x00\x10\x00\x00\x00\x00\x00"
+
+
+def scan_bus(port: Port, clock: Clock, joints: Mapping[int, str]) -> list[Identity]:
+    """Every node that answers a read of its device type, and those of `joints` (node id → joint name) that do not.
+
+    Sorted by node id. Raises BusFault where a node that answered stops answering.
+    """
+    network = PumpedNetwork(port.send)
+
+    def pump(done: Callable[[], bool], timeout: float) -> bool:
+        end = clock.now() + timeout
+        while not done():
+            frame = port.receive(max(0.0, end - clock.now()))
+            if frame is None:
+                return False
+            network.notify(frame[0], bytearray(frame[1]), 0.0)
+        return True
+
+    found = _search(port, pump, network)
+    dictionary = load_dictionary()
+    identities = []
+    for node in sorted({*found, *joints}):
+        name = joints.get(node, "")
+        if node in found:
+            identities.append(device.identify(NodeServices(network, name, node, dictionary, pump)))
+        else:
+            identities.append(Identity(name, node, present=False))
+    return identities
+
+
+def _search(port: Port, pump: Callable[[Callable[[], bool], float], bool], network: PumpedNetwork) -> set[int]:
+    found: set[int] = set()
+
+    def answered(can_id: int, data: bytearray, timestamp: float) -> None:
+        found.add(can_id - 0x580)
+
+    for node in range(1, 128):
+        network.subscribe(0x580 + node, answered)
+        port.send(0x600 + node, _READ_DEVICE_TYPE)
+        pump(lambda: False, 0.0)
+    pump(lambda: False, SEARCH_SECONDS)
+    for node in range(1, 128):
+        network.unsubscribe(0x580 + node, answered)
+    return found
+
+
+def describe_type(device_type: int) -> str:
+    """Device profile of 1000h in words, such as `CiA 402 servo drive`."""
+    profile = device_type & 0xFFFF
+    kind = {0x0001: "frequency converter", 0x0002: "servo drive", 0x0004: "stepper"}.get(device_type >> 16 & 0xFF, "")
+    return f"CiA {profile} {kind}".strip() if profile else "no profile"
