@@ -1,0 +1,83 @@
+"""Friction between motor and torque sensor: it shows on the motor side, and where there is no motor channel, in `tau`.
+
+F(v) = (Fc + Fb·exp(−(v/vs)²) + μ·|τ|)·(1 ± ratio) + d·|v|, opposing v; τ is the transmitted torque.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from sim_gap.effects.registry import Columns, Effect, Layout, Parameter, Shape
+from sim_gap.rigid import Array
+from sim_gap.signals import Signals
+
+
+class _Friction(Effect):
+    def column(self, s: Signals, joint: int, shape: Shape) -> Array:
+        """The one column of this effect, (K,)."""
+        raise NotImplementedError
+
+    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
+        return {(layout.motor_side, place): self.column(signals, place, shape)[:, None]}
+
+
+class Coulomb(_Friction):
+    """A constant torque against the motion."""
+
+    id = "friction.coulomb"
+    parameters = (Parameter("torque", "N·m"),)
+
+    def column(self, s: Signals, joint: int, shape: Shape) -> Array:
+        return s.direction[:, joint]
+
+
+class Viscous(_Friction):
+    """A torque proportional to the velocity."""
+
+    id = "friction.viscous"
+    parameters = (Parameter("damping", "N·m·s/rad"),)
+
+    def column(self, s: Signals, joint: int, shape: Shape) -> Array:
+        return s.v[:, joint]
+
+
+class Stribeck(_Friction):
+    """More friction at low speed: breakaway above Coulomb's, fading as exp(−(v/vs)²)."""
+
+    id = "friction.stribeck"
+    parameters = (Parameter("breakaway", "N·m"), Parameter("velocity", "rad/s"))
+    needs = ("friction.coulomb",)
+    shapes = ((0.03,), (0.06,), (0.12,), (0.25,), (0.5,))
+
+    def column(self, s: Signals, joint: int, shape: Shape) -> Array:
+        return s.direction[:, joint] * np.exp(-((s.v[:, joint] / shape[0]) ** 2))
+
+    def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
+        return np.array([coefficients[0], shape[0]])
+
+
+class Asymmetric(_Friction):
+    """Friction that is (1 + ratio) times as large one way and (1 − ratio) the other; Coulomb's part of it."""
+
+    id = "friction.asymmetric"
+    parameters = (Parameter("ratio", "1"),)
+    needs = ("friction.coulomb",)
+
+    def column(self, s: Signals, joint: int, shape: Shape) -> Array:
+        return np.abs(s.direction[:, joint])
+
+    def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
+        return coefficients / max(abs(float(beneath["friction.coulomb"][0])), 1e-9)
+
+
+class Load(_Friction):
+    """Friction in proportion to the torque that the transmission carries."""
+
+    id = "friction.load"
+    parameters = (Parameter("coefficient", "N·m/(N·m)"),)
+
+    def column(self, s: Signals, joint: int, shape: Shape) -> Array:
+        return s.direction[:, joint] * np.abs(s.model[:, joint])
+
+
+EFFECTS: tuple[Effect, ...] = (Coulomb(), Viscous(), Stribeck(), Asymmetric(), Load())

@@ -1,0 +1,84 @@
+"""Links that weigh otherwise than the model says: they show wherever the model is compared, from the base to that link."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from sim_gap.effects.registry import Columns, Effect, Layout, Parameter, Shape
+from sim_gap.rigid import Array
+from sim_gap.signals import Signals
+
+LEVER = 0.15
+"""Plausible shift of a link's centre of mass [m], and radius of gyration of what is added [m]."""
+LIGHTEST = 0.2
+"""A link counts as at least this heavy [kg] where the plausible error of its inertials is judged."""
+
+
+def _rows(signals: Signals, layout: Layout, link: int, columns: Array) -> Columns:
+    """Columns (K, n, p) at every joint that carries the link."""
+    carrying = np.flatnonzero(signals.arm.carries[:, link])
+    return {(layout.against_model, int(joint)): columns[:, joint] for joint in carrying}
+
+
+class MassMoment(Effect):
+    """An error of a link's first moment m·s; its inertia about the joint moves along with it."""
+
+    id = "link.mass_moment"
+    parameters = (Parameter("x", "kg·m"), Parameter("y", "kg·m"), Parameter("z", "kg·m"))
+
+    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
+        own = signals.regressor[:, :, place]
+        return _rows(
+            signals, layout, place, own[..., 1:4] + own[..., 4:] @ moment_to_inertia(signals.arm.inertial[place])
+        )
+
+    def spread(self, signals: Signals, place: int) -> Array:
+        return np.full(3, LEVER * max(signals.arm.inertial[place, 0], LIGHTEST))
+
+
+class Inertia(Effect):
+    """An error of a link's inertia about its joint."""
+
+    id = "link.inertia"
+    parameters = tuple(Parameter(name, "kg·m²") for name in ("xx", "xy", "xz", "yy", "yz", "zz"))
+
+    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
+        return _rows(signals, layout, place, signals.regressor[:, :, place, 4:])
+
+    def spread(self, signals: Signals, place: int) -> Array:
+        return np.full(6, LEVER**2 * max(signals.arm.inertial[place, 0], LIGHTEST))
+
+
+class Payload(Effect):
+    """A mass fixed to the tip: mass, and centre of mass in the last link's frame, its origin on the last joint's axis."""
+
+    id = "link.payload"
+    parameters = (Parameter("mass", "kg"), Parameter("x", "m"), Parameter("y", "m"), Parameter("z", "m"))
+    whole_arm = True
+
+    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
+        tip = signals.n - 1
+        return _rows(signals, layout, tip, signals.regressor[:, :, tip, :4])
+
+    def spread(self, signals: Signals, place: int) -> Array:
+        return np.array([20.0, 4.0, 4.0, 4.0])
+
+    def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
+        mass = float(coefficients[0])
+        return np.concatenate([[mass], coefficients[1:] / (mass if abs(mass) > 1e-6 else np.inf)])
+
+
+def moment_to_inertia(inertial: Array) -> Array:
+    """Change of the inertia about the joint with the first moment, to first order at the nominal centre c, (6, 3).
+
+    I = Σ m (|r|² 1 − r rᵀ), so moving mass at c by δ adds 2 (c·mδ) 1 − (c mδᵀ + mδ cᵀ).
+    """
+    centre = inertial[1:4] / max(float(inertial[0]), 1e-9)
+    out = np.empty((6, 3))
+    for k, unit in enumerate(np.eye(3)):
+        change = 2.0 * centre @ unit * np.eye(3) - np.outer(centre, unit) - np.outer(unit, centre)
+        out[:, k] = change[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    return out
+
+
+EFFECTS: tuple[Effect, ...] = (MassMoment(), Inertia(), Payload())

@@ -1,0 +1,83 @@
+"""A position sensor that misleads: the model, put at the read position, answers for another pose than the true one.
+
+True angle θ = gain·φ + offset + amplitude·sin(φ + phase), φ the reading. Columns are derivatives of the model torque by
+finite difference, taken through position, velocity and acceleration together.
+"""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from sim_gap.effects.registry import Columns, Effect, Layout, Parameter, Shape
+from sim_gap.rigid import Array
+from sim_gap.signals import Signals
+
+EPSILON = 1e-4
+
+
+def _response(
+    signals: Signals, layout: Layout, joint: int, bend: Callable[[Array], tuple[Array, Array, Array]]
+) -> Columns:
+    """Change of the model torque per unit of `bend`, which gives δ(φ), δ'(φ) and δ''(φ)."""
+    q, v, a = signals.q[:, joint], signals.v[:, joint], signals.a[:, joint]
+    shift, slope, curve = bend(q)
+
+    def at(scale: float) -> Array:
+        moved = [x.copy() for x in (signals.q, signals.v, signals.a)]
+        moved[0][:, joint] += scale * shift
+        moved[1][:, joint] += scale * slope * v
+        moved[2][:, joint] += scale * (slope * a + curve * v**2)
+        return signals.arm.torque(*moved)
+
+    change = (at(EPSILON) - at(-EPSILON)) / (2.0 * EPSILON)
+    return {(layout.against_model, i): change[:, i, None] for i in range(signals.n)}
+
+
+class Offset(Effect):
+    """A constant angle added."""
+
+    id = "position.offset"
+    parameters = (Parameter("offset", "rad"),)
+
+    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
+        return _response(signals, layout, place, lambda q: (np.ones_like(q), 0 * q, 0 * q))
+
+    def spread(self, signals: Signals, place: int) -> Array:
+        return np.full(1, 0.2)
+
+
+class Gain(Effect):
+    """Angles scaled."""
+
+    id = "position.gain"
+    parameters = (Parameter("gain", "1"),)
+
+    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
+        return _response(signals, layout, place, lambda q: (q, np.ones_like(q), 0 * q))
+
+    def spread(self, signals: Signals, place: int) -> Array:
+        return np.full(1, 0.2)
+
+    def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
+        return 1.0 + coefficients
+
+
+class Eccentricity(Effect):
+    """A sensor ring out of centre: an error once a turn."""
+
+    id = "position.eccentricity"
+    parameters = (Parameter("amplitude", "rad"), Parameter("phase", "rad"))
+
+    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
+        sine = _response(signals, layout, place, lambda q: (np.sin(q), np.cos(q), -np.sin(q)))
+        cosine = _response(signals, layout, place, lambda q: (np.cos(q), -np.sin(q), -np.cos(q)))
+        return {row: np.hstack([sine[row], cosine[row]]) for row in sine}
+
+    def spread(self, signals: Signals, place: int) -> Array:
+        return np.full(2, 0.1)
+
+    def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
+        return np.array([np.hypot(*coefficients), np.arctan2(coefficients[1], coefficients[0])])
+
+
+EFFECTS: tuple[Effect, ...] = (Offset(), Gain(), Eccentricity())

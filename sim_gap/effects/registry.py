@@ -1,0 +1,114 @@
+"""What an effect is to the diagnosis, and the list of all of them: one small file a family."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from typing import ClassVar
+
+import numpy as np
+
+from sim_gap.rigid import Array
+from sim_gap.signals import Signals
+
+Row = tuple[str, int]
+"""A channel and a joint's index: one residual over time."""
+Columns = dict[Row, Array]
+"""How an effect shows: at each row that it touches, one column per coefficient, (K, p)."""
+Shape = tuple[float, ...]
+"""Nonlinear parameters of an effect, such as its Stribeck velocity."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One reported parameter of an effect."""
+
+    name: str
+    unit: str
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which channels a data set has, and what each is compared with.
+
+    The sensor row of a joint is `tau` − model. Where there is a sensor, the motor row is `tau_motor` − `tau`, so that
+    what is wrong with the links does not show there; where there is none, it is `tau_motor` − model.
+    """
+
+    n: int
+    sensor: str | None
+    motor: str | None
+    command: str | None = None
+
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """All residuals: sensor rows first, base to tip, then motor rows, then command rows."""
+        channels = [channel for channel in (self.sensor, self.motor, self.command) if channel]
+        return tuple((channel, joint) for channel in channels for joint in range(self.n))
+
+    @property
+    def against_model(self) -> str:
+        """The channel in which links and positions show: the sensor's, else the motor's."""
+        channel = self.sensor or self.motor
+        assert channel is not None
+        return channel
+
+    @property
+    def motor_side(self) -> str:
+        """The channel in which friction shows: the motor's; where there is none, the only one there is."""
+        channel = self.motor or self.sensor
+        assert channel is not None
+        return channel
+
+    def sensor_columns(self, joint: int, column: Array) -> Columns:
+        """A term of the sensor's reading: with its sign in the sensor row, against it in motor − sensor."""
+        if self.sensor is None:
+            return {(self.motor_side, joint): column}
+        out = {(self.sensor, joint): column}
+        return out | ({(self.motor, joint): -column} if self.motor else {})
+
+
+def layout_of(signals: list[Signals]) -> Layout:
+    """The channels that all recordings have."""
+    common = set.intersection(*(set(s.channels) for s in signals))
+    sensor = "tau" if "tau" in common else None
+    motor = next((channel for channel in ("tau_motor", "tau_cmd") if channel in common), None)
+    command = "tau_cmd" if {"tau_motor", "tau_cmd"} <= common else None
+    return Layout(signals[0].n, sensor, motor, command)
+
+
+class Effect(ABC):
+    """The inverse form of one effect: how it shows in a recording, linear in its coefficients at a given shape."""
+
+    id: ClassVar[str]
+    parameters: ClassVar[tuple[Parameter, ...]]
+    needs: ClassVar[tuple[str, ...]] = ()
+    """Effects at the same place that it stands upon: the simpler model beneath it."""
+    shapes: ClassVar[tuple[Shape, ...]] = ((),)
+    """Shapes tried at first; the best is then refined between its neighbours."""
+    whole_arm: ClassVar[bool] = False
+
+    def places(self, layout: Layout) -> range:
+        """Joints or links at which it may sit; empty where these channels cannot show it."""
+        return range(1) if self.whole_arm else range(layout.n)
+
+    @abstractmethod
+    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
+        """Its columns at the work rate."""
+
+    def spread(self, signals: Signals, place: int) -> Array:
+        """Largest plausible size of each coefficient (a prior standard deviation), (p,); infinite where open."""
+        return np.full(1, np.inf)
+
+    def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
+        """Reported parameters, one per `parameters`; `beneath` holds the coefficients of what it stands upon."""
+        return coefficients
+
+
+@cache
+def effects() -> dict[str, Effect]:
+    """All effects by id."""
+    families = ("friction", "link", "base", "position", "torque", "timing", "transmission", "actuator")
+    found = [effect for family in families for effect in import_module(f"sim_gap.effects.{family}").EFFECTS]
+    return {effect.id: effect for effect in found}

@@ -1,0 +1,79 @@
+"""Errors of the transmission between motor and torque sensor."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from sim_gap.effects.registry import Columns, Effect, Layout, Parameter, Shape
+from sim_gap.rigid import Array
+from sim_gap.signals import Signals
+
+
+class Ripple(Effect):
+    """Motor torque that varies with the position of the gear's teeth: amplitude·sin(cycles·q + phase)."""
+
+    id = "transmission.ripple"
+    parameters = (Parameter("amplitude", "N·m"), Parameter("cycles", "1/rad"), Parameter("phase", "rad"))
+
+    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
+        angle = shape[0] * signals.q[:, place]
+        return {(layout.motor_side, place): np.column_stack([np.sin(angle), np.cos(angle)])}
+
+    shapes = tuple((float(cycles),) for cycles in range(4, 25, 2))
+
+    def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
+        return np.array([np.hypot(*coefficients), shape[0], np.arctan2(coefficients[1], coefficients[0])])
+
+
+class Spring(Effect):
+    """A spring across the joint, as a cable bundle makes: torque linear in position on the link side."""
+
+    id = "transmission.spring"
+    parameters = (Parameter("stiffness", "N·m/rad"), Parameter("rest", "rad"))
+
+    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
+        q = signals.q[:, place]
+        return {(layout.against_model, place): np.column_stack([q, np.ones_like(q)])}
+
+    def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
+        stiffness = float(coefficients[0])
+        return np.array([stiffness, -coefficients[1] / (stiffness if abs(stiffness) > 1e-9 else np.inf)])
+
+
+class Coupling(Effect):
+    """The motor of this joint turns with another joint too: it feels that joint's friction and inertia.
+
+    Motor i turns by q_i + c·q_j. Its friction follows that speed, and by the same lever c it loads joint j, so that the
+    columns touch both: rotor inertia, Coulomb and viscous friction of the shared motor.
+    """
+
+    id = "transmission.coupling"
+    parameters = (
+        Parameter("coefficient", "1"),
+        Parameter("other_joint", "index"),
+        Parameter("inertia", "kg·m²"),
+        Parameter("coulomb", "N·m"),
+        Parameter("viscous", "N·m·s/rad"),
+    )
+    shapes = ((-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
+
+    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
+        from sim_gap.signals import CREEP
+
+        other = place + int(shape[0])
+        if not 0 <= other < signals.n:
+            return {}
+        lever = shape[1]
+        speed = signals.v[:, place] + lever * signals.v[:, other]
+        push = signals.a[:, place] + lever * signals.a[:, other]
+        shared = np.column_stack([push, np.clip(speed / CREEP, -1.0, 1.0), speed])
+        return {(layout.motor_side, place): shared, (layout.motor_side, other): lever * shared}
+
+    def places(self, layout: Layout) -> range:
+        return range(layout.n)
+
+    def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
+        return np.array([shape[1], shape[0], *coefficients])
+
+
+EFFECTS: tuple[Effect, ...] = (Ripple(), Spring(), Coupling())

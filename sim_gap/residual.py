@@ -1,0 +1,128 @@
+"""Residuals of a set of recordings: one row per channel and joint, with its noise floor, valid samples and folds."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_gap.effects.registry import Columns, Effect, Layout, Row, Shape
+from sim_gap.rigid import Array
+from sim_gap.signals import Signals
+
+MODEL_FLOOR = 1e-3
+"""Numerical and geometrical error that every model is granted, as a share of its torque."""
+FOLDS = 6
+MOVING_SHARE = 0.8
+"""A sample of the motor row counts where the joint moves during this share of the filter's window."""
+BLOCK_S = 2.0
+"""Length of the blocks within which errors may be correlated, for confidence intervals [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualSet:
+    """Recordings with a common layout. All arrays are at the decimated rate, recordings one after the other."""
+
+    signals: tuple[Signals, ...]
+    layout: Layout
+
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """Channel and joint of each residual."""
+        return self.layout.rows
+
+    @cached_property
+    def lengths(self) -> tuple[int, ...]:
+        """Samples of each recording."""
+        return tuple(len(s.filtered(s.t)) for s in self.signals)
+
+    @cached_property
+    def time(self) -> Array:
+        """Time since each recording's start [s], (K,)."""
+        return np.concatenate([s.sampled(s.t) for s in self.signals])
+
+    @cached_property
+    def values(self) -> dict[Row, Array]:
+        """Reading minus what it is compared with [N·m], (K,) per row."""
+        stacked = [self._differences(s) for s in self.signals]
+        return {row: np.concatenate([one[row] for one in stacked]) for row in self.rows}
+
+    def _differences(self, s: Signals) -> dict[Row, Array]:
+        layout, out = self.layout, {}
+        joints = s.arm.nominal_joint_torque(s.q, s.v, s.a)
+        for channel in (layout.sensor, layout.motor, layout.command):
+            if channel is None:
+                continue
+            against = s.model if channel == layout.sensor else s.model + joints
+            if channel == layout.motor and layout.sensor:
+                against = s.reading[layout.sensor] + joints
+            if channel == layout.command and layout.motor:
+                against = s.reading[layout.motor]
+            difference = s.filtered(s.reading[channel] - against)
+            out |= {(channel, j): difference[:, j] for j in range(layout.n)}
+        return out
+
+    @cached_property
+    def valid(self) -> dict[Row, NDArray[np.bool_]]:
+        """Samples that count: really read, and for the motor row with the joint in motion."""
+        out: dict[Row, list[NDArray[np.bool_]]] = {row: [] for row in self.rows}
+        for s in self.signals:
+            moving = s.filtered(s.moving) > MOVING_SHARE
+            for channel, joint in self.rows:
+                there = s.filtered(s.known[channel][:, joint]) > 0.9
+                if channel == self.layout.motor and self.layout.sensor:
+                    there &= s.filtered(s.known[self.layout.sensor][:, joint]) > 0.9
+                if channel == self.layout.motor_side:
+                    there &= moving[:, joint] if self.layout.motor else True
+                out[channel, joint].append(there)
+        return {row: np.concatenate(parts) for row, parts in out.items()}
+
+    @cached_property
+    def floor(self) -> dict[Row, float]:
+        """Noise floor of each row [N·m]: sensor noise, noise of the differentiated position, and model's own error."""
+        return {row: float(np.mean([self._floor(s, row) for s in self.signals])) for row in self.rows}
+
+    def _floor(self, s: Signals, row: Row) -> float:
+        channel, joint = row
+        load = float(np.sqrt(np.mean(s.model[:, joint] ** 2)))
+        parts = [s.noise[channel][joint], MODEL_FLOOR * load]
+        if channel == self.layout.motor and self.layout.sensor:
+            parts.append(s.noise[self.layout.sensor][joint])
+        return float(np.linalg.norm(parts)) + 1e-6
+
+    @cached_property
+    def folds(self) -> NDArray[np.intp]:
+        """Fold of each sample: contiguous stretches of time, (K,)."""
+        total, out, first = sum(self.lengths), [], 0
+        for length in self.lengths:
+            count = max(1, round(FOLDS * length / total))
+            out.append(first + np.minimum(np.arange(length) * count // length, count - 1))
+            first += count
+        return np.concatenate(out)
+
+    @cached_property
+    def blocks(self) -> NDArray[np.intp]:
+        """Block of each sample: stretches of BLOCK_S, (K,)."""
+        out, first = [], 0
+        for s, length in zip(self.signals, self.lengths, strict=True):
+            own = (np.arange(length) * s.step / s.rate // BLOCK_S).astype(np.intp)
+            out.append(first + own)
+            first += int(own[-1]) + 1
+        return np.concatenate(out)
+
+    def columns(self, effect: Effect, place: int, shape: Shape) -> Columns:
+        """The effect's columns, filtered as the readings are, (K, p) per row that it touches."""
+        parts = [effect.columns(s, self.layout, place, shape) for s in self.signals]
+        filtered = [
+            {row: s.filtered(x) for row, x in part.items()} for s, part in zip(self.signals, parts, strict=True)
+        ]
+        return {row: np.concatenate([part[row] for part in filtered]) for row in filtered[0]}
+
+    def spread(self, effect: Effect, place: int) -> Array:
+        """Prior standard deviation of the effect's coefficients."""
+        return effect.spread(self.signals[0], place)
+
+
+def root_mean_square(x: Array) -> float:
+    """Root of the mean square; NaN for nothing."""
+    return float(np.sqrt(np.mean(x**2))) if len(x) else float("nan")

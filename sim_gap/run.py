@@ -1,0 +1,75 @@
+"""What `armlink gap diagnose` does: load, diagnose, tell, write."""
+
+import json as json_format
+import sys
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from armlink.errors import BadInput
+from armlink.recording import load_recording
+from sim_gap.diagnose import diagnose
+from sim_gap.diagnosis import Diagnosis
+
+
+def run_diagnose(
+    sim: str,
+    train: list[Path],
+    heldout: list[Path],
+    json: str | None,
+    report: Path | None,
+    out_model: Path | None,
+    console: Console,
+) -> Diagnosis:
+    """Diagnose, show tables on `console`, write what was asked for. Raises BadInput."""
+    paths = [*train, *heldout]
+    for target in (None if json == "-" else json, report, out_model):
+        if target is not None and not Path(target).resolve().parent.is_dir():
+            raise BadInput(f"{target}: its folder does not exist: make it first")
+    console.print(f"reading {len(paths)} recordings")
+    recordings = [load_recording(path) for path in paths]
+    for path, recording in zip(paths, recordings, strict=True):
+        if recording.warning:
+            console.print(f"{path}: {recording.warning}", style="yellow")
+    console.print("comparing with the model; every effect competes")
+    answer = diagnose(sim, recordings[: len(train)], recordings[len(train) :], labels=[str(path) for path in paths])
+    show(answer, console)
+    text = json_format.dumps(answer.to_json(), indent=1, ensure_ascii=False)
+    if json == "-":
+        sys.stdout.write(text + "\n")
+    elif json is not None:
+        Path(json).write_text(text + "\n", encoding="utf-8")
+    return answer
+
+
+def show(answer: Diagnosis, console: Console) -> None:
+    """Print verdict, causes and gap as tables for people."""
+    console.print(f"[bold]{answer.verdict}[/bold]: {_sentence(answer)}")
+    if answer.causes:
+        table = Table(
+            "effect", "joints", "RMS before", "after", "confidence", "confounded with", title="causes, held-out motion"
+        )
+        for cause in answer.causes:
+            joints = ", ".join(cause.joints)
+            numbers = f"{cause.gap_before:.3g}", f"{cause.gap_after:.3g}", f"{cause.confidence:.2f}"
+            table.add_row(cause.effect, joints, *numbers, ", ".join(cause.confounded_with))
+        console.print(table)
+    table = Table("joint", "noise floor", "before", "after", title=f"gap on {answer.heldout_is}, RMS in N·m")
+    for j, name in enumerate(answer.names):
+        numbers = answer.noise_floor[j], answer.heldout_before[j], answer.heldout_after[j]
+        table.add_row(name, *(f"{value:.3g}" for value in numbers))
+    console.print(table)
+    for note in answer.notes:
+        console.print(note, style="yellow")
+
+
+def _sentence(answer: Diagnosis) -> str:
+    if answer.verdict == "no_gap":
+        return "nothing above twice the noise floor by a margin worth caring about"
+    if answer.verdict == "unexplained":
+        return f"{answer.unexplained:.0%} of the gap is left that no effect of the library accounts for"
+    if answer.verdict == "ambiguous":
+        rivals = ", ".join(answer.causes[0].confounded_with)
+        return f"{answer.causes[0].effect} explains it, and so would {rivals}; {answer.causes[0].separate_by}"
+    return f"{1 - answer.unexplained:.0%} of the gap is accounted for on motion not fitted"

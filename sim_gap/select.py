@@ -1,0 +1,183 @@
+"""Which effects: every term of the library competes, judged on motion left out of its fit, at a price per parameter."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sim_gap.effects.registry import Layout, effects
+from sim_gap.normal import ColumnStore, Normal, Term, Weighted
+from sim_gap.rigid import Array
+
+PRICE = 0.012
+"""What a coefficient must lower Σ ½ log(R² + floor²) by, over all rows, to earn its place: about 1 % of one row's RMS."""
+SHORTLIST = 10
+MOST_TERMS = 60
+
+
+def candidates(layout: Layout, library: Sequence[str]) -> list[Term]:
+    """Every effect of the library at every place and starting shape that these channels can show."""
+    return [
+        Term(name, place, shape)
+        for name in library
+        for place in effects()[name].places(layout)
+        for shape in effects()[name].shapes
+    ]
+
+
+@dataclass
+class Search:
+    """Stepwise search over one set of normal equations."""
+
+    normal: Normal
+    active: list[Term] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.reweigh()
+
+    def reweigh(self) -> None:
+        """Weigh rows by what the active terms leave, twice, so that weights and fit agree."""
+        mean_square = self.normal.square.sum(0) / np.maximum(self.normal.count.sum(0), 1.0)
+        for _ in range(3):
+            self.weighted = Weighted(self.normal, mean_square)
+            mean_square = self.normal.mean_square(*self.weighted.fit(self.active))
+        self.score = self.judge(self.active)
+
+    def judge(self, terms: Sequence[Term]) -> float:
+        """Σ ½ log(cross-validated R² + floor²) over the rows, plus the price of the terms; lower is better."""
+        normal = self.normal
+        squares = self.weighted.cross_validated(terms)
+        fit = 0.5 * np.log(squares + normal.floor**2)[normal.seen].sum()
+        return float(fit + PRICE * sum(self.cost(term) for term in terms))
+
+    def cost(self, term: Term) -> int:
+        """Coefficients and shape parameters of a term."""
+        return len(self.normal.at[term]) + len(term.shape)
+
+    def with_beneath(self, term: Term, terms: Sequence[Term]) -> list[Term]:
+        """`terms` plus `term` plus what it stands upon; another shape of the same effect there gives way."""
+        kept = [other for other in terms if other.key != term.key]
+        have = {other.key for other in kept}
+        missing = [other for other in self.normal.terms if other.key in term.beneath and other.key not in have]
+        return [*kept, *missing, term]
+
+    def without(self, term: Term, terms: Sequence[Term]) -> list[Term]:
+        """`terms` less `term` and what stands upon it."""
+        return [other for other in terms if other != term and term.key not in other.beneath]
+
+    def forward(self) -> bool:
+        """Add the term that helps most, if any earns its place."""
+        inactive = [term for term in self.normal.terms if term not in self.active]
+        best, chosen = self.score - 1e-4, None
+        for _, term in shortlist(self.weighted.screen(self.active, inactive)):
+            trial = self.with_beneath(term, self.active)
+            score = self.judge(trial)
+            if score < best:
+                best, chosen = score, trial
+        if chosen is None or len(chosen) > MOST_TERMS:
+            return False
+        self.active = chosen
+        self.reweigh()
+        return True
+
+    def backward(self) -> bool:
+        """Drop the term that is missed least, if the rest does better without it."""
+        best, chosen = self.score, None
+        for term in self.active:
+            trial = self.without(term, self.active)
+            score = self.judge(trial)
+            if score < best:
+                best, chosen = score, trial
+        if chosen is None:
+            return False
+        self.active = chosen
+        self.reweigh()
+        return True
+
+    def swap(self) -> bool:
+        """Exchange one term for another that does better in its stead."""
+        best, chosen = self.score - 1e-3, None
+        for term in list(self.active):
+            rest = self.without(term, self.active)
+            inactive = [other for other in self.normal.terms if other not in rest and other != term]
+            for _, other in shortlist(self.weighted.screen(rest, inactive))[:4]:
+                trial = self.with_beneath(other, rest)
+                score = self.judge(trial)
+                if score < best:
+                    best, chosen = score, trial
+        if chosen is None:
+            return False
+        self.active = chosen
+        self.reweigh()
+        return True
+
+    def run(self) -> list[Term]:
+        """Forward and backward until nothing helps, then exchanges, then again."""
+        for _ in range(4):
+            while self.forward():
+                while self.backward():
+                    pass
+            while self.backward():
+                pass
+            if not self.swap():
+                break
+        return self.active
+
+
+def shortlist(screened: list[tuple[float, Term]]) -> list[tuple[float, Term]]:
+    """The first few, no effect at one place more than twice."""
+    seen: dict[tuple[str, int], int] = {}
+    out = []
+    for fall, term in screened:
+        seen[term.key] = seen.get(term.key, 0) + 1
+        if seen[term.key] <= 2:
+            out.append((fall, term))
+        if len(out) == SHORTLIST:
+            break
+    return out
+
+
+def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
+    """Move each shape between its neighbours of the starting grid to where the fit is best (golden section)."""
+    out = list(active)
+    for term in active:
+        grid = sorted({shape[0] for shape in effects()[term.effect].shapes if shape})
+        if not term.shape or len(term.shape) > 1 or len(grid) < 2:
+            continue
+        at = int(np.argmin(np.abs(np.array(grid) - term.shape[0])))
+        low, high = grid[max(at - 1, 0)], grid[min(at + 1, len(grid) - 1)]
+
+        def fit(value: float, term: Term = term) -> float:
+            trial = [Term(term.effect, term.place, (value,)) if other == term else other for other in out]
+            normal = Normal(store, trial)
+            start = normal.square.sum(0) / np.maximum(normal.count.sum(0), 1.0)
+            squares = normal.mean_square(*Weighted(normal, start).fit(normal.terms))
+            return float(0.5 * np.log(squares + normal.floor**2)[normal.seen].sum())
+
+        value = golden(fit, low, high)
+        out[out.index(term)] = Term(term.effect, term.place, (value,))
+    return out
+
+
+def golden(function: Callable[[float], float], low: float, high: float, steps: int = 10) -> float:
+    """Minimum of a function between two values by golden-section search."""
+    ratio = 0.5 * (np.sqrt(5.0) - 1.0)
+    a, b = high - ratio * (high - low), low + ratio * (high - low)
+    fa, fb = function(a), function(b)
+    for _ in range(steps):
+        if fa < fb:
+            high, b, fb = b, a, fa
+            a = high - ratio * (high - low)
+            fa = function(a)
+        else:
+            low, a, fa = a, b, fb
+            b = low + ratio * (high - low)
+            fb = function(b)
+    return float(0.5 * (low + high))
+
+
+def coefficients_of(normal: Normal, terms: Sequence[Term]) -> tuple[Array, Array]:
+    """Indices and coefficients of a fit on everything, weights settled."""
+    search = Search(normal, list(terms))
+    index, values = search.weighted.fit(terms)
+    return index, values

@@ -1,0 +1,203 @@
+"""A recording made ready: even sampling, smooth velocity and acceleration, model torque, and one filter for both sides.
+
+Every column that is compared with a reading goes through the same zero-phase low pass and is decimated with it, so the
+filter changes neither side against the other. Signs, plays and clips are taken at the work rate, before that filter.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.signal import butter, sosfiltfilt
+
+from armlink.errors import BadInput
+from armlink.recording import Recording
+from sim_gap.rigid import Array, RigidArm
+
+BAND_HZ = 6.0
+"""Pass band in which model and recording are compared."""
+SMOOTH_HZ = 20.0
+"""Pass band of position and velocity before anything nonlinear is taken of them."""
+WORK_HZ = 250.0
+"""Highest rate at which columns are computed; faster recordings are low-passed and decimated to it."""
+TRIM_S = 0.3
+"""Cut at both ends after filtering."""
+CREEP = 0.01
+"""Speed [rad/s] below which the sign of a velocity means nothing and friction may take any value."""
+SHORTEST_S = 3.0
+CHANNELS = {"tau": "torque", "tau_motor": "motor_torque", "tau_cmd": "torque_command"}
+
+
+@dataclass(frozen=True, eq=False)
+class Signals:
+    """One recording at an even work rate, with the nominal model's answer to its motion."""
+
+    label: str
+    rate: float
+    """Work rate [Hz]."""
+    band: float
+    """Pass band [Hz]."""
+    t: Array
+    q: Array
+    v: Array
+    a: Array
+    """(K,), then (K, n) each in rad, rad/s, rad/s²."""
+    reading: dict[str, Array]
+    """Torque channels `tau`, `tau_motor`, `tau_cmd` that are there [N·m], (K, n)."""
+    known: dict[str, Array]
+    """1 where the channel was really read, 0 where a gap was bridged, (K, n)."""
+    noise: dict[str, Array]
+    """Standard deviation of each channel's noise within the pass band [N·m], (n,)."""
+    arm: RigidArm
+    temperature: Array | None = None
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return int(self.q.shape[1])
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Torque channels that are there."""
+        return tuple(self.reading)
+
+    @cached_property
+    def model(self) -> Array:
+        """Nominal rigid-body torque [N·m], (K, n)."""
+        return self.arm.torque(self.q, self.v, self.a)
+
+    @cached_property
+    def gravity_columns(self) -> Array:
+        """Model torque per unit of gravity along each base axis, (K, n, 3)."""
+        still = np.zeros_like(self.q)
+        return np.stack([self.arm.torque(self.q, still, still, axis) for axis in np.eye(3)], axis=-1)
+
+    @cached_property
+    def regressor(self) -> Array:
+        """Columns of the model torque in the links' inertial parameters, (K, n, n, 10)."""
+        return self.arm.regressor(self.q, self.v, self.a)
+
+    @cached_property
+    def direction(self) -> Array:
+        """Sign of the velocity, passing through zero linearly within the creeping speed, (K, n)."""
+        return np.clip(self.v / CREEP, -1.0, 1.0)
+
+    @cached_property
+    def moving(self) -> Array:
+        """1 where a joint moves faster than it creeps, (K, n)."""
+        return (np.abs(self.v) > CREEP).astype(float)
+
+    @property
+    def step(self) -> int:
+        """Decimation from the work rate to that of the comparison."""
+        return max(1, round(self.rate / (4.0 * self.band)))
+
+    def filtered(self, x: Array) -> Array:
+        """Low-pass (4th-order Butterworth, forward and backward), trimmed at the ends and decimated; (K, …) → (k, …)."""
+        sections = butter(4, self.band, fs=self.rate, output="sos")
+        trim = max(1, round(TRIM_S * self.rate))
+        return np.asarray(sosfiltfilt(sections, x, axis=0)[trim : len(x) - trim : self.step])
+
+    def sampled(self, x: Array) -> Array:
+        """The rows of `x` at which `filtered` gives its values, unfiltered."""
+        trim = max(1, round(TRIM_S * self.rate))
+        return x[trim : len(x) - trim : self.step]
+
+
+def prepare(recording: Recording, arm: RigidArm, label: str = "recording") -> Signals:
+    """Make a recording ready for comparison with `arm`. Raises BadInput where it cannot be used, saying why."""
+    if recording.n != arm.n:
+        raise BadInput(f"{label}: has {recording.n} joints, the model {arm.n}: give the model of the recorded arm")
+    if len(recording.t) < 4 or recording.t[-1] - recording.t[0] < SHORTEST_S:
+        span = recording.t[-1] - recording.t[0]
+        raise BadInput(
+            f"{label}: {len(recording.t)} rows over {span:.3g} s: too short to tell anything; record at least {SHORTEST_S:.0f} s"
+        )
+    raw_step = float(np.median(np.diff(recording.t)))
+    even = np.arange(recording.t[0], recording.t[-1] + 0.5 * raw_step, raw_step)
+    stride = max(1, int(1.0 / raw_step / WORK_HZ + 1e-6))
+    rate = 1.0 / (raw_step * stride)
+    band = min(BAND_HZ, rate / 5.0)
+    if band < 0.5:
+        raise BadInput(f"{label}: {rate:.3g} rows a second are too few: record at 10 Hz or more")
+    thin = _thinner(1.0 / raw_step, stride)
+    q = thin(_bridged(recording.t, recording.position, even, label, "q"))
+    smooth = _low_pass(min(SMOOTH_HZ, 0.4 * rate), rate)
+    measured = recording.velocity is not None and np.isfinite(recording.velocity).mean() > 0.5
+    v = (
+        thin(_bridged(recording.t, recording.velocity, even, label, "dq"))
+        if measured and recording.velocity is not None
+        else np.gradient(q, 1.0 / rate, axis=0)
+    )
+    v = smooth(v)
+    reading, known, noise = {}, {}, {}
+    for channel, name in CHANNELS.items():
+        values = getattr(recording, name)
+        if values is None or not np.isfinite(values).any():
+            continue
+        reading[channel] = thin(_bridged(recording.t, values, even, label, channel))
+        known[channel] = _coverage(recording.t, values, even)[::stride]
+        noise[channel] = np.array([_band_noise(recording.t, values[:, j], band) for j in range(arm.n)])
+    if not reading:
+        raise BadInput(f"{label}: no torque channel holds a number: at least one of tau, tau_motor, tau_cmd is needed")
+    shared = smooth(q), v, np.gradient(v, 1.0 / rate, axis=0)
+    return Signals(
+        label, rate, band, even[::stride] - even[0], *shared, reading, known, noise, arm, recording.temperature
+    )
+
+
+def _bridged(t: Array, values: Array, even: Array, label: str, column: str) -> Array:
+    """Values on the even time base, gaps bridged linearly; raises BadInput where a whole column is missing."""
+    out = np.empty((len(even), values.shape[1]))
+    for j in range(values.shape[1]):
+        there = np.isfinite(values[:, j])
+        if there.sum() < 4 or (column == "q" and there.mean() < 0.2):
+            raise BadInput(
+                f"{label}: column {column}_{j + 1} holds {int(there.sum())} numbers in {len(t)} rows: expected a reading "
+                "in most rows; record that channel or leave it out"
+            )
+        out[:, j] = np.interp(even, t[there], values[there, j])
+    return out
+
+
+def _coverage(t: Array, values: Array, even: Array) -> Array:
+    """1 where a reading is no further away than a few of the channel's own periods, (K, n)."""
+    out = np.zeros((len(even), values.shape[1]))
+    for j in range(values.shape[1]):
+        there = t[np.isfinite(values[:, j])]
+        after = np.clip(np.searchsorted(there, even), 1, len(there) - 1)
+        gap = there[after] - there[after - 1]
+        out[:, j] = gap <= max(6.0 * float(np.median(np.diff(there))), 0.05)
+    return out
+
+
+def _thinner(rate: float, stride: int) -> Callable[[Array], Array]:
+    if stride == 1:
+        return lambda x: x
+    low = _low_pass(0.4 * rate / stride, rate)
+    return lambda x: low(x)[::stride]
+
+
+def _low_pass(cut: float, rate: float) -> Callable[[Array], Array]:
+    sections = butter(4, cut, fs=rate, output="sos")
+    return lambda x: np.asarray(sosfiltfilt(sections, x, axis=0))
+
+
+def _band_noise(t: Array, values: Array, band: float) -> float:
+    """Noise within the pass band [N·m], from the channel's own spectrum above twice that band (median: no lines)."""
+    there = np.isfinite(values)
+    x, own = values[there], t[there]
+    if len(x) < 64:
+        return 0.0
+    rate = 1.0 / float(np.median(np.diff(own)))
+    frequency, density = _spectrum(x - x.mean(), rate)
+    high = frequency > min(2.0 * band, 0.3 * rate)
+    return float(np.sqrt(np.median(density[high]) / 0.69 * band)) if high.any() else 0.0
+
+
+def _spectrum(x: Array, rate: float) -> tuple[Array, Array]:
+    from scipy.signal import welch
+
+    frequency, density = welch(x, fs=rate, nperseg=min(len(x), 512), detrend="linear")
+    return np.asarray(frequency), np.asarray(density)
