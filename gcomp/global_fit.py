@@ -1,6 +1,6 @@
 """Global identification: sensors, mass moments and load point from all data at once (theory note, section 7)."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,8 @@ from gcomp.sensor_model import predict
 MAX_STD = {"gain": 0.2, "offset": 0.5, "position_gain": 0.1, "position_offset": 0.35, "beta": 0.5, "rho": 0.2}
 """Standard deviation beyond which a value is no answer, per family: shares of the gain; of the readings' size for
 offset and of that size over g for mass moments; rad; m."""
+DOUBT = 2.0
+"""chi² per degree of freedom from which on another start is tried."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,12 +94,30 @@ def identify_global(
     readings.require_arm(arm)
     begin = start or _start_of(arm.n, priors or {})
     problem = Problem.of(arm, readings, unknown, priors or {}, loss, position_sigma, _units(arm, readings, begin))
-    first = linear_start(arm, readings, begin, problem.free)
-    outcome = solve(problem, first)
-    if outcome.chi2 > 2 * max(1, outcome.dof):  # far from the noise: try the plain start too, keep the better
-        other = solve(problem, begin)
+    starts = _starts(problem, begin)
+    outcome = solve(problem, next(starts))
+    for first in starts:
+        if outcome.converged and outcome.chi2 < DOUBT * max(1, outcome.dof):
+            break
+        other = solve(problem, first)
         outcome = other if other.cost < outcome.cost else outcome
     return _report(problem, outcome, {**MAX_STD, **(max_std or {})})
+
+
+def _starts(problem: Problem, begin: Parameters) -> Iterator[Parameters]:
+    """Starts in the order in which to try them: the linear solution, with position errors taken out first; `begin`."""
+    n, places, loaded = problem.arm.n, family_slices(problem.arm.n), problem.readings.load != 0
+    positions = slice(places["position_gain"].start, places["position_offset"].stop)
+    if problem.free[positions].any() and problem.free[places["beta"]].any() and loaded.any() and not loaded.all():
+        bare = problem.readings.rows(~loaded)
+        if bare.counted.any():
+            plain = linear_start(problem.arm, bare, begin, problem.free)
+            found = solve(problem.on(bare), plain).vector
+            better = begin.vector
+            better[positions] = found[positions]
+            yield linear_start(problem.arm, problem.readings, Parameters.from_vector(better, n), problem.free)
+    yield linear_start(problem.arm, problem.readings, begin, problem.free)
+    yield begin
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,8 @@ from gcomp.arrays import Array, Mask
 NULL_RATIO = 1e-7
 """Singular values below this share of the largest are zero. Structural zeros come out below 1e-8 (angles are written
 with eight digits), and the smallest true ones seen above 1e-4: the bound stands in the gap."""
-NULL_STD = 30.0
-"""A direction known to no better than thirty natural units is held fixed: its linearisation would mean nothing."""
+NULL_STD = 1.0
+"""A direction known to no better than one natural unit is held fixed: its linearisation would mean nothing."""
 PARTICIPATION = 1e-4
 """Share of a null direction from which on a parameter counts as taking part in it."""
 

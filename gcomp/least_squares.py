@@ -53,6 +53,10 @@ class Problem:
         mean, std = prior_vectors(arm.n, priors)
         return cls(arm, readings, free_mask(arm.n, unknown), mean, std, loss, noise, unit)
 
+    def on(self, readings: Readings) -> "Problem":
+        """The same fitted to other readings."""
+        return replace(self, readings=readings)
+
     @property
     def reweighted(self) -> bool:
         """Whether the weights depend on the parameters."""
@@ -157,15 +161,15 @@ def _step(
     problem: Problem, vector: Array, weight: list[Array], cost: float, spectrum: Spectrum, along: Array, damping: float
 ) -> tuple[Array | None, float, float]:
     """(Vector with a lower cost or None, its cost, damping for the next step)."""
-    typical = float(np.median(spectrum.values**2))
+    weakest = float(spectrum.values[-1] ** 2)
     for _ in range(12):
         shrunk = along * spectrum.values / (spectrum.values**2 + damping)
         trial = vector.copy()
         trial[problem.free] += problem.unit[problem.free] * (spectrum.right.T @ shrunk)
         trial_cost = problem.cost(trial, weight)
         if trial_cost < cost:
-            return trial, trial_cost, damping / 10 if damping > 1e-4 * typical else 0.0
-        damping = max(10 * damping, 1e-3 * typical)
+            return trial, trial_cost, damping / 10 if damping > 1e-3 * weakest else 0.0
+        damping = max(10 * damping, 0.1 * weakest)
     return None, cost, damping
 
 
