@@ -4,8 +4,6 @@ Pure: samples in, events out; no bus, clock, file or thread. Readings are those 
 every estimate is relative to it: reading = gain·τ + offset with gain 1 and offset 0 while nothing has drifted.
 """
 
-from collections import deque
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -16,6 +14,7 @@ from calib.causes import CauseTest, Verdict, Window
 from calib.cusum import Cusum
 from calib.decision import Finding, agreed, decide
 from calib.observer_config import ObserverConfig
+from calib.places import Places
 from calib.records import Array
 from calib.rest import RestDetector, Row
 from calib.sensor_filter import SensorFilter
@@ -76,9 +75,10 @@ class Observer:
         self._rest = RestDetector(arm.n, self.config)
         self._filter = SensorFilter(arm.n, self.config)
         self._cusum = Cusum(arm.n, self.config)
-        self._places: deque[Array] = deque(maxlen=self.config.excitation_rows)
+        self._places = Places(arm.n, self.config.place_size, self.config.places, self.config.place_memory)
         self._window: list[Row] = []
-        self._fresh = 0
+        self._fresh = self._repeated = 0
+        self._doubtful = False
         self._first: tuple[list[Row], CauseTest, int] | None = None
         self._said: tuple[str, int | None] | None = None
         self._learnt = 0
@@ -97,13 +97,15 @@ class Observer:
         events = [] if self.held else self._watch(row)
         if events:
             self._start_test()
-        elif self._is_new_place(row, [kept.position for kept in self._window]):
-            self._window.append(row)
-            self._fresh += 1
-            if self._fresh >= self.config.window:
-                self._fresh = 0
-                events = self._test(row.t) if self.held else self._audit(row.t)
-        return events
+            return events
+        if not self._is_new(row):
+            return self._repeat(row.t)
+        self._window.append(row)
+        self._fresh += 1
+        if self._fresh < self.config.window:
+            return []
+        self._fresh = 0
+        return self._test(row.t) if self.held else self._audit(row.t)
 
     def estimate(self) -> Estimate:
         """Gain and offset of every joint against the installed calibration, as known now."""
@@ -115,20 +117,23 @@ class Observer:
         """The finding was written to the controller: from now on readings are right again, as far as it was known."""
         floor = np.diag([self.config.drift_gain**2, self.config.drift_offset**2])
         self._filter.restart(finding.joint, covariance=finding.covariance + floor)
+        self._places.forget()
         self._resume()
 
     def _watch(self, row: Row) -> list[Event]:
         """Filter and change detection; returns alarms."""
-        torque = self.belief.torque(row.position[None])[0]
-        variance = self.sigma**2 + self.belief.torque_variance(row.position, self.config.position_std)
-        alarms = self._cusum.handle(row.torque - torque, torque, variance)
-        events = [self._event(row.t, "alarm", joint, channel=channel) for joint, channel in alarms]
-        if not events and self._is_new_place(row, self._places):
-            self._places.append(row.position)
-            self._filter.handle(row.torque, torque, variance)
-            over = np.flatnonzero(self._filter.rejected >= self.config.outliers_in_a_row)
-            events = [self._event(row.t, "outliers", int(joint), rows=self.config.outliers_in_a_row) for joint in over]
-        return events
+        q, noise = row.position, self.sigma**2
+        torque = self.belief.torque(q[None])[0]
+        of_model = self.belief.torque_variance(q, self.config.position_std)
+        expected, left = self._places.expected(q, of_model, noise)
+        alarms = self._cusum.handle(row.torque - torque - expected, torque, noise + left)
+        if alarms:
+            return [self._event(row.t, "alarm", joint, channel=channel) for joint, channel in alarms]
+        if self._places.seen(q) < self.config.place_rows:
+            self._filter.handle(row.torque, torque, noise + of_model)
+        self._places.add(q, row.torque - torque)
+        over = np.flatnonzero(self._filter.rejected >= self.config.outliers_in_a_row)
+        return [self._event(row.t, "outliers", int(joint), rows=self.config.outliers_in_a_row) for joint in over]
 
     def _audit(self, t: float) -> list[Event]:
         """No alarm stands: test the last rows all the same, for what is too small or too slow for an alarm."""
@@ -138,6 +143,7 @@ class Observer:
             if self._learnt < self.config.baseline_rows:
                 window = _window(self._window[-self.config.window :])
                 self.belief.learn(window.position, window.torque, self.sigma)
+                self._places.forget()
                 self._learnt += self.config.window
             return []
         if verdict.cause in ("unknown", "ambiguous"):
@@ -149,10 +155,12 @@ class Observer:
         """An alarm stands and its window is full: say what it was, and propose where two windows agree on a drift."""
         test = self._cause_test(self._window)
         verdict = test.verdict()
-        undecided = verdict.cause in ("unknown", "ambiguous")
-        if undecided and len(self._window) < self.config.longest_window:
+        if verdict.cause == "ambiguous" and len(self._window) < self.config.longest_window:
             return []  # more rows may tell
         window, self._window = self._window, []
+        doubted, self._doubtful = self._doubtful, verdict.cause == "unknown"
+        if self._doubtful and not doubted:
+            return []  # the cause may have changed within this window: one more
         if verdict.cause == "none":
             self._resume()
             return [self._verdict_event(t, verdict)]
@@ -194,18 +202,32 @@ class Observer:
         return CauseTest(self.belief, _window(rows), self.sigma, self.config)
 
     def _start_test(self) -> None:
-        self.held, self._said, self._first = True, None, None
-        self._window, self._fresh = [], 0
+        self._clear()
+        self.held = True
 
     def _resume(self) -> None:
-        self.held, self._said, self._first = False, None, None
-        self._window, self._fresh = [], 0
+        self._clear()
+        self.held = False
         self._cusum.reset()
 
-    def _is_new_place(self, row: Row, places: Iterable[Array]) -> bool:
-        """Whether this place is not among the rows so often already that one more would only wind the estimate up."""
-        near = sum(bool(np.abs(place - row.position).max() < self.config.bucket_size) for place in places)
-        return near < self.config.bucket_rows
+    def _clear(self) -> None:
+        self._said, self._first, self._doubtful = None, None, False
+        self._window, self._fresh, self._repeated = [], 0, 0
+
+    def _is_new(self, row: Row) -> bool:
+        """Whether the window has few enough rows of this place that one more would not only wind it up."""
+        away = [np.abs(kept.position - row.position).max() for kept in self._window]
+        return sum(bool(far < self.config.place_size) for far in away) < self.config.place_rows
+
+    def _repeat(self, t: float) -> list[Event]:
+        """One more row of a place that the window knows: too many of them under an alarm, and no test is possible."""
+        self._repeated += self.held
+        if self._repeated < self.config.patience:
+            return []
+        self._clear()
+        return [
+            self._event(t, "undecided", None, reasons=["too few different poses to tell a cause: sweep, or move more"])
+        ]
 
     def _say(self, t: float, verdict: Verdict) -> list[Event]:
         """The verdict's event, once as long as it stays the same."""

@@ -45,10 +45,14 @@ class ObserverConfig:
     """Gain is updated only where the last rows could tell it to this standard deviation: K·Var τ ≥ (σ/δk)²."""
     excitation_rows: int = 60
     """Rows that the excitation gate looks back on."""
-    bucket_size: float = 0.2
-    """Poses in the same cell of this size count as one place [rad]."""
-    bucket_rows: int = 3
-    """Rows of one place used among the last `excitation_rows`, and in one window: a repeated pose adds nothing."""
+    place_size: float = 0.2
+    """Poses within this distance in every joint are one place [rad]."""
+    place_rows: int = 3
+    """Rows of one place that the filter and a window take: a repeated pose adds nothing."""
+    place_memory: int = 20
+    """Rows that the mean residual of a place is made of: what is left of its error is small against an alarm."""
+    places: int = 60
+    """Places remembered."""
 
     # alarm
     alarm_gain: float = 0.01
@@ -69,6 +73,8 @@ class ObserverConfig:
     """(χ² − dof)/√(2 dof) above which no entry explains the window."""
     position_std: float = 1e-3
     """How well a position reading's zero is known [rad]; marginalised like the model's error."""
+    patience: int = 120
+    """Rows after an alarm that may be left out as repeated poses before the test is given up as undecided."""
     baseline_rows: int = 40
     """Rows without drift from which the model takes over what the sensors, as installed, read."""
 
