@@ -64,7 +64,7 @@ def _invoke(point: EntryPoint, arguments: list[str]) -> int:
         app = target
         arguments = arguments or ["--help"]
     else:
-        app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+        app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
         app.command(name=point.name)(target)
     try:
         outcome = app(args=arguments, prog_name=f"armlink {point.name}", standalone_mode=False)

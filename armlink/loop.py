@@ -19,6 +19,8 @@ FRAME_BITS = 47
 COLLECT_SHARE = 0.8
 """Share of a period after SYNC in which TPDOs of this cycle are waited for."""
 
+NO_STATUS = 0xFFFF
+"""Stands for the status word of a joint that has sent none; no state of CiA 402."""
 _NOTHING = b""
 _OPERATIONAL = bytes([objects.OPERATIONAL])
 
@@ -52,9 +54,10 @@ class Loop:
         self._torque: list[float] = [math.nan] * self.n
         self._motor: list[float] = [math.nan] * self.n
         self._velocity: list[float] = [math.nan] * self.n
-        self._status: list[int] = [0] * self.n
+        self._status: list[int] = [NO_STATUS] * self.n
         self._awaited = 0
-        self._bits = 0
+        self.bits = 0
+        """Bits that the frames so far took on the wire, with nominal stuffing."""
         self._seen = np.full(self.n, -math.inf)
         self._first: float | None = None
         self.latest_position = np.full(self.n, math.nan)
@@ -65,7 +68,7 @@ class Loop:
 
     def reset_counters(self) -> None:
         """Begin to count anew."""
-        self.stats, self._bits, self._first = Stats(), 0, None
+        self.stats, self.bits, self._first = Stats(), 0, None
 
     def set_units(self, units: tuple[Units, ...]) -> None:
         """Scales of the joints."""
@@ -76,7 +79,7 @@ class Loop:
         """Send one frame and count it."""
         self._port.send(can_id, data)
         self.stats.frames += 1
-        self._bits += FRAME_BITS + 8 * len(data)
+        self.bits += FRAME_BITS + 8 * len(data)
 
     def send_mode(self, joint: int, mode: int) -> None:
         """RPDO2: the mode of one joint."""
@@ -117,7 +120,15 @@ class Loop:
                 break
         while self.receive(0.0):
             pass
-        return self._sample(now)
+        return self.sample(now)
+
+    def listen(self, seconds: float) -> Sample:
+        """Take in what comes within `seconds` without sending anything; of each reading the newest."""
+        self.drain()
+        end = self._clock.now() + seconds
+        while (remaining := end - self._clock.now()) > 0:
+            self.receive(remaining)
+        return self.sample(self._clock.now())
 
     def age(self, now: float) -> Array:
         """Time since each joint's position and torque last came [s], (n,); inf before the first."""
@@ -127,11 +138,11 @@ class Loop:
         """Bring rate and load of the stats up to date for `elapsed` seconds."""
         if elapsed > 0:
             self.stats.rate_hz = self.stats.cycles / elapsed
-            self.stats.load = self._bits / (bitrate * elapsed)
+            self.stats.load = self.bits / (bitrate * elapsed)
 
     def _take(self, can_id: int, data: bytes) -> None:
         self.stats.frames += 1
-        self._bits += FRAME_BITS + 8 * len(data)
+        self.bits += FRAME_BITS + 8 * len(data)
         entry = self._table.get(can_id)
         if entry is None:
             self._take_other(can_id, data)
@@ -157,7 +168,8 @@ class Loop:
         else:
             self.on_other(can_id, data)
 
-    def _sample(self, now: float) -> Sample:
+    def sample(self, now: float) -> Sample:
+        """What came since the last sample, newest of each reading, as of time `now`; NaN where nothing came."""
         position = np.array(self._position) * self._position_unit
         torque = np.array(self._torque) * TORQUE_PER_MICRO
         motor = np.array(self._motor) * self._torque_unit

@@ -15,6 +15,7 @@ def scan(
 
     Example: armlink scan sarcos --bus socketcan:vcan0
     """
+    from rich.box import SIMPLE
     from rich.console import Console
     from rich.table import Table
 
@@ -42,14 +43,14 @@ def scan(
         channel = str(opened.channel_info)
     finally:
         opened.shutdown()
-    table = Table("node", "joint", "state", "device", "name", "vendor", "product", "revision", "serial", title=channel)
+    table = Table("node", "joint", "state", "device", "vendor:product:revision", "serial", box=SIMPLE, title=channel)
     for each in found:
         if each.present:
-            numbers = (f"{each.vendor:#x}", f"{each.product:#x}", f"{each.revision:#x}", str(each.serial))
-            told = (each.state.value, describe_type(each.device_type), each.name, *numbers)
+            told = (each.state.value, each.name or describe_type(each.device_type))
+            identity = f"{each.vendor:x}:{each.product:x}:{each.revision:x}"
+            table.add_row(str(each.node), each.joint, *told, identity, str(each.serial))
         else:
-            told = ("[red]no answer[/red]",) + ("",) * 6
-        table.add_row(str(each.node), each.joint, *told)
+            table.add_row(str(each.node), each.joint, "[red]no answer[/red]")
     Console(stderr=True).print(table if found else f"{channel}: no node answers")
     write_json(json, {"bus": channel, "nodes": [{**vars(each), "state": each.state.value} for each in found]})
     missing = [f"{each.joint} (node {each.node})" for each in found if not each.present]

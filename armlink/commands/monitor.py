@@ -1,0 +1,91 @@
+"""Live table of an arm's joints: position, torque, state, age, bus load; commands nothing."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import Group
+
+REFRESH_SECONDS = 0.2
+ONCE_SECONDS = 0.5
+COLUMNS = ("joint", "node", "position\nrad", "torque\nN·m", "motor\nN·m", "state", "NMT", "age\ns")
+
+
+def monitor(
+    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
+    bus: Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")] = None,
+    once: Annotated[bool, typer.Option("--once", help="Show one table and end.")] = False,
+    cycles: Annotated[int, typer.Option(min=0, help="End after so many refreshes (5 a second); 0: Ctrl-C.")] = 0,
+    sync: Annotated[bool, typer.Option("--sync", help="Start the nodes and send SYNC, where no host does.")] = False,
+    json: Annotated[Path | None, typer.Option(help="Write the last state here; - is standard output.")] = None,
+) -> int:
+    """Show what an arm's joints send; exit status 3 where no joint is heard.
+
+    It listens beside the host that runs the arm. Scales are the arm file's rated torques and 2^20 units a turn.
+
+    Example: armlink monitor sarcos --bus socketcan:vcan0
+    """
+    from rich.console import Console
+    from rich.live import Live
+
+    from armlink.armfile import load_arm
+    from armlink.bus import open_bus
+    from armlink.commands.output import write_json
+    from armlink.errors import BusFault
+    from armlink.monitor import Monitor
+    from armlink.signals import terminate_as_interrupt
+
+    arm_file = load_arm(arm)
+    opened = open_bus(bus, arm_file.require_link().bus)
+    console = Console(stderr=True)
+    answer: dict[str, Any] = {}
+    title = f"{arm_file.name} on {opened.channel_info}"
+    try:
+        watcher = Monitor(arm_file, opened, sync)
+        refreshes = 1 if once else cycles
+        shown = 0
+        with terminate_as_interrupt(), Live(console=console, auto_refresh=False, transient=True) as live:
+            while not refreshes or shown < refreshes:
+                answer = watcher.describe(watcher.watch(ONCE_SECONDS if once else REFRESH_SECONDS))
+                shown += 1
+                if console.is_terminal:
+                    live.update(_table(title, answer), refresh=True)
+    finally:
+        opened.shutdown()
+        if answer:
+            console.print(_table(title, answer))
+            write_json(json, {"arm": arm_file.name, "serial": arm_file.serial, **answer})
+    if all(joint["state"] is None and joint["position"] != joint["position"] for joint in answer["joints"]):
+        raise BusFault(f"{title}: no joint is heard: does a host send SYNC? (--sync sends it)")
+    return 0
+
+
+def _table(title: str, answer: dict[str, Any]) -> "Group":
+    from rich.box import SIMPLE
+    from rich.console import Group
+    from rich.table import Table
+
+    table = Table(*COLUMNS, box=SIMPLE, title=title)
+    for column in (1, 2, 3, 4, 7):
+        table.columns[column].justify = "right"
+    for joint in answer["joints"]:
+        table.add_row(
+            joint["joint"],
+            str(joint["node"]),
+            _number(joint["position"], "{:+.4f}"),
+            _number(joint["torque"], "{:+.2f}"),
+            _number(joint["motor_torque"], "{:+.2f}"),
+            joint["state"] or "—",
+            joint["nmt"] or "—",
+            _number(joint["age"], "{:.1f}"),
+        )
+    bus = answer["bus"]
+    line = f"SYNC {bus['rate_hz']:.1f} Hz, load {bus['load']:.1%}, {bus['frames']} frames, {bus['errors']} errors"
+    emergencies = [f"{each['joint']}: {each['code']} {each['meaning']}" for each in answer["emergencies"][-5:]]
+    return Group(table, line, *emergencies)
+
+
+def _number(value: float, form: str) -> str:
+    return form.format(value) if abs(value) < float("inf") else "—"
