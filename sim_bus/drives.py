@@ -30,6 +30,8 @@ VELOCITY_FILTER = 0.008
 REMOTE, INTERNAL_LIMIT, FOLLOWS = 0x0210, 0x0800, 0x1000
 INTEGRAL_SHARE = 0.3
 """Integral action: stiffness · bandwidth · this."""
+TUNING_POSES = 50
+"""The loops are tuned for the largest inertia among so many poses, so that they are stable in all of them."""
 
 
 class Drives:
@@ -40,7 +42,8 @@ class Drives:
         section, self.n = sim_section(arm).servo, plant.n
         self._plant, self._sensors, self._signals = plant, sensors, signals
         self.rated = np.array([joint.rated_torque for joint in arm.require_link().joints])
-        inertia = np.diag(plant.inertia((plant.lower + plant.upper) / 2))
+        poses = np.random.default_rng(0).uniform(plant.lower, plant.upper, (TUNING_POSES, self.n))
+        inertia = np.max([np.diag(plant.inertia(pose)) for pose in poses], axis=0)
         self._stiffness = inertia * section.bandwidth**2
         self._damping = 2 * section.damping * inertia * section.bandwidth
         self._integration = INTEGRAL_SHARE * section.bandwidth * self._stiffness
