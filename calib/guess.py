@@ -1,0 +1,93 @@
+"""The rough gravity model that the scout's static readings give: enough to choose bias torques that surely hold."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from gcomp.arm import Arm
+from gcomp.gravity import gravity_regressor, gravity_stiffness
+
+Array = npt.NDArray[np.float64]
+
+GAIN_STD = 0.3
+"""What is assumed of an uncalibrated torque gain: 1 ± 0.3."""
+SIGMAS = 3.0
+"""Standard deviations of the rough model that bounds take in."""
+
+
+@dataclass(frozen=True, eq=False)
+class GravityGuess:
+    """Mass moments in the scale of the drives' own torque, which is the scale of the commands."""
+
+    arm: Arm
+    beta: Array
+    """(2n,) [kg·m]"""
+    covariance: Array
+    """(2n, 2n)"""
+
+    def torque(self, q: Array) -> Array:
+        """Holding torque (…, n) [N·m] at poses q (…, n) [rad]."""
+        return gravity_regressor(self.arm, q) @ self.beta
+
+    def uncertainty(self, q: Array) -> Array:
+        """Bound of the model's error (…, n) [N·m] at poses q (…, n) [rad]."""
+        regressor = gravity_regressor(self.arm, q)
+        variance = np.einsum("...ip,pq,...iq->...i", regressor, self.covariance, regressor, optimize=True)
+        return SIGMAS * np.sqrt(np.maximum(variance, 0.0))
+
+    def inertia(self) -> Array:
+        """Rough upper size (n,) [kg·m²] of each joint's inertia: composite mass moment times reach."""
+        moment = np.linalg.norm(self.beta.reshape(-1, 2), axis=1)[::-1].cumsum()[::-1]
+        return moment * reach(self.arm)
+
+
+def reach(arm: Arm, hand: float = 0.15) -> Array:
+    """Longest distance (n,) [m] from each joint to the tip's far side."""
+    return np.hypot(arm.a, arm.d)[::-1].cumsum()[::-1] + hand
+
+
+def guess_gravity(
+    arm: Arm, position: Array, torque: Array, motor_torque: Array, rated: Array, friction: float
+) -> GravityGuess:
+    """Rough mass moments from servo-held poses: positions, sensor readings, drive torques, all (P, n).
+
+    Linear least squares on κ v − ω = Y β and τ_motor = Y β, with κ = 1/gain near 1; `friction`, a share of rated
+    torque (n,) [N·m], is how far the drive's torque may lie off. Where the fit is worse, the covariance says so.
+    """
+    poses, n = position.shape
+    regressor = gravity_regressor(arm, position)
+    sensor_rows = np.zeros((poses, n, 4 * n))
+    motor_rows = np.zeros((poses, n, 4 * n))
+    joints = np.arange(n)
+    sensor_rows[:, joints, joints] = torque
+    sensor_rows[:, joints, n + joints] = -1.0
+    sensor_rows[:, :, 2 * n :] = -regressor
+    motor_rows[:, :, 2 * n :] = regressor
+    sensor_sigma, motor_sigma = 0.005 * rated, friction * rated
+    spread = np.concatenate([np.full(n, GAIN_STD), 0.3 * rated, np.full(2 * n, _largest_moment(arm, rated))])
+    expected = np.concatenate([np.ones(n), np.zeros(3 * n)])
+    counted = np.isfinite(motor_torque)
+    design = np.concatenate(
+        [
+            (sensor_rows / sensor_sigma[:, None]).reshape(-1, 4 * n),
+            (motor_rows / motor_sigma[:, None])[counted],
+            np.diag(1 / spread),
+        ]
+    )
+    target = np.concatenate([np.zeros(poses * n), (motor_torque / motor_sigma)[counted], expected / spread])
+    solution = np.linalg.lstsq(design, target, rcond=None)[0]
+    covariance = np.linalg.inv(design.T @ design)
+    residual = design @ solution - target
+    excess = max(float(residual @ residual) / max(len(target) - 4 * n, 1), 1.0)
+    return GravityGuess(arm, solution[2 * n :], covariance[2 * n :, 2 * n :] * excess)
+
+
+def position_allowance(guess: GravityGuess, q: Array, error: Array) -> Array:
+    """Change of holding torque (…, n) [N·m] that position errors (n,) [rad] can make at poses q (…, n)."""
+    return np.abs(gravity_stiffness(guess.arm, guess.beta, q)) @ error
+
+
+def _largest_moment(arm: Arm, rated: Array) -> float:
+    """A mass moment [kg·m] that no arm of these drives exceeds."""
+    return 2 * float(rated.max()) / max(float(np.linalg.norm(arm.gravity)), 1.0)

@@ -1,0 +1,232 @@
+"""Moves the arm through the link: coordinated travel, creeping onto stops, pressing, resting until a reading is exact."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from armlink.errors import Refused
+from armlink.link import Link
+from armlink.sample import Command, Sample
+from calib.motion import trajectory
+from calib.plan_limits import Limits
+from calib.section import SweepSection
+from calib.settle import SettleRule
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+POSITION, TORQUE = 8, 10
+STALL = 0.2
+"""Following error at which a joint counts as blocked [rad]."""
+SLIP = 0.01
+"""How far a pressed joint may leave its stop [rad]."""
+CONTACT_LEAD = 0.015
+"""A joint that its target leads by so much, and that does not move, stands at its stop [rad]."""
+CONTACT_STILL = 0.15
+"""Share of the approach speed below which a joint does not move."""
+PRESS_SECONDS = 0.3
+STOP_TOLERANCE = 0.06
+"""How far from the arm file's place a stop may be found, beyond the position sensor's own error [rad]."""
+
+
+class Stalled(Exception):
+    """A joint did not follow: its drive is too weak there, or something is in the way."""
+
+    def __init__(self, joint: int, position: float, target: float) -> None:
+        """Joint index, where it stands and where it should be [rad]."""
+        super().__init__(joint, position, target)
+        self.joint, self.position, self.target = joint, position, target
+
+
+class Slipped(Exception):
+    """A pressed joint left its stop."""
+
+    def __init__(self, joint: int) -> None:
+        """Joint index."""
+        super().__init__(joint)
+        self.joint = joint
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """Averages over the samples of one static reading, (n,) each."""
+
+    t: float
+    count: int
+    settled: bool
+    position: Array
+    position_std: Array
+    torque: Array
+    torque_std: Array
+    motor_torque: Array
+
+
+class Mover:
+    """Holds the arm's command and changes it in small, safe ways. The link must be enabled."""
+
+    def __init__(self, link: Link, section: SweepSection, limits: Limits) -> None:
+        """Take over an enabled link: every joint is held at its last target."""
+        self.link, self.section, self.limits = link, section, limits
+        self.rule = SettleRule.of(section, limits.rated, link.period)
+        self.speed = section.travel_speed * limits.speed
+        self.command = Command.hold(link.position_sent)
+        self.position: Array = link.cycle(self.command).position.copy()
+        self.pressed: Flags = np.zeros(link.n, dtype=bool)
+        self.side = np.zeros(link.n)
+        self.resolution = np.full(link.n, np.inf)
+        self._contact = self.position.copy()
+        self._produced = np.zeros(link.n)
+        self.contacts: dict[tuple[int, int], float] = {}
+        """(joint, side) → reading at which that stop was found [rad]."""
+
+    def cycle(self) -> Sample:
+        """One cycle of the present command; raises Slipped when a pressed joint has left its stop."""
+        sample = self.link.cycle(self.command)
+        np.copyto(self.position, sample.position, where=np.isfinite(sample.position))
+        if self.pressed.any():
+            off = self.side * (self._contact - self.position) > SLIP
+            if off.any():
+                raise Slipped(int(np.argmax(off & self.pressed)))
+        return sample
+
+    def hold_all(self) -> None:
+        """Every joint under position control where it stands."""
+        self.pressed[:] = False
+        self.side[:] = 0.0
+        joints = self.command.mode != POSITION
+        self.command.mode[:] = POSITION
+        self.command.position[joints] = self.position[joints]
+
+    def travel(self, goal: Array, acceleration: float) -> None:
+        """Move the joints under position control to goal (n,) [rad], together; raises Stalled."""
+        movable = self.command.mode == POSITION
+        goal = np.where(movable, goal, self.command.position)
+        path = trajectory(
+            self.command.position.copy(), goal, self.speed, np.full(len(goal), acceleration), self.link.period
+        )
+        seen = []
+        for target in path:
+            self.command.position[movable] = target[movable]
+            seen.append(self.cycle().position)
+            lag = np.abs(self.command.position - self.position)
+            if lag[movable].max() > STALL:
+                joint = int(np.argmax(np.where(movable, lag, 0.0)))
+                raise Stalled(joint, float(self.position[joint]), float(goal[joint]))
+        self._learn_resolution(seen)
+
+    def press(self, stops: npt.NDArray[np.int64], bias: Array) -> None:
+        """Creep the joints with stops ±1 onto them, then press with bias (n,) [N·m]; raises Refused, Stalled."""
+        joints = stops != 0
+        self._creep(stops, joints)
+        self.command.mode[joints] = TORQUE
+        cycles = max(int(PRESS_SECONDS / self.link.period), 1)
+        start = np.where(joints, self._produced, 0.0)
+        for share in np.linspace(1 / cycles, 1.0, cycles):
+            self.command.torque[joints] = (start + share * (bias - start))[joints]
+            self.cycle()
+        for _ in range(cycles // 2):
+            self.cycle()
+        for joint in np.flatnonzero(joints):
+            self._check_stop(int(joint), int(stops[joint]))
+        self._contact = self.position.copy()
+        self.side = np.where(joints, stops, 0).astype(float)
+        self.pressed = joints.copy()
+
+    def before_stop(self, joint: int, side: int, gap: float) -> float:
+        """Position [rad] a gap before a stop: where it was found last, else where the arm file has it."""
+        found = self.contacts.get((joint, side))
+        if found is not None:
+            return found - side * gap / 2
+        limit = float(self.limits.upper[joint] if side > 0 else self.limits.lower[joint])
+        return limit - side * (gap + 0.02 * abs(limit))
+
+    def rest(self, counts: Flags) -> Rest:
+        """Wait until all has settled and the torque averages that `counts` (n,) are exact enough; raises Slipped."""
+        rule, samples = self.rule, list[Sample]()
+        begin: int | None = None
+        resolution = np.where(np.isfinite(self.resolution), self.resolution, 0.0)
+        while True:
+            samples.append(self.cycle())
+            count = len(samples)
+            if count < rule.window or (count - rule.window) % 5:
+                continue
+            if begin is None:
+                window = samples[-rule.window :]
+                if rule.settled(_stack(window, "position"), _stack(window, "torque"), counts, resolution):
+                    begin = count - rule.window
+                elif count >= rule.timeout:
+                    return _average(samples[-rule.max_samples :], settled=False)
+            if begin is not None:
+                enough = count - begin >= rule.max_samples
+                if enough or rule.exact(_stack(samples[begin:], "torque"), counts):
+                    return _average(samples[begin:], settled=True)
+
+    def _creep(self, stops: npt.NDArray[np.int64], joints: Flags) -> None:
+        """Move each joint towards its stop until it does not follow any more."""
+        period = self.link.period
+        stride = np.minimum(self.section.approach_speed, self.limits.speed) * period * stops
+        window = max(int(0.1 / period), 4)
+        history, open_joints = [self.position.copy()], joints.copy()
+        while open_joints.any():
+            self.command.position[open_joints] += stride[open_joints]
+            sample = self.cycle()
+            np.copyto(self._produced, sample.motor_torque, where=np.isfinite(sample.motor_torque))
+            history.append(self.position.copy())
+            if len(history) <= window:
+                continue
+            moved = (self.position - history[-window]) * stops
+            lead = (self.command.position - self.position) * stops
+            still = moved < CONTACT_STILL * np.abs(stride) * window
+            open_joints &= ~(still & (lead > CONTACT_LEAD))
+            for joint in np.flatnonzero(open_joints):
+                self._check_creep(int(joint), int(stops[joint]))
+
+    def _check_creep(self, joint: int, side: int) -> None:
+        """Raise Refused where a joint has gone beyond the place at which its stop should have been."""
+        limit = float(self.limits.upper[joint] if side > 0 else self.limits.lower[joint])
+        beyond = side * (self.command.position[joint] - limit)
+        if beyond > 2 * STOP_TOLERANCE + 0.03 * abs(limit):
+            raise Refused(
+                f"{self.link.names[joint]}: no stop found at {limit:.3f} rad (went to {self.position[joint]:.3f}):"
+                " check lower and upper in the arm file"
+            )
+
+    def _check_stop(self, joint: int, side: int) -> None:
+        """Note where a stop was found; raise Refused where that is not the stop of the arm file."""
+        limit = float(self.limits.upper[joint] if side > 0 else self.limits.lower[joint])
+        found = float(self.position[joint])
+        if abs(found - limit) > STOP_TOLERANCE + 0.025 * abs(limit):
+            raise Refused(
+                f"{self.link.names[joint]}: blocked at {found:.3f} rad, but its stop should be at {limit:.3f} rad:"
+                " is something in the way, or the arm file's range wrong?"
+            )
+        self.contacts[joint, side] = found
+
+    def _learn_resolution(self, seen: list[Array]) -> None:
+        """Keep the smallest step that each position sensor has shown."""
+        if len(seen) < 2:
+            return
+        steps = np.abs(np.diff(np.array(seen), axis=0))
+        steps = np.where(steps > 1e-9, steps, np.inf)
+        self.resolution = np.minimum(self.resolution, np.nanmin(np.where(np.isnan(steps), np.inf, steps), axis=0))
+
+
+def _stack(samples: list[Sample], channel: str) -> Array:
+    return np.array([getattr(sample, channel) for sample in samples])
+
+
+def _average(samples: list[Sample], settled: bool) -> Rest:
+    position, torque, motor = (_stack(samples, name) for name in ("position", "torque", "motor_torque"))
+    reported = np.isfinite(motor).sum(axis=0)
+    mean = np.nansum(motor, axis=0) / np.maximum(reported, 1)
+    return Rest(
+        t=samples[-1].t,
+        count=int(np.isfinite(torque).all(axis=1).sum()),
+        settled=settled,
+        position=np.nanmean(position, axis=0),
+        position_std=np.nanstd(position, axis=0),
+        torque=np.nanmean(torque, axis=0),
+        torque_std=np.nanstd(torque, axis=0, ddof=1),
+        motor_torque=np.where(reported > 0, mean, np.nan),
+    )

@@ -1,0 +1,241 @@
+"""Planning of sweeps: from the arm file alone, then once more with the scout's rough gravity model."""
+
+import numpy as np
+import numpy.typing as npt
+
+from armlink.armfile import ArmFile
+from armlink.errors import BadInput
+from calib.description import gcomp_arm
+from calib.design import Candidates, choose, guessed_moments, reachable, stop_combinations
+from calib.guess import GravityGuess, reach
+from calib.plan_limits import Limits
+from calib.plan_model import Sweep, SweepPlan
+from calib.section import SweepSection, sweep_section
+from gcomp.arm import Arm
+from gcomp.gravity import gravity_regressor
+from gcomp.moments import payload_columns
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+DEAD_LEVER = 0.005
+"""Γ/g below which a joint feels no gravity: its offset is still swept, at one combination."""
+SLOWEST = 0.3
+"""Acceleration that every planned sweep must allow [rad/s²]."""
+MASS_SHARE = 0.3
+"""Share of the torque left over gravity that the reference mass may take."""
+ASSUMED_GRAVITY = 0.6
+"""Share of max_torque that gravity is assumed to take while nothing has been measured."""
+SERVO_GAP = 0.05
+"""Distance from the stop at which a servo-held joint rests [rad]."""
+HAND = 0.15
+"""How far from the flange the reference mass may hang [m]."""
+SCOUT_CANDIDATES = 300
+
+
+def plan_sweep(arm: ArmFile, guess: GravityGuess | None = None, seed: int = 0) -> SweepPlan:
+    """The plan of one pass over all joints, tip to base.
+
+    Without `guess` nothing is known of the masses and no bias torque is set. With the scout's guess, combinations
+    that cannot be held within max_torque are left out and the others get their bias torques. Raises BadInput where
+    a joint's range is too short to sweep or no combination can be held.
+    """
+    section, limits, described = sweep_section(arm), Limits.of(arm), gcomp_arm(arm)
+    _require_range(section, limits, described)
+    options, notes = [], []
+    for joint in reversed(range(described.n)):
+        found, remarks = _options(joint, section, limits, described, guess)
+        options.append(found)
+        notes += remarks
+    moments = guessed_moments(described, seed) if guess is None else [guess.beta]
+    sigma = section.standard_error * limits.rated
+    mass = section.reference_mass or _reference_mass(described, limits, options, guess)
+    counts = [1 if each.lever.max() < DEAD_LEVER else section.poses for each in options]
+    picks = choose(described, options, counts, moments, sigma, mass)
+    sweeps = [
+        _sweep(described.names[each.joint], number, each, pick, section, limits, guess)
+        for each, chosen in zip(options, picks, strict=True)
+        for number, pick in enumerate(chosen, start=1)
+    ]
+    scout = scout_poses(described, section, limits, seed)
+    return SweepPlan(sweeps=tuple(sweeps), scout=scout, reference_mass=mass, notes=tuple(notes))
+
+
+def sweep_range(section: SweepSection, limits: Limits, joint: int) -> tuple[float, float]:
+    """First and last step [rad] of a joint: the margin grows with the angle, for the position gain is unknown."""
+    low, high = float(limits.lower[joint]), float(limits.upper[joint])
+    margin = section.range_margin
+    return low + margin + 0.02 * abs(low), high - margin - 0.02 * abs(high)
+
+
+def scout_poses(described: Arm, section: SweepSection, limits: Limits, seed: int) -> tuple[tuple[float, ...], ...]:
+    """n + 3 poses (n,) that determine mass moments and sensor offsets well, ordered for short ways between them."""
+    n = described.n
+    ends = np.array([sweep_range(section, limits, joint) for joint in range(n)])
+    generator = np.random.default_rng(seed)
+    poses = ends[:, 0] + generator.random((SCOUT_CANDIDATES, n)) * (ends[:, 1] - ends[:, 0])
+    regressor = gravity_regressor(described, poses)
+    offsets = np.broadcast_to(np.eye(n), (SCOUT_CANDIDATES, n, n))
+    rows = np.concatenate([regressor, 10 * offsets], axis=2) / limits.rated[:, None]
+    information = np.einsum("kip,kiq->kpq", rows, rows)
+    total = np.eye(3 * n) * 1e-6
+    chosen: list[int] = []
+    for _ in range(n + 3):
+        score = np.linalg.slogdet(total + information)[1]
+        score[chosen] = -np.inf
+        chosen.append(int(np.argmax(score)))
+        total = total + information[chosen[-1]]
+    return tuple(tuple(pose.tolist()) for pose in _short_way(poses[chosen], ends.mean(axis=1)))
+
+
+def hold_torque(
+    guess: GravityGuess, section: SweepSection, limits: Limits, poses: Array
+) -> tuple[Array, Array, Array]:
+    """(Least, largest, allowance) holding torque (C, n) [N·m] along candidate sweeps with poses (C, S, n).
+
+    The allowance covers the rough model's error, the torque scale and friction, but not the margin.
+    """
+    torque = guess.torque(poses)
+    doubt = (guess.uncertainty(poses) + section.gain_tolerance * np.abs(torque)).max(axis=1)
+    return torque.min(axis=1), torque.max(axis=1), doubt + section.friction * limits.rated
+
+
+def required_bias(
+    guess: GravityGuess, section: SweepSection, limits: Limits, stops: npt.NDArray[np.int8], poses: Array
+) -> Array:
+    """Size of the torque (C, n) [N·m] that keeps each resting joint pressed along candidate sweeps; 0 if swept."""
+    least, largest, allowance = hold_torque(guess, section, limits, poses)
+    against = np.where(stops > 0, largest, -least)
+    floor = section.bias_margin * limits.max_torque + section.friction * limits.rated
+    needed = np.maximum(against + allowance + section.bias_margin * limits.max_torque, floor)
+    return np.where(stops == 0, 0.0, needed)
+
+
+def _options(
+    joint: int, section: SweepSection, limits: Limits, described: Arm, guess: GravityGuess | None
+) -> tuple[Candidates, list[str]]:
+    """The combinations from which a joint's sweeps are chosen, and what had to be given up."""
+    swept = sweep_range(section, limits, joint)
+    everything = stop_combinations(described, joint, limits.lower, limits.upper, swept)
+    if guess is None:
+        return reachable(everything), []
+    least, largest, allowance = hold_torque(guess, section, limits, everything.poses)
+    strongest = np.maximum(np.abs(least), np.abs(largest))
+    drivable = strongest[:, joint] + allowance[:, joint] <= limits.max_torque[joint]
+    if not drivable.any():
+        drivable = strongest[:, joint] <= limits.max_torque[joint]
+    pressed = _pressable(guess, section, limits, everything).all(axis=1) & drivable
+    name = described.names[joint]
+    if pressed.sum() >= section.poses:
+        return reachable(everything.kept(pressed)), []
+    holdable = (strongest + section.friction * limits.rated <= limits.max_torque).all(axis=1) & drivable
+    if not (pressed | holdable).any():
+        raise BadInput(
+            f"joint {name}: no combination of stops can be held within max_torque: gravity needs up to"
+            f" {_torques(strongest.min(axis=0))} N·m; sweep a lighter arm, or allow more torque"
+        )
+    note = f"{name}: too few stop combinations can be pressed within max_torque: some joints are servo-held instead"
+    return reachable(everything.kept(pressed | holdable)), [note]
+
+
+def _pressable(guess: GravityGuess, section: SweepSection, limits: Limits, candidates: Candidates) -> Flags:
+    """Which resting joints (C, n) can be pressed on their stop within max_torque; True for the swept joint."""
+    needed = required_bias(guess, section, limits, candidates.stops, candidates.poses)
+    needed = needed + SLOWEST * _reaction(guess, candidates.joint)
+    given = limits.max_torque if section.bias_torque is None else np.array(section.bias_torque)
+    flags: Flags = (needed <= np.minimum(given, limits.max_torque)) | (candidates.stops == 0)
+    return flags
+
+
+def _reaction(guess: GravityGuess, joint: int) -> Array:
+    """Bound of the torque (n,) [N·m] that 1 rad/s² of the swept joint makes at every joint: √(M_ii M_jj)."""
+    inertia = guess.inertia()
+    return np.sqrt(inertia * inertia[joint])
+
+
+def _sweep(
+    name: str,
+    number: int,
+    options: Candidates,
+    pick: int,
+    section: SweepSection,
+    limits: Limits,
+    guess: GravityGuess | None,
+) -> Sweep:
+    joint, stops = options.joint, options.stops[pick]
+    steps = np.linspace(*sweep_range(section, limits, joint), section.steps)
+    resting = stops != 0
+    bias = acceleration = None
+    servo = resting & (section.hold == "servo")
+    if guess is not None:
+        one = options.kept(np.arange(len(options.stops)) == pick)
+        servo = servo | (resting & ~_pressable(guess, section, limits, one)[0])
+        needed = required_bias(guess, section, limits, one.stops, one.poses)[0]
+        size, acceleration = _with_reaction(needed, _reaction(guess, joint), resting & ~servo, section, limits)
+        bias = tuple((stops * np.where(resting & ~servo, size, 0.0)).tolist())
+    rest = np.where(stops > 0, limits.upper, limits.lower) - SERVO_GAP * stops * servo
+    rest[joint] = steps[0]
+    return Sweep(
+        name=f"{name}.{number}",
+        joint=joint,
+        stops=tuple(int(side) for side in stops),
+        rest=tuple(rest.tolist()),
+        steps=tuple(steps.tolist()),
+        lever=float(options.lever[pick]),
+        servo=tuple(bool(held) for held in servo),
+        bias=bias,
+        acceleration=section.acceleration if acceleration is None else acceleration,
+    )
+
+
+def _with_reaction(
+    needed: Array, reaction: Array, pressed: Flags, section: SweepSection, limits: Limits
+) -> tuple[Array, float]:
+    """(Bias size (n,) [N·m], acceleration [rad/s²]): as fast as the resting joints' torque allows."""
+    given = limits.max_torque if section.bias_torque is None else np.array(section.bias_torque)
+    room = np.where(pressed, (given - needed) / np.maximum(reaction, 1e-9), np.inf)
+    acceleration = float(np.clip(room.min(), SLOWEST, section.acceleration))
+    if section.bias_torque is not None:
+        return given, acceleration
+    return np.minimum(needed + acceleration * reaction, limits.max_torque), acceleration
+
+
+def _reference_mass(described: Arm, limits: Limits, options: list[Candidates], guess: GravityGuess | None) -> float:
+    """The mass [kg] that takes `MASS_SHARE` of the torque left at the joint that it loads most, to two digits."""
+    poses = np.concatenate([each.poses.reshape(-1, described.n) for each in options])
+    regressor = gravity_regressor(described, poses)
+    at_origin, by_point = payload_columns(described)
+    flange = np.array([described.a[-1], 0.0, described.d[-1]])
+    per_kg = np.abs(regressor @ (at_origin + by_point @ flange))
+    per_kg += HAND * np.linalg.norm(regressor @ by_point, axis=-1)
+    gravity = ASSUMED_GRAVITY * limits.max_torque if guess is None else np.abs(guess.torque(poses)).max(axis=0)
+    room = np.maximum(limits.max_torque - gravity, 0.05 * limits.max_torque)
+    mass = MASS_SHARE * float(np.min(room / np.maximum(per_kg.max(axis=0), 1e-9)))
+    mass = min(mass, 2 * float(limits.rated.max()) / (9.81 * float(reach(described)[0])))
+    return float(f"{mass:.2g}")
+
+
+def _require_range(section: SweepSection, limits: Limits, described: Arm) -> None:
+    for joint, name in enumerate(described.names):
+        first, last = sweep_range(section, limits, joint)
+        if not np.isfinite([first, last]).all() or last - first < 0.2:
+            raise BadInput(
+                f"joint {name}: its range {limits.lower[joint]} to {limits.upper[joint]} rad leaves nothing to sweep"
+                f" within range_margin {section.range_margin} rad: check lower and upper, or lessen the margin"
+            )
+
+
+def _short_way(poses: Array, begin: Array) -> Array:
+    """The same poses, each followed by the nearest that is left."""
+    left, way = list(range(len(poses))), []
+    here = begin
+    while left:
+        nearest = min(left, key=lambda k: float(np.abs(poses[k] - here).max()))
+        left.remove(nearest)
+        way.append(nearest)
+        here = poses[nearest]
+    return poses[way]
+
+
+def _torques(values: Array) -> str:
+    return " ".join(f"{value:.1f}" for value in values)

@@ -1,0 +1,72 @@
+"""What a sweep plan says: which joint turns when, where the others rest and what holds them there."""
+
+from typing import Annotated, Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+
+Array = npt.NDArray[np.float64]
+Side = Literal[-1, 0, 1]
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Sweep(_Model):
+    """One sweep: a joint steps through its range while the others rest."""
+
+    name: str
+    """Unique in the plan: joint name and number of the stop combination."""
+    joint: int
+    """Index of the swept joint, from 0 at the base."""
+    stops: tuple[Side, ...]
+    """Where each resting joint stands: -1 at its lower stop, 1 at its upper; 0 for the swept joint."""
+    rest: tuple[FiniteFloat, ...]
+    """Position (n,) of each resting joint, by the arm file [rad]; the swept joint's entry is its first step."""
+    steps: tuple[FiniteFloat, ...]
+    """Positions of the swept joint on the way up [rad]; the way down takes them backwards."""
+    lever: FiniteFloat
+    """Γ/g: how much of gravity the swept joint can feel here, 0 to 1."""
+    servo: tuple[bool, ...]
+    """Which resting joints are held by their drive's position loop instead of a stop."""
+    bias: tuple[FiniteFloat, ...] | None = None
+    """Signed torque (n,) that presses each resting joint on its stop [N·m]; None until the scout has been made."""
+    acceleration: FiniteFloat = 1.0
+    """Peak acceleration of the swept joint, so that its reaction moves no resting joint off its stop [rad/s²]."""
+
+    @property
+    def readings(self) -> int:
+        """How many steps are read: the way up and the way down."""
+        return 2 * len(self.steps)
+
+    def target(self, reading: int) -> tuple[float, int]:
+        """(position of the swept joint [rad], direction of approach ±1) of one reading, counted from 0."""
+        count = len(self.steps)
+        return (self.steps[reading], 1) if reading < count else (self.steps[2 * count - 1 - reading], -1)
+
+
+class SweepPlan(_Model):
+    """All sweeps of one pass, tip to base, and the poses that the scout takes first."""
+
+    sweeps: Annotated[tuple[Sweep, ...], Field(min_length=1)]
+    scout: tuple[tuple[FiniteFloat, ...], ...]
+    """Poses (P, n) at which all joints are servo-held and every sensor is read [rad]."""
+    reference_mass: FiniteFloat
+    """Mass to attach for the second pass [kg]."""
+    notes: tuple[str, ...] = ()
+    """What the plan could not do as asked, one sentence each."""
+
+    @property
+    def readings(self) -> int:
+        """Static readings of one pass, scout included."""
+        return len(self.scout) + sum(sweep.readings for sweep in self.sweeps)
+
+    @property
+    def levers(self) -> dict[int, float]:
+        """Best Γ/g of each swept joint over its sweeps."""
+        best: dict[int, float] = {}
+        for sweep in self.sweeps:
+            best[sweep.joint] = max(sweep.lever, best.get(sweep.joint, 0.0))
+        return best

@@ -1,0 +1,86 @@
+"""The scout: servo-held poses at which every sensor is read, before anything is pressed."""
+
+from collections.abc import Callable, Collection, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from armlink.armfile import ArmFile
+from armlink.errors import Refused
+from calib.dataset import Reading
+from calib.description import gcomp_arm
+from calib.guess import GravityGuess, guess_gravity
+from calib.mover import Mover, Rest, Stalled
+from calib.plan_limits import Limits
+from calib.plan_model import SweepPlan
+from calib.section import sweep_section
+
+Array = npt.NDArray[np.float64]
+SCOUT = "scout"
+SCOUT_ACCELERATION = 1.0
+"""Nothing is known of the arm's weight yet [rad/s²]."""
+
+
+def run_scout(
+    mover: Mover, plan: SweepPlan, done: Collection[int], save: Callable[[Reading], None]
+) -> None:
+    """Read every scout pose that is not `done`, each passed to `save`; a pose that the drives cannot reach is left out.
+
+    Raises Refused where too few poses were reached to know the arm's weight.
+    """
+    n = mover.link.n
+    everything = np.ones(n, dtype=bool)
+    last, unreached = mover.position.copy(), []
+    for index, pose in enumerate(plan.scout):
+        if index in done:
+            continue
+        try:
+            mover.travel(np.array(pose), SCOUT_ACCELERATION)
+        except Stalled as stall:
+            unreached.append(stall)
+            mover.hold_all()
+            mover.command.position[:] = mover.position
+            mover.travel(last, SCOUT_ACCELERATION)
+            continue
+        rest = mover.rest(everything)
+        last = mover.position.copy()
+        save(as_reading(rest, SCOUT, index, None, 0, everything))
+    if len(plan.scout) - len(unreached) < 4:
+        stall = unreached[0]
+        raise Refused(
+            f"{mover.link.names[stall.joint]}: stopped at {stall.position:.3f} rad on the way to {stall.target:.3f}:"
+            " its drive is too weak there, or something is in the way"
+        )
+
+
+def rough_model(arm: ArmFile, readings: Sequence[Reading]) -> GravityGuess:
+    """The rough gravity model from the scout's readings among `readings`."""
+    rows = [reading for reading in readings if reading.sweep == SCOUT]
+    limits, section = Limits.of(arm), sweep_section(arm)
+    return guess_gravity(
+        gcomp_arm(arm),
+        np.array([row.position for row in rows]),
+        np.array([row.torque for row in rows]),
+        np.array([row.motor_torque for row in rows]),
+        limits.rated,
+        section.friction,
+    )
+
+
+def as_reading(rest: Rest, sweep: str, index: int, joint: int | None, direction: int, servo: Array) -> Reading:
+    """One line of the data set from the averages at rest."""
+    return Reading(
+        sweep=sweep,
+        index=index,
+        joint=joint,
+        direction=1 if direction > 0 else -1 if direction < 0 else 0,
+        t=rest.t,
+        count=rest.count,
+        settled=rest.settled,
+        servo=tuple(bool(held) for held in servo),
+        position=tuple(rest.position.tolist()),
+        position_std=tuple(rest.position_std.tolist()),
+        torque=tuple(rest.torque.tolist()),
+        torque_std=tuple(rest.torque_std.tolist()),
+        motor_torque=tuple(rest.motor_torque.tolist()),
+    )

@@ -1,0 +1,198 @@
+"""The sensor fit: torque gains and offsets, position gains, mass moments and load point from sweeps, in one problem."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+
+from armlink.armfile import ArmFile
+from calib.dataset import SweepData
+from calib.description import gcomp_arm
+from calib.fit_rows import FitRows, fit_rows
+from calib.records import PARAMETERS, CalibrationRecord, JointCalibration, Parameter, matrix, provenance
+from calib.section import sweep_section
+from gcomp.global_fit import GlobalFit, identify_global
+from gcomp.parameters import Prior
+from gcomp.readings import Readings
+
+Array = npt.NDArray[np.float64]
+NOISE_ROUNDS = 2
+"""Rounds in which each joint's noise is raised to the scatter that is really there."""
+
+
+@dataclass(frozen=True, eq=False)
+class SensorFit:
+    """What the sweeps say about every sensor; NaN where they say nothing, and then `reasons` says why."""
+
+    names: tuple[str, ...]
+    fit: GlobalFit
+    rows: FitRows
+    noise_factor: Array
+    """Factor (n,) by which readings scatter more than the samples' noise explains; 1 where they do not."""
+    hysteresis: Array
+    """Half the mean difference between readings approached upwards and downwards (n,) [N·m]."""
+    quantile: float
+    """Student quantile of a 95 % interval."""
+    reasons: dict[tuple[str, Parameter], str]
+    """(joint, parameter) → why there is no value."""
+    gain_ratio: Array | None
+    """Without a reference mass: gains as multiples of the last joint's (n,); NaN where not known."""
+    sources: dict[str, str]
+
+    def value(self, parameter: Parameter) -> Array:
+        """Estimates of one parameter (n,), NaN where not identifiable."""
+        found: Array = getattr(self.fit.values, parameter).copy()
+        for joint, name in enumerate(self.names):
+            if (name, parameter) in self.reasons:
+                found[joint] = np.nan
+        return found
+
+    def std(self, parameter: Parameter) -> Array:
+        """Standard deviations (n,), NaN where not identifiable."""
+        spread: Array = getattr(self.fit.std, parameter)
+        return np.where(np.isnan(self.value(parameter)), np.nan, spread)
+
+    def ci95(self, parameter: Parameter) -> Array:
+        """95 % intervals (n, 2), NaN where not identifiable."""
+        half = self.quantile * self.std(parameter)
+        return np.stack([self.value(parameter) - half, self.value(parameter) + half], axis=1)
+
+    @property
+    def residual_rms(self) -> Array:
+        """RMS of each joint's torque residual over the readings that count (n,) [N·m]."""
+        return np.sqrt(np.nanmean(self.fit.residual**2, axis=0))
+
+    def record(self, arm: ArmFile) -> CalibrationRecord:
+        """The calibration record of this fit."""
+        residual = self.residual_rms
+        joints = tuple(
+            JointCalibration(
+                name=name,
+                **{parameter: _number(self.value(parameter)[joint]) for parameter in PARAMETERS},
+                not_identifiable={p: self.reasons[name, p] for p in PARAMETERS if (name, p) in self.reasons},
+                residual_std=_number(residual[joint]),
+            )
+            for joint, name in enumerate(self.names)
+        )
+        wanted = [
+            (f"{name}.{parameter}", f"{parameter}[{name}]")
+            for name in self.names
+            for parameter in PARAMETERS
+            if (name, parameter) not in self.reasons and f"{parameter}[{name}]" in self.fit.names
+        ]
+        covariance = self.fit.covariance_of(*(inner for _, inner in wanted)) if wanted else np.zeros((0, 0))
+        return CalibrationRecord(
+            **provenance(arm, self.sources),
+            joints=joints,
+            covariance_of=tuple(outer for outer, _ in wanted),
+            covariance=matrix(covariance) if wanted else (),
+        )
+
+
+def fit_sensors(arm: ArmFile, data: Sequence[SweepData]) -> SensorFit:
+    """Fit every sensor of the arm to its sweep data sets (unloaded, with a reference mass, or several of each).
+
+    Unknown are torque gains k and offsets o, position gains c, position offsets within the arm file's trust
+    (`sweep.position_offset_std`), mass moments β and the load point ρ; theory.md section 7. Raises BadInput on data
+    that cannot be fitted, Refused on data of another arm.
+    """
+    rows = fit_rows([each.require(arm) for each in data])
+    fit, factor = _fit(arm, rows)
+    reasons = _reasons(fit, rows)
+    loaded = any(rows.masses)
+    return SensorFit(
+        names=arm.joint_names,
+        fit=fit,
+        rows=rows,
+        noise_factor=factor,
+        hysteresis=_hysteresis(fit, rows),
+        quantile=float(stats.t.ppf(0.975, max(fit.dof, 1))),
+        reasons=reasons,
+        gain_ratio=None if loaded else _gain_ratio(arm, rows),
+        sources={each.path.name: each.digest for each in data},
+    )
+
+
+def _fit(arm: ArmFile, rows: FitRows, **extra: Prior) -> tuple[GlobalFit, Array]:
+    """The global fit, with each joint's noise raised to what its residuals show; and the factors (n,)."""
+    described, zero_std = gcomp_arm(arm), sweep_section(arm).position_offset_std
+    unknown = {"gain", "offset", "position_gain", "beta"}
+    priors = dict(extra)
+    if zero_std > 0:
+        unknown.add("position_offset")
+        priors["position_offset"] = Prior(0.0, zero_std)
+    if any(rows.masses):
+        unknown.add("rho")
+    readings, factor = rows.readings, np.ones(described.n)
+    for _ in range(NOISE_ROUNDS):
+        scaled = Readings(readings.position, readings.torque, readings.sigma * factor, readings.load)
+        fit = identify_global(
+            described, scaled, unknown=unknown, priors=priors, position_sigma=rows.position_sigma
+        )
+        excess = _excess(fit, scaled, rows.position_sigma)
+        if np.all(excess <= 1.0):
+            break
+        factor = factor * np.maximum(excess, 1.0)
+    return fit, factor
+
+
+def _excess(fit: GlobalFit, readings: Readings, position_sigma: Array) -> Array:
+    """Scatter over expected noise (n,) where it is significantly more, else 1."""
+    counted = readings.counted
+    share = 1 - (counted.sum() - fit.dof) / max(int(counted.sum()), 1)
+    score = np.where(counted, fit.residual / readings.sigma, 0.0)
+    dof = np.maximum(counted.sum(axis=0) * max(share, 0.1), 1.0)
+    ratio = (score**2).sum(axis=0) / dof
+    return np.where(ratio > 1 + 2 * np.sqrt(2 / dof), np.sqrt(ratio), 1.0)
+
+
+def _hysteresis(fit: GlobalFit, rows: FitRows) -> Array:
+    """Half the mean difference of the own sensor's residual between the two directions (n,) [N·m]."""
+    own = np.where(rows.own, fit.residual, np.nan)
+    up, down = own[rows.direction > 0], own[rows.direction < 0]
+    return np.array([_mean(up[:, j]) - _mean(down[:, j]) for j in range(own.shape[1])]) / 2
+
+
+def _mean(values: Array) -> float:
+    kept = values[~np.isnan(values)]
+    return float(kept.mean()) if len(kept) else 0.0
+
+
+def _reasons(fit: GlobalFit, rows: FitRows) -> dict[tuple[str, Parameter], str]:
+    """Why each parameter without a value has none."""
+    reasons: dict[tuple[str, Parameter], str] = {}
+    lost = {name: found for name, found in zip(fit.names, fit.identifiable, strict=True) if not found}
+    for name in (*lost, *fit.hopeless):
+        family, _, joint = name.rstrip("]").partition("[")
+        for parameter in PARAMETERS:
+            if parameter == family:
+                reasons[joint, parameter] = _reason(name, fit, rows)
+    return reasons
+
+
+def _reason(name: str, fit: GlobalFit, rows: FitRows) -> str:
+    if name in fit.hopeless:
+        spread = float(np.sqrt(fit.covariance_of(name)[0, 0]))
+        return f"these sweeps would give it to ± {2 * spread:.2g} only: gravity hardly acts on it in these poses"
+    for sentence in fit.null_space:
+        if name in sentence:
+            if "common factor" in sentence and not any(rows.masses):
+                return "no readings with a reference mass: only ratios of gains are determined"
+            return sentence
+    return "the readings do not determine it"
+
+
+def _gain_ratio(arm: ArmFile, rows: FitRows) -> Array:
+    """Gains as multiples of the last joint's (n,), from data without a reference mass."""
+    n = len(arm.joint_names)
+    std = np.full(n, np.inf)
+    std[-1] = 1e-9
+    fit, _ = _fit(arm, rows, gain=Prior(1.0, std))
+    ratio: Array = fit.values.gain
+    return np.where(fit.std.gain < 0.2, ratio, np.nan)
+
+
+def _number(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)

@@ -1,0 +1,64 @@
+"""When is a joint at rest, and when is its average exact enough: judged from the samples, not from a fixed sleep."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from calib.section import SweepSection
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+QUIET = 3.0
+"""Torque scatter that is this many times the standard error asked for has settled whatever its shape."""
+
+
+@dataclass(frozen=True, eq=False)
+class SettleRule:
+    """The rule of one arm; all arrays (n,)."""
+
+    window: int
+    """Cycles over which it judges."""
+    timeout: int
+    """Cycles after which a reading is taken as it is."""
+    max_samples: int
+    span: float
+    """How far a joint may have moved between the halves of the window [rad]."""
+    scatter: float
+    standard_error: Array
+    """Asked for [N·m]."""
+
+    @classmethod
+    def of(cls, section: SweepSection, rated: Array, period: float) -> "SettleRule":
+        """From the sweep section, for a cycle `period` [s]."""
+        window = max(int(round(section.settle_window / period)), 8)
+        return cls(
+            window=window,
+            timeout=int(round(section.settle_timeout / period)),
+            max_samples=max(section.max_samples, window),
+            span=section.settle_velocity * window * period / 2,
+            scatter=section.settle_scatter,
+            standard_error=section.standard_error * rated,
+        )
+
+    def settled(self, position: Array, torque: Array, counts: Flags, resolution: Array) -> bool:
+        """Whether nothing moves any more: position and torque (W, n) of the last window.
+
+        A joint moves if its mean position differs between the window's halves by more than `span` and half a step of
+        its sensor. A torque that `counts` (n,) has settled if it scatters no more than its own sample-to-sample noise
+        explains (von Neumann's ratio), or too little to matter.
+        """
+        half = len(position) // 2
+        drift = np.abs(np.nanmean(position[half:], axis=0) - np.nanmean(position[:half], axis=0))
+        if np.any(drift > np.maximum(self.span, resolution)):
+            return False
+        spread = np.nanvar(torque, axis=0)
+        step = np.nanmean(np.diff(torque, axis=0) ** 2, axis=0) / 2
+        allowed = np.maximum(self.scatter**2 * step, (QUIET * self.standard_error) ** 2)
+        return bool(np.all((spread <= allowed) | ~counts))
+
+    def exact(self, torque: Array, counts: Flags) -> bool:
+        """Whether the mean of the torque samples (K, n) is as exact as asked for, in every joint that `counts`."""
+        error = np.nanstd(torque, axis=0, ddof=1) / np.sqrt(len(torque))
+        return bool(np.all((error <= self.standard_error) | ~counts))
