@@ -92,7 +92,7 @@ def _set_options(spec: Any, arm: ArmFile, section: SimSection) -> None:
     option = spec.option
     option.gravity = arm.kinematics.gravity
     option.timestep = section.step
-    option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.iterations, option.ls_iterations = 20, 20
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)

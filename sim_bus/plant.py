@@ -31,6 +31,7 @@ class Plant:
         joints = [self.model.joint(name).id for name in arm.joint_names]
         self._qpos = self.model.jnt_qposadr[joints]
         self._dof = self.model.jnt_dofadr[joints]
+        self._straight = bool((self._dof == np.arange(self.n)).all() and self.model.nv == self.n)
         self.lower, self.upper = self.model.jnt_range[joints].T.copy()
         self._nominal = (self.model.body_mass.copy(), self.model.body_ipos.copy(), self.model.opt.gravity.copy())
         self._nominal_inertia = _full_inertia(self.model)
@@ -191,9 +192,7 @@ class Plant:
         model.body_mass[:], model.body_ipos[:] = mass, com
         for body in (*bodies, self._payload):
             model.body_inertia[body], model.body_iquat[body] = _principal(inertia[body])
-        position = self.data.qpos.copy()
-        mujoco.mj_setConst(model, self.data)
-        self.data.qpos[:] = position
+        mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
 def _full_inertia(model: mujoco.MjModel) -> Array:

@@ -76,9 +76,9 @@ class Sensors:
         counts = np.rint(np.clip(reading, -self.torque_limit, self.torque_limit) / self.torque_step)
         return counts * self.torque_step
 
-    def position(self, angle: Array) -> Array:
-        """The readings `φ` [rad] of true angles, quantised."""
-        return np.rint(self.reading_of(angle) / self.position_step) * self.position_step
+    def position_counts(self, angle: Array) -> Array:
+        """The readings `φ` of true angles in the encoders' whole increments."""
+        return np.rint(self.reading_of(angle) / self.position_step)
 
     def reading_of(self, angle: Array) -> Array:
         """The exact `φ` with `θ = position_gain·φ + position_offset + amplitude·sin(φ + phase)`."""

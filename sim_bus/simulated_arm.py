@@ -8,13 +8,14 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from armlink.armfile import ArmFile
+from armlink.armfile import ArmFile, LinkJoint
 from armlink.errors import BadInput
 from sim_bus.cia402 import State
-from sim_bus.drives import FEED, SUPPORTED_MODES, Drives
-from sim_bus.effects.state import Entry, imperfections
+from sim_bus.drives import SUPPORTED_MODES, UNWATCHED, Drives
+from sim_bus.loops import FEED, UNIT
+from sim_bus.effects.state import Entry, Imperfections, imperfections
 from sim_bus.node import OPERATIONAL, PRE_OPERATIONAL, STOPPED, Node
-from sim_bus.pdo import Frame, PdoTable
+from sim_bus.pdo import Frame, PdoGroup, PdoTable
 from sim_bus.plant import Plant
 from sim_bus.section import sim_section
 from sim_bus.sensors import Sensors
@@ -24,7 +25,9 @@ from sim_bus.truth import Truth
 
 Array = NDArray[np.float64]
 SYNC_ID = 0x80
-TARGETS = {(0x6071, 0): "new_torque", (0x607A, 0): "new_position", (0x60FF, 0): "new_velocity"}
+DRIVE_ERROR = 0x21
+"""Error register: generic and device profile."""
+TARGETS = {(0x6071, 0), (0x607A, 0), (0x60FF, 0)}
 
 
 class SimulatedArm:
@@ -46,17 +49,18 @@ class SimulatedArm:
         self._operational = bytearray(self.n)
         self._pdos = PdoTable(self._signals, self._operational, self.outbox.append)
         self._sampled = 0.0
-        self._synchronous = False
+        self._synchronous = self._watching = False
         self.nodes = [Node(j, joint.node, self._signals, self.outbox.append) for j, joint in enumerate(link.joints)]
         self._sdo = {0x600 + node.node_id: node for node in self.nodes}
         self.supervision = Supervision(self.nodes, self.drives, self.outbox.append)
         for node, joint in zip(self.nodes, link.joints, strict=True):
-            node.identity = self._identity(node, joint.rated_torque, joint.max_torque)
+            node.identity = self._identity(node, joint)
             node.reset()
             node.on_write = lambda key, node=node: self._written(node, key)  # type: ignore[misc]
             node.on_pdo_change = self._compile
             self._apply(node)
         self._compile()
+        self.drives.on_state, self.drives.on_fault = self._state_changed, self._faulted
         self.drives.take_commands()
         self.drives.sample(0.0, 0.0)
 
@@ -70,8 +74,11 @@ class SimulatedArm:
         elif can_id == SYNC_ID:
             self._sync()
         elif can_id in self._sdo:
+            if self.time > self._sampled:
+                self._sample()
             self._sdo[can_id].on_sdo(data)
-            self._asynchronous()
+            self.drives.take_commands()
+            self._pdos.send_events()
         elif can_id == 0:
             self._nmt(data)
         elif 0x700 < can_id < 0x780 and data:
@@ -82,12 +89,14 @@ class SimulatedArm:
         remaining = duration
         while remaining > 1e-9:
             piece = min(remaining, self.period)
-            self.drives.advance(piece, self._synchronous)
+            self.drives.loops.advance(piece, self._synchronous)
             self._synchronous = False
             self.time += piece
             remaining -= piece
             if self.supervision.due <= self.time:
                 self.supervision.check(self.time)
+            if self._watching:
+                self.drives.watch()
             if remaining > 1e-9:
                 self._sample()
             self._pdos.send_events()
@@ -137,7 +146,7 @@ class SimulatedArm:
 
     # ---- inside
 
-    def _imperfections(self, entries: tuple[Entry, ...]):  # type: ignore[no-untyped-def]
+    def _imperfections(self, entries: tuple[Entry, ...]) -> Imperfections:
         try:
             return imperfections(self.names, entries)
         except ValueError as error:
@@ -150,20 +159,24 @@ class SimulatedArm:
             raise BadInput(f"no joint {joint!r}; there are {', '.join(self.names)}")
         return self.names.index(joint)
 
-    def _identity(self, node: Node, rated: float, greatest: float) -> dict[Key, int | str]:
+    def _identity(self, node: Node, joint: LinkJoint) -> dict[Key, int | str]:
+        deceleration = round(self.drives.loops.deceleration[node.place] / UNIT)
         increments = int(self.sensors.increments[node.place])
         serial = crc32(f"{self.arm.name} {self.arm.serial} {self.names[node.place]}".encode())
         return {
             (0x1018, 4): serial,
-            (0x6076, 0): round(rated * 1000),
-            (0x6072, 0): min(round(greatest * 1000 / rated), 0xFFFF),
+            (0x6076, 0): round(joint.rated_torque * 1000),
+            (0x6072, 0): min(round(joint.max_torque * 1000 / joint.rated_torque), 0xFFFF),
             (0x6092, 1): FEED,
             (0x608F, 1): increments,
             (0x6502, 0): SUPPORTED_MODES,
-            (0x6085, 0): round(self.drives.deceleration[node.place] / (2 * np.pi) * FEED),
+            (0x6081, 0): round(joint.max_velocity / UNIT),
+            (0x6083, 0): deceleration,
+            (0x6085, 0): deceleration,
+            (0x6087, 0): round(joint.max_torque_rate * 1000 / joint.rated_torque),
         }
 
-    def _receive_pdo(self, slot, data: bytes) -> None:  # type: ignore[no-untyped-def]
+    def _receive_pdo(self, slot: tuple[PdoGroup, int], data: bytes) -> None:
         group, place = slot
         joint, size = group.nodes[place], group.size
         if not self._operational[joint]:
@@ -177,7 +190,6 @@ class SimulatedArm:
             self.supervision.rpdo(joint, group.number, self.time)
         if group.kind > 240:
             self._take(group)
-            self.drives.take_commands()
             self._pdos.send_events()
 
     def _sync(self) -> None:
@@ -188,29 +200,34 @@ class SimulatedArm:
         self._pdos.send_sync()
         for group in self._pdos.sync_receive:
             self._take(group)
-        self.drives.take_commands()
         self._pdos.send_events()
         self._synchronous = True
         self.supervision.sync(self.time)
 
-    def _take(self, group) -> None:  # type: ignore[no-untyped-def]
+    def _take(self, group: PdoGroup) -> None:
         rows = group.take()
         if rows is not None:
-            for key in TARGETS.keys() & group.keys:
-                getattr(self.drives, TARGETS[key])[rows] = True
+            self.drives.take_commands()
+            for index, _ in TARGETS & group.keys:
+                self.drives.loops.fresh(index, rows)
+
+    def _state_changed(self, joint: int) -> None:
+        node = self.nodes[joint]
+        if node.errors and self.drives.state[joint] is State.SWITCH_ON_DISABLED:
+            node.emergency(0, 0)
+        self._watching = self.drives.needs_watch
+
+    def _faulted(self, joint: int, code: int) -> None:
+        self.nodes[joint].emergency(code, DRIVE_ERROR)
 
     def _sample(self) -> None:
         self.drives.sample(self.time, self.time - self._sampled)
         self._sampled = self.time
 
-    def _asynchronous(self) -> None:
-        self.drives.take_commands()
-        self._pdos.send_events()
-
     def _written(self, node: Node, key: Key) -> None:
         if key in TARGETS:
-            getattr(self.drives, TARGETS[key])[node.place] = True
-        elif key[0] < 0x6000 or key[0] in (0x6007, 0x605A, 0x6085):
+            self.drives.loops.fresh(key[0], node.place)
+        elif key[0] < 0x6000 or key[0] in (0x6007, 0x605A, 0x6065, 0x607D, 0x6085):
             self._apply(node)
 
     def _apply(self, node: Node) -> None:
@@ -218,7 +235,11 @@ class SimulatedArm:
         joint, record = node.place, node.record.active
         self.drives.gain[joint], self.drives.offset[joint] = record.gain, record.offset
         self.drives.quick_stop_option[joint] = node.value(0x605A)
-        self.drives.deceleration[joint] = max(node.value(0x6085), 1) * 2 * np.pi / FEED
+        loops, window = self.drives.loops, node.value(0x6065)
+        loops.deceleration[joint] = max(node.value(0x6085), 1) * UNIT
+        loops.lowest[joint], loops.highest[joint] = node.value(0x607D, 1), node.value(0x607D, 2)
+        self.drives.following_window[joint] = np.inf if window == UNWATCHED else window * UNIT
+        self._watching = self.drives.needs_watch
         self.supervision.configure(node, self.time)
         given = self.nodes[0].value(0x1006)
         self._period = given * 1e-6 if given else self.default_period

@@ -1,4 +1,4 @@
-"""What each node watches: its heartbeat producer's clock, the master's heartbeat, RPDO deadlines and the SYNC period."""
+"""What each node watches: its own heartbeat's clock, the master's heartbeat, RPDO deadlines and the SYNC period."""
 
 import math
 import struct
@@ -102,12 +102,11 @@ class Supervision:
 
     def _lost(self, node: Node, code: int, detail: bytes) -> None:
         node.emergency(code, COMMUNICATION_ERROR, detail)
-        self._drives.error_code[node.place] = code
-        self._abort_connection(node)
+        self._abort_connection(node, code)
         if code == HEARTBEAT_LOST and node.nmt == OPERATIONAL:
             node.nmt = {0: PRE_OPERATIONAL, 2: STOPPED}.get(node.value(0x1029, 1), OPERATIONAL)
 
-    def _abort_connection(self, node: Node) -> None:
+    def _abort_connection(self, node: Node, code: int = 0) -> None:
         """The abort connection option (6007h): 0 nothing, 1 fault, 2 disable voltage, 3 quick stop."""
         if self._drives.state[node.place] is not State.ENABLED:
             return
@@ -118,6 +117,7 @@ class Supervision:
             self._drives.enter(node.place, State.SWITCH_ON_DISABLED)
         elif option == ABORT_QUICK_STOP:
             self._drives.quick_stop(node.place)
+        self._drives.error_code[node.place] = code
 
     def _schedule(self) -> None:
         dues = [due for _, due in self._produce] + self._sync_due
