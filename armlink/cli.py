@@ -3,23 +3,23 @@
 import ast
 import importlib.util
 import os
-import signal
 import sys
 from importlib.metadata import EntryPoint, entry_points, version
 from pathlib import Path
+
+from armlink.signals import terminate_as_interrupt
 
 PURPOSE = (
     "Calibrates a robot arm's joint torque sensors over CAN, learns its gravity model, explains the sim-to-real gap."
 )
 USAGE_STATUS = 2
 INTERRUPTED_STATUS = 130
-TERMINATED_STATUS = 143
 
 
 def main() -> None:
     """Run `armlink` on the command line's arguments and exit with the status of the contract (0, 1, 2, 3 or 130)."""
-    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(TERMINATED_STATUS))  # leaves through every `with`
-    sys.exit(run(sys.argv[1:]))
+    with terminate_as_interrupt():
+        sys.exit(run(sys.argv[1:]))
 
 
 def run(arguments: list[str]) -> int:
