@@ -28,11 +28,11 @@ class SimulatedClock:
             self._arm.advance(instant - self._arm.time)
 
 
-class LockStepBus(can.BusABC):
+class LockStepBus(can.BusABC):  # type: ignore[misc]
     """One endpoint of a CAN bus whose other end is the arm. As a python-can interface: `armlink_sim:ARM`.
 
-    `recv` pops what the nodes sent; where there is nothing and `timeout` is positive, simulated time passes instead, up to
-    the first frame, and None is returned if none comes. With `timeout=None` it waits likewise for at most a second.
+    `recv` pops what the nodes sent; where there is nothing and `timeout` is positive, simulated time passes instead,
+    up to the first frame, and None is returned if none comes. A timeout of None is a second.
     """
 
     def __init__(self, channel: Any = None, *, arm: SimulatedArm | None = None, seed: int = 0, **kwargs: Any) -> None:

@@ -9,8 +9,8 @@
 | 7, 8 | U32 | rw | record id and date (seconds since 1970-01-01), staged with 4 and 5 |
 | 9 | U32 | rw | CRC-32 (IEEE 802.3, as `zlib.crc32`) over the 16 bytes `<ffII` of 4, 5, 7 and 8 |
 
-Writing 6 aborts with 0609 0030h where the CRC does not match, the gain is zero or a value is not finite; what is in force
-then stays. A record in force is lost at reset unless 1010h:4 (or :1) has stored it.
+Writing 6 aborts with 0609 0030h where the CRC does not match, the gain is zero or a value is not finite; what is in
+force then stays. A record in force is lost at reset unless 1010h:4 (or :1) has stored it.
 """
 
 import math

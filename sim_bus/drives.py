@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from armlink.armfile import ArmFile
 from sim_bus.cia402 import STATUS, State, command, next_state
-from sim_bus.loops import CSP, CSV, CST, FEED, KINDS, OFF, POSITION, PROFILE_POSITION, PROFILE_TORQUE, Loops
+from sim_bus.loops import CSP, CST, CSV, FEED, KINDS, OFF, POSITION, PROFILE_POSITION, PROFILE_TORQUE, Loops
 from sim_bus.plant import Plant
 from sim_bus.sensors import Sensors
 from sim_bus.signals import Signals

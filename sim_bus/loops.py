@@ -1,7 +1,7 @@
 """The drives' torque and position loops, for all joints at once.
 
-The motor torque is `drive − stiffness·q − damping·q̇`, clamped to the max torque (6072h); the plant evaluates it at every
-step of the physics. `drive` is the target torque in torque modes and
+The motor torque is `drive − stiffness·q − damping·q̇`, clamped to the max torque (6072h); the plant evaluates it at
+every step of the physics. `drive` is the target torque in torque modes and
 `stiffness·target + damping·target rate + integral + feed-forward` in position modes. The integrator rests within a dead
 band and at the clamp, so that it neither hunts under stiction nor winds up on a stop.
 """
@@ -24,6 +24,8 @@ PROFILE_POSITION, PROFILE_TORQUE, CSP, CSV, CST = 1, 4, 8, 9, 10
 KINDS = {PROFILE_POSITION: POSITION, PROFILE_TORQUE: TORQUE, CSP: POSITION, CSV: POSITION, CST: TORQUE}
 INTEGRAL_SHARE = 0.3
 """Integral action: stiffness · bandwidth · this."""
+TUNING_POSES = 50
+"""The loops are tuned for the largest inertia among so many poses, so that they are stable in all of them."""
 SPARE_ACCELERATION = 300.0
 """The loops are tuned for the inertia of the bare arm plus what rated torque accelerates by this much [rad/s²]."""
 
@@ -36,7 +38,7 @@ class Loops:
         section, self.n = sim_section(arm).servo, plant.n
         self._plant, self._sensors = plant, sensors
         self.rated = np.array([joint.rated_torque for joint in arm.require_link().joints])
-        poses = np.linspace(plant.lower, plant.upper, 5)
+        poses = np.random.default_rng(0).uniform(plant.lower, plant.upper, (TUNING_POSES, self.n))
         inertia = np.max([np.diag(plant.inertia(pose)) for pose in poses], axis=0) + self.rated / SPARE_ACCELERATION
         self._stiffness = inertia * section.bandwidth**2
         self._damping = 2 * section.damping * inertia * section.bandwidth
@@ -55,6 +57,8 @@ class Loops:
         self._feed_forward_in, self._profile_velocity = signals[0x60B2, 0], signals[0x6081, 0]
         self._profile_acceleration, self._torque_slope = signals[0x6083, 0], signals[0x6087, 0]
         self._max_torque_in = signals[0x6072, 0]
+        self.interpolation = np.zeros(self.n)
+        """60C2h: time over which a cyclic position target is approached [s]."""
         self.lowest, self.highest = np.full(self.n, -np.inf), np.full(self.n, np.inf)
         """Software position limits (607Dh) in user units."""
         self.reconfigure()
@@ -152,7 +156,7 @@ class Loops:
         if self._any_position:
             if synchronous:
                 wanted = np.minimum(np.maximum(self._position_in, self.lowest), self.highest)
-                rate = (self._sensors.angle_of(wanted * UNIT) - self._target) / duration
+                rate = (self._sensors.angle_of(wanted * UNIT) - self._target) / np.maximum(self.interpolation, duration)
                 np.copyto(self._rate, rate, where=self._cyclic_position)
             else:
                 self._rate[self._cyclic_position] = 0.0
@@ -162,12 +166,12 @@ class Loops:
 
     def _follow_profiles(self, duration: float) -> None:
         """Profile torque (slope 6087h), profile position (6081h, 6083h) and cyclic velocity (60FFh)."""
-        step = self._torque_slope * self.rated * 1e-3 * duration
-        wanted = self._torque_in * self.rated * 1e-3
+        step = self._torque_slope * (self.rated * 1e-3 * duration)
+        wanted = self._torque_in * (self.rated * 1e-3)
         ramped = self._torque + np.clip(wanted - self._torque, -step, step)
         np.copyto(self._torque, ramped, where=self._profile_torque)
         gain = self._sensors.position_gain
-        np.copyto(self._rate, self._velocity_in * UNIT * gain, where=self._cyclic_velocity)
+        np.copyto(self._rate, self._velocity_in * (UNIT * gain), where=self._cyclic_velocity)
         target = np.minimum(np.maximum(self._position_in, self.lowest), self.highest)
         way = self._sensors.angle_of(target * UNIT) - self._target
         acceleration = self._profile_acceleration * UNIT

@@ -4,6 +4,8 @@ A joint's sensor reads what the transmission passes on to the link: motor torque
 acceleration. The stops push on the link, beyond the sensor, so a joint pressed on its stop reads the pressing torque.
 """
 
+from typing import Any
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -31,9 +33,23 @@ class Plant:
         joints = [self.model.joint(name).id for name in arm.joint_names]
         self._qpos = self.model.jnt_qposadr[joints]
         self._dof = self.model.jnt_dofadr[joints]
-        self._straight = bool((self._dof == np.arange(self.n)).all() and self.model.nv == self.n)
+        data = self.data
+        self._positions: Array = data.qpos
+        self._velocities: Array = data.qvel
+        self._accelerations: Array = data.qacc
+        self._motor_torques: Array = data.qfrc_actuator
+        self._place_of_dof = np.full(self.model.nv, -1)
+        self._place_of_dof[self._dof] = np.arange(self.n)
+        if (self._dof == np.arange(self.n)).all():
+            self._dof = slice(0, self.n)
+        if (self._qpos == np.arange(self.n)).all():
+            self._qpos = slice(0, self.n)
         self.lower, self.upper = self.model.jnt_range[joints].T.copy()
-        self._nominal = (self.model.body_mass.copy(), self.model.body_ipos.copy(), self.model.opt.gravity.copy())
+        self._nominal: tuple[Array, Array, Array] = (
+            self.model.body_mass.copy(),
+            self.model.body_ipos.copy(),
+            self.model.opt.gravity.copy(),
+        )
         self._nominal_inertia = _full_inertia(self.model)
         self._armature = self.model.dof_armature[self._dof].copy()
         self._damping = self.model.dof_damping[self._dof].copy()
@@ -52,7 +68,9 @@ class Plant:
         """Take over masses, base and friction of `imperfections`; state and motion stay."""
         self._imperfections = imperfections
         self._viscous = self._damping + imperfections.viscous
-        self.model.dof_armature[self._dof] = self._armature + imperfections.rotor_inertia
+        self._rotor_inertia = self._armature + imperfections.rotor_inertia
+        self._has_rotors = bool(self._rotor_inertia.any())
+        self.model.dof_armature[self._dof] = self._rotor_inertia
         self.model.dof_damping[self._dof] = self._viscous
         self.model.opt.gravity[:] = _tilt(imperfections.tilt).T @ self._nominal[2]
         self.model.jnt_stiffness[:] = 0.0
@@ -89,24 +107,24 @@ class Plant:
         scratch.qpos[self._qpos] = q
         mujoco.mj_forward(self.model, scratch)
         mujoco.mj_fullM(self.model, scratch, full)
-        return full[np.ix_(self._dof, self._dof)]
+        return full[self._dof][:, self._dof]
 
     # ---- what it does
 
     @property
     def position(self) -> Array:
         """True joint angles [rad]."""
-        return self.data.qpos[self._qpos]
+        return self._positions[self._qpos].copy()
 
     @property
     def velocity(self) -> Array:
         """True joint velocities [rad/s]."""
-        return self.data.qvel[self._dof]
+        return self._velocities[self._dof].copy()
 
     @property
     def motor_torque(self) -> Array:
         """Torque that each motor makes."""
-        return self.data.qfrc_actuator[self._dof]
+        return self._motor_torques[self._dof].copy()
 
     @property
     def drive_torque(self) -> Array:
@@ -117,13 +135,11 @@ class Plant:
     def link_torque(self) -> Array:
         """Torque that each transmission passes on to its link: what an ideal joint torque sensor reads."""
         data, dof = self.data, self._dof
-        transmitted = data.qfrc_actuator[dof] - self._viscous * data.qvel[dof]
-        transmitted -= self.model.dof_armature[dof] * data.qacc[dof]
-        friction = data.efc_force[data.ne : data.ne + data.nf]
-        if data.nf == self.n:
-            return transmitted + friction
-        transmitted[np.searchsorted(dof, data.efc_id[data.ne : data.ne + data.nf])] += friction
-        return transmitted
+        torque = self._motor_torques[dof] - self._viscous * self._velocities[dof]
+        if self._has_rotors:
+            torque -= self._rotor_inertia * self._accelerations[dof]
+        torque[self._friction_rows()] += data.efc_force[data.ne : data.ne + data.nf]
+        return torque
 
     def set_servo(self, stiffness: Array, damping: Array, limit: Array) -> None:
         """Motor torque = clamp(drive − stiffness·q − damping·q̇, ±limit), at every step of the physics."""
@@ -173,6 +189,13 @@ class Plant:
             heading = np.where(resting, np.sign(self.motor_torque - load), np.sign(velocity))
             level = level * (1.0 + state.asymmetry * heading)
         self.model.dof_frictionloss[self._dof] = np.where(self._braked, self._brake_torque, np.maximum(level, 0.0))
+
+    def _friction_rows(self) -> Any:
+        """Places of the joints that have a friction constraint, in the order of the constraints."""
+        data = self.data
+        if data.nf == self.n:
+            return slice(0, self.n)
+        return self._place_of_dof[data.efc_id[data.ne : data.ne + data.nf]]
 
     def _set_inertias(self) -> None:
         """Masses, centres of mass and inertias from nominal, effects and what is attached."""

@@ -34,7 +34,7 @@ class LinkBody(Section):
 
 
 class Sensors(Section):
-    """Torque and position sensors, one value a joint: `v = gain·τ + offset`, `θ = position_gain·φ + position_offset`."""
+    """Sensors, one value a joint: torque `v = gain·τ + offset`, position `θ = position_gain·φ + position_offset`."""
 
     gain: tuple[FiniteFloat, ...] | None = None
     """Default 1."""

@@ -1,6 +1,7 @@
 """The objects of all joints that PDOs can carry, as one array per object: the cyclic path works on them whole."""
 
 from functools import cache
+from typing import Any
 
 import canopen
 import numpy as np
@@ -42,11 +43,11 @@ class Signals:
             for entry in ([item] if isinstance(item, ODVariable) else item.subindices.values())
             if entry.pdo_mappable
         ]
-        self.values: dict[Key, NDArray[np.generic]] = {
+        self.values: dict[Key, NDArray[Any]] = {
             (entry.index, entry.subindex): np.full(n, entry.default or 0, DTYPES[entry.data_type]) for entry in entries
         }
 
-    def __getitem__(self, key: Key) -> NDArray[np.generic]:
+    def __getitem__(self, key: Key) -> NDArray[Any]:
         return self.values[key]
 
     def __contains__(self, key: Key) -> bool:

@@ -12,8 +12,8 @@ from armlink.armfile import ArmFile, LinkJoint
 from armlink.errors import BadInput
 from sim_bus.cia402 import State
 from sim_bus.drives import SUPPORTED_MODES, UNWATCHED, Drives
-from sim_bus.loops import FEED, UNIT
 from sim_bus.effects.state import Entry, Imperfections, imperfections
+from sim_bus.loops import FEED, UNIT
 from sim_bus.node import OPERATIONAL, PRE_OPERATIONAL, STOPPED, Node
 from sim_bus.pdo import Frame, PdoGroup, PdoTable
 from sim_bus.plant import Plant
@@ -25,6 +25,8 @@ from sim_bus.truth import Truth
 
 Array = NDArray[np.float64]
 SYNC_ID = 0x80
+APPLIED = (0x6007, 0x605A, 0x6065, 0x607D, 0x6085, 0x60C2)
+"""Objects of the drive profile that come into force when written."""
 DRIVE_ERROR = 0x21
 """Error register: generic and device profile."""
 TARGETS = {(0x6071, 0), (0x607A, 0), (0x60FF, 0)}
@@ -170,6 +172,7 @@ class SimulatedArm:
             (0x6092, 1): FEED,
             (0x608F, 1): increments,
             (0x6502, 0): SUPPORTED_MODES,
+            (0x60C2, 1): min(max(round(self.default_period * 1e3), 1), 255),
             (0x6081, 0): round(joint.max_velocity / UNIT),
             (0x6083, 0): deceleration,
             (0x6085, 0): deceleration,
@@ -227,7 +230,7 @@ class SimulatedArm:
     def _written(self, node: Node, key: Key) -> None:
         if key in TARGETS:
             self.drives.loops.fresh(key[0], node.place)
-        elif key[0] < 0x6000 or key[0] in (0x6007, 0x605A, 0x6065, 0x607D, 0x6085):
+        elif key[0] < 0x6000 or key[0] in APPLIED:
             self._apply(node)
 
     def _apply(self, node: Node) -> None:
@@ -237,6 +240,7 @@ class SimulatedArm:
         self.drives.quick_stop_option[joint] = node.value(0x605A)
         loops, window = self.drives.loops, node.value(0x6065)
         loops.deceleration[joint] = max(node.value(0x6085), 1) * UNIT
+        loops.interpolation[joint] = node.value(0x60C2, 1) * 10.0 ** node.value(0x60C2, 2)
         loops.lowest[joint], loops.highest[joint] = node.value(0x607D, 1), node.value(0x607D, 2)
         self.drives.following_window[joint] = np.inf if window == UNWATCHED else window * UNIT
         self._watching = self.drives.needs_watch

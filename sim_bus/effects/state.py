@@ -91,8 +91,9 @@ class Imperfections:
     def __post_init__(self) -> None:
         """Start from a perfect arm."""
         n = len(self.names)
-        shapes = {"ripple": (n, 3), "spring": (n, 2), "coupling": (n, n), "crosstalk": (n, n), "eccentricity": (n, 2)}
-        shapes |= {"mass_moment": (n, 3), "inertia": (n, 6), "payload": (4,), "tilt": (2,)}
+        square, pair = (n, n), (n, 2)
+        shapes: dict[str, tuple[int, ...]] = {"ripple": (n, 3), "spring": pair, "coupling": square, "tilt": (2,)}
+        shapes |= {"crosstalk": square, "eccentricity": pair, "mass_moment": (n, 3), "inertia": (n, 6), "payload": (4,)}
         initial = {"stribeck_velocity": 0.01, "actuator_gain": 1.0, "torque_gain": 1.0, "position_gain": 1.0}
         initial |= {"actuator_saturation": np.inf, "torque_saturation": np.inf}
         for item in fields(self):
