@@ -4,9 +4,11 @@ import math
 from dataclasses import dataclass
 
 from armlink import objects, pdo
-from armlink.armfile import LinkJoint
+from armlink.armfile import LinkJoint, LinkSection
 from armlink.cia402 import SUPPORTED_BITS, state_of
 from armlink.errors import BadInput, BusFault
+from armlink.gate import JointLimits
+from armlink.limits import milliseconds
 from armlink.objects import Entry
 from armlink.sample import Identity
 from armlink.services import NodeServices
@@ -33,6 +35,18 @@ class Protection:
     """A joint that hears no heartbeat of the host for so long goes to quick stop."""
     producer_ms: int
     """Period of the joint's own heartbeat."""
+
+
+def protection_of(section: LinkSection) -> Protection:
+    """Host node (the highest that no joint has) and times from the arm file's deadline."""
+    nodes = {joint.node for joint in section.joints}
+    host = next(node for node in range(127, 0, -1) if node not in nodes)
+    return Protection(
+        host,
+        deadline_ms=milliseconds(section.deadline),
+        heartbeat_ms=milliseconds(2 * section.deadline),
+        producer_ms=milliseconds(section.deadline / 2),
+    )
 
 
 def identify(services: NodeServices) -> Identity:
@@ -97,19 +111,19 @@ def configure_pdos(services: NodeServices, deadline_ms: int) -> None:
             raise BusFault(f"{services.joint} (node {services.node}): {error}") from None
 
 
-def protect(
-    services: NodeServices,
-    joint: LinkJoint,
-    units: Units,
-    window: tuple[float, float],
-    period: float,
-    protection: Protection,
+def configure(
+    services: NodeServices, joint: LinkJoint, unit: Units, limits: JointLimits, period: float, protection: Protection
 ) -> None:
-    """Set the limits that hold even without this host: torque, position window [rad], quick stop, who is watched."""
+    """PDOs, and the limits that hold even without this host: torque, position window, quick stop, who is watched.
+
+    All is read back. Raises BusFault naming joint and object.
+    """
+    check_modes(services)
+    configure_pdos(services, protection.deadline_ms)
     check = services.write_checked
-    check(objects.MAX_TORQUE, math.floor(joint.max_torque / units.torque + 1e-9))
-    check(objects.POSITION_LOWER, math.ceil(window[0] / units.position))
-    check(objects.POSITION_UPPER, math.floor(window[1] / units.position))
+    check(objects.MAX_TORQUE, math.floor(joint.max_torque / unit.torque + 1e-9))
+    check(objects.POSITION_LOWER, math.ceil(limits.lower / unit.position))
+    check(objects.POSITION_UPPER, math.floor(limits.upper / unit.position))
     check(objects.QUICK_STOP_OPTION, QUICK_STOP_AND_HOLD)
     check(objects.ABORT_OPTION, ABORT_IS_QUICK_STOP)
     value, exponent = interpolation(period)

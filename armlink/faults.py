@@ -1,21 +1,21 @@
 """Faults that a cycle shows, in words: which joint, what, and what to do. Pure."""
 
+import math
 from collections.abc import Mapping, Sequence
-
-import numpy as np
 
 from armlink import emcy, objects
 from armlink.cia402 import Mode, State, state_of
-from armlink.gate import Limits, Passed
+from armlink.gate import MODES, is_fresh
 from armlink.sample import Command, Sample
 
+ENABLED_BITS = 0x27
 _FAULTS = (State.FAULT, State.FAULT_REACTION)
 
 
 def find_fault(
     names: Sequence[str],
     sample: Sample,
-    mode: Sequence[int],
+    modes: Sequence[int],
     emergencies: Sequence[tuple[int, int, int]],
     node_states: Mapping[int, int],
     max_age: float,
@@ -34,25 +34,44 @@ def find_fault(
         if state != objects.OPERATIONAL:
             return f"{names[joint]}: NMT state is {objects.NMT_STATES.get(state, state)}, expected operational"
     for joint, status in enumerate(sample.status.tolist()):
+        if status & 0x6F == ENABLED_BITS:
+            continue
         state_402 = state_of(status)
-        if state_402 is not State.ENABLED and (mode[joint] != Mode.OFF or state_402 in _FAULTS):
+        if modes[joint] != Mode.OFF or state_402 in _FAULTS:
             return f"{names[joint]}: {state_402.value} (status word {status:#06x}), expected operation enabled"
-    joint = int(np.argmax(sample.age))
-    if sample.age[joint] > max_age:
-        return f"{names[joint]}: no reading for {sample.age[joint] * 1e3:.0f} ms, limit {max_age * 1e3:.0f} ms"
+    for joint, age in enumerate(sample.age.tolist()):
+        if age > max_age:
+            return f"{names[joint]}: no reading for {age * 1e3:.0f} ms, limit {max_age * 1e3:.0f} ms"
     return None
 
 
-def refusal(names: Sequence[str], passed: Passed, command: Command, limits: Limits, command_age: float) -> str:
-    """Why the gate refused the first joint's command, in one line."""
-    joint = int(np.argmax(passed.refused))
-    if not 0 <= command_age <= limits.max_command_age:
-        return f"the command is {command_age * 1e3:.0f} ms old, limit {limits.max_command_age * 1e3:.0f} ms"
-    mode = int(command.mode[joint])
-    if mode == Mode.TORQUE and not np.isfinite(command.torque[joint]):
-        return f"{names[joint]}: target torque is {command.torque[joint]}, expected a finite number"
-    if mode == Mode.POSITION and not np.isfinite(command.position[joint]):
-        return f"{names[joint]}: target position is {command.position[joint]}, expected a finite number"
-    if mode not in (Mode.OFF, Mode.POSITION, Mode.TORQUE):
+def refusal(names: Sequence[str], refused: Sequence[bool], command: Command, command_age: float, max_age: float) -> str:
+    """Why the gate refused the first joint's command, in one line; ages in [s]."""
+    joint = refused.index(True)
+    mode, torque, position = int(command.mode[joint]), command.torque[joint], command.position[joint]
+    if not is_fresh(command_age, max_age):
+        return f"the command is {command_age * 1e3:.0f} ms old, expected 0 to {max_age * 1e3:.0f} ms"
+    if mode == Mode.TORQUE and not math.isfinite(torque):
+        return f"{names[joint]}: target torque is {torque}, expected a finite number"
+    if mode == Mode.POSITION and not math.isfinite(position):
+        return f"{names[joint]}: target position is {position}, expected a finite number"
+    if mode not in MODES:
         return f"{names[joint]}: mode {mode}, expected 0 (off), 8 (position) or 10 (torque)"
-    return f"{names[joint]}: its newest reading is older than {limits.max_sample_age * 1e3:.0f} ms"
+    return f"{names[joint]}: its newest reading is older than {max_age * 1e3:.0f} ms"
+
+
+def stuck(
+    names: Sequence[str],
+    states: Sequence[State],
+    target: State,
+    emergencies: Sequence[tuple[int, int, int]],
+    seconds: float,
+) -> str:
+    """Why the joints did not all reach `target` within `seconds`: the first that did not, and its emergency if any."""
+    for joint, code, _ in emergencies:
+        if code and states[joint] is not target:
+            return f"{names[joint]}: {states[joint].value} after emergency {code:04X}h, {emcy.name_of(code)}"
+    for name, state in zip(names, states, strict=True):
+        if state is not target:
+            return f"{name}: stays in {state.value}, expected {target.value} within {seconds} s"
+    return f"no complete set of readings within {seconds} s of cycles: frames are lost"

@@ -1,116 +1,119 @@
-"""The gate: limits checked last, just before a command becomes a frame. Pure: arrays in, wire values out.
+"""The gate: limits checked last, just before a command becomes a frame. Pure and scalar: one joint, one cycle.
 
-What it does with what it gets, joint by joint:
+What it does with what it gets:
 
 - torque beyond the limit or changing faster than the rate: limited;
-- target position outside the window or moving faster than the limit: limited (a joint that stands outside the
-  window is led back into it at the velocity limit, and no further out);
-- a number that is not finite where the mode needs it, an unknown mode, a command or sample that is too old: refused.
+- target position outside the window or moving faster than the limit: limited (a joint that stands outside the window
+  is led back into it at the velocity limit, never further out);
+- a number that is not finite where the mode needs it, an unknown mode, a command or reading that is too old: refused.
   The joint goes to quick stop in this very cycle, and the link raises.
+
+A joint under torque control follows its measured position with the target position, and a joint under position control
+its produced torque with the target torque, so that a change of mode starts from what is: zero would drop the load.
 """
 
-from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
+import math
+from typing import NamedTuple
 
 from armlink.cia402 import Mode
 
-Array = NDArray[np.float64]
+OFF, POSITION, TORQUE = int(Mode.OFF), int(Mode.POSITION), int(Mode.TORQUE)
+MODES = (OFF, POSITION, TORQUE)
 
 
-@dataclass(frozen=True, eq=False)
-class Limits:
-    """Limits of n joints, each (n,); no frame exceeds them."""
+class JointLimits(NamedTuple):
+    """Limits of one joint; no frame exceeds them."""
 
-    max_torque: Array
+    max_torque: float
     """[N·m]."""
-    max_torque_rate: Array
-    """[N·m/s]."""
-    max_velocity: Array
-    """Of the target position [rad/s]."""
-    lower: Array
+    torque_step: float
+    """Most that the target torque changes in one cycle [N·m]."""
+    position_step: float
+    """Most that the target position moves in one cycle [rad]."""
+    lower: float
     """Lower end of the target window [rad]."""
-    upper: Array
+    upper: float
     """Upper end of the target window [rad]."""
-    torque_unit: Array
+    torque_unit: float
     """One per mille of the rated torque [N·m]."""
-    position_unit: Array
+    position_unit: float
     """One user unit [rad]."""
-    max_command_age: float
-    """[s]."""
-    max_sample_age: float
-    """[s]."""
 
 
-@dataclass(eq=False)
-class Passed:
-    """What leaves the gate; torque and position are also what the next cycle starts from."""
+class Passed(NamedTuple):
+    """What leaves the gate for one joint; torque and position are also what the next cycle starts from."""
 
-    torque: Array
-    """Target torque before quantisation [N·m], (n,)."""
-    position: Array
-    """Target position before quantisation [rad], (n,)."""
-    torque_wire: NDArray[np.int64]
+    torque: float
+    """Target torque before quantisation [N·m]."""
+    position: float
+    """Target position before quantisation [rad]."""
+    torque_wire: int
     """6071h, per mille of the rated torque, rounded towards zero."""
-    position_wire: NDArray[np.int64]
+    position_wire: int
     """607Ah, user units, rounded into the window."""
-    refused: NDArray[np.bool_]
-    """Joints whose command was refused: they must be stopped."""
+    refused: bool
+    """The command was refused: the joint must be stopped."""
 
 
 def pass_gate(
-    limits: Limits,
-    period: float,
-    mode: NDArray[np.int8],
-    torque: Array,
-    position: Array,
+    limits: JointLimits,
+    mode: int,
+    torque: float,
+    position: float,
     held: Passed,
-    produced_torque: Array,
-    measured_position: Array,
-    sample_age: Array,
-    command_age: float,
+    produced_torque: float,
+    measured_position: float,
+    fresh: bool,
 ) -> Passed:
-    """Limit one command of n joints.
+    """Limit one joint's command (torque [N·m], position [rad]).
 
-    `held` is what passed last; `produced_torque` (6077h) and `measured_position` are the newest readings (NaN where
-    there is none). A joint under torque follows its measured position with the target position, and a joint under
-    position control its produced torque with the target torque, so that a change of mode starts from what is.
+    `held` is what passed in the cycle before; `produced_torque` (6077h) and `measured_position` are the newest
+    readings, NaN where there is none; `fresh` says that neither the command nor the reading is too old.
     """
-    on_torque, on_position = mode == Mode.TORQUE, mode == Mode.POSITION
-    finite_torque, finite_position = np.isfinite(torque), np.isfinite(position)
-    known = on_torque | on_position | (mode == Mode.OFF)
-    usable = (finite_torque | ~on_torque) & (finite_position | ~on_position) & known
-    fresh = (sample_age <= limits.max_sample_age) & (0.0 <= command_age <= limits.max_command_age)
-    refused = ~(usable & fresh)
-
-    follow_torque = np.where(np.isfinite(produced_torque), produced_torque, held.torque)
-    follow_position = np.where(np.isfinite(measured_position), measured_position, held.position)
-    step = limits.max_torque_rate * period
-    wanted = np.where(on_torque & ~refused, torque, held.torque)
-    limited = held.torque + np.clip(wanted - held.torque, -step, step)
-    next_torque = np.where(on_torque, limited, np.where(on_position, follow_torque, 0.0))
-    next_torque = np.clip(next_torque, -limits.max_torque, limits.max_torque)
-
-    stride = limits.max_velocity * period
-    aim = np.clip(np.where(on_position & ~refused, position, held.position), limits.lower, limits.upper)
-    strode = held.position + np.clip(aim - held.position, -stride, stride)
-    next_position = np.where(on_position, strode, follow_position)
-    return Passed(next_torque, next_position, *_quantise(limits, next_torque, next_position), refused)
+    needed = torque if mode == TORQUE else position if mode == POSITION else 0.0
+    refused = not (fresh and mode in MODES and math.isfinite(needed))
+    if refused or mode == TORQUE:
+        goal = held.torque if refused else torque
+        next_torque = _towards(held.torque, goal, limits.torque_step)
+    elif mode == POSITION:
+        next_torque = produced_torque if math.isfinite(produced_torque) else held.torque
+    else:
+        next_torque = 0.0
+    if mode == POSITION and not refused:
+        goal = _within(position, limits.lower, limits.upper)
+        next_position = _towards(held.position, goal, limits.position_step)
+    else:
+        next_position = measured_position if math.isfinite(measured_position) else held.position
+    return _passed(limits, next_torque, next_position, refused)
 
 
-def start_from(limits: Limits, torque: Array, position: Array) -> Passed:
-    """What the first cycle starts from: the torque now produced and the position now measured."""
-    start = np.clip(np.nan_to_num(torque), -limits.max_torque, limits.max_torque)
-    passed = Passed(start, position.copy(), *(np.zeros(start.size, np.int64),) * 2, np.zeros(start.size, bool))
-    passed.torque_wire, passed.position_wire = _quantise(limits, start, position)
-    return passed
+def start_from(limits: JointLimits, produced_torque: float, measured_position: float) -> Passed:
+    """What the first cycle starts from: the torque now produced [N·m] and the position now measured [rad]."""
+    return _passed(limits, produced_torque if math.isfinite(produced_torque) else 0.0, measured_position, False)
 
 
-def _quantise(limits: Limits, torque: Array, position: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Wire values; rounding never leads out of a limit, nor further out of the window than the joint already is."""
-    torque_wire = np.clip(np.trunc(torque / limits.torque_unit), -32768, 32767)
-    lowest = np.ceil(np.minimum(limits.lower, position) / limits.position_unit)
-    highest = np.floor(np.maximum(limits.upper, position) / limits.position_unit)
-    position_wire = np.clip(np.rint(position / limits.position_unit), lowest, highest)
-    return torque_wire.astype(np.int64), np.clip(position_wire, -(2**31), 2**31 - 1).astype(np.int64)
+def is_fresh(age: float, limit: float) -> bool:
+    """Whether an age is between zero and a limit [s]; false for NaN."""
+    return 0.0 <= age <= limit
+
+
+def _passed(limits: JointLimits, torque: float, position: float, refused: bool) -> Passed:
+    """Quantise; rounding never leads out of the torque limit, nor out of the window from within."""
+    torque = _within(torque, -limits.max_torque, limits.max_torque)
+    wire = round(position / limits.position_unit)
+    if limits.lower <= position <= limits.upper:
+        lowest = math.ceil(limits.lower / limits.position_unit)
+        wire = _within_whole(wire, lowest, math.floor(limits.upper / limits.position_unit))
+    return Passed(torque, position, int(torque / limits.torque_unit), wire, refused)
+
+
+def _towards(start: float, goal: float, step: float) -> float:
+    return goal if abs(goal - start) <= step else start + math.copysign(step, goal - start)
+
+
+def _within(value: float, lower: float, upper: float) -> float:
+    return lower if value < lower else upper if value > upper else value
+
+
+def _within_whole(value: int, lower: int, upper: int) -> int:
+    return lower if value < lower else upper if value > upper else value

@@ -2,14 +2,12 @@
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
-from armlink.armfile import ArmFile, LinkSection
+from armlink.armfile import ArmFile, LinkJoint
 from armlink.errors import BadInput
-from armlink.gate import Limits
+from armlink.gate import JointLimits
 from armlink.units import Units
 
+INT16_MAX, INT32_MAX = 2**15 - 1, 2**31 - 1
 POSITION_GAIN_ERROR = 0.02
 """A position sensor may read so much more of its range than is true: the stops are found beyond their nominal place."""
 PRESS_IN = 0.05
@@ -43,23 +41,21 @@ def target_window(lower: float, upper: float) -> tuple[float, float]:
     return lower - margin, upper + margin
 
 
-def gate_limits(section: LinkSection, windows: NDArray[np.float64], units: tuple[Units, ...]) -> Limits:
-    """Limits for the gate; `windows` (n, 2) [rad]."""
-    joints = section.joints
-
-    def each(name: str) -> NDArray[np.float64]:
-        return np.array([getattr(joint, name) for joint in joints], dtype=np.float64)
-
-    return Limits(
-        max_torque=each("max_torque"),
-        max_torque_rate=each("max_torque_rate"),
-        max_velocity=each("max_velocity"),
-        lower=windows[:, 0].copy(),
-        upper=windows[:, 1].copy(),
-        torque_unit=np.array([unit.torque for unit in units]),
-        position_unit=np.array([unit.position for unit in units]),
-        max_command_age=section.deadline,
-        max_sample_age=section.deadline,
+def gate_limits(joint: LinkJoint, window: tuple[float, float], unit: Units, period: float) -> JointLimits:
+    """Limits for the gate of one joint with its target window [rad]; raises BadInput where they fit no frame."""
+    if joint.max_torque / unit.torque > INT16_MAX:
+        most = INT16_MAX * unit.torque
+        raise BadInput(f"{joint.name}: max_torque {joint.max_torque} N·m: 6071h carries at most {most:.6g} N·m")
+    if max(map(abs, window)) / unit.position > INT32_MAX:
+        raise BadInput(f"{joint.name}: its range is more than 607Ah carries at {unit.position:.3g} rad a user unit")
+    return JointLimits(
+        max_torque=joint.max_torque,
+        torque_step=joint.max_torque_rate * period,
+        position_step=joint.max_velocity * period,
+        lower=window[0],
+        upper=window[1],
+        torque_unit=unit.torque,
+        position_unit=unit.position,
     )
 
 

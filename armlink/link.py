@@ -1,6 +1,7 @@
 """The link: an arm's joint controllers on a CAN bus; samples in SI units out, limited commands in."""
 
 import contextlib
+import math
 from collections.abc import Callable
 from functools import cached_property
 from types import TracebackType
@@ -8,15 +9,14 @@ from typing import Any, Self
 
 import numpy as np
 
-from armlink import calibration, device, emcy, objects
+from armlink import calibration, device, objects
 from armlink.armfile import ArmFile
 from armlink.cia402 import Control, Mode, State, next_control, state_of
 from armlink.clock import Clock, MonotonicClock
-from armlink.device import Protection
 from armlink.errors import ArmlinkError, BusFault, Refused
-from armlink.faults import find_fault, refusal
-from armlink.gate import Passed, pass_gate, start_from
-from armlink.limits import gate_limits, joint_ranges, milliseconds, target_window
+from armlink.faults import find_fault, refusal, stuck
+from armlink.gate import JointLimits, Passed, is_fresh, pass_gate, start_from
+from armlink.limits import gate_limits, joint_ranges, target_window
 from armlink.loop import Loop
 from armlink.port import open_port
 from armlink.sample import Array, Calibration, Command, Identity, Sample, Stats
@@ -24,6 +24,7 @@ from armlink.services import NodeServices, PumpedNetwork, load_dictionary
 
 ENABLE_SECONDS = 3.0
 """The joints must reach a commanded CiA 402 state within this time."""
+OFF = int(Mode.OFF)
 STOP_CYCLES = 25
 """Cycles in which a quick stop is repeated until every joint reports it."""
 
@@ -44,22 +45,17 @@ class Link:
         own_clock: Clock | None = getattr(bus, "clock", None)
         self._lock_step = own_clock is not None
         self.clock: Clock = clock or own_clock or MonotonicClock()
-        self._windows = np.array([target_window(*limits) for limits in joint_ranges(arm)])
-        host = next(node for node in range(127, 0, -1) if node not in self.nodes)
-        self._protection = Protection(
-            host,
-            milliseconds(section.deadline),
-            milliseconds(2 * section.deadline),
-            milliseconds(section.deadline / 2),
-        )
-        self._port = open_port(bus)
-        self._loop = Loop(self._port, self.clock, self.nodes, host, self.period, self._lock_step)
+        self._windows = [target_window(*limits) for limits in joint_ranges(arm)]
+        self._protection = device.protection_of(section)
+        self._loop = Loop(open_port(bus), self.clock, self.nodes, self._protection.host, self.period, self._lock_step)
         self._loop.heartbeat_cycles = max(1, int(section.deadline / 2 * self.rate))
-        self._modes = [int(Mode.OFF)] * self.n
+        self._enabled_control = [int(Control.ENABLE)] * self.n
+        self._modes = [OFF] * self.n
         self._cycling = self._enabled = False
         self._due = self._since = 0.0
         self._last: Command | None = None
-        self._passed: Passed
+        self._limits: list[JointLimits] = []
+        self._passed: list[Passed] = []
 
     @classmethod
     def open(cls, arm: ArmFile, bus: str | None = None) -> "Link":
@@ -89,14 +85,14 @@ class Link:
     @property
     def torque_sent(self) -> Array:
         """Target torque of the last frames [N·m], (n,)."""
-        sent: Array = self._passed.torque_wire * self._limits.torque_unit
-        return sent
+        pairs = zip(self._passed, self._limits, strict=True)
+        return np.array([passed.torque_wire * limits.torque_unit for passed, limits in pairs])
 
     @property
     def position_sent(self) -> Array:
         """Target position of the last frames [rad], (n,)."""
-        sent: Array = self._passed.position_wire * self._limits.position_unit
-        return sent
+        pairs = zip(self._passed, self._limits, strict=True)
+        return np.array([passed.position_wire * limits.position_unit for passed, limits in pairs])
 
     def scan(self) -> list[Identity]:
         """Identity and state of each joint's controller; one that does not answer is there with `present` false."""
@@ -112,19 +108,16 @@ class Link:
             channel = self.bus.channel_info
             raise BusFault(f"no answer from {', '.join(missing)} on {channel}: is it powered, and its node id right?")
         self._loop.send(objects.NMT_ID, bytes([objects.NMT_PRE_OPERATIONAL, 0]))
-        units = []
+        self._limits, self._passed, units = [], [], []
         for services, joint, window in zip(self._services, self.section.joints, self._windows, strict=True):
             unit = device.read_units(services, joint)
-            device.check_modes(services)
-            device.configure_pdos(services, self._protection.deadline_ms)
-            device.protect(services, joint, unit, tuple(window), self.period, self._protection)
+            limits = gate_limits(joint, window, unit, self.period)
+            device.configure(services, joint, unit, limits, self.period, self._protection)
+            torque = services.read(objects.MOTOR_TORQUE) * unit.torque
+            self._passed.append(start_from(limits, torque, services.read(objects.POSITION) * unit.position))
+            self._limits.append(limits)
             units.append(unit)
-        self._limits = gate_limits(self.section, self._windows, tuple(units))
         self._loop.set_units(tuple(units))
-        position = np.array([float(services.read(objects.POSITION)) for services in self._services])
-        torque = np.array([float(services.read(objects.MOTOR_TORQUE)) for services in self._services])
-        limits = self._limits
-        self._passed = start_from(limits, torque * limits.torque_unit, position * limits.position_unit)
         for node in self.nodes:
             self._loop.send(objects.NMT_ID, bytes([objects.NMT_START, node]))
         self._loop.node_states.clear()
@@ -141,7 +134,7 @@ class Link:
         sample = self._walk(State.ENABLED)
         self._loop.emergencies.clear()
         self._enabled = True
-        self._last = Command.hold(self._loop.latest_position)
+        self._last = Command.hold(np.array(self._loop.latest_position))
         return sample
 
     def disable(self) -> None:
@@ -191,40 +184,39 @@ class Link:
         if not self._enabled:
             raise BusFault("the joints are not enabled: start() and enable() come before cycle()")
         self._await_turn()
+        loop, max_age = self._loop, self.section.deadline
         now = self.clock.now()
-        loop = self._loop
-        passed = pass_gate(
-            self._limits,
-            self.period,
-            command.mode,
-            command.torque,
-            command.position,
-            self._passed,
-            loop.latest_motor_torque,
-            loop.latest_position,
-            loop.age(now),
-            0.0 if command.t is None else now - command.t,
-        )
-        self._passed = passed
-        control = [int(Control.ENABLE)] * self.n
+        command_age = 0.0 if command.t is None else now - command.t
+        timely = is_fresh(command_age, max_age)
+        modes, torques, positions = command.mode.tolist(), command.torque.tolist(), command.position.tolist()
+        control = self._enabled_control.copy()
+        passed = self._passed
         for joint in range(self.n):
-            mode = int(command.mode[joint])
-            if passed.refused[joint]:
+            mode = modes[joint]
+            passed[joint] = pass_gate(
+                self._limits[joint],
+                mode,
+                torques[joint],
+                positions[joint],
+                passed[joint],
+                loop.latest_motor_torque[joint],
+                loop.latest_position[joint],
+                timely and is_fresh(now - loop.seen[joint], max_age),
+            )
+            if passed[joint].refused:
                 control[joint] = int(Control.QUICK_STOP)
-            elif mode == Mode.OFF:
+            elif mode == OFF:
                 control[joint] = int(Control.DISABLE_VOLTAGE)
             elif mode != self._modes[joint]:
                 loop.send_mode(joint, mode)
                 self._modes[joint] = mode
-        sample = loop.exchange(control, passed.torque_wire.tolist(), passed.position_wire.tolist())
-        fault = find_fault(
-            self.names, sample, command.mode.tolist(), loop.emergencies, loop.node_states, self.section.deadline
-        )
+        sample = loop.exchange(control, [each.torque_wire for each in passed], [each.position_wire for each in passed])
+        fault = find_fault(self.names, sample, modes, loop.emergencies, loop.node_states, max_age)
         if fault:
             raise BusFault(fault)
-        if passed.refused.any():
-            age = 0.0 if command.t is None else now - command.t
-            raise Refused(f"gate: {refusal(self.names, passed, command, self._limits, age)}")
+        refused = [each.refused for each in passed]
+        if True in refused:
+            raise Refused(f"gate: {refusal(self.names, refused, command, command_age, max_age)}")
         return sample
 
     def _await_turn(self) -> None:
@@ -239,14 +231,13 @@ class Link:
         """A cycle that commands no motion: control words only, targets as they are."""
         self._await_turn()
         loop = self._loop
-        hold = start_from(self._limits, loop.latest_motor_torque, self._standing())
-        self._passed = hold
-        return loop.exchange(control, hold.torque_wire.tolist(), hold.position_wire.tolist())
-
-    def _standing(self) -> Array:
-        """Newest measured position of each joint; what was sent last for one that has sent none."""
-        measured = self._loop.latest_position
-        return np.where(np.isfinite(measured), measured, self._passed.position)
+        for joint, (limits, passed) in enumerate(zip(self._limits, self._passed, strict=True)):
+            position = loop.latest_position[joint]
+            standing = position if math.isfinite(position) else passed.position
+            self._passed[joint] = start_from(limits, loop.latest_motor_torque[joint], standing)
+        return loop.exchange(
+            control, [each.torque_wire for each in self._passed], [each.position_wire for each in self._passed]
+        )
 
     def _walk(self, target: State) -> Sample:
         """Cycle until every joint is in `target`, each by the next control word of the table."""
@@ -265,16 +256,7 @@ class Link:
             for joint, state in enumerate(states):
                 reset_again = state is State.FAULT and control[joint] == Control.FAULT_RESET
                 control[joint] = int(Control.DISABLE_VOLTAGE) if reset_again else next_control(state, target)
-        raise BusFault(self._stuck(states, target))
-
-    def _stuck(self, states: list[State], target: State) -> str:
-        for joint, code, _ in self._loop.emergencies:
-            if code and states[joint] is not target:
-                return f"{self.names[joint]}: {states[joint].value} after emergency {code:04X}h, {emcy.name_of(code)}"
-        joint = next((joint for joint, state in enumerate(states) if state is not target), 0)
-        if states[joint] is target:
-            return f"no complete set of readings within {ENABLE_SECONDS} s of cycles: frames are lost"
-        return f"{self.names[joint]}: stays in {states[joint].value}, expected {target.value} within {ENABLE_SECONDS} s"
+        raise BusFault(stuck(self.names, states, target, self._loop.emergencies, ENABLE_SECONDS))
 
     @cached_property
     def _services(self) -> tuple[NodeServices, ...]:

@@ -58,11 +58,14 @@ class Loop:
         self._awaited = 0
         self.bits = 0
         """Bits that the frames so far took on the wire, with nominal stuffing."""
-        self._seen = np.full(self.n, -math.inf)
+        self._slow_came = False
+        self._nothing = np.full(self.n, math.nan)
+        self.seen = [-math.inf] * self.n
+        """When position and torque of each joint last came, by the clock [s]."""
         self._first: float | None = None
-        self.latest_position = np.full(self.n, math.nan)
+        self.latest_position = [math.nan] * self.n
         """Newest position of each joint whenever it came [rad]; for the gate, never for a sample."""
-        self.latest_motor_torque = np.full(self.n, math.nan)
+        self.latest_motor_torque = [math.nan] * self.n
         """Newest torque actual value of each joint whenever it came [N·m]; for the gate, never for a sample."""
         self.set_units((Units(1.0, 1.0, 1.0),) * self.n)
 
@@ -120,6 +123,7 @@ class Loop:
                 break
         while self.receive(0.0):
             pass
+        self.stats.missed += self._awaited
         return self.sample(now)
 
     def listen(self, seconds: float) -> Sample:
@@ -129,10 +133,6 @@ class Loop:
         while (remaining := end - self._clock.now()) > 0:
             self.receive(remaining)
         return self.sample(self._clock.now())
-
-    def age(self, now: float) -> Array:
-        """Time since each joint's position and torque last came [s], (n,); inf before the first."""
-        return now - self._seen
 
     def measure(self, elapsed: float, bitrate: int) -> None:
         """Bring rate and load of the stats up to date for `elapsed` seconds."""
@@ -155,6 +155,7 @@ class Loop:
             self._position[joint], self._torque[joint] = unpack(data)
         elif kind == 1:
             self._status[joint], self._motor[joint], self._velocity[joint] = unpack(data)
+            self._slow_came = True
         else:
             (self._status[joint],) = unpack(data)
 
@@ -172,16 +173,26 @@ class Loop:
         """What came since the last sample, newest of each reading, as of time `now`; NaN where nothing came."""
         position = np.array(self._position) * self._position_unit
         torque = np.array(self._torque) * TORQUE_PER_MICRO
-        motor = np.array(self._motor) * self._torque_unit
-        velocity = np.array(self._velocity) * self._position_unit
-        self._motor = [math.nan] * self.n
-        self._velocity = [math.nan] * self.n
-        came = np.isfinite(position)
-        self._seen[came] = now
-        np.copyto(self.latest_position, position, where=came)
-        np.copyto(self.latest_motor_torque, motor, where=np.isfinite(motor))
+        if self._slow_came:
+            motor = np.array(self._motor) * self._torque_unit
+            velocity = np.array(self._velocity) * self._position_unit
+            self._keep(motor, self.latest_motor_torque)
+            self._motor, self._velocity = [math.nan] * self.n, [math.nan] * self.n
+            self._slow_came = False
+        else:
+            motor, velocity = self._nothing.copy(), self._nothing.copy()
+        for joint in self._keep(position, self.latest_position):
+            self.seen[joint] = now
         self.stats.cycles += 1
-        self.stats.missed += self.n - int(came.sum())
         status: NDArray[np.int64] = np.array(self._status, np.int64)
-        age: Array = now - self._seen
+        age: Array = now - np.array(self.seen)
         return Sample(now - (self._first or 0.0), position, velocity, torque, motor, status, age)
+
+    def _keep(self, values: Array, latest: list[float]) -> list[int]:
+        """Put the values that came into `latest`; the joints that they came from."""
+        came = []
+        for joint, value in enumerate(values.tolist()):
+            if value == value:  # not NaN
+                latest[joint] = value
+                came.append(joint)
+        return came
