@@ -35,7 +35,7 @@ format: .venv/.dev ## Put the code in shape
 	$(BIN)/ruff format
 
 bench: .venv/.dev ## Measure side by side with peers; writes benchmarks/latest.json
-	$(BIN)/python benchmarks/run.py
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python benchmarks/run.py
 
 docs: .venv/.dev ## Check the documentation: links, and that its commands run
 	$(BIN)/python -m pytest -q tests/house/test_docs.py
