@@ -13,8 +13,10 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
+import yaml
 
 from armlink import cli
+from armlink.armfile import parse_arm
 
 ROOT = Path(__file__).parent.parent.parent
 PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])
@@ -97,6 +99,13 @@ def test_commands_and_options_in_the_documentation_exist(capsys):
             helps[path] = capsys.readouterr().out
         for option in re.findall(r"(?:^| )(--[a-z][a-z-]*)", " ".join(words[len(path) + 1 :])):
             assert re.search(rf"{option}\b(?!-)", helps[path]), f"{page}: armlink {' '.join(path)} has no {option}"
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "yaml")], ids=name)
+def test_arm_files_in_the_documentation_are_valid(page):
+    for text in blocks(page, "yaml"):
+        if text.startswith("name:"):
+            assert parse_arm(yaml.safe_load(text), page).joint_names
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "sh run")], ids=name)
