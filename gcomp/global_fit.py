@@ -105,17 +105,19 @@ def identify_global(
 
 
 def _starts(problem: Problem, begin: Parameters) -> Iterator[Parameters]:
-    """Starts in the order in which to try them: the linear solution, with position errors taken out first; `begin`."""
+    """Starts in the order in which to try them.
+
+    Position errors spoil the linear solution: so first everything but the scale from the rows without a reference mass,
+    then the scale from all rows; next the linear solution of all rows; then the values given.
+    """
     n, places, loaded = problem.arm.n, family_slices(problem.arm.n), problem.readings.load != 0
     positions = slice(places["position_gain"].start, places["position_offset"].stop)
     if problem.free[positions].any() and problem.free[places["beta"]].any() and loaded.any() and not loaded.all():
         bare = problem.readings.rows(~loaded)
         if bare.counted.any():
             plain = linear_start(problem.arm, bare, begin, problem.free)
-            found = solve(problem.on(bare), plain).vector
-            better = begin.vector
-            better[positions] = found[positions]
-            yield linear_start(problem.arm, problem.readings, Parameters.from_vector(better, n), problem.free)
+            found = Parameters.from_vector(solve(problem.on(bare), plain).vector, n)
+            yield linear_start(problem.arm, problem.readings, found, problem.free, keep_ratios=True)
     yield linear_start(problem.arm, problem.readings, begin, problem.free)
     yield begin
 

@@ -17,6 +17,9 @@ from gcomp.sensor_model import predict, predict_and_jacobian
 BLOCK = 2048
 """Rows worked on at a time: memory stays bounded whatever the number of rows."""
 MAX_ITERATIONS = 60
+SETTLED, STALLED, EXACT = 1e-9, 1e-5, 1e-16
+"""The last step is the one that can lower the cost by less than this share; that share where no step lowers it at all;
+cost per reading at which the residual is rounding."""
 TUNING = {"huber": 1.345, "cauchy": 2.385}
 """Where a robust loss starts to doubt a residual, in standard deviations: 95 % efficient on Gaussian noise."""
 
@@ -135,7 +138,6 @@ def solve(problem: Problem, first: Parameters) -> Outcome:
     vector, damping, converged = first.vector, 0.0, False
     weight = problem.weights(vector)
     cost = problem.cost(vector, weight)
-    tolerance = 1e-12 if problem.reweighted else 1e-15
     iterations = 0
     while iterations < MAX_ITERATIONS and not converged:
         iterations += 1
@@ -143,12 +145,10 @@ def solve(problem: Problem, first: Parameters) -> Outcome:
         spectrum = Spectrum.of(triangle, problem.unit[problem.free])
         along = spectrum.left.T @ target
         gain = float(along @ along)
-        if gain <= tolerance * cost:
-            converged = True
-            continue
+        converged = gain <= SETTLED * cost or cost <= EXACT * sum(map(len, weight))
         trial, trial_cost, damping = _step(problem, vector, weight, cost, spectrum, along, damping)
         if trial is None:
-            converged = gain <= 1e-6 * cost + 1e-12
+            converged = converged or gain <= STALLED * cost
             break
         vector, cost = trial, trial_cost
         if problem.reweighted:

@@ -14,19 +14,22 @@ SANE_GAIN_RATIO = 5.0
 """A gain that comes out further than this factor from its start was not determined by its rows."""
 
 
-def linear_start(arm: Arm, readings: Readings, start: Parameters, free: Mask) -> Parameters:
+def linear_start(
+    arm: Arm, readings: Readings, start: Parameters, free: Mask, *, keep_ratios: bool = False
+) -> Parameters:
     """Gains, offsets, mass moments and load point that solve (L) at the start's position gains and offsets.
 
     κ_i v − ω_i − Y_i (β + μ E_ρ ρ) = μ Y_i E_0 with κ = 1/gain, ω = offset/gain; what `free` (6n + 3,) holds fixed
     stays as in `start`. Without any reference mass and with β unknown the equation has no scale: then the gain of the
-    joint whose torque varies most stays. So do gains that their rows do not determine.
+    joint whose torque varies most stays. So do gains that their rows do not determine. `keep_ratios` leaves only a
+    common factor of the gains free.
     """
     places = family_slices(arm.n)
     free_gain = free[places["gain"]].copy()
     if free[places["beta"]].any() and not np.any(readings.load != 0):
         free_gain[_strongest(readings)] = False
     while True:
-        kappa, omega, beta, rho = _solve(arm, readings, start, free, free_gain)
+        kappa, omega, beta, rho = _solve(arm, readings, start, free, free_gain, keep_ratios)
         ratio = np.abs(kappa * start.gain)
         lost = free_gain & ~((ratio > 1 / SANE_GAIN_RATIO) & (ratio < SANE_GAIN_RATIO))
         if not lost.any():
@@ -40,15 +43,22 @@ def linear_start(arm: Arm, readings: Readings, start: Parameters, free: Mask) ->
     return Parameters.from_vector(vector, arm.n)
 
 
-def _solve(arm: Arm, readings: Readings, start: Parameters, free: Mask, free_gain: Mask) -> tuple[Array, ...]:
+def _solve(
+    arm: Arm, readings: Readings, start: Parameters, free: Mask, free_gain: Mask, keep_ratios: bool
+) -> tuple[Array, ...]:
     """(κ (n,), ω (n,), β (2n,), ρ (3,)) of least norm; zero where not free."""
     n, (row, joint) = arm.n, np.nonzero(readings.counted)
     columns, target = _linear_rows(arm, readings, start, free, free_gain)
     weight = np.abs(start.gain[joint]) / readings.sigma[row, joint]
     columns *= weight[:, None]
+    if keep_ratios:
+        columns[:, 0] = columns[:, :n] @ (1 / start.gain)
+        columns[:, 1:n] = 0.0
     scale = np.linalg.norm(columns, axis=0)
     scale[scale == 0] = 1.0
     solution = np.linalg.lstsq(columns / scale, target * weight, rcond=1e-9)[0] / scale
+    if keep_ratios:
+        solution[:n] = np.where(free_gain, solution[0] / start.gain, 0.0)
     return tuple(np.split(solution, [n, 2 * n, 4 * n]))
 
 
