@@ -70,7 +70,11 @@ class Rivals:
             rest = search.without(term, search.active)
             lost = search.judge(rest) - search.score
             weakest, own = lost, []
-            others = [other for other in search.normal.terms if other.key != term.key and other not in rest]
+            others = [
+                other
+                for other in search.normal.terms
+                if other.key != term.key and other not in rest and term.key not in other.beneath
+            ]
             for _, other in shortlist(search.weighted.screen(rest, others))[:TRIED]:
                 worse = search.judge(search.with_beneath(other, rest)) - search.score
                 weakest = min(weakest, worse)

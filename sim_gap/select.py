@@ -1,5 +1,6 @@
 """Which effects: every term of the library competes, judged on motion left out of its fit, at a price per parameter."""
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -13,6 +14,8 @@ PRICE = 0.012
 """What a coefficient must lower Σ ½ log(R² + floor²) by, over all rows, to earn its place: about 1 % of one row's RMS."""
 SHORTLIST = 10
 MOST_TERMS = 60
+TRIES = 3
+"""How often one effect at one place may come in during a search."""
 
 
 def candidates(layout: Layout, library: Sequence[str]) -> list[Term]:
@@ -31,6 +34,8 @@ class Search:
 
     normal: Normal
     active: list[Term] = field(default_factory=list)
+    added: Counter[tuple[str, int]] = field(default_factory=Counter)
+    """How often each effect and place came in, so that nothing goes in and out for ever."""
 
     def __post_init__(self) -> None:
         self.reweigh()
@@ -41,14 +46,34 @@ class Search:
         for _ in range(3):
             self.weighted = Weighted(self.normal, mean_square)
             mean_square = self.normal.mean_square(*self.weighted.fit(self.active))
+        while wrong := self._implausible(self.active):
+            self.active = self.without(wrong, self.active)
         self.score = self.judge(self.active)
 
     def judge(self, terms: Sequence[Term]) -> float:
         """Σ ½ log(cross-validated R² + floor²) over the rows, plus the price of the terms; lower is better."""
         normal = self.normal
+        if self._implausible(terms):
+            return float("inf")
         squares = self.weighted.cross_validated(terms)
         fit = 0.5 * np.log(squares + normal.floor**2)[normal.seen].sum()
         return float(fit + PRICE * sum(self.cost(term) for term in terms))
+
+    def _implausible(self, terms: Sequence[Term]) -> Term | None:
+        """The first of the terms whose coefficients no such effect can have."""
+        at, (_, coefficients) = 0, self.weighted.fit(terms)
+        for term in terms:
+            width = len(self.normal.at[term])
+            if not effects()[term.effect].plausible(coefficients[at : at + width], term.shape):
+                return term
+            at += width
+        return None
+
+    def accept(self, chosen: list[Term]) -> None:
+        """Go on with these terms."""
+        self.added.update(term.key for term in chosen if term not in self.active)
+        self.active = chosen
+        self.reweigh()
 
     def cost(self, term: Term) -> int:
         """Coefficients and shape parameters of a term."""
@@ -67,7 +92,7 @@ class Search:
 
     def forward(self) -> bool:
         """Add the term that helps most, if any earns its place."""
-        inactive = [term for term in self.normal.terms if term not in self.active]
+        inactive = [term for term in self.normal.terms if term not in self.active and self.added[term.key] < TRIES]
         best, chosen = self.score - 1e-4, None
         for _, term in shortlist(self.weighted.screen(self.active, inactive)):
             trial = self.with_beneath(term, self.active)
@@ -76,8 +101,7 @@ class Search:
                 best, chosen = score, trial
         if chosen is None or len(chosen) > MOST_TERMS:
             return False
-        self.active = chosen
-        self.reweigh()
+        self.accept(chosen)
         return True
 
     def backward(self) -> bool:
@@ -90,8 +114,7 @@ class Search:
                 best, chosen = score, trial
         if chosen is None:
             return False
-        self.active = chosen
-        self.reweigh()
+        self.accept(chosen)
         return True
 
     def swap(self) -> bool:
@@ -99,7 +122,11 @@ class Search:
         best, chosen = self.score - 1e-3, None
         for term in list(self.active):
             rest = self.without(term, self.active)
-            inactive = [other for other in self.normal.terms if other not in rest and other != term]
+            inactive = [
+                other
+                for other in self.normal.terms
+                if other not in rest and other != term and self.added[other.key] < TRIES
+            ]
             for _, other in shortlist(self.weighted.screen(rest, inactive))[:4]:
                 trial = self.with_beneath(other, rest)
                 score = self.judge(trial)
@@ -107,8 +134,7 @@ class Search:
                     best, chosen = score, trial
         if chosen is None:
             return False
-        self.active = chosen
-        self.reweigh()
+        self.accept(chosen)
         return True
 
     def run(self) -> list[Term]:
@@ -174,10 +200,3 @@ def golden(function: Callable[[float], float], low: float, high: float, steps: i
             b = low + ratio * (high - low)
             fb = function(b)
     return float(0.5 * (low + high))
-
-
-def coefficients_of(normal: Normal, terms: Sequence[Term]) -> tuple[Array, Array]:
-    """Indices and coefficients of a fit on everything, weights settled."""
-    search = Search(normal, list(terms))
-    index, values = search.weighted.fit(terms)
-    return index, values

@@ -24,6 +24,9 @@ class Gain(Effect):
     def spread(self, signals: Signals, place: int) -> Array:
         return np.full(1, 0.5)
 
+    def plausible(self, coefficients: Array, shape: Shape) -> bool:
+        return bool(-0.5 < coefficients[0] < 1.0)
+
     def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
         return 1.0 / (1.0 + coefficients)
 
@@ -39,6 +42,9 @@ class RotorInertia(Effect):
 
     def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
         return {(layout.motor_side, place): signals.a[:, place, None]}
+
+    def plausible(self, coefficients: Array, shape: Shape) -> bool:
+        return bool(coefficients[0] >= 0.0)
 
 
 EFFECTS: tuple[Effect, ...] = (Gain(), RotorInertia())

@@ -20,6 +20,9 @@ class _Friction(Effect):
     def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
         return {(layout.motor_side, place): self.column(signals, place, shape)[:, None]}
 
+    def plausible(self, coefficients: Array, shape: Shape) -> bool:
+        return bool(coefficients[0] >= 0.0)
+
 
 class Coulomb(_Friction):
     """A constant torque against the motion."""
@@ -65,6 +68,9 @@ class Asymmetric(_Friction):
 
     def column(self, s: Signals, joint: int, shape: Shape) -> Array:
         return np.abs(s.direction[:, joint])
+
+    def plausible(self, coefficients: Array, shape: Shape) -> bool:
+        return True
 
     def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
         return coefficients / max(abs(float(beneath["friction.coulomb"][0])), 1e-9)

@@ -13,6 +13,9 @@ LEVER = 0.15
 LIGHTEST = 0.2
 """A link counts as at least this heavy [kg] where the plausible error of its inertials is judged."""
 
+FARTHEST = 0.6
+"""A payload's centre of mass is no farther from the last joint than this [m]."""
+
 
 def _rows(signals: Signals, layout: Layout, link: int, columns: Array) -> Columns:
     """Columns (K, n, p) at every joint that carries the link."""
@@ -62,6 +65,10 @@ class Payload(Effect):
 
     def spread(self, signals: Signals, place: int) -> Array:
         return np.array([20.0, 4.0, 4.0, 4.0])
+
+    def plausible(self, coefficients: Array, shape: Shape) -> bool:
+        mass = float(coefficients[0])
+        return mass > 0.0 and float(np.linalg.norm(coefficients[1:])) < FARTHEST * mass
 
     def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
         mass = float(coefficients[0])

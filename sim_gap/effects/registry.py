@@ -101,6 +101,10 @@ class Effect(ABC):
         """Largest plausible size of each coefficient (a prior standard deviation), (p,); infinite where open."""
         return np.full(1, np.inf)
 
+    def plausible(self, coefficients: Array, shape: Shape) -> bool:
+        """Whether such an effect can exist: friction opposes motion, masses are positive, delays are not foresight."""
+        return True
+
     def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
         """Reported parameters, one per `parameters`; `beneath` holds the coefficients of what it stands upon."""
         return coefficients

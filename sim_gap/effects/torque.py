@@ -33,6 +33,9 @@ class Gain(_Sensor):
     def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
         return layout.sensor_columns(place, signals.model[:, place, None])
 
+    def plausible(self, coefficients: Array, shape: Shape) -> bool:
+        return bool(-0.5 < coefficients[0] < 1.0)
+
     def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
         return 1.0 + coefficients
 

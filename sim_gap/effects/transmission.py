@@ -35,6 +35,9 @@ class Spring(Effect):
         q = signals.q[:, place]
         return {(layout.against_model, place): np.column_stack([q, np.ones_like(q)])}
 
+    def plausible(self, coefficients: Array, shape: Shape) -> bool:
+        return bool(coefficients[0] > 0.0)
+
     def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
         stiffness = float(coefficients[0])
         return np.array([stiffness, -coefficients[1] / (stiffness if abs(stiffness) > 1e-9 else np.inf)])
@@ -71,6 +74,9 @@ class Coupling(Effect):
 
     def places(self, layout: Layout) -> range:
         return range(layout.n)
+
+    def plausible(self, coefficients: Array, shape: Shape) -> bool:
+        return bool(np.all(coefficients >= 0.0))
 
     def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
         return np.array([shape[1], shape[0], *coefficients])
