@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from armlink.armfile import ArmFile
 from sim_bus.effects.state import Imperfections
-from sim_bus.mjcf import TINY_INERTIA, build_model
+from sim_bus.inertials import Inertials
+from sim_bus.mjcf import build_model
 from sim_bus.section import sim_section
 
 Array = NDArray[np.float64]
@@ -29,10 +30,9 @@ class Plant:
         built = build_model(arm)
         self.model, self.n = built.model, len(built.bodies)
         self.data = mujoco.MjData(self.model)
-        self._bodies, self._payload = list(built.bodies), built.payload_body
         joints = [self.model.joint(name).id for name in arm.joint_names]
-        self._qpos = self.model.jnt_qposadr[joints]
-        self._dof = self.model.jnt_dofadr[joints]
+        self._qpos: NDArray[np.intp] | slice = self.model.jnt_qposadr[joints]
+        self._dof: NDArray[np.intp] | slice = self.model.jnt_dofadr[joints]
         data = self.data
         self._positions: Array = data.qpos
         self._velocities: Array = data.qvel
@@ -45,12 +45,8 @@ class Plant:
         if (self._qpos == np.arange(self.n)).all():
             self._qpos = slice(0, self.n)
         self.lower, self.upper = self.model.jnt_range[joints].T.copy()
-        self._nominal: tuple[Array, Array, Array] = (
-            self.model.body_mass.copy(),
-            self.model.body_ipos.copy(),
-            self.model.opt.gravity.copy(),
-        )
-        self._nominal_inertia = _full_inertia(self.model)
+        self._inertials = Inertials(self.model, list(built.bodies), built.payload_body)
+        self._gravity: Array = self.model.opt.gravity.copy()
         self._armature = self.model.dof_armature[self._dof].copy()
         self._damping = self.model.dof_damping[self._dof].copy()
         self._attached = np.zeros(4)
@@ -72,9 +68,9 @@ class Plant:
         self._has_rotors = bool(self._rotor_inertia.any())
         self.model.dof_armature[self._dof] = self._rotor_inertia
         self.model.dof_damping[self._dof] = self._viscous
-        self.model.opt.gravity[:] = _tilt(imperfections.tilt).T @ self._nominal[2]
+        self.model.opt.gravity[:] = _tilt(imperfections.tilt).T @ self._gravity
         self.model.jnt_stiffness[:] = 0.0
-        self._set_inertias()
+        self._inertials.apply(self._imperfections, self._attached)
         self._set_friction()
         self.set_servo(*self._servo)
         mujoco.mj_forward(self.model, self.data)
@@ -82,7 +78,7 @@ class Plant:
     def attach_mass(self, mass: float, point: Array) -> None:
         """Bolt a point mass [kg] on at `point` of the last link's bar frame [m]; it replaces an earlier one."""
         self._attached = np.array([mass, *np.asarray(point, float)])
-        self._set_inertias()
+        self._inertials.apply(self._imperfections, self._attached)
         mujoco.mj_forward(self.model, self.data)
 
     def detach_mass(self) -> None:
@@ -107,7 +103,8 @@ class Plant:
         scratch.qpos[self._qpos] = q
         mujoco.mj_forward(self.model, scratch)
         mujoco.mj_fullM(self.model, scratch, full)
-        return full[self._dof][:, self._dof]
+        inertia: Array = full[self._dof][:, self._dof]
+        return inertia
 
     # ---- what it does
 
@@ -135,7 +132,7 @@ class Plant:
     def link_torque(self) -> Array:
         """Torque that each transmission passes on to its link: what an ideal joint torque sensor reads."""
         data, dof = self.data, self._dof
-        torque = self._motor_torques[dof] - self._viscous * self._velocities[dof]
+        torque: Array = self._motor_torques[dof] - self._viscous * self._velocities[dof]
         if self._has_rotors:
             torque -= self._rotor_inertia * self._accelerations[dof]
         torque[self._friction_rows()] += data.efc_force[data.ne : data.ne + data.nf]
@@ -197,57 +194,11 @@ class Plant:
             return slice(0, self.n)
         return self._place_of_dof[data.efc_id[data.ne : data.ne + data.nf]]
 
-    def _set_inertias(self) -> None:
-        """Masses, centres of mass and inertias from nominal, effects and what is attached."""
-        state, model = self._imperfections, self.model
-        mass, com, inertia = self._nominal[0].copy(), self._nominal[1].copy(), self._nominal_inertia.copy()
-        bodies = self._bodies
-        com[bodies] += state.mass_moment / mass[bodies, None]
-        inertia[bodies] += state.inertia
-        load, moment = TINY_INERTIA, np.zeros(3)
-        points = [item for item in (state.payload, self._attached) if item[0] != 0.0]
-        for item in points:
-            load, moment = load + item[0], moment + item[0] * item[1:]
-        mass[self._payload], com[self._payload] = load, moment / load
-        inertia[self._payload] = np.array([1, 1, 1, 0, 0, 0]) * TINY_INERTIA
-        for item in points:
-            inertia[self._payload] += item[0] * _point_inertia(item[1:] - com[self._payload])
-        model.body_mass[:], model.body_ipos[:] = mass, com
-        for body in (*bodies, self._payload):
-            model.body_inertia[body], model.body_iquat[body] = _principal(inertia[body])
-        mujoco.mj_setConst(model, mujoco.MjData(model))
-
-
-def _full_inertia(model: mujoco.MjModel) -> Array:
-    """Inertias about the centres of mass along the bodies' axes (bodies, 6): xx, yy, zz, xy, xz, yz."""
-    full, turn = np.empty((model.nbody, 6)), np.empty(9)
-    for body in range(model.nbody):
-        mujoco.mju_quat2Mat(turn, model.body_iquat[body])
-        axes = turn.reshape(3, 3)
-        matrix = axes @ np.diag(model.body_inertia[body]) @ axes.T
-        full[body] = matrix[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-    return full
-
-
-def _principal(inertia: Array) -> tuple[Array, Array]:
-    """Principal moments and the quaternion of the principal axes."""
-    xx, yy, zz, xy, xz, yz = inertia
-    moments, axes = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
-    if np.linalg.det(axes) < 0:
-        axes[:, 0] *= -1
-    quaternion = np.empty(4)
-    mujoco.mju_mat2Quat(quaternion, axes.ravel())
-    return moments, quaternion
-
-
-def _point_inertia(arm: Array) -> Array:
-    x, y, z = arm
-    return np.array([y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z])
-
 
 def _tilt(angles: Array) -> Array:
     """Rotation of the base: about its x axis, then about its y axis (3, 3)."""
     (cx, cy), (sx, sy) = np.cos(angles), np.sin(angles)
     about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
     about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-    return about_x @ about_y
+    rotation: Array = about_x @ about_y
+    return rotation

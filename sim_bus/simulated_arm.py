@@ -108,6 +108,11 @@ class SimulatedArm:
         """What one SYNC stands for: 1006h where it is set, else the arm file's rate [s]."""
         return self._period
 
+    @property
+    def operational(self) -> bool:
+        """Whether any node is operational, so that SYNC means something."""
+        return any(self._operational)
+
     # ---- the plant's side: what a fit must not see
 
     def gravity_torque(self, q: Array) -> Array:

@@ -1,0 +1,60 @@
+"""Runs a simulated arm on a CAN bus, in real time, until stopped."""
+
+from typing import Annotated
+
+import typer
+
+
+def sim(
+    arm: Annotated[str, typer.Argument(help="A bundled arm's name, or the path of an arm file with a sim section.")],
+    bus: Annotated[str, typer.Option(help="INTERFACE:CHANNEL[@BITRATE]; default the arm file's.")] = "",
+    effect: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="ID:JOINT:VALUE[,VALUE…] or ID:JOINT:NAME=VALUE[,…]; ID::VALUE for all."
+        ),
+    ] = None,
+    drift: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="JOINT:GAIN:OFFSET@T: at T s the torque sensor changes, by a factor and by N·m."
+        ),
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Draw the sensors' truth from this seed; default is what the arm file states.")
+    ] = None,
+    lockstep: Annotated[
+        bool, typer.Option(help="Each SYNC advances the physics by one period, whatever the time of day.")
+    ] = False,
+) -> int:
+    """Run a simulated arm on a CAN bus until SIGINT or SIGTERM.
+
+    Example: armlink sim sarcos --bus socketcan:vcan0 --effect friction.coulomb:joint_2:1.5 --seed 1
+    """
+    from rich.console import Console
+
+    from armlink.armfile import load_arm
+    from armlink.bus import open_bus, resolve_bus
+    from armlink.errors import BadInput
+    from sim_bus.options import parse_drift, parse_effect
+    from sim_bus.server import Server
+    from sim_bus.simulated_arm import SimulatedArm
+    from sim_bus.truth import Truth
+
+    described = load_arm(arm)
+    entries = [parse_effect(text, described.joint_names) for text in effect or ()]
+    drifts = [parse_drift(text, described.joint_names) for text in drift or ()]
+    truth = Truth.of(described) if seed is None else Truth.draw(described, seed)
+    simulated = SimulatedArm(described, truth, seed or 0)
+    simulated.set_effects([*simulated.effects, *entries])
+    if resolve_bus(bus or None, described.require_link().bus).interface == "armlink_sim":
+        raise BadInput("sim: bus armlink_sim is a simulated arm itself; give --bus socketcan:vcan0, for example")
+    endpoint = open_bus(bus or None, described.require_link().bus)
+    try:
+        Console(stderr=True).print(
+            f"{described.name}: {simulated.n} joints, nodes {', '.join(str(node.node_id) for node in simulated.nodes)} "
+            f"on {endpoint.channel_info}; stop with Ctrl-C"
+        )
+        return Server(simulated, endpoint, drifts, lockstep).run()
+    finally:
+        endpoint.shutdown()

@@ -1,0 +1,102 @@
+"""A simulated arm on a bus of python-can's, in a process of its own: real time, or in lock-step with SYNC."""
+
+import signal
+import time
+from collections.abc import Callable, Sequence
+from types import FrameType
+
+import can
+
+from armlink.errors import BusFault
+from sim_bus.options import Drift
+from sim_bus.simulated_arm import SYNC_ID, SimulatedArm
+
+LARGEST_LAG = 0.25
+"""What the physics lags behind the clock by more than this is dropped, as after a stopped process [s]."""
+TICK = 0.002
+"""Longest wait for a frame: timers and physics go on meanwhile [s]."""
+SEND_PATIENCE = 0.1
+"""How long a full transmit queue is waited for [s]; a frame that still does not go is lost, as on a dead bus."""
+INTERRUPTED, TERMINATED = 130, 0
+
+
+class Server:
+    """Frames from the bus into the arm, and back."""
+
+    def __init__(
+        self,
+        arm: SimulatedArm,
+        bus: can.BusABC,
+        drifts: Sequence[Drift] = (),
+        lockstep: bool = False,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """`now` is the clock that the physics follows unless `lockstep`."""
+        self._arm, self._bus, self._lockstep, self._now = arm, bus, lockstep, now
+        self._drifts = sorted(drifts, key=lambda drift: drift.time)
+        self._offset = now() - arm.time
+        self._ended: int | None = None
+        self.lost = 0
+        """Frames that the bus did not take."""
+
+    def run(self) -> int:
+        """Serve until SIGINT (130) or SIGTERM (0). Raises BusFault where the bus goes away."""
+        before = {number: signal.signal(number, self._end) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            while self._ended is None:
+                self.turn()
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+        return self._ended
+
+    def turn(self) -> None:
+        """Wait for at most a tick, then deal with everything that is there."""
+        try:
+            message = self._bus.recv(TICK)
+            while message is not None:
+                self._frame(message)
+                message = self._bus.recv(0)
+        except can.CanError as error:
+            raise BusFault(f"bus {self._bus.channel_info}: {error}") from None
+        except OSError as error:
+            raise BusFault(f"bus {self._bus.channel_info}: {error.strerror or error}") from None
+        self._let_time_pass()
+        self._flush()
+
+    def _frame(self, message: can.Message) -> None:
+        if message.is_error_frame or message.is_remote_frame or message.is_extended_id or message.is_fd:
+            return
+        if not self._lockstep:
+            self._let_time_pass()
+        self._arm.on_frame(message.arbitration_id, bytes(message.data))
+        if self._lockstep and message.arbitration_id == SYNC_ID:
+            self._arm.advance(self._arm.period)
+        self._flush()
+
+    def _let_time_pass(self) -> None:
+        """Bring the physics up to the clock; in lock-step time rests between SYNCs once nodes are operational."""
+        if self._lockstep and self._arm.operational:
+            self._offset = self._now() - self._arm.time
+        lag = self._now() - self._offset - self._arm.time
+        if lag > LARGEST_LAG:
+            self._offset += lag - LARGEST_LAG
+            lag = LARGEST_LAG
+        if lag > 0:
+            self._arm.advance(lag)
+        while self._drifts and self._drifts[0].time <= self._arm.time:
+            drift = self._drifts.pop(0)
+            self._arm.drift(drift.joint, drift.gain, drift.offset)
+
+    def _flush(self) -> None:
+        outbox = self._arm.outbox
+        while outbox:
+            can_id, data = outbox.popleft()
+            message = can.Message(arbitration_id=can_id, data=data, is_extended_id=False, check=False)
+            try:
+                self._bus.send(message, timeout=SEND_PATIENCE)
+            except can.CanOperationError:
+                self.lost += 1
+
+    def _end(self, number: int, _frame: FrameType | None) -> None:
+        self._ended = INTERRUPTED if number == signal.SIGINT else TERMINATED
