@@ -33,31 +33,30 @@ def find_fault(
             return f"{names[joint]}: its controller has restarted (boot-up message): calibration and mode are lost"
         if state != objects.OPERATIONAL:
             return f"{names[joint]}: NMT state is {objects.NMT_STATES.get(state, state)}, expected operational"
+    for joint, age in enumerate(sample.age.tolist()):
+        if age > max_age:
+            return f"{names[joint]}: no reading for {age * 1e3:.0f} ms, limit {max_age * 1e3:.0f} ms"
     for joint, status in enumerate(sample.status.tolist()):
         if status & 0x6F == ENABLED_BITS:
             continue
         state_402 = state_of(status)
         if modes[joint] != Mode.OFF or state_402 in _FAULTS:
             return f"{names[joint]}: {state_402.value} (status word {status:#06x}), expected operation enabled"
-    for joint, age in enumerate(sample.age.tolist()):
-        if age > max_age:
-            return f"{names[joint]}: no reading for {age * 1e3:.0f} ms, limit {max_age * 1e3:.0f} ms"
     return None
 
 
-def refusal(names: Sequence[str], refused: Sequence[bool], command: Command, command_age: float, max_age: float) -> str:
-    """Why the gate refused the first joint's command, in one line; ages in [s]."""
-    joint = refused.index(True)
-    mode, torque, position = int(command.mode[joint]), command.torque[joint], command.position[joint]
+def refusal(names: Sequence[str], command: Command, command_age: float, max_age: float) -> str | None:
+    """Why the gate refused a command, in one line; None where the command was not the reason. Ages in [s]."""
     if not is_fresh(command_age, max_age):
         return f"the command is {command_age * 1e3:.0f} ms old, expected 0 to {max_age * 1e3:.0f} ms"
-    if mode == Mode.TORQUE and not math.isfinite(torque):
-        return f"{names[joint]}: target torque is {torque}, expected a finite number"
-    if mode == Mode.POSITION and not math.isfinite(position):
-        return f"{names[joint]}: target position is {position}, expected a finite number"
-    if mode not in MODES:
-        return f"{names[joint]}: mode {mode}, expected 0 (off), 8 (position) or 10 (torque)"
-    return f"{names[joint]}: its newest reading is older than {max_age * 1e3:.0f} ms"
+    for name, mode, torque, position in zip(names, command.mode, command.torque, command.position, strict=True):
+        if mode not in MODES:
+            return f"{name}: mode {mode}, expected 0 (off), 8 (position) or 10 (torque)"
+        if mode == Mode.TORQUE and not math.isfinite(torque):
+            return f"{name}: target torque is {torque}, expected a finite number"
+        if mode == Mode.POSITION and not math.isfinite(position):
+            return f"{name}: target position is {position}, expected a finite number"
+    return None
 
 
 def stuck(

@@ -53,6 +53,8 @@ class Passed(NamedTuple):
     """607Ah, user units, rounded into the window."""
     refused: bool
     """The command was refused: the joint must be stopped."""
+    mode: int
+    """Mode that was commanded."""
 
 
 def pass_gate(
@@ -72,24 +74,28 @@ def pass_gate(
     """
     needed = torque if mode == TORQUE else position if mode == POSITION else 0.0
     refused = not (fresh and mode in MODES and math.isfinite(needed))
-    if refused or mode == TORQUE:
-        goal = held.torque if refused else torque
-        next_torque = _towards(held.torque, goal, limits.torque_step)
+    start_torque, start_position = held.torque, held.position
+    if held.mode != TORQUE and math.isfinite(produced_torque):
+        start_torque = produced_torque
+    if held.mode != POSITION and math.isfinite(measured_position):
+        start_position = measured_position
+    if refused:
+        next_torque, next_position = start_torque, start_position
+    elif mode == TORQUE:
+        next_torque = _towards(start_torque, torque, limits.torque_step)
+        next_position = measured_position if math.isfinite(measured_position) else start_position
     elif mode == POSITION:
-        next_torque = produced_torque if math.isfinite(produced_torque) else held.torque
-    else:
-        next_torque = 0.0
-    if mode == POSITION and not refused:
+        next_torque = produced_torque if math.isfinite(produced_torque) else start_torque
         goal = _within(position, limits.lower, limits.upper)
-        next_position = _towards(held.position, goal, limits.position_step)
+        next_position = _towards(start_position, goal, limits.position_step)
     else:
-        next_position = measured_position if math.isfinite(measured_position) else held.position
-    return _passed(limits, next_torque, next_position, refused)
+        next_torque, next_position = 0.0, start_position
+    return _passed(limits, next_torque, next_position, refused, mode)
 
 
 def start_from(limits: JointLimits, produced_torque: float, measured_position: float) -> Passed:
     """What the first cycle starts from: the torque now produced [N·m] and the position now measured [rad]."""
-    return _passed(limits, produced_torque if math.isfinite(produced_torque) else 0.0, measured_position, False)
+    return _passed(limits, produced_torque if math.isfinite(produced_torque) else 0.0, measured_position, False, OFF)
 
 
 def is_fresh(age: float, limit: float) -> bool:
@@ -97,14 +103,14 @@ def is_fresh(age: float, limit: float) -> bool:
     return 0.0 <= age <= limit
 
 
-def _passed(limits: JointLimits, torque: float, position: float, refused: bool) -> Passed:
+def _passed(limits: JointLimits, torque: float, position: float, refused: bool, mode: int) -> Passed:
     """Quantise; rounding never leads out of the torque limit, nor out of the window from within."""
     torque = _within(torque, -limits.max_torque, limits.max_torque)
     wire = round(position / limits.position_unit)
     if limits.lower <= position <= limits.upper:
         lowest = math.ceil(limits.lower / limits.position_unit)
         wire = _within_whole(wire, lowest, math.floor(limits.upper / limits.position_unit))
-    return Passed(torque, position, int(torque / limits.torque_unit), wire, refused)
+    return Passed(torque, position, int(torque / limits.torque_unit), wire, refused, mode)
 
 
 def _towards(start: float, goal: float, step: float) -> float:

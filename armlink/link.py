@@ -189,6 +189,10 @@ class Link:
         command_age = 0.0 if command.t is None else now - command.t
         timely = is_fresh(command_age, max_age)
         modes, torques, positions = command.mode.tolist(), command.torque.tolist(), command.position.tolist()
+        if not len(modes) == len(torques) == len(positions) == self.n:
+            raise Refused(
+                f"gate: a command for {len(modes)} joints, expected {self.n} of each: {', '.join(self.names)}"
+            )
         control = self._enabled_control.copy()
         passed = self._passed
         for joint in range(self.n):
@@ -211,12 +215,11 @@ class Link:
                 loop.send_mode(joint, mode)
                 self._modes[joint] = mode
         sample = loop.exchange(control, [each.torque_wire for each in passed], [each.position_wire for each in passed])
+        if any(each.refused for each in passed) and (why := refusal(self.names, command, command_age, max_age)):
+            raise Refused(f"gate: {why}")
         fault = find_fault(self.names, sample, modes, loop.emergencies, loop.node_states, max_age)
         if fault:
             raise BusFault(fault)
-        refused = [each.refused for each in passed]
-        if True in refused:
-            raise Refused(f"gate: {refusal(self.names, refused, command, command_age, max_age)}")
         return sample
 
     def _await_turn(self) -> None:

@@ -1,10 +1,15 @@
-"""A tiny lock-step arm for tests: n nodes that answer by a dictionary, with no physics beyond "follows its target"."""
+"""Arm files, and a tiny lock-step arm: nodes that answer from a dictionary and follow their targets."""
 
 import struct
 import zlib
 from collections import deque
+from pathlib import Path
+
+import pytest
 
 from armlink import objects
+from armlink.armfile import parse_arm
+from armlink.link import Link
 
 SWITCH_ON_DISABLED, READY, SWITCHED_ON, ENABLED, QUICK_STOP, FAULT = 0x40, 0x21, 0x23, 0x27, 0x07, 0x08
 
@@ -159,3 +164,40 @@ class FakeBus:
 
     def shutdown(self):
         self.closed = True
+
+
+def make_arm(n=3, link=(), joint=()):
+    joints = [{"name": f"joint_{i}", "d": 0.1, "lower": -2.0, "upper": 2.0} for i in range(1, n + 1)]
+    linked = [
+        {"name": f"joint_{i}", "node": i, "rated_torque": 40.0, "max_torque": 30.0, **dict(joint)}
+        for i in range(1, n + 1)
+    ]
+    content = {"name": "test", "kinematics": {"joints": joints}, "link": {"joints": linked, **dict(link)}}
+    return parse_arm(content, Path("test.yaml"))
+
+
+@pytest.fixture
+def arm_of():
+    """Makes an arm of n joints, nodes 1 to n, at 250 Hz; `link` and `joint` are further keys of the arm file."""
+    return make_arm
+
+
+@pytest.fixture
+def bus():
+    """Three nodes in lock-step."""
+    return FakeBus(range(1, 4))
+
+
+@pytest.fixture
+def link(bus):
+    """A link to the three nodes; not started."""
+    with Link(make_arm(), bus) as link:
+        yield link
+
+
+@pytest.fixture
+def enabled(link):
+    """A link whose joints are enabled."""
+    link.start()
+    link.enable()
+    return link
