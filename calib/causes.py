@@ -132,7 +132,7 @@ class CauseTest:
         top = min(classes.values())
         weights = {name: np.exp(-(bic - top) / 2) for name, bic in classes.items()}
         total = sum(weights.values())
-        evidence = {name: round(bic - top, 1) for name, bic in sorted(classes.items(), key=lambda item: item[1])[:6]}
+        evidence = {name: round(float(bic - top), 1) for name, bic in sorted(classes.items(), key=lambda item: item[1])[:6]}
 
         def answer(cause: str, fit: _Fit | None, of: str, rivals: tuple[str, ...] = ()) -> Verdict:
             known = (fit.values, fit.covariance) if fit else (np.empty(0), np.empty((0, 0)))

@@ -15,7 +15,7 @@ from calib.cusum import Cusum
 from calib.decision import Finding, agreed, decide
 from calib.observer_config import ObserverConfig
 from calib.places import Places
-from calib.records import Array
+from calib.records import Array, CalibrationRecord, GravityRecord
 from calib.rest import RestDetector, Row
 from calib.sensor_filter import SensorFilter
 from gcomp.arm import Arm
@@ -62,7 +62,8 @@ class Observer:
         """Watch an arm.
 
         beta (2n,) [kg·m] and its covariance (2n, 2n) as the gravity record has them; sigma (n,) [N·m], standard
-        deviation of one averaged torque reading; position gains and offsets (n,) of the calibration record.
+        deviation of one averaged torque reading to begin with, which the readings themselves tell afterwards; position
+        gains and offsets (n,) of the calibration record.
         """
         self.arm, self.config = arm, config or ObserverConfig()
         self.belief = ModelBelief(arm, beta, beta_covariance)
@@ -84,9 +85,24 @@ class Observer:
         self._learnt = 0
         self._proposed = np.full(arm.n, -np.inf)
 
-    def handle(self, t: float, position: Array, velocity: Array | None, torque: Array) -> list[Event]:
+    @classmethod
+    def of_records(
+        cls,
+        arm: Arm,
+        calibration: CalibrationRecord,
+        gravity: GravityRecord,
+        rated_torque: Array,
+        config: ObserverConfig | None = None,
+    ) -> "Observer":
+        """Observer of an arm with these records in force; rated_torque (n,) [N·m] scales the noise assumed at first."""
+        config = config or ObserverConfig()
+        sigma = config.noise_share * np.asarray(rated_torque, dtype=float)
+        position = (calibration.values("position_gain", 1.0), calibration.values("position_offset", 0.0))
+        return cls(arm, np.array(gravity.beta), np.array(gravity.covariance), sigma, config, *position)
+
+    def handle(self, t: float, position: Array, torque: Array) -> list[Event]:
         """Take one sample: readings (n,) in SI units, NaN where missing; returns what there is to say, if anything."""
-        row = self._rest.handle(t, position, velocity, torque)
+        row = self._rest.handle(t, position, torque)
         return [] if row is None else self.handle_row(row)
 
     def handle_row(self, row: Row) -> list[Event]:
@@ -94,6 +110,9 @@ class Observer:
         self.rows += 1
         angle = self._position_gain * row.position + self._position_offset
         row = replace(row, position=angle)
+        if row.noise is not None:
+            weight = 1 / min(self.rows + self.config.noise_rows, self.config.noise_memory)
+            self.sigma = np.sqrt((1 - weight) * self.sigma**2 + weight * row.noise**2)
         events = [] if self.held else self._watch(row)
         if events:
             self._start_test()

@@ -13,20 +13,24 @@ class ObserverConfig:
     """Thresholds of rest detection, filter, alarm, cause test and decision (theory.md section 6)."""
 
     # rest detection: one row per stop
-    still_band: float = 2e-3
-    """The arm rests while no joint leaves this band [rad]: 0.02 N·m at a stiffness of 10 N·m/rad."""
-    still_velocity: float = 0.05
-    """…and none is faster [rad/s]: √(ε/M̄), ε = 0.02 N·m against M̄ = 8 kg·m², and above encoder velocity noise."""
-    settle_time: float = 0.2
-    """Rest before averaging begins [s]: several periods of servo and sensor filter."""
-    average_time: float = 0.2
-    """Averaging [s]: 50 samples at 250 Hz take sensor noise down seven times."""
+    still_band: float = 4e-3
+    """The arm rests while no joint leaves this band [rad]: over a rest that is 0.01 rad/s on average, and room for a
+    servo that hunts against friction; its jerks average out, since they begin and end at rest."""
+    settle_time: float = 0.1
+    """Rest before averaging begins [s]: several periods of the torque sensor's filter."""
+    average_time: float = 0.3
+    """Averaging [s]: 75 samples at 250 Hz take sensor noise down nine times."""
     gap_time: float = 0.05
     """A rest with readings missing for longer starts again [s]: 12 cycles at 250 Hz."""
-    steady_ratio: float = 6.0
-    """Halves of the average may differ by so many standard errors; more is contact or ringing, not rest."""
     new_pose: float = 0.05
     """A stop counts as another one when some joint has moved so far [rad]: a long rest is one row."""
+
+    noise_share: float = 1e-3
+    """Standard deviation of one row assumed at first, as a share of rated torque: half a sample's noise of 0.2 %."""
+    noise_rows: float = 20.0
+    """Rows that the standard deviation given at the start counts for; since then the halves of each average tell it."""
+    noise_memory: float = 200.0
+    """Rows that it is averaged over."""
 
     # per-joint filter
     drift_gain: float = 1e-4

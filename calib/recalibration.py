@@ -21,12 +21,12 @@ SAME_REAL32 = 1e-6
 class Controllers(Protocol):
     """What recalibration needs of the link (`armlink.link.Link`)."""
 
-    def read_calibration(self, j: int) -> Calibration:
+    def read_calibration(self, joint: int) -> Calibration:
         """Active gain and offset [N·m] of joint j."""
         ...
 
-    def write_calibration(self, j: int, gain: float, offset: float, record_id: int) -> Calibration:
-        """Stage, read back and make active gain and offset [N·m] of joint j; raises BusFault."""
+    def write_calibration(self, joint: int, gain: float, offset: float, record_id: int) -> Calibration:
+        """Stage, read back and make active gain and offset [N·m] of a joint; raises BusFault."""
         ...
 
 

@@ -20,29 +20,30 @@ class Row:
     """Mean torque reading (n,) [N·m]."""
     direction: Array
     """Sign of each joint's last motion (n,): +1, -1, or 0 where it has not moved yet."""
+    noise: Array | None = None
+    """Half the difference of the average's two halves (n,) [N·m]: as large as the average's own error."""
 
 
 class RestDetector:
-    """Averages position and torque over each rest. A rest is told by position alone where velocity is missing."""
+    """Averages position and torque over each rest, which position alone tells: velocity from an encoder is coarse."""
 
     def __init__(self, n: int, config: ObserverConfig) -> None:
         """n joints."""
         self._config = config
         self._anchor = np.full(n, np.nan)
-        self._since = self._last = -np.inf
+        self._since, self._last = -np.inf, -np.inf
         self._left = np.full(n, np.nan)
         self._direction = np.zeros(n)
         self._samples: list[tuple[float, Array, Array]] = []
         self._done = False
 
-    def handle(self, t: float, position: Array, velocity: Array | None, torque: Array) -> Row | None:
+    def handle(self, t: float, position: Array, torque: Array) -> Row | None:
         """Take one sample (SI, (n,) each, NaN where missing); the row of this rest once it is complete, else None."""
         config = self._config
         if np.isnan(position).any() or np.isnan(torque).any():
             return None
         moved = not np.abs(position - self._anchor).max() <= config.still_band
-        fast = velocity is not None and bool((np.abs(velocity) > config.still_velocity).any())
-        if moved or fast or t - self._last > config.gap_time:
+        if moved or t - self._last > config.gap_time:
             self._restart(t, position, moved=moved)
         self._last = t
         if self._done or t - self._since < config.settle_time:
@@ -61,15 +62,11 @@ class RestDetector:
         away = np.abs(position - self._left).max()
         self._done = self._done and bool(away < self._config.new_pose)
 
-    def _complete(self) -> Row | None:
+    def _complete(self) -> Row:
         times, positions, torques = (np.array(column) for column in zip(*self._samples, strict=True))
         self._samples.clear()
         half = len(times) // 2
-        first, second = torques[:half], torques[half:]
-        scatter = np.sqrt((first.var(axis=0) + second.var(axis=0)) / max(half, 1))
-        limit = self._config.steady_ratio * scatter + 1e-3 * np.abs(torques).mean(axis=0) + 1e-3
-        if (np.abs(second.mean(axis=0) - first.mean(axis=0)) > limit).any():
-            return None  # not steady yet: average anew
+        noise = (torques[:half].mean(axis=0) - torques[half:].mean(axis=0)) / 2
         here: Array = positions.mean(axis=0)
         self._left, self._done = here, True
-        return Row(float(times.mean()), here, torques.mean(axis=0), self._direction)
+        return Row(float(times.mean()), here, torques.mean(axis=0), self._direction, noise)

@@ -57,7 +57,7 @@ def watch(
         sample = link.cycle(Command.hold(target))
         end = sample.t + seconds if end is None else end
         rows = observer.rows
-        events = observer.handle(sample.t, sample.position, sample.velocity, sample.torque)
+        events = observer.handle(sample.t, sample.position, sample.torque)
         for event in events:
             history.events.append(event)
             if event.finding is not None and recalibrator is not None:
