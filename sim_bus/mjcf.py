@@ -11,7 +11,8 @@ from armlink.errors import BadInput
 from sim_bus.section import LinkBody, SimSection, sim_section
 
 STOP_IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)
-FRICTION_IMPEDANCE = (0.999, 0.9999, 0.001, 0.5, 2.0)
+FRICTION_IMPEDANCE = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+"""So close to 1 that what rests under stiction creeps by some µrad/s at most."""
 TINY_INERTIA = 1e-9
 
 
@@ -94,7 +95,8 @@ def _set_options(spec: Any, arm: ArmFile, section: SimSection) -> None:
     option.timestep = section.step
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    option.iterations, option.ls_iterations = 20, 20
+    option.iterations, option.ls_iterations = 50, 50
+    option.tolerance, option.ls_tolerance = 1e-12, 1e-6  # looser ones let stiction chatter
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     spec.compiler.balanceinertia = False
 

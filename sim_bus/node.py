@@ -77,8 +77,6 @@ class Node:
             return bytes(self._signals[index, sub][self.place].tobytes())
         if index == 0x2100:
             return self.record.read(sub)
-        if index == 0x1001:
-            return bytes([1 if self.errors else 0])
         if index == 0x1003:
             return self._error_history(sub)
         return self._values[index, sub]
@@ -201,6 +199,7 @@ class Node:
             self.errors.append(code)
         else:
             self.errors.clear()
+        self._signals[0x1001, 0][self.place] = register
         self._outbox((0x80 + self.node_id, struct.pack("<HB5s", code, register, manufacturer)))
 
 

@@ -153,6 +153,7 @@ class Plant:
         """Close or open the holding brakes; they act before the torque sensor, as friction does."""
         self._braked = np.array(closed, bool)
         self._set_friction()
+        mujoco.mj_forward(self.model, self.data)
 
     def step(self, start: Array, end: Array, duration: float) -> None:
         """Run for `duration` [s] while the motors' `drive` torque goes linearly from `start` to `end`."""
