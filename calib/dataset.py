@@ -14,12 +14,11 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from armlink.armfile import ArmFile, describe
+from armlink.armfile import ArmFile, describe, load_arm
 from armlink.errors import BadInput, Refused
 from calib.plan_model import SweepPlan
 
 Array = npt.NDArray[np.float64]
-SCHEMA = "armlink.sweep/1"
 MANIFEST, LINES = "manifest.json", "readings.jsonl"
 
 
@@ -30,10 +29,12 @@ class _Model(BaseModel):
 class Manifest(_Model):
     """Whose data this is, and with what load it was taken."""
 
-    schema_: Literal["armlink.sweep/1"] = Field(default=SCHEMA, alias="schema")
+    schema_: Literal["armlink.sweep/1"] = Field(default="armlink.sweep/1", alias="schema")
     arm: str
     serial: str
     description_hash: str
+    arm_file: str
+    """Path of the arm file that it was made with."""
     names: tuple[str, ...]
     reference_mass: float
     """Reference mass attached during this pass [kg]; 0 for none."""
@@ -54,6 +55,7 @@ class Manifest(_Model):
             arm=arm.name,
             serial=arm.serial,
             description_hash=arm.description_hash,
+            arm_file=str(arm.path),
             names=arm.joint_names,
             reference_mass=reference_mass,
             rated_torque=tuple(joint.rated_torque for joint in arm.require_link().joints),
@@ -137,6 +139,14 @@ class SweepData:
             if ours != wanted:
                 raise Refused(f"{self.path}: {what} is {ours}, but {wanted} is wanted: swept on something else")
         return self
+
+    def load_arm(self, override: str | None = None) -> ArmFile:
+        """The arm file that it was made with, or the one given instead; raises BadInput, Refused on another arm."""
+        path = Path(self.manifest.arm_file)
+        found = override or (str(path) if path.is_file() else self.manifest.arm)
+        arm = load_arm(found)
+        self.require(arm)
+        return arm
 
     def array(self, name: str) -> Array:
         """One field of all readings, (K,) or (K, n), as numbers."""

@@ -1,4 +1,4 @@
-"""Choice of stop combinations: the D-optimal design of the whole sensor and gravity fit (theory.md sections 2, 4, 7)."""
+"""Choice of stop combinations: the D-optimal design of the whole sensor and gravity fit (theory.md 2, 4, 7)."""
 
 from dataclasses import dataclass
 from itertools import product
@@ -118,7 +118,8 @@ def _information(arm: Arm, candidates: Candidates, beta: Array, sigma: Array, ma
         jacobian[..., 5 * n :] = load * regressor @ by_point
         parts.append(jacobian / sigma[i])
     both = np.concatenate(parts, axis=1)
-    return np.einsum("csp,csq->cpq", both, both, optimize=True)
+    information: Array = np.einsum("csp,csq->cpq", both, both, optimize=True)
+    return information
 
 
 def _prior(arm: Arm, beta: Array, sigma: Array) -> Array:

@@ -85,4 +85,5 @@ def fit_rows(data: Sequence[SweepData]) -> FitRows:
 def _raw(data: SweepData) -> Array:
     """Torque readings (K, n) as the sensor gives them, the controllers' own calibration taken out [N·m]."""
     gain, offset = np.array(data.manifest.installed_gain), np.array(data.manifest.installed_offset)
-    return data.array("torque") * gain + offset
+    raw: Array = data.array("torque") * gain + offset
+    return raw

@@ -28,18 +28,21 @@ class GravityGuess:
 
     def torque(self, q: Array) -> Array:
         """Holding torque (…, n) [N·m] at poses q (…, n) [rad]."""
-        return gravity_regressor(self.arm, q) @ self.beta
+        torque: Array = gravity_regressor(self.arm, q) @ self.beta
+        return torque
 
     def uncertainty(self, q: Array) -> Array:
         """Bound of the model's error (…, n) [N·m] at poses q (…, n) [rad]."""
         regressor = gravity_regressor(self.arm, q)
         variance = np.einsum("...ip,pq,...iq->...i", regressor, self.covariance, regressor, optimize=True)
-        return SIGMAS * np.sqrt(np.maximum(variance, 0.0))
+        bound: Array = SIGMAS * np.sqrt(np.maximum(variance, 0.0))
+        return bound
 
     def inertia(self) -> Array:
         """Rough upper size (n,) [kg·m²] of each joint's inertia: composite mass moment times reach."""
         moment = np.linalg.norm(self.beta.reshape(-1, 2), axis=1)[::-1].cumsum()[::-1]
-        return moment * reach(self.arm)
+        size: Array = moment * reach(self.arm)
+        return size
 
 
 def reach(arm: Arm, hand: float = 0.15) -> Array:

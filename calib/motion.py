@@ -24,9 +24,9 @@ def trajectory(start: Array, goal: Array, speed: Array, acceleration: Array, per
     ramp = min(top / gain, float(np.sqrt(1 / gain)))
     total = ramp + 1 / (gain * ramp)
     count = max(int(np.ceil(total / period)), 2)
-    t = np.arange(1, count + 1) * (total / count)
+    t: Array = np.arange(1, count + 1, dtype=np.float64) * (total / count)
     s = _trapezoid(t, total, ramp)
-    width = max(int(round(ROUNDING / period)), 1)
+    width = max(round(ROUNDING / period), 1)
     padded = np.concatenate([np.zeros(width - 1), s, np.ones(width - 1)])
     smooth = np.convolve(padded, np.full(width, 1 / width), mode="valid")
     smooth[-1] = 1.0

@@ -1,4 +1,4 @@
-"""Moves the arm through the link: coordinated travel, creeping onto stops, pressing, resting until a reading is exact."""
+"""Moves the arm through the link: travel, creeping onto stops, pressing, resting until a reading is exact."""
 
 from dataclasses import dataclass
 

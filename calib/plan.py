@@ -85,12 +85,10 @@ def scout_poses(described: Arm, section: SweepSection, limits: Limits, seed: int
         score[chosen] = -np.inf
         chosen.append(int(np.argmax(score)))
         total = total + information[chosen[-1]]
-    return tuple(tuple(pose.tolist()) for pose in _short_way(poses[chosen], ends.mean(axis=1)))
+    return tuple(tuple(pose.tolist()) for pose in short_way(poses[chosen], ends.mean(axis=1)))
 
 
-def hold_torque(
-    guess: GravityGuess, section: SweepSection, limits: Limits, poses: Array
-) -> tuple[Array, Array, Array]:
+def hold_torque(guess: GravityGuess, section: SweepSection, limits: Limits, poses: Array) -> tuple[Array, Array, Array]:
     """(Least, largest, allowance) holding torque (C, n) [N·m] along candidate sweeps with poses (C, S, n).
 
     The allowance covers the rough model's error, the torque scale and friction, but not the margin.
@@ -150,7 +148,8 @@ def _pressable(guess: GravityGuess, section: SweepSection, limits: Limits, candi
 def _reaction(guess: GravityGuess, joint: int) -> Array:
     """Bound of the torque (n,) [N·m] that 1 rad/s² of the swept joint makes at every joint: √(M_ii M_jj)."""
     inertia = guess.inertia()
-    return np.sqrt(inertia * inertia[joint])
+    bound: Array = np.sqrt(inertia * inertia[joint])
+    return bound
 
 
 def _sweep(
@@ -178,7 +177,7 @@ def _sweep(
     return Sweep(
         name=f"{name}.{number}",
         joint=joint,
-        stops=tuple(int(side) for side in stops),
+        stops=tuple(-1 if side < 0 else 1 if side > 0 else 0 for side in stops),
         rest=tuple(rest.tolist()),
         steps=tuple(steps.tolist()),
         lever=float(options.lever[pick]),
@@ -225,7 +224,7 @@ def _require_range(section: SweepSection, limits: Limits, described: Arm) -> Non
             )
 
 
-def _short_way(poses: Array, begin: Array) -> Array:
+def short_way(poses: Array, begin: Array) -> Array:
     """The same poses, each followed by the nearest that is left."""
     left, way = list(range(len(poses))), []
     here = begin

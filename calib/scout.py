@@ -21,9 +21,7 @@ SCOUT_ACCELERATION = 1.0
 """Nothing is known of the arm's weight yet [rad/s²]."""
 
 
-def run_scout(
-    mover: Mover, plan: SweepPlan, done: Collection[int], save: Callable[[Reading], None]
-) -> None:
+def run_scout(mover: Mover, plan: SweepPlan, done: Collection[int], save: Callable[[Reading], None]) -> None:
     """Read every scout pose that is not `done`, each passed to `save`; a pose that the drives cannot reach is left out.
 
     Raises Refused where too few poses were reached to know the arm's weight.
@@ -46,9 +44,9 @@ def run_scout(
         last = mover.position.copy()
         save(as_reading(rest, SCOUT, index, None, 0, everything))
     if len(plan.scout) - len(unreached) < 4:
-        stall = unreached[0]
+        first = unreached[0]
         raise Refused(
-            f"{mover.link.names[stall.joint]}: stopped at {stall.position:.3f} rad on the way to {stall.target:.3f}:"
+            f"{mover.link.names[first.joint]}: stopped at {first.position:.3f} rad on the way to {first.target:.3f}:"
             " its drive is too weak there, or something is in the way"
         )
 

@@ -18,8 +18,14 @@ from gcomp.parameters import Prior
 from gcomp.readings import Readings
 
 Array = npt.NDArray[np.float64]
-NOISE_ROUNDS = 2
-"""Rounds in which each joint's noise is raised to the scatter that is really there."""
+NOISE_ROUNDS = 3
+"""Rounds in which each joint's noise is brought to the scatter that is really there."""
+LEAST_FACTOR = 0.3
+"""Readings are never taken to scatter less than this share of what their samples' noise explains."""
+FEWEST = 10
+"""Free readings of a joint from which its scatter is judged."""
+WORDY = 6
+"""Parameters that a reason names one by one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +36,7 @@ class SensorFit:
     fit: GlobalFit
     rows: FitRows
     noise_factor: Array
-    """Factor (n,) by which readings scatter more than the samples' noise explains; 1 where they do not."""
+    """Scatter of the readings over what their samples' noise explains (n,)."""
     hysteresis: Array
     """Half the mean difference between readings approached upwards and downwards (n,) [N·m]."""
     quantile: float
@@ -62,7 +68,8 @@ class SensorFit:
     @property
     def residual_rms(self) -> Array:
         """RMS of each joint's torque residual over the readings that count (n,) [N·m]."""
-        return np.sqrt(np.nanmean(self.fit.residual**2, axis=0))
+        rms: Array = np.sqrt(np.nanmean(self.fit.residual**2, axis=0))
+        return rms
 
     def record(self, arm: ArmFile) -> CalibrationRecord:
         """The calibration record of this fit."""
@@ -128,24 +135,19 @@ def _fit(arm: ArmFile, rows: FitRows, **extra: Prior) -> tuple[GlobalFit, Array]
     readings, factor = rows.readings, np.ones(described.n)
     for _ in range(NOISE_ROUNDS):
         scaled = Readings(readings.position, readings.torque, readings.sigma * factor, readings.load)
-        fit = identify_global(
-            described, scaled, unknown=unknown, priors=priors, position_sigma=rows.position_sigma
-        )
-        excess = _excess(fit, scaled, rows.position_sigma)
-        if np.all(excess <= 1.0):
-            break
-        factor = factor * np.maximum(excess, 1.0)
+        fit = identify_global(described, scaled, unknown=unknown, priors=priors, position_sigma=rows.position_sigma)
+        factor = np.maximum(factor * _scatter(fit, scaled), LEAST_FACTOR)
     return fit, factor
 
 
-def _excess(fit: GlobalFit, readings: Readings, position_sigma: Array) -> Array:
-    """Scatter over expected noise (n,) where it is significantly more, else 1."""
+def _scatter(fit: GlobalFit, readings: Readings) -> Array:
+    """Scatter of each joint's residuals over what was expected of them (n,); 1 for a joint with too few readings."""
     counted = readings.counted
-    share = 1 - (counted.sum() - fit.dof) / max(int(counted.sum()), 1)
+    free = max(fit.dof, 1) / max(int(counted.sum()), 1)  # share of the readings that the parameters leave free
     score = np.where(counted, fit.residual / readings.sigma, 0.0)
-    dof = np.maximum(counted.sum(axis=0) * max(share, 0.1), 1.0)
-    ratio = (score**2).sum(axis=0) / dof
-    return np.where(ratio > 1 + 2 * np.sqrt(2 / dof), np.sqrt(ratio), 1.0)
+    dof = counted.sum(axis=0) * free
+    ratio = (score**2).sum(axis=0) / np.maximum(dof, 1.0)
+    return np.where(dof >= FEWEST, np.sqrt(ratio), 1.0)
 
 
 def _hysteresis(fit: GlobalFit, rows: FitRows) -> Array:
@@ -180,6 +182,9 @@ def _reason(name: str, fit: GlobalFit, rows: FitRows) -> str:
         if name in sentence:
             if "common factor" in sentence and not any(rows.masses):
                 return "no readings with a reference mass: only ratios of gains are determined"
+            others = sentence.count(",")
+            if others > WORDY:
+                return f"it can change together with {others} other parameters without changing any reading"
             return sentence
     return "the readings do not determine it"
 

@@ -32,10 +32,10 @@ class SettleRule:
     @classmethod
     def of(cls, section: SweepSection, rated: Array, period: float) -> "SettleRule":
         """From the sweep section, for a cycle `period` [s]."""
-        window = max(int(round(section.settle_window / period)), 8)
+        window = max(round(section.settle_window / period), 8)
         return cls(
             window=window,
-            timeout=int(round(section.settle_timeout / period)),
+            timeout=round(section.settle_timeout / period),
             max_samples=max(section.max_samples, window),
             span=section.settle_velocity * window * period / 2,
             scatter=section.settle_scatter,

@@ -1,0 +1,94 @@
+"""Torque and position sensor gains and offsets from sweeps; writes a calibration record."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from armlink.armfile import ArmFile
+    from calib.records import CalibrationRecord, Parameter
+    from calib.sensors import SensorFit
+
+
+def calibrate(
+    directories: Annotated[list[Path], typer.Argument(help="Data sets of armlink sweep, without and with load.")],
+    arm: Annotated[str | None, typer.Option(help="Arm file, where it is no longer where the sweep had it.")] = None,
+    apply: Annotated[bool, typer.Option("--apply", help="Also write gains and offsets to the controllers.")] = False,
+    bus: Annotated[str | None, typer.Option(help="With --apply: INTERFACE:CHANNEL[@BITRATE].")] = None,
+    store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")
+    ] = None,
+) -> None:
+    """Fit every sensor to sweeps, all directories in one problem, and keep the result as a calibration record.
+
+    Example: armlink calibrate unloaded loaded --json calibration.json
+    """
+    from armlink.commands.output import write_json
+    from armlink.errors import BadInput
+    from calib.dataset import load_data
+    from calib.sensors import fit_sensors
+    from calib.store import RecordStore
+
+    if not directories:
+        raise BadInput("calibrate: give the directories that armlink sweep wrote")
+    data = [load_data(path) for path in directories]
+    arm_file = data[0].load_arm(arm)
+    fit = fit_sensors(arm_file, data)
+    record = fit.record(arm_file)
+    _show(fit)
+    records = RecordStore(store)
+    records.put(record, arm_file, by="armlink calibrate", reason="sweeps")
+    if apply:
+        _apply(arm_file, record, bus)
+    write_json(json_file, _answer(fit, record, apply))
+
+
+def _answer(fit: "SensorFit", record: "CalibrationRecord", applied: bool) -> dict[str, Any]:
+    from calib.records import PARAMETERS
+
+    return {
+        "schema": "armlink.calibration/1",
+        "record": record.id,
+        "applied": applied,
+        "joints": list(fit.names),
+        **{name: {"estimated": fit.value(name).tolist(), "ci95": fit.ci95(name).tolist()} for name in PARAMETERS},
+        "not_identifiable": [
+            {"joint": joint, "parameter": parameter, "reason": reason}
+            for (joint, parameter), reason in fit.reasons.items()
+        ],
+        "gain_ratio": None if fit.gain_ratio is None else fit.gain_ratio.tolist(),
+        "residual_rms": fit.residual_rms.tolist(),
+        "hysteresis": fit.hysteresis.tolist(),
+        "chi2": fit.fit.chi2,
+        "dof": fit.fit.dof,
+    }
+
+
+def _show(fit: "SensorFit") -> None:
+    from calib.commands.screen import print_intervals, print_lines
+
+    headings: dict[Parameter, str] = {"gain": "gain", "offset": "offset [N·m]", "position_gain": "position gain"}
+    columns = {heading: (fit.value(name), fit.quantile * fit.std(name)) for name, heading in headings.items()}
+    print_intervals("Sensors, ± half of the 95 % interval", fit.names, columns)
+    lines = [f"{joint} {parameter}: {reason}" for (joint, parameter), reason in fit.reasons.items()]
+    if fit.gain_ratio is not None:
+        ratios = ", ".join(f"{name} {ratio:.4f}" for name, ratio in zip(fit.names, fit.gain_ratio, strict=True))
+        lines.append(f"gains as multiples of the last joint's: {ratios}")
+    print_lines(lines)
+
+
+def _apply(arm_file: "ArmFile", record: "CalibrationRecord", bus: str | None) -> None:
+    """Write every gain and offset that is known to its controller, read back; the joints need not be enabled."""
+    from armlink.errors import Refused
+    from armlink.link import Link
+
+    known = [joint for joint in record.joints if joint.gain is not None and joint.offset is not None]
+    if not known:
+        raise Refused("--apply: no joint has both a gain and an offset, so nothing is written")
+    with Link.open(arm_file, bus) as link:
+        link.start()
+        for index, joint in enumerate(record.joints):
+            if joint.gain is not None and joint.offset is not None:
+                link.write_calibration(index, joint.gain, joint.offset, record.number, int(record.created.timestamp()))

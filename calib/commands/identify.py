@@ -1,0 +1,86 @@
+"""Gravity parameters from sweeps, recursive from tip to base and then global; writes a gravity record."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from calib.identify import GravityFit
+
+
+def identify(
+    directories: Annotated[list[Path], typer.Argument(help="Data sets of armlink sweep, without and with load.")],
+    arm: Annotated[str | None, typer.Option(help="Arm file, where it is no longer where the sweep had it.")] = None,
+    calibration: Annotated[
+        str | None, typer.Option(help="Id of the calibration record to use; default: fitted from the same sweeps.")
+    ] = None,
+    store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")
+    ] = None,
+) -> None:
+    """Find the mass moments that gravity compensation needs and keep them as a gravity record.
+
+    Example: armlink identify unloaded loaded --json gravity.json
+    """
+    from armlink.commands.output import write_json
+    from armlink.errors import BadInput
+    from calib.dataset import load_data
+    from calib.identify import identify_gravity
+    from calib.records import CalibrationRecord
+    from calib.sensors import SensorFit, fit_sensors
+    from calib.store import RecordStore
+
+    if not directories:
+        raise BadInput("identify: give the directories that armlink sweep wrote")
+    data = [load_data(path) for path in directories]
+    arm_file = data[0].load_arm(arm)
+    records = RecordStore(store)
+    sensors: SensorFit | CalibrationRecord
+    if calibration is None:
+        sensors = fit_sensors(arm_file, data)
+        used: CalibrationRecord | None = records.current(CalibrationRecord, arm_file)
+    else:
+        kept = records.get(calibration)
+        if not isinstance(kept, CalibrationRecord):
+            raise BadInput(f"--calibration {calibration}: that is a {kept.kind} record, expected a calibration record")
+        sensors = used = kept
+    fit = identify_gravity(arm_file, data, sensors)
+    record = fit.record(arm_file, used)
+    records.put(record, arm_file, by="armlink identify", reason="sweeps")
+    _show(fit)
+    write_json(json_file, _answer(fit, record.id))
+
+
+def _answer(fit: "GravityFit", record: str) -> dict[str, Any]:
+    return {
+        "schema": "armlink.gravity/1",
+        "record": record,
+        "joints": list(fit.names),
+        "beta": fit.beta.tolist(),
+        "std": fit.std.tolist(),
+        "identifiable": fit.identifiable.tolist(),
+        "recursive": None if fit.recursive is None else fit.recursive.beta.tolist(),
+        "residual_rms": fit.residual_rms.tolist(),
+    }
+
+
+def _show(fit: "GravityFit") -> None:
+    import numpy as np
+
+    from calib.commands.screen import print_intervals
+
+    recursive = np.full(len(fit.beta), np.nan) if fit.recursive is None else fit.recursive.beta
+    beta, half = np.where(fit.identifiable, fit.beta, np.nan), 1.96 * fit.std
+    print_intervals(
+        "Mass moments [kg·m], ± half of the 95 % interval",
+        fit.names,
+        {
+            "x": (beta[0::2], half[0::2]),
+            "y": (beta[1::2], half[1::2]),
+            "x, recursive": (recursive[0::2], 0 * half[0::2]),
+            "y, recursive": (recursive[1::2], 0 * half[1::2]),
+            "residual [N·m]": (fit.residual_rms, 0 * fit.residual_rms),
+        },
+    )

@@ -1,0 +1,93 @@
+"""What the sweep commands show to people: progress with time left, plans and results as tables on standard error."""
+
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.table import Table
+
+from armlink.armfile import ArmFile
+from calib.plan_model import SweepPlan
+
+_CONSOLE = Console(stderr=True)
+
+
+class SweepScreen:
+    """A progress bar with readings done, time left and what is being done; a context manager."""
+
+    def __init__(self, title: str) -> None:
+        """With `title` before the bar."""
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+            TextColumn("{task.fields[left]} left  {task.fields[text]}"),
+        )
+        self._progress = Progress(*columns, console=_CONSOLE, transient=False)
+        self._task = self._progress.add_task(title, total=1, left="?", text="connecting")
+
+    def update(self, done: int, total: int, seconds_left: float, text: str) -> None:
+        """As run_sweep's progress."""
+        left = f"{int(seconds_left) // 60}:{int(seconds_left) % 60:02d}"
+        self._progress.update(self._task, completed=done, total=total, left=left, text=text)
+
+    def count(self, done: int, total: int) -> None:
+        """As run_verify's progress."""
+        self._progress.update(self._task, completed=done, total=total, left="", text="poses")
+
+    def say(self, text: str) -> None:
+        """One line below the bar."""
+        _CONSOLE.print(text, highlight=False)
+
+    def __enter__(self) -> Self:
+        """Show the bar."""
+        self._progress.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        """Leave it as it stands."""
+        self._progress.stop()
+
+
+def print_plan(arm: ArmFile, plan: SweepPlan) -> None:
+    """The sweeps of a plan as a table: where each joint rests, what presses it, range and lever of gravity."""
+    table = Table("sweep", "from … to [rad]", "Γ/g", *arm.joint_names, title=f"{arm.name}: {len(plan.sweeps)} sweeps")
+    for sweep in plan.sweeps:
+        cells = []
+        for joint in range(len(arm.joint_names)):
+            if joint == sweep.joint:
+                cells.append("sweeps")
+            elif sweep.servo[joint]:
+                cells.append(f"servo {sweep.rest[joint]:.2f}")
+            else:
+                end = "upper" if sweep.stops[joint] > 0 else "lower"
+                cells.append(end if sweep.bias is None else f"{end} {sweep.bias[joint]:+.1f}")
+        table.add_row(sweep.name, f"{sweep.steps[0]:.2f} … {sweep.steps[-1]:.2f}", f"{sweep.lever:.2f}", *cells)
+    _CONSOLE.print(table)
+    if plan.sweeps[0].bias is None:
+        _CONSOLE.print("Bias torques [N·m] are set by the scout, which weighs the arm first.", highlight=False)
+    _CONSOLE.print(f"{plan.readings} readings; reference mass {plan.reference_mass:g} kg", highlight=False)
+    for note in plan.notes:
+        _CONSOLE.print(f"[yellow]{note}[/yellow]", highlight=False)
+
+
+def print_intervals(title: str, names: tuple[str, ...], columns: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:
+    """Values with the half width of their 95 % interval, a row a joint; `columns` maps heading to (value, half)."""
+    table = Table("joint", *columns, title=title)
+    for joint, name in enumerate(names):
+        table.add_row(name, *(_interval(value[joint], half[joint]) for value, half in columns.values()))
+    _CONSOLE.print(table)
+
+
+def print_lines(lines: list[str]) -> None:
+    """Plain lines."""
+    for line in lines:
+        _CONSOLE.print(line, highlight=False)
+
+
+def _interval(value: float, half: float) -> str:
+    if np.isnan(value):
+        return "not observable"
+    return f"{value:.4f} ± {half:.4f}" if half > 0 else f"{value:.4f}"

@@ -1,0 +1,92 @@
+"""Model torque against sensor torque at poses that were not used for the fit (the paper's Figure 6)."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from calib.records import CalibrationRecord, GravityRecord
+    from calib.verify import Verification
+
+
+def verify(
+    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
+    bus: Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")] = None,
+    record: Annotated[
+        list[str] | None, typer.Option(help="Id of a gravity or calibration record; default: the current ones.")
+    ] = None,
+    store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
+    poses: Annotated[int, typer.Option(min=1, help="Poses to drive to.")] = 24,
+    seed: Annotated[int, typer.Option(min=0, help="Draws other poses.")] = 0,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")
+    ] = None,
+) -> int:
+    """Drive to random poses and compare; exit status 1 where a joint's RMS exceeds its tolerance.
+
+    Example: armlink verify sarcos --bus socketcan:vcan0 --poses 40 --json -
+    """
+    from armlink.armfile import load_arm
+    from armlink.commands.output import write_json
+    from armlink.link import Link
+    from calib.commands.screen import SweepScreen
+    from calib.store import RecordStore
+    from calib.verify import run_verify
+
+    arm_file = load_arm(arm)
+    gravity, calibration = _records(RecordStore(store), arm_file, record or [])
+    with SweepScreen(f"{arm_file.name}: verify") as screen, Link.open(arm_file, bus) as link:
+        link.start()
+        link.enable()
+        result = run_verify(link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=screen.count)
+    _show(result)
+    write_json(json_file, _answer(result, gravity, calibration))
+    return 0 if result.passed else 1
+
+
+def _records(store: Any, arm_file: Any, ids: list[str]) -> "tuple[GravityRecord, CalibrationRecord | None]":
+    """The records named, else the current ones; raises Refused where there is no gravity record."""
+    from armlink.errors import Refused
+    from calib.records import CalibrationRecord, GravityRecord
+
+    named = [store.get(record).require(arm_file) for record in ids]
+    gravity = next((each for each in named if isinstance(each, GravityRecord)), None)
+    calibration = next((each for each in named if isinstance(each, CalibrationRecord)), None)
+    gravity = gravity or store.current(GravityRecord, arm_file)
+    if gravity is None:
+        raise Refused(f"{arm_file.name} {arm_file.serial}: no gravity record yet: armlink identify makes one")
+    return gravity, calibration or store.current(CalibrationRecord, arm_file)
+
+
+def _answer(
+    result: "Verification", gravity: "GravityRecord", calibration: "CalibrationRecord | None"
+) -> dict[str, Any]:
+    return {
+        "schema": "armlink.verify/1",
+        "gravity_record": gravity.id,
+        "calibration_record": None if calibration is None else calibration.id,
+        "joints": list(result.names),
+        "position": result.position.tolist(),
+        "sensor": result.sensor.tolist(),
+        "model": result.model.tolist(),
+        "model_std": result.model_std.tolist(),
+        "rms": result.rms.tolist(),
+        "max_error": result.max_error.tolist(),
+        "tolerance": result.tolerance.tolist(),
+        "skipped": result.skipped,
+        "passed": result.passed,
+    }
+
+
+def _show(result: "Verification") -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    title = f"Model against sensor at {len(result.sensor)} poses [N·m]"
+    table = Table("joint", "RMS", "largest", "allowed RMS", title=title)
+    for joint, name in enumerate(result.names):
+        table.add_row(
+            name, f"{result.rms[joint]:.3f}", f"{result.max_error[joint]:.3f}", f"{result.tolerance[joint]:.3f}"
+        )
+    Console(stderr=True).print(table)
