@@ -4,7 +4,7 @@ Pure: samples in, events out; no bus, clock, file or thread. Readings are those 
 every estimate is relative to it: reading = gain·τ + offset with gain 1 and offset 0 while nothing has drifted.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,37 +13,13 @@ from calib.belief import ModelBelief
 from calib.causes import CauseTest, Verdict, Window
 from calib.cusum import Cusum
 from calib.decision import Finding, agreed, decide
+from calib.events import Estimate, Event
 from calib.observer_config import ObserverConfig
 from calib.places import Places
 from calib.records import Array, CalibrationRecord, GravityRecord
 from calib.rest import RestDetector, Row
 from calib.sensor_filter import SensorFilter
 from gcomp.arm import Arm
-
-
-@dataclass(frozen=True)
-class Event:
-    """Something that the observer has to say. `kind`: alarm, outliers, verdict, proposal or undecided."""
-
-    t: float
-    kind: str
-    joint: str | None
-    evidence: dict[str, Any] = field(default_factory=dict)
-    finding: Finding | None = None
-    """What to write, for a proposal."""
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """Gain and offset of every joint against the installed calibration, with standard deviations; (n,) each."""
-
-    gain: Array
-    gain_std: Array
-    offset: Array
-    """[N·m]"""
-    offset_std: Array
-    accepted: Array
-    """Rows that went into each."""
 
 
 class Observer:
@@ -80,8 +56,9 @@ class Observer:
         self._window: list[Row] = []
         self._fresh = self._repeated = 0
         self._doubtful = False
-        self._first: tuple[list[Row], CauseTest, int] | None = None
+        self._first: _Agreeing | None = None
         self._said: tuple[str, int | None] | None = None
+        self._reasons: tuple[str, ...] = ()
         self._learnt = 0
         self._proposed = np.full(arm.n, -np.inf)
 
@@ -186,32 +163,35 @@ class Observer:
         if not verdict.is_drift:
             self._first = None
             return self._say(t, verdict)
-        assert verdict.joint is not None
-        first, self._first = self._first, (window, test, verdict.joint)
-        events = self._say(t, verdict)
-        change, covariance = test.drift(verdict.joint, verdict.cause)
-        self._filter.restart(verdict.joint, 1 + change[0], change[1], covariance)
-        if first is None or first[2] != verdict.joint:
-            return events
-        if not agreed(first[1], test, verdict.joint, self.config.agreement):
-            return [
-                *events,
-                self._event(t, "undecided", verdict.joint, reasons=["two windows disagree: still drifting"]),
-            ]
-        return events + self._decide(t, first[0] + window, verdict.joint)
+        return self._say(t, verdict) + self._confirm(t, window, test, verdict)
 
-    def _decide(self, t: float, rows: list[Row], joint: int) -> list[Event]:
-        """Two windows agree: the estimate from both together, as proposal or with what forbids it."""
-        test = self._cause_test(rows)
+    def _confirm(self, t: float, window: list[Row], test: CauseTest, verdict: Verdict) -> list[Event]:
+        """A window says drift of a joint: once another one before it agrees, decide on the rows of all that agree."""
+        joint = verdict.joint
+        assert joint is not None
+        first, self._first = self._first, _Agreeing(window, test, joint)
+        change, covariance = test.drift(joint, verdict.cause)
+        self._filter.restart(joint, 1 + change[0], change[1], covariance)
+        if first is None or first.joint != joint:
+            return []
+        if not agreed(first.test, test, joint, self.config.agreement):
+            return self._undecided(t, joint, "two windows disagree: still drifting")
+        rows = (first.rows + window)[-self.config.longest_window :]
+        together = self._cause_test(rows)
+        self._first = _Agreeing(rows, together, joint)
+        return self._decide(t, together, joint)
+
+    def _decide(self, t: float, test: CauseTest, joint: int) -> list[Event]:
+        """The estimate from all rows that agree, as a proposal or with what forbids it."""
         verdict = test.verdict()
         if not verdict.is_drift or verdict.joint != joint:
-            return [self._event(t, "undecided", joint, reasons=["both windows together say something else"])]
+            return self._undecided(t, joint, "all windows together say something else")
         finding = decide(test, verdict, self.config)
-        self._filter.restart(joint, finding.gain, finding.offset, test.drift(joint, finding.cause)[1])
+        self._filter.restart(joint, finding.gain, finding.offset, finding.covariance)
+        if finding.refused:
+            return self._undecided(t, joint, *finding.refused)
         if t - self._proposed[joint] < self.config.rest_between_writes:
             return []
-        if finding.refused:
-            return [self._event(t, "undecided", joint, reasons=list(finding.refused))]
         self._proposed[joint] = t
         std = dict(zip(("gain_std", "offset_std"), finding.std, strict=True))
         evidence = {"gain": finding.gain, "offset": finding.offset, **std, "rows": finding.rows}
@@ -230,7 +210,7 @@ class Observer:
         self._cusum.reset()
 
     def _clear(self) -> None:
-        self._said, self._first, self._doubtful = None, None, False
+        self._said, self._first, self._doubtful, self._reasons = None, None, False, ()
         self._window, self._fresh, self._repeated = [], 0, 0
 
     def _is_new(self, row: Row) -> bool:
@@ -244,9 +224,12 @@ class Observer:
         if self._repeated < self.config.patience:
             return []
         self._clear()
-        return [
-            self._event(t, "undecided", None, reasons=["too few different poses to tell a cause: sweep, or move more"])
-        ]
+        return self._undecided(t, None, "too few different poses to tell a cause: sweep, or move more")
+
+    def _undecided(self, t: float, joint: int | None, *reasons: str) -> list[Event]:
+        """Why nothing is proposed, once as long as it stays the same."""
+        before, self._reasons = self._reasons, reasons
+        return [] if before == reasons else [self._event(t, "undecided", joint, reasons=list(reasons))]
 
     def _say(self, t: float, verdict: Verdict) -> list[Event]:
         """The verdict's event, once as long as it stays the same."""
@@ -261,6 +244,15 @@ class Observer:
 
     def _event(self, t: float, kind: str, joint: int | None, **evidence: Any) -> Event:
         return Event(t, kind, None if joint is None else self.arm.names[joint], evidence)
+
+
+@dataclass(frozen=True)
+class _Agreeing:
+    """Rows that agree on a drift of one joint."""
+
+    rows: list[Row]
+    test: CauseTest
+    joint: int
 
 
 def _window(rows: list[Row]) -> Window:

@@ -27,7 +27,7 @@ class ObserverConfig:
 
     noise_share: float = 1e-3
     """Standard deviation of one row assumed at first, as a share of rated torque: half a sample's noise of 0.2 %."""
-    noise_rows: float = 20.0
+    noise_rows: float = 5.0
     """Rows that the standard deviation given at the start counts for; since then the halves of each average tell it."""
     noise_memory: float = 200.0
     """Rows that it is averaged over."""

@@ -6,7 +6,8 @@ from typing import Protocol
 
 from armlink.errors import Refused
 from armlink.sample import Command, Sample
-from calib.observer import Event, Observer
+from calib.events import Event
+from calib.observer import Observer
 from calib.recalibration import Recalibration, Recalibrator
 from calib.records import Array
 
