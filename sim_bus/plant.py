@@ -14,6 +14,7 @@ from armlink.armfile import ArmFile
 from sim_bus.effects.state import Imperfections
 from sim_bus.inertials import Inertials
 from sim_bus.mjcf import build_model
+from sim_bus.motors import LateMotors
 from sim_bus.section import sim_section
 
 Array = NDArray[np.float64]
@@ -30,7 +31,7 @@ class Plant:
         built = build_model(arm)
         self.model, self.n = built.model, len(built.bodies)
         self.data = mujoco.MjData(self.model)
-        joints = [self.model.joint(name).id for name in arm.joint_names]
+        self._joints = joints = [self.model.joint(name).id for name in arm.joint_names]
         self._qpos: NDArray[np.intp] | slice = self.model.jnt_qposadr[joints]
         self._dof: NDArray[np.intp] | slice = self.model.jnt_dofadr[joints]
         data = self.data
@@ -69,8 +70,13 @@ class Plant:
         self.model.dof_armature[self._dof] = self._rotor_inertia
         self.model.dof_damping[self._dof] = self._viscous
         self.model.opt.gravity[:] = _tilt(imperfections.tilt).T @ self._gravity
-        self.model.jnt_stiffness[:] = 0.0
+        self.model.jnt_stiffness[self._joints] = imperfections.spring[:, 0]
+        self.model.qpos_spring[self._qpos] = imperfections.spring[:, 1]
         self._inertials.apply(self._imperfections, self._attached)
+        self._steady_friction = imperfections.steady_friction
+        self._motors = None if imperfections.prompt_motors else LateMotors(imperfections, self.motor_torque)
+        self._plain = self._steady_friction and self._motors is None
+        self.data.qfrc_applied[:] = 0.0
         self._set_friction()
         self.set_servo(*self._servo)
         mujoco.mj_forward(self.model, self.data)
@@ -135,19 +141,22 @@ class Plant:
         torque: Array = self._motor_torques[dof] - self._viscous * self._velocities[dof]
         if self._has_rotors:
             torque -= self._rotor_inertia * self._accelerations[dof]
+        if self._motors is not None:
+            torque += data.qfrc_applied[dof]
         torque[self._friction_rows()] += data.efc_force[data.ne : data.ne + data.nf]
         return torque
 
     def set_servo(self, stiffness: Array, damping: Array, limit: Array) -> None:
         """Motor torque = clamp(drive − stiffness·q − damping·q̇, ±limit), at every step of the physics."""
-        self._servo = (stiffness, damping, limit)
-        gain = self._imperfections.actuator_gain
-        limit = gain * np.minimum(limit, self._imperfections.actuator_saturation)
-        self.model.actuator_biasprm[:, 1] = -gain * stiffness
-        self.model.actuator_biasprm[:, 2] = -gain * damping
-        self.model.actuator_gainprm[:, 0] = gain
-        self.model.actuator_forcerange[:, 0] = -limit
-        self.model.actuator_forcerange[:, 1] = limit
+        self._servo, state = (stiffness, damping, limit), self._imperfections
+        gain, model = state.actuator_gain, self.model
+        limit = gain * np.minimum(limit, state.actuator_saturation)
+        fed_back = gain if self._motors is None else np.zeros(self.n)
+        model.actuator_gainprm[:, 0] = gain
+        model.actuator_biasprm[:, 1] = -fed_back * stiffness
+        model.actuator_biasprm[:, 2] = -fed_back * damping
+        model.actuator_forcerange[:, 0] = -limit
+        model.actuator_forcerange[:, 1] = limit
 
     def set_brakes(self, closed: NDArray[np.bool_]) -> None:
         """Close or open the holding brakes; they act before the torque sensor, as friction does."""
@@ -160,18 +169,27 @@ class Plant:
         count = max(1, int(np.ceil(duration / self.step_time - 1e-9)))
         model, data = self.model, self.data
         model.opt.timestep = duration / count
-        if start is end and self._imperfections.static:
+        if start is end and self._plain:
             data.ctrl[:] = end
             mujoco.mj_step(model, data, count)
             return
         slope = (end - start) / count
         level = start + 0.5 * slope
         for _ in range(count):
-            data.ctrl[:] = level
-            if not self._imperfections.static:
+            data.ctrl[:] = level if self._motors is None else self._asked(level, duration / count)
+            if not self._steady_friction:
                 self._set_friction()
             mujoco.mj_step(model, data)
             level = level + slope
+
+    def _asked(self, level: Array, duration: float) -> Array:
+        """What late motors make of the drive's torque; the ripple is taken off on the way to the link."""
+        assert self._motors is not None
+        stiffness, damping, limit = self._servo
+        wanted = level - stiffness * self.position - damping * self.velocity
+        amplitude, cycles, phase = self._imperfections.ripple.T
+        self.data.qfrc_applied[self._dof] = -amplitude * np.sin(cycles * self.position + phase)
+        return self._motors.torque(np.clip(wanted, -limit, limit), duration)
 
     # ---- inside
 
@@ -179,7 +197,7 @@ class Plant:
         """Level of dry friction at the present velocity and load, or the brake's."""
         state = self._imperfections
         level = state.coulomb
-        if not state.static:
+        if not state.steady_friction:
             velocity, load = self.velocity, self.link_torque
             level = level + state.breakaway * np.exp(-((velocity / state.stribeck_velocity) ** 2))
             level = level + state.load_friction * np.abs(load)

@@ -10,15 +10,11 @@ def sim(
     bus: Annotated[str, typer.Option(help="INTERFACE:CHANNEL[@BITRATE]; default the arm file's.")] = "",
     effect: Annotated[
         list[str] | None,
-        typer.Option(
-            help="ID:JOINT:VALUE[,VALUE…] or ID:JOINT:NAME=VALUE[,…]; ID::VALUE for all."
-        ),
+        typer.Option(help="ID:JOINT:VALUE[,VALUE…] or ID:JOINT:NAME=VALUE[,…]; ID::VALUE for all."),
     ] = None,
     drift: Annotated[
         list[str] | None,
-        typer.Option(
-            help="JOINT:GAIN:OFFSET@T: at T s the torque sensor changes, by a factor and by N·m."
-        ),
+        typer.Option(help="JOINT:GAIN:OFFSET@T: at T s the torque sensor changes, by a factor and by N·m."),
     ] = None,
     seed: Annotated[
         int | None, typer.Option(help="Draw the sensors' truth from this seed; default is what the arm file states.")

@@ -44,12 +44,6 @@ class Imperfections:
     """Amplitude, cycles per rad, phase (n, 3)."""
     spring: Array = field(init=False)
     """Stiffness [N·m/rad] and rest angle [rad] (n, 2)."""
-    elasticity: Array = field(init=False)
-    """Stiffness of the transmission [N·m/rad]; 0 is rigid."""
-    backlash: Array = field(init=False)
-    """Play of the transmission [rad]."""
-    coupling: Array = field(init=False)
-    """Rad of motor i per rad of joint j (n, n)."""
     rotor_inertia: Array = field(init=False)
     """At the joint [kg·m²]."""
     actuator_gain: Array = field(init=False)
@@ -92,7 +86,7 @@ class Imperfections:
         """Start from a perfect arm."""
         n = len(self.names)
         square, pair = (n, n), (n, 2)
-        shapes: dict[str, tuple[int, ...]] = {"ripple": (n, 3), "spring": pair, "coupling": square, "tilt": (2,)}
+        shapes: dict[str, tuple[int, ...]] = {"ripple": (n, 3), "spring": pair, "tilt": (2,)}
         shapes |= {"crosstalk": square, "eccentricity": pair, "mass_moment": (n, 3), "inertia": (n, 6), "payload": (4,)}
         initial = {"stribeck_velocity": 0.01, "actuator_gain": 1.0, "torque_gain": 1.0, "position_gain": 1.0}
         initial |= {"actuator_saturation": np.inf, "torque_saturation": np.inf}
@@ -101,9 +95,14 @@ class Imperfections:
                 setattr(self, item.name, np.full(shapes.get(item.name, (n,)), initial.get(item.name, 0.0)))
 
     @property
-    def static(self) -> bool:
+    def steady_friction(self) -> bool:
         """Whether friction keeps one level whatever the velocity, direction and load."""
         return not (self.breakaway.any() or self.asymmetry.any() or self.load_friction.any())
+
+    @property
+    def prompt_motors(self) -> bool:
+        """Whether motors make at once, and pass on whole, the torque that is asked for."""
+        return not (self.actuator_lag.any() or self.actuator_delay.any() or self.ripple[:, 0].any())
 
 
 def imperfections(names: Sequence[str], entries: Iterable[Entry]) -> Imperfections:

@@ -1,12 +1,13 @@
 """The plant's gravity against Pinocchio and against the published arm's numbers."""
 
+from pathlib import Path
+
 import numpy as np
 import pinocchio as pin
 import pytest
 from rig import Rig, one_joint
 
 from armlink.armfile import ArmFile, load_arm, parse_arm
-from pathlib import Path
 from sim_bus.effects.state import imperfections
 from sim_bus.plant import Plant
 from sim_bus.section import EffectEntry, sim_section
@@ -111,6 +112,4 @@ def test_moved_masses_payload_and_tilt_change_gravity_as_they_should() -> None:
 def test_an_arm_at_rest_on_its_brakes_reads_its_gravity() -> None:
     rig = Rig("sarcos")
     rig.arm.advance(0.5)
-    np.testing.assert_allclose(
-        rig.arm.plant.link_torque, rig.arm.gravity_torque(rig.arm.plant.position)[0], atol=0.02
-    )
+    np.testing.assert_allclose(rig.arm.plant.link_torque, rig.arm.gravity_torque(rig.arm.plant.position)[0], atol=0.02)

@@ -1,0 +1,38 @@
+"""Motors that make their torque late: a pure delay, then a lag of first order."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_bus.effects.state import Imperfections
+
+Array = NDArray[np.float64]
+
+
+class LateMotors:
+    """Torques asked for in, torques made out, step by step; arrays (n,)."""
+
+    def __init__(self, imperfections: Imperfections, torque: Array) -> None:
+        """Motors that make `torque` now [N·m]."""
+        self._lag, self._delay = imperfections.actuator_lag, imperfections.actuator_delay
+        self._made = torque / imperfections.actuator_gain
+        self._time = 0.0
+        self._asked: list[tuple[float, Array]] = [(0.0, self._made)]
+
+    def torque(self, asked: Array, duration: float) -> Array:
+        """The torque made during the next `duration` [s], `asked` being asked for from now on."""
+        due = self._delayed(asked)
+        with np.errstate(divide="ignore"):
+            share = np.where(self._lag > 0, 1.0 - np.exp(-duration / self._lag), 1.0)
+        self._made = self._made + share * (due - self._made)
+        self._time += duration
+        return self._made
+
+    def _delayed(self, asked: Array) -> Array:
+        """What was asked for `delay` ago, held between steps."""
+        self._asked.append((self._time, asked))
+        oldest = self._time - self._delay.max()
+        while len(self._asked) > 1 and self._asked[1][0] <= oldest + 1e-12:
+            del self._asked[0]
+        times = np.array([time for time, _ in self._asked])
+        places = np.searchsorted(times, self._time - self._delay + 1e-9, side="right") - 1
+        return np.array([self._asked[max(place, 0)][1][joint] for joint, place in enumerate(places)])
