@@ -44,12 +44,13 @@ def sweep(
         return
     if out is None:
         raise BadInput("sweep: give --out DIR for the data set, or --plan to print the plan alone")
-    with SweepScreen(f"{arm_file.name}, {reference_mass:g} kg attached") as screen, Link.open(arm_file, bus) as link:
+    with Link.open(arm_file, bus) as link:
         link.start()
-        link.enable()
-        data = run_sweep(
-            link, arm_file, out, reference_mass=reference_mass, resume=resume, progress=screen.update, seed=seed
-        )
+        with SweepScreen(f"{arm_file.name}, {reference_mass:g} kg attached") as screen:
+            link.enable()
+            data = run_sweep(
+                link, arm_file, out, reference_mass=reference_mass, resume=resume, progress=screen.update, seed=seed
+            )
     assert data.plan is not None
     print_plan(arm_file, data.plan)
     if not reference_mass:

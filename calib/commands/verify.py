@@ -35,11 +35,12 @@ def verify(
     from calib.verify import run_verify
 
     arm_file = load_arm(arm)
-    gravity, calibration = _records(RecordStore(store), arm_file, record or [])
-    with SweepScreen(f"{arm_file.name}: verify") as screen, Link.open(arm_file, bus) as link:
+    with Link.open(arm_file, bus) as link:
+        gravity, calibration = _records(RecordStore(store), arm_file, record or [])
         link.start()
-        link.enable()
-        result = run_verify(link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=screen.count)
+        with SweepScreen(f"{arm_file.name}: verify") as screen:
+            link.enable()
+            result = run_verify(link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=screen.count)
     _show(result)
     write_json(json_file, _answer(result, gravity, calibration))
     return 0 if result.passed else 1
