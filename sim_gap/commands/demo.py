@@ -9,7 +9,9 @@ import typer
 def demo(
     arm: Annotated[str, typer.Option(help="Bundled arm's name or path of an arm file with a sim section.")] = "sarcos",
     seed: Annotated[int, typer.Option(min=0, help="Draws another hidden truth.")] = 0,
-    out: Annotated[Path, typer.Option(help="Folder for report.html, summary.json and the data.")] = Path("armlink-demo"),
+    out: Annotated[Path, typer.Option(help="Folder for report.html, summary.json and the data.")] = Path(
+        "armlink-demo"
+    ),
     json: Annotated[Path | None, typer.Option(help="Also write the summary here; - is standard output.")] = None,
 ) -> None:
     """Run the whole job on a simulated arm on an in-process CAN bus and write report.html and summary.json.
@@ -18,6 +20,6 @@ def demo(
     """
     from rich.console import Console
 
-    from sim_gap.demo import run_demo
+    from sim_gap.demo.run import run_demo
 
     run_demo(arm, seed=seed, out=out, json_path=json, console=Console(stderr=True))

@@ -1,0 +1,72 @@
+"""The demo's bench: a simulated arm with a hidden truth, the link to it, and the operator's hands."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from armlink.armfile import ArmFile
+from armlink.link import Link
+from calib.records import CalibrationRecord
+from gcomp.arm import Arm
+from gcomp.gravity import gravity_torque
+from sim_bus.bus import LockStepBus
+from sim_bus.simulated_arm import SimulatedArm
+from sim_bus.truth import Truth
+
+Array = npt.NDArray[np.float64]
+GRAVITY_POSES = 500
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """What stands on the bench. Only `link` may be used to find anything out; the rest is for checking afterwards."""
+
+    arm: ArmFile
+    described: Arm
+    truth: Truth
+    simulated: SimulatedArm
+    link: Link
+
+    @classmethod
+    def build(cls, arm: ArmFile, described: Arm, seed: int) -> "Bench":
+        """A simulated arm with the truth of `seed` on an in-process bus; raises BadInput."""
+        truth = Truth.draw(arm, seed)
+        simulated = SimulatedArm(arm, truth, seed)
+        return cls(arm, described, truth, simulated, Link(arm, LockStepBus(arm=simulated)))
+
+    def random_poses(self, count: int, seed: int) -> Array:
+        """True joint angles (count, n) within the stops [rad]."""
+        low, high = self.described.lower, self.described.upper
+        return np.random.default_rng(seed).uniform(low, high, (count, self.described.n))
+
+    def sensor_error(self, joint: int) -> tuple[float, float]:
+        """(Gain error, offset error [N·m]) of what a joint's controller sends now, against the truth."""
+        held, true = self.link.read_calibration(joint), self.simulated.true_sensors
+        return (
+            float(true.gain[joint]) / held.gain - 1.0,
+            (float(true.offset[joint]) - held.offset) / held.gain,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class GravityCheck:
+    """The identified model against the plant's own gravity torque at random poses, (n,) [N·m]."""
+
+    poses: int
+    max_torque: Array
+    rms_error: Array
+    max_abs_error: Array
+
+
+def check_gravity(bench: Bench, beta: Array, record: CalibrationRecord, seed: int) -> GravityCheck:
+    """Compare at random true poses; the model is asked at the angles that the calibrated position sensors report."""
+    angles = bench.random_poses(GRAVITY_POSES, seed)
+    truth = bench.truth
+    reading = (angles - truth.position_offset) / truth.position_gain
+    reported = record.values("position_gain", missing=1.0) * reading + record.values("position_offset", missing=0.0)
+    true = bench.simulated.gravity_torque(angles)
+    error = gravity_torque(bench.described, beta, reported) - true
+    return GravityCheck(
+        len(angles), np.abs(true).max(axis=0), np.sqrt((error**2).mean(axis=0)), np.abs(error).max(axis=0)
+    )

@@ -1,0 +1,144 @@
+"""The demo's drift: a torque sensor changes while the arm works, the observer finds it and recalibrates by itself."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from armlink.sample import Sample
+from calib.observer import Observer
+from calib.recalibration import Recalibrator
+from calib.records import CalibrationRecord, GravityRecord
+from calib.sensors import SensorFit
+from calib.store import RecordStore
+from calib.verify import Verification
+from calib.watch import WatchHistory, watch
+from calib.work import work_targets
+from sim_gap.demo.bench import Bench
+from sim_gap.demo.narrator import Report
+
+Array = npt.NDArray[np.float64]
+
+GAIN, OFFSET = 1.03, 0.3
+OFFSET_SHARE = 0.05
+"""The offset drift is no more than this share of rated torque."""
+QUIET_SECONDS = 30.0
+"""Ordinary work before the drift begins [s]."""
+SECONDS = 300.0
+"""Ordinary work at most [s]."""
+SETTLED_SECONDS = 40.0
+"""Ordinary work watched after a recalibration [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """What happened."""
+
+    joint: int
+    gain: float
+    offset: float
+    """[N·m]."""
+    began: float
+    """Link time at which the sensor changed [s]."""
+    detected: float | None
+    recalibrated: float | None
+    """Link times [s]; None where it did not happen."""
+    error_before: tuple[float, float]
+    """(Gain, offset [N·m]) error of the joint's readings right after the drift."""
+    error_after: tuple[float, float]
+    """The same at the end."""
+    history: WatchHistory
+
+
+def run_drift(
+    bench: Bench,
+    store: RecordStore,
+    fit: SensorFit,
+    gravity: GravityRecord,
+    check: Verification,
+    seed: int,
+    report: Report,
+) -> Drift:
+    """Let the arm work, change one sensor, and watch until the observer has put it right or the time is over."""
+    link, described = bench.link, bench.described
+    calibration = store.current(CalibrationRecord, bench.arm)
+    assert calibration is not None
+    observer = _observer(bench, fit, gravity, calibration)
+    recalibrator = Recalibrator(bench.arm, link, store, "apply")
+    limits = bench.arm.require_link().joints
+    joint = drifting_joint(fit, check, np.array([each.rated_torque for each in limits]))
+    offset = min(OFFSET, OFFSET_SHARE * limits[joint].rated_torque)
+    speed = np.array([each.max_velocity for each in limits])
+    state = _Course(report, bench, joint, offset)
+    history = watch(
+        link,
+        observer,
+        work_targets(
+            link.position_sent, described.lower, described.upper, speed, link.period, np.random.default_rng([seed, 8])
+        ),
+        SECONDS,
+        recalibrator,
+        state,
+    )
+    name = link.names[joint]
+    return Drift(
+        joint,
+        GAIN,
+        offset,
+        state.began,
+        _first(history, name, ("alarm", "outliers"), state.began),
+        next((t for t, outcome in history.recalibrations if outcome.joint == name and outcome.applied), None),
+        state.error_before,
+        bench.sensor_error(joint),
+        history,
+    )
+
+
+def drifting_joint(fit: SensorFit, check: Verification, rated: Array) -> int:
+    """The third joint, if gravity moves its torque as well as any other's; else the one that it moves most."""
+    spread = np.where(np.isnan(fit.value("gain")), 0.0, check.model.std(axis=0)) / rated
+    third = min(2, len(spread) - 1)
+    return third if spread[third] >= 0.3 * spread.max() else int(np.argmax(spread))
+
+
+class _Course:
+    """Called with every sample: makes the sensor drift when its time has come, and ends the watch."""
+
+    def __init__(self, report: Report, bench: Bench, joint: int, offset: float) -> None:
+        self._report, self._bench, self._joint, self._offset = report, bench, joint, offset
+        self._start: float | None = None
+        self.began = np.inf
+        self.error_before = (0.0, 0.0)
+
+    def __call__(self, sample: Sample, history: WatchHistory) -> bool:
+        if self._start is None:
+            self._start = sample.t
+        if self.began == np.inf and sample.t - self._start >= QUIET_SECONDS:
+            self.began = sample.t
+            self._bench.simulated.drift(self._joint, GAIN, self._offset)
+            self.error_before = self._bench.sensor_error(self._joint)
+        written = [t for t, outcome in history.recalibrations if outcome.applied]
+        if int(sample.t * 10) % 10 == 0:
+            doing = (
+                "the arm works" if self.began == np.inf else "the sensor has drifted" if not written else "put right"
+            )
+            self._report(sample.t - self._start, SECONDS, None, doing)
+        return bool(written) and sample.t - written[-1] >= SETTLED_SECONDS
+
+
+def _observer(bench: Bench, fit: SensorFit, gravity: GravityRecord, calibration: CalibrationRecord) -> Observer:
+    """An observer with the records just made; a reading at rest is as exact as some forty samples."""
+    sigma = fit.rows.noise * fit.noise_factor / np.sqrt(40.0)
+    return Observer(
+        bench.described,
+        np.array(gravity.beta),
+        np.array(gravity.covariance),
+        sigma,
+        position_gain=calibration.values("position_gain", 1.0),
+        position_offset=calibration.values("position_offset", 0.0),
+    )
+
+
+def _first(history: WatchHistory, joint: str, kinds: tuple[str, ...], after: float) -> float | None:
+    found = [t for kind in kinds if (t := history.first(kind, joint, after)) is not None]
+    return min(found, default=None)

@@ -1,0 +1,166 @@
+"""Runs the demo: sweep, calibrate, identify, verify, record, drift and recalibrate, diagnose, report."""
+
+import json
+import shutil
+import sys
+from concurrent.futures import Future, ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+from rich.console import Console
+
+from armlink.armfile import ArmFile, load_arm
+from armlink.errors import BadInput
+from armlink.recording import Recording, save_recording
+from calib.dataset import SweepData
+from calib.description import gcomp_arm
+from calib.identify import identify_gravity
+from calib.recalibration import write_record
+from calib.records import CalibrationRecord
+from calib.runner import run_sweep
+from calib.sensors import fit_sensors
+from calib.store import RecordStore
+from calib.verify import run_verify
+from sim_gap.demo.bench import Bench, check_gravity
+from sim_gap.demo.drift import run_drift
+from sim_gap.demo.motion import multisine, record_motion, travel
+from sim_gap.demo.narrator import Narrator, Report
+from sim_gap.demo.report import write_report
+from sim_gap.demo.show import calibration_table, drift_line, gap_line, verify_table
+from sim_gap.demo.summary import DemoResult, summary
+from sim_gap.diagnose import diagnose
+from sim_gap.diagnosis import Diagnosis
+from sim_gap.from_arm import nominal_model
+
+TRAIN_SECONDS, HELDOUT_SECONDS = 40.0, 25.0
+"""Length of the gap's recordings [s]."""
+BY = "armlink demo"
+
+
+def run_demo(arm_name: str, *, seed: int, out: Path, json_path: Path | None, console: Console) -> DemoResult:
+    """Run it, write `report.html`, `summary.json` and the data into `out`; raises BadInput, Refused, BusFault."""
+    arm = load_arm(arm_name)
+    arm.require_link()
+    data_folder = _fresh(out)
+    teller = Narrator(console)
+    teller.say(f"arm [bold]{arm.name}[/bold], hidden truth of seed {seed}, results in {out}")
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as other_core:
+        bench = Bench.build(arm, gcomp_arm(arm), seed)
+        store = RecordStore(str(data_folder / "records.sqlite"))
+        with bench.link:
+            result = _work(bench, store, arm, seed, data_folder, teller, other_core)
+        store.close()
+    write_report(result, out / "report.html")
+    text = json.dumps(summary(result), indent=1, ensure_ascii=False) + "\n"
+    (out / "summary.json").write_text(text, encoding="utf-8")
+    if json_path is not None:
+        sys.stdout.write(text) if str(json_path) == "-" else json_path.write_text(text, encoding="utf-8")
+    teller.say(f"done: open [bold]{out / 'report.html'}[/bold]; numbers in {out / 'summary.json'}")
+    return result
+
+
+def _work(
+    bench: Bench,
+    store: RecordStore,
+    arm: ArmFile,
+    seed: int,
+    folder: Path,
+    teller: Narrator,
+    other_core: ProcessPoolExecutor,
+) -> DemoResult:
+    link = bench.link
+    link.start()
+    link.enable()
+    teller.say(f"{link.n} nodes found on the bus, mapped and enabled; SYNC at {link.rate:g} Hz")
+    data = _sweeps(bench, folder, seed, teller)
+    with teller.stage("fitting sensors and mass moments, all joints together"):
+        sensors = fit_sensors(arm, data)
+    gravity = identify_gravity(arm, data, sensors)
+    record, gravity_record = sensors.record(arm), None
+    store.put(record, arm, by=BY, reason="sweeps without and with reference mass")
+    gravity_record = gravity.record(arm, record)
+    store.put(gravity_record, arm, by=BY, reason="sweeps")
+    written = write_record(record, link)
+    teller.show(calibration_table(bench, sensors))
+    teller.say(f"record {record.id} written to {len(written)} controllers and read back")
+    with teller.stage("verifying at poses that the fit has not seen") as report:
+        check = run_verify(link, arm, gravity_record, seed=seed, progress=lambda k, n: report(k, n, None, f"pose {k}"))
+    gravity_check = check_gravity(bench, gravity.beta, record, seed)
+    teller.show(verify_table(link.names, check, gravity_check))
+    with teller.stage("recording motion for the gap diagnosis") as report:
+        recordings = _record(bench, record, folder, seed, report)
+    diagnosis = other_core.submit(_diagnose, arm.path, recordings)
+    with teller.stage("ordinary work: a torque sensor will drift") as report:
+        drift = run_drift(bench, store, sensors, gravity_record, check, seed, report)
+    teller.say(drift_line(link.names, drift))
+    with teller.stage("diagnosing the gap between the recording and the nominal simulation"):
+        answer = _await(diagnosis)
+    teller.say(gap_line(answer))
+    stats = link.stats
+    link.disable()
+    return DemoResult(
+        arm.name,
+        seed,
+        link.names,
+        bench.truth,
+        data,
+        sensors,
+        gravity,
+        gravity_check,
+        check,
+        drift,
+        answer,
+        stats,
+        teller.elapsed,
+        bench.simulated.time,
+    )
+
+
+def _sweeps(bench: Bench, folder: Path, seed: int, teller: Narrator) -> tuple[SweepData, SweepData]:
+    """Both passes; between them the operator bolts the reference mass on, somewhere the fit is not told."""
+    with teller.stage("sweeping each joint, tip to base, the others pressed on their stops") as report:
+        bare = run_sweep(bench.link, bench.arm, folder / "unloaded", progress=report, seed=seed)
+    assert bare.plan is not None
+    mass = bare.plan.reference_mass
+    bench.simulated.attach_mass(mass)
+    with teller.stage(f"sweeping again with a reference mass of {mass:g} kg on the hand") as report:
+        loaded = run_sweep(bench.link, bench.arm, folder / "loaded", reference_mass=mass, progress=report, seed=seed)
+    bench.simulated.detach_mass()
+    return bare, loaded
+
+
+def _record(
+    bench: Bench, calibration: CalibrationRecord, folder: Path, seed: int, report: Report
+) -> tuple[Recording, Recording]:
+    """Two different motions, kept as MCAP too."""
+    found = []
+    for number, (name, seconds) in enumerate((("train", TRAIN_SECONDS), ("heldout", HELDOUT_SECONDS))):
+        targets = multisine(bench, seconds, seed=1000 * (seed + 1) + number)
+        travel(bench, bench.link.position_sent, targets[0])
+        found.append(record_motion(bench, targets, calibration, report, name))
+        save_recording(found[-1], folder / f"{name}.mcap")
+    return found[0], found[1]
+
+
+def _diagnose(arm_path: Path, recordings: tuple[Recording, Recording]) -> Diagnosis:
+    """In the other process: the recordings against the arm's nominal model."""
+    return diagnose(nominal_model(arm_path), recordings[:1], recordings[1:], labels=["train", "heldout"])
+
+
+def _await(diagnosis: Future[Diagnosis]) -> Diagnosis:
+    return diagnosis.result()
+
+
+def _fresh(out: Path) -> Path:
+    """The folder for the data, empty; an earlier demo's is replaced, anything else is not touched."""
+    data = out / "data"
+    if data.exists():
+        if not (data / ".armlink-demo").exists():
+            raise BadInput(f"{data}: exists and is not an earlier demo's: choose another folder with --out")
+        shutil.rmtree(data)
+    try:
+        data.mkdir(parents=True)
+        (data / ".armlink-demo").touch()
+    except OSError as error:
+        raise BadInput(f"{out}: cannot be written: {error.strerror}") from None
+    return data
