@@ -1,5 +1,6 @@
 """An in-process CAN bus with the simulated arm on it: SYNC advances the physics by one period, nothing ever sleeps."""
 
+from threading import RLock
 from typing import Any
 
 import can
@@ -14,9 +15,9 @@ SYNC_ID = 0x80
 class SimulatedClock:
     """The simulated arm's time as a clock; sleeping lets the arm run."""
 
-    def __init__(self, arm: SimulatedArm) -> None:
-        """The clock of `arm`."""
-        self._arm = arm
+    def __init__(self, arm: SimulatedArm, lock: RLock) -> None:
+        """The clock of `arm`, which `lock` guards."""
+        self._arm, self._lock = arm, lock
 
     def now(self) -> float:
         """Simulated seconds since power-on."""
@@ -24,8 +25,9 @@ class SimulatedClock:
 
     def sleep_until(self, instant: float) -> None:
         """Let simulated time pass until `instant` [s]; at once where it is past."""
-        if instant > self._arm.time + 1e-9:
-            self._arm.advance(instant - self._arm.time)
+        with self._lock:
+            if instant > self._arm.time + 1e-9:
+                self._arm.advance(instant - self._arm.time)
 
 
 class LockStepBus(can.BusABC):  # type: ignore[misc]
@@ -41,7 +43,8 @@ class LockStepBus(can.BusABC):  # type: ignore[misc]
             described = load_arm(str(channel))
             arm = SimulatedArm(described, Truth.of(described), seed)
         self.arm = arm
-        self.clock = SimulatedClock(arm)
+        self._lock = RLock()
+        self.clock = SimulatedClock(arm, self._lock)
         self.channel_info = f"simulated arm {arm.arm.name}"
         self._outbox = arm.outbox
         super().__init__(channel=channel, **kwargs)
@@ -53,17 +56,23 @@ class LockStepBus(can.BusABC):  # type: ignore[misc]
     def put(self, can_id: int, data: bytes) -> None:
         """As send, without a message object."""
         arm = self.arm
-        arm.on_frame(can_id, data)
-        if can_id == SYNC_ID:
-            arm.advance(arm.period)
+        with self._lock:
+            arm.on_frame(can_id, data)
+            if can_id == SYNC_ID:
+                arm.advance(arm.period)
 
     def take(self, timeout: float = 0.0) -> tuple[int, bytes] | None:
         """As recv, without a message object."""
         if not self._outbox and timeout > 0:
-            deadline = self.arm.time + timeout
-            while not self._outbox and self.arm.time < deadline - 1e-9:
-                self.arm.advance(min(self.arm.period, deadline - self.arm.time))
+            self._wait(timeout)
         return self._outbox.popleft() if self._outbox else None
+
+    def _wait(self, timeout: float) -> None:
+        """Let time pass until a frame comes; another thread may send meanwhile, as python-can's Notifier has it."""
+        deadline = self.arm.time + timeout
+        while not self._outbox and self.arm.time < deadline - 1e-9:
+            with self._lock:
+                self.arm.advance(min(self.arm.period, deadline - self.arm.time))
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """The next frame that a node sent, or None."""

@@ -99,6 +99,7 @@ def _set_options(spec: Any, arm: ArmFile, section: SimSection) -> None:
     option.tolerance, option.ls_tolerance = 1e-12, 1e-6  # looser ones let stiction chatter
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     spec.compiler.balanceinertia = False
+    spec.compiler.fusestatic = False
 
 
 def _set_joint(joint: Any, section: SimSection) -> None:
