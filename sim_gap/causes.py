@@ -1,6 +1,7 @@
-"""From fitted terms to causes: one entry an effect, ordered by what each brings on motion not fitted, with confidence."""
+"""From fitted terms to causes: one entry an effect, ordered by what each brings on motion not fitted."""
 
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,9 +9,8 @@ import numpy as np
 from sim_gap.confound import Rivals
 from sim_gap.diagnosis import Cause
 from sim_gap.effects.registry import Row
-from sim_gap.estimate import Estimate
+from sim_gap.estimate import Estimate, Value
 from sim_gap.normal import ColumnStore, Normal, Term
-from sim_gap.regime import by_joint
 from sim_gap.residual import ResidualSet
 from sim_gap.rigid import Array
 
@@ -34,7 +34,7 @@ def ordered(estimate: Estimate, heldout: ResidualSet) -> list[Step]:
     """Effects in the order in which each, added to those before it, lowers the held-out RMS of some joint most."""
     groups: dict[str, list[Term]] = defaultdict(list)
     for term in estimate.terms:
-        groups[term.effect].append(term)
+        groups[_belongs(term, estimate.terms, heldout.layout.n - 1)].append(term)
     scorer = _Scorer(estimate, heldout)
     chosen: list[Term] = []
     before, steps = scorer.rms([]), []
@@ -45,6 +45,13 @@ def ordered(estimate: Estimate, heldout: ResidualSet) -> list[Step]:
         chosen += steps[-1].terms
         before = outcomes[effect]
     return steps
+
+
+def _belongs(term: Term, terms: Sequence[Term], tip: int) -> str:
+    """The effect that a term counts to: where there is a payload, its inertia is the payload's."""
+    loaded = any(other.effect == "link.payload" for other in terms)
+    inertia_of_payload = loaded and term.effect == "link.inertia" and term.place == tip
+    return "link.payload" if inertia_of_payload else term.effect
 
 
 class _Scorer:
@@ -68,14 +75,13 @@ def causes(estimate: Estimate, heldout: ResidualSet, rivals: Rivals, names: tupl
     out = []
     for step in ordered(estimate, heldout):
         places = sorted({term.place for term in step.terms})
-        whole = len(step.terms) == 1 and rivals.whole_arm(step.effect)
+        whole = rivals.whole_arm(step.effect)
         joints = names if whole else tuple(names[place] for place in places)
         touched = np.arange(len(names)) if whole else np.array(places)
         verdict = rivals.weigh(step.effect, step.terms)
-        parameters = {
-            ("arm" if whole else names[term.place]): estimate.parameters(term)
-            for term in sorted(step.terms, key=lambda t: t.place)
-        }
+        parameters: dict[str, dict[str, Value]] = {}
+        for term in sorted(step.terms, key=lambda t: t.place):
+            parameters.setdefault("arm" if whole else names[term.place], {}).update(estimate.parameters(term))
         out.append(
             Cause(
                 effect=step.effect,
@@ -95,6 +101,3 @@ def causes(estimate: Estimate, heldout: ResidualSet, rivals: Rivals, names: tupl
 def left_over(data: ResidualSet, explained: dict[Row, Array]) -> dict[Row, Array]:
     """Residual less what the terms explain, (K,) per row."""
     return {row: values - explained[row] for row, values in data.values.items()}
-
-
-__all__ = ["Step", "by_joint", "causes", "left_over", "ordered"]

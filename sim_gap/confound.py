@@ -17,7 +17,7 @@ TRIED = 4
 MOTION = {
     frozenset(
         {"friction.coulomb", "friction.load"}
-    ): "the joint moved both ways at the same speed under clearly different loads (stretched out and folded, with and without a payload)",
+    ): "both ways at the same speed under clearly different loads (stretched out, folded, with a payload)",
     frozenset({"friction.coulomb", "friction.stribeck"}): "constant speeds from creeping to fast, both ways",
     frozenset({"friction.coulomb", "friction.viscous"}): "constant speeds from slow to fast, both ways",
     frozenset(
@@ -62,10 +62,11 @@ class Rivals:
         return effects()[effect].whole_arm
 
     def weigh(self, effect: str, terms: Sequence[Term]) -> Weighed:
-        """Confidence of a cause from what is lost without it, and without its best-founded joint, whatever stands in."""
+        """Confidence of a cause from what is lost without it at its best-founded place, whatever stands in."""
         search = self.search
         present = [term for term in search.active if term.effect == effect]
-        evidence, rivals = 0.0, []
+        evidence = 0.0
+        rivals: list[str] = []
         for term in present:
             rest = search.without(term, search.active)
             lost = search.judge(rest) - search.score

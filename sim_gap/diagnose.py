@@ -4,29 +4,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from armlink.errors import BadInput
 from armlink.recording import Recording, slice_rows
 from sim_gap.causes import causes, left_over
 from sim_gap.confound import Rivals
-from sim_gap.diagnosis import Cause, Diagnosis, Verdict
+from sim_gap.diagnosis import Cause, Diagnosis
 from sim_gap.effects.registry import effects, layout_of
 from sim_gap.estimate import Estimate
 from sim_gap.model import SimModel, load_model
 from sim_gap.normal import ColumnStore, Normal
-from sim_gap.regime import by_joint, floor_by_joint, places
+from sim_gap.regime import by_joint, combined, places
 from sim_gap.residual import ResidualSet
-from sim_gap.rigid import Array
 from sim_gap.select import Search, candidates, refine
-from sim_gap.signals import Signals, prepare
+from sim_gap.signals import prepare
+from sim_gap.verdict import is_quiet, share_left, verdict
 
 OWN_HELDOUT = 0.3
 """Share at the end of each training recording that is kept for judging where no other motion is given."""
-CARE = 0.01
-"""A gap that a user would care about, as a share of the joint's largest torque in the recording."""
-EXPLAINED = 0.15
-"""Share of the gap (in squares, above the noise) that may be left in an explained diagnosis."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,50 +62,37 @@ def diagnose(
     ready = [prepare(r, sim.arm, label) for r, label in zip([*train, *heldout], labels, strict=False)]
     layout = layout_of(ready)
     fit, judge = (ResidualSet(tuple(part), layout) for part in (ready[: len(train)], ready[len(train) :]))
-    margin = 2.0 * floor_by_joint(judge) + CARE * _largest_torque(ready)
-    notes = _notes(fit)
     _refuse_rest(fit)
-    before, before_train = by_joint(judge), by_joint(fit)
-    if np.all(np.maximum(before, before_train) <= margin):
-        nothing = Internals(sim, fit, judge, None)
-        same = before_train, before_train, before, before, 0.0
-        return Diagnosis(
-            "no_gap",
-            sim.arm.names,
-            tuple(places(judge)),
-            (),
-            floor_by_joint(judge),
-            *same,
-            margin,
-            told,
-            None,
-            notes,
-            nothing,
-        )
-    store = ColumnStore(fit)
-    search = Search(Normal(store, candidates(layout, [name for name in effects() if name not in withhold])))
-    estimate = Estimate(store, refine(store, search.run()))
-    found = causes(estimate, judge, Rivals(search), sim.arm.names)
-    after = by_joint(judge, left_over(judge, estimate.predict(judge)))
-    after_train = by_joint(fit, left_over(fit, estimate.predict(fit)))
-    floor = floor_by_joint(judge)
-    unexplained = _share_left(before, after, floor)
+    estimate, found = None, []
+    if not (is_quiet(judge) and is_quiet(fit)):
+        store = ColumnStore(fit)
+        search = Search(Normal(store, candidates(layout, [name for name in effects() if name not in withhold])))
+        estimate = Estimate(store, refine(store, search.run()))
+        found = causes(estimate, judge, Rivals(search), sim.arm.names)
+    return _answer(Internals(sim, fit, judge, estimate), found, told)
+
+
+def _answer(made: Internals, found: list[Cause], told: str) -> Diagnosis:
+    fit, judge, estimate = made.train, made.heldout, made.estimate
+    left, left_fit = (
+        left_over(data, estimate.predict(data)) if estimate is not None else data.values for data in (judge, fit)
+    )
     return Diagnosis(
-        _verdict(found, unexplained, after, margin),
-        sim.arm.names,
-        tuple(places(judge)),
-        tuple(found),
-        floor,
-        before_train,
-        after_train,
-        before,
-        after,
-        unexplained,
-        margin,
-        told,
-        None,
-        notes,
-        Internals(sim, fit, judge, estimate),
+        verdict="no_gap" if estimate is None else verdict(found, judge, left),
+        names=made.model.arm.names,
+        where=tuple(places(judge)),
+        causes=tuple(found),
+        noise_floor=combined(judge, judge.floor),
+        train_before=by_joint(fit),
+        train_after=by_joint(fit, left_fit),
+        heldout_before=by_joint(judge),
+        heldout_after=by_joint(judge, left),
+        unexplained=share_left(judge, left),
+        margin=combined(judge, judge.margin),
+        heldout_is=told,
+        rollout=None,
+        notes=_notes(fit),
+        internals=made,
     )
 
 
@@ -128,10 +109,6 @@ def _split(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Recor
     return first, last
 
 
-def _largest_torque(ready: Sequence[Signals]) -> Array:
-    return np.asarray(np.max([np.abs(s.model).max(0) for s in ready], axis=0))
-
-
 def _notes(data: ResidualSet) -> tuple[str, ...]:
     still = [
         f"{data.signals[0].arm.names[joint]} hardly moves: its {channel} tells nothing of friction here"
@@ -145,21 +122,6 @@ def _refuse_rest(data: ResidualSet) -> None:
     """Raise BadInput where no joint moves: such a recording cannot tell anything."""
     if not any(s.moving.mean(0).max() > 0.02 for s in data.signals):
         raise BadInput(
-            f"{data.signals[0].label}: no joint moves in the training recordings: this recording cannot tell what causes a gap; "
-            "record every joint in motion"
+            f"{data.signals[0].label}: no joint moves in the training recordings: this recording cannot tell what "
+            "causes a gap; record every joint in motion"
         )
-
-
-def _share_left(before: Array, after: Array, floor: Array) -> float:
-    """Share of the squared gap above the noise that is left, each joint relative to its own gap before, worst joints count most."""
-    excess_before = np.maximum(before**2 - floor**2, 0.0)
-    excess_after = np.maximum(after**2 - floor**2, 0.0)
-    weight = 1.0 / np.maximum(before**2, 1e-12) * (before > 2.0 * floor)
-    total = float((weight * excess_before).sum())
-    return float((weight * excess_after).sum()) / total if total > 0 else 0.0
-
-
-def _verdict(found: Sequence[Cause], unexplained: float, after: Array, margin: Array) -> Verdict:
-    if not found or (unexplained > EXPLAINED and np.any(after > margin)):
-        return "unexplained"
-    return "ambiguous" if found[0].confounded_with else "explained"

@@ -1,9 +1,10 @@
-"""The final fit of the chosen terms: coefficients, honest covariance, reported parameters with intervals, predictions."""
+"""The final fit of the chosen terms: coefficients, honest covariance, reported parameters, predictions."""
 
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from sim_gap.effects.registry import Row, effects
@@ -47,7 +48,7 @@ class Estimate:
         return out
 
     @cached_property
-    def _jacobian(self) -> list[tuple[float, Array, Array, Array]]:
+    def _jacobian(self) -> list[tuple[float, Array, Array, NDArray[np.intp]]]:
         """Per row: weight, columns with shape derivatives (k, P + S), residual (k,), block (k,)."""
         data, out = self.store.data, []
         weights = self.normal.weights(self.normal.mean_square(self.index, self.coefficients))
@@ -67,7 +68,7 @@ class Estimate:
 
     @staticmethod
     def _smooth(term: Term) -> bool:
-        return len(term.shape) == 1
+        return len(term.shape) == 1 and not effects()[term.effect].secant
 
     def _shape_slope(self, term: Term, i: int, row: Row) -> Array:
         step = SHAPE_STEP * abs(term.shape[i])
@@ -79,7 +80,7 @@ class Estimate:
 
     @cached_property
     def covariance(self) -> Array:
-        """Of coefficients and smooth shapes, (P + S, P + S): sandwich over blocks of time, so correlation inflates it."""
+        """Of coefficients and smooth shapes, (P + S, P + S): sandwich over blocks of time."""
         size = self._jacobian[0][1].shape[1]
         bread, scores = np.zeros((size, size)), np.zeros((int(self.store.data.blocks.max()) + 1, size))
         for weight, x, residual, block in self._jacobian:

@@ -87,13 +87,12 @@ def _check(model: Any, joints: list[int], arm: RigidArm, label: str) -> None:
             data.qpos[adr], data.qvel[dof], data.qacc[dof] = q[row], v[row], a[row]
             mujoco.mj_inverse(model, data)
             ours = arm.torque(q[row : row + 1], v[row : row + 1], a[row : row + 1])[0]
-            ours += arm.nominal_joint_torque(q[row : row + 1], v[row : row + 1], a[row : row + 1])[0]
-            ours -= arm.frictionloss * np.sign(v[row])
+            ours += arm.nominal_joint_torque(q[row], v[row], a[row], np.zeros(arm.n))
             worst = int(np.argmax(np.abs(ours - data.qfrc_inverse[dof])))
             if abs(ours[worst] - data.qfrc_inverse[dof][worst]) > 1e-6 * (1.0 + np.abs(ours).max()):
                 raise BadInput(
-                    f"{label}: joint {arm.names[worst]}: the model's torque is {data.qfrc_inverse[dof][worst]:.6g} N·m, "
-                    f"its rigid chain gives {ours[worst]:.6g}: expected a plain chain of hinges (no tendons, gravity "
+                    f"{label}: joint {arm.names[worst]}: the model's torque is {data.qfrc_inverse[dof][worst]:.6g} "
+                    f"N·m, its rigid chain gives {ours[worst]:.6g}: expected a plain hinge chain (no tendons, gravity "
                     "compensation, fluid forces or joint couplings)"
                 )
     finally:

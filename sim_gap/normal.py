@@ -1,4 +1,4 @@
-"""Normal equations of all candidate terms at once, per row and fold, so that trying a set of terms costs microseconds."""
+"""Normal equations of all candidate terms at once, per row and fold: trying a set of terms costs microseconds."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -72,7 +72,7 @@ class Normal:
         self.side = np.zeros((*shape, self.size))
         self.square = np.zeros(shape)
         self.count = np.zeros(shape)
-        self.floor = np.array([data.floor[row] for row in self.rows])
+        self.floor = np.array([data.care[row] for row in self.rows])
         for r, row in enumerate(self.rows):
             self._accumulate(store, r, row)
         self.seen = self.count.sum(0) > 25
@@ -98,7 +98,7 @@ class Normal:
 
     def weights(self, mean_square: Array) -> Array:
         """Weight of one sample of each row: 1/(floor² + R²), less the correlation of neighbours."""
-        return np.where(self.seen, 1.0 / (self.floor**2 + mean_square) / CORRELATED, 0.0)
+        return np.asarray(np.where(self.seen, 1.0 / (self.floor**2 + mean_square) / CORRELATED, 0.0))
 
     def index(self, terms: Sequence[Term]) -> NDArray[np.intp]:
         """Positions of the terms' coefficients."""
@@ -115,7 +115,7 @@ class Normal:
     def mean_square(self, index: NDArray[np.intp], coefficients: Array, fold: int | None = None) -> Array:
         """Residual's mean square per row after the terms, over one fold or all, (R,)."""
         folds = slice(None) if fold is None else slice(fold, fold + 1)
-        return self._errors(index, coefficients, folds) / np.maximum(self.count[folds].sum(0), 1.0)
+        return np.asarray(self._errors(index, coefficients, folds) / np.maximum(self.count[folds].sum(0), 1.0))
 
     def _errors(self, index: NDArray[np.intp], coefficients: Array, folds: slice) -> Array:
         gram = self.gram[folds][:, :, index][..., index].sum(0)
@@ -125,7 +125,7 @@ class Normal:
             - 2.0 * side @ coefficients
             + np.einsum("p,rpq,q->r", coefficients, gram, coefficients)
         )
-        return np.maximum(error, 0.0)
+        return np.asarray(np.maximum(error, 0.0))
 
 
 class Weighted:
@@ -150,7 +150,7 @@ class Weighted:
         for fold in range(normal.folds):
             coefficients = normal.solve(index, self.gram - self.gram_fold[fold], self.side - self.side_fold[fold])
             errors += normal._errors(index, coefficients, slice(fold, fold + 1))
-        return errors / np.maximum(normal.count.sum(0), 1.0)
+        return np.asarray(errors / np.maximum(normal.count.sum(0), 1.0))
 
     def screen(self, terms: Sequence[Term], candidates: Sequence[Term]) -> list[tuple[float, Term]]:
         """Candidates by the fall of the weighted squares that each would bring on top of `terms`, best first."""

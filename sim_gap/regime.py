@@ -81,10 +81,10 @@ def by_joint(data: ResidualSet, left: dict[Row, Array] | None = None) -> Array:
     return np.asarray(np.sqrt(squares))
 
 
-def floor_by_joint(data: ResidualSet) -> Array:
-    """Noise floor per joint, combined as in `by_joint`, (n,)."""
+def combined(data: ResidualSet, levels: dict[Row, float]) -> Array:
+    """A level per row (noise floor, margin) combined per joint as in `by_joint`, (n,)."""
     squares = np.zeros(data.layout.n)
     for channel, joint in data.rows:
         if channel != data.layout.command and data.valid[channel, joint].any():
-            squares[joint] += data.floor[channel, joint] ** 2
+            squares[joint] += levels[channel, joint] ** 2
     return np.asarray(np.sqrt(squares))

@@ -12,6 +12,10 @@ from sim_gap.signals import Signals
 
 MODEL_FLOOR = 1e-3
 """Numerical and geometrical error that every model is granted, as a share of its torque."""
+SMALL = 3e-3
+"""Share of a joint's largest torque below which a residual is not worth a parameter."""
+CARE, CARE_INNER = 0.01, 0.003
+"""A gap that a user would care about, as a share of the largest torque: against the model, motor against sensor."""
 FOLDS = 6
 MOVING_SHARE = 0.8
 """A sample of the motor row counts where the joint moves during this share of the filter's window."""
@@ -48,8 +52,9 @@ class ResidualSet:
         return {row: np.concatenate([one[row] for one in stacked]) for row in self.rows}
 
     def _differences(self, s: Signals) -> dict[Row, Array]:
-        layout, out = self.layout, {}
-        joints = s.arm.nominal_joint_torque(s.q, s.v, s.a)
+        layout = self.layout
+        out: dict[Row, Array] = {}
+        joints = s.arm.nominal_joint_torque(s.q, s.v, s.a, s.direction)
         for channel in (layout.sensor, layout.motor, layout.command):
             if channel is None:
                 continue
@@ -81,6 +86,16 @@ class ResidualSet:
     def floor(self) -> dict[Row, float]:
         """Noise floor of each row [N·m]: sensor noise, noise of the differentiated position, and model's own error."""
         return {row: float(np.mean([self._floor(s, row) for s in self.signals])) for row in self.rows}
+
+    @cached_property
+    def care(self) -> dict[Row, float]:
+        """What is not worth explaining in each row [N·m]: noise, and a small share of the largest torque."""
+        return {row: float(np.hypot(self.floor[row], SMALL * self.largest_torque[row[1]])) for row in self.rows}
+
+    @cached_property
+    def largest_torque(self) -> Array:
+        """Largest model torque of each joint [N·m], (n,)."""
+        return np.asarray(np.max([np.abs(s.model).max(0) for s in self.signals], axis=0))
 
     def _floor(self, s: Signals, row: Row) -> float:
         channel, joint = row
@@ -117,6 +132,16 @@ class ResidualSet:
             {row: s.filtered(x) for row, x in part.items()} for s, part in zip(self.signals, parts, strict=True)
         ]
         return {row: np.concatenate([part[row] for part in filtered]) for row in filtered[0]}
+
+    @cached_property
+    def margin(self) -> dict[Row, float]:
+        """Below this a row's RMS is no gap [N·m]: twice its noise, and a share of the joint's largest torque.
+
+        The share is smaller where the motor is compared with the sensor, for no error of the links shows there.
+        """
+        inner = self.layout.motor if self.layout.sensor else None
+        care = {row: CARE_INNER if row[0] == inner else CARE for row in self.rows}
+        return {row: 2.0 * self.floor[row] + care[row] * self.largest_torque[row[1]] for row in self.rows}
 
     def spread(self, effect: Effect, place: int) -> Array:
         """Prior standard deviation of the effect's coefficients."""

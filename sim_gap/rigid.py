@@ -107,7 +107,7 @@ class RigidArm:
         couple = np.cross(moment, m.acceleration) + np.einsum("knij,knj->kni", inertia, m.alpha)
         couple += np.cross(m.omega, spin)
         couple_origin = couple + np.cross(m.origin, force)  # about the base's origin, so that links simply add
-        tau = np.empty_like(q)
+        tau: Array = np.empty_like(q)
         for i in range(self.n):
             carried = self.carries[i]
             about = couple_origin[:, carried].sum(1) - np.cross(m.origin[:, i], force[:, carried].sum(1))
@@ -127,10 +127,13 @@ class RigidArm:
                 out[:, i, j] = _link_columns(axis, lever, omega, alpha, push)
         return out
 
-    def nominal_joint_torque(self, q: Array, v: Array, a: Array) -> Array:
-        """What the nominal model's joints add on the motor side: armature, damping, friction loss, spring (K, n)."""
+    def nominal_joint_torque(self, q: Array, v: Array, a: Array, direction: Array) -> Array:
+        """What the nominal model's joints add on the motor side: armature, damping, friction loss, spring (K, n).
+
+        `direction` is the sign of the velocity, however it is smoothed around rest.
+        """
         spring = self.stiffness * (q - self.rest)
-        return self.armature * a + self.damping * v + self.frictionloss * np.sign(v) + spring
+        return self.armature * a + self.damping * v + self.frictionloss * direction + spring
 
 
 def _link_columns(axis: Array, lever: Array, omega: Array, alpha: Array, push: Array) -> Array:
@@ -147,7 +150,7 @@ def _link_columns(axis: Array, lever: Array, omega: Array, alpha: Array, push: A
 
 
 def _apply(rotation: Array, vector: Array) -> Array:
-    return np.einsum("kij,kj->ki", rotation, vector)
+    return np.asarray(np.einsum("kij,kj->ki", rotation, vector))
 
 
 def _rotations(axis: Array, angle: Array) -> Array:
@@ -160,7 +163,7 @@ def _rotations(axis: Array, angle: Array) -> Array:
 
 def _symmetric(six: Array) -> Array:
     """(…, 6) as xx, xy, xz, yy, yz, zz → (…, 3, 3)."""
-    return six[..., [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+    return np.asarray(six[..., [[0, 1, 2], [1, 3, 4], [2, 4, 5]]])
 
 
 def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:
@@ -189,9 +192,8 @@ def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:
             turn, origin = frames[link]
             spin = turn.T @ data.ximat[body].reshape(3, 3)
             centre = turn.T @ (data.xipos[body] - origin)
-            inertial[link] += inertial_of(
-                model.body_mass[body], centre, spin @ np.diag(model.body_inertia[body]) @ spin.T
-            )
+            inertia = spin @ np.diag(model.body_inertia[body]) @ spin.T
+            inertial[link] += inertial_of(float(model.body_mass[body]), centre, inertia)
     ups = [frames[p] if p >= 0 else (np.eye(3), np.zeros(3)) for p in parent]
     dof, adr = [int(model.jnt_dofadr[j]) for j in joints], [int(model.jnt_qposadr[j]) for j in joints]
     return RigidArm(
@@ -214,6 +216,6 @@ def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:
 
 
 def inertial_of(mass: float, centre: Array, inertia: Array) -> Array:
-    """Ten parameters about the frame's origin from mass [kg], centre [m] and inertia about the centre [kg·m²] (3, 3)."""
+    """Ten parameters about the origin from mass [kg], centre [m] and inertia about the centre [kg·m²] (3, 3)."""
     about = inertia + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
     return np.concatenate([[mass], mass * centre, about[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]])

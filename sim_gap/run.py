@@ -11,6 +11,7 @@ from armlink.errors import BadInput
 from armlink.recording import load_recording
 from sim_gap.diagnose import diagnose
 from sim_gap.diagnosis import Diagnosis
+from sim_gap.wording import sentence
 
 
 def run_diagnose(
@@ -35,6 +36,11 @@ def run_diagnose(
     console.print("comparing with the model; every effect competes")
     answer = diagnose(sim, recordings[: len(train)], recordings[len(train) :], labels=[str(path) for path in paths])
     show(answer, console)
+    if report is not None:
+        from sim_gap.report import write_report
+
+        write_report(answer, report, subtitle=f"{sim} against {', '.join(str(path) for path in paths)}")
+        console.print(f"report in {report}")
     text = json_format.dumps(answer.to_json(), indent=1, ensure_ascii=False)
     if json == "-":
         sys.stdout.write(text + "\n")
@@ -45,7 +51,7 @@ def run_diagnose(
 
 def show(answer: Diagnosis, console: Console) -> None:
     """Print verdict, causes and gap as tables for people."""
-    console.print(f"[bold]{answer.verdict}[/bold]: {_sentence(answer)}")
+    console.print(f"[bold]{answer.verdict}[/bold]: {sentence(answer)}")
     if answer.causes:
         table = Table(
             "effect", "joints", "RMS before", "after", "confidence", "confounded with", title="causes, held-out motion"
@@ -62,14 +68,3 @@ def show(answer: Diagnosis, console: Console) -> None:
     console.print(table)
     for note in answer.notes:
         console.print(note, style="yellow")
-
-
-def _sentence(answer: Diagnosis) -> str:
-    if answer.verdict == "no_gap":
-        return "nothing above twice the noise floor by a margin worth caring about"
-    if answer.verdict == "unexplained":
-        return f"{answer.unexplained:.0%} of the gap is left that no effect of the library accounts for"
-    if answer.verdict == "ambiguous":
-        rivals = ", ".join(answer.causes[0].confounded_with)
-        return f"{answer.causes[0].effect} explains it, and so would {rivals}; {answer.causes[0].separate_by}"
-    return f"{1 - answer.unexplained:.0%} of the gap is accounted for on motion not fitted"

@@ -8,10 +8,9 @@ import numpy as np
 
 from sim_gap.effects.registry import Layout, effects
 from sim_gap.normal import ColumnStore, Normal, Term, Weighted
-from sim_gap.rigid import Array
 
 PRICE = 0.012
-"""What a coefficient must lower Σ ½ log(R² + floor²) by, over all rows, to earn its place: about 1 % of one row's RMS."""
+"""What a coefficient must lower Σ ½ log(R² + floor²) over all rows by: about 1 % of one row's RMS."""
 SHORTLIST = 10
 MOST_TERMS = 60
 TRIES = 3
@@ -77,7 +76,7 @@ class Search:
 
     def cost(self, term: Term) -> int:
         """Coefficients and shape parameters of a term."""
-        return len(self.normal.at[term]) + len(term.shape)
+        return len(self.normal.at[term]) + len(term.shape) * (not effects()[term.effect].secant)
 
     def with_beneath(self, term: Term, terms: Sequence[Term]) -> list[Term]:
         """`terms` plus `term` plus what it stands upon; another shape of the same effect there gives way."""
@@ -165,8 +164,8 @@ def shortlist(screened: list[tuple[float, Term]]) -> list[tuple[float, Term]]:
 
 def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
     """Move each shape between its neighbours of the starting grid to where the fit is best (golden section)."""
-    out = list(active)
-    for term in active:
+    out = secants(store, secants(store, list(active)))
+    for term in list(out):
         grid = sorted({shape[0] for shape in effects()[term.effect].shapes if shape})
         if not term.shape or len(term.shape) > 1 or len(grid) < 2:
             continue
@@ -183,6 +182,17 @@ def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
         value = golden(fit, low, high)
         out[out.index(term)] = Term(term.effect, term.place, (value,))
     return out
+
+
+def secants(store: ColumnStore, active: list[Term]) -> list[Term]:
+    """Take the secant of every curved effect at its fitted size."""
+    if not any(effects()[term.effect].secant for term in active):
+        return active
+    normal = Normal(store, active)
+    search = Search(normal, list(normal.terms))
+    _, values = search.weighted.fit(normal.terms)
+    sizes = {term: (float(values[normal.at[term][0]]),) for term in normal.terms if effects()[term.effect].secant}
+    return [Term(term.effect, term.place, sizes.get(term, term.shape)) for term in active]
 
 
 def golden(function: Callable[[float], float], low: float, high: float, steps: int = 10) -> float:

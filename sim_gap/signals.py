@@ -94,7 +94,7 @@ class Signals:
         return max(1, round(self.rate / (4.0 * self.band)))
 
     def filtered(self, x: Array) -> Array:
-        """Low-pass (4th-order Butterworth, forward and backward), trimmed at the ends and decimated; (K, …) → (k, …)."""
+        """Low-pass (4th-order Butterworth, forth and back), trimmed at the ends and decimated; (K, …) → (k, …)."""
         sections = butter(4, self.band, fs=self.rate, output="sos")
         trim = max(1, round(TRIM_S * self.rate))
         return np.asarray(sosfiltfilt(sections, x, axis=0)[trim : len(x) - trim : self.step])
@@ -112,7 +112,8 @@ def prepare(recording: Recording, arm: RigidArm, label: str = "recording") -> Si
     if len(recording.t) < 4 or recording.t[-1] - recording.t[0] < SHORTEST_S:
         span = recording.t[-1] - recording.t[0]
         raise BadInput(
-            f"{label}: {len(recording.t)} rows over {span:.3g} s: too short to tell anything; record at least {SHORTEST_S:.0f} s"
+            f"{label}: {len(recording.t)} rows over {span:.3g} s: too short to tell anything; "
+            f"record at least {SHORTEST_S:.0f} s"
         )
     raw_step = float(np.median(np.diff(recording.t)))
     even = np.arange(recording.t[0], recording.t[-1] + 0.5 * raw_step, raw_step)
@@ -154,8 +155,8 @@ def _bridged(t: Array, values: Array, even: Array, label: str, column: str) -> A
         there = np.isfinite(values[:, j])
         if there.sum() < 4 or (column == "q" and there.mean() < 0.2):
             raise BadInput(
-                f"{label}: column {column}_{j + 1} holds {int(there.sum())} numbers in {len(t)} rows: expected a reading "
-                "in most rows; record that channel or leave it out"
+                f"{label}: column {column}_{j + 1} holds {int(there.sum())} numbers in {len(t)} rows: "
+                "expected a reading in most rows; record that channel or leave it out"
             )
         out[:, j] = np.interp(even, t[there], values[there, j])
     return out

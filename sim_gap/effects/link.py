@@ -1,4 +1,4 @@
-"""Links that weigh otherwise than the model says: they show wherever the model is compared, from the base to that link."""
+"""Links that weigh otherwise than the model says: they show at every joint from the base to that link."""
 
 from collections.abc import Mapping
 
@@ -53,7 +53,7 @@ class Inertia(Effect):
 
 
 class Payload(Effect):
-    """A mass fixed to the tip: mass, and centre of mass in the last link's frame, its origin on the last joint's axis."""
+    """A mass fixed to the tip; its centre of mass is in the last link's frame, whose origin is on that joint's axis."""
 
     id = "link.payload"
     parameters = (Parameter("mass", "kg"), Parameter("x", "m"), Parameter("y", "m"), Parameter("z", "m"))

@@ -16,9 +16,12 @@ EPSILON = 1e-4
 
 
 def _response(
-    signals: Signals, layout: Layout, joint: int, bend: Callable[[Array], tuple[Array, Array, Array]]
+    signals: Signals, layout: Layout, joint: int, bend: Callable[[Array], tuple[Array, Array, Array]], size: float = 0.0
 ) -> Columns:
-    """Change of the model torque per unit of `bend`, which gives δ(φ), δ'(φ) and δ''(φ)."""
+    """Change of the model torque per unit of `bend`, which gives δ(φ), δ'(φ) and δ''(φ).
+
+    `size` is the amount over which the secant is taken; zero is the derivative.
+    """
     q, v, a = signals.q[:, joint], signals.v[:, joint], signals.a[:, joint]
     shift, slope, curve = bend(q)
 
@@ -29,7 +32,10 @@ def _response(
         moved[2][:, joint] += scale * (slope * a + curve * v**2)
         return signals.arm.torque(*moved)
 
-    change = (at(EPSILON) - at(-EPSILON)) / (2.0 * EPSILON)
+    if abs(size) > EPSILON:
+        change = (at(size) - signals.model) / size
+    else:
+        change = (at(EPSILON) - at(-EPSILON)) / (2.0 * EPSILON)
     return {(layout.against_model, i): change[:, i, None] for i in range(signals.n)}
 
 
@@ -38,9 +44,11 @@ class Offset(Effect):
 
     id = "position.offset"
     parameters = (Parameter("offset", "rad"),)
+    shapes = ((0.0,),)
+    secant = True
 
     def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
-        return _response(signals, layout, place, lambda q: (np.ones_like(q), 0 * q, 0 * q))
+        return _response(signals, layout, place, lambda q: (np.ones_like(q), 0 * q, 0 * q), shape[0])
 
     def spread(self, signals: Signals, place: int) -> Array:
         return np.full(1, 0.2)
@@ -51,9 +59,11 @@ class Gain(Effect):
 
     id = "position.gain"
     parameters = (Parameter("gain", "1"),)
+    shapes = ((0.0,),)
+    secant = True
 
     def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
-        return _response(signals, layout, place, lambda q: (q, np.ones_like(q), 0 * q))
+        return _response(signals, layout, place, lambda q: (q, np.ones_like(q), 0 * q), shape[0])
 
     def spread(self, signals: Signals, place: int) -> Array:
         return np.full(1, 0.2)

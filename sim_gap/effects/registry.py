@@ -88,6 +88,8 @@ class Effect(ABC):
     shapes: ClassVar[tuple[Shape, ...]] = ((),)
     """Shapes tried at first; the best is then refined between its neighbours."""
     whole_arm: ClassVar[bool] = False
+    secant: ClassVar[bool] = False
+    """Whether the shape is the coefficient at which a curved effect's secant is taken: set to the fit, then exact."""
 
     def places(self, layout: Layout) -> range:
         """Joints or links at which it may sit; empty where these channels cannot show it."""

@@ -1,4 +1,4 @@
-"""A joint torque sensor that misleads: it shows in `tau` against the model, and with the other sign in motor against `tau`."""
+"""A joint torque sensor that misleads: in `tau` against the model, and with the other sign in motor against `tau`."""
 
 from collections.abc import Mapping
 
