@@ -98,7 +98,7 @@ class Observer:
             return self._repeat(row.t)
         self._window.append(row)
         self._fresh += 1
-        if self._fresh < self.config.window:
+        if self._fresh < (self.config.window if self.held else self.config.audit_rows):
             return []
         self._fresh = 0
         return self._test(row.t) if self.held else self._audit(row.t)
@@ -137,10 +137,10 @@ class Observer:
         verdict = self._cause_test(self._window).verdict()
         if verdict.cause == "none":
             if self._learnt < self.config.baseline_rows:
-                window = _window(self._window[-self.config.window :])
+                window = _window(self._window[-self.config.audit_rows :])
                 self.belief.learn(window.position, window.torque, self.sigma)
                 self._places.forget()
-                self._learnt += self.config.window
+                self._learnt += self.config.audit_rows
             return []
         if verdict.cause in ("unknown", "ambiguous"):
             return []  # an alarm will come if it lasts

@@ -69,6 +69,8 @@ class ObserverConfig:
     # cause test
     window: int = 20
     """Rows of one test: at 20, 98 % of the verdicts of 200 are reached, in 40 s of motion."""
+    audit_rows: int = 10
+    """Rows between tests while no alarm stands, each on the last `longest_window`: what is too small for an alarm."""
     longest_window: int = 60
     """Rows kept for a test that could not tell yet, and for the final estimate."""
     evidence: float = 10.0
