@@ -1,0 +1,103 @@
+"""Friction of one joint beyond what the nominal model says."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from sim_gap.blind.arms import Arm
+from sim_gap.blind.effects.drawn import Draw, Drawn, motor_level, pick, sign
+from sim_gap.blind.scene import Scene, rms
+from sim_gap.blind.truth import Truth
+
+MOVING = 0.02
+"""Below this speed [rad/s] friction shows nothing that can be read."""
+
+
+def _known_coulomb(joint: int, torque: float, known: bool) -> tuple[object, tuple[str, ...]]:
+    """Coulomb friction under another effect: either the nominal model has it, or it is implied."""
+
+    def nominal(arm: Arm) -> Arm:
+        frictionloss = arm.frictionloss.copy()
+        frictionloss[joint] = torque
+        return replace(arm, frictionloss=frictionloss)
+
+    return (nominal, ()) if known else (None, ("friction.coulomb",))
+
+
+def coulomb(scene: Scene, random: np.random.Generator) -> Drawn | None:
+    """A constant torque against the motion."""
+    j = int(random.integers(scene.arm.n))
+    torque = float(motor_level(scene, random)[j] * random.uniform(1.0, 2.0))
+
+    def apply(truth: Truth) -> None:
+        truth.coulomb[j] += torque
+
+    return Drawn("friction.coulomb", {scene.arm.names[j]: {"torque": torque}}, apply)
+
+
+def viscous(scene: Scene, random: np.random.Generator) -> Drawn | None:
+    """A torque proportional to the velocity."""
+    j = int(random.integers(scene.arm.n))
+    damping = float(motor_level(scene, random)[j] * random.uniform(1.0, 2.0) / rms(scene.motion[1])[j])
+
+    def apply(truth: Truth) -> None:
+        truth.viscous[j] += damping
+
+    return Drawn("friction.viscous", {scene.arm.names[j]: {"damping": damping}}, apply)
+
+
+def stribeck(scene: Scene, random: np.random.Generator) -> Drawn | None:
+    """More friction at low speed, on top of Coulomb friction."""
+    j = int(random.integers(scene.arm.n))
+    level, speed = float(motor_level(scene, random)[j]), np.abs(scene.motion[1][:, j])
+    moving = speed[speed > MOVING]
+    velocity = float(np.clip(np.quantile(moving, random.uniform(0.25, 0.5)), 0.05, 0.35))
+    breakaway = float(1.2 * level / rms(np.exp(-((moving / velocity) ** 2))))
+    base = breakaway * random.uniform(0.8, 1.6)
+    nominal, implied = _known_coulomb(j, base, bool(random.random() < 0.5))
+
+    def apply(truth: Truth) -> None:
+        truth.coulomb[j] = base + 0.02
+        truth.breakaway[j], truth.stribeck_velocity[j] = breakaway, velocity
+
+    values = {"breakaway": breakaway, "velocity": velocity}
+    return Drawn("friction.stribeck", {scene.arm.names[j]: values}, apply, nominal, implied)  # type: ignore[arg-type]
+
+
+def asymmetric(scene: Scene, random: np.random.Generator) -> Drawn | None:
+    """Friction that differs by direction."""
+    j = int(random.integers(scene.arm.n))
+    ratio = sign(random) * random.uniform(0.25, 0.6)
+    base = float(1.5 * motor_level(scene, random)[j] / abs(ratio))
+    nominal, implied = _known_coulomb(j, base, bool(random.random() < 0.5))
+
+    def apply(truth: Truth) -> None:
+        truth.coulomb[j], truth.asymmetry[j] = base, ratio
+
+    values = {"ratio": ratio}
+    return Drawn("friction.asymmetric", {scene.arm.names[j]: values}, apply, nominal, implied)  # type: ignore[arg-type]
+
+
+def load(scene: Scene, random: np.random.Generator) -> Drawn | None:
+    """Friction in proportion to the torque carried; on a joint where that torque varies."""
+    size = np.abs(scene.torque)
+    varies = size.std(0) > 0.4 * size.mean(0)
+    wanted = 1.5 * motor_level(scene, random) / rms(size)
+    j = pick(wanted, 0.35, random, varies & (rms(size) > 3.0))
+    if j is None:
+        return None
+    coefficient = float(wanted[j])
+
+    def apply(truth: Truth) -> None:
+        truth.load_friction[j] = coefficient
+
+    return Drawn("friction.load", {scene.arm.names[j]: {"coefficient": coefficient}}, apply)
+
+
+DRAWS: dict[str, Draw] = {
+    "friction.coulomb": coulomb,
+    "friction.viscous": viscous,
+    "friction.stribeck": stribeck,
+    "friction.asymmetric": asymmetric,
+    "friction.load": load,
+}

@@ -1,0 +1,14 @@
+"""All effects that the blind check draws, by id."""
+
+from sim_gap.blind.effects import actuator, friction, link, position, torque, transmission
+from sim_gap.blind.effects.drawn import Draw
+
+DRAWS: dict[str, Draw] = {
+    **link.DRAWS,
+    **position.DRAWS,
+    **torque.DRAWS,
+    **friction.DRAWS,
+    **transmission.DRAWS,
+    **actuator.DRAWS,
+}
+EFFECTS = tuple(sorted(DRAWS))

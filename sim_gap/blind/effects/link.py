@@ -1,0 +1,117 @@
+"""Links, payload and base that are not as the nominal model says."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from sim_gap.blind.arms import Arm, Array
+from sim_gap.blind.effects.drawn import Draw, Drawn, sensor_level
+from sim_gap.blind.scene import Scene, rms
+from sim_gap.blind.truth import Truth
+
+XYZ = ("x", "y", "z")
+INERTIA = (("xx", 0, 0), ("xy", 0, 1), ("xz", 0, 2), ("yy", 1, 1), ("yz", 1, 2), ("zz", 2, 2))
+
+
+def _scale(scene: Scene, other: Arm, joints: Array, random: np.random.Generator) -> float:
+    """By how much to scale a change so that it shows on the best of `joints`."""
+    return float((1.0 / (rms(scene.change(other)) / sensor_level(scene, random))[joints].max()))
+
+
+def mass_moment(scene: Scene, random: np.random.Generator) -> Drawn | None:
+    """A centre of mass elsewhere, across the link's own axis, so that its own joint feels it."""
+    arm, level = scene.arm, sensor_level(scene, random)
+    shift = random.uniform(0.15, 0.3)
+    for link in random.permutation(arm.n).tolist():
+        across = np.cross(arm.axis[link], random.standard_normal(3))
+        unit = across / np.linalg.norm(across) * 1e-2
+        wanted = level[link] / max(float(rms(scene.change(arm.with_moved(link, unit)))[link]), 1e-9)
+        moment = unit * wanted
+        if np.linalg.norm(moment) / arm.mass[link] > shift:
+            continue
+
+        def apply(truth: Truth, link: int = link, moment: Array = moment) -> None:
+            truth.arm = truth.arm.with_moved(link, moment)
+
+        return Drawn("link.mass_moment", {arm.names[link]: dict(zip(XYZ, moment.tolist(), strict=True))}, apply)
+    return None
+
+
+def inertia(scene: Scene, random: np.random.Generator) -> Drawn | None:
+    """More inertia, most of it about the joint's own axis, that no shift of mass explains."""
+    arm, level = scene.arm, 1.3 * sensor_level(scene, random)
+    for link in random.permutation(arm.n).tolist():
+        axis = np.outer(arm.axis[link], arm.axis[link])
+        unit = 0.01 * (0.55 * np.eye(3) + 0.45 * axis)
+        wanted = level[link] / max(float(rms(scene.change(_thicker(arm, link, unit)))[link]), 1e-9)
+        if 0.01 * wanted > 0.12 + 0.03 * float(arm.mass[link:].sum()):
+            continue
+        added = unit * wanted
+
+        def apply(truth: Truth, link: int = link, added: Array = added) -> None:
+            truth.arm = _thicker(truth.arm, link, added)
+
+        return Drawn("link.inertia", {arm.names[link]: {name: float(added[r, c]) for name, r, c in INERTIA}}, apply)
+    return None
+
+
+def _thicker(arm: Arm, link: int, added: Array) -> Arm:
+    out = replace(arm, inertia=arm.inertia.copy())
+    out.inertia[link] += added
+    return out
+
+
+def payload(scene: Scene, random: np.random.Generator) -> Drawn | None:
+    """A mass fixed to the last link."""
+    arm, tip = scene.arm, scene.arm.n - 1
+    com = arm.com[tip] * 1.5 + random.uniform(-0.06, 0.06, 3)
+    light = _loaded(arm, 0.5, com)
+    mass = float(
+        np.clip(0.5 * 1.5 * _scale(scene, light, np.arange(arm.n), random), 0.3, 6.0) * random.uniform(1.0, 1.5)
+    )
+
+    def apply(truth: Truth) -> None:
+        truth.arm = _loaded(truth.arm, mass, com)
+
+    return Drawn("link.payload", {"arm": {"mass": mass, **dict(zip(XYZ, com.tolist(), strict=True))}}, apply)
+
+
+def _loaded(arm: Arm, mass: float, com: Array) -> Arm:
+    about = mass * (com @ com * np.eye(3) - np.outer(com, com)) + 0.002 * mass * np.eye(3)
+    return arm.with_added(arm.n - 1, mass, mass * com, about)
+
+
+def tilt(scene: Scene, random: np.random.Generator) -> Drawn | None:
+    """The base turned by a small angle about an axis across gravity."""
+    arm = scene.arm
+    down = arm.gravity / np.linalg.norm(arm.gravity)
+    axis = np.cross(down, random.standard_normal(3))
+    axis /= np.linalg.norm(axis)
+    wanted = 0.01 * _scale(scene, _tilted(arm, 0.01 * axis), np.arange(arm.n), random)
+    if wanted > 0.12:
+        return None
+    turn = axis * max(wanted, 0.03)
+
+    def apply(truth: Truth) -> None:
+        truth.arm = _tilted(truth.arm, turn)
+
+    named = np.sort(np.argsort(np.abs(arm.gravity), kind="stable")[:2])  # the two base axes most nearly across gravity
+    aligned = np.abs(down).max() > 0.999
+    values = {f"angle_{k + 1}": float(turn[axis]) for k, axis in enumerate(named)} if aligned else {}
+    return Drawn("base.tilt", {"arm": values}, apply)
+
+
+def _tilted(arm: Arm, turn: Array) -> Arm:
+    """The base turned by the rotation vector `turn` [rad]: gravity turns the other way in the base frame."""
+    angle = float(np.linalg.norm(turn))
+    axis, g = turn / angle, arm.gravity
+    gravity = g * np.cos(angle) - np.cross(axis, g) * np.sin(angle) + axis * (axis @ g) * (1.0 - np.cos(angle))
+    return replace(arm, gravity=gravity)
+
+
+DRAWS: dict[str, Draw] = {
+    "link.mass_moment": mass_moment,
+    "link.inertia": inertia,
+    "link.payload": payload,
+    "base.tilt": tilt,
+}

@@ -1,0 +1,96 @@
+"""Position sensors that mislead, and torque readings that come late."""
+
+import numpy as np
+
+from sim_gap.blind.arms import Array
+from sim_gap.blind.effects.drawn import Draw, Drawn, pick, sensor_level, sign
+from sim_gap.blind.scene import Scene, rms
+from sim_gap.blind.truth import Truth
+
+PERIOD_S = 0.004
+"""The recordings' sample interval: shorter delays are not in them."""
+
+
+def _felt(scene: Scene, random: np.random.Generator, error: Array) -> Array:
+    """Scale (n,) of a joint's position error (K', n) at which some joint's torque shows it."""
+    shown = np.stack([rms(scene.slope[:, :, j] * error[:, j, None]) for j in range(scene.arm.n)], axis=1)
+    return np.asarray(1.0 / np.maximum((shown / sensor_level(scene, random)[:, None]).max(0), 1e-9))
+
+
+def offset(scene: Scene, random: np.random.Generator) -> Drawn | None:
+    """A constant angle: true = read + offset."""
+    wanted = _felt(scene, random, np.ones_like(scene.command[::25]))
+    j = pick(wanted, 0.12, random)
+    if j is None:
+        return None
+    angle = sign(random) * max(float(wanted[j]), 0.015)
+    twins = {0: ("base.tilt",), scene.arm.n - 1: ("link.mass_moment",)}
+
+    def apply(truth: Truth) -> None:
+        truth.position_offset[j] += angle
+
+    why = {
+        0: "of joint 1: base tilt does the same",
+        scene.arm.n - 1: "of the last joint: its mass moment does the same",
+    }
+    return Drawn(
+        "position.offset",
+        {scene.arm.names[j]: {"offset": angle}},
+        apply,
+        undecided=why.get(j, ""),
+        confused_with=twins.get(j, ()),
+    )
+
+
+def gain(scene: Scene, random: np.random.Generator) -> Drawn | None:
+    """Angles scaled: true = gain · read."""
+    wanted = _felt(scene, random, scene.motion[0])
+    j = pick(wanted, 0.06, random)
+    if j is None:
+        return None
+    value = 1.0 + sign(random) * max(float(wanted[j]), 0.015)
+
+    def apply(truth: Truth) -> None:
+        truth.position_gain[j] = value
+
+    return Drawn("position.gain", {scene.arm.names[j]: {"gain": value}}, apply)
+
+
+def eccentricity(scene: Scene, random: np.random.Generator) -> Drawn | None:
+    """An error once a turn: true = read + amplitude·sin(read + phase)."""
+    phase = random.uniform(-np.pi, np.pi)
+    wanted = 1.3 * _felt(scene, random, np.sin(scene.motion[0] + phase))
+    far = np.ptp(scene.motion[0], axis=0) > 2.5  # a small part of a turn is an offset and a gain
+    j = pick(wanted, 0.08, random, far)
+    if j is None:
+        return None
+    amplitude = max(float(wanted[j]), 0.02)
+
+    def apply(truth: Truth) -> None:
+        truth.eccentricity[j] = amplitude, phase
+
+    return Drawn("position.eccentricity", {scene.arm.names[j]: {"amplitude": amplitude, "phase": float(phase)}}, apply)
+
+
+def delay(scene: Scene, random: np.random.Generator) -> Drawn | None:
+    """The torque sensor's reading late against the position, on one joint or on all."""
+    change = np.gradient(scene.torque, 0.05, axis=0)  # every 25th row at 500 Hz
+    wanted = np.maximum(sensor_level(scene, random) / rms(change), 2.0 * PERIOD_S)
+    j = pick(wanted, 0.04, random)
+    if j is None:
+        return None
+    late = float(wanted[j])
+    joints = list(range(scene.arm.n)) if random.random() < 0.25 else [j]
+
+    def apply(truth: Truth) -> None:
+        truth.torque_delay[joints] = late
+
+    return Drawn("timing.delay", {scene.arm.names[k]: {"delay": late} for k in joints}, apply)
+
+
+DRAWS: dict[str, Draw] = {
+    "position.offset": offset,
+    "position.gain": gain,
+    "position.eccentricity": eccentricity,
+    "timing.delay": delay,
+}
