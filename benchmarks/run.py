@@ -9,11 +9,11 @@ from rich.table import Table
 from side_by_side import measure
 
 HERE = Path(__file__).parent
-MODULES = sorted(path.stem for path in HERE.glob("*.py") if path.stem not in ("run", "side_by_side"))
+MODULES = sorted(path.stem for path in HERE.glob("bench_*.py"))
 
 
 def main() -> None:
-    """Measure every case of every module beside this one that has `cases()`."""
+    """Measure every case of `bench_*.py` beside this file."""
     console = Console(stderr=True)
     results = []
     for module in MODULES:
