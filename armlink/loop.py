@@ -118,9 +118,10 @@ class Loop:
         send(objects.SYNC_ID, _NOTHING)
         end = now + self._patience
         while self._awaited > 0:
-            remaining = end - self._clock.now()
-            if not self.receive(max(remaining, 0.0)) and remaining <= 0:
-                break
+            if not self.receive(0.0):
+                remaining = end - self._clock.now()
+                if remaining <= 0 or not self.receive(remaining):
+                    break
         while self.receive(0.0):
             pass
         self.stats.missed += self._awaited

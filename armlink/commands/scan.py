@@ -43,7 +43,7 @@ def scan(
         channel = str(opened.channel_info)
     finally:
         opened.shutdown()
-    table = Table("node", "joint", "state", "device", "vendor:product:revision", "serial", box=SIMPLE, title=channel)
+    table = Table("node", "joint", "state", "device", "identity", "serial", box=SIMPLE, title=channel)
     for each in found:
         if each.present:
             told = (each.state.value, each.name or describe_type(each.device_type))
