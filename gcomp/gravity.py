@@ -8,24 +8,21 @@ from numpy.typing import ArrayLike
 
 from gcomp.arm import Arm, bar_frames
 from gcomp.arrays import Array, as_array, as_batch, as_poses
+from gcomp.kernel import GravityModel, regressor
 
 
 def gravity_torque(arm: Arm, beta: ArrayLike, q: ArrayLike) -> Array:
-    """Holding torque τ (…, n) [N·m] at poses q (…, n) [rad] for mass moments β (2n,) [kg·m]; equation (E4)."""
-    poses, leading = as_poses("q", q, arm.n)
-    moments = as_array("beta", beta, (2 * arm.n,), finite=False).reshape(arm.n, 2)
-    frames = bar_frames(arm, poses)
-    torque = np.einsum("kid,kid->ki", frames.lever, composite_moments(frames.rotation, moments))
-    return as_batch(torque, leading)
+    """Holding torque τ (…, n) [N·m] at poses q (…, n) [rad] for mass moments β (2n,) [kg·m]; equation (E4).
+
+    For many calls with the same mass moments, prepare a GravityModel.
+    """
+    return GravityModel(arm, beta).many(q)
 
 
 def gravity_regressor(arm: Arm, q: ArrayLike) -> Array:
     """Regressor Y (…, n, 2n) [m/s²] at poses q (…, n) [rad], with τ = Y β; equation (Y)."""
     poses, leading = as_poses("q", q, arm.n)
-    frames = bar_frames(arm, poses)
-    regressor = np.einsum("kid,kjdc->kijc", frames.lever, frames.rotation[..., :2], optimize=True)
-    regressor *= np.triu(np.ones((arm.n, arm.n)))[:, :, None]
-    return as_batch(regressor.reshape(len(poses), arm.n, 2 * arm.n), leading)
+    return as_batch(regressor(arm, poses), leading)
 
 
 def gravity_stiffness(arm: Arm, beta: ArrayLike, q: ArrayLike) -> Array:

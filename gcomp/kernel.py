@@ -1,0 +1,173 @@
+"""Gravity torque computed fast: one pose in plain floats, many poses in blocks of arrays that stay in the cache.
+
+Two passes along the arm: composite mass moments inwards, gravity outwards into each bar frame, and at each joint
+τ_i = ḡ_ix N_iy − ḡ_iy N_ix, equation (E4) of the theory note. The components across a joint's axis are one complex
+number, so that turning about the axis by θ is a product with e^{iθ}.
+"""
+
+from collections.abc import Callable
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gcomp.arm import Arm
+from gcomp.arrays import Array, as_array, as_batch, as_poses
+from gcomp.unrolled import compile_single_pose, without_rounding
+
+BLOCK = 2048
+"""Poses worked on at a time: about half a megabyte of work space for seven joints."""
+
+REGRESSOR_BLOCK = 512
+"""The same for the regressor, which is larger."""
+
+REGRESSOR_BLOCK = 512
+"""The same for the regressor, which is larger."""
+
+ComplexArray = NDArray[np.complex128]
+
+
+class GravityModel:
+    """The gravity torque of one arm with one set of mass moments, prepared for many calls.
+
+    Not for several threads at once: calls share their work space.
+    """
+
+    def __init__(self, arm: Arm, beta: ArrayLike) -> None:
+        """Prepare for mass moments β (2n,) [kg·m]; raises BadArray on a wrong shape."""
+        self.arm = arm
+        self.beta = as_array("beta", beta, (2 * arm.n,), finite=False)
+        self._moments = self.beta[::2] + 1j * self.beta[1::2]
+        self._twists = [without_rounding(alpha) for alpha in arm.alpha]
+        self._space: _Space | None = None
+
+    @cached_property
+    def one(self) -> Callable[[Array], Array]:
+        """Holding torque (n,) [N·m] at one pose q (n,) [rad], in a few microseconds: its argument is not checked."""
+        return compile_single_pose(self.arm, self.beta)
+
+    def many(self, q: ArrayLike) -> Array:
+        """Holding torque (…, n) [N·m] at poses q (…, n) [rad]; raises BadArray where the last axis is not n."""
+        poses, leading = as_poses("q", q, self.arm.n)
+        torque = np.empty(poses.shape)
+        for begin in range(0, len(poses), BLOCK):
+            block = slice(begin, begin + BLOCK)
+            space = self._space_for(len(poses[block]))
+            _turn(self.arm, poses[block], space.tangent, space.square, space.turn)
+            self._moments_inwards(space)
+            self._gravity_outwards(space)
+            np.copyto(torque[block], space.moment.imag.T)
+        return as_batch(torque, leading)
+
+    def _space_for(self, size: int) -> "_Space":
+        """Work space for a block, kept for the next one of that size."""
+        if self._space is None or self._space.size != size:
+            self._space = _Space(self.arm.n, size)
+        return self._space
+
+    def _moments_inwards(self, space: "_Space") -> None:
+        """Composite mass moments N_i = n_i + Rx(α_i) Rz(θ_{i+1}) N_{i+1} into space.moment."""
+        z, next_z = space.along
+        last = self.arm.n - 1
+        space.moment[last].fill(self._moments[last])
+        z.fill(0.0)
+        for i in range(last, 0, -1):
+            moment = np.multiply(space.turn[i], space.moment[i], out=space.moment[i - 1])
+            _turn_about_x(*self._twists[i - 1], moment.imag, z, next_z, space.spare)
+            np.add(moment, self._moments[i - 1], out=moment)
+            z, next_z = next_z, z
+
+    def _gravity_outwards(self, space: "_Space") -> None:
+        """Gravity's conjugate ḡ_x − i ḡ_y into each bar frame; its product with N_i has τ_i as imaginary part."""
+        gravity, (z, next_z) = space.gravity, space.along
+        gravity.fill(complex(self.arm.gravity[0], -self.arm.gravity[1]))
+        z.fill(self.arm.gravity[2])
+        for i, (ca, sa) in enumerate(self._twists):
+            np.multiply(space.turn[i], gravity, out=gravity)
+            np.multiply(gravity, space.moment[i], out=space.moment[i])
+            _turn_about_x(ca, sa, gravity.imag, z, next_z, space.spare)
+            z, next_z = next_z, z
+
+
+def regressor(arm: Arm, q: Array) -> Array:
+    """Regressor Y (K, n, 2n) [m/s²] at poses q (K, n) [rad], equation (Y): each w_i = z_{i-1} × g, frame by frame."""
+    n, (size, _) = arm.n, q.shape
+    regressor = np.empty((size, n, n), dtype=np.complex128)
+    twists = [without_rounding(alpha) for alpha in arm.alpha]
+    rows = np.zeros((n, n, min(size, REGRESSOR_BLOCK)), dtype=np.complex128)
+    scratch = np.empty((3, n, rows.shape[2]))
+    turn, stack = np.empty((2, *rows.shape[1:]), dtype=np.complex128)
+    for begin in range(0, size, REGRESSOR_BLOCK):
+        block = slice(begin, min(begin + REGRESSOR_BLOCK, size))
+        count = block.stop - begin
+        _turn(arm, q[block], scratch[0, :, :count], scratch[1, :, :count], turn[:, :count])
+        _levers_outwards(arm, twists, turn[:, :count], rows[..., :count], stack[:, :count], scratch[..., :count])
+        np.conjugate(rows[..., :count].transpose(2, 1, 0), out=regressor[block])
+    return regressor.view(np.float64)
+
+
+def _levers_outwards(
+    arm: Arm,
+    twists: list[tuple[float, float]],
+    turn: ComplexArray,
+    rows: ComplexArray,
+    stack: ComplexArray,
+    scratch: Array,
+) -> None:
+    """Conjugates of w_i in bar frame j into rows[j, i], i ≤ j; gravity itself goes along as row j + 1."""
+    z, next_z, spare = scratch
+    stack[0].fill(complex(arm.gravity[0], -arm.gravity[1]))
+    z[0].fill(arm.gravity[2])
+    for j, (ca, sa) in enumerate(twists):
+        frame = rows[j, : j + 1]
+        np.multiply(turn[j], stack[: j + 1], out=frame)
+        if j + 1 < arm.n:
+            stack[j + 1] = frame[j]
+            z[j + 1] = z[j]
+        z[j].fill(0.0)
+        np.multiply(frame[j], -1j, out=frame[j])
+        if j + 1 < arm.n:
+            stack[: j + 1] = frame
+            _turn_about_x(ca, sa, stack[: j + 2].imag, z[: j + 2], next_z[: j + 2], spare[: j + 2])
+            z, next_z = next_z, z
+
+
+class _Space:
+    """Work space for `size` poses of n joints, one row a joint."""
+
+    def __init__(self, n: int, size: int) -> None:
+        self.size = size
+        self.tangent, self.square = np.empty((2, n, size))
+        self.turn, self.moment = np.empty((2, n, size), dtype=np.complex128)
+        self.gravity: ComplexArray = np.empty(size, dtype=np.complex128)
+        self.along, self.spare = np.empty((2, size)), np.empty(size)
+
+
+def _turn(arm: Arm, q: Array, tangent: Array, square: Array, turn: ComplexArray) -> None:
+    """e^{iθ} (n, K) from t = tan(θ/2): numpy's tan is vectorised where its sin and cos are not."""
+    np.multiply(q.T, 0.5, out=tangent)
+    if arm.theta_offset.any():
+        np.add(tangent, arm.theta_offset[:, None] / 2, out=tangent)
+    np.tan(tangent, out=tangent)
+    np.multiply(tangent, tangent, out=square)
+    np.add(square, 1.0, out=square)
+    np.divide(2.0, square, out=square)
+    np.multiply(tangent, square, out=turn.imag)
+    np.subtract(square, 1.0, out=turn.real)
+
+
+def _turn_about_x(ca: float, sa: float, y: Array, z: Array, to_z: Array, spare: Array) -> None:
+    """y becomes ca y − sa z, and to_z is sa y + ca z; fewer operations where the twist is a multiple of 90°."""
+    if ca == 0.0:
+        np.multiply(y, sa, out=to_z)
+        np.multiply(z, -sa, out=y)
+        return
+    np.multiply(z, ca, out=to_z)
+    if sa != 0.0:
+        np.multiply(y, sa, out=spare)
+        np.add(to_z, spare, out=to_z)
+        np.multiply(z, sa, out=spare)
+    if ca != 1.0:
+        np.multiply(y, ca, out=y)
+    if sa != 0.0:
+        np.subtract(y, spare, out=y)
