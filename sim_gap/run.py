@@ -28,13 +28,13 @@ def run_diagnose(
     for target in (None if json == "-" else json, report, out_model):
         if target is not None and not Path(target).resolve().parent.is_dir():
             raise BadInput(f"{target}: its folder does not exist: make it first")
-    console.print(f"reading {len(paths)} recordings")
-    recordings = [load_recording(path) for path in paths]
+    with console.status(f"reading {len(paths)} recordings"):
+        recordings = [load_recording(path) for path in paths]
+    with console.status("comparing with the model; every effect competes"):
+        answer = diagnose(sim, recordings[: len(train)], recordings[len(train) :], labels=[str(path) for path in paths])
     for path, recording in zip(paths, recordings, strict=True):
         if recording.warning:
             console.print(f"{path}: {recording.warning}", style="yellow")
-    console.print("comparing with the model; every effect competes")
-    answer = diagnose(sim, recordings[: len(train)], recordings[len(train) :], labels=[str(path) for path in paths])
     show(answer, console)
     if report is not None:
         from sim_gap.report import write_report
