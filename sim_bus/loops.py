@@ -38,6 +38,7 @@ class Loops:
         section, self.n = sim_section(arm).servo, plant.n
         self._plant, self._sensors = plant, sensors
         self.rated = np.array([joint.rated_torque for joint in arm.require_link().joints])
+        self._per_mille = self.rated / 1000
         poses = np.random.default_rng(0).uniform(plant.lower, plant.upper, (TUNING_POSES, self.n))
         inertia = np.max([np.diag(plant.inertia(pose)) for pose in poses], axis=0) + self.rated / SPARE_ACCELERATION
         self._stiffness = inertia * section.bandwidth**2
@@ -104,12 +105,13 @@ class Loops:
 
     def reconfigure(self) -> None:
         """Pass modes and limits on to the plant."""
-        self.limit = self._max_torque_in * self.rated / 1000
+        self.limit = self._max_torque_in * self._per_mille
         closed = self.kind == POSITION
         self._k, self._d = self._stiffness * closed, self._damping * closed
         self._ki = INTEGRAL_SHARE * self._bandwidth * self._k
         self._closed = closed.astype(float)
         self._powered = self.kind != OFF
+        self._fed_forward = self._per_mille * self._powered
         self._plant.set_servo(self._k, self._d, np.where(self._powered, self.limit, 0.0))
         if self._with_brake:
             self._plant.set_brakes(~self._powered)
@@ -131,10 +133,10 @@ class Loops:
 
     def advance(self, duration: float, synchronous: bool) -> None:
         """Run loops and plant for `duration` [s]; `synchronous` where it follows a SYNC, which brings new targets."""
-        np.copyto(self._torque, self._torque_in * self.rated * 1e-3, where=self._cyclic_torque)
+        np.copyto(self._torque, self._torque_in * self._per_mille, where=self._cyclic_torque)
         if self._any_slow:
             self._follow_profiles(duration)
-        level = self._torque + self._feed_forward_in * self.rated * 1e-3 * self._powered
+        level = self._torque + self._feed_forward_in * self._fed_forward
         if not self._any_closed:
             self._plant.step(level, level, duration)
             return
@@ -166,8 +168,8 @@ class Loops:
 
     def _follow_profiles(self, duration: float) -> None:
         """Profile torque (slope 6087h), profile position (6081h, 6083h) and cyclic velocity (60FFh)."""
-        step = self._torque_slope * (self.rated * 1e-3 * duration)
-        wanted = self._torque_in * (self.rated * 1e-3)
+        step = self._torque_slope * (self._per_mille * duration)
+        wanted = self._torque_in * self._per_mille
         ramped = self._torque + np.clip(wanted - self._torque, -step, step)
         np.copyto(self._torque, ramped, where=self._profile_torque)
         gain = self._sensors.position_gain

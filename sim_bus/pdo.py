@@ -59,6 +59,8 @@ class PdoGroup:
         self.rows = np.array(self.nodes)
         self.fresh = bytearray(len(members))
         self.sent = [b""] * len(members)
+        self.settled = b""
+        """What was packed when every member had sent its latest."""
         self._all_fresh = bytearray(b"\1" * len(members))
         self._none_fresh = bytes(len(members))
 
@@ -121,6 +123,9 @@ class PdoTable:
         """Send the event-driven TPDOs whose content changed."""
         for group in self._event_send:
             data, size = group.pack(), group.size
+            if data == group.settled:
+                continue
+            group.settled = data if all(self._operational[node] for node in group.nodes) else b""
             for place, cob_id in enumerate(group.cob_ids):
                 content = data[place * size : (place + 1) * size]
                 if content != group.sent[place] and self._operational[group.nodes[place]]:

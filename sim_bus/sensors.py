@@ -73,7 +73,8 @@ class Sensors:
             self._next = 0
         reading += self._block[self._next]
         self._next += 1
-        counts = np.rint(np.clip(reading, -self.torque_limit, self.torque_limit) / self.torque_step)
+        np.maximum(np.minimum(reading, self.torque_limit, out=reading), -self.torque_limit, out=reading)
+        counts: Array = np.rint(reading / self.torque_step)
         return counts * self.torque_step
 
     def position_counts(self, angle: Array) -> Array:

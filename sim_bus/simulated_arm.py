@@ -3,30 +3,27 @@
 import struct
 from collections import deque
 from collections.abc import Iterable
-from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
-from armlink.armfile import ArmFile, LinkJoint
+from armlink.armfile import ArmFile
 from armlink.errors import BadInput
 from sim_bus.cia402 import State
-from sim_bus.drives import SUPPORTED_MODES, UNWATCHED, Drives
+from sim_bus.drives import Drives
 from sim_bus.effects.state import Entry, Imperfections, imperfections
-from sim_bus.loops import FEED, UNIT
 from sim_bus.node import OPERATIONAL, PRE_OPERATIONAL, STOPPED, Node
 from sim_bus.pdo import Frame, PdoGroup, PdoTable
 from sim_bus.plant import Plant
 from sim_bus.section import sim_section
 from sim_bus.sensors import Sensors
+from sim_bus.settings import APPLIED, bring_into_force, power_on_values
 from sim_bus.signals import Key, Signals
 from sim_bus.supervision import Supervision
 from sim_bus.truth import Truth
 
 Array = NDArray[np.float64]
 SYNC_ID = 0x80
-APPLIED = (0x6007, 0x605A, 0x6065, 0x607D, 0x6085, 0x60C2)
-"""Objects of the drive profile that come into force when written."""
 DRIVE_ERROR = 0x21
 """Error register: generic and device profile."""
 TARGETS = {(0x6071, 0), (0x607A, 0), (0x60FF, 0)}
@@ -56,7 +53,7 @@ class SimulatedArm:
         self._sdo = {0x600 + node.node_id: node for node in self.nodes}
         self.supervision = Supervision(self.nodes, self.drives, self.outbox.append)
         for node, joint in zip(self.nodes, link.joints, strict=True):
-            node.identity = self._identity(node, joint)
+            node.identity = power_on_values(arm, joint, int(self.sensors.increments[node.place]))
             node.reset()
             node.on_write = lambda key, node=node: self._written(node, key)  # type: ignore[misc]
             node.on_pdo_change = self._compile
@@ -97,6 +94,7 @@ class SimulatedArm:
             remaining -= piece
             if self.supervision.due <= self.time:
                 self.supervision.check(self.time)
+                self._operational[:] = bytes(node.nmt == OPERATIONAL for node in self.nodes)
             if self._watching:
                 self.drives.watch()
             if remaining > 1e-9:
@@ -166,24 +164,6 @@ class SimulatedArm:
             raise BadInput(f"no joint {joint!r}; there are {', '.join(self.names)}")
         return self.names.index(joint)
 
-    def _identity(self, node: Node, joint: LinkJoint) -> dict[Key, int | str]:
-        deceleration = round(self.drives.loops.deceleration[node.place] / UNIT)
-        increments = int(self.sensors.increments[node.place])
-        serial = crc32(f"{self.arm.name} {self.arm.serial} {self.names[node.place]}".encode())
-        return {
-            (0x1018, 4): serial,
-            (0x6076, 0): round(joint.rated_torque * 1000),
-            (0x6072, 0): min(round(joint.max_torque * 1000 / joint.rated_torque), 0xFFFF),
-            (0x6092, 1): FEED,
-            (0x608F, 1): increments,
-            (0x6502, 0): SUPPORTED_MODES,
-            (0x60C2, 1): min(max(round(self.default_period * 1e3), 1), 255),
-            (0x6081, 0): round(joint.max_velocity / UNIT),
-            (0x6083, 0): deceleration,
-            (0x6085, 0): deceleration,
-            (0x6087, 0): round(joint.max_torque_rate * 1000 / joint.rated_torque),
-        }
-
     def _receive_pdo(self, slot: tuple[PdoGroup, int], data: bytes) -> None:
         group, place = slot
         joint, size = group.nodes[place], group.size
@@ -240,14 +220,7 @@ class SimulatedArm:
 
     def _apply(self, node: Node) -> None:
         """Bring objects that were written into force."""
-        joint, record = node.place, node.record.active
-        self.drives.gain[joint], self.drives.offset[joint] = record.gain, record.offset
-        self.drives.quick_stop_option[joint] = node.value(0x605A)
-        loops, window = self.drives.loops, node.value(0x6065)
-        loops.deceleration[joint] = max(node.value(0x6085), 1) * UNIT
-        loops.interpolation[joint] = node.value(0x60C2, 1) * 10.0 ** node.value(0x60C2, 2)
-        loops.lowest[joint], loops.highest[joint] = node.value(0x607D, 1), node.value(0x607D, 2)
-        self.drives.following_window[joint] = np.inf if window == UNWATCHED else window * UNIT
+        bring_into_force(node, self.drives)
         self._watching = self.drives.needs_watch
         self.supervision.configure(node, self.time)
         given = self.nodes[0].value(0x1006)
