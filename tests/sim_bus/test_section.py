@@ -9,6 +9,7 @@ from rig import one_joint
 
 from armlink.armfile import load_arm, parse_arm
 from armlink.errors import BadInput
+from sim_bus.effects.registry import described, effects
 from sim_bus.options import parse_drift, parse_effect
 from sim_bus.section import sim_section
 from sim_bus.simulated_arm import SimulatedArm
@@ -100,3 +101,10 @@ def test_effects_and_drifts_of_the_command_line() -> None:
     for wrong in ("joint_1:1.03", "joint_1:a:0@1", "knee:1:0@1", "joint_1:0:0@1"):
         with pytest.raises(BadInput, match="--drift"):
             parse_drift(wrong, joints)
+
+
+def test_the_documentation_lists_every_effect_with_its_parameters_and_units() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "simulated-arm.md").read_text(encoding="utf-8")
+    for effect in effects().values():
+        whose = "joint" if effect.per_joint else "arm"
+        assert f"| `{effect.id}` | {whose} | {described(effect)} |" in page
