@@ -65,3 +65,23 @@ def test_what_is_wrong_is_one_line(arguments, status, says, capsys):
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1
     assert says in lines[0]
+
+
+def test_convert_keeps_the_data_and_says_what_it_left_out(tmp_path, capsys):
+    (tmp_path / "a.csv").write_text("t,q_1,tau_1,gripper\n0,1,2,3\n0.5,1.5,,3\n")
+    assert run(["convert", str(tmp_path / "a.csv"), str(tmp_path / "b.mcap"), "--json", "-"]) == 0
+    captured = capsys.readouterr()
+    answer = json.loads(captured.out)
+    assert (answer["rows"], answer["channels"]) == (2, ["position", "torque"])
+    assert "gripper" in captured.err
+    assert run(["convert", str(tmp_path / "b.mcap"), str(tmp_path / "c.csv")]) == 0
+    assert (tmp_path / "c.csv").read_text() == "t,q_1,tau_1\n0,1,2\n0.5,1.5,\n"
+
+
+def test_convert_says_in_one_line_what_it_cannot_read_or_write(tmp_path, capsys):
+    (tmp_path / "a.csv").write_text("t,q_1,tau_1\n0,1,2\n0,1,2\n")
+    assert run(["convert", str(tmp_path / "a.csv"), str(tmp_path / "b.mcap")]) == 2
+    assert "row 2: t 0 does not follow 0: time must increase" in capsys.readouterr().err
+    (tmp_path / "a.csv").write_text("t,q_1,tau_1\n0,1,2\n1,1,2\n")
+    assert run(["convert", str(tmp_path / "a.csv"), str(tmp_path / "none" / "b.parquet")]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1

@@ -1,0 +1,37 @@
+"""Writes a recording in another format: CSV, gzipped CSV, Parquet or MCAP, by suffix."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def convert(
+    source: Annotated[Path, typer.Argument(help="Recording: .csv, .csv.gz, .parquet or .mcap (a ROS 2 bag too).")],
+    target: Annotated[Path, typer.Argument(help="File to write; its suffix says the format.")],
+    json: Annotated[Path | None, typer.Option(help="Write what was converted here; - is standard output.")] = None,
+) -> int:
+    """Convert a recording; joint names are kept where the format has them (Parquet, MCAP).
+
+    Example: armlink convert run.mcap run.csv.gz
+    """
+    from rich.console import Console
+
+    from armlink.commands.output import write_json
+    from armlink.errors import BadInput
+    from armlink.recording import load_recording, save_recording
+
+    recording = load_recording(source)
+    try:
+        save_recording(recording, target)
+    except OSError as error:
+        raise BadInput(f"{target}: cannot write it: {error.strerror}") from None
+    console = Console(stderr=True)
+    if recording.warning:
+        console.print(f"{source}: {recording.warning}", markup=False, highlight=False)
+    rows, seconds = int(recording.t.size), float(recording.t[-1] - recording.t[0])
+    channels = list(recording.channels())
+    console.print(f"{target}: {rows} rows, {seconds:.1f} s, {recording.n} joints, {', '.join(channels)}", markup=False)
+    answer = {"rows": rows, "seconds": seconds, "joints": list(recording.names), "channels": channels}
+    write_json(json, {**answer, "warning": recording.warning})
+    return 0
