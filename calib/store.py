@@ -74,14 +74,15 @@ class RecordStore:
 
     def __init__(self, url: str | None = None) -> None:
         """Open, and make where missing, the store at an SQLAlchemy URL or a file path; raises BadInput if it cannot."""
-        self.url = _full_url(url or default_url())
+        full = _full_url(url or default_url())
         try:
-            self._engine = sa.create_engine(self.url)
+            self._engine = sa.create_engine(full)
+            self.url = self._engine.url.render_as_string(hide_password=True)
             if self._engine.dialect.name == "sqlite":
                 _prepare_sqlite(self._engine)
             _TABLES.create_all(self._engine)
         except (sa.exc.SQLAlchemyError, ImportError, OSError) as error:
-            raise BadInput(f"record store {url or self.url}: cannot be opened: {_first_line(error)}") from None
+            raise BadInput(f"record store {full}: cannot be opened: {_first_line(error)}") from None
 
     def close(self) -> None:
         """Let go of the database."""
