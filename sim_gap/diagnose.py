@@ -12,10 +12,11 @@ from sim_gap.diagnosis import Cause, Diagnosis
 from sim_gap.effects.registry import effects, layout_of
 from sim_gap.estimate import Estimate
 from sim_gap.model import SimModel, load_model
-from sim_gap.normal import ColumnStore, Normal
+from sim_gap.normal import ColumnStore
 from sim_gap.regime import by_joint, combined, places
 from sim_gap.residual import ResidualSet
-from sim_gap.select import Search, candidates, refine
+from sim_gap.rollout import roll_out
+from sim_gap.select import compete
 from sim_gap.signals import prepare
 from sim_gap.verdict import is_quiet, share_left, verdict
 
@@ -66,8 +67,8 @@ def diagnose(
     estimate, found = None, []
     if not (is_quiet(judge) and is_quiet(fit)):
         store = ColumnStore(fit)
-        search = Search(Normal(store, candidates(layout, [name for name in effects() if name not in withhold])))
-        estimate = Estimate(store, refine(store, search.run()))
+        search = compete(store, [name for name in effects() if name not in withhold])
+        estimate = Estimate(store, search.active)
         found = causes(estimate, judge, Rivals(search), sim.arm.names)
     return _answer(Internals(sim, fit, judge, estimate), found, told)
 
@@ -90,7 +91,7 @@ def _answer(made: Internals, found: list[Cause], told: str) -> Diagnosis:
         unexplained=share_left(judge, left),
         margin=combined(judge, judge.margin),
         heldout_is=told,
-        rollout=None,
+        rollout=roll_out(made.model, judge, estimate),
         notes=_notes(fit),
         internals=made,
     )

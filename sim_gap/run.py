@@ -9,6 +9,7 @@ from rich.table import Table
 
 from armlink.errors import BadInput
 from armlink.recording import load_recording
+from sim_gap.closed import write_model
 from sim_gap.diagnose import diagnose
 from sim_gap.diagnosis import Diagnosis
 from sim_gap.wording import sentence
@@ -41,6 +42,11 @@ def run_diagnose(
 
         write_report(answer, report, subtitle=f"{sim} against {', '.join(str(path) for path in paths)}")
         console.print(f"report in {report}")
+    if out_model is not None:
+        missing = write_model(answer.internals.model, answer.internals.estimate, out_model)
+        console.print(f"model with the effects in {out_model}")
+        for line in missing:
+            console.print(f"MJCF cannot hold {line}", style="yellow")
     text = json_format.dumps(answer.to_json(), indent=1, ensure_ascii=False)
     if json == "-":
         sys.stdout.write(text + "\n")

@@ -149,6 +149,17 @@ class Search:
         return self.active
 
 
+def compete(store: ColumnStore, library: Sequence[str]) -> Search:
+    """Search the library, refine the shapes of what was chosen, and drop what no longer earns its place."""
+    offered = candidates(store.data.layout, library)
+    chosen = refine(store, Search(Normal(store, offered)).run())
+    keys = {term.key for term in chosen}
+    search = Search(Normal(store, [*chosen, *(term for term in offered if term.key not in keys)]), chosen)
+    while search.backward():
+        pass
+    return search
+
+
 def shortlist(screened: list[tuple[float, Term]]) -> list[tuple[float, Term]]:
     """The first few, no effect at one place more than twice."""
     seen: dict[tuple[str, int], int] = {}

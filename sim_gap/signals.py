@@ -78,6 +78,27 @@ class Signals:
         """Columns of the model torque in the links' inertial parameters, (K, n, n, 10)."""
         return self.arm.regressor(self.q, self.v, self.a)
 
+    def sensitivity(self, joint: int) -> tuple[Array, Array, Array]:
+        """Derivatives of the model torque in one joint's position, velocity and acceleration, (K, n) each."""
+        if joint not in self._sensitivities:
+            unit = np.eye(self.n)[joint]
+            moved = [
+                (
+                    self.arm.torque(self.q + h * unit * (k == 0), self.v + h * unit * (k == 1), self.a)
+                    - self.arm.torque(self.q - h * unit * (k == 0), self.v - h * unit * (k == 1), self.a)
+                )
+                / (2.0 * h)
+                for k, h in ((0, 1e-5), (1, 1e-3))
+            ]
+            still = np.zeros_like(self.q)
+            inertia = self.arm.torque(self.q, still, still + unit, np.zeros(3))
+            self._sensitivities[joint] = moved[0], moved[1], inertia
+        return self._sensitivities[joint]
+
+    @cached_property
+    def _sensitivities(self) -> dict[int, tuple[Array, Array, Array]]:
+        return {}
+
     @cached_property
     def direction(self) -> Array:
         """Sign of the velocity, passing through zero linearly within the creeping speed, (K, n)."""

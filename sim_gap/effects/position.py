@@ -24,18 +24,15 @@ def _response(
     """
     q, v, a = signals.q[:, joint], signals.v[:, joint], signals.a[:, joint]
     shift, slope, curve = bend(q)
-
-    def at(scale: float) -> Array:
-        moved = [x.copy() for x in (signals.q, signals.v, signals.a)]
-        moved[0][:, joint] += scale * shift
-        moved[1][:, joint] += scale * slope * v
-        moved[2][:, joint] += scale * (slope * a + curve * v**2)
-        return signals.arm.torque(*moved)
-
+    moves = shift, slope * v, slope * a + curve * v**2
     if abs(size) > EPSILON:
-        change = (at(size) - signals.model) / size
+        moved = [x.copy() for x in (signals.q, signals.v, signals.a)]
+        for x, move in zip(moved, moves, strict=True):
+            x[:, joint] += size * move
+        change = (signals.arm.torque(*moved) - signals.model) / size
     else:
-        change = (at(EPSILON) - at(-EPSILON)) / (2.0 * EPSILON)
+        slopes = signals.sensitivity(joint)
+        change = slopes[0] * moves[0][:, None] + slopes[1] * moves[1][:, None] + slopes[2] * moves[2][:, None]
     return {(layout.against_model, i): change[:, i, None] for i in range(signals.n)}
 
 
