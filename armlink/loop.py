@@ -101,8 +101,11 @@ class Loop:
         self._awaited = 0
         while self.receive(0.0):
             pass
-        self._position = [math.nan] * self.n
-        self._torque = [math.nan] * self.n
+        self.drop_readings()
+
+    def drop_readings(self) -> None:
+        """Forget position and torque that came: what comes from now on belongs to the next sample."""
+        self._position, self._torque = [math.nan] * self.n, [math.nan] * self.n
 
     def exchange(self, control: list[int], torque_wire: list[int], position_wire: list[int]) -> Sample:
         """One cycle: RPDO1 of every joint, heartbeat when due, SYNC, then the TPDOs that it brings."""
