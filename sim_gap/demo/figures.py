@@ -3,58 +3,63 @@
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
 from calib.sensors import SensorFit
 from calib.verify import Verification
+from gcomp.arm import Arm
+from gcomp.readings import Readings
+from gcomp.sensor_model import predict
 from sim_gap.demo.drift import Drift
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
 
 COLOURS = ("#1f5fa8", "#d9622b", "#3c8d5a", "#8a4fa3", "#b8912b", "#4f7f95", "#a83248", "#5b6b7a")
 GREY, RED = "#9aa7b3", "#a83248"
+CURVE_POINTS = 60
 PANEL = 230
 """Height of a row of panels [px]."""
 
 
-def sweep_figure(fit: SensorFit) -> Any:
+def sweep_figure(arm: Arm, fit: SensorFit) -> Any:
     """Per joint: readings of its sweeps over position with the fitted curve, and what the fit leaves."""
     n = len(fit.names)
     titles = [title for name in fit.names for title in (f"{name}: sensor [N·m]", f"{name}: residual [N·m]")]
     figure = make_subplots(rows=n, cols=2, column_widths=[0.62, 0.38], subplot_titles=titles, vertical_spacing=0.25 / n)
     for row in range(n):
-        _sweeps_of_joint(figure, fit, row)
+        _sweeps_of_joint(figure, arm, fit, row)
     figure.update_xaxes(title_text="position reading [rad]", row=n)
     return figure.update_layout(height=PANEL * n + 80, showlegend=False)
 
 
-def _sweeps_of_joint(figure: Any, fit: SensorFit, joint: int) -> None:
+def _sweeps_of_joint(figure: Any, arm: Arm, fit: SensorFit, joint: int) -> None:
     rows = fit.rows
     for colour, sweep in enumerate(dict.fromkeys(np.array(rows.sweep)[rows.swept == joint].tolist())):
         at = np.flatnonzero((rows.swept == joint) & (np.array(rows.sweep) == sweep))
         at = at[np.argsort(rows.readings.position[at, joint])]
         x, y = rows.readings.position[at, joint], rows.readings.torque[at, joint]
         left, up = fit.fit.residual[at, joint], rows.direction[at] > 0
-        style = {"color": COLOURS[colour % len(COLOURS)], "size": 7}
-        symbols = np.where(up, "triangle-right", "triangle-left")
-        figure.add_scatter(
-            x=x,
-            y=y - left,
-            mode="lines",
-            line={"color": style["color"], "width": 1.5},
-            name=sweep,
-            row=joint + 1,
-            col=1,
-        )
-        for column, values in ((1, y), (2, left)):
-            figure.add_scatter(
-                x=x,
-                y=values,
-                mode="markers",
-                marker={**style, "symbol": symbols},
-                name=sweep,
-                row=joint + 1,
-                col=column,
-            )
+        place = {"name": sweep, "row": joint + 1}
+        paint = COLOURS[colour % len(COLOURS)]
+        marker = {"color": paint, "size": 7, "symbol": np.where(up, "triangle-right", "triangle-left")}
+        angle, reading = _curve(arm, fit, at, joint)
+        figure.add_scatter(x=angle, y=reading, mode="lines", line={"color": paint, "width": 1.5}, col=1, **place)
+        figure.add_scatter(x=x, y=y, mode="markers", marker=marker, col=1, **place)
+        figure.add_scatter(x=x, y=left, mode="markers", marker=marker, col=2, **place)
+
+
+def _curve(arm: Arm, fit: SensorFit, rows: Indices, joint: int) -> tuple[Array, Array]:
+    """(Position, reading) of the fitted model between the first and the last of one sweep's rows."""
+    readings = fit.rows.readings
+    position = np.repeat(readings.position[rows].mean(axis=0)[None], CURVE_POINTS, axis=0)
+    position[:, joint] = np.linspace(
+        readings.position[rows[0], joint], readings.position[rows[-1], joint], CURVE_POINTS
+    )
+    asked = Readings.of(position, np.zeros_like(position), 1.0, readings.load[rows[0]])
+    return position[:, joint], predict(arm, fit.fit.complete, asked)[:, joint]
 
 
 def verify_figure(check: Verification) -> Any:
@@ -103,14 +108,20 @@ def drift_figure(drift: Drift) -> Any:
         figure.add_scatter(x=t, y=value, name="observer", line={"color": COLOURS[0]}, **place)
         figure.add_scatter(x=ends, y=true, name="truth", line={"color": GREY, "dash": "dot"}, **place)
         figure.update_yaxes(title_text=unit, row=row, col=1)
-    for when, what in ((drift.began, "drifts"), (drift.detected, "noticed"), (drift.recalibrated, "recalibrated")):
-        if when is not None:
-            figure.add_vline(x=when, line={"color": RED, "width": 1}, annotation_text=what, row="all", col=1)
+    noticed = "not noticed" if drift.detected is None else f"noticed {drift.detected - drift.began:.1f} s later"
+    marks = [(drift.began, f"drifts, {noticed}")]
+    if drift.recalibrated is not None:
+        marks.append((drift.recalibrated, "recalibrated"))
+    for when, what in marks:
+        figure.add_vline(x=when, line={"color": RED, "width": 1}, row="all", col=1)
+        figure.add_annotation(
+            x=when, y=1.0, yref="y domain", text=what, showarrow=False, xanchor="left", yanchor="bottom"
+        )
     figure.update_xaxes(title_text="link time [s]", row=2)
     return figure.update_layout(height=520, legend={"orientation": "h", "y": 1.1, "x": 0})
 
 
-def error_bars(fit: SensorFit, truth: np.ndarray[Any, Any]) -> Any:
+def error_bars(fit: SensorFit, truth: Array) -> Any:
     """Gain error of each joint with its 95 % interval, in per cent."""
     value, interval = fit.value("gain"), fit.ci95("gain")
     figure = go.Figure()

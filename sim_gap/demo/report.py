@@ -48,13 +48,11 @@ def _calibration(result: DemoResult) -> Section:
         row = [escape(name)]
         for parameter, digits in SHOWN:
             value, (low, high) = fit.value(parameter)[j], fit.ci95(parameter)[j]
-            true = f"{getattr(truth, parameter)[j]:.{digits}f}"
-            estimate = "not observable" if np.isnan(value) else f"{value:.{digits}f}"
-            interval = "" if np.isnan(value) else f"{low:.{digits}f} … {high:.{digits}f}"
-            row += [true, estimate, interval]
+            estimate = f"{value:.{digits}f}&nbsp;±&nbsp;{(high - low) / 2:.{digits}f}"
+            row += [f"{getattr(truth, parameter)[j]:.{digits}f}", "not observable" if np.isnan(value) else estimate]
         rows.append(row)
     what = ("gain", "offset [N·m]", "position gain")
-    header = ("joint", *(cell for name in what for cell in (f"{name}: true", "estimated", "95 %")))
+    header = ("joint", *(cell for name in what for cell in (f"{name}: true", "estimated ± 95 %")))
     reasons = [f"{joint}, {what.replace('_', ' ')}: {reason}" for (joint, what), reason in fit.reasons.items()]
     mass, point = max(fit.rows.masses), fit.fit.values.rho
     text = (
@@ -72,7 +70,7 @@ def _sweeps(result: DemoResult) -> Section:
         " Lines are the fit of all sweeps together: a sinusoid each, A sin(θ + Φ). A colour is a sweep;"
         " those with the reference mass are the larger ones."
     )
-    return Section("Sweeps and their sinusoids", paragraph(text), [sweep_figure(result.sensors)])
+    return Section("Sweeps and their sinusoids", paragraph(text), [sweep_figure(result.described, result.sensors)])
 
 
 def _gravity(result: DemoResult) -> Section:

@@ -102,6 +102,7 @@ def _work(
         arm.name,
         seed,
         link.names,
+        bench.described,
         bench.truth,
         data,
         sensors,

@@ -51,7 +51,7 @@ def drift_line(names: tuple[str, ...], drift: Drift) -> str:
     what = f"{name} drifted by {drift.gain - 1:+.0%} gain and {drift.offset:+.2f} N·m"
     if drift.detected is None:
         return f"{what}: not detected"
-    seen = f"{what}: noticed after {drift.detected - drift.began:.0f} s"
+    seen = f"{what}: noticed after {drift.detected - drift.began:.1f} s"
     if drift.recalibrated is None:
         return f"{seen}, not recalibrated"
     gain, offset = drift.error_after

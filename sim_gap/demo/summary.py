@@ -12,6 +12,7 @@ from calib.identify import GravityFit
 from calib.records import Parameter
 from calib.sensors import SensorFit
 from calib.verify import Verification
+from gcomp.arm import Arm
 from sim_bus.truth import Truth
 from sim_gap.demo.bench import GravityCheck
 from sim_gap.demo.drift import Drift
@@ -29,6 +30,7 @@ class DemoResult:
     arm: str
     seed: int
     names: tuple[str, ...]
+    described: Arm
     truth: Truth
     data: tuple[SweepData, ...]
     sensors: SensorFit
