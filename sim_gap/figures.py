@@ -96,7 +96,7 @@ def _panel(figure: Any, row: int, column: int, x: Array, residual: Array, explai
         if values is not None:
             marker = {"color": colour, "size": size, "opacity": 0.75}
             figure.add_trace(
-                go.Scattergl(x=x.round(4), y=values.round(4), mode="markers", marker=marker, name=name),
+                go.Scatter(x=x.round(4), y=values.round(4), mode="markers", marker=marker, name=name),
                 row=row,
                 col=column,
             )
