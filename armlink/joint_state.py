@@ -23,6 +23,7 @@ uint32 nanosec
 """Message definition in the form that rosbag2 stores (encoding `ros2msg`)."""
 
 _HEADER = 4  # encapsulation; alignment counts from behind it
+_STAMPED = 12  # encapsulation and stamp
 _NANO = 1_000_000_000
 
 
@@ -79,6 +80,50 @@ def decode_joint_state(data: bytes) -> JointState:
     return JointState(seconds * _NANO + nanoseconds, tuple(names), position, velocity, effort)
 
 
+class JointStateDecoder:
+    """Decodes a stream of messages; those that look like one before are taken apart by one compiled layout."""
+
+    def __init__(self) -> None:
+        self._known: dict[int, tuple[bytes, bytes, tuple[str, ...], struct.Struct, tuple[int, int, int]]] = {}
+
+    def __call__(self, data: bytes) -> JointState:
+        """Decode one message; raises ValueError where the bytes are not one."""
+        known = self._known.get(len(data))
+        if known is not None:
+            encapsulation, head, names, layout, counts = known
+            if data[:_HEADER] == encapsulation and data[_STAMPED : _STAMPED + len(head)] == head:
+                seconds, nanoseconds, *values = layout.unpack_from(data, _HEADER)
+                lists = []
+                at = 0
+                for count in counts:
+                    if values[at] != count:
+                        break
+                    lists.append(tuple(values[at + 1 : at + 1 + count]))
+                    at += 1 + count
+                else:
+                    return JointState(seconds * _NANO + nanoseconds, names, *lists)
+        state = decode_joint_state(data)
+        self._learn(data, state)
+        return state
+
+    def _learn(self, data: bytes, state: JointState) -> None:
+        lists = (state.position, state.velocity, state.effort)
+        if not data[1] & 1 or any(len(values) not in (0, len(state.names)) for values in lists):
+            return
+        there = (bool(lists[0]), bool(lists[1]), bool(lists[2]))
+        reader = _Reader(data, "<")
+        _, at = reader.text(_STAMPED)
+        at = reader.number(at)[1]
+        for _ in state.names:
+            at = reader.text(at)[1]
+        body, end = _body(at, len(state.names), there)
+        if end != len(data):
+            return
+        counts = (len(lists[0]), len(lists[1]), len(lists[2]))
+        layout = struct.Struct(f"<iI{at - _STAMPED}x{body}")
+        self._known[len(data)] = (data[:_HEADER], data[_STAMPED:at], state.names, layout, counts)
+
+
 def joint_state_encoder(
     names: Sequence[str], lists: tuple[bool, bool, bool]
 ) -> Callable[[int, Sequence[float]], bytes]:
@@ -92,18 +137,8 @@ def joint_state_encoder(
         head += bytes(_aligned(len(head), 4) - len(head))
         text = name.encode() + b"\0"
         head += struct.pack("<I", len(text)) + text
-    layout, counts = "<", []
-    at = len(head)
-    for there in lists:
-        padded = _aligned(at, 4)
-        layout += "x" * (padded - at) + "I"
-        at = padded + 4
-        counts.append(len(names) if there else 0)
-        if there and names:
-            padded = _aligned(at, 8)
-            layout += "x" * (padded - at) + f"{len(names)}d"
-            at = padded + 8 * len(names)
-    body = struct.Struct(layout)
+    body = struct.Struct("<" + _body(len(head), len(names), lists)[0])
+    counts = [len(names) if there else 0 for there in lists]
     stamped = struct.Struct("<4siI")
     encapsulation, rest = bytes(head[:_HEADER]), bytes(head[stamped.size :])
     n = len(names)
@@ -120,6 +155,20 @@ def joint_state_encoder(
         return stamped.pack(encapsulation, *divmod(stamp, _NANO)) + rest + body.pack(*values)
 
     return encode
+
+
+def _body(at: int, n: int, lists: tuple[bool, bool, bool]) -> tuple[str, int]:
+    """Struct codes of the three lists that begin at byte `at`, counts and padding included, and where they end."""
+    layout = ""
+    for there in lists:
+        padded = _aligned(at, 4)
+        layout += "x" * (padded - at) + "I"
+        at = padded + 4
+        if there and n:
+            padded = _aligned(at, 8)
+            layout += "x" * (padded - at) + f"{n}d"
+            at = padded + 8 * n
+    return layout, at
 
 
 def _aligned(at: int, size: int) -> int:

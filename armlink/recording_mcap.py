@@ -21,7 +21,7 @@ from mcap.writer import Writer
 from zstandard import ZstdError
 
 from armlink.errors import BadInput
-from armlink.joint_state import SCHEMA, SCHEMA_NAME, JointState, decode_joint_state, joint_state_encoder
+from armlink.joint_state import SCHEMA, SCHEMA_NAME, JointState, JointStateDecoder, joint_state_encoder
 from armlink.recording import Array, Recording
 
 TOPICS: dict[str, tuple[str | None, str | None, str | None]] = {
@@ -117,12 +117,13 @@ def _read(path: Path) -> tuple[dict[str, list[JointState]], str]:
     found: dict[str, list[JointState]] = defaultdict(list)
     topics: dict[int, str] = {}
     schemas: dict[int, Schema] = {}
+    decode = JointStateDecoder()
     complete, why = False, "the file ends early"
     with path.open("rb") as stream:
         try:
             for record in StreamReader(stream, validate_crcs=True).records:
                 if isinstance(record, Message) and record.channel_id in topics:
-                    found[topics[record.channel_id]].append(decode_joint_state(record.data))
+                    found[topics[record.channel_id]].append(decode(record.data))
                 elif isinstance(record, Schema):
                     schemas[record.id] = record
                 elif isinstance(record, Channel) and record.topic in TOPICS:

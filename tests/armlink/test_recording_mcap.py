@@ -7,7 +7,7 @@ from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer as RosWriter
 
 from armlink.errors import BadInput
-from armlink.joint_state import SCHEMA, SCHEMA_NAME, decode_joint_state, joint_state_encoder
+from armlink.joint_state import SCHEMA, SCHEMA_NAME, JointStateDecoder, decode_joint_state, joint_state_encoder
 from armlink.recording import Recording, load_recording, save_recording
 from armlink.recording_mcap import RecordingWriter
 
@@ -83,6 +83,8 @@ def test_the_codec_agrees_with_the_ros_library(lists, names):
     ours = joint_state_encoder(names, lists)(5_000_000_007, [x for each in values for x in each])
     decoded = decode_joint_state(ours)
     assert decoded == (5_000_000_007, names, *map(tuple, values))
+    stream = JointStateDecoder()
+    assert stream(ours) == stream(ours) == decoded
     from mcap.records import Schema
 
     decode = DecoderFactory().decoder_for(
@@ -92,6 +94,21 @@ def test_the_codec_agrees_with_the_ros_library(lists, names):
     assert (theirs.header.stamp.sec, theirs.header.stamp.nanosec) == (5, 7)
     assert tuple(theirs.name) == names
     assert [list(theirs.position), list(theirs.velocity), list(theirs.effort)] == values
+
+
+def test_a_stream_decodes_as_single_messages_do():
+    """Messages of one length that differ in names, lists, frame or byte order must not be taken for one another."""
+    some = [
+        joint_state_encoder(("ab", "cd"), (True, False, True))(7, [1.0, 2.0, 3.0, 4.0]),
+        joint_state_encoder(("ab", "ce"), (True, True, False))(8, [1.0, 2.0, 3.0, 4.0]),
+        joint_state_encoder(("ab", "cd"), (False, True, True))(9, [5.0, 6.0, 7.0, 8.0]),
+        joint_state_encoder(("ab", "cd"), (True, False, True))(10, [1.5, 2.5, 3.5, 4.5]),
+    ]
+    assert len({len(data) for data in some}) < len(some)
+    rng = np.random.default_rng(2)
+    stream = JointStateDecoder()
+    for choice in rng.integers(0, len(some), 200):
+        assert stream(some[choice]) == decode_joint_state(some[choice])
 
 
 def test_a_recording_cut_anywhere_loads_up_to_the_cut_and_says_so(tmp_path):
