@@ -35,7 +35,7 @@ def load_model(source: Any, names: tuple[str, ...] = (), count: int | None = Non
     import mujoco
 
     path = Path(source) if isinstance(source, str | Path) else None
-    model = source if path is None else _compile(path)
+    model = source if path is None else compiled(path)
     hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
     known = {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, j): j for j in hinges}
     label = str(path or "the model")
@@ -57,15 +57,18 @@ def load_model(source: Any, names: tuple[str, ...] = (), count: int | None = Non
     return SimModel(model, tuple(joints), arm, path)
 
 
-def _compile(path: Path) -> Any:
+def compiled(path: Path) -> Any:
+    """Compile an MJCF or URDF file, or an arm file (by path or bundled name), to a `mujoco.MjModel`. Raises BadInput."""
     import mujoco
 
-    if not path.is_file():
-        raise BadInput(f"no model file {path}: give an MJCF, URDF or arm file")
-    if path.suffix in (".yaml", ".yml"):
+    from armlink.armfile import bundled_arms
+
+    if path.suffix in (".yaml", ".yml") or str(path) in bundled_arms():
         from sim_gap.from_arm import nominal_model
 
         return nominal_model(path)
+    if not path.is_file():
+        raise BadInput(f"no model file {path}: give an MJCF, URDF or arm file")
     try:
         return mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
