@@ -1,45 +1,16 @@
 """The cause test: which one effect explains a window's torque residual, if any does (theory.md section 6)."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from dataclasses import dataclass, field
+from itertools import combinations, pairwise, product
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
 from calib.belief import ModelBelief
+from calib.dictionary import DRIFT, Entry, Window, class_of, dictionary, kin
 from calib.observer_config import ObserverConfig
 from calib.records import Array
-from gcomp.arm import Arm
-from gcomp.gravity import gravity_levers, gravity_regressor, gravity_stiffness
-from gcomp.moments import payload_columns
-
-DRIFT = ("gain", "offset", "drift")
-
-
-@dataclass(frozen=True)
-class Window:
-    """K rows: true-angle positions (K, n) [rad], torque readings as installed (K, n) [N·m], directions (K, n)."""
-
-    position: Array
-    torque: Array
-    direction: Array
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One effect of the dictionary."""
-
-    cause: str
-    """gain, offset, drift (both), friction, spring, slip, payload, tilt or scale."""
-    joint: int | None
-    """Index of the joint, None where it concerns the arm."""
-    columns: Array
-    """What a unit of each parameter adds to the torque readings, (K·n, p)."""
-    contains: tuple[str, ...] = ()
-    """Causes of the same joint that are special cases of this one."""
-    price: int | None = None
-    """Parameters that it is charged for in the BIC; by default those that it has."""
+from gcomp.gravity import gravity_levers
 
 
 @dataclass(frozen=True)
@@ -49,6 +20,7 @@ class Verdict:
     cause: str
     """none, unknown, ambiguous or the winning entry's cause."""
     joint: int | None
+    """Index of the joint, None where it concerns the arm."""
     confidence: float
     """Share of the winner among all classes, exp(−BIC/2) weighted; for unknown and ambiguous that of the best entry."""
     values: Array
@@ -57,42 +29,22 @@ class Verdict:
     """BIC of the best entry of each class above the best one; `misfit` of the winner in standard deviations."""
     rivals: tuple[str, ...] = ()
     """Classes that fit as well, where ambiguous."""
+    beside: int | None = None
+    """Another joint whose sensor drifts at the same time."""
 
     @property
     def is_drift(self) -> bool:
-        """Whether it is a drift of one joint's torque sensor, the only verdict that may lead to a new record."""
+        """Whether it is a drift of torque sensors, the only verdict that may lead to a new record."""
         return self.cause in DRIFT
 
+    @property
+    def joints(self) -> tuple[int, ...]:
+        """The joints concerned, the one with more evidence first."""
+        return tuple(joint for joint in (self.joint, self.beside) if joint is not None)
 
-def dictionary(arm: Arm, beta: Array, window: Window) -> Iterator[Entry]:
-    """Every entry of the dictionary for the poses of a window; beta (2n,) [kg·m] is the model believed."""
-    q, n = window.position, arm.n
-    regressor = gravity_regressor(arm, q)
-    torque = regressor @ beta
-    middle = np.where(np.isfinite(arm.lower + arm.upper), (arm.lower + arm.upper) / 2, 0.0)
-    one = np.ones(len(q))
-
-    def row_of(joint: int, *columns: Array) -> Array:
-        full = np.zeros((len(q), n, len(columns)))
-        full[:, joint] = np.stack(columns, axis=1)
-        return full.reshape(len(q) * n, len(columns))
-
-    for j in range(n):
-        yield Entry("gain", j, row_of(j, torque[:, j]))
-        yield Entry("offset", j, row_of(j, one))
-        yield Entry("drift", j, row_of(j, torque[:, j], one), contains=("gain", "offset"))
-        yield Entry("friction", j, row_of(j, window.direction[:, j]))
-        yield Entry("spring", j, row_of(j, q[:, j] - middle[j], one), contains=("offset",))
-    stiffness = gravity_stiffness(arm, beta, q)
-    for j in range(n):
-        yield Entry("slip", j, stiffness[:, :, j].reshape(-1, 1))
-    at_origin, by_point = payload_columns(arm)
-    yield Entry("payload", None, (regressor @ np.column_stack([at_origin, by_point])).reshape(-1, 4))
-    across = np.linalg.svd(arm.gravity[None])[2][1:] * np.linalg.norm(arm.gravity)
-    tilted = [gravity_regressor(replace(arm, gravity=direction), q) @ beta for direction in across]
-    yield Entry("tilt", None, np.stack(tilted, axis=-1).reshape(-1, 2))
-    # a payload explains nine tenths of a common scale and is far more frequent: same price, so that it wins
-    yield Entry("scale", None, torque.reshape(-1, 1), price=4)
+    def other(self, joint: int) -> int | None:
+        """The joint that drifts beside this one, if any."""
+        return next((other for other in self.joints if other != joint), None)
 
 
 @dataclass(frozen=True)
@@ -128,11 +80,13 @@ class CauseTest:
         best, config = fits[0], self._config
         classes = {"none": self.chi2_none}
         for fit in reversed(fits):
-            classes[_class(fit.entry)] = fit.bic
+            classes[class_of(fit.entry)] = fit.bic
         top = min(classes.values())
         weights = {name: np.exp(-(bic - top) / 2) for name, bic in classes.items()}
         total = sum(weights.values())
-        evidence = {name: round(float(bic - top), 1) for name, bic in sorted(classes.items(), key=lambda item: item[1])[:6]}
+        evidence = {
+            name: round(float(bic - top), 1) for name, bic in sorted(classes.items(), key=lambda item: item[1])[:6]
+        }
 
         def answer(cause: str, fit: _Fit | None, of: str, rivals: tuple[str, ...] = ()) -> Verdict:
             known = (fit.values, fit.covariance) if fit else (np.empty(0), np.empty((0, 0)))
@@ -143,21 +97,22 @@ class CauseTest:
             misfit = self._misfit(self.chi2_none, 0)
             evidence["misfit"] = misfit
             return answer("unknown" if misfit > config.misfit else "none", None, "none")
-        winner, name = best.entry, _class(best.entry)
+        winner, name = best.entry, class_of(best.entry)
         evidence["misfit"] = self._misfit(best.chi2, winner.columns.shape[1])
         if evidence["misfit"] > config.misfit or (winner.cause == "payload" and best.values[0] <= 0):
-            return answer("unknown", None, name)
+            return self._two_drifts() or answer("unknown", None, name)
         near = [fit.entry for fit in fits[1:] if fit.bic - best.bic < config.evidence]
-        rivals = tuple(dict.fromkeys(_class(entry) for entry in near if not _kin(entry, winner)))
+        rivals = tuple(dict.fromkeys(class_of(entry) for entry in near if not kin(entry, winner)))
         if rivals:
             return answer("ambiguous", best, name, rivals)
         return answer(winner.cause, best, name)
 
-    def _fit(self, index: int) -> _Fit:
-        """Generalised least squares of one entry; one whose columns these poses do not tell apart never wins."""
-        entry, columns = self.entries[index], self._columns[index]
+    def _fit(self, *indices: int) -> _Fit:
+        """Generalised least squares of entries together; columns that these poses do not tell apart never win."""
+        columns = np.hstack([self._columns[index] for index in indices])
+        entries = [self.entries[index] for index in indices]
         count = columns.shape[1]
-        nothing = _Fit(entry, np.inf, np.inf, np.full(count, np.nan), np.full((count, count), np.nan))
+        nothing = _Fit(entries[0], np.inf, np.inf, np.full(count, np.nan), np.full((count, count), np.nan))
         size = np.linalg.norm(columns, axis=0)
         if (size < 1e-9).any():
             return nothing
@@ -167,21 +122,48 @@ class CauseTest:
         back = (vt.T / s) / size[:, None]
         explained = u.T @ self._white
         chi2 = self.chi2_none - float(explained @ explained)
-        price = count if entry.price is None else entry.price
-        return _Fit(entry, chi2 + price * np.log(len(self._white)), chi2, back @ explained, back @ back.T)
+        price = sum(entry.columns.shape[1] if entry.price is None else entry.price for entry in entries)
+        return _Fit(entries[0], chi2 + price * np.log(len(self._white)), chi2, back @ explained, back @ back.T)
 
-    def drift(self, joint: int, cause: str) -> tuple[Array, Array]:
-        """Gain and offset change of a joint (2,), as `cause` (gain, offset or drift) has it, and covariance (2, 2)."""
-        fit = self._fit(self._index(cause, joint))
+    def _two_drifts(self) -> Verdict | None:
+        """Two joints that drift at once, where that alone explains the window; else None.
+
+        Competes with one joint's drift beside an effect on the whole arm: a payload picked up meanwhile, say.
+        """
+        whole = [index for index, entry in enumerate(self.entries) if entry.joint is None]
+        drifts = [index for index, entry in enumerate(self.entries) if entry.cause == "drift"]
+        drifts.sort(key=lambda index: self._fit(index).chi2)
+        pairs = [*combinations(drifts, 2), *product(drifts, whole)]
+        fits = {pair: self._fit(*pair) for pair in pairs}
+        best = min(fits, key=lambda pair: fits[pair].bic)
+        fit = fits[best]
+        if not np.isfinite(fit.bic) or self._misfit(fit.chi2, 4) > self._config.misfit or best[1] in whole:
+            return None
+        above = np.array([other.bic - fit.bic for pair, other in fits.items() if pair != best])
+        if above.min() < self._config.evidence:
+            return None
+        confidence = float(1 / (1 + np.exp(-above / 2).sum()))
+        evidence = {"next": round(float(above.min()), 1), "misfit": self._misfit(fit.chi2, 4)}
+        first, second = (self.entries[index].joint for index in best)
+        return Verdict("drift", first, confidence, fit.values, fit.covariance, evidence, beside=second)
+
+    def drift(self, joint: int, cause: str, beside: int | None = None) -> tuple[Array, Array]:
+        """Gain and offset change of a joint (2,), as `cause` (gain, offset or drift) has it, and covariance (2, 2).
+
+        Where the joint `beside` drifts too, both are fitted together.
+        """
+        also = [] if beside is None else [self._index("drift", beside)]
+        fit = self._fit(self._index(cause, joint), *also)
         at = [index for index, name in enumerate(("gain", "offset")) if cause in (name, "drift")]
         values, covariance = np.zeros(2), np.zeros((2, 2))
-        values[at] = fit.values
-        covariance[np.ix_(at, at)] = fit.covariance
+        values[at] = fit.values[: len(at)]
+        covariance[np.ix_(at, at)] = fit.covariance[: len(at), : len(at)]
         return values, covariance
 
-    def loss(self, joint: int, simple: str, full: str) -> float:
+    def loss(self, joint: int, simple: str, full: str, beside: int | None = None) -> float:
         """How much worse (BIC) the drift `simple` of a joint explains the window than `full` (gain, offset, drift)."""
-        return self._fit(self._index(simple, joint)).bic - self._fit(self._index(full, joint)).bic
+        also = [] if beside is None else [self._index("drift", beside)]
+        return self._fit(self._index(simple, joint), *also).bic - self._fit(self._index(full, joint), *also).bic
 
     def lever_share(self, joint: int) -> float:
         """Largest Γ_j/g that the window reached."""
@@ -194,14 +176,3 @@ class CauseTest:
     def _misfit(self, chi2: float, parameters: int) -> float:
         dof = len(self._white) - parameters
         return round(float((chi2 - dof) / np.sqrt(2 * dof)), 2)
-
-
-def _class(entry: Entry) -> str:
-    """What an entry counts as when verdicts compete: gain, offset and both of one joint are one class."""
-    cause = "drift" if entry.cause in DRIFT else entry.cause
-    return cause if entry.joint is None else f"{cause}_{entry.joint + 1}"
-
-
-def _kin(entry: Entry, winner: Entry) -> bool:
-    """Whether an entry is no rival: same class, or the winner is a special case of it."""
-    return _class(entry) == _class(winner) or (entry.joint == winner.joint and winner.cause in entry.contains)

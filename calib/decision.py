@@ -33,25 +33,29 @@ class Finding:
         return float(gain), float(offset)
 
 
-def agreed(first: CauseTest, second: CauseTest, joint: int, limit: float) -> bool:
-    """Whether two disjoint windows find the same gain and offset change of a joint: χ²₂ of the difference."""
-    (a, cov_a), (b, cov_b) = first.drift(joint, "drift"), second.drift(joint, "drift")
+def agreed(first: CauseTest, second: CauseTest, joint: int, beside: int | None, limit: float) -> bool:
+    """Whether two disjoint windows find the same gain and offset change of a joint: χ²₂ of the difference.
+
+    Where gravity does not load the joint, the offset alone is compared. `beside`: a joint that drifts at the same time.
+    """
+    (a, cov_a), (b, cov_b) = (window.drift(joint, "drift", beside) for window in (first, second))
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
-        return False
+        (a, cov_a), (b, cov_b) = (window.drift(joint, "offset", beside) for window in (first, second))
+        return bool((a - b)[1] ** 2 < limit * (cov_a + cov_b)[1, 1])
     return float((a - b) @ np.linalg.solve(cov_a + cov_b, a - b)) < limit
 
 
-def decide(test: CauseTest, verdict: Verdict, config: ObserverConfig) -> Finding:
-    """The finding of a drift verdict on the rows of both windows together, with every rule that forbids to write it."""
-    assert verdict.joint is not None
-    joint, cause, refused = verdict.joint, verdict.cause, []
-    change, covariance = test.drift(joint, cause)
+def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig) -> Finding:
+    """The finding for one joint of a drift verdict on all rows that agree, with every rule that forbids to write it."""
+    cause, refused = verdict.cause, []
+    beside = verdict.other(joint)
+    change, covariance = test.drift(joint, cause, beside)
     weak_lever = test.lever_share(joint) < config.lever_share
     if cause != "offset" and (weak_lever or covariance[0, 0] > config.gain_std**2):
         told = f"gain known to {np.sqrt(covariance[0, 0]):.2%} only, {config.gain_std:.2%} is asked: sweep this joint"
-        if test.loss(joint, "offset", cause) < config.evidence:
+        if test.loss(joint, "offset", cause, beside) < config.evidence:
             cause = "offset"  # as well explained without the gain, which stays frozen
-            change, covariance = test.drift(joint, cause)
+            change, covariance = test.drift(joint, cause, beside)
         else:
             refused.append("gravity's lever too short for a gain" if weak_lever else told)
     if covariance[1, 1] > config.offset_std**2:

@@ -3,6 +3,9 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
+from calib.causes import Verdict
 from calib.decision import Finding
 from calib.records import Array
 
@@ -30,3 +33,17 @@ class Estimate:
     offset_std: Array
     accepted: Array
     """Rows that went into each."""
+
+
+def verdict_evidence(verdict: Verdict, names: tuple[str, ...]) -> dict[str, Any]:
+    """A verdict as an event shows it: cause, confidence, how far behind the other classes are, parameters."""
+    beside = {} if verdict.beside is None else {"beside": names[verdict.beside]}
+    return {
+        "cause": verdict.cause,
+        **beside,
+        "confidence": verdict.confidence,
+        "bic": verdict.evidence,
+        "values": verdict.values.tolist(),
+        "std": np.sqrt(np.diag(verdict.covariance)).tolist(),
+        "rivals": list(verdict.rivals),
+    }

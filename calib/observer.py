@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from calib.belief import ModelBelief
-from calib.causes import CauseTest, Verdict, Window
+from calib.causes import CauseTest, Verdict
 from calib.cusum import Cusum
 from calib.decision import Finding, agreed, decide
-from calib.events import Estimate, Event
+from calib.dictionary import Window
+from calib.events import Estimate, Event, verdict_evidence
 from calib.observer_config import ObserverConfig
 from calib.places import Places
 from calib.records import Array, CalibrationRecord, GravityRecord
@@ -57,7 +58,7 @@ class Observer:
         self._fresh = self._repeated = 0
         self._doubtful = False
         self._first: _Agreeing | None = None
-        self._said: tuple[str, int | None] | None = None
+        self._said: tuple[str, tuple[int, ...]] | None = None
         self._reasons: tuple[str, ...] = ()
         self._learnt = 0
         self._proposed = np.full(arm.n, -np.inf)
@@ -145,7 +146,7 @@ class Observer:
         if verdict.cause in ("unknown", "ambiguous"):
             return []  # an alarm will come if it lasts
         self._start_test()
-        return [self._verdict_event(t, verdict)]
+        return [self._event(t, "verdict", verdict.joint, **verdict_evidence(verdict, self.arm.names))]
 
     def _test(self, t: float) -> list[Event]:
         """An alarm stands and its window is full: say what it was, and propose where two windows agree on a drift."""
@@ -159,34 +160,34 @@ class Observer:
             return []  # the cause may have changed within this window: one more
         if verdict.cause == "none":
             self._resume()
-            return [self._verdict_event(t, verdict)]
+            return [self._event(t, "verdict", verdict.joint, **verdict_evidence(verdict, self.arm.names))]
         if not verdict.is_drift:
             self._first = None
             return self._say(t, verdict)
         return self._say(t, verdict) + self._confirm(t, window, test, verdict)
 
     def _confirm(self, t: float, window: list[Row], test: CauseTest, verdict: Verdict) -> list[Event]:
-        """A window says drift of a joint: once another one before it agrees, decide on the rows of all that agree."""
-        joint = verdict.joint
-        assert joint is not None
-        first, self._first = self._first, _Agreeing(window, test, joint)
-        change, covariance = test.drift(joint, verdict.cause)
-        self._filter.restart(joint, 1 + change[0], change[1], covariance)
-        if first is None or first.joint != joint:
+        """A window says drift: once another one before it agrees, decide on the rows of all that agree."""
+        first, self._first = self._first, _Agreeing(window, test, frozenset(verdict.joints))
+        for joint in verdict.joints:
+            change, covariance = test.drift(joint, verdict.cause, verdict.other(joint))
+            self._filter.restart(joint, 1 + change[0], change[1], covariance)
+        if first is None or first.joints != self._first.joints:
             return []
-        if not agreed(first.test, test, joint, self.config.agreement):
-            return self._undecided(t, joint, "two windows disagree: still drifting")
+        for joint in verdict.joints:
+            if not agreed(first.test, test, joint, verdict.other(joint), self.config.agreement):
+                return self._undecided(t, joint, "two windows disagree: still drifting")
         rows = (first.rows + window)[-self.config.longest_window :]
         together = self._cause_test(rows)
-        self._first = _Agreeing(rows, together, joint)
-        return self._decide(t, together, joint)
+        self._first = _Agreeing(rows, together, first.joints)
+        verdict = together.verdict()
+        if not verdict.is_drift or frozenset(verdict.joints) != first.joints:
+            return self._undecided(t, None, "all windows together say something else")
+        return [event for joint in verdict.joints for event in self._decide(t, together, verdict, joint)]
 
-    def _decide(self, t: float, test: CauseTest, joint: int) -> list[Event]:
+    def _decide(self, t: float, test: CauseTest, verdict: Verdict, joint: int) -> list[Event]:
         """The estimate from all rows that agree, as a proposal or with what forbids it."""
-        verdict = test.verdict()
-        if not verdict.is_drift or verdict.joint != joint:
-            return self._undecided(t, joint, "all windows together say something else")
-        finding = decide(test, verdict, self.config)
+        finding = decide(test, verdict, joint, self.config)
         self._filter.restart(joint, finding.gain, finding.offset, finding.covariance)
         if finding.refused:
             return self._undecided(t, joint, *finding.refused)
@@ -233,14 +234,12 @@ class Observer:
 
     def _say(self, t: float, verdict: Verdict) -> list[Event]:
         """The verdict's event, once as long as it stays the same."""
-        said, self._said = self._said, (verdict.cause, verdict.joint)
-        return [] if said == self._said else [self._verdict_event(t, verdict)]
-
-    def _verdict_event(self, t: float, verdict: Verdict) -> Event:
-        std = np.sqrt(np.diag(verdict.covariance))
-        evidence = {"cause": verdict.cause, "confidence": verdict.confidence, "bic": verdict.evidence}
-        values = {"values": verdict.values.tolist(), "std": std.tolist(), "rivals": list(verdict.rivals)}
-        return self._event(t, "verdict", verdict.joint, **evidence, **values)
+        said, self._said = self._said, (verdict.cause, verdict.joints)
+        return (
+            []
+            if said == self._said
+            else [self._event(t, "verdict", verdict.joint, **verdict_evidence(verdict, self.arm.names))]
+        )
 
     def _event(self, t: float, kind: str, joint: int | None, **evidence: Any) -> Event:
         return Event(t, kind, None if joint is None else self.arm.names[joint], evidence)
@@ -248,11 +247,11 @@ class Observer:
 
 @dataclass(frozen=True)
 class _Agreeing:
-    """Rows that agree on a drift of one joint."""
+    """Rows that agree on a drift of these joints."""
 
     rows: list[Row]
     test: CauseTest
-    joint: int
+    joints: frozenset[int]
 
 
 def _window(rows: list[Row]) -> Window:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from calib.belief import ModelBelief
-from calib.causes import CauseTest, Verdict, Window, dictionary
+from calib.causes import CauseTest, Verdict
+from calib.dictionary import Window, dictionary
 from calib.observer_config import ObserverConfig
 from gcomp.arm import Arm
 from gcomp.gravity import gravity_regressor, gravity_stiffness, gravity_torque
@@ -61,6 +62,13 @@ def payload(mass):
         return "payload"
 
     return effect
+
+
+def two_drifts(arm, beta, q, direction, v, random):
+    first, second = random.choice(4, 2, replace=False)
+    v[:, first] *= 1.03
+    v[:, second] += 0.4
+    return f"two drifts {sorted([int(first), int(second)])}"
 
 
 def friction(torque):
@@ -133,6 +141,8 @@ def verdict(arm, beta, effect, rows, random, model_std=None) -> tuple[str, Verdi
 
 def answer(truth: str, said: Verdict) -> str:
     """The verdict in the words of the truth: gain, offset and both count as drift unless both is asked for."""
+    if said.beside is not None:
+        return f"two drifts {sorted(said.joints)}"
     cause = "both" if said.cause == "drift" and truth.startswith("both") else "drift" if said.is_drift else said.cause
     return cause if said.joint is None else f"{cause} {said.joint}"
 
@@ -173,10 +183,15 @@ def test_gain_and_offset_drift_of_one_joint_at_once_are_found_as_both(sarcos, sa
     assert right >= 0.9, said
 
 
+def test_two_joints_that_drift_at_once_are_both_named(sarcos, sarcos_beta) -> None:
+    right, said = share_right(sarcos, sarcos_beta, two_drifts, 20)
+    assert right >= 0.8, said
+
+
 @pytest.mark.parametrize("mass", [0.02, 0.05, 0.25, 1.0, 3.0])
 def test_a_payload_is_never_called_drift(sarcos, sarcos_beta, mass) -> None:
     _, said = share_right(sarcos, sarcos_beta, payload(mass), 20, trials=60)
-    assert not [word for word in said if word.startswith("drift")]
+    assert not [word for word in said if "drift" in word]
 
 
 def test_a_payload_comes_with_its_mass(sarcos, sarcos_beta) -> None:

@@ -167,6 +167,20 @@ def test_a_slow_drift_is_followed(sarcos, sarcos_beta) -> None:
     assert worst < 0.005
 
 
+def test_a_step_and_a_ramp_on_two_joints_at_once_are_put_right(sarcos, sarcos_beta) -> None:
+    bench = Bench(sarcos, sarcos_beta, 65)
+    bench.work(40)
+    bench.drift(1, offset=0.5)
+    for _ in range(60):
+        bench.drift(2, gain=1.0 + 0.03 / 60)
+        bench.work(1)
+    bench.work(200)
+    for joint in range(7):
+        gain_error, offset_error = bench.error(joint)
+        assert gain_error <= 0.003
+        assert offset_error <= 0.05
+
+
 def test_three_joints_that_change_alike_are_not_written(sarcos, sarcos_beta) -> None:
     bench = Bench(sarcos, sarcos_beta, 70)
     bench.work(40)
