@@ -16,7 +16,7 @@ SKETCH_STEPS = 5
 """Steps by which a candidate sweep is judged: enough for a sinusoid and an offset."""
 MINIMUM_LEVER = 0.3
 """Γ/g below which a combination is taken only where there is no better one."""
-EXCHANGES = 2
+EXCHANGES = 1
 """Rounds in which every chosen combination is compared once more with all others."""
 PRIOR_GAIN, PRIOR_POSITION_GAIN, PRIOR_POINT = 0.15, 0.02, 0.2
 """What is known before any reading: standard deviations of torque gain, position gain, attachment point [m]."""

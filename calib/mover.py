@@ -116,9 +116,12 @@ class Mover:
         self._learn_resolution(seen)
 
     def press(self, stops: npt.NDArray[np.int64], bias: Array) -> None:
-        """Creep the joints with stops ±1 onto them, then press with bias (n,) [N·m]; raises Refused, Stalled."""
+        """Creep the joints with stops ±1 onto them, then press with bias (n,) [N·m]; raises Refused, Slipped."""
         joints = stops != 0
         self._creep(stops, joints)
+        self._contact = self.position.copy()
+        self.side = np.where(joints, stops, 0).astype(float)
+        self.pressed = joints.copy()
         self.command.mode[joints] = TORQUE
         cycles = max(int(PRESS_SECONDS / self.link.period), 1)
         start = np.where(joints, self._produced, 0.0)
@@ -130,8 +133,6 @@ class Mover:
         for joint in np.flatnonzero(joints):
             self._check_stop(int(joint), int(stops[joint]))
         self._contact = self.position.copy()
-        self.side = np.where(joints, stops, 0).astype(float)
-        self.pressed = joints.copy()
 
     def before_stop(self, joint: int, side: int, gap: float) -> float:
         """Position [rad] a gap before a stop: where it was found last, else where the arm file has it."""
@@ -154,11 +155,13 @@ class Mover:
             if begin is None:
                 window = samples[-rule.window :]
                 if rule.settled(_stack(window, "position"), _stack(window, "torque"), counts, resolution):
-                    begin = count - rule.window
+                    begin = count - rule.window // 2  # what settled last still decays in the first half
                 elif count >= rule.timeout:
                     return _average(samples[-rule.max_samples :], settled=False)
             if begin is not None:
                 enough = count - begin >= rule.max_samples
+                if count - begin < rule.window:
+                    continue
                 if enough or rule.exact(_stack(samples[begin:], "torque"), counts):
                     return _average(samples[begin:], settled=True)
 

@@ -22,7 +22,7 @@ DEAD_LEVER = 0.005
 """Γ/g below which a joint feels no gravity: its offset is still swept, at one combination."""
 SLOWEST = 0.3
 """Acceleration that every planned sweep must allow [rad/s²]."""
-MASS_SHARE = 0.3
+MASS_SHARE = 0.5
 """Share of the torque left over gravity that the reference mass may take."""
 ASSUMED_GRAVITY = 0.6
 """Share of max_torque that gravity is assumed to take while nothing has been measured."""
@@ -33,9 +33,12 @@ HAND = 0.15
 SCOUT_CANDIDATES = 300
 
 
-def plan_sweep(arm: ArmFile, guess: GravityGuess | None = None, seed: int = 0) -> SweepPlan:
+def plan_sweep(
+    arm: ArmFile, guess: GravityGuess | None = None, *, seed: int = 0, reference_mass: float = 0.0
+) -> SweepPlan:
     """The plan of one pass over all joints, tip to base.
 
+    `reference_mass` [kg] is what hangs on the arm during this pass, 0 for nothing.
     Without `guess` nothing is known of the masses and no bias torque is set. With the scout's guess, combinations
     that cannot be held within max_torque are left out and the others get their bias torques. Raises BadInput where
     a joint's range is too short to sweep or no combination can be held.
@@ -49,8 +52,9 @@ def plan_sweep(arm: ArmFile, guess: GravityGuess | None = None, seed: int = 0) -
         notes += remarks
     moments = guessed_moments(described, seed) if guess is None else [guess.beta]
     sigma = section.standard_error * limits.rated
-    mass = section.reference_mass or _reference_mass(described, limits, options, guess)
-    counts = [1 if each.lever.max() < DEAD_LEVER else section.poses for each in options]
+    mass = reference_mass or section.reference_mass or _reference_mass(described, limits, options, guess)
+    poses = section.loaded_poses if reference_mass else section.poses
+    counts = [1 if each.lever.max() < DEAD_LEVER else poses for each in options]
     picks = choose(described, options, counts, moments, sigma, mass)
     sweeps = [
         _sweep(described.names[each.joint], number, each, pick, section, limits, guess)

@@ -55,7 +55,7 @@ def run_sweep(
         mover = Mover(link, sweep_section(arm), Limits.of(arm))
         run = _Pass(mover, writer, list(data.readings), progress or (lambda *_: None), clock)
         if data.plan is None:
-            first = plan_sweep(arm, seed=seed)
+            first = plan_sweep(arm, seed=seed, reference_mass=reference_mass)
             run.total = first.readings
             run.scout(first)
             plan = _final_plan(arm, first, run.readings, reference_mass, seed)
@@ -73,10 +73,10 @@ def run_sweep(
 
 
 def _final_plan(arm: ArmFile, first: SweepPlan, readings: list[Reading], mass: float, seed: int) -> SweepPlan:
-    """The plan with bias torques; a pass with the mass attached says which mass that is."""
-    plan = plan_sweep(arm, rough_model(arm, readings), seed)
+    """The plan with bias torques, and the scout poses that were reached."""
+    plan = plan_sweep(arm, rough_model(arm, readings), seed=seed, reference_mass=mass)
     reached = tuple(first.scout[reading.index] for reading in readings if reading.sweep == SCOUT)
-    return plan.model_copy(update={"scout": reached, **({"reference_mass": mass} if mass else {})})
+    return plan.model_copy(update={"scout": reached})
 
 
 class _Pass:

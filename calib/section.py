@@ -13,17 +13,19 @@ Share = Annotated[FiniteFloat, Field(gt=0, lt=1)]
 class SweepSection(Section):
     """Steps, poses, settle rule, averaging and how resting joints are held."""
 
-    steps: Annotated[int, Field(ge=5, le=200)] = 9
+    steps: Annotated[int, Field(ge=5, le=200)] = 6
     """Positions per sweep; each is taken on the way up and again on the way down."""
     poses: Annotated[int, Field(ge=1, le=8)] = 2
     """Stop combinations of the resting joints per swept joint."""
+    loaded_poses: Annotated[int, Field(ge=1, le=8)] = 1
+    """The same in the pass with the reference mass."""
     hold: Literal["stops", "servo"] = "stops"
     """Resting joints are pressed on their stops (only the swept joint's sensor counts) or servo-held (all count)."""
     range_margin: Annotated[FiniteFloat, Field(gt=0)] = 0.06
     """Distance that the steps of a sweep keep from the mechanical stops [rad]."""
     approach_speed: PositiveFloat = 0.1
     """Speed at which a joint is brought against its stop [rad/s]."""
-    travel_speed: Share = 0.8
+    travel_speed: Share = 0.9
     """Speed of travel as a share of each joint's max_velocity."""
     acceleration: PositiveFloat = 3.0
     """Peak acceleration of travel and of steps [rad/s²]."""
@@ -35,11 +37,11 @@ class SweepSection(Section):
     """Allowance for friction of the drives, as a share of rated torque."""
     gain_tolerance: Share = 0.15
     """Allowance for error of the torque scale before anything is calibrated."""
-    settle_window: PositiveFloat = 0.1
+    settle_window: PositiveFloat = 0.15
     """Window over which velocity and torque scatter are judged [s]."""
-    settle_velocity: PositiveFloat = 0.004
+    settle_velocity: PositiveFloat = 0.001
     """A joint is at rest when it moves slower than this over the window [rad/s]."""
-    settle_scatter: PositiveFloat = 1.6
+    settle_scatter: PositiveFloat = 1.35
     """Torque has settled when its scatter over the window is below this multiple of the sensor's own noise."""
     settle_timeout: PositiveFloat = 4.0
     """A step that has not settled by then is taken as it is, and marked [s]."""

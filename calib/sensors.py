@@ -193,7 +193,7 @@ def _gain_ratio(arm: ArmFile, rows: FitRows) -> Array:
     """Gains as multiples of the last joint's (n,), from data without a reference mass."""
     n = len(arm.joint_names)
     std = np.full(n, np.inf)
-    std[-1] = 1e-9
+    std[-1] = 1e-4
     fit, _ = _fit(arm, rows, gain=Prior(1.0, std))
     ratio: Array = fit.values.gain
     return np.where(fit.std.gain < 0.2, ratio, np.nan)

@@ -10,6 +10,8 @@ from calib.section import SweepSection
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
+DRIFT = 2.5
+"""Standard errors by which the means of the window's halves may differ."""
 QUIET = 3.0
 """Torque scatter that is this many times the standard error asked for has settled whatever its shape."""
 
@@ -24,7 +26,7 @@ class SettleRule:
     """Cycles after which a reading is taken as it is."""
     max_samples: int
     span: float
-    """How far a joint may have moved between the halves of the window [rad]."""
+    """Half of what a joint at rest may cover during the window [rad]."""
     scatter: float
     standard_error: Array
     """Asked for [N·m]."""
@@ -45,18 +47,21 @@ class SettleRule:
     def settled(self, position: Array, torque: Array, counts: Flags, resolution: Array) -> bool:
         """Whether nothing moves any more: position and torque (W, n) of the last window.
 
-        A joint moves if its mean position differs between the window's halves by more than `span` and half a step of
-        its sensor. A torque that `counts` (n,) has settled if it scatters no more than its own sample-to-sample noise
-        explains (von Neumann's ratio), or too little to matter.
+        A joint moves if its position covers more than twice `span` and more than one step of its sensor (an overshoot
+        that is turning back covers as much as one that is under way). A torque that `counts` (n,) has settled if it
+        scatters no more than its own sample-to-sample noise explains (von Neumann's ratio) and does not drift between
+        the window's halves, or scatters too little to matter.
         """
-        half = len(position) // 2
-        drift = np.abs(np.nanmean(position[half:], axis=0) - np.nanmean(position[:half], axis=0))
-        if np.any(drift > np.maximum(self.span, resolution)):
+        covered = np.nanmax(position, axis=0) - np.nanmin(position, axis=0)
+        if np.any(covered > np.maximum(2 * self.span, 1.5 * resolution)):
             return False
+        half = len(torque) // 2
+        drift = np.nanmean(torque[half:], axis=0) - np.nanmean(torque[:half], axis=0)
         spread = np.nanvar(torque, axis=0)
         step = np.nanmean(np.diff(torque, axis=0) ** 2, axis=0) / 2
         allowed = np.maximum(self.scatter**2 * step, (QUIET * self.standard_error) ** 2)
-        return bool(np.all((spread <= allowed) | ~counts))
+        steady = drift**2 <= DRIFT**2 * np.maximum(step, self.standard_error**2) * 4 / len(torque)
+        return bool(np.all((spread <= allowed) & steady | ~counts))
 
     def exact(self, torque: Array, counts: Flags) -> bool:
         """Whether the mean of the torque samples (K, n) is as exact as asked for, in every joint that `counts`."""

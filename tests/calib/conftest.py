@@ -1,9 +1,14 @@
 """The paper's arm for the observer's tests, from the numbers of theory.md sections 3 and 8."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from gcomp.arm import Arm
+
+sys.path.insert(0, str(Path(__file__).parent))
 
 NAMES = tuple(f"joint_{i}" for i in range(1, 8))
 BETA = (
