@@ -122,14 +122,19 @@ class RecordStore:
         self.add(record.require(arm))
         return self.activate(record.id, arm, by, reason).record
 
+    def former(self, arm: ArmFile, record_id: str) -> AnyRecord:
+        """A record that was current before and is not now; raises Refused if it never was, or is of another arm."""
+        record = self.get(record_id).require(arm)
+        log = [line.record for line in self.activations(arm) if line.kind == record.kind]
+        if record_id not in log:
+            raise Refused(f"record {record_id} was never current on {arm.name} {arm.serial}: nothing to go back to")
+        if log[-1] == record_id:
+            raise Refused(f"record {record_id} is current on {arm.name} {arm.serial} already")
+        return record
+
     def rollback(self, arm: ArmFile, to: str, by: str, reason: str = "rollback") -> Activation:
         """Go back to a record that was current before; raises Refused if it never was, or is now."""
-        log = [line for line in self.activations(arm) if line.kind == self.get(to).kind]
-        if to not in {line.record for line in log}:
-            raise Refused(f"record {to} was never current on {arm.name} {arm.serial}: nothing to go back to")
-        if log[-1].record == to:
-            raise Refused(f"record {to} is current on {arm.name} {arm.serial} already")
-        return self.activate(to, arm, by, reason)
+        return self.activate(self.former(arm, to).id, arm, by, reason)
 
     def current(self, kind: type[R], arm: ArmFile) -> R | None:
         """The current record of a kind, None where there is none yet.

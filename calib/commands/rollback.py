@@ -1,30 +1,54 @@
-"""Makes an earlier record of an arm the current one again."""
+"""Makes an earlier record of an arm the current one again, and writes it to the controllers if asked to."""
 
 import getpass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from armlink.armfile import ArmFile
+    from calib.records import CalibrationRecord
 
 
 def rollback(
     arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
     to: Annotated[str, typer.Option(help="Id of a record that was current before (armlink history ARM).")],
     reason: Annotated[str, typer.Option(help="Why; kept in the log.")] = "rollback",
+    apply: Annotated[
+        bool, typer.Option("--apply", help="Also write its gains and offsets to the controllers.")
+    ] = False,
+    bus: Annotated[str | None, typer.Option(help="With --apply: INTERFACE:CHANNEL[@BITRATE].")] = None,
     store: Annotated[
         str | None, typer.Option(help="Record store: file or database URL; default: state folder.")
     ] = None,
 ) -> None:
-    """Go back to an earlier record: a new line of the log, nothing is deleted; controllers are not written here.
+    """Go back to an earlier record: a new line of the log, nothing is deleted.
 
-    Example: armlink rollback sarcos --to 1f0c9a2b
+    Example: armlink rollback sarcos --to 1f0c9a2b --reason "sensor exchanged" --apply
     """
     from armlink.armfile import load_arm
+    from armlink.errors import BadInput
+    from calib.records import CalibrationRecord
     from calib.store import RecordStore
 
-    arm_file = load_arm(arm)
-    line = RecordStore(store).rollback(arm_file, to, by=getpass.getuser(), reason=reason)
-    typer.echo(
-        f"{line.kind} record {line.record} is current on {arm_file.name} {arm_file.serial} since {line.at}", err=True
-    )
-    if line.kind == "calibration":
-        typer.echo("the joint controllers keep what they hold until armlink calibrate --apply", err=True)
+    arm_file, records = load_arm(arm), RecordStore(store)
+    record = records.former(arm_file, to)
+    if apply:
+        if not isinstance(record, CalibrationRecord):
+            raise BadInput(f"--apply: record {to} is a {record.kind} record; controllers hold calibrations only")
+        _apply(arm_file, record, bus)
+    line = records.rollback(arm_file, to, by=getpass.getuser(), reason=reason)
+    typer.echo(f"{line.kind} record {to} is current on {arm_file.name} {arm_file.serial} since {line.at}", err=True)
+    if isinstance(record, CalibrationRecord) and not apply:
+        typer.echo("the joint controllers keep what they hold; --apply writes it to them", err=True)
+
+
+def _apply(arm_file: "ArmFile", record: "CalibrationRecord", bus: str | None) -> None:
+    """Write the record to every controller, read back; the joints need not be enabled."""
+    from armlink.link import Link
+    from calib.recalibration import write_record
+
+    with Link.open(arm_file, bus) as link:
+        link.start()
+        written = write_record(record, link)
+    typer.echo(f"written to {len(written)} controllers and read back", err=True)

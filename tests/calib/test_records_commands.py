@@ -75,3 +75,12 @@ def test_a_store_that_is_no_database_is_one_line(capsys, tmp_path) -> None:
     (tmp_path / "records.db").write_text("not a database, but long enough to have been taken for one" * 20)
     assert run(["history", "sarcos", "--store", str(tmp_path / "records.db")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_rollback_with_apply_writes_the_controllers_first(kept, capsys) -> None:
+    """On the simulated arm's own bus; where no controller answers, the log stays as it was."""
+    path, first, second = kept
+    assert run(["rollback", "sarcos", "--to", first, "--store", path, "--apply"]) == 0
+    assert "written to 7 controllers" in capsys.readouterr().err
+    assert run(["rollback", "sarcos", "--to", second, "--store", path, "--apply", "--bus", "socketcan:no_such_bus"]) > 1
+    assert [line.record for line in RecordStore(path).activations(load_arm("sarcos"))] == [first, second, first]
