@@ -123,9 +123,10 @@ def mjcf(arm: Arm, shared_rotors: tuple[tuple[int, int, float, float], ...] = ()
     ]
     for k, name in enumerate(arm.names):
         inertia = arm.inertia[k][[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+        span = _text([arm.lower[k], arm.upper[k]])
         lines += [
             f'<body name="link_{k + 1}" pos="{_text(arm.offset[k])}" quat="{_text(quaternion(arm.rotation[k]))}">',
-            f'<joint name="{name}" type="hinge" axis="{_text(arm.axis[k])}" range="{_text([arm.lower[k], arm.upper[k]])}"'
+            f'<joint name="{name}" type="hinge" axis="{_text(arm.axis[k])}" range="{span}"'
             f' limited="true" armature="{arm.armature[k]:.12g}" damping="{arm.damping[k]:.12g}"'
             f' frictionloss="{arm.frictionloss[k]:.12g}"/>',
             f'<inertial pos="{_text(arm.com[k])}" mass="{arm.mass[k]:.12g}" fullinertia="{_text(inertia)}"/>',

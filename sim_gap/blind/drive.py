@@ -1,8 +1,9 @@
-"""Motors, friction, gears and position sensors of many arms: from commanded torque to the torque that moves the links."""
+"""Motors, friction, gears and position sensors of many arms: from commanded torque to what moves the links."""
 
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_gap.blind.arms import Array
 from sim_gap.blind.friction import Bristles, padded
@@ -27,8 +28,8 @@ class Drives:
         self.limit = padded([t.motor_limit for t in truths], width, np.inf)
         self.gain = padded([t.motor_gain for t in truths], width, 1.0)
         delay = np.rint(padded([t.motor_delay for t in truths], width) / step).astype(int)
-        self.late = _cells(delay > 0)
-        self.wait = delay[self.late]
+        self.late = _Cells(delay > 0)
+        self.wait = delay[self.late.all]
         self.queue = np.repeat(self.current[None], int(delay.max()) + 1, axis=0)
         self.bristles = Bristles(truths, inertia, step)
         self.ripple = [padded([t.ripple[:, c] for t in truths], width) for c in range(3)]
@@ -43,30 +44,33 @@ class Drives:
     def _sense(self, truths: Sequence[Truth], width: int) -> None:
         self.position_gain = padded([t.position_gain for t in truths], width, 1.0)
         self.position_offset = padded([t.position_offset for t in truths], width)
-        self.bent = _cells(padded([t.eccentricity[:, 0] for t in truths], width) != 0.0)
+        self.bent = _Cells(padded([t.eccentricity[:, 0] for t in truths], width) != 0.0)
         self.amplitude, self.phase = (
-            padded([t.eccentricity[:, c] for t in truths], width)[self.bent] for c in range(2)
+            padded([t.eccentricity[:, c] for t in truths], width)[self.bent.all] for c in range(2)
         )
 
     def _two_masses(self, truths: Sequence[Truth], angle: Array) -> None:
-        self.soft = _cells(np.isfinite(padded([t.stiffness for t in truths], angle.shape[1], np.inf)))
-        rows = list(zip(*self.soft, strict=True))
+        self.soft = _Cells(np.isfinite(padded([t.stiffness for t in truths], angle.shape[1], np.inf)))
+        rows = list(zip(*(cells.tolist() for cells in self.soft.all), strict=True))
         self.stiffness = np.array([truths[b].stiffness[j] for b, j in rows])
         self.half_play = np.array([0.5 * truths[b].backlash[j] for b, j in rows])
         self.rotor = np.array([truths[b].arm.armature[j] for b, j in rows])
         self.spring_damping = 2.0 * SPRING_DAMPING * np.sqrt(self.stiffness * self.rotor)
-        torque = self.current[self.soft]
-        self.motor_angle = angle[self.soft] + torque / self.stiffness + self.half_play * np.sign(torque)
+        torque = self.current[self.soft.all]
+        self.motor_angle = angle[self.soft.all] + torque / self.stiffness + self.half_play * np.sign(torque)
         self.motor_half, self.motor_speed, self.motor_push = (np.zeros(len(rows)) for _ in range(3))
 
     def reading(self, angle: Array) -> Array:
-        """Exact reading φ of the position sensors, which sit at the motor: θ = gain·φ + offset + amplitude·sin(φ + phase)."""
+        """Exact reading φ of the position sensors, which sit at the motor.
+
+        θ = gain·φ + offset + amplitude·sin(φ + phase).
+        """
         k = len(angle)
         turned = angle.copy()
-        soft, few = _first(self.soft, k)
+        soft, few = self.soft.within(k)
         turned[soft] = self.motor_angle[:few]
         reading = (turned - self.position_offset[:k]) / self.position_gain[:k]
-        bent, few = _first(self.bent, k)
+        bent, few = self.bent.within(k)
         if few:
             straight, gain = reading[bent], self.position_gain[bent]
             phi = straight
@@ -80,12 +84,12 @@ class Drives:
         k = len(angle)
         self._follow(command)
         speed, turned = velocity, angle
-        soft, few = _first(self.soft, k)
+        soft, few = self.soft.within(k)
         if few or self.shared:
             speed, turned = velocity.copy(), angle.copy()
         if few:
             speed[soft], turned[soft] = self.motor_speed[:few], self.motor_angle[:few]
-        shared = [(b, s) for b, s in self.shared if b < k]
+        shared = [(b, s) for b, s in self.shared if b < k] if self.shared else ()
         for b, s in shared:
             speed[b, s.joint] += s.coefficient * velocity[b, s.other]
         amplitude, cycles, phase = (part[:k] for part in self.ripple)
@@ -103,7 +107,7 @@ class Drives:
     def move(self, k: int) -> None:
         """Leapfrog of the motors behind springs, one step."""
         self.count += 1
-        _, few = _first(self.soft, k)
+        _, few = self.soft.within(k)
         if few:
             push = self.motor_push[:few]
             self.motor_half[:few] += self.step * push
@@ -126,7 +130,7 @@ class Drives:
         """The current loops: delay, lag, limit."""
         k, size = len(command), len(self.queue)
         self.queue[self.count % size, :k] = command
-        late, few = _first(self.late, k)
+        late, few = self.late.within(k)
         if few:
             command = command.copy()
             command[late] = self.queue[(self.count - self.wait[:few]) % size, late[0], late[1]]
@@ -143,11 +147,16 @@ class Drives:
         return np.asarray(np.where(free, 0.0, torque))
 
 
-def _cells(mask: Array) -> tuple[Array, Array]:
-    return np.nonzero(mask)
+class _Cells:
+    """Cells (arm, joint) of a mask in row order; `within(k)` gives those of the first k arms, and how many they are."""
 
+    def __init__(self, mask: NDArray[np.bool_]) -> None:
+        self.rows, self.columns = np.nonzero(mask)
+        self.all = (self.rows, self.columns)
+        self._k, self._found = -1, (self.all, len(self.rows))
 
-def _first(cells: tuple[Array, Array], k: int) -> tuple[tuple[Array, Array], int]:
-    """Of cells in row order those in the first k rows, and how many they are."""
-    few = int(np.searchsorted(cells[0], k))
-    return (cells[0][:few], cells[1][:few]), few
+    def within(self, k: int) -> tuple[tuple[NDArray[np.intp], NDArray[np.intp]], int]:
+        if k != self._k:
+            few = int(np.searchsorted(self.rows, k))
+            self._k, self._found = k, ((self.rows[:few], self.columns[:few]), few)
+        return self._found

@@ -1,7 +1,7 @@
 """Elasto-plastic bristles (Dupont, Hayward, Armstrong, Altpeter 2002): LuGre friction that does not creep at rest.
 
-f = σ₀ z + σ₁ ż + d v,  ż = v (1 − α(z, v) z/z_ss),  z_ss = g(v, τ)/σ₀ in the direction of v; α is 0 while the bristle bends
-elastically (|z| below 0.7 z_ss, or v and z apart), rises smoothly and is 1 where it slides.
+f = σ₀ z + σ₁ ż + d v,  ż = v (1 − α(z, v) z/z_ss),  z_ss = g(v, τ)/σ₀ in the direction of v; α is 0 while the
+bristle bends elastically (|z| below 0.7 z_ss, or v and z apart), rises smoothly and is 1 where it slides.
 g = (coulomb + breakaway·exp(−(v/v_s)²) + load·|τ|)·(1 ± asymmetry).
 """
 
@@ -37,7 +37,7 @@ class Bristles:
         self.bend = np.zeros_like(inertia)
 
     def force(self, v: Array, load: Array) -> Array:
-        """Friction torque against the motor velocities `v` [rad/s] of the first len(v) arms, `load` the torque carried."""
+        """Friction torque against motor velocities `v` [rad/s] of the first len(v) arms, `load` the torque carried."""
         k = len(v)
         level = self.coulomb[:k]
         if self.rows[:k].any():

@@ -18,7 +18,7 @@ MOVING = 0.03
 
 
 def gap(arm: Arm, columns: dict[str, Array]) -> dict[str, list[float]]:
-    """RMS [N·m] per joint of each torque channel against the nominal model, below 6 Hz: `tau`, `tau_motor`, `tau_cmd`."""
+    """RMS [N·m] per joint of `tau`, `tau_motor` and `tau_cmd` against the nominal model, below 6 Hz."""
     from scipy.signal import butter, sosfiltfilt
 
     t = np.arange(columns["t"][0], columns["t"][-1], 1.0 / RATE)

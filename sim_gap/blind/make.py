@@ -41,7 +41,7 @@ def make_cases(
     A case whose effects do not stand out on the held-out motion, or whose arm was not under control, is drawn again.
     """
     labels.mkdir(parents=True, exist_ok=True)
-    open_cases = {recipe: 0 for recipe in wanted}
+    open_cases = dict.fromkeys(wanted, 0)
     for last in (*[False] * (ROUNDS - 1), True):
         drawings = [draw(recipe, train_s, heldout_s, first) for recipe, first in open_cases.items()]
         logs = iter(simulate([run for d in drawings for run in (d.heldout, *d.without)]))
@@ -143,6 +143,19 @@ def main() -> None:
         ]
         for job in jobs:
             job.result()
+    (given.labels / "withhold.txt").write_text("\n".join(withheld(given.labels)), encoding="utf-8")
+
+
+def withheld(labels: Path, each: int = 2) -> list[str]:
+    """Lines "case effect": the first `each` single-effect cases of every effect that the recording can tell."""
+    chosen: dict[str, list[str]] = {}
+    for path in sorted(labels.glob("*.json")):
+        truth = json.loads(path.read_text(encoding="utf-8"))
+        if truth["kind"] == "single" and not truth["effects"][0]["undecided"]:
+            cases = chosen.setdefault(truth["effects"][0]["effect"], [])
+            if len(cases) < each:
+                cases.append(truth["case"])
+    return [f"{case} {effect}" for effect in sorted(chosen) for case in chosen[effect]]
 
 
 if __name__ == "__main__":

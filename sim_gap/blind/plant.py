@@ -1,8 +1,8 @@
 """Many arms moved at once: rigid links by MuJoCo's forward dynamics, all else by its own leapfrog at 0.5 ms.
 
-Links get velocities at half steps from accelerations at full steps. Motors, bristles, gear play and the position controller
-(PD with feed-forward of the nominal model, 500 Hz, on a quantised and noisy reading) are arrays over all arms. An arm is
-simulated alike whoever its neighbours are.
+Links get velocities at half steps from accelerations at full steps. Motors, bristles, gear play and the position
+controller (PID with feed-forward of the nominal model, 500 Hz, on a quantised and noisy reading) are arrays over all
+arms. An arm is simulated alike whoever its neighbours are.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from sim_gap.blind.truth import Truth
 
 SUBSTEPS = 4
 STEP = 1.0 / (RATE * SUBSTEPS)
-CHANNELS = ("position", "torque", "motor", "command", "angle", "velocity", "acceleration")
+CHANNELS = ("position", "torque", "motor", "command", "angle")
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,7 @@ class Log:
     """What the drive believes that it makes [N·m]."""
     command: Array
     angle: Array
-    velocity: Array
-    acceleration: Array
-    """Of the links: rad, rad/s, rad/s²."""
+    """Of the links [rad]."""
 
 
 def simulate(runs: Sequence[Run]) -> list[Log]:
@@ -84,9 +82,7 @@ class _Batch:
         truths = [run.truth for run in runs]
         self.drives = Drives(truths, self._least_inertia(), self.angle, [run.feed_forward[0] for run in runs], STEP)
         self.controller = Controller(runs, self.drives.reading(self.angle), self.width)
-        self.logs = [
-            {name: np.empty((k, run.truth.n)) for name in CHANNELS} for k, run in zip(self.lengths, runs, strict=True)
-        ]
+        self.kept = {name: np.zeros((self.lengths[0], *shape)) for name in CHANNELS}
 
     def run(self) -> list[Log]:
         """Move until the longest run is over."""
@@ -101,7 +97,11 @@ class _Batch:
                 if sub == 0:
                     self._record(k, tick, reading, command)
                 self._move(k)
-        return [Log(**log) for log in self.logs]
+        sizes = [(length, run.truth.n) for length, run in zip(self.lengths, self.runs, strict=True)]
+        return [
+            Log(**{name: values[:length, b, :n] for name, values in self.kept.items()})
+            for b, (length, n) in enumerate(sizes)
+        ]
 
     def _step(self, k: int, command: Array) -> None:
         """Forces and accelerations now."""
@@ -121,11 +121,8 @@ class _Batch:
 
     def _record(self, k: int, tick: int, reading: Array, command: Array) -> None:
         torque = self.drives.link_torque(self.acceleration[:k])
-        values = (reading, torque, self.drives.current[:k], command, self.angle, self.velocity, self.acceleration)
-        for b in range(k):
-            n, log = self.runs[b].truth.n, self.logs[b]
-            for name, value in zip(CHANNELS, values, strict=True):
-                log[name][tick] = value[b, :n]
+        for name, now in zip(CHANNELS, (reading, torque, self.drives.current, command, self.angle), strict=True):
+            self.kept[name][tick, :k] = now[:k]
 
     def _least_inertia(self) -> Array:
         """A lower bound of the inertia that each motor moves, (B, width)."""

@@ -11,7 +11,7 @@ from sim_gap.blind.effects.library import DRAWS, EFFECTS
 from sim_gap.blind.motion import KINDS, Limits, trajectory
 from sim_gap.blind.plant import Run
 from sim_gap.blind.scene import Scene
-from sim_gap.blind.truth import Truth, ordinary
+from sim_gap.blind.truth import ordinary
 
 ATTEMPTS = 60
 NONE_SHARE, TWO_SHARE = 0.12, 0.18
@@ -42,7 +42,7 @@ class Drawing:
     train: Run
     heldout: Run
     without: tuple[Run, ...]
-    """The held-out motion of the same arm without each effect in turn, then without any (one run where there is one effect)."""
+    """The held-out motion of the same arm without each effect in turn, then without any; one run for one effect."""
     attempt: int
     """Which of the recipe's drawings this is."""
     columns: dict[str, bool]
@@ -135,12 +135,13 @@ def _compatible(drawn: list[Drawn]) -> bool:
 
 def label(drawing: Drawing) -> dict[str, Any]:
     """What the case truly is, for the score; gaps are added once it has run."""
-    chirp = "chirp" in drawing.motions["train"]
+    chirp, nominal = "chirp" in drawing.motions["train"], drawing.nominal
     effects = [
         {
             "effect": d.effect,
             "joints": list(d.joints),
             "parameters": d.parameters,
+            "axis": nominal.axis[nominal.names.index(d.joints[0])].tolist() if d.joints else None,
             "implied": list(d.implied),
             "undecided": "" if chirp and d.effect in ("actuator.lag", "actuator.delay") else d.undecided,
             "confused_with": list(d.confused_with),
@@ -151,7 +152,7 @@ def label(drawing: Drawing) -> dict[str, Any]:
         "schema": "armlink.blind-label/1",
         "case": drawing.recipe.name,
         "kind": drawing.recipe.kind,
-        "n": drawing.nominal.n,
+        "n": nominal.n,
         "effects": effects,
         "motions": {name: list(kinds) for name, kinds in drawing.motions.items()},
     }

@@ -8,7 +8,7 @@ import numpy as np
 
 from sim_gap.blind.arms import Arm, Array
 from sim_gap.blind.motion import derivatives
-from sim_gap.blind.rigid_body import compiled, inverse, controlled_inertia
+from sim_gap.blind.rigid_body import compiled, controlled_inertia, inverse
 
 THIN = 25
 """Every 25th row of the trajectory is enough to judge magnitudes."""

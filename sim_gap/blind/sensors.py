@@ -20,7 +20,7 @@ SENSOR_BITS = 16
 def record(
     truth: Truth, log: Log, rate: float, velocity: bool, command: Array, random: np.random.Generator
 ) -> dict[str, Array]:
-    """Columns of a recording at about `rate` Hz: `t` (K,) and q, dq where `velocity`, tau, tau_motor, tau_cmd, q_cmd (K, n)."""
+    """Columns of a recording at about `rate` Hz: `t` (K,); q, tau, tau_motor, tau_cmd, q_cmd, dq if `velocity` (K, n)."""
     clock = np.arange(len(log.position)) / RATE
     t = _times(clock[-1], rate, random)
     shape = (len(t), truth.n)
@@ -70,7 +70,7 @@ def _drive_velocity(position: Array, step: float, random: np.random.Generator) -
 
 
 def _sensor(truth: Truth, torque: Array, clock: Array) -> Array:
-    """Readings without noise: late, mixed by crosstalk, bent by hysteresis, dead band and saturation, then gain, offset, drift."""
+    """Readings without noise: late, crosstalk, then hysteresis, dead band, saturation, then gain, offset, drift."""
     late = np.column_stack(
         [np.interp(clock - d, clock, column) for d, column in zip(truth.torque_delay, torque.T, strict=True)]
     )

@@ -1,8 +1,9 @@
-"""Everything that is wrong with one arm of the blind check, as arrays; without effects only the small errors that every arm has."""
+"""All that is wrong with one arm of the blind check, as arrays; without effects, what is wrong with every arm."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_gap.blind.arms import Arm, Array, perturbed
 
@@ -72,7 +73,7 @@ class Truth:
         return self.arm.n
 
     @property
-    def elastic(self) -> Array:
+    def elastic(self) -> NDArray[np.bool_]:
         """Joints with two masses (those with elasticity or backlash), (n,) of bool."""
         return np.isfinite(self.stiffness)
 
@@ -85,36 +86,36 @@ class Truth:
 def ordinary(nominal: Arm, rated: Array, random: np.random.Generator) -> Truth:
     """The arm without effects: nominal parameters a little wrong everywhere, a little friction, noise of sensors."""
     n = nominal.n
-    zero, one, never = np.zeros, np.ones, lambda k: np.full(k, np.inf)
+    zero, one, never = np.zeros(n), np.ones(n), np.full(n, np.inf)
     return Truth(
         arm=perturbed(nominal, random),
         coulomb=nominal.frictionloss * random.uniform(0.98, 1.02, n) + random.uniform(0.01, 0.04, n),
         viscous=nominal.damping * random.uniform(0.98, 1.02, n) + random.uniform(0.0, 0.02, n),
-        breakaway=zero(n),
+        breakaway=zero.copy(),
         stribeck_velocity=np.full(n, 0.05),
-        asymmetry=zero(n),
-        load_friction=zero(n),
+        asymmetry=zero.copy(),
+        load_friction=zero.copy(),
         ripple=np.column_stack(
             [random.uniform(0.0, 0.01, n), random.uniform(5.0, 30.0, n), random.uniform(0.0, 6.0, n)]
         ),
-        spring=zero((n, 2)),
-        stiffness=never(n),
-        backlash=zero(n),
+        spring=np.zeros((n, 2)),
+        stiffness=never.copy(),
+        backlash=zero.copy(),
         motor_gain=1.0 + random.uniform(-0.003, 0.003, n),
         motor_lag=np.full(n, 0.0005),
-        motor_delay=zero(n),
-        motor_limit=never(n),
+        motor_delay=zero.copy(),
+        motor_limit=never.copy(),
         torque_gain=1.0 + random.uniform(-0.002, 0.002, n),
         torque_offset=random.uniform(-0.02, 0.02, n),
-        torque_drift=zero(n),
-        crosstalk=zero((n, n)),
-        hysteresis=zero(n),
-        deadband=zero(n),
+        torque_drift=zero.copy(),
+        crosstalk=np.zeros((n, n)),
+        hysteresis=zero.copy(),
+        deadband=zero.copy(),
         torque_limit=2.5 * rated,
-        torque_delay=zero(n),
-        position_gain=one(n),
+        torque_delay=zero.copy(),
+        position_gain=one.copy(),
         position_offset=random.uniform(-3e-4, 3e-4, n),
-        eccentricity=zero((n, 2)),
+        eccentricity=np.zeros((n, 2)),
         rated=rated,
         torque_noise=rated * random.uniform(0.0005, 0.003),
         motor_noise=rated * random.uniform(0.001, 0.004),

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_gap.blind.arms import Arm, Array
 from sim_gap.blind.scene import Scene, rms
@@ -20,7 +21,7 @@ Values = dict[str, float]
 
 @dataclass(frozen=True)
 class Drawn:
-    """An effect on one arm. `apply` puts it into the truth; `nominal` changes what the nominal model says, if anything."""
+    """An effect on one arm. `apply` puts it into the truth; `nominal` changes the nominal model, where need be."""
 
     effect: str
     parameters: dict[str, Values]
@@ -53,10 +54,13 @@ def motor_level(scene: Scene, random: np.random.Generator) -> Array:
     return np.maximum(MOTOR_LEAST, random.uniform(*SHARES) * rms(scene.torque + scene.rotor_torque))
 
 
-def pick(wanted: Array, cap: float | Array, random: np.random.Generator, allowed: Array | None = None) -> int | None:
+def pick(
+    wanted: Array, cap: float | Array, random: np.random.Generator, allowed: NDArray[np.bool_] | None = None
+) -> int | None:
     """A joint whose wanted magnitude is finite and within the cap; None where there is none."""
     fit = np.isfinite(wanted) & (wanted <= cap)
-    fit &= True if allowed is None else allowed
+    if allowed is not None:
+        fit &= allowed
     return int(random.choice(np.flatnonzero(fit))) if fit.any() else None
 
 

@@ -1,5 +1,6 @@
 """Friction of one joint beyond what the nominal model says."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,7 @@ MOVING = 0.02
 """Below this speed [rad/s] friction shows nothing that can be read."""
 
 
-def _known_coulomb(joint: int, torque: float, known: bool) -> tuple[object, tuple[str, ...]]:
+def _known_coulomb(joint: int, torque: float, known: bool) -> tuple[Callable[[Arm], Arm] | None, tuple[str, ...]]:
     """Coulomb friction under another effect: either the nominal model has it, or it is implied."""
 
     def nominal(arm: Arm) -> Arm:
@@ -61,7 +62,7 @@ def stribeck(scene: Scene, random: np.random.Generator) -> Drawn | None:
         truth.breakaway[j], truth.stribeck_velocity[j] = breakaway, velocity
 
     values = {"breakaway": breakaway, "velocity": velocity}
-    return Drawn("friction.stribeck", {scene.arm.names[j]: values}, apply, nominal, implied)  # type: ignore[arg-type]
+    return Drawn("friction.stribeck", {scene.arm.names[j]: values}, apply, nominal, implied)
 
 
 def asymmetric(scene: Scene, random: np.random.Generator) -> Drawn | None:
@@ -75,7 +76,7 @@ def asymmetric(scene: Scene, random: np.random.Generator) -> Drawn | None:
         truth.coulomb[j], truth.asymmetry[j] = base, ratio
 
     values = {"ratio": ratio}
-    return Drawn("friction.asymmetric", {scene.arm.names[j]: values}, apply, nominal, implied)  # type: ignore[arg-type]
+    return Drawn("friction.asymmetric", {scene.arm.names[j]: values}, apply, nominal, implied)
 
 
 def load(scene: Scene, random: np.random.Generator) -> Drawn | None:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_gap.blind.arms import Arm, Array
 from sim_gap.blind.effects.drawn import Draw, Drawn, sensor_level
@@ -13,9 +14,9 @@ XYZ = ("x", "y", "z")
 INERTIA = (("xx", 0, 0), ("xy", 0, 1), ("xz", 0, 2), ("yy", 1, 1), ("yz", 1, 2), ("zz", 2, 2))
 
 
-def _scale(scene: Scene, other: Arm, joints: Array, random: np.random.Generator) -> float:
+def _scale(scene: Scene, other: Arm, joints: NDArray[np.intp], random: np.random.Generator) -> float:
     """By how much to scale a change so that it shows on the best of `joints`."""
-    return float((1.0 / (rms(scene.change(other)) / sensor_level(scene, random))[joints].max()))
+    return float(1.0 / (rms(scene.change(other)) / sensor_level(scene, random))[joints].max())
 
 
 def mass_moment(scene: Scene, random: np.random.Generator) -> Drawn | None:

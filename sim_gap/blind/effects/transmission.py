@@ -121,7 +121,7 @@ def coupling(scene: Scene, random: np.random.Generator) -> Drawn | None:
         "coulomb": coulomb,
         "viscous": viscous,
     }
-    own = tuple(f"friction.{kind}" for kind in ("coulomb", "viscous")) + ("actuator.rotor_inertia",)
+    own = ("friction.coulomb", "friction.viscous", "actuator.rotor_inertia")
     return Drawn("transmission.coupling", {scene.arm.names[j]: values}, apply, nominal, own)
 
 

@@ -1,0 +1,118 @@
+"""The blind check from end to end: cases made by a process of their own, answers sealed, labels opened, score."""
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from armlink.errors import ArmlinkError, BadInput, Refused
+from sim_gap.blind.score import answer_name, score
+from sim_gap.blind.seal import open_labels, seal, write_answer
+
+Diagnose = Callable[[Path, Sequence[Path], Sequence[Path], Sequence[str]], dict[str, Any]]
+"""Model, training and held-out recordings, effects withheld → the answer of contract 5."""
+
+
+def run_bench(
+    diagnose: Diagnose,
+    out: Path,
+    seed: int = 1,
+    cases: int = 150,
+    workers: int = 2,
+    progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+) -> dict[str, Any]:
+    """Make `cases` sealed cases under `out`, have them diagnosed, seal the answers, open the labels and score.
+
+    `progress` gets stage, done, total. `diagnose` must be a module's function where `workers` exceeds 1. Raises
+    BadInput where `out` holds an earlier check.
+    """
+    if cases < 1:
+        raise BadInput(f"--cases {cases}: expected at least 1")
+    if (out / "answers").exists() or (out / "cases").exists():
+        raise BadInput(f"{out}: holds an earlier check: give another --out, or remove it")
+    started = time.monotonic()
+    progress("making cases", 0, cases)
+    for done in make_apart(out, seed, cases, workers):
+        progress("making cases", done, cases)
+    made = time.monotonic()
+    todo = tasks(out)
+    for done, (name, answer) in enumerate(_answers(diagnose, out / "cases", todo, workers), start=1):
+        write_answer(out / "answers", name, answer)
+        progress("diagnosing", done, len(todo))
+    digest = seal(out / "answers")
+    answered = time.monotonic()
+    answers, labels = open_labels(out / "answers", out / "labels", digest)
+    result = score(answers, labels)
+    seconds = {"making": made - started, "diagnosing": answered - made}
+    return {**result, "seed": seed, "sealed": digest, "seconds": seconds}
+
+
+def make_apart(out: Path, seed: int, cases: int, workers: int) -> Iterator[int]:
+    """Make the cases in a separate process; yields now and then how many there are. Raises Refused where it fails."""
+    command = [sys.executable, "-m", "sim_gap.blind.make", "--seed", str(seed), "--cases", str(cases)]
+    command += ["--out", str(out / "cases"), "--labels", str(out / "labels"), "--workers", str(workers)]
+    (out / "cases").mkdir(parents=True)
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as maker:
+        while True:
+            try:
+                _, complaint = maker.communicate(timeout=2.0)
+                break
+            except subprocess.TimeoutExpired:
+                yield len(list((out / "cases").glob("*/heldout.csv")))
+    if maker.returncode:
+        raise Refused(
+            f"the cases could not be made: {complaint.strip().splitlines()[-1] if complaint else maker.returncode}"
+        )
+
+
+def tasks(out: Path) -> list[tuple[str, str]]:
+    """(case, effect withheld or nothing) of every diagnosis to run.
+
+    Which effects to withhold the maker says (`labels/withhold.txt`); no label is opened for it.
+    """
+    names = sorted(path.name for path in (out / "cases").iterdir())
+    lines = (out / "labels" / "withhold.txt").read_text(encoding="utf-8").splitlines()
+    withheld = [(case, effect) for case, effect in (line.split() for line in lines)]
+    return [*((name, "") for name in names), *withheld]
+
+
+def diagnose_files(sim: Path, train: Sequence[Path], heldout: Sequence[Path], exclude: Sequence[str]) -> dict[str, Any]:
+    """The diagnosis of this package on files, `exclude` taken out of its library."""
+    from armlink.recording import load_recording
+    from sim_gap.diagnose import diagnose
+
+    answer = diagnose(
+        sim, [load_recording(path) for path in train], [load_recording(path) for path in heldout], withhold=exclude
+    )
+    return answer.to_json()
+
+
+def answer_case(diagnose: Diagnose, cases: Path, case: str, withheld: str) -> tuple[str, dict[str, Any]]:
+    """Name and answer of one diagnosis; one that refuses its input is an answer too, without causes."""
+    folder = cases / case
+    started = time.monotonic()
+    try:
+        answer = diagnose(
+            folder / "sim.xml", [folder / "train.csv"], [folder / "heldout.csv"], [withheld] if withheld else []
+        )
+    except ArmlinkError as error:
+        nothing: dict[str, Any] = {"before": [], "after": []}
+        answer = {"verdict": "unexplained", "causes": [], "gap": {"heldout": nothing}, "refused": str(error)}
+    return answer_name(case, withheld), {**answer, "seconds": time.monotonic() - started}
+
+
+def _answers(
+    diagnose: Diagnose, cases: Path, todo: Sequence[tuple[str, str]], workers: int
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    if workers <= 1:
+        for case, withheld in todo:
+            yield answer_case(diagnose, cases, case, withheld)
+        return
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        jobs = [pool.submit(answer_case, diagnose, cases, case, withheld) for case, withheld in todo]
+        for job in as_completed(jobs):
+            yield job.result()

@@ -1,0 +1,189 @@
+"""One answer against one label: what was right, what was wrong, how near the parameters came. Pure functions."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+CONFIDENT = 0.8
+"""A cause claimed with more than this counts as blamed."""
+MAIN_SHARE = 0.15
+"""A joint counts to a cause where its parameter is at least this share of the cause's largest."""
+BESIDE_POINT = ("phase", "rest", "source", "other_joint")
+"""Parameters that are indices, or matter only together with another."""
+
+Json = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class ParameterError:
+    """One estimated parameter: its relative error, and whether the 95 % interval holds the truth (None if none)."""
+
+    effect: str
+    name: str
+    relative: float
+    inside: bool | None
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """One case judged."""
+
+    case: str
+    kind: str
+    truth: tuple[str, ...]
+    withheld: str
+    """The effect taken out of the library, or nothing."""
+    verdict: str
+    first: str
+    """First effect named, steps beneath a true effect passed over; empty where none is named."""
+    confidence: float
+    first_right: bool
+    named: bool
+    """Whether a true effect stands first or among those it is confounded with."""
+    tellable: bool
+    found: tuple[str, ...]
+    """True effects among the causes, whatever their place."""
+    blamed: tuple[str, ...]
+    """Causes claimed with confidence that are not in this arm (small true imperfections listed last are forgiven)."""
+    joints_right: int = 0
+    joints_wrong: int = 0
+    joints_missed: int = 0
+    errors: tuple[ParameterError, ...] = ()
+    shrink: float = float("nan")
+    """Held-out shrink claimed on the joint concerned."""
+    shrink_true: float = float("nan")
+    """Held-out shrink of adding the true effects."""
+
+
+def judge(answer: Json, label: Json, withheld: str = "") -> Judgement:
+    """Judge an answer (contract 5) against its label; `withheld` names the effect that was not in the library."""
+    truths = [t for t in label["effects"] if t["effect"] != withheld]
+    names = {t["effect"] for t in truths}
+    implied = {name for t in label["effects"] for name in t["implied"]}
+    causes = list(answer["causes"])
+    leading = [c for c in causes if c["effect"] in names or c["effect"] not in implied] or causes
+    first = leading[0] if leading else None
+    offered = {first["effect"], *(first["confounded_with"] or ())} if first else set()
+    right, wrong, missed = _joints(causes, truths)
+    shrink, shrink_true = _shrinks(answer, label)
+    return Judgement(
+        case=label["case"],
+        kind=label["kind"],
+        truth=tuple(t["effect"] for t in label["effects"]),
+        withheld=withheld,
+        verdict=answer["verdict"],
+        first=first["effect"] if first else "",
+        confidence=float(first["confidence"]) if first else 0.0,
+        first_right=bool(first and first["effect"] in names),
+        named=bool(offered & names),
+        tellable=bool(truths) and not any(t["undecided"] for t in truths),
+        found=tuple(t["effect"] for t in truths if t["effect"] in {c["effect"] for c in causes}),
+        blamed=_blamed(causes, label, withheld),
+        joints_right=right,
+        joints_wrong=wrong,
+        joints_missed=missed,
+        errors=tuple(error for t in truths for error in _parameter_errors(causes, t)),
+        shrink=shrink,
+        shrink_true=shrink_true,
+    )
+
+
+def _blamed(causes: Sequence[Json], label: Json, withheld: str) -> tuple[str, ...]:
+    """Confident causes that are not true.
+
+    Forgiven: what a true effect implies, a rival of an effect that this motion cannot tell, and what comes after every
+    true effect and lowers the gap by no more than the small errors of this very arm make.
+    """
+    present = [t for t in label["effects"] if t["effect"] != withheld]
+    fine = {name for t in label["effects"] for name in t["implied"]} | {t["effect"] for t in present}
+    fine |= {name for t in present if t["undecided"] for name in t["confused_with"]}
+    small = max((value for values in label["gap"]["without"].values() for value in values), default=0.0)
+    out, due = [], {t["effect"] for t in present}
+    for cause in causes:
+        due.discard(cause["effect"])
+        if cause["effect"] in fine or cause["confidence"] <= CONFIDENT:
+            continue
+        if not due and float(cause["gap_before"] or 0.0) - float(cause["gap_after"] or 0.0) <= small:
+            continue
+        out.append(str(cause["effect"]))
+    return tuple(out)
+
+
+def _joints(causes: Sequence[Json], truths: Sequence[Json]) -> tuple[int, int, int]:
+    """Joints right, wrong and missed, over the true effects that sit on joints and were named."""
+    right = wrong = missed = 0
+    for truth in truths:
+        told = next((c for c in causes if c["effect"] == truth["effect"]), None)
+        if not truth["joints"] or told is None:
+            continue
+        claimed, true = set(_main_joints(told)), set(truth["joints"])
+        right, wrong, missed = right + len(claimed & true), wrong + len(claimed - true), missed + len(true - claimed)
+    return right, wrong, missed
+
+
+def _main_joints(cause: Json) -> list[str]:
+    """Joints of a cause whose first parameter (a gain's distance from 1) is not small beside the largest."""
+    sizes = {}
+    for joint in cause["joints"]:
+        values = cause["parameters"].get(joint) or {}
+        numbers = [
+            _deviation(n, p["value"]) for n, p in values.items() if n not in BESIDE_POINT and p["value"] is not None
+        ]
+        sizes[joint] = max((abs(x) for x in numbers), default=np.inf)
+    limit = MAIN_SHARE * max(sizes.values(), default=0.0)
+    return [joint for joint, size in sizes.items() if size >= limit or np.isinf(size)]
+
+
+def _deviation(name: str, value: float) -> float:
+    return value - 1.0 if name == "gain" else value
+
+
+def _parameter_errors(causes: Sequence[Json], truth: Json) -> list[ParameterError]:
+    """Relative errors of a true effect's parameters: vectors by their norm, an inertia about the joint's axis."""
+    told = next((c for c in causes if c["effect"] == truth["effect"]), None)
+    out: list[ParameterError] = []
+    for joint, true in truth["parameters"].items():
+        given = (told["parameters"].get(joint) if told else None) or {}
+        values = {name: p["value"] for name, p in given.items() if name in true and p["value"] is not None}
+        if not values:
+            continue
+        if truth["effect"] in ("link.mass_moment", "link.inertia", "base.tilt"):
+            out += _vector_error(truth, true, values)
+            continue
+        names = [n for n in true if n in values and n not in BESIDE_POINT]
+        if truth["effect"] == "link.payload":
+            names = ["mass"]
+        for name in names:
+            size = abs(_deviation(name, true[name]))
+            low_high = given[name].get("ci95") or (None, None)
+            inside = None if None in low_high else bool(low_high[0] <= true[name] <= low_high[1])
+            out.append(ParameterError(truth["effect"], name, abs(values[name] - true[name]) / max(size, 1e-9), inside))
+    return out
+
+
+def _vector_error(truth: Json, true: Json, values: Json) -> list[ParameterError]:
+    if truth["effect"] == "link.inertia":
+        name, axis = "about_axis", np.array(truth["axis"])
+        part = dict(zip("xyz", axis, strict=True))
+        weight = {r + c: (1 if r == c else 2) * part[r] * part[c] for r in "xyz" for c in "xyz" if r <= c}
+        ours, theirs = (sum(weight[k] * float(source.get(k, 0.0)) for k in weight) for source in (true, values))
+        return [ParameterError(truth["effect"], name, abs(theirs - ours) / abs(ours), None)]
+    keys = [key for key in true if key in values]
+    ours, theirs = np.array([true[k] for k in keys]), np.array([values[k] for k in keys])
+    return [
+        ParameterError(truth["effect"], "vector", float(np.linalg.norm(theirs - ours) / np.linalg.norm(ours)), None)
+    ]
+
+
+def _shrinks(answer: Json, label: Json) -> tuple[float, float]:
+    """Held-out shrink on the joint that the first true effect touches most: all causes together, and by the truth."""
+    falls = label["gap"]["falls"]
+    if not falls:
+        return float("nan"), float("nan")
+    joint, channel = int(falls[0]["joint"].removeprefix("joint_")) - 1, falls[0]["channel"]
+    held = answer["gap"]["heldout"]
+    before, after = (held[key][joint] if joint < len(held[key]) else None for key in ("before", "after"))
+    true = 1.0 - label["gap"]["without"][channel][joint] / label["gap"]["with"][channel][joint]
+    return (1.0 - after / before if before and after is not None else float("nan")), true
