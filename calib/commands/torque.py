@@ -1,0 +1,83 @@
+"""Gravity torque at poses, from a model's own inertials or an identified gravity record."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from gcomp.arm import Arm
+
+    Array = npt.NDArray[np.float64]
+
+MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
+
+
+def torque(
+    arm: Annotated[str, typer.Argument(help="Bundled arm, path of an arm file, or a URDF or MJCF file.")],
+    q: Annotated[Path, typer.Option(help="CSV file of poses: a header row with columns q_1 … q_n [rad].")],
+    record: Annotated[
+        str | None, typer.Option(help="Id of a gravity record; default: the model's inertials, else the current one.")
+    ] = None,
+    store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")
+    ] = None,
+) -> None:
+    """Holding torque against gravity at each pose of a file, one row a pose [N·m].
+
+    Example: armlink torque arm.urdf --q poses.csv --json -
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from armlink.commands.output import write_json
+    from calib.poses import load_poses
+    from gcomp.gravity import gravity_torque
+
+    described, beta, source = _model(arm, record, store)
+    poses = load_poses(q, described.n)
+    answer = gravity_torque(described, beta, poses)
+    table = Table("pose", *described.names, title=f"Holding torque [N·m], {source}")
+    for number, row in enumerate(answer, start=1):
+        table.add_row(str(number), *(f"{value:+.4f}" for value in row))
+    if json_file is None or str(json_file) != "-":
+        Console(stderr=True).print(table)
+    write_json(json_file, {"joints": list(described.names), "source": source, "torque": answer.tolist()})
+
+
+def _model(arm: str, record: str | None, store: str | None) -> "tuple[Arm, Array, str]":
+    """The arm, its mass moments (2n,) [kg·m], and where these come from; raises BadInput or Refused."""
+    import numpy as np
+
+    from armlink.armfile import load_arm
+    from armlink.errors import BadInput, Refused
+    from calib.description import gcomp_arm, model_arm
+    from calib.records import GravityRecord
+    from calib.store import RecordStore
+    from gcomp.model import load_model
+
+    if Path(arm).suffix.lower() in MODEL_SUFFIXES:
+        if record is not None:
+            raise BadInput(f"--record {record}: a record belongs to an arm file, and {arm} is a model file")
+        if not Path(arm).is_file():
+            raise BadInput(f"no model file {arm}: give the path of a URDF or MJCF file, or of an arm file")
+        model = load_model(Path(arm))
+        return model.arm, model.beta, f"inertials of {arm}"
+    arm_file = load_arm(arm)
+    if record is None and arm_file.model_path is not None:
+        model = model_arm(arm_file)
+        return model.arm, model.beta, f"inertials of {arm_file.model_path.name}"
+    records = RecordStore(store)
+    kept = records.current(GravityRecord, arm_file) if record is None else records.get(record).require(arm_file)
+    if kept is None:
+        raise Refused(
+            f"{arm_file.name} {arm_file.serial}: its description has no inertials, and there is no gravity record yet:"
+            " armlink identify makes one"
+        )
+    if not isinstance(kept, GravityRecord):
+        raise BadInput(f"--record {record}: that is a {kept.kind} record, expected a gravity record")
+    return gcomp_arm(arm_file), np.array(kept.beta), f"gravity record {kept.id}"
