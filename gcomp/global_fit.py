@@ -19,7 +19,7 @@ MAX_STD = {"gain": 0.2, "offset": 0.5, "position_gain": 0.1, "position_offset": 
 """Standard deviation beyond which a value is no answer, per family: shares of the gain; of the readings' size for
 offset and of that size over g for mass moments; rad; m."""
 DOUBT = 2.0
-"""chi² per degree of freedom from which on another start is tried."""
+"""Weighted squares per degree of freedom from which on another start is tried."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ def identify_global(
     starts = _starts(problem, begin)
     outcome = solve(problem, next(starts))
     for first in starts:
-        if outcome.converged and outcome.chi2 < DOUBT * max(1, outcome.dof):
+        if outcome.converged and outcome.cost < DOUBT * max(1, outcome.dof):
             break
         other = solve(problem, first)
         outcome = other if other.cost < outcome.cost else outcome

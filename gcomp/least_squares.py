@@ -1,6 +1,6 @@
 """Weighted nonlinear least squares of the sensor model: Levenberg-Marquardt on a QR factor built block by block."""
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,14 +8,13 @@ from numpy.typing import ArrayLike
 
 from gcomp.arm import Arm
 from gcomp.arrays import Array, Mask, as_array
+from gcomp.blocks import fold
 from gcomp.errors import BadArray
 from gcomp.information import Information, Spectrum, analyse
 from gcomp.parameters import Parameters, Prior, free_mask, prior_vectors
 from gcomp.readings import Readings
 from gcomp.sensor_model import predict, predict_and_jacobian
 
-BLOCK = 2048
-"""Rows worked on at a time: memory stays bounded whatever the number of rows."""
 MAX_ITERATIONS = 60
 SETTLED, STALLED, EXACT = 1e-9, 1e-5, 1e-16
 """The last step is the one that can lower the cost by less than this share; that share where no step lowers it at all;
@@ -65,16 +64,11 @@ class Problem:
         """Whether the weights depend on the parameters."""
         return self.loss != "linear" or bool(self.position_sigma.any())
 
-    def blocks(self) -> Iterator[Readings]:
-        """The readings, some rows at a time."""
-        for begin in range(0, len(self.readings.load), BLOCK):
-            yield self.readings.rows(slice(begin, begin + BLOCK))
-
     def cost(self, vector: Array, weight: list[Array]) -> float:
         """Weighted sum of squares (priors included) at a parameter vector, with the weights of each block."""
         parameters = Parameters.from_vector(vector, self.arm.n)
         total = float(np.sum(self._prior_residual(vector) ** 2))
-        for block, block_weight in zip(self.blocks(), weight, strict=True):
+        for block, block_weight in zip(self.readings.blocks(), weight, strict=True):
             residual = (block.torque - predict(self.arm, parameters, block))[block.counted]
             total += float(np.sum((residual * block_weight) ** 2))
         return total
@@ -82,7 +76,7 @@ class Problem:
     def weights(self, vector: Array, robust: bool = True) -> list[Array]:
         """Weight of each counted reading, block by block: 1/σ with position noise, times the loss's root weight."""
         parameters, weights = Parameters.from_vector(vector, self.arm.n), []
-        for block in self.blocks():
+        for block in self.readings.blocks():
             variance = block.sigma[block.counted] ** 2
             if not self.reweighted:
                 weights.append(1 / np.sqrt(variance))
@@ -109,12 +103,12 @@ class Problem:
         """(R (p, p), Qᵀr (p,)) of the weighted Jacobian and residual, priors included."""
         parameters, size = Parameters.from_vector(vector, self.arm.n), int(self.free.sum())
         prior = np.diag(1 / self.prior_std[self.free])
-        triangle = np.linalg.qr(np.column_stack([prior, self._prior_residual(vector)]), mode="r")
-        for block, block_weight in zip(self.blocks(), weight, strict=True):
+        triangle = np.column_stack([prior, self._prior_residual(vector)])
+        for block, block_weight in zip(self.readings.blocks(), weight, strict=True):
             modelled, jacobian, _ = predict_and_jacobian(self.arm, parameters, block)
             residual = block.torque[block.counted] - modelled
             rows = np.column_stack([jacobian[:, self.free], residual]) * block_weight[:, None]
-            triangle = np.linalg.qr(np.vstack([triangle, rows]), mode="r")
+            triangle = fold(triangle, rows)
         square = np.zeros((size, size + 1))
         square[: min(size, len(triangle))] = triangle[:size]
         return square[:, :size], square[:, size]
@@ -161,7 +155,7 @@ def _step(
     problem: Problem, vector: Array, weight: list[Array], cost: float, spectrum: Spectrum, along: Array, damping: float
 ) -> tuple[Array | None, float, float]:
     """(Vector with a lower cost or None, its cost, damping for the next step)."""
-    weakest = float(spectrum.values[-1] ** 2)
+    weakest = float(spectrum.values.min(initial=np.inf)) ** 2
     for _ in range(12):
         shrunk = along * spectrum.values / (spectrum.values**2 + damping)
         trial = vector.copy()
@@ -179,7 +173,7 @@ def _finish(problem: Problem, vector: Array, cost: float, iterations: int, conve
     information = analyse(problem.factor(vector, weight)[0], problem.unit[problem.free])
     residual = [
         (block.torque - predict(problem.arm, Parameters.from_vector(vector, problem.arm.n), block))[block.counted]
-        for block in problem.blocks()
+        for block in problem.readings.blocks()
     ]
     scaled = np.concatenate(residual) * np.concatenate(weight)
     dof = len(scaled) - information.rank

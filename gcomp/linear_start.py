@@ -4,6 +4,7 @@ import numpy as np
 
 from gcomp.arm import Arm
 from gcomp.arrays import Array, Mask
+from gcomp.blocks import least_squares
 from gcomp.gravity import gravity_regressor
 from gcomp.moments import payload_columns
 from gcomp.parameters import Parameters, family_slices
@@ -47,16 +48,18 @@ def _solve(
     arm: Arm, readings: Readings, start: Parameters, free: Mask, free_gain: Mask, keep_ratios: bool
 ) -> tuple[Array, ...]:
     """(κ (n,), ω (n,), β (2n,), ρ (3,)) of least norm; zero where not free."""
-    n, (row, joint) = arm.n, np.nonzero(readings.counted)
-    columns, target = _linear_rows(arm, readings, start, free, free_gain)
-    weight = np.abs(start.gain[joint]) / readings.sigma[row, joint]
-    columns *= weight[:, None]
-    if keep_ratios:
-        columns[:, 0] = columns[:, :n] @ (1 / start.gain)
-        columns[:, 1:n] = 0.0
-    scale = np.linalg.norm(columns, axis=0)
-    scale[scale == 0] = 1.0
-    solution = np.linalg.lstsq(columns / scale, target * weight, rcond=1e-9)[0] / scale
+    n = arm.n
+
+    def rows(block: Readings) -> Array:
+        row, joint = np.nonzero(block.counted)
+        columns, target = _linear_rows(arm, block, start, free, free_gain)
+        if keep_ratios:
+            columns[:, 0] = columns[:, :n] @ (1 / start.gain)
+            columns[:, 1:n] = 0.0
+        weight = np.abs(start.gain[joint]) / block.sigma[row, joint]
+        return np.column_stack([columns, target]) * weight[:, None]
+
+    solution = least_squares(map(rows, readings.blocks()), 4 * n + 3, rcond=1e-9)
     if keep_ratios:
         solution[:n] = np.where(free_gain, solution[0] / start.gain, 0.0)
     return tuple(np.split(solution, [n, 2 * n, 4 * n]))

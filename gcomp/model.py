@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from gcomp.arm import Arm
 from gcomp.arrays import Array, as_array
-from gcomp.denavit import axes_to_arm
+from gcomp.denavit import ArmGeometry, axes_to_arm
 from gcomp.errors import BadModel
 
 if TYPE_CHECKING:
@@ -43,9 +43,27 @@ def load_model(path: Path, *, tip: str | None = None, gravity: ArrayLike | None 
     is given: then they stay where the file puts them. `gravity` (3,) [m/s²] in the model's world frame replaces the
     model's own. Raises BadModel, naming the joint, where the chain is not a serial arm of revolute joints.
     """
-    compiled = compile_model(path)
-    chain = _chain(compiled, path, tip)
-    return _convert(compiled, chain, gravity)
+    return place_chain(path, tip=tip, gravity=gravity).arm
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedChain:
+    """The chain in MuJoCo's reference configuration: what it takes to write inertials back into the file."""
+
+    model: "mujoco.MjModel"
+    data: "mujoco.MjData"
+    arm: ModelArm
+    geometry: ArmGeometry
+    anchors: Array
+    """A point on each joint's axis (n, 3), world frame [m]."""
+    bodies: tuple[tuple[int, ...], ...]
+    """Ids of the bodies that each link consists of."""
+
+
+def place_chain(path: Path, *, tip: str | None = None, gravity: ArrayLike | None = None) -> PlacedChain:
+    """As load_model, with the bodies behind the links; raises BadModel likewise."""
+    model = compile_model(path)
+    return _place(model, _chain(model, path, tip), gravity)
 
 
 def compile_model(path: Path) -> "mujoco.MjModel":
@@ -120,7 +138,7 @@ def _refuse_couplings(model: "mujoco.MjModel", chain: list[int], path: Path) -> 
             raise BadModel(f"{path}: joint {model.joint(coupled).name} mimics another: one drive per joint is needed")
 
 
-def _convert(model: "mujoco.MjModel", chain: list[int], gravity: ArrayLike | None) -> ModelArm:
+def _place(model: "mujoco.MjModel", chain: list[int], gravity: ArrayLike | None) -> PlacedChain:
     """Axes, points and inertials in the model's reference configuration, then Denavit-Hartenberg form."""
     import mujoco
 
@@ -132,11 +150,11 @@ def _convert(model: "mujoco.MjModel", chain: list[int], gravity: ArrayLike | Non
     reference = np.array([model.qpos0[model.jnt_qposadr[joint]] for joint in chain])
     link_of = _links(model, chain)
     mass, first_moment = np.zeros(len(chain)), np.zeros((len(chain), 3))
-    bodies: list[list[str]] = [[] for _ in chain]
+    bodies: list[list[int]] = [[] for _ in chain]
     for body, link in link_of.items():
         mass[link] += model.body_mass[body]
         first_moment[link] += model.body_mass[body] * (data.xipos[body] - data.xanchor[chain[link]])
-        bodies[link].append(model.body(body).name)
+        bodies[link].append(body)
     geometry = axes_to_arm(
         names=tuple(model.joint(joint).name or f"joint_{i + 1}" for i, joint in enumerate(chain)),
         axes=data.xaxis[chain],
@@ -146,7 +164,9 @@ def _convert(model: "mujoco.MjModel", chain: list[int], gravity: ArrayLike | Non
         limits=limits,
     )
     moments = np.einsum("ndk,nd->nk", geometry.bar, first_moment)
-    return ModelArm(geometry.arm, geometry.base_parameters(mass, moments), mass, moments, tuple(map(tuple, bodies)))
+    names = tuple(tuple(model.body(body).name for body in of_link) for of_link in bodies)
+    arm = ModelArm(geometry.arm, geometry.base_parameters(mass, moments), mass, moments, names)
+    return PlacedChain(model, data, arm, geometry, data.xanchor[chain], tuple(map(tuple, bodies)))
 
 
 def _links(model: "mujoco.MjModel", chain: list[int]) -> dict[int, int]:

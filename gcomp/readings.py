@@ -1,5 +1,6 @@
 """What an identification is given: positions, torques and loads, row by row."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,6 +55,11 @@ class Readings:
     def rows(self, which: Mask | slice) -> "Readings":
         """These rows alone."""
         return Readings(self.position[which], self.torque[which], self.sigma[which], self.load[which])
+
+    def blocks(self, size: int = 2048) -> Iterator["Readings"]:
+        """The same rows, at most `size` at a time: memory for what is computed from them stays bounded."""
+        for begin in range(0, len(self.load), size):
+            yield self.rows(slice(begin, begin + size))
 
     def joined(self, other: "Readings") -> "Readings":
         """These rows, then the other's."""
