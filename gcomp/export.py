@@ -1,4 +1,4 @@
-"""Identified mass moments back into a URDF or MJCF file: the nearest feasible inertials with the same gravity torque."""
+"""Identified mass moments back into URDF or MJCF: the nearest feasible inertials with the same gravity torque."""
 
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
@@ -43,6 +43,9 @@ def write_model(
     """
     placed = place_chain(source, tip=tip)
     wanted = as_array("beta", beta, (2 * placed.arm.arm.n,), finite=False)
+    for name, bodies in zip(placed.arm.arm.names, placed.bodies, strict=True):
+        if not bodies or not placed.model.body_mass[list(bodies)].any():
+            raise BadModel(f"{source}: joint {name} moves no mass of its own: nothing there can carry its mass moments")
     carriers = [max(bodies, key=lambda body: placed.model.body_mass[body]) for bodies in placed.bodies]
     nominal = Inertials(placed.arm.mass, placed.arm.first_moment)
     heaviest = placed.model.body_mass[carriers]

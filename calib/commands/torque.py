@@ -19,6 +19,9 @@ MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
 def torque(
     arm: Annotated[str, typer.Argument(help="Bundled arm, path of an arm file, or a URDF or MJCF file.")],
     q: Annotated[Path, typer.Option(help="CSV file of poses: a header row with columns q_1 … q_n [rad].")],
+    tip: Annotated[
+        str | None, typer.Option(help="Body of the model file that the chain ends in; default: the last that moves.")
+    ] = None,
     record: Annotated[
         str | None, typer.Option(help="Id of a gravity record; default: the model's inertials, else the current one.")
     ] = None,
@@ -38,7 +41,7 @@ def torque(
     from calib.poses import load_poses
     from gcomp.gravity import gravity_torque
 
-    described, beta, source = _model(arm, record, store)
+    described, beta, source = _model(arm, tip, record, store)
     poses = load_poses(q, described.n)
     answer = gravity_torque(described, beta, poses)
     table = Table("pose", *described.names, title=f"Holding torque [N·m], {source}")
@@ -49,7 +52,7 @@ def torque(
     write_json(json_file, {"joints": list(described.names), "source": source, "torque": answer.tolist()})
 
 
-def _model(arm: str, record: str | None, store: str | None) -> "tuple[Arm, Array, str]":
+def _model(arm: str, tip: str | None, record: str | None, store: str | None) -> "tuple[Arm, Array, str]":
     """The arm, its mass moments (2n,) [kg·m], and where these come from; raises BadInput or Refused."""
     import numpy as np
 
@@ -65,8 +68,10 @@ def _model(arm: str, record: str | None, store: str | None) -> "tuple[Arm, Array
             raise BadInput(f"--record {record}: a record belongs to an arm file, and {arm} is a model file")
         if not Path(arm).is_file():
             raise BadInput(f"no model file {arm}: give the path of a URDF or MJCF file, or of an arm file")
-        model = load_model(Path(arm))
+        model = load_model(Path(arm), tip=tip)
         return model.arm, model.beta, f"inertials of {arm}"
+    if tip is not None:
+        raise BadInput(f"--tip {tip}: an arm file says so itself, under kinematics")
     arm_file = load_arm(arm)
     if record is None and arm_file.model_path is not None:
         model = model_arm(arm_file)
