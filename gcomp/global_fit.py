@@ -93,7 +93,9 @@ def identify_global(
     """
     readings.require_arm(arm)
     begin = start or _start_of(arm.n, priors or {})
-    problem = Problem.of(arm, readings, unknown, priors or {}, loss, position_sigma, _units(arm, readings, begin))
+    problem = Problem.of(
+        arm, readings, unknown, priors or {}, loss, position_sigma, natural_units(arm, readings, begin)
+    )
     starts = _starts(problem, begin)
     outcome = solve(problem, next(starts))
     for first in starts:
@@ -149,7 +151,9 @@ def predict_covariance(
     """
     design.require_arm(arm)
     expected = replace_torque(design, np.where(design.counted, predict(arm, guess, design), np.nan))
-    problem = Problem.of(arm, expected, unknown, priors or {}, "linear", position_sigma, _units(arm, expected, guess))
+    problem = Problem.of(
+        arm, expected, unknown, priors or {}, "linear", position_sigma, natural_units(arm, expected, guess)
+    )
     weight = problem.weights(guess.vector)
     information = analyse(problem.factor(guess.vector, weight)[0], problem.unit[problem.free])
     names, std = _names_and_std(problem, information)
@@ -173,8 +177,11 @@ def _start_of(n: int, priors: Mapping[str, Prior]) -> Parameters:
     return Parameters.from_vector(np.where(np.isfinite(std), mean, Parameters.nominal(n).vector), n)
 
 
-def _units(arm: Arm, readings: Readings, start: Parameters) -> Array:
-    """Natural units of the parameter vector: gain as it starts, 1 rad, 1 m, the readings' size, that size over g."""
+def natural_units(arm: Arm, readings: Readings, start: Parameters) -> Array:
+    """Natural units of the parameter vector (6n + 3,): changes that matter.
+
+    The gain as it starts, 1 rad, 1 m, the readings' size, that size over g.
+    """
     with np.errstate(invalid="ignore"):
         per_joint = np.sqrt(np.nansum(readings.torque**2, axis=0) / np.maximum(readings.counted.sum(axis=0), 1))
     torque = float(per_joint.max()) or 1.0

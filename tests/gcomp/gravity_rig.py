@@ -13,8 +13,12 @@ from gcomp.readings import Readings
 from gcomp.sensor_model import predict
 
 DOWN, TILTED = (0.0, 0.0, -9.81), (9.81, 0.0, 0.0)
-SARCOS_BETA = np.array(["0.1116", "-0.9594", "-0.1063", "-4.6877", "0.1256", "-1.0284", "0.0437", "1.5219"], dtype=float)
-SARCOS_BETA = np.append(SARCOS_BETA, [0.0376, 0.0871, -0.0217, 0.6686, 0.1132, -0.0594])
+SARCOS_BETA = np.array(
+    [
+        *(0.1116, -0.9594, -0.1063, -4.6877, 0.1256, -1.0284, 0.0437),
+        *(1.5219, 0.0376, 0.0871, -0.0217, 0.6686, 0.1132, -0.0594),
+    ]
+)
 """Table 2 of the paper, n_7y as its own Table 1 demands it (theory note, section 3) [kg·m]."""
 SARCOS_MASS = np.array([8, 6, 5, 3.0264, 1.2, 0.73235, 3.90125])
 SARCOS_MOMENTS = np.array(  # Table 1 of the paper from o_{i-1}, frame-i axes: theory note, section 3

@@ -187,7 +187,7 @@ def test_known_moments_make_even_the_last_position_offset_observable(sarcos, rng
 
 def test_wrong_names_and_shapes_are_refused(sarcos, rng) -> None:
     rows = make_readings(sarcos, Parameters.nominal(7), *sweep_rows(sarcos, 1, 3, rng))
-    with pytest.raises(BadArray, match="unknown is .*'gains'.*, expected some of gain, offset"):
+    with pytest.raises(BadArray, match=r"unknown is .*'gains'.*, expected some of gain, offset"):
         identify_global(sarcos, rows, unknown=("gains",))
     with pytest.raises(BadArray, match="loss is 'tukey', expected linear, huber or cauchy"):
         identify_global(sarcos, rows, unknown=("beta",), loss="tukey")

@@ -49,7 +49,7 @@ def fit(
 def test_rank_deficit_of_the_calibration(
     unknown: tuple[str, ...], poses: int, sensors: str, loads: tuple[float, ...], deficit: int
 ) -> None:
-    """Section 4's table; minus one where θ0_n is among the unknowns: gcomp holds it at once (turning link n's frame)."""
+    """Section 4's table; minus one where θ0_n is among the unknowns: gcomp holds it (turning link n's frame)."""
     found = fit(make_sarcos(), unknown, poses=poses, sensors=sensors, loads=loads)
     assert len(found.null_space) == deficit
 

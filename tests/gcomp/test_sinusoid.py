@@ -75,7 +75,7 @@ def test_constant_friction_is_an_offset_from_one_side_and_nothing_from_both() ->
 
 
 def test_load_dependent_friction_biases_as_the_note_says() -> None:
-    """μ_f = 0.03: one direction gives an offset of 2 μ_f A/π over a turn, and a gain where the torque keeps its sign."""
+    """μ_f = 0.03: one direction gives an offset of 2 μ_f A/π over a turn, a gain where the torque keeps its sign."""
     torque = A * np.sin(BOTH[:36])
     assert fit_sinusoid(BOTH[:36], torque + 0.03 * np.abs(torque), 0.05).offset == pytest.approx(0.37, abs=0.02)
     phi = swept(160, 37)
@@ -107,5 +107,5 @@ def test_unequal_stop_angles_do_not_matter_with_the_friction_column(rng) -> None
 
 
 def test_too_few_steps_are_refused() -> None:
-    with pytest.raises(BadArray, match="2 steps over 1.000 rad do not determine amplitude, phase, offset"):
+    with pytest.raises(BadArray, match=r"2 steps over 1.000 rad do not determine amplitude, phase, offset"):
         fit_sinusoid([0, 1.0], [0, 1.0], 0.05)
