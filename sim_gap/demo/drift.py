@@ -9,7 +9,6 @@ from armlink.sample import Sample
 from calib.observer import Observer
 from calib.recalibration import Recalibrator
 from calib.records import CalibrationRecord, GravityRecord
-from calib.sensors import SensorFit
 from calib.store import RecordStore
 from calib.verify import Verification
 from calib.watch import WatchHistory, watch
@@ -53,7 +52,6 @@ class Drift:
 def run_drift(
     bench: Bench,
     store: RecordStore,
-    fit: SensorFit,
     gravity: GravityRecord,
     check: Verification,
     seed: int,
@@ -63,10 +61,11 @@ def run_drift(
     link, described = bench.link, bench.described
     calibration = store.current(CalibrationRecord, bench.arm)
     assert calibration is not None
-    observer = _observer(bench, fit, gravity, calibration)
     recalibrator = Recalibrator(bench.arm, link, store, "apply")
     limits = bench.arm.require_link().joints
-    joint = drifting_joint(fit, check, np.array([each.rated_torque for each in limits]))
+    rated = np.array([each.rated_torque for each in limits])
+    observer = Observer.of_records(described, calibration, gravity, rated)
+    joint = drifting_joint(calibration, check, rated)
     offset = min(OFFSET, OFFSET_SHARE * limits[joint].rated_torque)
     speed = np.array([each.max_velocity for each in limits])
     state = _Course(report, bench, joint, offset)
@@ -94,9 +93,9 @@ def run_drift(
     )
 
 
-def drifting_joint(fit: SensorFit, check: Verification, rated: Array) -> int:
+def drifting_joint(calibration: CalibrationRecord, check: Verification, rated: Array) -> int:
     """The third joint, if gravity moves its torque as well as any other's; else the one that it moves most."""
-    spread = np.where(np.isnan(fit.value("gain")), 0.0, check.model.std(axis=0)) / rated
+    spread = np.where(np.isnan(calibration.values("gain")), 0.0, check.model.std(axis=0)) / rated
     third = min(2, len(spread) - 1)
     return third if spread[third] >= 0.3 * spread.max() else int(np.argmax(spread))
 
@@ -124,19 +123,6 @@ class _Course:
             )
             self._report(sample.t - self._start, SECONDS, None, doing)
         return bool(written) and sample.t - written[-1] >= SETTLED_SECONDS
-
-
-def _observer(bench: Bench, fit: SensorFit, gravity: GravityRecord, calibration: CalibrationRecord) -> Observer:
-    """An observer with the records just made; a reading at rest is as exact as some forty samples."""
-    sigma = fit.rows.noise * fit.noise_factor / np.sqrt(40.0)
-    return Observer(
-        bench.described,
-        np.array(gravity.beta),
-        np.array(gravity.covariance),
-        sigma,
-        position_gain=calibration.values("position_gain", 1.0),
-        position_offset=calibration.values("position_offset", 0.0),
-    )
 
 
 def _first(history: WatchHistory, joint: str, kinds: tuple[str, ...], after: float) -> float | None:

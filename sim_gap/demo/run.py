@@ -3,7 +3,8 @@
 import json
 import shutil
 import sys
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -76,7 +77,7 @@ def _work(
     with teller.stage("fitting sensors and mass moments, all joints together"):
         sensors = fit_sensors(arm, data)
     gravity = identify_gravity(arm, data, sensors)
-    record, gravity_record = sensors.record(arm), None
+    record = sensors.record(arm)
     store.put(record, arm, by=BY, reason="sweeps without and with reference mass")
     gravity_record = gravity.record(arm, record)
     store.put(gravity_record, arm, by=BY, reason="sweeps")
@@ -91,10 +92,14 @@ def _work(
         recordings = _record(bench, record, folder, seed, report)
     diagnosis = other_core.submit(_diagnose, arm.path, recordings)
     with teller.stage("ordinary work: a torque sensor will drift") as report:
-        drift = run_drift(bench, store, sensors, gravity_record, check, seed, report)
+        drift = run_drift(bench, store, gravity_record, check, seed, report)
     teller.say(drift_line(link.names, drift))
     with teller.stage("diagnosing the gap between the recording and the nominal simulation"):
-        answer = _await(diagnosis)
+        try:
+            answer = diagnosis.result()
+        except BrokenProcessPool:
+            teller.say("the process that did it was killed: doing it again in this one")
+            answer = _diagnose(arm.path, recordings)
     teller.say(gap_line(answer))
     stats = link.stats
     link.disable()
@@ -146,10 +151,6 @@ def _record(
 def _diagnose(arm_path: Path, recordings: tuple[Recording, Recording]) -> Diagnosis:
     """In the other process: the recordings against the arm's nominal model."""
     return diagnose(nominal_model(arm_path), recordings[:1], recordings[1:], labels=["train", "heldout"])
-
-
-def _await(diagnosis: Future[Diagnosis]) -> Diagnosis:
-    return diagnosis.result()
 
 
 def _fresh(out: Path) -> Path:
