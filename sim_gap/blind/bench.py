@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from armlink.errors import ArmlinkError, BadInput, Refused
+from sim_gap.blind.make import HELDOUT_S, TRAIN_S
 from sim_gap.blind.score import answer_name, score
 from sim_gap.blind.seal import open_labels, seal, write_answer
 
@@ -23,12 +24,13 @@ def run_bench(
     seed: int = 1,
     cases: int = 150,
     workers: int = 2,
+    lengths: tuple[float, float] = (TRAIN_S, HELDOUT_S),
     progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
 ) -> dict[str, Any]:
     """Make `cases` sealed cases under `out`, have them diagnosed, seal the answers, open the labels and score.
 
-    `progress` gets stage, done, total. `diagnose` must be a module's function where `workers` exceeds 1. Raises
-    BadInput where `out` holds an earlier check.
+    `lengths` are the seconds of training and held-out recordings. `progress` gets stage, done, total. `diagnose` must
+    be a module's function where `workers` exceeds 1. Raises BadInput where `out` holds an earlier check.
     """
     if cases < 1:
         raise BadInput(f"--cases {cases}: expected at least 1")
@@ -36,7 +38,7 @@ def run_bench(
         raise BadInput(f"{out}: holds an earlier check: give another --out, or remove it")
     started = time.monotonic()
     progress("making cases", 0, cases)
-    for done in make_apart(out, seed, cases, workers):
+    for done in make_apart(out, seed, cases, workers, lengths):
         progress("making cases", done, cases)
     made = time.monotonic()
     todo = tasks(out)
@@ -51,10 +53,11 @@ def run_bench(
     return {**result, "seed": seed, "sealed": digest, "seconds": seconds}
 
 
-def make_apart(out: Path, seed: int, cases: int, workers: int) -> Iterator[int]:
+def make_apart(out: Path, seed: int, cases: int, workers: int, lengths: tuple[float, float]) -> Iterator[int]:
     """Make the cases in a separate process; yields now and then how many there are. Raises Refused where it fails."""
     command = [sys.executable, "-m", "sim_gap.blind.make", "--seed", str(seed), "--cases", str(cases)]
     command += ["--out", str(out / "cases"), "--labels", str(out / "labels"), "--workers", str(workers)]
+    command += ["--train-s", str(lengths[0]), "--heldout-s", str(lengths[1])]
     (out / "cases").mkdir(parents=True)
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as maker:
         while True:

@@ -105,12 +105,13 @@ def _sweeps(t: Array, limits: Limits, random: np.random.Generator) -> Array:
 
 
 def _chirp(t: Array, limits: Limits, random: np.random.Generator) -> Array:
-    """0.5 to 9 Hz at a constant acceleration."""
+    """0.5 to 9 Hz at a nearly constant acceleration."""
     low, high = 0.5, 9.0
     frequency = low * (high / low) ** (t / t[-1])
     phase = 2 * np.pi * np.cumsum(frequency) / RATE
     shift = random.uniform(0.0, 2 * np.pi, len(limits.lower))
-    amplitude = np.minimum(0.6 * limits.acceleration / (2 * np.pi * frequency[:, None]) ** 2, 0.15)
+    most = 0.6 * limits.acceleration
+    amplitude = most / ((2 * np.pi * frequency[:, None]) ** 2 + most / 0.15)  # at most 0.15 rad
     return np.asarray(amplitude * np.sin(phase[:, None] + shift) * _window(t)[:, None])
 
 

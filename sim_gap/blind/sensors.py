@@ -20,7 +20,7 @@ SENSOR_BITS = 16
 def record(
     truth: Truth, log: Log, rate: float, velocity: bool, command: Array, random: np.random.Generator
 ) -> dict[str, Array]:
-    """Columns of a recording at about `rate` Hz: `t` (K,); q, tau, tau_motor, tau_cmd, q_cmd, dq if `velocity` (K, n)."""
+    """Columns of a recording at about `rate` Hz: `t` (K,); q, tau, tau_motor, tau_cmd, q_cmd; dq if `velocity`."""
     clock = np.arange(len(log.position)) / RATE
     t = _times(clock[-1], rate, random)
     shape = (len(t), truth.n)

@@ -19,7 +19,7 @@ def ripple(scene: Scene, random: np.random.Generator) -> Drawn | None:
     """Torque lost to the gear's teeth: amplitude·sin(cycles·θ + phase), slow enough to pass a 6 Hz filter."""
     fastest = np.quantile(np.abs(scene.motion[1]), 0.9, axis=0)
     j = int(random.integers(scene.arm.n))
-    most = max(8.0, min(30.0, 2 * np.pi * 4.0 / float(fastest[j])))
+    most = max(8.0, min(30.0, 2 * np.pi * 4.0 / max(float(fastest[j]), 0.1)))
     values = {
         "amplitude": float(1.5 * motor_level(scene, random)[j]),
         "cycles": float(random.uniform(6.0, most)),

@@ -1,0 +1,49 @@
+"""The score of a blind check as tables for people."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+ROWS = (
+    ("right effect first, where the recording can tell", "label_withheld", "first_right_where_tellable"),
+    ("right effect first", "label_withheld", "first_right"),
+    ("first, or named as confounded", "label_withheld", "first_or_confounded"),
+    ("an extra cause claimed with confidence", "label_withheld", "extra_confident"),
+    ("joints: F1", "label_withheld", "joints", "f1"),
+    ("no effect: false alarms", "label_withheld", "no_effect", "false_alarms"),
+    ("two effects: both found", "label_withheld", "two", "both_found"),
+    ("parameters: median error", "label_withheld", "parameters", "median_error"),
+    ("parameters: within 10 %", "label_withheld", "parameters", "within_10_percent"),
+    ("shrink against the true effect's: median", "label_withheld", "shrink", "median_ratio"),
+    ("effect withheld: a wrong one blamed", "effect_withheld", "false_blame"),
+)
+
+
+def show(result: Mapping[str, Any], console: Console) -> None:
+    """Print shares, effects and calibration of a score."""
+    table = Table("figure", "value", title=f"blind check, {result['label_withheld']['cases']} cases")
+    for text, *path in ROWS:
+        value: Any = result
+        for key in path:
+            value = value[key]
+        table.add_row(text, _percent(value))
+    console.print(table)
+    table = Table("effect", "cases", "right first", "named", "median error", "first named instead")
+    for effect, line in result["by_effect"].items():
+        others = {name: k for name, k in result["confusion"].get(effect, {}).items() if name != effect}
+        instead = ", ".join(f"{name} {k}" for name, k in others.items())
+        counts = (str(line[key]) for key in ("cases", "first_right", "named"))
+        table.add_row(effect, *counts, _percent(line["median_error"]), instead)
+    console.print(table)
+    table = Table("confidence", "answers", "right")
+    for line in result["calibration"]:
+        table.add_row(f"{line['from']:.2f} to {line['to']:.2f}", str(line["count"]), _percent(line["right"]))
+    console.print(table)
+    missed = [name for name, met in result["meets"].items() if not met]
+    console.print("all bounds met" if not missed else f"bounds not met: {', '.join(missed)}")
+
+
+def _percent(value: float | None) -> str:
+    return "–" if value is None else f"{100 * value:.1f} %"

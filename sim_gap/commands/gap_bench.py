@@ -1,0 +1,47 @@
+"""Checks the diagnosis on sealed cases of simulated arms whose cause it cannot see."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def bench(
+    seed: Annotated[int, typer.Option(help="Draws other arms, effects and motions.")] = 1,
+    cases: Annotated[int, typer.Option(help="How many cases.")] = 150,
+    json: Annotated[str | None, typer.Option(help="Write the score here; - is standard output.")] = None,
+    out: Annotated[Path, typer.Option(help="New folder for cases, answers and labels.")] = Path("armlink-bench"),
+    workers: Annotated[int, typer.Option(help="Processes.")] = 2,
+) -> None:
+    """Make sealed cases, diagnose them, then open the labels and score (label withheld, and effect withheld).
+
+    Example: armlink gap bench --seed 3 --cases 60 --out bench-3 --json bench-3.json
+    """
+    import json as json_format
+    import sys
+
+    from rich.console import Console
+    from rich.progress import Progress, TaskID
+
+    from armlink.errors import BadInput
+    from sim_gap.blind.bench import diagnose_files, run_bench
+    from sim_gap.blind.tables import show
+
+    if json not in (None, "-") and not Path(str(json)).resolve().parent.is_dir():
+        raise BadInput(f"--json {json}: its folder does not exist: make it first")
+    console = Console(stderr=True)
+    with Progress(console=console) as bars:
+        known: dict[str, TaskID] = {}
+
+        def progress(stage: str, done: int, total: int) -> None:
+            if stage not in known:
+                known[stage] = bars.add_task(stage, total=total)
+            bars.update(known[stage], completed=done)
+
+        result = run_bench(diagnose_files, out, seed, cases, workers, progress=progress)
+    show(result, console)
+    text = json_format.dumps(result, indent=1, ensure_ascii=False) + "\n"
+    if json == "-":
+        sys.stdout.write(text)
+    elif json is not None:
+        Path(json).write_text(text, encoding="utf-8")
