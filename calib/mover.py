@@ -19,6 +19,8 @@ Flags = npt.NDArray[np.bool_]
 POSITION, TORQUE = 8, 10
 STALL = 0.2
 """Following error at which a joint counts as blocked [rad]."""
+LOST = 0.05
+"""Following error at which a joint is no longer asked to go where it was asked to [rad]."""
 SLIP = 0.01
 """How far a pressed joint may leave its stop [rad]."""
 CONTACT_LEAD = 0.015
@@ -68,7 +70,7 @@ class Mover:
     def __init__(self, link: Link, section: SweepSection, limits: Limits) -> None:
         """Take over an enabled link: every joint is held at its last target."""
         self.link, self.section, self.limits = link, section, limits
-        self.rule = SettleRule.of(section, limits.rated, link.period)
+        self.average_to(section.standard_error)
         self.speed = section.travel_speed * limits.speed
         self.command = Command.hold(link.position_sent)
         self.position: Array = link.cycle(self.command).position.copy()
@@ -79,6 +81,10 @@ class Mover:
         self._produced = np.zeros(link.n)
         self.contacts: dict[tuple[int, int], float] = {}
         """(joint, side) → reading at which that stop was found [rad]."""
+
+    def average_to(self, share: float) -> None:
+        """From now on average readings to this standard error, a share of rated torque."""
+        self.rule = SettleRule.of(self.section, share * self.limits.rated, self.link.period)
 
     def cycle(self) -> Sample:
         """One cycle of the present command; raises Slipped when a pressed joint has left its stop."""
@@ -94,7 +100,8 @@ class Mover:
         """Every joint under position control where it stands."""
         self.pressed[:] = False
         self.side[:] = 0.0
-        joints = self.command.mode != POSITION
+        lost = np.abs(self.command.position - self.position) > LOST
+        joints = (self.command.mode != POSITION) | lost
         self.command.mode[:] = POSITION
         self.command.position[joints] = self.position[joints]
 

@@ -10,6 +10,8 @@ from calib.design import Candidates, choose, guessed_moments, reachable, stop_co
 from calib.guess import GravityGuess, reach
 from calib.plan_limits import Limits
 from calib.plan_model import Sweep, SweepPlan
+from calib.plan_poses import require_range, scout_poses, sweep_range
+from calib.precision import predicted_gain_std, worst_gain_std
 from calib.section import SweepSection, sweep_section
 from gcomp.arm import Arm
 from gcomp.gravity import gravity_regressor
@@ -22,7 +24,7 @@ DEAD_LEVER = 0.005
 """Γ/g below which a joint feels no gravity: its offset is still swept, at one combination."""
 SLOWEST = 0.3
 """Acceleration that every planned sweep must allow [rad/s²]."""
-MASS_SHARE = 0.5
+MASS_SHARE = 0.7
 """Share of the torque left over gravity that the reference mass may take."""
 ASSUMED_GRAVITY = 0.6
 """Share of max_torque that gravity is assumed to take while nothing has been measured."""
@@ -30,7 +32,10 @@ SERVO_GAP = 0.05
 """Distance from the stop at which a servo-held joint rests [rad]."""
 HAND = 0.15
 """How far from the flange the reference mass may hang [m]."""
-SCOUT_CANDIDATES = 300
+FINEST = 3.0
+"""How many times finer than asked readings may be averaged to reach the gains' precision."""
+FASTEST = 2.0
+"""Acceleration between sweeps where the drives allow it [rad/s²]."""
 
 
 def plan_sweep(
@@ -44,7 +49,7 @@ def plan_sweep(
     a joint's range is too short to sweep or no combination can be held.
     """
     section, limits, described = sweep_section(arm), Limits.of(arm), gcomp_arm(arm)
-    _require_range(section, limits, described)
+    require_range(section, limits, described)
     options, notes = [], []
     for joint in reversed(range(described.n)):
         found, remarks = _options(joint, section, limits, described, guess)
@@ -62,34 +67,20 @@ def plan_sweep(
         for number, pick in enumerate(chosen, start=1)
     ]
     scout = scout_poses(described, section, limits, seed)
-    return SweepPlan(sweeps=tuple(sweeps), scout=scout, reference_mass=mass, notes=tuple(notes))
-
-
-def sweep_range(section: SweepSection, limits: Limits, joint: int) -> tuple[float, float]:
-    """First and last step [rad] of a joint: the margin grows with the angle, for the position gain is unknown."""
-    low, high = float(limits.lower[joint]), float(limits.upper[joint])
-    margin = section.range_margin
-    return low + margin + 0.02 * abs(low), high - margin - 0.02 * abs(high)
-
-
-def scout_poses(described: Arm, section: SweepSection, limits: Limits, seed: int) -> tuple[tuple[float, ...], ...]:
-    """n + 3 poses (n,) that determine mass moments and sensor offsets well, ordered for short ways between them."""
-    n = described.n
-    ends = np.array([sweep_range(section, limits, joint) for joint in range(n)])
-    generator = np.random.default_rng(seed)
-    poses = ends[:, 0] + generator.random((SCOUT_CANDIDATES, n)) * (ends[:, 1] - ends[:, 0])
-    regressor = gravity_regressor(described, poses)
-    offsets = np.broadcast_to(np.eye(n), (SCOUT_CANDIDATES, n, n))
-    rows = np.concatenate([regressor, 10 * offsets], axis=2) / limits.rated[:, None]
-    information = np.einsum("kip,kiq->kpq", rows, rows)
-    total = np.eye(3 * n) * 1e-6
-    chosen: list[int] = []
-    for _ in range(n + 3):
-        score = np.linalg.slogdet(total + information)[1]
-        score[chosen] = -np.inf
-        chosen.append(int(np.argmax(score)))
-        total = total + information[chosen[-1]]
-    return tuple(tuple(pose.tolist()) for pose in short_way(poses[chosen], ends.mean(axis=1)))
+    gain_std, finer = None, 1.0
+    if guess is not None:
+        std = predicted_gain_std(guess, sweeps, np.array(scout), mass, sigma, section.position_offset_std)
+        gain_std = worst_gain_std(std)
+        finer = float(np.clip(gain_std / section.gain_std, 1.0, FINEST))
+    return SweepPlan(
+        sweeps=tuple(sweeps),
+        scout=scout,
+        reference_mass=mass,
+        standard_error=section.standard_error / finer,
+        travel_acceleration=_travel_acceleration(limits, options, guess),
+        gain_std=None if gain_std is None else gain_std / finer,
+        notes=tuple(notes),
+    )
 
 
 def hold_torque(guess: GravityGuess, section: SweepSection, limits: Limits, poses: Array) -> tuple[Array, Array, Array]:
@@ -126,11 +117,11 @@ def _options(
     drivable = strongest[:, joint] + allowance[:, joint] <= limits.max_torque[joint]
     if not drivable.any():
         drivable = strongest[:, joint] <= limits.max_torque[joint]
-    pressed = _pressable(guess, section, limits, everything).all(axis=1) & drivable
+    holdable = (strongest + section.friction * limits.rated <= limits.max_torque).all(axis=1) & drivable
+    pressed = _pressable(guess, section, limits, everything).all(axis=1) & holdable  # it must leave its stop again
     name = described.names[joint]
     if pressed.sum() >= section.poses:
         return reachable(everything.kept(pressed)), []
-    holdable = (strongest + section.friction * limits.rated <= limits.max_torque).all(axis=1) & drivable
     if not (pressed | holdable).any():
         raise BadInput(
             f"joint {name}: no combination of stops can be held within max_torque: gravity needs up to"
@@ -174,7 +165,11 @@ def _sweep(
         one = options.kept(np.arange(len(options.stops)) == pick)
         servo = servo | (resting & ~_pressable(guess, section, limits, one)[0])
         needed = required_bias(guess, section, limits, one.stops, one.poses)[0]
-        size, acceleration = _with_reaction(needed, _reaction(guess, joint), resting & ~servo, section, limits)
+        least, largest, _ = hold_torque(guess, section, limits, one.poses)
+        spare = limits.max_torque - np.maximum(np.abs(least), np.abs(largest))[0]
+        own = float(spare[joint] / max(2 * guess.inertia()[joint], 1e-9))
+        pressed = resting & ~servo
+        size, acceleration = _with_reaction(needed, _reaction(guess, joint), pressed, section, limits, joint, own)
         bias = tuple((stops * np.where(resting & ~servo, size, 0.0)).tolist())
     rest = np.where(stops > 0, limits.upper, limits.lower) - SERVO_GAP * stops * servo
     rest[joint] = steps[0]
@@ -192,11 +187,12 @@ def _sweep(
 
 
 def _with_reaction(
-    needed: Array, reaction: Array, pressed: Flags, section: SweepSection, limits: Limits
+    needed: Array, reaction: Array, pressed: Flags, section: SweepSection, limits: Limits, joint: int, own: float
 ) -> tuple[Array, float]:
-    """(Bias size (n,) [N·m], acceleration [rad/s²]): as fast as the resting joints' torque allows."""
+    """(Bias size (n,) [N·m], acceleration [rad/s²]): as fast as the resting joints' torque and its own allow."""
     given = limits.max_torque if section.bias_torque is None else np.array(section.bias_torque)
     room = np.where(pressed, (given - needed) / np.maximum(reaction, 1e-9), np.inf)
+    room[joint] = own
     acceleration = float(np.clip(room.min(), SLOWEST, section.acceleration))
     if section.bias_torque is not None:
         return given, acceleration
@@ -218,26 +214,13 @@ def _reference_mass(described: Arm, limits: Limits, options: list[Candidates], g
     return float(f"{mass:.2g}")
 
 
-def _require_range(section: SweepSection, limits: Limits, described: Arm) -> None:
-    for joint, name in enumerate(described.names):
-        first, last = sweep_range(section, limits, joint)
-        if not np.isfinite([first, last]).all() or last - first < 0.2:
-            raise BadInput(
-                f"joint {name}: its range {limits.lower[joint]} to {limits.upper[joint]} rad leaves nothing to sweep"
-                f" within range_margin {section.range_margin} rad: check lower and upper, or lessen the margin"
-            )
-
-
-def short_way(poses: Array, begin: Array) -> Array:
-    """The same poses, each followed by the nearest that is left."""
-    left, way = list(range(len(poses))), []
-    here = begin
-    while left:
-        nearest = min(left, key=lambda k: float(np.abs(poses[k] - here).max()))
-        left.remove(nearest)
-        way.append(nearest)
-        here = poses[nearest]
-    return poses[way]
+def _travel_acceleration(limits: Limits, options: list[Candidates], guess: GravityGuess | None) -> float:
+    """Acceleration [rad/s²] that the drives can give beside gravity at the poses between which they travel."""
+    if guess is None:
+        return 1.0
+    poses = np.concatenate([each.poses.reshape(-1, guess.arm.n) for each in options])
+    spare = limits.max_torque - np.abs(guess.torque(poses)).max(axis=0)
+    return float(np.clip(np.min(spare / np.maximum(2 * guess.inertia(), 1e-9)), SLOWEST, FASTEST))
 
 
 def _torques(values: Array) -> str:

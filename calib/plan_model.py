@@ -55,6 +55,12 @@ class SweepPlan(_Model):
     """Poses (P, n) at which all joints are servo-held and every sensor is read [rad]."""
     reference_mass: FiniteFloat
     """Mass to attach for the second pass [kg]."""
+    standard_error: FiniteFloat
+    """Standard error to which each torque reading is averaged, as a share of rated torque."""
+    travel_acceleration: FiniteFloat = 1.0
+    """Peak acceleration on the way from one sweep to the next [rad/s²]."""
+    gain_std: FiniteFloat | None = None
+    """Standard deviation that the worst observable torque gain will have after both passes; None before the scout."""
     notes: tuple[str, ...] = ()
     """What the plan could not do as asked, one sentence each."""
 

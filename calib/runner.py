@@ -26,9 +26,10 @@ APPROACH = 0.03
 """Each step is approached over at least this way [rad]."""
 GAP = 0.02
 """Distance from a stop at which creeping begins [rad]."""
-TRAVEL_ACCELERATION = 2.0
+SLOWER = 0.4
+"""Factor on the acceleration after a joint did not follow."""
 RETRIES = 3
-"""How often a resting joint that slipped is pressed again before the sweep gives up."""
+"""How often a joint that slipped or stalled is tried again before the sweep gives up."""
 
 
 def run_sweep(
@@ -65,6 +66,8 @@ def run_sweep(
             plan = data.plan
             mover.resolution = np.where(data.resolution > 0, data.resolution, np.inf)
         run.total = plan.readings
+        run.acceleration, run.refuge = plan.travel_acceleration, np.array(plan.scout[0])
+        mover.average_to(plan.standard_error)
         for sweep in plan.sweeps:
             run.sweep(sweep)
         mover.hold_all()
@@ -92,7 +95,8 @@ class _Pass:
     ) -> None:
         self.mover, self.writer, self.readings = mover, writer, readings
         self.section: SweepSection = mover.section
-        self.total = 0
+        self.total, self.acceleration = 0, 1.0
+        self.refuge = mover.position.copy()
         self._progress, self._clock = progress, clock
         self._began, self._at_start = clock(), len(readings)
 
@@ -119,7 +123,7 @@ class _Pass:
             index = open_readings[0]
             try:
                 if not standing:
-                    self._rest_others(sweep, bias, *sweep.target(index))
+                    self._rest_others(sweep, bias, *sweep.target(index), detour=retries > 0)
                     standing = True
                 rest = self._step(sweep, *sweep.target(index))
             except Slipped as slip:
@@ -128,6 +132,11 @@ class _Pass:
                 bias = self._more_bias(sweep, bias, slip.joint, retries)
                 continue
             except Stalled as stall:
+                retries += 1
+                standing = False
+                self.acceleration *= SLOWER
+                if retries <= RETRIES:
+                    continue
                 raise Refused(
                     f"{self.mover.link.names[stall.joint]}: stopped at {stall.position:.3f} rad on the way to"
                     f" {stall.target:.3f} in sweep {sweep.name}: its drive is too weak, or something is in the way"
@@ -136,16 +145,18 @@ class _Pass:
             self.save(as_reading(rest, sweep.name, index, sweep.joint, sweep.target(index)[1], counts))
             open_readings.pop(0)
 
-    def _rest_others(self, sweep: Sweep, bias: Array, target: float, direction: int) -> None:
-        """Bring the resting joints to their places and press or hold them there."""
+    def _rest_others(self, sweep: Sweep, bias: Array, target: float, direction: int, *, detour: bool = False) -> None:
+        """Bring the resting joints to their places, by way of a pose known to be good, and press or hold them there."""
         mover = self.mover
         mover.hold_all()
+        if detour:
+            mover.travel(self.refuge, self.acceleration)
         goal = np.array(sweep.rest)
         stops = np.array(sweep.stops, dtype=np.int64) * ~np.array(sweep.servo)
         for joint in np.flatnonzero(stops):
             goal[joint] = mover.before_stop(int(joint), int(stops[joint]), GAP)
         goal[sweep.joint] = target - direction * APPROACH
-        mover.travel(goal, TRAVEL_ACCELERATION)
+        mover.travel(goal, self.acceleration)
         if stops.any():
             mover.press(stops, bias)
 

@@ -37,7 +37,6 @@ def run_scout(mover: Mover, plan: SweepPlan, done: Collection[int], save: Callab
         except Stalled as stall:
             unreached.append(stall)
             mover.hold_all()
-            mover.command.position[:] = mover.position
             mover.travel(last, SCOUT_ACCELERATION)
             continue
         rest = mover.rest(everything)

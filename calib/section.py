@@ -46,12 +46,14 @@ class SweepSection(Section):
     settle_timeout: PositiveFloat = 4.0
     """A step that has not settled by then is taken as it is, and marked [s]."""
     standard_error: Share = 0.0005
-    """Standard error of the torque average asked for, as a share of rated torque."""
-    max_samples: Annotated[int, Field(ge=10)] = 150
+    """Standard error of the torque average asked for, as a share of rated torque; less where `gain_std` needs it."""
+    gain_std: Share = 0.0015
+    """Standard deviation of the torque gains aimed at: where the plan predicts more, it averages longer."""
+    max_samples: Annotated[int, Field(ge=10)] = 200
     """Samples averaged at most."""
     reference_mass: PositiveFloat | None = None
     """Mass attached for the second pass [kg]; by default chosen from the torque limits."""
-    position_offset_std: Annotated[FiniteFloat, Field(ge=0)] = 0.002
+    position_offset_std: Annotated[FiniteFloat, Field(ge=0)] = 0.005
     """How well the zero of the position sensors is known beforehand [rad]; 0 takes it as exact."""
 
     @model_validator(mode="after")

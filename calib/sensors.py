@@ -20,8 +20,6 @@ from gcomp.readings import Readings
 Array = npt.NDArray[np.float64]
 NOISE_ROUNDS = 3
 """Rounds in which each joint's noise is brought to the scatter that is really there."""
-LEAST_FACTOR = 0.3
-"""Readings are never taken to scatter less than this share of what their samples' noise explains."""
 FEWEST = 10
 """Free readings of a joint from which its scatter is judged."""
 WORDY = 6
@@ -36,7 +34,7 @@ class SensorFit:
     fit: GlobalFit
     rows: FitRows
     noise_factor: Array
-    """Scatter of the readings over what their samples' noise explains (n,)."""
+    """Scatter of the readings over what their samples' noise explains (n,); at least 1."""
     hysteresis: Array
     """Half the mean difference between readings approached upwards and downwards (n,) [N·m]."""
     quantile: float
@@ -136,7 +134,7 @@ def _fit(arm: ArmFile, rows: FitRows, **extra: Prior) -> tuple[GlobalFit, Array]
     for _ in range(NOISE_ROUNDS):
         scaled = Readings(readings.position, readings.torque, readings.sigma * factor, readings.load)
         fit = identify_global(described, scaled, unknown=unknown, priors=priors, position_sigma=rows.position_sigma)
-        factor = np.maximum(factor * _scatter(fit, scaled), LEAST_FACTOR)
+        factor = np.maximum(factor * _scatter(fit, scaled), 1.0)
     return fit, factor
 
 

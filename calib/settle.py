@@ -32,8 +32,8 @@ class SettleRule:
     """Asked for [N·m]."""
 
     @classmethod
-    def of(cls, section: SweepSection, rated: Array, period: float) -> "SettleRule":
-        """From the sweep section, for a cycle `period` [s]."""
+    def of(cls, section: SweepSection, standard_error: Array, period: float) -> "SettleRule":
+        """From the sweep section; standard error (n,) [N·m] of each reading, cycle `period` [s]."""
         window = max(round(section.settle_window / period), 8)
         return cls(
             window=window,
@@ -41,7 +41,7 @@ class SettleRule:
             max_samples=max(section.max_samples, window),
             span=section.settle_velocity * window * period / 2,
             scatter=section.settle_scatter,
-            standard_error=section.standard_error * rated,
+            standard_error=standard_error,
         )
 
     def settled(self, position: Array, torque: Array, counts: Flags, resolution: Array) -> bool:

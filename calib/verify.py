@@ -11,8 +11,8 @@ from armlink.errors import Refused
 from armlink.link import Link
 from calib.description import gcomp_arm
 from calib.mover import Mover, Stalled
-from calib.plan import short_way, sweep_range
 from calib.plan_limits import Limits
+from calib.plan_poses import short_way, sweep_range
 from calib.records import CalibrationRecord, GravityRecord
 from calib.section import SweepSection, sweep_section
 from gcomp.gravity import gravity_torque, torque_covariance
@@ -90,7 +90,6 @@ def run_verify(
         except Stalled:
             skipped += 1
             mover.hold_all()
-            mover.command.position[:] = mover.position
             mover.travel(begin, ACCELERATION)
             continue
         rest = mover.rest(everything)
