@@ -113,7 +113,9 @@ def write_csv(path: Path, columns: dict[str, Array]) -> None:
     for name, values in columns.items():
         rounded = np.round(values, DECIMALS.get(name, 5)) + 0.0
         flat |= {name: rounded} if values.ndim == 1 else {f"{name}_{j + 1}": x for j, x in enumerate(rounded.T)}
-    write_csv(pa.table(flat), path, WriteOptions(quoting_style="none"))
+    with path.open("wb") as file:
+        file.write((",".join(flat) + "\n").encode())  # pyarrow would quote the names
+        write_csv(pa.table(flat), file, WriteOptions(include_header=False))
 
 
 def batches(wanted: Sequence[Recipe], size: int = BATCH) -> Iterator[Sequence[Recipe]]:

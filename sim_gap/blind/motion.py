@@ -53,9 +53,9 @@ def derivatives(q: Array) -> tuple[Array, Array]:
 
 def _sines(t: Array, limits: Limits, random: np.random.Generator) -> Array:
     n, waves = len(limits.lower), 7
-    frequency = random.uniform(0.03, 0.9, (waves, n))
+    frequency = np.exp(random.uniform(np.log(0.03), np.log(0.7), (waves, n)))
     phase = random.uniform(0.0, 2 * np.pi, (waves, n))
-    amplitude = random.uniform(0.4, 1.0, (waves, n)) / (0.15 + frequency)
+    amplitude = random.uniform(0.4, 1.0, (waves, n)) / (0.1 + frequency) ** 1.5
     x = np.einsum("wn,wkn->kn", amplitude, np.sin(2 * np.pi * frequency[:, None] * t[:, None] + phase[:, None]))
     return _scaled(x * _window(t)[:, None], limits)
 

@@ -5,12 +5,17 @@ from typing import Annotated
 
 import typer
 
+from sim_gap.commands.gap_bench import bench
+
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True, help=__doc__)
 
 
 @app.callback()
 def gap() -> None:
     """Explain the gap between a simulation model and recordings of the real arm."""
+
+
+app.command()(bench)
 
 
 @app.command()
