@@ -4,7 +4,7 @@ BIN := .venv/bin
 export PYTHON
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint format bench soak docs constraints clean
+.PHONY: help venv demo test lint format bench soak blind docs constraints clean
 
 help: ## Say what can be done
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
@@ -39,6 +39,9 @@ bench: .venv/.dev ## Measure side by side with peers; writes benchmarks/latest.j
 
 soak: .venv/.dev ## Long campaigns outside make test: the demo over ten hidden truths
 	$(BIN)/python tests/campaigns/demo_seeds.py $(ARGS)
+
+blind: .venv/.dev ## Long campaign outside make test: the diagnosis against sealed cases (ARGS="--cases 20")
+	$(BIN)/armlink gap bench $(ARGS)
 
 docs: .venv/.dev ## Check the documentation: links, and that its commands run
 	$(BIN)/python -m pytest -q tests/house/test_docs.py
