@@ -11,7 +11,7 @@ from sim_gap.diagnosis import Cause
 from sim_gap.effects.registry import Row
 from sim_gap.estimate import Estimate, Value
 from sim_gap.normal import ColumnStore, Normal, Term
-from sim_gap.residual import ResidualSet
+from sim_gap.residual import CARE_NM, ResidualSet
 from sim_gap.rigid import Array
 
 
@@ -58,9 +58,8 @@ class _Scorer:
     def __init__(self, estimate: Estimate, heldout: ResidualSet) -> None:
         self.estimate, self.heldout = estimate, heldout
         self.normal = Normal(ColumnStore(heldout), estimate.terms)
-        command = heldout.layout.command
         self.joint = np.array([row[1] for row in self.normal.rows])
-        self.counts = np.array([row[0] != command for row in self.normal.rows]) & (self.normal.count.sum(0) > 0)
+        self.counts = self.normal.count.sum(0) > 0
 
     def rms(self, terms: list[Term]) -> Array:
         """Held-out RMS per joint after fitting these terms on the training set, (n,)."""
@@ -70,9 +69,22 @@ class _Scorer:
         return np.asarray(np.sqrt(out))
 
 
-def causes(estimate: Estimate, heldout: ResidualSet, rivals: Rivals, names: tuple[str, ...]) -> list[Cause]:
-    """The causes, most important first."""
-    out = []
+MINOR = 5e-3
+"""Share of a joint's largest torque that a cause must lower some joint's RMS by, not to be minor."""
+
+
+def is_minor(step: Step, heldout: ResidualSet) -> bool:
+    """Whether a step lowers no joint's RMS by what a user would care about."""
+    least = np.maximum(MINOR * heldout.largest_torque, CARE_NM)
+    return bool(np.all(step.before - step.after < least))
+
+
+def causes(
+    estimate: Estimate, heldout: ResidualSet, rivals: Rivals, names: tuple[str, ...]
+) -> tuple[list[Cause], list[Cause]]:
+    """The causes, most important first, and the minor ones."""
+    found: list[Cause] = []
+    minor: list[Cause] = []
     for step in ordered(estimate, heldout):
         places = sorted({term.place for term in step.terms})
         whole = rivals.whole_arm(step.effect)
@@ -82,7 +94,7 @@ def causes(estimate: Estimate, heldout: ResidualSet, rivals: Rivals, names: tupl
         parameters: dict[str, dict[str, Value]] = {}
         for term in sorted(step.terms, key=lambda t: t.place):
             parameters.setdefault("arm" if whole else names[term.place], {}).update(estimate.parameters(term))
-        out.append(
+        (minor if is_minor(step, heldout) else found).append(
             Cause(
                 effect=step.effect,
                 joints=joints,
@@ -95,7 +107,7 @@ def causes(estimate: Estimate, heldout: ResidualSet, rivals: Rivals, names: tupl
                 separate_by=verdict.separate_by,
             )
         )
-    return out
+    return found, minor
 
 
 def left_over(data: ResidualSet, explained: dict[Row, Array]) -> dict[Row, Array]:

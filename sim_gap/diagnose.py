@@ -64,16 +64,18 @@ def diagnose(
     layout = layout_of(ready)
     fit, judge = (ResidualSet(tuple(part), layout) for part in (ready[: len(train)], ready[len(train) :]))
     _refuse_rest(fit)
-    estimate, found = None, []
+    estimate = None
+    found: list[Cause] = []
+    minor: list[Cause] = []
     if not (is_quiet(judge) and is_quiet(fit)):
         store = ColumnStore(fit)
         search = compete(store, [name for name in effects() if name not in withhold])
         estimate = Estimate(store, search.active)
-        found = causes(estimate, judge, Rivals(search), sim.arm.names)
-    return _answer(Internals(sim, fit, judge, estimate), found, told)
+        found, minor = causes(estimate, judge, Rivals(search), sim.arm.names)
+    return _answer(Internals(sim, fit, judge, estimate), found, minor, told)
 
 
-def _answer(made: Internals, found: list[Cause], told: str) -> Diagnosis:
+def _answer(made: Internals, found: list[Cause], minor: list[Cause], told: str) -> Diagnosis:
     fit, judge, estimate = made.train, made.heldout, made.estimate
     left, left_fit = (
         left_over(data, estimate.predict(data)) if estimate is not None else data.values for data in (judge, fit)
@@ -83,6 +85,7 @@ def _answer(made: Internals, found: list[Cause], told: str) -> Diagnosis:
         names=made.model.arm.names,
         where=tuple(places(judge)),
         causes=tuple(found),
+        minor=tuple(minor),
         noise_floor=combined(judge, judge.floor),
         train_before=by_joint(fit),
         train_after=by_joint(fit, left_fit),

@@ -51,6 +51,8 @@ class Diagnosis:
     names: tuple[str, ...]
     where: tuple[Place, ...]
     causes: tuple[Cause, ...]
+    minor: tuple[Cause, ...]
+    """Small true imperfections that came out besides: none lowers any joint's gap by what a user would care about."""
     noise_floor: Array
     train_before: Array
     train_after: Array
@@ -84,6 +86,7 @@ class Diagnosis:
                 for place in self.where
             ],
             "causes": [_cause(cause) for cause in self.causes],
+            "minor": [_cause(cause) for cause in self.minor],
             "gap": {
                 "unit": "N·m",
                 "joints": list(self.names),

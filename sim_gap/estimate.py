@@ -68,7 +68,8 @@ class Estimate:
 
     @staticmethod
     def _smooth(term: Term) -> bool:
-        return len(term.shape) == 1 and not effects()[term.effect].secant
+        effect = effects()[term.effect]
+        return len(term.shape) == 1 and not effect.secant and not effect.counted
 
     def _shape_slope(self, term: Term, i: int, row: Row) -> Array:
         step = SHAPE_STEP * abs(term.shape[i])

@@ -58,7 +58,7 @@ def load_model(source: Any, names: tuple[str, ...] = (), count: int | None = Non
 
 
 def compiled(path: Path) -> Any:
-    """Compile an MJCF or URDF file, or an arm file (by path or bundled name), to a `mujoco.MjModel`. Raises BadInput."""
+    """Compile an MJCF, URDF or arm file (by path or bundled name) to a `mujoco.MjModel`. Raises BadInput."""
     import mujoco
 
     from armlink.armfile import bundled_arms

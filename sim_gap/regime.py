@@ -76,7 +76,7 @@ def by_joint(data: ResidualSet, left: dict[Row, Array] | None = None) -> Array:
     values = data.values if left is None else left
     squares = np.zeros(data.layout.n)
     for channel, joint in data.rows:
-        if channel != data.layout.command and (valid := data.valid[channel, joint]).any():
+        if (valid := data.valid[channel, joint]).any():
             squares[joint] += np.mean(values[channel, joint][valid] ** 2)
     return np.asarray(np.sqrt(squares))
 
@@ -85,6 +85,6 @@ def combined(data: ResidualSet, levels: dict[Row, float]) -> Array:
     """A level per row (noise floor, margin) combined per joint as in `by_joint`, (n,)."""
     squares = np.zeros(data.layout.n)
     for channel, joint in data.rows:
-        if channel != data.layout.command and data.valid[channel, joint].any():
+        if data.valid[channel, joint].any():
             squares[joint] += levels[channel, joint] ** 2
     return np.asarray(np.sqrt(squares))

@@ -12,8 +12,10 @@ from sim_gap.signals import Signals
 
 MODEL_FLOOR = 1e-3
 """Numerical and geometrical error that every model is granted, as a share of its torque."""
-SMALL = 3e-3
-"""Share of a joint's largest torque below which a residual is not worth a parameter."""
+SMALL, SMALL_NM = 3e-3, 0.01
+"""Residual that is not worth a parameter: share of a joint's largest torque, and [N·m]."""
+CARE_NM = 0.05
+"""Smallest gap that a user would care about [N·m]: every arm has a few hundredths of friction and offset."""
 CARE, CARE_INNER = 0.01, 0.003
 """A gap that a user would care about, as a share of the largest torque: against the model, motor against sensor."""
 FOLDS = 6
@@ -90,7 +92,8 @@ class ResidualSet:
     @cached_property
     def care(self) -> dict[Row, float]:
         """What is not worth explaining in each row [N·m]: noise, and a small share of the largest torque."""
-        return {row: float(np.hypot(self.floor[row], SMALL * self.largest_torque[row[1]])) for row in self.rows}
+        parts = {row: (self.floor[row], SMALL * self.largest_torque[row[1]], SMALL_NM) for row in self.rows}
+        return {row: float(np.linalg.norm(part)) for row, part in parts.items()}
 
     @cached_property
     def largest_torque(self) -> Array:
@@ -127,25 +130,29 @@ class ResidualSet:
 
     def columns(self, effect: Effect, place: int, shape: Shape) -> Columns:
         """The effect's columns, filtered as the readings are, (K, p) per row that it touches."""
-        parts = [effect.columns(s, self.layout, place, shape) for s in self.signals]
-        filtered = [
-            {row: s.filtered(x) for row, x in part.items()} for s, part in zip(self.signals, parts, strict=True)
-        ]
-        return {row: np.concatenate([part[row] for part in filtered]) for row in filtered[0]}
+        parts = [_filtered(s, effect.columns(s, self.layout, place, shape)) for s in self.signals]
+        return {row: np.concatenate([part[row] for part in parts]) for row in parts[0]}
 
     @cached_property
     def margin(self) -> dict[Row, float]:
-        """Below this a row's RMS is no gap [N·m]: twice its noise, and a share of the joint's largest torque.
+        """Below this a row's RMS is no gap [N·m]: twice its noise and what a user would care about.
 
         The share is smaller where the motor is compared with the sensor, for no error of the links shows there.
         """
-        inner = self.layout.motor if self.layout.sensor else None
-        care = {row: CARE_INNER if row[0] == inner else CARE for row in self.rows}
-        return {row: 2.0 * self.floor[row] + care[row] * self.largest_torque[row[1]] for row in self.rows}
+        care = {row: CARE if row[0] == self.layout.against_model else CARE_INNER for row in self.rows}
+        torque = self.largest_torque
+        return {row: 2.0 * self.floor[row] + max(care[row] * torque[row[1]], CARE_NM) for row in self.rows}
 
     def spread(self, effect: Effect, place: int) -> Array:
         """Prior standard deviation of the effect's coefficients."""
         return effect.spread(self.signals[0], place)
+
+
+def _filtered(s: Signals, columns: Columns) -> Columns:
+    """Columns of all rows through the filter at once."""
+    ends = np.cumsum([x.shape[1] for x in columns.values()])[:-1]
+    pieces = np.split(s.filtered(np.hstack(list(columns.values()))), ends, axis=1)
+    return dict(zip(columns, pieces, strict=True))
 
 
 def root_mean_square(x: Array) -> float:

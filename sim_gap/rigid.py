@@ -17,24 +17,6 @@ INERTIAL = ("mass", "mx", "my", "mz", "ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 @dataclass(frozen=True)
-class Motion:
-    """Pose, velocity and acceleration of every link over K rows, in the base frame (gravity as upward acceleration)."""
-
-    rotation: Array
-    """Link to base, (K, n, 3, 3)."""
-    origin: Array
-    """A point on each joint's axis, the link frame's origin [m], (K, n, 3)."""
-    axis: Array
-    """Joint axes, (K, n, 3)."""
-    omega: Array
-    """Angular velocity [rad/s], (K, n, 3)."""
-    alpha: Array
-    """Angular acceleration [rad/s²], (K, n, 3)."""
-    acceleration: Array
-    """Acceleration of the origin less gravity [m/s²], (K, n, 3)."""
-
-
-@dataclass(frozen=True)
 class RigidArm:
     """An arm of n hinges: geometry, nominal inertial parameters, and what the model's joints carry besides."""
 
@@ -78,54 +60,64 @@ class RigidArm:
         """The same arm with other inertial parameters (n, 10)."""
         return replace(self, inertial=inertial)
 
-    def motion(self, q: Array, v: Array, a: Array, gravity: Array | None = None) -> Motion:
-        """Move every link; q, v, a (K, n) in rad, rad/s, rad/s²; gravity (3,) or (K, 3), by default the model's."""
-        rows = len(q)
-        field = np.broadcast_to(self.gravity if gravity is None else gravity, (rows, 3))
-        still, base = np.zeros((rows, 3)), np.broadcast_to(np.eye(3), (rows, 3, 3))
-        moved: list[tuple[Array, ...]] = []
-        for j in range(self.n):
-            up = self.parent[j]
-            turn, place, omega, alpha, push = moved[up][:5] if up >= 0 else (base, still, still, still, -field)
-            lever = turn @ self.offset[j]
-            axis = turn @ (self.rotation[j] @ self.axis[j])
-            push = push + np.cross(alpha, lever) + np.cross(omega, np.cross(omega, lever))
-            alpha = alpha + axis * a[:, j, None] + np.cross(omega, axis) * v[:, j, None]
-            rotation = turn @ (self.rotation[j] @ _rotations(self.axis[j], q[:, j] - self.zero[j]))
-            moved.append((rotation, place + lever, omega + axis * v[:, j, None], alpha, push, axis))
-        rotation, origin, omega, alpha, push, axis = (np.stack(part, axis=1) for part in zip(*moved, strict=True))
-        return Motion(rotation, origin, axis, omega, alpha, push)
-
     def torque(self, q: Array, v: Array, a: Array, gravity: Array | None = None) -> Array:
-        """Link-side torque τ = M(q) a + C(q, v) v + ∂V/∂q of the rigid links [N·m], (K, n)."""
-        m = self.motion(q, v, a, gravity)
-        moment = np.einsum("knij,nj->kni", m.rotation, self.inertial[:, 1:4])
-        inertia = m.rotation @ _symmetric(self.inertial[:, 4:]) @ np.swapaxes(m.rotation, -1, -2)
-        force = self.inertial[:, :1] * m.acceleration + np.cross(m.alpha, moment)
-        force += np.cross(m.omega, np.cross(m.omega, moment))
-        spin = np.einsum("knij,knj->kni", inertia, m.omega)
-        couple = np.cross(moment, m.acceleration) + np.einsum("knij,knj->kni", inertia, m.alpha)
-        couple += np.cross(m.omega, spin)
-        couple_origin = couple + np.cross(m.origin, force)  # about the base's origin, so that links simply add
+        """Link-side torque τ = M(q) a + C(q, v) v + ∂V/∂q of the rigid links [N·m], (K, n).
+
+        q, v, a (K, n) in rad, rad/s, rad/s²; gravity (3,) in the base frame, by default the model's.
+        """
+        turns, moves = self._forward(q, v, a, gravity)
+        forces, couples = [], []
+        for j, (omega, alpha, push) in enumerate(moves):
+            mass, moment, inertia = self.inertial[j, 0], self.inertial[j, 1:4], _symmetric(self.inertial[j, 4:])
+            forces.append(mass * push + _cross(alpha, moment) + _cross(omega, _cross(omega, moment)))
+            couples.append(inertia @ alpha + _cross(omega, inertia @ omega) - _cross(push, moment))
         tau: Array = np.empty_like(q)
-        for i in range(self.n):
-            carried = self.carries[i]
-            about = couple_origin[:, carried].sum(1) - np.cross(m.origin[:, i], force[:, carried].sum(1))
-            tau[:, i] = np.einsum("ki,ki->k", m.axis[:, i], about)
+        for j in reversed(range(self.n)):
+            tau[:, j] = self.axis[j] @ couples[j]
+            up = self.parent[j]
+            if up >= 0:
+                force = _out(turns[j], forces[j])
+                forces[up] = forces[up] + force
+                couples[up] = couples[up] + _out(turns[j], couples[j]) - _cross(force, self.offset[j])
         return tau
 
     def regressor(self, q: Array, v: Array, a: Array, gravity: Array | None = None) -> Array:
         """Columns of `torque` in the inertial parameters: τ = Σ_j Y[:, i, j] · inertial[j]; (K, n, n, 10)."""
-        m = self.motion(q, v, a, gravity)
-        out = np.zeros((len(q), self.n, self.n, 10))
+        turns, moves = self._forward(q, v, a, gravity)
+        out = np.zeros((self.n, self.n, 10, len(q)))
+        for i in range(self.n):
+            axes = {i: np.repeat(self.axis[i][:, None], len(q), axis=1)}
+            arms = {i: np.zeros((3, len(q)))}
+            for j in range(i, self.n):
+                if j > i and self.parent[j] in axes:
+                    axes[j] = _in(turns[j], axes[self.parent[j]])
+                    arms[j] = _in(turns[j], arms[self.parent[j]] + self.offset[j][:, None])
+                if j in axes:
+                    out[i, j] = _link_columns(axes[j], _cross(axes[j], arms[j]), *moves[j])
+        return np.moveaxis(out, -1, 0)
+
+    def _forward(
+        self, q: Array, v: Array, a: Array, gravity: Array | None
+    ) -> tuple[list[Array], list[tuple[Array, Array, Array]]]:
+        """Each link's rotation to its parent (3, 3, K); its angular velocity and acceleration and the acceleration of
+        its origin less gravity, in its own frame, (3, K) each."""
+        field = self.gravity if gravity is None else gravity
+        still = np.zeros((3, len(q)))
+        base = still, still, still - np.asarray(field, float)[:, None]
+        turns: list[Array] = []
+        moves: list[tuple[Array, Array, Array]] = []
         for j in range(self.n):
-            turn = np.swapaxes(m.rotation[:, j], -1, -2)
-            omega, alpha, push = (_apply(turn, x[:, j]) for x in (m.omega, m.alpha, m.acceleration))
-            for i in np.flatnonzero(self.carries[:, j]):
-                axis = _apply(turn, m.axis[:, i])
-                lever = _apply(turn, np.cross(m.axis[:, i], m.origin[:, j] - m.origin[:, i]))
-                out[:, i, j] = _link_columns(axis, lever, omega, alpha, push)
-        return out
+            turn = _turned(self.rotation[j], self.axis[j], q[:, j] - self.zero[j])
+            omega, alpha, push = moves[self.parent[j]] if self.parent[j] >= 0 else base
+            if self.parent[j] >= 0:
+                lever = self.offset[j]
+                push = push + _cross(alpha, lever) + _cross(omega, _cross(omega, lever))
+            omega, alpha, push = _in(turn, omega), _in(turn, alpha), _in(turn, push)
+            spin = self.axis[j][:, None] * v[:, j]
+            alpha = alpha + self.axis[j][:, None] * a[:, j] + _cross(omega, spin)
+            turns.append(turn)
+            moves.append((omega + spin, alpha, push))
+        return turns, moves
 
     def nominal_joint_torque(self, q: Array, v: Array, a: Array, direction: Array) -> Array:
         """What the nominal model's joints add on the motor side: armature, damping, friction loss, spring (K, n).
@@ -137,28 +129,39 @@ class RigidArm:
 
 
 def _link_columns(axis: Array, lever: Array, omega: Array, alpha: Array, push: Array) -> Array:
-    """Ten columns of one link for one joint: axis·(torque) + lever·(force), all in the link's frame (K, 10)."""
-    out = np.empty((len(axis), 10))
-    out[:, 0] = np.einsum("ki,ki->k", lever, push)
-    turning = np.cross(lever, alpha) + np.cross(np.cross(lever, omega), omega)  # leverᵀ([α×] + [ω×]²)
-    out[:, 1:4] = turning + np.cross(push, axis)
-    gyro = np.cross(axis, omega)
+    """Ten columns of one link for one joint: axis·(torque) + lever·(force), all in the link's frame, (10, K)."""
+    out = np.empty((10, axis.shape[1]))
+    out[0] = (lever * push).sum(0)
+    out[1:4] = _cross(lever, alpha) + _cross(_cross(lever, omega), omega) + _cross(push, axis)
+    gyro = _cross(axis, omega)
     for column, (r, c) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)), start=4):
-        value = axis[:, r] * alpha[:, c] + gyro[:, r] * omega[:, c]
-        out[:, column] = value if r == c else value + axis[:, c] * alpha[:, r] + gyro[:, c] * omega[:, r]
+        value = axis[r] * alpha[c] + gyro[r] * omega[c]
+        out[column] = value if r == c else value + axis[c] * alpha[r] + gyro[c] * omega[r]
     return out
 
 
-def _apply(rotation: Array, vector: Array) -> Array:
-    return np.asarray(np.einsum("kij,kj->ki", rotation, vector))
+def _cross(x: Array, y: Array) -> Array:
+    """Cross product of vectors (3, K) with vectors (3, K) or one vector (3,)."""
+    return np.stack([x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]])
 
 
-def _rotations(axis: Array, angle: Array) -> Array:
-    """Rodrigues' formula for one axis (3,) and many angles (K,) → (K, 3, 3)."""
+def _in(turn: Array, vector: Array) -> Array:
+    """Into the turned frame: Rᵀ x for rotations (3, 3, K) and vectors (3, K)."""
+    return np.stack([turn[0, i] * vector[0] + turn[1, i] * vector[1] + turn[2, i] * vector[2] for i in range(3)])
+
+
+def _out(turn: Array, vector: Array) -> Array:
+    """Out of the turned frame: R x."""
+    return np.stack([turn[i, 0] * vector[0] + turn[i, 1] * vector[1] + turn[i, 2] * vector[2] for i in range(3)])
+
+
+def _turned(start: Array, axis: Array, angle: Array) -> Array:
+    """Rotation `start` (3, 3) followed by angles (K,) about one axis (3,), by Rodrigues' formula, (3, 3, K)."""
     x, y, z = axis
     hat = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    sine, versine = np.sin(angle)[:, None, None], (1.0 - np.cos(angle))[:, None, None]
-    return np.asarray(np.eye(3) + sine * hat + versine * (hat @ hat))
+    sine, versine = np.sin(angle), 1.0 - np.cos(angle)
+    parts = start, start @ hat, start @ hat @ hat
+    return np.asarray(parts[0][..., None] + parts[1][..., None] * sine + parts[2][..., None] * versine)
 
 
 def _symmetric(six: Array) -> Array:

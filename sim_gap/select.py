@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sim_gap.effects.registry import Layout, effects
+from sim_gap.effects.registry import effects
 from sim_gap.normal import ColumnStore, Normal, Term, Weighted
+from sim_gap.residual import ResidualSet
 
 PRICE = 0.012
 """What a coefficient must lower Σ ½ log(R² + floor²) over all rows by: about 1 % of one row's RMS."""
@@ -17,13 +18,14 @@ TRIES = 3
 """How often one effect at one place may come in during a search."""
 
 
-def candidates(layout: Layout, library: Sequence[str]) -> list[Term]:
+def candidates(data: ResidualSet, library: Sequence[str]) -> list[Term]:
     """Every effect of the library at every place and starting shape that these channels can show."""
+    layout = data.layout
     return [
         Term(name, place, shape)
         for name in library
         for place in effects()[name].places(layout)
-        for shape in effects()[name].shapes
+        for shape in effects()[name].grid(data.signals, place)
     ]
 
 
@@ -80,7 +82,8 @@ class Search:
 
     def with_beneath(self, term: Term, terms: Sequence[Term]) -> list[Term]:
         """`terms` plus `term` plus what it stands upon; another shape of the same effect there gives way."""
-        kept = [other for other in terms if other.key != term.key]
+        gone = {term.key, *term.covers(self.normal.layout)}
+        kept = [other for other in terms if other.key not in gone and term.key not in other.covers(self.normal.layout)]
         have = {other.key for other in kept}
         missing = [other for other in self.normal.terms if other.key in term.beneath and other.key not in have]
         return [*kept, *missing, term]
@@ -151,7 +154,7 @@ class Search:
 
 def compete(store: ColumnStore, library: Sequence[str]) -> Search:
     """Search the library, refine the shapes of what was chosen, and drop what no longer earns its place."""
-    offered = candidates(store.data.layout, library)
+    offered = candidates(store.data, library)
     chosen = refine(store, Search(Normal(store, offered)).run())
     keys = {term.key for term in chosen}
     search = Search(Normal(store, [*chosen, *(term for term in offered if term.key not in keys)]), chosen)
@@ -177,22 +180,33 @@ def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
     """Move each shape between its neighbours of the starting grid to where the fit is best (golden section)."""
     out = secants(store, secants(store, list(active)))
     for term in list(out):
-        grid = sorted({shape[0] for shape in effects()[term.effect].shapes if shape})
-        if not term.shape or len(term.shape) > 1 or len(grid) < 2:
+        found = _between(store.data, term)
+        if found is None:
             continue
-        at = int(np.argmin(np.abs(np.array(grid) - term.shape[0])))
-        low, high = grid[max(at - 1, 0)], grid[min(at + 1, len(grid) - 1)]
+        free, low, high = found
 
-        def fit(value: float, term: Term = term) -> float:
-            trial = [Term(term.effect, term.place, (value,)) if other == term else other for other in out]
+        def fit(value: float, term: Term = term, free: int = free) -> float:
+            trial = [term.reshaped(free, value) if other == term else other for other in out]
             normal = Normal(store, trial)
             start = normal.square.sum(0) / np.maximum(normal.count.sum(0), 1.0)
             squares = normal.mean_square(*Weighted(normal, start).fit(normal.terms))
             return float(0.5 * np.log(squares + normal.floor**2)[normal.seen].sum())
 
         value = golden(fit, low, high)
-        out[out.index(term)] = Term(term.effect, term.place, (value,))
+        out[out.index(term)] = term.reshaped(free, value)
     return out
+
+
+def _between(data: ResidualSet, term: Term) -> tuple[int, float, float] | None:
+    """The free entry of a term's shape and its neighbours on the starting grid; None where there is none."""
+    effect = effects()[term.effect]
+    free = [i for i in range(len(term.shape)) if i not in effect.counted]
+    if effect.secant or len(free) != 1:
+        return None
+    grid = sorted({shape[free[0]] for shape in effect.grid(data.signals, term.place)})
+    value = term.shape[free[0]]
+    lower, upper = [x for x in grid if x < value - 1e-9], [x for x in grid if x > value + 1e-9]
+    return free[0], (lower[-1] if lower else 0.5 * value), (upper[0] if upper else 1.5 * value)
 
 
 def secants(store: ColumnStore, active: list[Term]) -> list[Term]:

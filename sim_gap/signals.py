@@ -19,7 +19,7 @@ BAND_HZ = 6.0
 """Pass band in which model and recording are compared."""
 SMOOTH_HZ = 20.0
 """Pass band of position and velocity before anything nonlinear is taken of them."""
-WORK_HZ = 250.0
+WORK_HZ = 125.0
 """Highest rate at which columns are computed; faster recordings are low-passed and decimated to it."""
 TRIM_S = 0.3
 """Cut at both ends after filtering."""
@@ -116,9 +116,12 @@ class Signals:
 
     def filtered(self, x: Array) -> Array:
         """Low-pass (4th-order Butterworth, forth and back), trimmed at the ends and decimated; (K, …) → (k, …)."""
-        sections = butter(4, self.band, fs=self.rate, output="sos")
         trim = max(1, round(TRIM_S * self.rate))
-        return np.asarray(sosfiltfilt(sections, x, axis=0)[trim : len(x) - trim : self.step])
+        return np.asarray(sosfiltfilt(self._sections, x, axis=0)[trim : len(x) - trim : self.step])
+
+    @cached_property
+    def _sections(self) -> Array:
+        return np.asarray(butter(4, self.band, fs=self.rate, output="sos"))
 
     def sampled(self, x: Array) -> Array:
         """The rows of `x` at which `filtered` gives its values, unfiltered."""

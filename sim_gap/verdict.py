@@ -14,13 +14,9 @@ EXPLAINED = 0.15
 
 
 def row_rms(data: ResidualSet, left: dict[Row, Array] | None = None) -> dict[Row, float]:
-    """RMS of each row that has valid samples [N·m], command rows aside; of `left` instead of the raw residual."""
+    """RMS of each row that has valid samples [N·m]; of `left` instead of the raw residual."""
     values = data.values if left is None else left
-    return {
-        row: root_mean_square(values[row][data.valid[row]])
-        for row in data.rows
-        if row[0] != data.layout.command and data.valid[row].any()
-    }
+    return {row: root_mean_square(values[row][data.valid[row]]) for row in data.rows if data.valid[row].any()}
 
 
 def is_quiet(data: ResidualSet) -> bool:

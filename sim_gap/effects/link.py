@@ -66,6 +66,9 @@ class Payload(Effect):
     def spread(self, signals: Signals, place: int) -> Array:
         return np.array([20.0, 4.0, 4.0, 4.0])
 
+    def covers(self, layout: Layout, place: int) -> tuple[tuple[str, int], ...]:
+        return (("link.mass_moment", layout.n - 1),)
+
     def plausible(self, coefficients: Array, shape: Shape) -> bool:
         mass = float(coefficients[0])
         return mass > 0.0 and float(np.linalg.norm(coefficients[1:])) < FARTHEST * mass

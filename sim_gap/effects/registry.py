@@ -1,7 +1,7 @@
 """What an effect is to the diagnosis, and the list of all of them: one small file a family."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -12,6 +12,20 @@ import numpy as np
 from sim_gap.rigid import Array
 from sim_gap.signals import Signals
 
+FAMILIES = (
+    "friction",
+    "link",
+    "base",
+    "position",
+    "torque",
+    "bending",
+    "timing",
+    "transmission",
+    "soft",
+    "actuator",
+    "drive",
+)
+"""Modules of this package, one a family."""
 Row = tuple[str, int]
 """A channel and a joint's index: one residual over time."""
 Columns = dict[Row, Array]
@@ -87,6 +101,8 @@ class Effect(ABC):
     """Effects at the same place that it stands upon: the simpler model beneath it."""
     shapes: ClassVar[tuple[Shape, ...]] = ((),)
     """Shapes tried at first; the best is then refined between its neighbours."""
+    counted: ClassVar[frozenset[int]] = frozenset()
+    """Which entries of the shape are numbers of something (a joint): they are not refined."""
     whole_arm: ClassVar[bool] = False
     secant: ClassVar[bool] = False
     """Whether the shape is the coefficient at which a curved effect's secant is taken: set to the fit, then exact."""
@@ -94,6 +110,14 @@ class Effect(ABC):
     def places(self, layout: Layout) -> range:
         """Joints or links at which it may sit; empty where these channels cannot show it."""
         return range(1) if self.whole_arm else range(layout.n)
+
+    def grid(self, signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
+        """Shapes to start from on these recordings; by default `shapes`."""
+        return self.shapes
+
+    def covers(self, layout: Layout, place: int) -> tuple[tuple[str, int], ...]:
+        """Effects and places whose columns this one contains: they do not stand beside it."""
+        return ()
 
     @abstractmethod
     def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
@@ -115,6 +139,5 @@ class Effect(ABC):
 @cache
 def effects() -> dict[str, Effect]:
     """All effects by id."""
-    families = ("friction", "link", "base", "position", "torque", "timing", "transmission", "actuator")
-    found = [effect for family in families for effect in import_module(f"sim_gap.effects.{family}").EFFECTS]
+    found = [effect for family in FAMILIES for effect in import_module(f"sim_gap.effects.{family}").EFFECTS]
     return {effect.id: effect for effect in found}

@@ -1,12 +1,12 @@
 """Errors of the transmission between motor and torque sensor."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from sim_gap.effects.registry import Columns, Effect, Layout, Parameter, Shape
 from sim_gap.rigid import Array
-from sim_gap.signals import Signals
+from sim_gap.signals import CREEP, Signals
 
 
 class Ripple(Effect):
@@ -53,20 +53,19 @@ class Coupling(Effect):
     id = "transmission.coupling"
     parameters = (
         Parameter("coefficient", "1"),
-        Parameter("other_joint", "index"),
+        Parameter("other_joint", "joint number"),
         Parameter("inertia", "kg·m²"),
         Parameter("coulomb", "N·m"),
         Parameter("viscous", "N·m·s/rad"),
     )
-    shapes = ((-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
+    counted = frozenset({0})
+
+    def grid(self, signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
+        neighbours = [place + step for step in (-1, 1) if 0 <= place + step < signals[0].n]
+        return tuple((float(other + 1), lever) for other in neighbours for lever in (-1.0, -0.6, 0.6, 1.0))
 
     def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
-        from sim_gap.signals import CREEP
-
-        other = place + int(shape[0])
-        if not 0 <= other < signals.n:
-            return {}
-        lever = shape[1]
+        other, lever = int(shape[0]) - 1, shape[1]
         speed = signals.v[:, place] + lever * signals.v[:, other]
         push = signals.a[:, place] + lever * signals.a[:, other]
         shared = np.column_stack([push, np.clip(speed / CREEP, -1.0, 1.0), speed])

@@ -1,0 +1,81 @@
+"""Drives that do not make the torque they are asked for: they show in the command against the drive's own estimate.
+
+Where a recording has a command but no estimate, they show in the command against the sensor or the model.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.signal import lfilter
+
+from sim_gap.effects.registry import Columns, Effect, Layout, Parameter, Shape
+from sim_gap.rigid import Array
+from sim_gap.signals import Signals
+
+
+def commanding(layout: Layout) -> str | None:
+    """The channel whose residual a drive's shortcoming shows in."""
+    return layout.command or ("tau_cmd" if layout.motor == "tau_cmd" else None)
+
+
+class _Drive(Effect):
+    def places(self, layout: Layout) -> range:
+        return range(layout.n if commanding(layout) else 0)
+
+    def missing(self, command: Array, shape: float, rate: float) -> Array:
+        """Command less torque made, (K,), for the whole shape."""
+        raise NotImplementedError
+
+    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
+        channel = commanding(layout)
+        assert channel is not None
+        lost = self.missing(signals.reading["tau_cmd"][:, place], shape[0], signals.rate)
+        return {(channel, place): lost[:, None]}
+
+    def plausible(self, coefficients: Array, shape: Shape) -> bool:
+        return bool(0.6 < coefficients[0] < 1.6)
+
+    def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
+        return np.array([shape[0]])
+
+
+class Lag(_Drive):
+    """A first-order lag behind the command."""
+
+    id = "actuator.lag"
+    parameters = (Parameter("time", "s"),)
+    shapes = ((0.002,), (0.005,), (0.01,), (0.02,), (0.04,), (0.08,))
+
+    def missing(self, command: Array, shape: float, rate: float) -> Array:
+        keep = np.exp(-1.0 / (rate * shape))
+        follow, _ = lfilter([1.0 - keep], [1.0, -keep], command, zi=[keep * command[0]])
+        return np.asarray(command - follow)
+
+
+class Delay(_Drive):
+    """The command carried out late."""
+
+    id = "actuator.delay"
+    parameters = (Parameter("time", "s"),)
+    shapes = Lag.shapes
+
+    def missing(self, command: Array, shape: float, rate: float) -> Array:
+        t = np.arange(len(command)) / rate
+        return np.asarray(command - np.interp(t - shape, t, command))
+
+
+class Saturation(_Drive):
+    """Torque clipped at a limit."""
+
+    id = "actuator.saturation"
+    parameters = (Parameter("limit", "N·m"),)
+
+    def grid(self, signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
+        peak = max(float(np.abs(s.reading["tau_cmd"][:, place]).max()) for s in signals)
+        return tuple((share * peak,) for share in (0.3, 0.45, 0.6, 0.75, 0.85, 0.93, 0.98))
+
+    def missing(self, command: Array, shape: float, rate: float) -> Array:
+        return np.asarray(command - np.clip(command, -shape, shape))
+
+
+EFFECTS: tuple[Effect, ...] = (Lag(), Delay(), Saturation())
