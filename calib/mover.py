@@ -27,6 +27,8 @@ CONTACT_LEAD = 0.015
 """A joint that its target leads by so much, and that does not move, stands at its stop [rad]."""
 CONTACT_STILL = 0.15
 """Share of the approach speed below which a joint does not move."""
+CHECK_EVERY = 5
+"""Cycles from one look at the settle rule to the next."""
 PRESS_SECONDS = 0.3
 STOP_TOLERANCE = 0.06
 """How far from the arm file's place a stop may be found, beyond the position sensor's own error [rad]."""
@@ -154,23 +156,26 @@ class Mover:
         rule, samples = self.rule, list[Sample]()
         begin: int | None = None
         resolution = np.where(np.isfinite(self.resolution), self.resolution, 0.0)
+
+        def settled(some: list[Sample]) -> bool:
+            return rule.settled(_stack(some, "position"), _stack(some, "torque"), counts, resolution)
+
         while True:
             samples.append(self.cycle())
             count = len(samples)
-            if count < rule.window or (count - rule.window) % 5:
+            if count < rule.window or (count - rule.window) % CHECK_EVERY:
                 continue
+            if count >= rule.timeout:
+                return _average(samples[-rule.max_samples :], settled=False)
             if begin is None:
-                window = samples[-rule.window :]
-                if rule.settled(_stack(window, "position"), _stack(window, "torque"), counts, resolution):
+                if settled(samples[-rule.window :]):
                     begin = count - rule.window // 2  # what settled last still decays in the first half
-                elif count >= rule.timeout:
-                    return _average(samples[-rule.max_samples :], settled=False)
-            if begin is not None:
+            elif count - begin >= rule.window:
                 enough = count - begin >= rule.max_samples
-                if count - begin < rule.window:
-                    continue
                 if enough or rule.exact(_stack(samples[begin:], "torque"), counts):
-                    return _average(samples[begin:], settled=True)
+                    if settled(samples[begin:]):
+                        return _average(samples[begin:], settled=True)
+                    begin = None  # it only stood at a turning point
 
     def _creep(self, stops: npt.NDArray[np.int64], joints: Flags) -> None:
         """Move each joint towards its stop until it does not follow any more."""

@@ -24,8 +24,8 @@ DEAD_LEVER = 0.005
 """Γ/g below which a joint feels no gravity: its offset is still swept, at one combination."""
 SLOWEST = 0.3
 """Acceleration that every planned sweep must allow [rad/s²]."""
-MASS_SHARE = 0.7
-"""Share of the torque left over gravity that the reference mass may take."""
+MASS_SHARES = (0.3, 0.5, 0.7)
+"""Shares of the torque left over gravity that the reference mass may take: the least that gives the precision asked."""
 ASSUMED_GRAVITY = 0.6
 """Share of max_torque that gravity is assumed to take while nothing has been measured."""
 SERVO_GAP = 0.05
@@ -57,7 +57,9 @@ def plan_sweep(
         notes += remarks
     moments = guessed_moments(described, seed) if guess is None else [guess.beta]
     sigma = section.standard_error * limits.rated
-    mass = reference_mass or section.reference_mass or _reference_mass(described, limits, options, guess)
+    given = reference_mass or section.reference_mass
+    masses = [given] if given else _reference_masses(described, limits, options, guess)
+    mass = masses[-1]
     poses = section.loaded_poses if reference_mass else section.poses
     counts = [1 if each.lever.max() < DEAD_LEVER else poses for each in options]
     picks = choose(described, options, counts, moments, sigma, mass)
@@ -69,8 +71,12 @@ def plan_sweep(
     scout = scout_poses(described, section, limits, seed)
     gain_std, finer = None, 1.0
     if guess is not None:
-        std = predicted_gain_std(guess, sweeps, np.array(scout), mass, sigma, section.position_offset_std)
-        gain_std = worst_gain_std(std)
+        for mass in masses:
+            std = predicted_gain_std(guess, sweeps, np.array(scout), mass, sigma, section.position_offset_std)
+            gain_std = worst_gain_std(std)
+            if gain_std <= section.gain_std:
+                break
+        assert gain_std is not None
         finer = float(np.clip(gain_std / section.gain_std, 1.0, FINEST))
     return SweepPlan(
         sweeps=tuple(sweeps),
@@ -199,8 +205,10 @@ def _with_reaction(
     return np.minimum(needed + acceleration * reaction, limits.max_torque), acceleration
 
 
-def _reference_mass(described: Arm, limits: Limits, options: list[Candidates], guess: GravityGuess | None) -> float:
-    """The mass [kg] that takes `MASS_SHARE` of the torque left at the joint that it loads most, to two digits."""
+def _reference_masses(
+    described: Arm, limits: Limits, options: list[Candidates], guess: GravityGuess | None
+) -> list[float]:
+    """Masses [kg] that take `MASS_SHARES` of the torque left at the joint that they load most, to two digits."""
     poses = np.concatenate([each.poses.reshape(-1, described.n) for each in options])
     regressor = gravity_regressor(described, poses)
     at_origin, by_point = payload_columns(described)
@@ -209,9 +217,9 @@ def _reference_mass(described: Arm, limits: Limits, options: list[Candidates], g
     per_kg += HAND * np.linalg.norm(regressor @ by_point, axis=-1)
     gravity = ASSUMED_GRAVITY * limits.max_torque if guess is None else np.abs(guess.torque(poses)).max(axis=0)
     room = np.maximum(limits.max_torque - gravity, 0.05 * limits.max_torque)
-    mass = MASS_SHARE * float(np.min(room / np.maximum(per_kg.max(axis=0), 1e-9)))
-    mass = min(mass, 2 * float(limits.rated.max()) / (9.81 * float(reach(described)[0])))
-    return float(f"{mass:.2g}")
+    most = float(np.min(room / np.maximum(per_kg.max(axis=0), 1e-9)))
+    most = min(most, 2 * float(limits.rated.max()) / (9.81 * float(reach(described)[0])))
+    return [float(f"{share * most:.2g}") for share in MASS_SHARES]
 
 
 def _travel_acceleration(limits: Limits, options: list[Candidates], guess: GravityGuess | None) -> float:

@@ -41,11 +41,11 @@ class SweepSection(Section):
     """Window over which velocity and torque scatter are judged [s]."""
     settle_velocity: PositiveFloat = 0.001
     """A joint is at rest when it moves slower than this over the window [rad/s]."""
-    settle_scatter: PositiveFloat = 1.35
+    settle_scatter: PositiveFloat = 1.2
     """Torque has settled when its scatter over the window is below this multiple of the sensor's own noise."""
     settle_timeout: PositiveFloat = 4.0
     """A step that has not settled by then is taken as it is, and marked [s]."""
-    standard_error: Share = 0.0005
+    standard_error: Share = 0.00035
     """Standard error of the torque average asked for, as a share of rated torque; less where `gain_std` needs it."""
     gain_std: Share = 0.0015
     """Standard deviation of the torque gains aimed at: where the plan predicts more, it averages longer."""

@@ -12,7 +12,7 @@ Flags = npt.NDArray[np.bool_]
 
 DRIFT = 2.5
 """Standard errors by which the means of the window's halves may differ."""
-QUIET = 3.0
+QUIET = 1.0
 """Torque scatter that is this many times the standard error asked for has settled whatever its shape."""
 
 
