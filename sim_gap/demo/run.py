@@ -85,7 +85,9 @@ def _work(
     teller.show(calibration_table(bench, sensors))
     teller.say(f"record {record.id} written to {len(written)} controllers and read back")
     with teller.stage("verifying at poses that the fit has not seen") as report:
-        check = run_verify(link, arm, gravity_record, seed=seed, progress=lambda k, n: report(k, n, None, f"pose {k}"))
+        check = run_verify(
+            link, arm, gravity_record, record, seed=seed, progress=lambda k, n: report(k, n, None, f"pose {k}")
+        )
     gravity_check = check_gravity(bench, gravity.beta, record, seed)
     teller.show(verify_table(link.names, check, gravity_check))
     with teller.stage("recording motion for the gap diagnosis") as report:
