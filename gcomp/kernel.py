@@ -18,10 +18,10 @@ from gcomp.unrolled import compile_single_pose, without_rounding
 BLOCK = 2048
 """Poses worked on at a time: about half a megabyte of work space for seven joints."""
 
-REGRESSOR_BLOCK = 512
+REGRESSOR_BLOCK = 1024
 """The same for the regressor, which is larger."""
 
-REGRESSOR_BLOCK = 512
+REGRESSOR_BLOCK = 1024
 """The same for the regressor, which is larger."""
 
 ComplexArray = NDArray[np.complex128]
@@ -53,7 +53,7 @@ class GravityModel:
         for begin in range(0, len(poses), BLOCK):
             block = slice(begin, begin + BLOCK)
             space = self._space_for(len(poses[block]))
-            _turn(self.arm, poses[block], space.tangent, space.square, space.turn)
+            _turn(self.arm, poses[block], 1.0, space.tangent, space.square, space.turn)
             self._moments_inwards(space)
             self._gravity_outwards(space)
             np.copyto(torque[block], space.moment.imag.T)
@@ -73,7 +73,7 @@ class GravityModel:
         z.fill(0.0)
         for i in range(last, 0, -1):
             moment = np.multiply(space.turn[i], space.moment[i], out=space.moment[i - 1])
-            _turn_about_x(*self._twists[i - 1], moment.imag, z, next_z, space.spare)
+            _turn_about_x(*self._twists[i - 1], moment.imag, z, moment.imag, next_z, space.spare)
             np.add(moment, self._moments[i - 1], out=moment)
             z, next_z = next_z, z
 
@@ -85,7 +85,7 @@ class GravityModel:
         for i, (ca, sa) in enumerate(self._twists):
             np.multiply(space.turn[i], gravity, out=gravity)
             np.multiply(gravity, space.moment[i], out=space.moment[i])
-            _turn_about_x(ca, sa, gravity.imag, z, next_z, space.spare)
+            _turn_about_x(ca, sa, gravity.imag, z, gravity.imag, next_z, space.spare)
             z, next_z = next_z, z
 
 
@@ -95,14 +95,16 @@ def regressor(arm: Arm, q: Array) -> Array:
     regressor = np.empty((size, n, n), dtype=np.complex128)
     twists = [without_rounding(alpha) for alpha in arm.alpha]
     rows = np.zeros((n, n, min(size, REGRESSOR_BLOCK)), dtype=np.complex128)
-    scratch = np.empty((3, n, rows.shape[2]))
-    turn, stack = np.empty((2, *rows.shape[1:]), dtype=np.complex128)
+    scratch = np.empty((3, n + 1, rows.shape[2]))
+    turn, stack = np.empty((2, n + 1, rows.shape[2]), dtype=np.complex128)
     for begin in range(0, size, REGRESSOR_BLOCK):
-        block = slice(begin, min(begin + REGRESSOR_BLOCK, size))
-        count = block.stop - begin
-        _turn(arm, q[block], scratch[0, :, :count], scratch[1, :, :count], turn[:, :count])
-        _levers_outwards(arm, twists, turn[:, :count], rows[..., :count], stack[:, :count], scratch[..., :count])
-        np.conjugate(rows[..., :count].transpose(2, 1, 0), out=regressor[block])
+        block = regressor[begin : begin + REGRESSOR_BLOCK]
+        count = len(block)
+        if count < rows.shape[2]:
+            rows, scratch, turn, stack = (space[..., :count].copy() for space in (rows, scratch, turn, stack))
+        _turn(arm, q[begin : begin + count], -1.0, scratch[0, :n], scratch[1, :n], turn[:n])
+        _levers_outwards(arm, twists, turn, rows, stack, scratch)
+        np.copyto(block.reshape(count, n * n), rows.reshape(n * n, count).T)
     return regressor.view(np.float64)
 
 
@@ -114,21 +116,21 @@ def _levers_outwards(
     stack: ComplexArray,
     scratch: Array,
 ) -> None:
-    """Conjugates of w_i in bar frame j into rows[j, i], i ≤ j; gravity itself goes along as row j + 1."""
+    """w_i in bar frame j into rows[i, j], i ≤ j; gravity itself goes along in the stack until it becomes w_j."""
     z, next_z, spare = scratch
-    stack[0].fill(complex(arm.gravity[0], -arm.gravity[1]))
+    stack[0].fill(complex(arm.gravity[0], arm.gravity[1]))
     z[0].fill(arm.gravity[2])
     for j, (ca, sa) in enumerate(twists):
-        frame = rows[j, : j + 1]
+        frame, gravity = rows[: j + 1, j], stack[j + 1]
         np.multiply(turn[j], stack[: j + 1], out=frame)
-        if j + 1 < arm.n:
-            stack[j + 1] = frame[j]
-            z[j + 1] = z[j]
+        np.copyto(gravity, frame[j])
+        np.multiply(gravity, 1j, out=frame[j])
+        np.copyto(z[j + 1], z[j])
         z[j].fill(0.0)
-        np.multiply(frame[j], -1j, out=frame[j])
         if j + 1 < arm.n:
-            stack[: j + 1] = frame
-            _turn_about_x(ca, sa, stack[: j + 2].imag, z[: j + 2], next_z[: j + 2], spare[: j + 2])
+            np.copyto(stack[: j + 1].real, frame.real)
+            _turn_about_x(ca, -sa, frame.imag, z[: j + 1], stack[: j + 1].imag, next_z[: j + 1], spare[: j + 1])
+            _turn_about_x(ca, -sa, gravity.imag, z[j + 1], gravity.imag, next_z[j + 1], spare[j + 1])
             z, next_z = next_z, z
 
 
@@ -143,11 +145,11 @@ class _Space:
         self.along, self.spare = np.empty((2, size)), np.empty(size)
 
 
-def _turn(arm: Arm, q: Array, tangent: Array, square: Array, turn: ComplexArray) -> None:
-    """e^{iθ} (n, K) from t = tan(θ/2): numpy's tan is vectorised where its sin and cos are not."""
-    np.multiply(q.T, 0.5, out=tangent)
+def _turn(arm: Arm, q: Array, sign: float, tangent: Array, square: Array, turn: ComplexArray) -> None:
+    """e^{± iθ} (n, K) from t = tan(± θ/2): numpy's tan is vectorised where its sin and cos are not."""
+    np.multiply(q.T, 0.5 * sign, out=tangent)
     if arm.theta_offset.any():
-        np.add(tangent, arm.theta_offset[:, None] / 2, out=tangent)
+        np.add(tangent, arm.theta_offset[:, None] * (0.5 * sign), out=tangent)
     np.tan(tangent, out=tangent)
     np.multiply(tangent, tangent, out=square)
     np.add(square, 1.0, out=square)
@@ -156,18 +158,15 @@ def _turn(arm: Arm, q: Array, tangent: Array, square: Array, turn: ComplexArray)
     np.subtract(square, 1.0, out=turn.real)
 
 
-def _turn_about_x(ca: float, sa: float, y: Array, z: Array, to_z: Array, spare: Array) -> None:
-    """y becomes ca y − sa z, and to_z is sa y + ca z; fewer operations where the twist is a multiple of 90°."""
+def _turn_about_x(ca: float, sa: float, y: Array, z: Array, to_y: Array, to_z: Array, spare: Array) -> None:
+    """(to_y, to_z) = (ca y − sa z, sa y + ca z), to_y possibly y itself; right angles take two operations of six."""
     if ca == 0.0:
         np.multiply(y, sa, out=to_z)
-        np.multiply(z, -sa, out=y)
+        np.multiply(z, -sa, out=to_y)
         return
     np.multiply(z, ca, out=to_z)
-    if sa != 0.0:
-        np.multiply(y, sa, out=spare)
-        np.add(to_z, spare, out=to_z)
-        np.multiply(z, sa, out=spare)
-    if ca != 1.0:
-        np.multiply(y, ca, out=y)
-    if sa != 0.0:
-        np.subtract(y, spare, out=y)
+    np.multiply(y, sa, out=spare)
+    np.add(to_z, spare, out=to_z)
+    np.multiply(z, sa, out=spare)
+    np.multiply(y, ca, out=to_y)
+    np.subtract(to_y, spare, out=to_y)
