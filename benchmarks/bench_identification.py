@@ -45,7 +45,7 @@ def cases() -> list[Case]:
 
 
 def figaroh_residual(model: pin.Model, q: np.ndarray, torque: np.ndarray) -> float:
-    """FIGAROH's low-level fit of still samples: regressor, base parameters, estimate, deviations; residual RMS [N·m]."""
+    """FIGAROH's low-level fit of still samples: regressor, base parameters, estimate, deviations; residual [N·m]."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         from figaroh.identification.identification_tools import relative_stdev
