@@ -45,3 +45,16 @@ def payload_columns(arm: Arm) -> tuple[Array, Array]:
         moment[-1, axis] = 1.0
         by_point[:, axis] = base_parameters(arm, np.zeros(arm.n), moment)
     return at_origin, by_point
+
+
+def base_parameter_names(arm: Arm, tolerance: float = 1e-6) -> tuple[str, ...]:
+    """Names of the mass moments that gravity can show in some pose: 2(n − p) of them (theory note, section 2).
+
+    p leading joints have their axis along gravity in every pose, to within `tolerance` [rad]; they carry no torque.
+    """
+    vertical = 0
+    strength = float(np.linalg.norm(arm.gravity))
+    if np.hypot(arm.gravity[0], arm.gravity[1]) <= tolerance * strength:
+        bends = np.abs(np.sin(arm.alpha)) > tolerance
+        vertical = int(np.argmax(bends)) + 1 if bends[:-1].any() else arm.n
+    return tuple(f"mass_moment_{axis}[{name}]" for name in arm.names[vertical:] for axis in "xy")

@@ -6,6 +6,7 @@ from gravity_rig import DOWN, SARCOS_BETA, make_random_arm, make_readings, make_
 
 from gcomp.arm import Arm
 from gcomp.global_fit import GlobalFit, identify_global, predict_covariance
+from gcomp.moments import base_parameter_names
 from gcomp.parameters import FAMILIES, Parameters
 
 SENSORS = ("gain", "offset", "beta")
@@ -80,11 +81,12 @@ def test_vertical_first_axis_leaves_its_gain_zero_and_moment_dead_but_not_its_of
 
 
 def base_count(arm: Arm) -> int:
-    """Number of mass moments that poses of every joint determine."""
+    """Number of mass moments that poses of every joint determine; the names that need no poses are the same."""
     rng = np.random.default_rng(1)
     q = rng.uniform(-3, 3, (60, arm.n))
     true = Parameters.nominal(arm.n, beta=rng.normal(size=2 * arm.n))
     found = identify_global(arm, make_readings(arm, true, q, np.zeros_like(q)), unknown=("beta",), start=true)
+    assert base_parameter_names(arm) == tuple(np.array(found.names)[found.identifiable])
     return int(found.identifiable.sum())
 
 
