@@ -34,7 +34,7 @@ def run_bench(
     """
     if cases < 1:
         raise BadInput(f"--cases {cases}: expected at least 1")
-    if (out / "answers").exists() or (out / "cases").exists():
+    if any((out / name).exists() for name in ("answers", "cases", "labels")):
         raise BadInput(f"{out}: holds an earlier check: give another --out, or remove it")
     started = time.monotonic()
     progress("making cases", 0, cases)

@@ -94,17 +94,18 @@ def _blamed(causes: Sequence[Json], label: Json, withheld: str) -> tuple[str, ..
     """Confident causes that are not true.
 
     Forgiven: what a true effect implies, a rival of an effect that this motion cannot tell, and what comes after every
-    true effect and lowers the gap by no more than the small errors of this very arm make.
+    true effect and lowers the gap by no more than the small errors of this very arm make on the same joints.
     """
     present = [t for t in label["effects"] if t["effect"] != withheld]
     fine = {name for t in label["effects"] for name in t["implied"]} | {t["effect"] for t in present}
     fine |= {name for t in present if t["undecided"] for name in t["confused_with"]}
-    small = max((value for values in label["gap"]["without"].values() for value in values), default=0.0)
     out, due = [], {t["effect"] for t in present}
     for cause in causes:
         due.discard(cause["effect"])
         if cause["effect"] in fine or cause["confidence"] <= CONFIDENT:
             continue
+        places = [int(joint.removeprefix("joint_")) - 1 for joint in cause["joints"]]
+        small = max((rms[j] for rms in label["gap"]["without"].values() for j in places), default=0.0)
         if not due and float(cause["gap_before"] or 0.0) - float(cause["gap_after"] or 0.0) <= small:
             continue
         out.append(str(cause["effect"]))

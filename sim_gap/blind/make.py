@@ -41,17 +41,17 @@ def make_cases(
     A case whose effects do not stand out on the held-out motion, or whose arm was not under control, is drawn again.
     """
     labels.mkdir(parents=True, exist_ok=True)
-    open_cases = dict.fromkeys(wanted, 0)
+    todo = dict.fromkeys(wanted, 0)
     for last in (*[False] * (ROUNDS - 1), True):
-        drawings = [draw(recipe, train_s, heldout_s, first) for recipe, first in open_cases.items()]
+        drawings = [draw(recipe, train_s, heldout_s, first) for recipe, first in todo.items()]
         logs = iter(simulate([run for d in drawings for run in (d.heldout, *d.without)]))
         seen = [_judged(drawing, [next(logs) for _ in range(1 + len(drawing.without))], rate) for drawing in drawings]
         good = [(d, judged) for d, judged in zip(drawings, seen, strict=True) if last or judged.good]
         for (drawing, judged), train in zip(good, simulate([d.train for d, _ in good]) if good else (), strict=True):
             _write(drawing, judged, train, out / drawing.recipe.name, labels, rate)
-        done = {d.recipe for d, _ in good}
-        open_cases = {d.recipe: d.attempt + 1 for d in drawings if d.recipe not in done}
-        if not open_cases:
+        done = {d.recipe.name for d, _ in good}
+        todo = {d.recipe: d.attempt + 1 for d in drawings if d.recipe.name not in done}
+        if not todo:
             return
 
 

@@ -1,6 +1,6 @@
 """Which cases a blind check has, and how one is drawn: arm, effects, motions; all from one seed."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,9 @@ from sim_gap.blind.plant import Run
 from sim_gap.blind.scene import Scene
 from sim_gap.blind.truth import ordinary
 
-ATTEMPTS = 60
+ATTEMPTS = 150
+OTHER_PAIR = 20
+"""After so many arms that cannot show two effects together, two others are drawn."""
 NONE_SHARE, TWO_SHARE = 0.12, 0.18
 
 
@@ -55,16 +57,22 @@ def recipes(seed: int, count: int) -> list[Recipe]:
     none, two = round(NONE_SHARE * count), round(TWO_SHARE * count)
     order = [*random.permutation(EFFECTS).tolist()]
     singles = [(order[k % len(order)],) for k in range(count - none - two)]
-    pairs = [tuple(random.choice(EFFECTS, 2, replace=False).tolist()) for _ in range(two)]
+    pairs = [_pair(random) for _ in range(two)]
     mixed: list[tuple[str, ...]] = [*singles, *pairs, *([()] * none)]
     shuffled = [mixed[k] for k in random.permutation(len(mixed))]
     return [Recipe(f"case_{k:04d}", effects, (seed, k + 1)) for k, effects in enumerate(shuffled)]
+
+
+def _pair(random: np.random.Generator) -> tuple[str, ...]:
+    return tuple(random.choice(EFFECTS, 2, replace=False).tolist())
 
 
 def draw(recipe: Recipe, train_s: float, heldout_s: float, first: int = 0) -> Drawing:
     """Draw one case; arms that cannot show its effects are drawn again. `first` is the attempt to begin with."""
     for attempt in range(first, first + ATTEMPTS):
         random = np.random.default_rng([*recipe.seed, attempt])
+        if recipe.kind == "two" and attempt >= OTHER_PAIR:
+            recipe = replace(recipe, effects=_pair(np.random.default_rng([*recipe.seed, attempt // OTHER_PAIR])))
         arm = draw_arm(random)
         limits = _limits(arm, random)
         held = str(random.choice(KINDS))

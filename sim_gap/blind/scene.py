@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sim_gap.blind.arms import Arm, Array
-from sim_gap.blind.motion import derivatives
+from sim_gap.blind.motion import RATE, derivatives
 from sim_gap.blind.rigid_body import compiled, controlled_inertia, inverse
 
 THIN = 25
@@ -21,6 +21,11 @@ class Scene:
     arm: Arm
     command: Array
     """(K, n) [rad] at `motion.RATE`."""
+
+    @property
+    def seconds(self) -> float:
+        """Length of the motion [s]."""
+        return len(self.command) / RATE
 
     @cached_property
     def model(self) -> Any:

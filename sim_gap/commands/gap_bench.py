@@ -10,7 +10,7 @@ def bench(
     seed: Annotated[int, typer.Option(help="Draws other arms, effects and motions.")] = 1,
     cases: Annotated[int, typer.Option(help="How many cases.")] = 150,
     json: Annotated[str | None, typer.Option(help="Write the score here; - is standard output.")] = None,
-    out: Annotated[Path, typer.Option(help="New folder for cases, answers and labels.")] = Path("armlink-bench"),
+    out: Annotated[Path | None, typer.Option(help="Keep cases, answers and labels in this new folder.")] = None,
     workers: Annotated[int, typer.Option(help="Processes.")] = 2,
 ) -> None:
     """Make sealed cases, diagnose them, then open the labels and score (label withheld, and effect withheld).
@@ -19,6 +19,7 @@ def bench(
     """
     import json as json_format
     import sys
+    from tempfile import TemporaryDirectory
 
     from rich.console import Console
     from rich.progress import Progress, TaskID
@@ -30,7 +31,7 @@ def bench(
     if json not in (None, "-") and not Path(str(json)).resolve().parent.is_dir():
         raise BadInput(f"--json {json}: its folder does not exist: make it first")
     console = Console(stderr=True)
-    with Progress(console=console) as bars:
+    with TemporaryDirectory(prefix="armlink-bench-") as scratch, Progress(console=console) as bars:
         known: dict[str, TaskID] = {}
 
         def progress(stage: str, done: int, total: int) -> None:
@@ -38,7 +39,7 @@ def bench(
                 known[stage] = bars.add_task(stage, total=total)
             bars.update(known[stage], completed=done)
 
-        result = run_bench(diagnose_files, out, seed, cases, workers, progress=progress)
+        result = run_bench(diagnose_files, out or Path(scratch), seed, cases, workers, progress=progress)
     show(result, console)
     text = json_format.dumps(result, indent=1, ensure_ascii=False) + "\n"
     if json == "-":

@@ -198,9 +198,9 @@ def test_bench_runs_from_cases_to_score(tmp_path: Path) -> None:
             raise BadInput("cannot be used")
         return answer(verdict="no_gap")
 
-    result = run_bench(diagnose, tmp_path / "bench", seed=4, cases=3, workers=1, lengths=(15.0, 6.0))
-    assert result["label_withheld"]["cases"] == 3
-    assert len(seen) == 3 + result["effect_withheld"]["cases"]
+    result = run_bench(diagnose, tmp_path / "bench", seed=4, cases=2, workers=1, lengths=(8.0, 5.0))
+    assert result["label_withheld"]["cases"] == 2
+    assert len(seen) == 2 + result["effect_withheld"]["cases"]
     assert seen[0][:3] == ("sim.xml", "train.csv", "heldout.csv")
     assert len(result["sealed"]) == 64
     with pytest.raises(BadInput, match="earlier check"):

@@ -16,6 +16,9 @@ MOTOR_LEAST = 0.3
 SHARES = (0.06, 0.14)
 """RMS that an effect causes, as a share of the joint's RMS torque: several times what small errors cause."""
 
+OFTEN = 0.08
+"""Torque reversals a second that show what happens at a reversal."""
+
 Values = dict[str, float]
 
 

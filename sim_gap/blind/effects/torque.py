@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sim_gap.blind.effects.drawn import Draw, Drawn, pick, reversals, sensor_level, sign
+from sim_gap.blind.effects.drawn import OFTEN, Draw, Drawn, pick, reversals, sensor_level, sign
 from sim_gap.blind.scene import Scene, rms
 from sim_gap.blind.truth import Truth
 
@@ -35,8 +35,7 @@ def gain(scene: Scene, random: np.random.Generator) -> Drawn | None:
 def drift(scene: Scene, random: np.random.Generator) -> Drawn | None:
     """An offset that grows with time, from zero when a recording begins."""
     j = int(random.integers(scene.arm.n))
-    seconds = len(scene.command) / 500.0
-    rate = sign(random) * float(2.5 * sensor_level(scene, random)[j] / seconds)
+    rate = sign(random) * float(2.5 * sensor_level(scene, random)[j] / scene.seconds)
 
     def apply(truth: Truth) -> None:
         truth.torque_drift[j] = rate
@@ -78,7 +77,7 @@ def hysteresis(scene: Scene, random: np.random.Generator) -> Drawn | None:
 def deadband(scene: Scene, random: np.random.Generator) -> Drawn | None:
     """Nothing is read within ±width, and width less beyond; drawn where the torque changes sign often."""
     width = 1.3 * sensor_level(scene, random)
-    often = reversals(scene.torque, width) >= 8
+    often = reversals(scene.torque, width) >= OFTEN * scene.seconds
     j = pick(width, 0.4 * rms(scene.torque), random, often)
     if j is None:
         return None

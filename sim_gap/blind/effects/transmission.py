@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from sim_gap.blind.arms import Arm, Array
-from sim_gap.blind.effects.drawn import Draw, Drawn, motor_level, pick, reversals, sensor_level, sign
+from sim_gap.blind.effects.drawn import OFTEN, Draw, Drawn, motor_level, pick, reversals, sensor_level, sign
 from sim_gap.blind.scene import Scene, rms
 from sim_gap.blind.truth import SharedMotor, Truth
 
@@ -72,7 +72,7 @@ def backlash(scene: Scene, random: np.random.Generator) -> Drawn | None:
     """Play between rotor and link, on a joint whose torque changes sign often."""
     level = np.maximum(sensor_level(scene, random), 0.2)
     wanted = 2.2 * level / np.maximum(_turn_felt(scene, np.ones_like(scene.torque)), 1e-9)
-    often = reversals(scene.torque, 0.1 * rms(scene.torque)) >= 10
+    often = reversals(scene.torque, 0.1 * rms(scene.torque)) >= OFTEN * scene.seconds
     j = pick(wanted, 0.07, random, often)
     if j is None:
         return None
