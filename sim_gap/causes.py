@@ -69,13 +69,16 @@ class _Scorer:
         return np.asarray(np.sqrt(out))
 
 
-MINOR = 5e-3
-"""Share of a joint's largest torque that a cause must lower some joint's RMS by, not to be minor."""
+MINOR, MINOR_INNER = 5e-3, 1.5e-3
+"""Share of a joint's largest torque that a cause must lower some joint's RMS by, not to be minor; where the cause shows
+against the model, and where only in motor against sensor or command."""
 
 
-def is_minor(step: Step, heldout: ResidualSet) -> bool:
+def is_minor(step: Step, estimate: Estimate, heldout: ResidualSet) -> bool:
     """Whether a step lowers no joint's RMS by what a user would care about."""
-    least = np.maximum(MINOR * heldout.largest_torque, CARE_NM)
+    shows = {channel for term in step.terms for channel, _ in estimate.store.columns(term)}
+    share = MINOR if heldout.layout.against_model in shows else MINOR_INNER
+    least = np.maximum(share * heldout.largest_torque, CARE_NM)
     return bool(np.all(step.before - step.after < least))
 
 
@@ -94,7 +97,7 @@ def causes(
         parameters: dict[str, dict[str, Value]] = {}
         for term in sorted(step.terms, key=lambda t: t.place):
             parameters.setdefault("arm" if whole else names[term.place], {}).update(estimate.parameters(term))
-        (minor if is_minor(step, heldout) else found).append(
+        (minor if is_minor(step, estimate, heldout) else found).append(
             Cause(
                 effect=step.effect,
                 joints=joints,

@@ -12,8 +12,9 @@ from sim_gap.signals import Signals
 
 MODEL_FLOOR = 1e-3
 """Numerical and geometrical error that every model is granted, as a share of its torque."""
-SMALL, SMALL_NM = 3e-3, 0.01
-"""Residual that is not worth a parameter: share of a joint's largest torque, and [N·m]."""
+SMALL, SMALL_INNER, SMALL_NM = 3e-3, 1e-3, 0.01
+"""Residual that is not worth a parameter: share of a joint's largest torque against the model, of motor against sensor
+or command, and [N·m]."""
 CARE_NM = 0.05
 """Smallest gap that a user would care about [N·m]: every arm has a few hundredths of friction and offset."""
 CARE, CARE_INNER = 0.01, 0.003
@@ -92,7 +93,8 @@ class ResidualSet:
     @cached_property
     def care(self) -> dict[Row, float]:
         """What is not worth explaining in each row [N·m]: noise, and a small share of the largest torque."""
-        parts = {row: (self.floor[row], SMALL * self.largest_torque[row[1]], SMALL_NM) for row in self.rows}
+        small = {row: SMALL if row[0] == self.layout.against_model else SMALL_INNER for row in self.rows}
+        parts = {row: (self.floor[row], small[row] * self.largest_torque[row[1]], SMALL_NM) for row in self.rows}
         return {row: float(np.linalg.norm(part)) for row, part in parts.items()}
 
     @cached_property

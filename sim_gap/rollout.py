@@ -20,6 +20,8 @@ from sim_gap.signals import Signals
 HORIZON_S = 0.5
 WINDOWS = 40
 STEP_S = 0.002
+LOST, WILD = np.pi, 50.0
+"""A window ends where a joint has strayed so far [rad] or turns so fast [rad/s]; its rest counts as that far."""
 LOCKED = 1e9
 """Armature of joints of the model that the recording does not have: they stay where they are."""
 
@@ -84,4 +86,7 @@ def _window(model: Any, sim: SimModel, signals: Signals, drive: Array, start: in
         for _ in range(each):
             mujoco.mj_step(model, data)
         out[k] = data.qpos[adr] - signals.q[start + k + 1]
+        if np.abs(out[k]).max() > LOST or np.abs(data.qvel[dof]).max() > WILD:
+            out[k:] = np.clip(out[k], -LOST, LOST)
+            break
     return out

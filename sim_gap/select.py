@@ -62,12 +62,13 @@ class Search:
 
     def _implausible(self, terms: Sequence[Term]) -> Term | None:
         """The first of the terms whose coefficients no such effect can have."""
-        at, (_, coefficients) = 0, self.weighted.fit(terms)
+        ends = np.cumsum([len(self.normal.at[term]) for term in terms])
+        pieces = np.split(self.weighted.fit(terms)[1], ends[:-1]) if terms else []
+        values = {term.key: piece for term, piece in zip(terms, pieces, strict=True)}
         for term in terms:
-            width = len(self.normal.at[term])
-            if not effects()[term.effect].plausible(coefficients[at : at + width], term.shape):
+            beneath = {name: values[name, place] for name, place in term.beneath}
+            if not effects()[term.effect].plausible_on(values[term.key], term.shape, beneath):
                 return term
-            at += width
         return None
 
     def accept(self, chosen: list[Term]) -> None:
@@ -77,8 +78,9 @@ class Search:
         self.reweigh()
 
     def cost(self, term: Term) -> int:
-        """Coefficients and shape parameters of a term."""
-        return len(self.normal.at[term]) + len(term.shape) * (not effects()[term.effect].secant)
+        """Coefficients and shape parameters of a term, and what a rare effect must earn besides."""
+        effect = effects()[term.effect]
+        return len(self.normal.at[term]) + len(term.shape) * (not effect.secant) + effect.rare
 
     def with_beneath(self, term: Term, terms: Sequence[Term]) -> list[Term]:
         """`terms` plus `term` plus what it stands upon; another shape of the same effect there gives way."""
@@ -178,7 +180,9 @@ def shortlist(screened: list[tuple[float, Term]]) -> list[tuple[float, Term]]:
 
 def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
     """Move each shape between its neighbours of the starting grid to where the fit is best (golden section)."""
-    out = secants(store, secants(store, list(active)))
+    out = list(active)
+    for _ in range(3):
+        out = secants(store, out)
     for term in list(out):
         found = _between(store.data, term)
         if found is None:
@@ -216,8 +220,13 @@ def secants(store: ColumnStore, active: list[Term]) -> list[Term]:
     normal = Normal(store, active)
     search = Search(normal, list(normal.terms))
     _, values = search.weighted.fit(normal.terms)
-    sizes = {term: (float(values[normal.at[term][0]]),) for term in normal.terms if effects()[term.effect].secant}
-    return [Term(term.effect, term.place, sizes.get(term, term.shape)) for term in active]
+
+    def settled(term: Term) -> Term:
+        effect = effects()[term.effect]
+        shape = effect.resized(values[normal.at[term]], term.shape) if effect.secant else term.shape
+        return Term(term.effect, term.place, shape)
+
+    return [settled(term) for term in normal.terms]
 
 
 def golden(function: Callable[[float], float], low: float, high: float, steps: int = 10) -> float:

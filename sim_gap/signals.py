@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.interpolate import CubicSpline, make_interp_spline
 from scipy.signal import butter, sosfiltfilt
 
 from armlink.errors import BadInput
@@ -26,6 +27,10 @@ TRIM_S = 0.3
 CREEP = 0.01
 """Speed [rad/s] below which the sign of a velocity means nothing and friction may take any value."""
 SHORTEST_S = 3.0
+SLOW_HZ = 60.0
+"""Below this rate a recorded velocity is used; above, positions are differentiated, for drives report velocity late."""
+SPLINED = 3.5
+"""Largest step between readings, in median steps, up to which a channel is interpolated by splines."""
 CHANNELS = {"tau": "torque", "tau_motor": "motor_torque", "tau_cmd": "torque_command"}
 
 
@@ -149,13 +154,12 @@ def prepare(recording: Recording, arm: RigidArm, label: str = "recording") -> Si
     thin = _thinner(1.0 / raw_step, stride)
     q = thin(_bridged(recording.t, recording.position, even, label, "q"))
     smooth = _low_pass(min(SMOOTH_HZ, 0.4 * rate), rate)
-    measured = recording.velocity is not None and np.isfinite(recording.velocity).mean() > 0.5
-    v = (
-        thin(_bridged(recording.t, recording.velocity, even, label, "dq"))
-        if measured and recording.velocity is not None
-        else np.gradient(q, 1.0 / rate, axis=0)
-    )
-    v = smooth(v)
+    times = even[::stride]
+    spline = make_interp_spline(times, smooth(q), k=5)
+    q, v, a = (np.asarray(spline(times, order)) for order in range(3))
+    if rate < SLOW_HZ and recording.velocity is not None and np.isfinite(recording.velocity).all():
+        v = smooth(thin(_bridged(recording.t, recording.velocity, even, label, "dq")))
+        a = np.asarray(make_interp_spline(times, v, k=5)(times, 1))
     reading, known, noise = {}, {}, {}
     for channel, name in CHANNELS.items():
         values = getattr(recording, name)
@@ -166,14 +170,15 @@ def prepare(recording: Recording, arm: RigidArm, label: str = "recording") -> Si
         noise[channel] = np.array([_band_noise(recording.t, values[:, j], band) for j in range(arm.n)])
     if not reading:
         raise BadInput(f"{label}: no torque channel holds a number: at least one of tau, tau_motor, tau_cmd is needed")
-    shared = smooth(q), v, np.gradient(v, 1.0 / rate, axis=0)
-    return Signals(
-        label, rate, band, even[::stride] - even[0], *shared, reading, known, noise, arm, recording.temperature
-    )
+    clock = times - times[0]
+    return Signals(label, rate, band, clock, q, v, a, reading, known, noise, arm, recording.temperature)
 
 
 def _bridged(t: Array, values: Array, even: Array, label: str, column: str) -> Array:
-    """Values on the even time base, gaps bridged linearly; raises BadInput where a whole column is missing."""
+    """Values on the even time base, by cubic splines where there are no gaps, else linearly.
+
+    Raises BadInput where a whole column is missing.
+    """
     out = np.empty((len(even), values.shape[1]))
     for j in range(values.shape[1]):
         there = np.isfinite(values[:, j])
@@ -182,7 +187,11 @@ def _bridged(t: Array, values: Array, even: Array, label: str, column: str) -> A
                 f"{label}: column {column}_{j + 1} holds {int(there.sum())} numbers in {len(t)} rows: "
                 "expected a reading in most rows; record that channel or leave it out"
             )
-        out[:, j] = np.interp(even, t[there], values[there, j])
+        own = t[there]
+        gapless = np.diff(own).max() < SPLINED * float(np.median(np.diff(own)))
+        curve = CubicSpline(own, values[there, j]) if gapless else None
+        inside = np.clip(even, own[0], own[-1])
+        out[:, j] = np.interp(inside, own, values[there, j]) if curve is None else curve(inside)
     return out
 
 

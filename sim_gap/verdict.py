@@ -38,7 +38,9 @@ def share_left(data: ResidualSet, left: dict[Row, Array]) -> float:
 
 
 def verdict(found: Sequence[Cause], data: ResidualSet, left: dict[Row, Array]) -> Verdict:
-    """`unexplained` where a gap is left or nothing was found, `ambiguous` where the first cause has a rival."""
+    """`unexplained` where a gap is left or no cause of it was found, `ambiguous` where the first cause has a rival."""
+    if not found and is_quiet(data):
+        return "no_gap"
     still = any(rms > data.margin[row] for row, rms in row_rms(data, left).items())
     if not found or (still and share_left(data, left) > EXPLAINED):
         return "unexplained"

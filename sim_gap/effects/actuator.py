@@ -36,6 +36,7 @@ class RotorInertia(Effect):
 
     id = "actuator.rotor_inertia"
     parameters = (Parameter("inertia", "kg·m²"),)
+    rare = 0
 
     def places(self, layout: Layout) -> range:
         return range(layout.n if layout.motor else 0)

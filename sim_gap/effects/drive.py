@@ -12,6 +12,9 @@ from sim_gap.effects.registry import Columns, Effect, Layout, Parameter, Shape
 from sim_gap.rigid import Array
 from sim_gap.signals import Signals
 
+SHORTEST, LONGEST = 1e-3, 0.2
+"""Times that count as a lag or delay [s]."""
+
 
 def commanding(layout: Layout) -> str | None:
     """The channel whose residual a drive's shortcoming shows in."""
@@ -39,12 +42,25 @@ class _Drive(Effect):
         return np.array([shape[0]])
 
 
-class Lag(_Drive):
+class _Late(_Drive):
+    parameters = (Parameter("time", "s"),)
+    shapes = ((0.01,),)
+    secant = True
+
+    def resized(self, coefficients: Array, shape: Shape) -> Shape:
+        return (float(np.clip(shape[0] * coefficients[0], SHORTEST, LONGEST)),)
+
+    def plausible(self, coefficients: Array, shape: Shape) -> bool:
+        return bool(SHORTEST < coefficients[0] * shape[0] < LONGEST)
+
+    def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
+        return coefficients * shape[0]
+
+
+class Lag(_Late):
     """A first-order lag behind the command."""
 
     id = "actuator.lag"
-    parameters = (Parameter("time", "s"),)
-    shapes = ((0.002,), (0.005,), (0.01,), (0.02,), (0.04,), (0.08,))
 
     def missing(self, command: Array, shape: float, rate: float) -> Array:
         keep = np.exp(-1.0 / (rate * shape))
@@ -52,12 +68,10 @@ class Lag(_Drive):
         return np.asarray(command - follow)
 
 
-class Delay(_Drive):
+class Delay(_Late):
     """The command carried out late."""
 
     id = "actuator.delay"
-    parameters = (Parameter("time", "s"),)
-    shapes = Lag.shapes
 
     def missing(self, command: Array, shape: float, rate: float) -> Array:
         t = np.arange(len(command)) / rate

@@ -29,6 +29,7 @@ class Coulomb(_Friction):
 
     id = "friction.coulomb"
     parameters = (Parameter("torque", "N·m"),)
+    rare = 0
 
     def column(self, s: Signals, joint: int, shape: Shape) -> Array:
         return s.direction[:, joint]
@@ -39,13 +40,17 @@ class Viscous(_Friction):
 
     id = "friction.viscous"
     parameters = (Parameter("damping", "N·m·s/rad"),)
+    rare = 0
 
     def column(self, s: Signals, joint: int, shape: Shape) -> Array:
         return s.v[:, joint]
 
 
 class Stribeck(_Friction):
-    """More friction at low speed: breakaway above Coulomb's, fading as exp(−(v/vs)²)."""
+    """Friction that changes at low speed: breakaway above Coulomb's, fading as exp(−(v/vs)²).
+
+    Real gears also have less friction at low speed than Coulomb and viscous friction say: breakaway is then negative.
+    """
 
     id = "friction.stribeck"
     parameters = (Parameter("breakaway", "N·m"), Parameter("velocity", "rad/s"))
@@ -54,6 +59,12 @@ class Stribeck(_Friction):
 
     def column(self, s: Signals, joint: int, shape: Shape) -> Array:
         return s.direction[:, joint] * np.exp(-((s.v[:, joint] / shape[0]) ** 2))
+
+    def plausible(self, coefficients: Array, shape: Shape) -> bool:
+        return True
+
+    def plausible_on(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> bool:
+        return bool(coefficients[0] > -float(beneath["friction.coulomb"][0]))
 
     def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
         return np.array([coefficients[0], shape[0]])
@@ -71,6 +82,9 @@ class Asymmetric(_Friction):
 
     def plausible(self, coefficients: Array, shape: Shape) -> bool:
         return True
+
+    def plausible_on(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> bool:
+        return bool(abs(coefficients[0]) < float(beneath["friction.coulomb"][0]))
 
     def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
         return coefficients / max(abs(float(beneath["friction.coulomb"][0])), 1e-9)

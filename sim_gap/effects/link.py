@@ -28,6 +28,7 @@ class MassMoment(Effect):
 
     id = "link.mass_moment"
     parameters = (Parameter("x", "kg·m"), Parameter("y", "kg·m"), Parameter("z", "kg·m"))
+    rare = 0
 
     def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
         own = signals.regressor[:, :, place]
@@ -57,6 +58,7 @@ class Payload(Effect):
 
     id = "link.payload"
     parameters = (Parameter("mass", "kg"), Parameter("x", "m"), Parameter("y", "m"), Parameter("z", "m"))
+    rare = 0
     whole_arm = True
 
     def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:

@@ -101,11 +101,13 @@ class Effect(ABC):
     """Effects at the same place that it stands upon: the simpler model beneath it."""
     shapes: ClassVar[tuple[Shape, ...]] = ((),)
     """Shapes tried at first; the best is then refined between its neighbours."""
+    rare: ClassVar[int] = 3
+    """What it must earn besides, in parameters: 0 for what every arm has, more for what few have."""
     counted: ClassVar[frozenset[int]] = frozenset()
     """Which entries of the shape are numbers of something (a joint): they are not refined."""
     whole_arm: ClassVar[bool] = False
     secant: ClassVar[bool] = False
-    """Whether the shape is the coefficient at which a curved effect's secant is taken: set to the fit, then exact."""
+    """Whether the shape is the size at which a curved effect's secant is taken: set to the fit, then exact."""
 
     def places(self, layout: Layout) -> range:
         """Joints or links at which it may sit; empty where these channels cannot show it."""
@@ -114,6 +116,10 @@ class Effect(ABC):
     def grid(self, signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
         """Shapes to start from on these recordings; by default `shapes`."""
         return self.shapes
+
+    def resized(self, coefficients: Array, shape: Shape) -> Shape:
+        """The shape that these coefficients ask for, where the effect is fitted by its secant."""
+        return (float(coefficients[0]),)
 
     def covers(self, layout: Layout, place: int) -> tuple[tuple[str, int], ...]:
         """Effects and places whose columns this one contains: they do not stand beside it."""
@@ -130,6 +136,10 @@ class Effect(ABC):
     def plausible(self, coefficients: Array, shape: Shape) -> bool:
         """Whether such an effect can exist: friction opposes motion, masses are positive, delays are not foresight."""
         return True
+
+    def plausible_on(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> bool:
+        """`plausible`, where that depends on the coefficients of what it stands upon."""
+        return self.plausible(coefficients, shape)
 
     def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
         """Reported parameters, one per `parameters`; `beneath` holds the coefficients of what it stands upon."""

@@ -1,4 +1,6 @@
-"""Readings that come late against the position: to first order, the reading's derivative times the delay."""
+"""Readings that come late against the position."""
+
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -6,8 +8,8 @@ from sim_gap.effects.registry import Columns, Effect, Layout, Parameter, Shape
 from sim_gap.rigid import Array
 from sim_gap.signals import Signals
 
-LONGEST = 0.1
-"""Longest delay to which its first-order form applies [s]."""
+SHORTEST, LONGEST = 1e-3, 0.1
+"""Times that count as a delay [s]."""
 
 
 class Delay(Effect):
@@ -15,13 +17,22 @@ class Delay(Effect):
 
     id = "timing.delay"
     parameters = (Parameter("delay", "s"),)
+    shapes = ((0.005,),)
+    secant = True
 
     def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
-        late = -np.gradient(signals.model[:, place], 1.0 / signals.rate)
+        torque = signals.model[:, place]
+        late = np.interp(signals.t - shape[0], signals.t, torque) - torque
         return layout.sensor_columns(place, late[:, None])
 
+    def resized(self, coefficients: Array, shape: Shape) -> Shape:
+        return (float(np.clip(coefficients[0] * shape[0], SHORTEST, LONGEST)),)
+
     def plausible(self, coefficients: Array, shape: Shape) -> bool:
-        return bool(0.0 < coefficients[0] < LONGEST)
+        return bool(SHORTEST < coefficients[0] * shape[0] < LONGEST)
+
+    def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
+        return coefficients * shape[0]
 
 
 EFFECTS: tuple[Effect, ...] = (Delay(),)

@@ -1,0 +1,57 @@
+"""Real arms: the gap closes on motion that was not fitted, for the reasons that are known."""
+
+import numpy as np
+
+from armlink.recording import load_recording, slice_rows
+from sim_gap.diagnose import diagnose
+from sim_gap.diagnosis import Diagnosis
+
+
+def split(folder, share: float) -> Diagnosis:
+    whole = load_recording(folder / "recording.csv.gz")
+    cut = int(share * len(whole.t))
+    return diagnose(folder / "sim.xml", [slice_rows(whole, slice(0, cut))], [slice_rows(whole, slice(cut, None))])
+
+
+def joints(answer: Diagnosis, effect: str) -> set[str]:
+    return {joint for cause in answer.causes if cause.effect == effect for joint in cause.joints}
+
+
+def test_ur10e(realdata):
+    folder = realdata / "ur10e"
+    load = lambda name: load_recording(folder / f"{name}.csv.gz")  # noqa: E731
+    answer = diagnose(folder / "sim.xml", [load("train_a"), load("train_b")], [load("heldout")])
+    assert answer.verdict == "explained"
+    assert answer.causes[0].effect == "friction.coulomb"
+    assert len(joints(answer, "friction.coulomb")) == 6
+    assert joints(answer, "friction.load") == {"joint_2", "joint_3"}
+    assert np.all(answer.heldout_after <= [3.0, 4.0, 1.6, 0.40, 0.50, 0.35])
+    assert np.all(answer.rollout.after < 0.2 * answer.rollout.before)
+
+
+def test_panda_is_wrong_in_its_masses(realdata):
+    answer = split(realdata / "panda", 0.6)
+    assert answer.causes[0].effect == "link.mass_moment"
+    assert joints(answer, "link.mass_moment") & {"joint_2", "joint_3", "joint_4"}
+    assert np.all(answer.heldout_after[1:4] <= [0.6, 0.6, 0.7])
+
+
+def test_ur10_has_friction_that_is_more_than_coulomb_and_viscous(realdata):
+    answer = split(realdata / "ur10", 0.6)
+    assert "joint_1" in joints(answer, "friction.stribeck") or "joint_2" in joints(answer, "friction.load")
+    assert answer.heldout_after[0] < 1.5
+    assert answer.heldout_after[1] < 2.0
+
+
+def test_tx40_has_rotors_and_a_coupled_wrist(realdata):
+    answer = split(realdata / "tx40", 0.5)
+    assert joints(answer, "actuator.rotor_inertia")
+    assert joints(answer, "transmission.coupling") & {"joint_5", "joint_6"}
+    assert np.all(answer.heldout_after[4:] <= 1.3)
+
+
+def test_lwr4_is_not_made_worse_on_another_trajectory(realdata):
+    folder = realdata / "lwr4"
+    train, other = (load_recording(folder / f"{name}.csv.gz") for name in ("train", "other"))
+    answer = diagnose(folder / "sim.xml", [train], [other])
+    assert np.all(answer.heldout_after <= answer.heldout_before)
