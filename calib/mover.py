@@ -34,21 +34,23 @@ STOP_TOLERANCE = 0.06
 """How far from the arm file's place a stop may be found, beyond the position sensor's own error [rad]."""
 
 
-class Stalled(Exception):
-    """A joint did not follow: its drive is too weak there, or something is in the way."""
+class Stalled(Refused):
+    """A joint did not follow."""
 
-    def __init__(self, joint: int, position: float, target: float) -> None:
-        """Joint index, where it stands and where it should be [rad]."""
-        super().__init__(joint, position, target)
-        self.joint, self.position, self.target = joint, position, target
+    def __init__(self, name: str, position: float, target: float) -> None:
+        """Joint's name, where it stands and where it should go [rad]."""
+        super().__init__(
+            f"{name}: stopped at {position:.3f} rad on the way to {target:.3f}: its drive is too weak there,"
+            " its position loop does not bear the load, or something is in the way"
+        )
 
 
-class Slipped(Exception):
+class Slipped(Refused):
     """A pressed joint left its stop."""
 
-    def __init__(self, joint: int) -> None:
-        """Joint index."""
-        super().__init__(joint)
+    def __init__(self, name: str, joint: int) -> None:
+        """Joint's name and index."""
+        super().__init__(f"{name}: slipped off its stop")
         self.joint = joint
 
 
@@ -95,7 +97,8 @@ class Mover:
         if self.pressed.any():
             off = self.side * (self._contact - self.position) > SLIP
             if off.any():
-                raise Slipped(int(np.argmax(off & self.pressed)))
+                joint = int(np.argmax(off & self.pressed))
+                raise Slipped(self.link.names[joint], joint)
         return sample
 
     def hold_all(self) -> None:
@@ -121,7 +124,7 @@ class Mover:
             lag = np.abs(self.command.position - self.position)
             if lag[movable].max() > STALL:
                 joint = int(np.argmax(np.where(movable, lag, 0.0)))
-                raise Stalled(joint, float(self.position[joint]), float(goal[joint]))
+                raise Stalled(self.link.names[joint], float(self.position[joint]), float(goal[joint]))
         self._learn_resolution(seen)
 
     def press(self, stops: npt.NDArray[np.int64], bias: Array) -> None:

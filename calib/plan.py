@@ -24,8 +24,8 @@ DEAD_LEVER = 0.005
 """Γ/g below which a joint feels no gravity: its offset is still swept, at one combination."""
 SLOWEST = 0.3
 """Acceleration that every planned sweep must allow [rad/s²]."""
-MASS_SHARES = (0.3, 0.5, 0.7)
-"""Shares of the torque left over gravity that the reference mass may take: the least that gives the precision asked."""
+MASS_SHARES = (0.3, 0.5)
+"""Shares of the torque left over gravity that the reference mass may take; the least that is precise enough."""
 ASSUMED_GRAVITY = 0.6
 """Share of max_torque that gravity is assumed to take while nothing has been measured."""
 SERVO_GAP = 0.05

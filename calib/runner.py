@@ -131,16 +131,13 @@ class _Pass:
                 standing = False
                 bias = self._more_bias(sweep, bias, slip.joint, retries)
                 continue
-            except Stalled as stall:
+            except Stalled:
                 retries += 1
                 standing = False
                 self.acceleration *= SLOWER
-                if retries <= RETRIES:
-                    continue
-                raise Refused(
-                    f"{self.mover.link.names[stall.joint]}: stopped at {stall.position:.3f} rad on the way to"
-                    f" {stall.target:.3f} in sweep {sweep.name}: its drive is too weak, or something is in the way"
-                ) from None
+                if retries > RETRIES:
+                    raise
+                continue
             counts = np.array(sweep.servo)
             self.save(as_reading(rest, sweep.name, index, sweep.joint, sweep.target(index)[1], counts))
             open_readings.pop(0)

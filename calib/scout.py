@@ -6,7 +6,6 @@ import numpy as np
 import numpy.typing as npt
 
 from armlink.armfile import ArmFile
-from armlink.errors import Refused
 from calib.dataset import Reading
 from calib.description import gcomp_arm
 from calib.guess import GravityGuess, guess_gravity
@@ -24,7 +23,7 @@ SCOUT_ACCELERATION = 1.0
 def run_scout(mover: Mover, plan: SweepPlan, done: Collection[int], save: Callable[[Reading], None]) -> None:
     """Read every scout pose that is not `done`, each passed to `save`; a pose that the drives cannot reach is left out.
 
-    Raises Refused where too few poses were reached to know the arm's weight.
+    Raises Stalled where too few poses were reached to know the arm's weight.
     """
     n = mover.link.n
     everything = np.ones(n, dtype=bool)
@@ -43,11 +42,7 @@ def run_scout(mover: Mover, plan: SweepPlan, done: Collection[int], save: Callab
         last = mover.position.copy()
         save(as_reading(rest, SCOUT, index, None, 0, everything))
     if len(plan.scout) - len(unreached) < 4:
-        first = unreached[0]
-        raise Refused(
-            f"{mover.link.names[first.joint]}: stopped at {first.position:.3f} rad on the way to {first.target:.3f}:"
-            " its drive is too weak there, or something is in the way"
-        )
+        raise unreached[0]
 
 
 def rough_model(arm: ArmFile, readings: Sequence[Reading]) -> GravityGuess:

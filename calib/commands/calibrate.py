@@ -80,15 +80,13 @@ def _show(fit: "SensorFit") -> None:
 
 
 def _apply(arm_file: "ArmFile", record: "CalibrationRecord", bus: str | None) -> None:
-    """Write every gain and offset that is known to its controller, read back; the joints need not be enabled."""
+    """Write every gain and offset that is known to its controller, read back; the joints are not enabled."""
     from armlink.errors import Refused
     from armlink.link import Link
+    from calib.recalibration import write_record
 
-    known = [joint for joint in record.joints if joint.gain is not None and joint.offset is not None]
-    if not known:
-        raise Refused("--apply: no joint has both a gain and an offset, so nothing is written")
+    if all(joint.offset is None for joint in record.joints):
+        raise Refused("--apply: no joint has a gain or an offset, so nothing is written")
     with Link.open(arm_file, bus) as link:
         link.start()
-        for index, joint in enumerate(record.joints):
-            if joint.gain is not None and joint.offset is not None:
-                link.write_calibration(index, joint.gain, joint.offset, record.number, int(record.created.timestamp()))
+        write_record(record, link)
