@@ -26,7 +26,7 @@ INTEGRAL_SHARE = 0.3
 """Integral action: stiffness · bandwidth · this."""
 TUNING_POSES = 50
 """The loops are tuned for the largest inertia among so many poses, so that they are stable in all of them."""
-SPARE_ACCELERATION = 300.0
+SPARE_ACCELERATION = 100.0
 """The loops are tuned for the inertia of the bare arm plus what rated torque accelerates by this much [rad/s²]."""
 
 
