@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from armlink.errors import BadInput
-from armlink.recording import Recording, slice_rows
+from armlink.recording import Recording, default_names, slice_rows
 from sim_gap.causes import causes, left_over
 from sim_gap.confound import Rivals
 from sim_gap.diagnosis import Cause, Diagnosis
@@ -17,7 +17,7 @@ from sim_gap.regime import by_joint, combined, places
 from sim_gap.residual import ResidualSet
 from sim_gap.rollout import roll_out
 from sim_gap.select import compete
-from sim_gap.signals import prepare
+from sim_gap.signals import prepare, require_length
 from sim_gap.verdict import is_quiet, share_left, verdict
 
 OWN_HELDOUT = 0.3
@@ -57,6 +57,8 @@ def diagnose(
         raise BadInput("no training recording: give at least one (--train FILE)")
     sim = load_model(model, _names(train[0]), train[0].n)
     labels = list(labels) or [f"recording {i + 1}" for i in range(len(train) + len(heldout))]
+    for recording, label in zip([*train, *heldout], labels, strict=False):
+        require_length(recording, label)
     told = "the recordings given" if heldout else f"the last {OWN_HELDOUT:.0%} of each training recording"
     if not heldout:
         train, heldout, labels = *_split(train), labels * 2
@@ -101,7 +103,8 @@ def _answer(made: Internals, found: list[Cause], minor: list[Cause], told: str) 
 
 
 def _names(recording: Recording) -> tuple[str, ...]:
-    return tuple(recording.names)
+    """Joint names that the recording itself gives, if any."""
+    return () if recording.names == default_names(recording.n) else tuple(recording.names)
 
 
 def _split(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Recording]]:

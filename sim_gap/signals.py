@@ -134,16 +134,21 @@ class Signals:
         return x[trim : len(x) - trim : self.step]
 
 
-def prepare(recording: Recording, arm: RigidArm, label: str = "recording") -> Signals:
-    """Make a recording ready for comparison with `arm`. Raises BadInput where it cannot be used, saying why."""
-    if recording.n != arm.n:
-        raise BadInput(f"{label}: has {recording.n} joints, the model {arm.n}: give the model of the recorded arm")
-    if len(recording.t) < 4 or recording.t[-1] - recording.t[0] < SHORTEST_S:
-        span = recording.t[-1] - recording.t[0]
+def require_length(recording: Recording, label: str) -> None:
+    """Raise BadInput where a recording is too short to tell anything."""
+    span = float(recording.t[-1] - recording.t[0]) if len(recording.t) else 0.0
+    if len(recording.t) < 4 or span < SHORTEST_S:
         raise BadInput(
             f"{label}: {len(recording.t)} rows over {span:.3g} s: too short to tell anything; "
             f"record at least {SHORTEST_S:.0f} s"
         )
+
+
+def prepare(recording: Recording, arm: RigidArm, label: str = "recording") -> Signals:
+    """Make a recording ready for comparison with `arm`. Raises BadInput where it cannot be used, saying why."""
+    if recording.n != arm.n:
+        raise BadInput(f"{label}: has {recording.n} joints, the model {arm.n}: give the model of the recorded arm")
+    require_length(recording, label)
     raw_step = float(np.median(np.diff(recording.t)))
     even = np.arange(recording.t[0], recording.t[-1] + 0.5 * raw_step, raw_step)
     stride = max(1, int(1.0 / raw_step / WORK_HZ + 1e-6))

@@ -22,7 +22,8 @@ def test_the_written_model_has_no_gap_any_more(tmp_path, name):
     (tmp_path / "arm.xml").write_text(THREE)
     nominal = load_model(tmp_path / "arm.xml")
     train, other = (
-        record(nominal.mujoco_model, CASES[name], seed=s, seconds=30, channels=("tau_motor",)) for s in (1, 2)
+        record(nominal.mujoco_model, CASES[name], seed=s, seconds=30, noise=0.002, channels=("tau_motor",))
+        for s in (1, 2)
     )
     answer = diagnose(tmp_path / "arm.xml", [train], [other])
     assert write_model(nominal, answer.internals.estimate, tmp_path / "closed.xml") == []

@@ -17,7 +17,7 @@ def good(seconds: float = 12.0, **options) -> Recording:
 
 
 def test_too_few_rows():
-    with pytest.raises(BadInput, match="3 rows.*too short"):
+    with pytest.raises(BadInput, match=r"3 rows.*too short"):
         diagnose(model(), [replace(good(), t=np.arange(3) * 0.1, position=np.zeros((3, 3)),
                                    torque=np.zeros((3, 3)), motor_torque=None)])  # fmt: skip
 
@@ -25,14 +25,14 @@ def test_too_few_rows():
 def test_another_number_of_joints():
     recording = good()
     two = Recording(t=recording.t, position=recording.position[:, :2], torque=recording.torque[:, :2])
-    with pytest.raises(BadInput, match="3 hinge joints.*recording 2"):
+    with pytest.raises(BadInput, match=r"3 hinge joints.*recording 2"):
         diagnose(model(), [two])
 
 
 def test_at_rest():
     recording = good()
     still = replace(recording, position=np.tile(recording.position[:1], (len(recording.t), 1)))
-    with pytest.raises(BadInput, match="no joint moves.*cannot tell"):
+    with pytest.raises(BadInput, match=r"no joint moves.*cannot tell"):
         diagnose(model(), [still])
 
 
