@@ -168,7 +168,7 @@ def test_a_signal_ends_the_work_in_order(number):
         assert process.stdout.readline() == "working\n"
         process.send_signal(number)
         assert process.stdout.read() == "joints safe\n"
-        assert process.wait() == 130
+        assert process.wait(timeout=60) == 130
         assert "Traceback" not in process.stderr.read()
 
 
