@@ -19,12 +19,13 @@ def fold(triangle: Array, rows: Array) -> Array:
     return triangle
 
 
-def least_squares(blocks: Iterable[Array], size: int, rcond: float) -> Array:
-    """x (p,) of least norm that solves A x = b, from blocks of rows [A | b] (K, p + 1); columns are scaled alike."""
-    triangle = np.zeros((0, size + 1))
+def least_squares(blocks: Iterable[Array], unit: Array, rcond: float) -> Array:
+    """x (p,) that solves A x = b, of least norm in units (p,), from blocks of rows [A | b] (K, p + 1).
+
+    A direction with less than `rcond` of the largest singular value in those units is left at zero.
+    """
+    triangle = np.zeros((0, len(unit) + 1))
     for rows in blocks:
         triangle = fold(triangle, rows)
-    scale = np.linalg.norm(triangle[:, :-1], axis=0)
-    scale[scale == 0] = 1.0
-    solution: Array = np.linalg.lstsq(triangle[:, :-1] / scale, triangle[:, -1], rcond=rcond)[0] / scale
+    solution: Array = unit * np.linalg.lstsq(triangle[:, :-1] * unit, triangle[:, -1], rcond=rcond)[0]
     return solution

@@ -9,8 +9,8 @@ from gcomp.arm import Arm
 from gcomp.arrays import Array, Mask
 from gcomp.blocks import fold
 from gcomp.design import SKETCH_STEPS, Sweep, candidate_sweeps, expected_readings, readings_of
-from gcomp.global_fit import natural_units
 from gcomp.information import NULL_STD, analyse, describe_null_space
+from gcomp.natural import natural_units
 from gcomp.parameters import Parameters, free_mask, parameter_names
 from gcomp.readings import Readings
 from gcomp.sensor_model import predict_and_jacobian

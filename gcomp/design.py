@@ -15,8 +15,9 @@ from numpy.typing import ArrayLike
 from gcomp.arm import Arm
 from gcomp.arrays import Array, as_array
 from gcomp.errors import BadArray
-from gcomp.global_fit import Prediction, natural_units, predict_covariance
+from gcomp.global_fit import Prediction, predict_covariance
 from gcomp.gravity import gravity_levers
+from gcomp.natural import natural_units
 from gcomp.parameters import Parameters, free_mask
 from gcomp.readings import Readings
 from gcomp.sensor_model import predict, predict_and_jacobian

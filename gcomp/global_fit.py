@@ -11,6 +11,7 @@ from gcomp.arrays import Array, Mask
 from gcomp.information import Information, analyse, describe_null_space
 from gcomp.least_squares import Outcome, Problem, solve
 from gcomp.linear_start import linear_start
+from gcomp.natural import natural_units
 from gcomp.parameters import Parameters, Prior, family_slices, parameter_names, prior_vectors
 from gcomp.readings import Readings
 from gcomp.sensor_model import predict
@@ -175,19 +176,6 @@ def _start_of(n: int, priors: Mapping[str, Prior]) -> Parameters:
     """Nominal values, but the prior's mean where there is one."""
     mean, std = prior_vectors(n, priors)
     return Parameters.from_vector(np.where(np.isfinite(std), mean, Parameters.nominal(n).vector), n)
-
-
-def natural_units(arm: Arm, readings: Readings, start: Parameters) -> Array:
-    """Natural units of the parameter vector (6n + 3,): changes that matter.
-
-    The gain as it starts, 1 rad, 1 m, the readings' size, that size over g.
-    """
-    with np.errstate(invalid="ignore"):
-        per_joint = np.sqrt(np.nansum(readings.torque**2, axis=0) / np.maximum(readings.counted.sum(axis=0), 1))
-    torque = float(per_joint.max()) or 1.0
-    n, ones = arm.n, np.ones(arm.n)
-    moment = torque / (float(np.linalg.norm(arm.gravity)) or 1.0)
-    return Parameters(np.abs(start.gain), torque * ones, ones, ones, moment * np.ones(2 * n), np.ones(3)).vector
 
 
 def _names_and_std(problem: Problem, information: Information) -> tuple[tuple[str, ...], Array]:

@@ -6,7 +6,9 @@ from gcomp.arm import Arm
 from gcomp.arrays import Array, Mask
 from gcomp.blocks import least_squares
 from gcomp.gravity import gravity_regressor
+from gcomp.information import NULL_RATIO
 from gcomp.moments import payload_columns
+from gcomp.natural import natural_units
 from gcomp.parameters import Parameters, family_slices
 from gcomp.readings import Readings
 from gcomp.sensor_model import joint_positions
@@ -59,7 +61,9 @@ def _solve(
         weight = np.abs(start.gain[joint]) / block.sigma[row, joint]
         return np.column_stack([columns, target]) * weight[:, None]
 
-    solution = least_squares(map(rows, readings.blocks()), 4 * n + 3, rcond=1e-9)
+    unit, places = natural_units(arm, readings, start), family_slices(n)
+    unit = np.concatenate([1 / unit[places["gain"]], unit[places["offset"]], unit[places["beta"].start :]])
+    solution = least_squares(map(rows, readings.blocks()), unit, rcond=NULL_RATIO)
     if keep_ratios:
         solution[:n] = np.where(free_gain, solution[0] / start.gain, 0.0)
     return tuple(np.split(solution, [n, 2 * n, 4 * n]))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from gravity_rig import DOWN, SARCOS_BETA, make_random_arm, make_readings, make_sarcos, sweep_rows
 
+from gcomp.arm import Arm
 from gcomp.errors import BadArray
 from gcomp.global_fit import identify_global
 from gcomp.linear_start import linear_start
@@ -11,6 +12,7 @@ from gcomp.parameters import FAMILIES, Parameters, Prior, free_mask
 from gcomp.readings import Readings
 from gcomp.sensor_model import predict, predict_and_jacobian
 
+HALF = np.pi / 2
 GAINS = np.array([1.1, 0.93, 1.2, 0.8, 1.05, 0.97, -1.3])
 RHO = np.array([0.05, -0.03, 0.1])
 
@@ -132,7 +134,7 @@ def test_robust_loss_survives_outliers_with_honest_intervals(loss: str, sarcos) 
     true = truth(rng, positions=False)
     positions, marks = sweep_rows(sarcos, 2, 13, rng)
     scores = []
-    for _ in range(12):
+    for _ in range(6):
         rows = make_readings(sarcos, true, positions, marks, loads=(0.0, 2.0), rng=rng)
         torque = rows.torque + np.where(rng.random(rows.torque.shape) < 0.03, 3.0, 0.0)
         spoilt = Readings(rows.position, torque, rows.sigma, rows.load)
@@ -205,3 +207,21 @@ def test_upright_arm_keeps_honest_intervals_for_all_but_the_vertical_joint() -> 
     known = np.isfinite(found.std.vector) & (found.std.vector > 0)
     assert known.sum() == 7 * 6 + 3 - 1 - 5
     assert np.abs((found.values.vector - true.vector)[known] / found.std.vector[known]).max() < 4
+
+
+def test_columns_that_are_zero_but_for_rounding_do_not_run_away() -> None:
+    """Upright arm whose later axes are parallel: ρ_z reaches only the vertical joint, through cosines of 1e-17."""
+    rng = np.random.default_rng(322)
+    arm = Arm(
+        ("a", "b", "c"), np.array([HALF, np.pi, -HALF]), np.array([0.3, 0.17, -0.03]), np.array([0, 0.07, -0.2]),
+        np.zeros(3), np.array(DOWN), np.array([-2.0, -1.5, -2.0]), np.array([2.0, 1.9, 1.6]),
+    )  # fmt: skip
+    true = Parameters.nominal(
+        3, gain=[0.8, 0.87, 1.04], offset=[0, -0.3, -0.15], position_gain=[0.98, 1.01, 1.01],
+        beta=[1.6, -0.4, 0.3, 0.03, 0.19, -0.03], rho=[0, -0.02, 0.08],
+    )  # fmt: skip
+    rows = make_readings(arm, true, *sweep_rows(arm, 6, 13, rng), loads=(0.0, 0.76), sigma=0.01)
+    prior = {"position_offset": Prior(0.0, 0.017)}
+    found = identify_global(arm, rows, unknown=FAMILIES, priors=prior)
+    assert found.values.gain[1:] == pytest.approx([0.87, 1.04], abs=1e-6)
+    assert abs(found.complete.rho[2]) < 1
