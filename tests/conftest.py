@@ -63,7 +63,7 @@ def look(tmp_path: Path) -> Callable[..., Look]:
     def run(page: Path, *options: str) -> subprocess.CompletedProcess[str]:
         profile = tmp_path / f"profile{len(list(tmp_path.glob('profile*')))}"
         complete = [*command, f"--user-data-dir={profile}", *options, page.resolve().as_uri()]
-        return subprocess.run(complete, capture_output=True, text=True, timeout=120, check=True)
+        return subprocess.run(complete, capture_output=True, text=True, timeout=300, check=True)
 
     def open_page(page: Path, width: int = 1200, height: int = 2000) -> Look:
         picture = tmp_path / f"{page.stem}-{width}.png"
