@@ -19,8 +19,8 @@ def fold(triangle: Array, rows: Array) -> Array:
     return triangle
 
 
-def least_squares(blocks: Iterable[Array], unit: Array, rcond: float) -> Array:
-    """x (p,) that solves A x = b, of least norm in units (p,), from blocks of rows [A | b] (K, p + 1).
+def least_squares(blocks: Iterable[Array], unit: Array, rcond: float) -> tuple[Array, float]:
+    """(x (p,) that solves A x = b, norm of A x − b); x is of least norm in units (p,), rows [A | b] come in blocks.
 
     A direction with less than `rcond` of the largest singular value in those units is left at zero.
     """
@@ -28,4 +28,4 @@ def least_squares(blocks: Iterable[Array], unit: Array, rcond: float) -> Array:
     for rows in blocks:
         triangle = fold(triangle, rows)
     solution: Array = unit * np.linalg.lstsq(triangle[:, :-1] * unit, triangle[:, -1], rcond=rcond)[0]
-    return solution
+    return solution, float(np.linalg.norm(triangle[:, :-1] @ solution - triangle[:, -1]))

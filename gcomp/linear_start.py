@@ -17,6 +17,12 @@ SANE_GAIN_RATIO = 5.0
 """A gain that comes out further than this factor from its start was not determined by its rows."""
 
 
+FACTORS = (1.0, 0.7, 1.4, 0.5, 2.0, -1.0, -0.7, -1.4, -0.5, -2.0)
+"""Common factors tried for such gains: position errors make (L) shrink κ towards zero, sign and ratios survive."""
+SMALLEST_RATIO = 1e-2
+"""Below this share of its start a κ does not even tell its sign."""
+
+
 def linear_start(
     arm: Arm, readings: Readings, start: Parameters, free: Mask, *, keep_ratios: bool = False
 ) -> Parameters:
@@ -24,20 +30,24 @@ def linear_start(
 
     κ_i v − ω_i − Y_i (β + μ E_ρ ρ) = μ Y_i E_0 with κ = 1/gain, ω = offset/gain; what `free` (6n + 3,) holds fixed
     stays as in `start`. Without any reference mass and with β unknown the equation has no scale: then the gain of the
-    joint whose torque varies most stays. So do gains that their rows do not determine. `keep_ratios` leaves only a
-    common factor of the gains free.
+    joint whose torque varies most stays. Gains that their rows do not determine get the sign that fits and the common
+    factor that fits best. `keep_ratios` leaves only a common factor of the gains free.
     """
     places = family_slices(arm.n)
     free_gain = free[places["gain"]].copy()
     if free[places["beta"]].any() and not np.any(readings.load != 0):
         free_gain[_strongest(readings)] = False
     while True:
-        kappa, omega, beta, rho = _solve(arm, readings, start, free, free_gain, keep_ratios)
-        ratio = np.abs(kappa * start.gain)
-        lost = free_gain & ~((ratio > 1 / SANE_GAIN_RATIO) & (ratio < SANE_GAIN_RATIO))
+        (kappa, omega, beta, rho), _ = _solve(arm, readings, start, free, free_gain, keep_ratios)
+        ratio = kappa * start.gain
+        lost = free_gain & ~((np.abs(ratio) > 1 / SANE_GAIN_RATIO) & (np.abs(ratio) < SANE_GAIN_RATIO))
         if not lost.any():
             break
         free_gain &= ~lost
+        signed = np.where(ratio < -SMALLEST_RATIO, -1.0, 1.0)
+        tried = [_with_gain(start, np.where(lost, start.gain * signed * factor, start.gain)) for factor in FACTORS]
+        costs = [_solve(arm, readings, each, free, free_gain, keep_ratios)[1] for each in tried]
+        start = tried[int(np.argmin(costs))]
     gain = np.where(free_gain, 1 / np.where(free_gain, kappa, 1.0), start.gain)
     found = {"gain": gain, "offset": omega * gain, "beta": beta, "rho": rho}
     vector = start.vector.copy()
@@ -48,8 +58,8 @@ def linear_start(
 
 def _solve(
     arm: Arm, readings: Readings, start: Parameters, free: Mask, free_gain: Mask, keep_ratios: bool
-) -> tuple[Array, ...]:
-    """(κ (n,), ω (n,), β (2n,), ρ (3,)) of least norm; zero where not free."""
+) -> tuple[list[Array], float]:
+    """([κ (n,), ω (n,), β (2n,), ρ (3,)] of least norm, zero where not free; norm of the weighted residual)."""
     n = arm.n
 
     def rows(block: Readings) -> Array:
@@ -63,10 +73,17 @@ def _solve(
 
     unit, places = natural_units(arm, readings, start), family_slices(n)
     unit = np.concatenate([1 / unit[places["gain"]], unit[places["offset"]], unit[places["beta"].start :]])
-    solution = least_squares(map(rows, readings.blocks()), unit, rcond=NULL_RATIO)
+    solution, residual = least_squares(map(rows, readings.blocks()), unit, rcond=NULL_RATIO)
     if keep_ratios:
         solution[:n] = np.where(free_gain, solution[0] / start.gain, 0.0)
-    return tuple(np.split(solution, [n, 2 * n, 4 * n]))
+    return np.split(solution, [n, 2 * n, 4 * n]), residual
+
+
+def _with_gain(parameters: Parameters, gain: Array) -> Parameters:
+    """The same with other gains (n,)."""
+    vector = parameters.vector
+    vector[family_slices(len(gain))["gain"]] = gain
+    return Parameters.from_vector(vector, len(gain))
 
 
 def _linear_rows(arm: Arm, readings: Readings, start: Parameters, free: Mask, free_gain: Mask) -> tuple[Array, Array]:
