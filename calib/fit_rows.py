@@ -78,8 +78,20 @@ def fit_rows(data: Sequence[SweepData]) -> FitRows:
         np.array([reading.direction for _, reading in rows]),
         tuple(f"{each.path.name}/{reading.sweep}" for each, reading in rows),
         noise,
-        resolution / np.sqrt(12.0),
+        _rounding(position, resolution),
     )
+
+
+def _rounding(position: Array, resolution: Array) -> Array:
+    """Standard deviation (n,) [rad] of the rounding of positions (K, n), as if each row's were independent.
+
+    A resting joint repeats the same reading, and with it the same error, in many rows; that averages out no further.
+    """
+    sigma = np.zeros(len(resolution))
+    for joint in np.flatnonzero(resolution > 0):
+        distinct = len(np.unique(np.rint(position[:, joint] / resolution[joint])))
+        sigma[joint] = resolution[joint] / np.sqrt(12.0) * np.sqrt(len(position) / distinct)
+    return sigma
 
 
 def _raw(data: SweepData) -> Array:

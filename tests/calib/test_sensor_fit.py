@@ -58,14 +58,15 @@ def test_random_arms_are_calibrated_and_identified(seed: int, n: int) -> None:
 
 
 def test_intervals_hold_the_truth() -> None:
-    arm = load_arm("sarcos")
+    arm = random_arm(41, 4)
     inside = []
     bare, loaded = plans(arm, Truth.draw(arm, 0), 0)
-    for seed in range(6):
+    mass = bare.reference_mass
+    for seed in range(12):
         truth, random = Truth.draw(arm, seed), np.random.default_rng(seed)
-        data = [synthetic_pass(arm, truth, bare, 0.0, random), synthetic_pass(arm, truth, loaded, 3.0, random)]
+        data = [synthetic_pass(arm, truth, bare, 0.0, random), synthetic_pass(arm, truth, loaded, mass, random)]
         inside.append(np.abs(scores(fit_sensors(arm, data), truth)) < 1)
-    assert 0.90 <= float(np.mean(inside)) <= 0.995
+    assert 0.90 <= float(np.mean(inside)) <= 0.99
 
 
 def test_a_vertical_joint_is_named_and_gets_no_gain() -> None:
