@@ -62,9 +62,7 @@ def test_calibrate_without_a_mass_tells_ratios_and_says_why(
     assert answer["offset"]["estimated"] == pytest.approx([0.0, 0.0], abs=0.1)
 
 
-def test_identify_without_a_scale_is_refused(
-    swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_identify_without_a_scale_is_refused(swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["identify", str(swept), "--store", str(tmp_path / "records.db")]) == 1
     assert "--reference-mass" in capsys.readouterr().err
 
