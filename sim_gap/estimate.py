@@ -105,7 +105,7 @@ class Estimate:
 
         def evaluate(z: Array) -> Array:
             shape = (float(z[-1]),) if term in shaped else term.shape
-            under, at = {}, own
+            under, at = {"nominal": self.normal.known_friction[term.place, None]}, own
             for name, other in beneath.items():
                 width = len(self.normal.at[other])
                 under[name], at = z[at : at + width], at + width

@@ -70,6 +70,7 @@ class Normal:
         data = store.data
         self.terms = [term for term in terms if store.columns(term)]
         self.rows, self.layout = data.rows, data.layout
+        self.known_friction = data.signals[0].arm.frictionloss
         widths = [next(iter(store.columns(term).values())).shape[1] for term in self.terms]
         ends = np.cumsum([0, *widths])
         self.at = {term: np.arange(ends[i], ends[i + 1]) for i, term in enumerate(self.terms)}

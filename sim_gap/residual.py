@@ -17,8 +17,9 @@ SMALL, SMALL_INNER, SMALL_NM = 3e-3, 1e-3, 0.01
 or command, and [N·m]."""
 CARE_NM = 0.05
 """Smallest gap that a user would care about [N·m]: every arm has a few hundredths of friction and offset."""
-CARE, CARE_INNER = 0.01, 0.003
-"""A gap that a user would care about, as a share of the largest torque: against the model, motor against sensor."""
+CARE, CARE_INNER, CARE_COMMAND = 0.01, 0.003, 0.001
+"""A gap that a user would care about, as a share of the largest torque: against the model, motor against sensor,
+command against motor."""
 FOLDS = 6
 MOVING_SHARE = 0.8
 """A sample of the motor row counts where the joint moves during this share of the filter's window."""
@@ -141,7 +142,8 @@ class ResidualSet:
 
         The share is smaller where the motor is compared with the sensor, for no error of the links shows there.
         """
-        care = {row: CARE if row[0] == self.layout.against_model else CARE_INNER for row in self.rows}
+        shares = {self.layout.against_model: CARE, self.layout.command: CARE_COMMAND}
+        care = {row: shares.get(row[0], CARE_INNER) for row in self.rows}
         torque = self.largest_torque
         return {row: 2.0 * self.floor[row] + max(care[row] * torque[row[1]], CARE_NM) for row in self.rows}
 

@@ -67,6 +67,7 @@ class Search:
         values = {term.key: piece for term, piece in zip(terms, pieces, strict=True)}
         for term in terms:
             beneath = {name: values[name, place] for name, place in term.beneath}
+            beneath["nominal"] = self.normal.known_friction[term.place, None]
             if not effects()[term.effect].plausible_on(values[term.key], term.shape, beneath):
                 return term
         return None

@@ -30,7 +30,7 @@ SHORTEST_S = 3.0
 SLOW_HZ = 60.0
 """Below this rate a recorded velocity is used; above, positions are differentiated, for drives report velocity late."""
 SPLINED = 3.5
-"""Largest step between readings, in median steps, up to which a channel is interpolated by splines."""
+"""Steps between readings may differ so many times from the median for a channel to be interpolated by splines."""
 CHANNELS = {"tau": "torque", "tau_motor": "motor_torque", "tau_cmd": "torque_command"}
 
 
@@ -180,7 +180,7 @@ def prepare(recording: Recording, arm: RigidArm, label: str = "recording") -> Si
 
 
 def _bridged(t: Array, values: Array, even: Array, label: str, column: str) -> Array:
-    """Values on the even time base, by cubic splines where there are no gaps, else linearly.
+    """Values on the even time base, by cubic splines where a channel is slow and even, else linearly.
 
     Raises BadInput where a whole column is missing.
     """
@@ -193,8 +193,9 @@ def _bridged(t: Array, values: Array, even: Array, label: str, column: str) -> A
                 "expected a reading in most rows; record that channel or leave it out"
             )
         own = t[there]
-        gapless = np.diff(own).max() < SPLINED * float(np.median(np.diff(own)))
-        curve = CubicSpline(own, values[there, j]) if gapless else None
+        steps, usual = np.diff(own), float(np.median(np.diff(own)))
+        even_enough = steps.max() < SPLINED * usual and steps.min() > usual / SPLINED and usual > 1.0 / SLOW_HZ
+        curve = CubicSpline(own, values[there, j]) if even_enough else None
         inside = np.clip(even, own[0], own[-1])
         out[:, j] = np.interp(inside, own, values[there, j]) if curve is None else curve(inside)
     return out

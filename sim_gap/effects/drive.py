@@ -85,8 +85,8 @@ class Saturation(_Drive):
     parameters = (Parameter("limit", "N·m"),)
 
     def grid(self, signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
-        peak = max(float(np.abs(s.reading["tau_cmd"][:, place]).max()) for s in signals)
-        return tuple((share * peak,) for share in (0.3, 0.45, 0.6, 0.75, 0.85, 0.93, 0.98))
+        asked = np.concatenate([np.abs(s.reading["tau_cmd"][:, place]) for s in signals])
+        return tuple((float(level),) for level in np.quantile(asked, (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995)))
 
     def missing(self, command: Array, shape: float, rate: float) -> Array:
         return np.asarray(command - np.clip(command, -shape, shape))

@@ -12,6 +12,11 @@ from sim_gap.rigid import Array
 from sim_gap.signals import Signals
 
 
+def dry(beneath: Mapping[str, Array]) -> float:
+    """Coulomb friction in all [N·m]: what was found and what the nominal model has."""
+    return float(beneath["friction.coulomb"][0] + beneath["nominal"][0])
+
+
 class _Friction(Effect):
     def column(self, s: Signals, joint: int, shape: Shape) -> Array:
         """The one column of this effect, (K,)."""
@@ -30,6 +35,10 @@ class Coulomb(_Friction):
     id = "friction.coulomb"
     parameters = (Parameter("torque", "N·m"),)
     rare = 0
+
+    def plausible_on(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> bool:
+        """Less than the nominal model has is possible; a hundredth of a newton-metre below nothing is noise."""
+        return bool(coefficients[0] > -float(beneath["nominal"][0]) - 0.01)
 
     def column(self, s: Signals, joint: int, shape: Shape) -> Array:
         return s.direction[:, joint]
@@ -64,7 +73,7 @@ class Stribeck(_Friction):
         return True
 
     def plausible_on(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> bool:
-        return bool(coefficients[0] > -float(beneath["friction.coulomb"][0]))
+        return bool(coefficients[0] > -dry(beneath))
 
     def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
         return np.array([coefficients[0], shape[0]])
@@ -84,10 +93,10 @@ class Asymmetric(_Friction):
         return True
 
     def plausible_on(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> bool:
-        return bool(abs(coefficients[0]) < float(beneath["friction.coulomb"][0]))
+        return bool(abs(coefficients[0]) < dry(beneath))
 
     def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
-        return coefficients / max(abs(float(beneath["friction.coulomb"][0])), 1e-9)
+        return coefficients / max(abs(dry(beneath)), 1e-9)
 
 
 class Load(_Friction):

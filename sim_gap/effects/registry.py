@@ -142,7 +142,10 @@ class Effect(ABC):
         return self.plausible(coefficients, shape)
 
     def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
-        """Reported parameters, one per `parameters`; `beneath` holds the coefficients of what it stands upon."""
+        """Reported parameters, one per `parameters`.
+
+        `beneath` holds the coefficients of what it stands upon, and as `nominal` the model's own friction loss.
+        """
         return coefficients
 
 
