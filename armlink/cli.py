@@ -14,10 +14,15 @@ PURPOSE = (
 )
 USAGE_STATUS = 2
 INTERRUPTED_STATUS = 130
+ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+"""Environment of the linear algebra, set before numpy is imported: our matrices are small, and threads that wait for one
+another on a busy machine cost up to a hundred times the arithmetic."""
 
 
 def main() -> None:
     """Run `armlink` on the command line's arguments and exit with the status of the contract (0, 1, 2, 3 or 130)."""
+    for name in ONE_THREAD:
+        os.environ.setdefault(name, "1")
     with terminate_as_interrupt():
         sys.exit(run(sys.argv[1:]))
 
