@@ -15,8 +15,8 @@ PURPOSE = (
 USAGE_STATUS = 2
 INTERRUPTED_STATUS = 130
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-"""Environment of the linear algebra, set before numpy is imported: our matrices are small, and threads that wait for one
-another on a busy machine cost up to a hundred times the arithmetic."""
+"""Environment of the linear algebra, set before numpy is imported: our matrices are small, and threads that wait for
+one another on a busy machine cost up to a hundred times the arithmetic."""
 
 
 def main() -> None:
