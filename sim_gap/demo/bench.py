@@ -25,15 +25,15 @@ class Bench:
     arm: ArmFile
     described: Arm
     truth: Truth
+    """The sensors as they are when the demo begins, effects of the arm file included."""
     simulated: SimulatedArm
     link: Link
 
     @classmethod
     def build(cls, arm: ArmFile, described: Arm, seed: int) -> "Bench":
         """A simulated arm with the truth of `seed` on an in-process bus; raises BadInput."""
-        truth = Truth.draw(arm, seed)
-        simulated = SimulatedArm(arm, truth, seed)
-        return cls(arm, described, truth, simulated, Link(arm, LockStepBus(arm=simulated)))
+        simulated = SimulatedArm(arm, Truth.draw(arm, seed), seed)
+        return cls(arm, described, simulated.true_sensors, simulated, Link(arm, LockStepBus(arm=simulated)))
 
     def random_poses(self, count: int, seed: int) -> Array:
         """True joint angles (count, n) within the stops [rad]."""
