@@ -28,6 +28,7 @@ def calibrate(
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
     from calib.dataset import load_data
+    from calib.records import CalibrationRecord
     from calib.sensors import fit_sensors
     from calib.store import RecordStore
 
@@ -36,9 +37,10 @@ def calibrate(
     data = [load_data(path) for path in directories]
     arm_file = data[0].load_arm(arm)
     fit = fit_sensors(arm_file, data)
-    record = fit.record(arm_file)
-    _show(fit)
     records = RecordStore(store)
+    current = records.current(CalibrationRecord, arm_file)
+    record = fit.record(arm_file).model_copy(update={"parent": None if current is None else current.id})
+    _show(fit)
     records.put(record, arm_file, by="armlink calibrate", reason="sweeps")
     if apply:
         _apply(arm_file, record, bus)

@@ -38,9 +38,11 @@ def identify(
     arm_file = data[0].load_arm(arm)
     records = RecordStore(store)
     sensors: SensorFit | CalibrationRecord
+    used: CalibrationRecord | None
     if calibration is None:
         sensors = fit_sensors(arm_file, data)
-        used: CalibrationRecord | None = records.current(CalibrationRecord, arm_file)
+        current = records.current(CalibrationRecord, arm_file)
+        used = current if current is not None and current.sources == sensors.sources else None
     else:
         kept = records.get(calibration)
         if not isinstance(kept, CalibrationRecord):

@@ -8,6 +8,7 @@ import yaml
 from sweep_arms import random_arm
 
 from armlink.cli import run
+from calib.dataset import load_data
 
 
 @pytest.fixture(scope="module")
@@ -31,6 +32,44 @@ def swept(arm_path: Path) -> Path:
     out = arm_path.parent / "bare"
     assert run(["sweep", str(arm_path), "--bus", f"armlink_sim:{arm_path}", "--out", str(out)]) == 0
     return out
+
+
+@pytest.fixture(scope="module")
+def loaded(arm_path: Path, swept: Path) -> Path:
+    """The second pass: the same arm with the recommended mass bolted on."""
+    plan = load_data(swept).plan
+    assert plan is not None
+    mass = plan.reference_mass
+    content = yaml.safe_load(arm_path.read_text(encoding="utf-8"))
+    content["sim"]["effects"].append({"effect": "link.payload", "mass": mass, "com": [0.1, 0.12, 0.05]})
+    heavier = arm_path.parent / "heavier.yaml"
+    heavier.write_text(yaml.safe_dump(content), encoding="utf-8")
+    out = arm_path.parent / "loaded"
+    command = ["sweep", str(arm_path), "--bus", f"armlink_sim:{heavier}", "--out", str(out)]
+    assert run([*command, "--reference-mass", str(mass)]) == 0
+    return out
+
+
+def test_from_sweeps_to_a_verified_model(
+    arm_path: Path, swept: Path, loaded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store, bus = ["--store", str(tmp_path / "records.db")], ["--bus", f"armlink_sim:{arm_path}"]
+    passes = [str(swept), str(loaded)]
+    assert run(["calibrate", *passes, *store, "--apply", *bus, "--json", "-"]) == 0
+    calibration = json.loads(capsys.readouterr().out)
+    assert calibration["applied"]
+    for gain, (low, high) in zip(calibration["gain"]["estimated"], calibration["gain"]["ci95"], strict=True):
+        assert gain == pytest.approx(1.0, abs=0.01)
+        assert low < gain < high
+    assert run(["identify", *passes, *store, "--json", "-"]) == 0
+    gravity = json.loads(capsys.readouterr().out)
+    assert all(gravity["identifiable"])
+    assert gravity["recursive"] == pytest.approx(gravity["beta"], abs=0.02)
+    assert run(["verify", str(arm_path), *bus, *store, "--poses", "4", "--json", "-"]) == 0
+    verified = json.loads(capsys.readouterr().out)
+    assert verified["passed"]
+    assert verified["calibration_record"] == calibration["record"]
+    assert verified["gravity_record"] == gravity["record"]
 
 
 def test_plan_prints_and_moves_nothing(arm_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
