@@ -7,6 +7,8 @@ Array = npt.NDArray[np.float64]
 
 ROUNDING = 0.06
 """Time over which steps in acceleration are spread [s]."""
+THERE = 1e-12
+"""A joint so near its goal is there [rad]."""
 
 
 def trajectory(start: Array, goal: Array, speed: Array, acceleration: Array, period: float) -> Array:
@@ -16,9 +18,9 @@ def trajectory(start: Array, goal: Array, speed: Array, acceleration: Array, per
     is a trapezoid in speed, averaged over `ROUNDING`.
     """
     distance = np.abs(goal - start)
-    if not np.any(distance > 0):
+    moving = distance > THERE
+    if not moving.any():
         return np.empty((0, len(start)))
-    moving = distance > 0
     top = float(np.min(speed[moving] / distance[moving]))  # of the path parameter s from 0 to 1 [1/s]
     gain = float(np.min(acceleration[moving] / distance[moving]))
     ramp = min(top / gain, float(np.sqrt(1 / gain)))
