@@ -21,9 +21,6 @@ BLOCK = 2048
 REGRESSOR_BLOCK = 1024
 """The same for the regressor, which is larger."""
 
-REGRESSOR_BLOCK = 1024
-"""The same for the regressor, which is larger."""
-
 ComplexArray = NDArray[np.complex128]
 
 

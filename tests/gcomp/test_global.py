@@ -176,6 +176,11 @@ def test_field_calibration_with_known_moments_has_the_published_covariance(sarco
     both = found.covariance_of("gain[joint_3]", "offset[joint_3]")
     assert both[0, 1] == pytest.approx(-torque[:, 2].mean() * spread[2], rel=1e-6)
     assert np.abs((found.values.gain - GAINS) / found.std.gain).max() < 4
+    design = np.linalg.pinv(np.stack([torque[:, 2], np.ones(40)], axis=1))  # the same fit, joint 3 alone, 4000 times
+    scatter = np.cov(design @ (0.05 * rng.normal(size=(40, 4000))))
+    covariance = found.covariance_of("gain[joint_3]", "offset[joint_3]")
+    assert np.sqrt(np.diag(scatter)) == pytest.approx(np.sqrt(np.diag(covariance)), rel=0.05)
+    assert scatter[0, 1] == pytest.approx(covariance[0, 1], abs=0.05 * np.sqrt(covariance[0, 0] * covariance[1, 1]))
 
 
 def test_known_moments_make_even_the_last_position_offset_observable(sarcos, rng) -> None:

@@ -1,5 +1,7 @@
 """What can be told apart, exactly: the ranks and deficits of the theory note, sections 2, 4 and 8."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from gravity_rig import DOWN, SARCOS_BETA, make_random_arm, make_readings, make_sarcos, sweep_rows
@@ -7,7 +9,9 @@ from gravity_rig import DOWN, SARCOS_BETA, make_random_arm, make_readings, make_
 from gcomp.arm import Arm
 from gcomp.global_fit import GlobalFit, identify_global, predict_covariance
 from gcomp.moments import base_parameter_names
-from gcomp.parameters import FAMILIES, Parameters
+from gcomp.parameters import FAMILIES, Parameters, family_slices
+from gcomp.readings import Readings
+from gcomp.sensor_model import predict, predict_and_jacobian
 
 SENSORS = ("gain", "offset", "beta")
 POSITIONS = ("position_gain", "position_offset")
@@ -53,6 +57,31 @@ def test_rank_deficit_of_the_calibration(
     """Section 4's table; minus one where θ0_n is among the unknowns: gcomp holds it (turning link n's frame)."""
     found = fit(make_sarcos(), unknown, poses=poses, sensors=sensors, loads=loads)
     assert len(found.null_space) == deficit
+
+
+@pytest.mark.parametrize(("gravity_unknown", "deficit"), [(False, 2), (True, 3)])
+def test_an_unknown_direction_of_gravity_costs_one_more(gravity_unknown: bool, deficit: int) -> None:
+    """Section 4's table with θ0_n free: the analytic Jacobian, and two columns for turning g by differences."""
+    arm, rng = make_sarcos(), np.random.default_rng(6)
+    true = Parameters.nominal(7, gain=rng.uniform(0.8, 1.2, 7), beta=SARCOS_BETA)
+    positions, marks = sweep_rows(arm, 2, 13, rng)
+    generic = positions + np.repeat(0.3 * rng.normal(size=(14, 7)), 13, axis=0)  # another pose for each sweep
+    rows = Readings.of(generic, marks, 1.0)
+    jacobian = predict_and_jacobian(arm, true, rows)[1]
+    families = family_slices(7)
+    columns = [jacobian[:, families[name]] for name in (*SENSORS, *POSITIONS)]
+    if gravity_unknown:
+        step = 1e-5
+        for across in (np.array([0, 1.0, 0]), np.array([0, 0, 1.0])):
+            ahead, behind = (
+                predict(replace(arm, gravity=arm.gravity + sign * step * 9.81 * across), true, rows)[rows.counted]
+                for sign in (1, -1)
+            )
+            columns.append(((ahead - behind) / (2 * step))[:, None])
+    stacked = np.hstack(columns)
+    singular = np.linalg.svd(stacked / np.linalg.norm(stacked, axis=0), compute_uv=False)
+    assert np.sum(singular < 1e-9 * singular[0]) == deficit
+    assert singular[-deficit - 1] > 1e-6 * singular[0]
 
 
 def test_common_scale_is_named_and_offsets_stay() -> None:
