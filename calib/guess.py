@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gcomp.arm import Arm
-from gcomp.gravity import gravity_regressor, gravity_stiffness
+from gcomp.gravity import gravity_regressor
 
 Array = npt.NDArray[np.float64]
 
@@ -84,11 +84,6 @@ def guess_gravity(
     residual = design @ solution - target
     excess = max(float(residual @ residual) / max(len(target) - 4 * n, 1), 1.0)
     return GravityGuess(arm, solution[2 * n :], covariance[2 * n :, 2 * n :] * excess)
-
-
-def position_allowance(guess: GravityGuess, q: Array, error: Array) -> Array:
-    """Change of holding torque (…, n) [N·m] that position errors (n,) [rad] can make at poses q (…, n)."""
-    return np.abs(gravity_stiffness(guess.arm, guess.beta, q)) @ error
 
 
 def _largest_moment(arm: Arm, rated: Array) -> float:

@@ -130,7 +130,7 @@ def _require_scale(names: tuple[str, ...], lost: Flags) -> None:
     if lost.all():
         raise Refused(
             f"no torque gain of {', '.join(names)} is known, so mass moments are known up to a common factor only:"
-            " sweep with --reference-mass too, or give a calibration record"
+            " a sweep with --reference-mass gives the scale where the links have a lever; or give a calibration record"
         )
 
 

@@ -55,14 +55,6 @@ class ColumnStore:
         return self._columns[term]
 
 
-@dataclass(frozen=True)
-class Solution:
-    """Coefficients of a set of terms."""
-
-    terms: tuple[Term, ...]
-    coefficients: dict[Term, Array]
-
-
 class Normal:
     """Gram matrices of the terms' columns with each other and with the residuals, per fold and row."""
 

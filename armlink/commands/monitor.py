@@ -35,7 +35,6 @@ def monitor(
     from armlink.commands.output import write_json
     from armlink.errors import BusFault
     from armlink.monitor import Monitor
-    from armlink.signals import terminate_as_interrupt
 
     arm_file = load_arm(arm)
     opened = open_bus(bus, arm_file.require_link().bus)
@@ -46,7 +45,7 @@ def monitor(
         watcher = Monitor(arm_file, opened, sync)
         refreshes = 1 if once else cycles
         shown = 0
-        with terminate_as_interrupt(), Live(console=console, auto_refresh=False, transient=True) as live:
+        with Live(console=console, auto_refresh=False, transient=True) as live:
             while not refreshes or shown < refreshes:
                 answer = watcher.describe(watcher.watch(ONCE_SECONDS if once else REFRESH_SECONDS))
                 shown += 1

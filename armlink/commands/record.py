@@ -31,7 +31,6 @@ def record(
     from armlink.errors import BadInput, BusFault
     from armlink.recorder import Recorder
     from armlink.recording_mcap import RecordingWriter
-    from armlink.signals import terminate_as_interrupt
 
     arm_file = load_arm(arm)
     if out.suffix != SUFFIX:
@@ -40,11 +39,7 @@ def record(
     rows, last = 0, 0.0
     try:
         recorder = Recorder(arm_file, opened)
-        with (
-            contextlib.suppress(KeyboardInterrupt),
-            terminate_as_interrupt(),
-            RecordingWriter(out, recorder.names) as writer,
-        ):
+        with contextlib.suppress(KeyboardInterrupt), RecordingWriter(out, recorder.names) as writer:
             for t, channels in recorder.rows(seconds or float("inf")):
                 writer.append(t, channels)
                 rows, last = rows + 1, t
