@@ -1,0 +1,150 @@
+"""Listening to an arm that another controller commands: one sample a SYNC of that controller; nothing is sent.
+
+The one exception is asked for by name: `write_calibration` and `read_calibration` use SDO on object 2100h.
+"""
+
+import struct
+from collections import deque
+from collections.abc import Callable
+from functools import cached_property
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from armlink import calibration, objects
+from armlink.armfile import ArmFile
+from armlink.clock import Clock, MonotonicClock
+from armlink.loop import Loop
+from armlink.monitor import assumed_units
+from armlink.pdo import RPDO1
+from armlink.port import open_port
+from armlink.sample import Array, Calibration, Sample, Stats
+from armlink.services import NodeServices, PumpedNetwork, load_dictionary
+
+COMMAND_LAYOUT = struct.Struct("<Hhi")
+"""RPDO1: control word, target torque, target position."""
+
+
+class Listener:
+    """Context manager: `with Listener(arm, bus) as listener: sample = listener.next(0.1)`."""
+
+    def __init__(self, arm: ArmFile, bus: Any, clock: Clock | None = None) -> None:
+        """Take `bus` (python-can's, closed on leaving) and a clock: by default the bus's own or the machine's."""
+        self.arm, self.bus = arm, bus
+        self.section = section = arm.require_link()
+        self.names = tuple(joint.name for joint in section.joints)
+        self.nodes = tuple(joint.node for joint in section.joints)
+        self.n, self.period = len(self.names), 1.0 / section.rate
+        own_clock: Clock | None = getattr(bus, "clock", None)
+        self.clock: Clock = clock or own_clock or MonotonicClock()
+        self._loop = Loop(open_port(bus), self.clock, self.nodes, 0, self.period, own_clock is not None)
+        units = assumed_units(arm)
+        self._loop.set_units(units)
+        self._loop.on_other = self._take
+        self._torque_unit = np.array([unit.torque for unit in units])
+        self._position_unit = np.array([unit.position for unit in units])
+        self._joint_of = {RPDO1.cob_base + node: joint for joint, node in enumerate(self.nodes)}
+        self._ready: deque[Sample] = deque()
+        self._sync: float | None = None
+        self._since: float | None = None
+        self._notify: Callable[[int, bytearray, float], None] | None = None
+        self.torque_sent: Array = np.full(self.n, np.nan)
+        """Target torque of the other controller's newest frames [N·m], (n,); NaN before the first."""
+        self.position_sent: Array = np.full(self.n, np.nan)
+        """Likewise target position [rad]."""
+
+    def __enter__(self) -> Self:
+        """The listener itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        """Close the bus."""
+        self.bus.shutdown()
+
+    @property
+    def stats(self) -> Stats:
+        """Counters since the first SYNC heard, rate and load brought up to date; `late` stays 0."""
+        if self._since is not None:
+            self._loop.measure(self.clock.now() - self._since, self.section.bus.bitrate)
+        return self._loop.stats
+
+    @property
+    def emergencies(self) -> list[tuple[int, int, int]]:
+        """(Joint, code, error register) of every emergency heard; the caller may clear it."""
+        return self._loop.emergencies
+
+    @property
+    def node_states(self) -> dict[int, int]:
+        """Joint → NMT state of its newest heartbeat, 0 for boot-up; the caller may clear it."""
+        return self._loop.node_states
+
+    def next(self, timeout: float) -> Sample | None:
+        """The next complete sample, or None where no SYNC completes one within `timeout` [s]; raises BusFault.
+
+        A sample is complete when the SYNC after it comes; its time is that of its own SYNC, by `clock`.
+        """
+        end = self.clock.now() + timeout
+        while not self._ready:
+            remaining = end - self.clock.now()
+            if remaining <= 0:
+                return None
+            self._loop.receive(remaining)
+        return self._ready.popleft()
+
+    def read_calibration(self, joint: int) -> Calibration:
+        """The torque sensor record (2100h) of joint 0 … n−1, by SDO: sends; raises BusFault."""
+        return calibration.read_record(self._services[joint])
+
+    def write_calibration(
+        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
+    ) -> Calibration:
+        """Make gain and offset [N·m] active in joint 0 … n−1, by SDO: sends; raises BadInput, BusFault."""
+        return calibration.write_record(self._services[joint], gain, offset, record_id, date, store)
+
+    def _take(self, can_id: int, data: bytes) -> None:
+        if can_id == objects.SYNC_ID:
+            self._complete(self.clock.now())
+            return
+        joint = self._joint_of.get(can_id)
+        if joint is not None:
+            if len(data) == COMMAND_LAYOUT.size:
+                _, torque, position = COMMAND_LAYOUT.unpack(data)
+                self.torque_sent[joint] = torque * self._torque_unit[joint]
+                self.position_sent[joint] = position * self._position_unit[joint]
+        elif self._notify is not None:
+            self._notify(can_id, bytearray(data), 0.0)
+
+    def _complete(self, now: float) -> None:
+        """A SYNC: what came since the one before is its sample."""
+        if self._sync is None or self._since is None:
+            self._loop.reset_counters()
+            self._loop.drop_readings()
+            self._since = now
+        else:
+            sample = self._loop.sample(self._sync)
+            sample.t = self._sync
+            self._loop.stats.missed += int(np.isnan(sample.position).sum())
+            self._loop.drop_readings()
+            self._ready.append(sample)
+        self._sync = now
+
+    @cached_property
+    def _services(self) -> tuple[NodeServices, ...]:
+        network = PumpedNetwork(self._loop.send)
+        self._notify = network.notify
+        dictionary = load_dictionary()
+        return tuple(
+            NodeServices(network, name, node, dictionary, self._pump)
+            for name, node in zip(self.names, self.nodes, strict=True)
+        )
+
+    def _pump(self, done: Callable[[], bool], timeout: float) -> bool:
+        """Go on listening until `done` or the time is over."""
+        end = self.clock.now() + timeout
+        while not done():
+            remaining = end - self.clock.now()
+            if remaining <= 0:
+                return False
+            self._loop.receive(remaining)
+        return True
