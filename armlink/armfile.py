@@ -76,6 +76,18 @@ class Bus(Section):
     bitrate: Annotated[int, Field(gt=0)] = 1_000_000
 
 
+U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
+
+
+class DeviceIdentity(Section):
+    """Which controller a joint must have (1018h:01 to :04); what is not stated is not compared."""
+
+    vendor: U32 | None = None
+    product: U32 | None = None
+    revision: U32 | None = None
+    serial: U32 | None = None
+
+
 class LinkJoint(Section):
     """One joint controller: its node and the limits that no frame may exceed."""
 
@@ -89,6 +101,8 @@ class LinkJoint(Section):
     """[N·m/s]."""
     max_velocity: PositiveFloat = 1.0
     """[rad/s]."""
+    identity: DeviceIdentity = DeviceIdentity()
+    """Another controller than this one at the joint's node is refused at the start."""
 
 
 class LinkSection(Section):
@@ -109,7 +123,7 @@ class LinkSection(Section):
 
 
 class ArmFile(Section):
-    """A whole arm file. `sweep` and `sim` hold the models that their packages registered in `armlink.sections`."""
+    """A whole arm file. `sweep`, `sim`, `daemon` hold the models that their packages registered in `armlink.sections`."""
 
     name: str
     serial: str = "unknown"
@@ -117,6 +131,7 @@ class ArmFile(Section):
     link: LinkSection | None = None
     sweep: Any = None
     sim: Any = None
+    daemon: Any = None
     path: Path
 
     @model_validator(mode="after")

@@ -1,12 +1,13 @@
 """What the link reads from and sets on one joint's controller before the cycle starts."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from armlink import objects, pdo
-from armlink.armfile import LinkJoint, LinkSection
+from armlink.armfile import DeviceIdentity, LinkJoint, LinkSection
 from armlink.cia402 import SUPPORTED_BITS, state_of
-from armlink.errors import BadInput, BusFault
+from armlink.errors import BadInput, BusFault, Refused
 from armlink.gate import JointLimits
 from armlink.limits import milliseconds
 from armlink.objects import Entry
@@ -63,6 +64,41 @@ def identify(services: NodeServices) -> Identity:
         revision=int(read(objects.REVISION)),
         serial=int(read(objects.SERIAL)),
         state=state_of(int(read(objects.STATUS_WORD))),
+    )
+
+
+IDENTITY_OBJECTS = {
+    "vendor": objects.VENDOR,
+    "product": objects.PRODUCT,
+    "revision": objects.REVISION,
+    "serial": objects.SERIAL,
+}
+
+
+def identity_mismatches(stated: DeviceIdentity, found: Mapping[str, int]) -> list[str]:
+    """What of an identity (1018h: vendor, product, revision, serial) is not as the arm file states it, in words."""
+    mismatches = []
+    for key, entry in IDENTITY_OBJECTS.items():
+        expected = getattr(stated, key)
+        if expected is not None and found[key] != expected:
+            mismatches.append(f"{entry} is {found[key]:#x}, expected {expected:#x}")
+    return mismatches
+
+
+def check_identity(services: NodeServices, joint: LinkJoint) -> None:
+    """Raise Refused where another controller answers at the joint's node than the arm file states."""
+    stated = [key for key in IDENTITY_OBJECTS if getattr(joint.identity, key) is not None]
+    found = {key: int(services.read(IDENTITY_OBJECTS[key])) for key in stated}
+    mismatches = identity_mismatches(joint.identity, found)
+    if mismatches:
+        raise refused_identity(joint.name, joint.node, mismatches)
+
+
+def refused_identity(name: str, node: int, mismatches: list[str]) -> Refused:
+    """The refusal of a joint's controller, with what differs and how to mend it."""
+    return Refused(
+        f"{name} (node {node}): another controller than the arm file states: {'; '.join(mismatches)}: "
+        "connect the right arm, or correct identity of this joint under link.joints"
     )
 
 

@@ -65,6 +65,8 @@ class Identity:
     revision: int = 0
     serial: int = 0
     state: State = State.UNKNOWN
+    answers: int = 1
+    """How many answered one request at this node id; more than one is a duplicated id."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,8 @@
 """Which nodes are on a bus, who they are and in which state; nothing is written to them."""
 
+from collections import Counter
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 from armlink import device
 from armlink.clock import Clock
@@ -32,20 +34,22 @@ def scan_bus(port: Port, clock: Clock, joints: Mapping[int, str]) -> list[Identi
     found = _search(port, pump, network)
     dictionary = load_dictionary()
     identities = []
-    for node in sorted({*found, *joints}):
+    for node in sorted({*+found, *joints}):
         name = joints.get(node, "")
-        if node in found:
-            identities.append(device.identify(NodeServices(network, name, node, dictionary, pump)))
+        if found[node]:
+            identity = device.identify(NodeServices(network, name, node, dictionary, pump))
+            identities.append(replace(identity, answers=found[node]))
         else:
             identities.append(Identity(name, node, present=False))
     return identities
 
 
-def _search(port: Port, pump: Callable[[Callable[[], bool], float], bool], network: PumpedNetwork) -> set[int]:
-    found: set[int] = set()
+def _search(port: Port, pump: Callable[[Callable[[], bool], float], bool], network: PumpedNetwork) -> Counter[int]:
+    """Node id → number of answers to one request."""
+    found: Counter[int] = Counter()
 
     def answered(can_id: int, data: bytearray, timestamp: float) -> None:
-        found.add(can_id - 0x580)
+        found[can_id - 0x580] += bytes(data[1:4]) == _READ_DEVICE_TYPE[1:4]
 
     for node in range(1, 128):
         network.subscribe(0x580 + node, answered)

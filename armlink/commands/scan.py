@@ -13,6 +13,8 @@ def scan(
 ) -> int:
     """List the nodes that answer on a bus; with an arm file also those of its joints that do not (exit status 3).
 
+    Exit status 1 where a joint has another controller than the arm file states (link.joints, key identity).
+
     Example: armlink scan sarcos --bus socketcan:vcan0
     """
     from rich.box import SIMPLE
@@ -23,6 +25,7 @@ def scan(
     from armlink.bus import open_bus
     from armlink.clock import MonotonicClock
     from armlink.commands.output import write_json
+    from armlink.device import identity_mismatches, refused_identity
     from armlink.errors import BadInput, BusFault
     from armlink.port import open_port
     from armlink.scan import describe_type, scan_bus
@@ -32,10 +35,11 @@ def scan(
     if arm is None:
         from armlink.armfile import Bus
 
-        joints, section = {}, Bus()
+        joints, stated, section = {}, {}, Bus()
     else:
         link = load_arm(arm).require_link()
         joints, section = {joint.node: joint.name for joint in link.joints}, link.bus
+        stated = {joint.node: joint.identity for joint in link.joints}
     opened = open_bus(bus, section)
     try:
         clock = getattr(opened, "clock", None) or MonotonicClock()
@@ -43,17 +47,30 @@ def scan(
         channel = str(opened.channel_info)
     finally:
         opened.shutdown()
+    wrong = {
+        each.node: differs
+        for each in found
+        if each.present and each.node in stated and (differs := identity_mismatches(stated[each.node], vars(each)))
+    }
     table = Table("node", "joint", "state", "device", "identity", "serial", box=SIMPLE, title=channel)
     for each in found:
         if each.present:
             told = (each.state.value, each.name or describe_type(each.device_type))
             identity = f"{each.vendor:x}:{each.product:x}:{each.revision:x}"
-            table.add_row(str(each.node), each.joint, *told, identity, str(each.serial))
+            style = "red" if each.node in wrong or each.answers > 1 else ""
+            table.add_row(str(each.node), each.joint, *told, identity, str(each.serial), style=style)
         else:
             table.add_row(str(each.node), each.joint, "[red]no answer[/red]")
     Console(stderr=True).print(table if found else f"{channel}: no node answers")
-    write_json(json, {"bus": channel, "nodes": [{**vars(each), "state": each.state.value} for each in found]})
+    nodes = [{**vars(each), "state": each.state.value, "mismatches": wrong.get(each.node, [])} for each in found]
+    write_json(json, {"bus": channel, "nodes": nodes})
     missing = [f"{each.joint} (node {each.node})" for each in found if not each.present]
     if missing:
         raise BusFault(f"no answer from {', '.join(missing)} on {channel}")
+    twins = [str(each.node) for each in found if each.answers > 1]
+    if twins:
+        raise BusFault(f"{channel}: node id {', '.join(twins)} answers twice: give every node an id of its own")
+    if wrong:
+        node, differs = next(iter(wrong.items()))
+        raise refused_identity(joints[node], node, differs)
     return 0
