@@ -1,0 +1,64 @@
+"""What a person may set of the daemon: the arm file's section `daemon`, read again at SIGHUP."""
+
+from dataclasses import fields
+from typing import Annotated, Literal
+
+from pydantic import Field, FiniteFloat, PositiveFloat, field_validator
+
+from armlink.armfile import ArmFile, Section
+from calib.observer_config import ObserverConfig
+
+Policy = Literal["observe", "propose", "apply"]
+
+
+class RecordingSettings(Section):
+    """Recordings that the daemon keeps by itself (MCAP), the oldest dropped first."""
+
+    enabled: bool = True
+    rate: Annotated[FiniteFloat, Field(gt=0, le=1000)] = 25.0
+    """Rows a second; at most the SYNC rate."""
+    minutes: PositiveFloat = 10.0
+    """Length of one file."""
+    quota_mb: PositiveFloat = 2000.0
+    """All files together."""
+
+
+class DaemonSection(Section):
+    """The arm file's section `daemon`; every key has a default."""
+
+    policy: Policy = "propose"
+    """What becomes of a drift that was found: nothing, a proposal, or a new record written to the controller."""
+    rest_between_writes: PositiveFloat = 600.0
+    """At most one recalibration of a joint in this time [s]."""
+    writes_per_day: Annotated[int, Field(ge=1)] = 24
+    """At most so many recalibrations of the arm by the daemon's own decision."""
+    sweep_when_undecided: bool = False
+    """Whether the daemon may sweep the arm by itself where watching cannot decide; only where it drives the bus."""
+    sweep_every_hours: PositiveFloat | None = None
+    """Sweep so often; only where the daemon drives the bus."""
+    work: bool = False
+    """Whether the daemon, where it drives the bus, moves the arm among random poses: a stand-in for ordinary work."""
+    recording: RecordingSettings = RecordingSettings()
+    observer: dict[str, FiniteFloat] = {}
+    """Thresholds of the observer (calib/observer_config.py) that differ from their defaults."""
+
+    @field_validator("observer")
+    @classmethod
+    def _known(cls, given: dict[str, float]) -> dict[str, float]:
+        known = [field.name for field in fields(ObserverConfig)]
+        for name in given:
+            if name not in known:
+                raise ValueError(f"no threshold {name!r}; there are {', '.join(known)}")
+        return given
+
+    def observer_config(self) -> ObserverConfig:
+        """The observer's thresholds; whole numbers stay whole."""
+        whole = {field.name for field in fields(ObserverConfig) if field.type == "int" or field.type is int}
+        return ObserverConfig(
+            **{name: int(value) if name in whole else value for name, value in self.observer.items()}  # type: ignore[arg-type]
+        )
+
+
+def daemon_section(arm: ArmFile) -> DaemonSection:
+    """The arm file's section, or the defaults."""
+    return arm.daemon if isinstance(arm.daemon, DaemonSection) else DaemonSection()
