@@ -1,9 +1,7 @@
 """The one owner of the bus: raw frames out and in, by the fastest way that the interface offers, counted."""
 
-import errno
 import select
-import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import can
@@ -12,18 +10,21 @@ from armlink.errors import BusFault
 
 Frame = tuple[int, bytes]
 
-_CAN_FRAME = struct.Struct("=IB3x8s")
-_FLAGS = 0xE0000000  # extended, remote, error
-_ERROR_FLAG, _BUS_OFF = 0x20000000, 0x40
-_RECEIVE_BUFFER = 1 << 20
-_RETRY = 0.002  # [s] between tries while the transmit queue is full
-_TRIES = 25
+_SLICE = 0.001  # [s] that one of several buses is waited for where the operating system cannot wait for all at once
 
 
 class Port(Protocol):
     """Frames with 11-bit identifiers; error frames are counted, the others that are not ours are dropped."""
 
-    errors: int
+    @property
+    def errors(self) -> int:
+        """Error frames so far."""
+        ...
+
+    @property
+    def dropped(self) -> int:
+        """Frames that were lost because they were not read in time, where the interface tells."""
+        ...
 
     @property
     def send(self) -> Callable[[int, bytes], None]:
@@ -35,83 +36,59 @@ class Port(Protocol):
         """The next frame, or None after so many seconds without one (0: what is there already)."""
         ...
 
+    def send_all(self, frames: Sequence[Frame]) -> None:
+        """Send the frames of a cycle in this order; raises BusFault where the interface cannot take them."""
+        ...
+
 
 def open_port(bus: Any) -> Port:
-    """Wrap a python-can bus: lock-step bus (`put`, `take`), SocketCAN's own socket, or python-can messages."""
+    """Wrap a bus: several (`members`), lock-step (`put`, `take`), SocketCAN's own socket, or python-can messages."""
+    if hasattr(bus, "members"):
+        return GroupPort(bus)
     if hasattr(bus, "take"):
         return LockStepPort(bus)
+    fd = str(getattr(bus, "protocol", "")).startswith("CanProtocol.CAN_FD")
     if type(bus).__name__ == "SocketcanBus":
-        return SocketPort(bus)
-    return MessagePort(bus)
+        from armlink.socket_port import SocketPort
+
+        return SocketPort(bus, fd)
+    return MessagePort(bus, fd)
 
 
 class LockStepPort:
     """In-process bus that never blocks (`put`, `take`); waiting lets simulated time go on."""
 
     def __init__(self, bus: Any) -> None:
-        self.errors = 0
+        self.errors = self.dropped = 0
         self.send: Callable[[int, bytes], None] = bus.put
         self.receive: Callable[[float], Frame | None] = bus.take
 
-
-class SocketPort:
-    """SocketCAN without a message object a frame: struct and the raw socket."""
-
-    def __init__(self, bus: Any) -> None:
-        import socket
-
-        self.errors = 0
-        self._bus = bus
-        self._socket: socket.socket = bus.socket
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
-        self._now = socket.MSG_DONTWAIT
-
-    def send(self, can_id: int, data: bytes) -> None:
-        """Send one frame; a full transmit queue is tried again for some milliseconds, then BusFault."""
-        frame = _CAN_FRAME.pack(can_id, len(data), data)
-        for _ in range(_TRIES):
-            try:
-                self._socket.send(frame)
-                return
-            except OSError as error:
-                if error.errno != errno.ENOBUFS:
-                    raise BusFault(f"bus {self._bus.channel_info}: cannot send: {error.strerror}") from None
-                select.select([], [], [], _RETRY)
-        raise BusFault(f"bus {self._bus.channel_info}: transmit queue stays full: does any node acknowledge?")
-
-    def receive(self, timeout: float) -> Frame | None:
-        """The next data frame with an 11-bit identifier, or None after `timeout` seconds."""
-        while True:
-            try:
-                can_id, length, data = _CAN_FRAME.unpack(self._socket.recv(_CAN_FRAME.size, self._now))
-            except BlockingIOError:
-                if timeout <= 0 or not select.select([self._socket], [], [], timeout)[0]:
-                    return None
-                timeout = 0.0
-                continue
-            except OSError as error:
-                raise BusFault(f"bus {self._bus.channel_info}: cannot receive: {error.strerror}") from None
-            if not can_id & _FLAGS:
-                return can_id, data[:length]
-            if can_id & _ERROR_FLAG:
-                self.errors += 1
-                if can_id & _BUS_OFF:
-                    raise BusFault(f"bus {self._bus.channel_info}: bus-off: check wiring, termination and bit rate")
+    def send_all(self, frames: Sequence[Frame]) -> None:
+        """Send the frames in this order."""
+        for can_id, data in frames:
+            self.send(can_id, data)
 
 
 class MessagePort:
-    """Any python-can interface, by its messages."""
+    """Any python-can interface, by its messages; CAN FD frames with bit-rate switch where `fd`."""
 
-    def __init__(self, bus: Any) -> None:
-        self.errors = 0
-        self._bus = bus
+    def __init__(self, bus: Any, fd: bool = False) -> None:
+        self.errors = self.dropped = 0
+        self._bus, self._fd = bus, fd
 
     def send(self, can_id: int, data: bytes) -> None:
         """Send one frame; raises BusFault where python-can does."""
+        fd = self._fd
+        message = can.Message(arbitration_id=can_id, data=data, is_extended_id=False, is_fd=fd, bitrate_switch=fd)
         try:
-            self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+            self._bus.send(message)
         except (can.CanError, OSError) as error:
             raise BusFault(f"bus {self._bus.channel_info}: cannot send: {error}") from None
+
+    def send_all(self, frames: Sequence[Frame]) -> None:
+        """Send the frames in this order; raises BusFault as send."""
+        for can_id, data in frames:
+            self.send(can_id, data)
 
     def receive(self, timeout: float) -> Frame | None:
         """The next data frame with an 11-bit identifier, or None after `timeout` seconds."""
@@ -126,3 +103,56 @@ class MessagePort:
                 self.errors += 1
             elif not (message.is_extended_id or message.is_remote_frame):
                 return message.arbitration_id, bytes(message.data)
+
+
+class GroupPort:
+    """Several buses as one: a frame goes to the bus of its node, one for no node or for all of them to every bus."""
+
+    def __init__(self, group: Any) -> None:
+        """Take `group.members` (python-can buses) and `group.route` (node id → index of its bus)."""
+        self._ports = tuple(open_port(bus) for bus in group.members)
+        self._of_node: dict[int, Port] = {node: self._ports[index] for node, index in group.route.items()}
+        self._numbers = [port.fileno() for port in self._ports if hasattr(port, "fileno")]
+
+    @property
+    def errors(self) -> int:
+        """Error frames so far, of all buses."""
+        return sum(port.errors for port in self._ports)
+
+    @property
+    def dropped(self) -> int:
+        """Frames lost so far, of all buses."""
+        return sum(port.dropped for port in self._ports)
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Send one frame to the bus of its node, else to every bus; raises BusFault."""
+        port = self._of_node.get(can_id & 0x7F)
+        for each in self._ports if port is None else (port,):
+            each.send(can_id, data)
+
+    def send_all(self, frames: Sequence[Frame]) -> None:
+        """Send the frames in this order, bus by bus; raises BusFault."""
+        for port in self._ports:
+            port.send_all([frame for frame in frames if self._of_node.get(frame[0] & 0x7F, port) is port])
+
+    def receive(self, timeout: float) -> Frame | None:
+        """The next frame of any bus, or None after `timeout` seconds."""
+        frame = self._poll(0.0)
+        if frame is not None or timeout <= 0:
+            return frame
+        if len(self._numbers) == len(self._ports):
+            select.select(self._numbers, [], [], timeout)
+            return self._poll(0.0)
+        share = _SLICE / len(self._ports)
+        for _ in range(max(1, round(timeout / _SLICE))):
+            frame = self._poll(share)
+            if frame is not None:
+                return frame
+        return None
+
+    def _poll(self, timeout: float) -> Frame | None:
+        for port in self._ports:
+            frame = port.receive(timeout)
+            if frame is not None:
+                return frame
+        return None
