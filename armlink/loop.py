@@ -2,12 +2,14 @@
 
 import math
 import struct
+from collections import deque
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armlink import emcy, objects
+from armlink.bus_watch import MOST_FRAMES, BusWatch
 from armlink.clock import Clock
 from armlink.pdo import RPDO1, RPDO2, TPDO1, TPDO2, decoding_table
 from armlink.port import Port
@@ -21,7 +23,11 @@ COLLECT_SHARE = 0.8
 
 NO_STATUS = 0xFFFF
 """Stands for the status word of a joint that has sent none; no state of CiA 402."""
-_NOTHING = b""
+NO_MODE = 0
+"""Stands for the mode display of a joint that has sent none: no mode is active."""
+EMERGENCIES_KEPT = 64
+"""So many emergencies are kept; a storm of them costs no memory."""
+_SYNC = (objects.SYNC_ID, b"")
 _OPERATIONAL = bytes([objects.OPERATIONAL])
 
 
@@ -34,10 +40,15 @@ class Loop:
         self.nodes, self.n = nodes, len(nodes)
         self.period, self.heartbeat_cycles = period, 1
         self.stats = Stats()
-        self.emergencies: list[tuple[int, int, int]] = []
-        """(joint index, code, error register) in the order of arrival."""
+        self.emergencies: deque[tuple[int, int, int]] = deque(maxlen=EMERGENCIES_KEPT)
+        """(joint index, code, error register) in the order of arrival, the newest; resets (code 0) are not kept."""
         self.node_states: dict[int, int] = {}
-        """Joint index → NMT state of its newest heartbeat, 0 for boot-up; only those received while cycling."""
+        """Joint index → NMT state of its newest heartbeat; only those received while cycling."""
+        self.watch = BusWatch(nodes, host)
+        self.withheld: frozenset[int] = frozenset()
+        """Joints that get no RPDO1, so that their own deadline is put to the test."""
+        self.beating = True
+        """Whether the host's heartbeat is sent; not, so that the joints' watching it is put to the test."""
         self.on_other: Callable[[int, bytes], None] = lambda can_id, data: None
         """Takes frames that are no process data: SDO responses."""
         self._port, self._clock = port, clock
@@ -55,7 +66,9 @@ class Loop:
         self._motor: list[float] = [math.nan] * self.n
         self._velocity: list[float] = [math.nan] * self.n
         self._status: list[int] = [NO_STATUS] * self.n
-        self._awaited = 0
+        self.displays: list[int] = [NO_MODE] * self.n
+        """Newest mode of operation display (6061h) of each joint."""
+        self._awaited = self._counted = 0
         self.bits = 0
         """Bits that the frames so far took on the wire, with nominal stuffing."""
         self._slow_came = False
@@ -67,11 +80,15 @@ class Loop:
         """Newest position of each joint whenever it came [rad]; for the gate, never for a sample."""
         self.latest_motor_torque = [math.nan] * self.n
         """Newest torque actual value of each joint whenever it came [N·m]; for the gate, never for a sample."""
+        self.latest_velocity = [math.nan] * self.n
+        """Newest velocity of each joint whenever it came [rad/s]; for the gate, never for a sample."""
+        self.slow_seen = [-math.inf] * self.n
+        """When motor torque and velocity of each joint last came, by the clock [s]."""
         self.set_units((Units(1.0, 1.0, 1.0),) * self.n)
 
     def reset_counters(self) -> None:
         """Begin to count anew."""
-        self.stats, self.bits, self._first = Stats(), 0, None
+        self.stats, self.bits, self._first, self._counted = Stats(), 0, None, 0
 
     def set_units(self, units: tuple[Units, ...]) -> None:
         """Scales of the joints."""
@@ -99,9 +116,16 @@ class Loop:
     def drain(self) -> None:
         """Take in all that came between cycles; sensor frames among it missed their cycle and are dropped."""
         self._awaited = 0
-        while self.receive(0.0):
-            pass
+        self._take_what_is_there()
+        self.watch.cycle_ends(self.stats.frames - self._counted)
+        self._counted = self.stats.frames
         self.drop_readings()
+
+    def _take_what_is_there(self) -> None:
+        for _ in range(MOST_FRAMES):
+            if not self.receive(0.0):
+                return
+        self.watch.flooded = True
 
     def drop_readings(self) -> None:
         """Forget position and torque that came: what comes from now on belongs to the next sample."""
@@ -109,24 +133,29 @@ class Loop:
 
     def exchange(self, control: list[int], torque_wire: list[int], position_wire: list[int]) -> Sample:
         """One cycle: RPDO1 of every joint, heartbeat when due, SYNC, then the TPDOs that it brings."""
-        send, command = self.send, self._command
-        for joint, can_id in enumerate(self._command_ids):
-            send(can_id, command(control[joint], torque_wire[joint], position_wire[joint]))
-        if self.stats.cycles % self.heartbeat_cycles == 0:
-            send(self._heartbeat_id, _OPERATIONAL)
+        command = self._command
+        frames = [
+            (can_id, command(control[joint], torque_wire[joint], position_wire[joint]))
+            for joint, can_id in enumerate(self._command_ids)
+            if joint not in self.withheld
+        ]
+        if self.beating and self.stats.cycles % self.heartbeat_cycles == 0:
+            frames.append((self._heartbeat_id, _OPERATIONAL))
+        frames.append(_SYNC)
         now = self._clock.now()
         if self._first is None:
             self._first = now
         self._awaited = self.n
-        send(objects.SYNC_ID, _NOTHING)
+        self._port.send_all(frames)
+        self.stats.frames += len(frames)
+        self.bits += sum(FRAME_BITS + 8 * len(data) for _, data in frames)
         end = now + self._patience
         while self._awaited > 0:
             if not self.receive(0.0):
                 remaining = end - self._clock.now()
                 if remaining <= 0 or not self.receive(remaining):
                     break
-        while self.receive(0.0):
-            pass
+        self._take_what_is_there()
         self.stats.missed += self._awaited
         return self.sample(now)
 
@@ -155,21 +184,30 @@ class Loop:
         if len(data) != size:
             self.stats.errors += 1
         elif kind == 0:
-            self._awaited -= self._position[joint] != self._position[joint]
+            if self._position[joint] != self._position[joint]:  # NaN: the first in this cycle
+                self._awaited -= 1
+            else:
+                self.watch.again(joint)
             self._position[joint], self._torque[joint] = unpack(data)
         elif kind == 1:
             self._status[joint], self._motor[joint], self._velocity[joint] = unpack(data)
             self._slow_came = True
         else:
-            (self._status[joint],) = unpack(data)
+            self._status[joint], self.displays[joint] = unpack(data)
 
     def _take_other(self, can_id: int, data: bytes) -> None:
+        self.watch.other(can_id)
         joint = self._joint_of.get(can_id & 0x7F)
         service = can_id & 0x780
         if joint is not None and service == objects.EMCY_ID:
-            self.emergencies.append((joint, *emcy.parse(data)))
+            code, register = emcy.parse(data)
+            if code:
+                self.emergencies.append((joint, code, register))
         elif joint is not None and service == objects.HEARTBEAT_ID:
-            self.node_states[joint] = data[0] & 0x7F if data else 0
+            state = data[0] & 0x7F if data else 0
+            self.node_states[joint] = state
+            if state == 0:
+                self.watch.restarted.add(joint)
         else:
             self.on_other(can_id, data)
 
@@ -180,7 +218,9 @@ class Loop:
         if self._slow_came:
             motor = np.array(self._motor) * self._torque_unit
             velocity = np.array(self._velocity) * self._position_unit
-            self._keep(motor, self.latest_motor_torque)
+            for joint in self._keep(motor, self.latest_motor_torque):
+                self.slow_seen[joint] = now
+            self._keep(velocity, self.latest_velocity)
             self._motor, self._velocity = [math.nan] * self.n, [math.nan] * self.n
             self._slow_came = False
         else:

@@ -60,7 +60,7 @@ TPDO2 = Pdo(
     (objects.STATUS_WORD, objects.MOTOR_TORQUE, objects.VELOCITY),
     STATUS_DECIMATION,
 )
-TPDO3 = Pdo("TPDO3", 0x380, 0x1802, 0x1A02, (objects.STATUS_WORD,), EVENT_TYPE)
+TPDO3 = Pdo("TPDO3", 0x380, 0x1802, 0x1A02, (objects.STATUS_WORD, objects.MODE_DISPLAY), EVENT_TYPE)
 LINK_PDOS = (RPDO1, RPDO2, TPDO1, TPDO2, TPDO3)
 
 Write = Callable[[Entry, int], None]

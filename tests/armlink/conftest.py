@@ -35,6 +35,8 @@ class FakeNode:
         self.syncs = 0
         self.silent = self.no_tpdo = False
         self.mapping_lies = False
+        self.modes = (8, 10)  # those that it enters when told to
+        self.display = self.shown = 0
         self.commands = []
         u32 = struct.Struct("<I").pack
         self.values |= {
@@ -63,6 +65,7 @@ class FakeNode:
         if command == 0x40:
             dynamic = {
                 (0x6041, 0): struct.pack("<H", self.status),
+                (0x6061, 0): struct.pack("<b", self.display),
                 (0x6064, 0): struct.pack("<i", self.position),
                 (0x6077, 0): struct.pack("<h", self.motor),
             }
@@ -143,6 +146,8 @@ class FakeBus:
             node.control = struct.unpack("<Hhi", data)
         elif can_id & 0x780 == 0x300:
             node.mode = data[0]
+            if node.mode in node.modes:
+                node.display = node.mode
 
     def _sync(self, node):
         if node.silent or not node.operational:
@@ -154,8 +159,9 @@ class FakeBus:
         self.out.append((0x180 + node.node, struct.pack("<ii", node.position, node.torque)))
         if node.syncs % 4 == 0:
             self.out.append((0x280 + node.node, struct.pack("<Hhi", node.status, node.motor, 0)))
-        if changed:
-            self.out.append((0x380 + node.node, struct.pack("<H", node.status)))
+        if changed or node.shown != node.display:
+            node.shown = node.display
+            self.out.append((0x380 + node.node, struct.pack("<Hb", node.status, node.display)))
 
     def take(self, timeout=0.0):
         if not self.out and timeout > 0:

@@ -58,7 +58,7 @@ def test_pdo_layouts_are_packed_little_endian():
     assert pdo.RPDO1.layout.pack(0x000F, -100, 0x01020304) == bytes.fromhex("0f009cff04030201")
     assert pdo.TPDO1.layout.unpack(bytes.fromhex("0400000000 f0ffff".replace(" ", ""))) == (4, -4096)
     assert pdo.TPDO2.layout.unpack(bytes.fromhex("2712ceff10000000")) == (0x1227, -50, 16)
-    assert pdo.TPDO3.layout.size == 2
+    assert pdo.TPDO3.layout.size == 3
     assert pdo.RPDO2.layout.size == 1
 
 
