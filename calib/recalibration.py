@@ -1,6 +1,6 @@
 """Recalibration: from a finding of the observer to a new record, and from a record to the controllers."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import numpy as np
@@ -126,27 +126,61 @@ class Recalibrator:
         self._reference = self._swept(current)
 
     def handle(self, finding: Finding) -> Recalibration | None:
-        """Make of a finding what the policy says; None under observe.
-
-        Under apply the record is kept first, then written to the controller, then made current: a crash in between
-        leaves a record that was never current, never a controller that holds an unknown pair. Raises Refused where
-        the change is implausible or the controller does not hold what the current record says.
-        """
+        """Make of a finding what the policy says; None under observe. Raises Refused, as propose and apply do."""
         if self._policy == "observe":
             return None
-        j = finding.joint
-        held = require_installed(self.record, self._controllers, j)
         apply = self._policy == "apply"
-        new = recalibrated(self.record, self._arm, finding, held.gain, APPLIED_BY if apply else None)
+        proposed = self.propose(finding, by=APPLIED_BY if apply else None)
+        if not apply:
+            return proposed
+        self.apply(proposed.record, finding.joint, by=APPLIED_BY)
+        return replace(proposed, applied=True)
+
+    def propose(self, finding: Finding, by: str | None = None, ask: bool = True) -> Recalibration:
+        """Keep the record that a finding leads to, current nowhere yet; `by` is who confirms it, if anybody does.
+
+        With `ask` the controller is asked what it holds; without, it is taken to hold the current record. Raises
+        Refused where the change is implausible, or the controller does not hold what the current record says.
+        """
+        j = finding.joint
+        held = require_installed(self.record, self._controllers, j).gain if ask else 1.0
+        new = recalibrated(self.record, self._arm, finding, held, by)
         check_plausible(new, self._reference, j, self._arm.require_link().joints[j].rated_torque, self._bounds)
-        gain = float(new.values("gain", missing=held.gain)[j])
+        gain = float(new.values("gain", missing=held)[j])
         offset = float(new.values("offset")[j])
         self._store.add(new)
-        if apply:
-            self._controllers.write_calibration(j, gain, offset, new.number)
-            self._store.activate(new.id, self._arm, by=APPLIED_BY, reason=new.note)
-            self.record = new
-        return Recalibration(new.joints[j].name, new, gain, offset, apply)
+        return Recalibration(new.joints[j].name, new, gain, offset, False)
+
+    def apply(self, new: CalibrationRecord, j: int, by: str) -> None:
+        """Write joint j of a kept record to its controller and make the record current.
+
+        In this order, so that a crash in between leaves a controller that holds a kept record, never an unknown pair.
+        Raises Refused where the record does not follow from the current one or the controller holds something else,
+        BusFault.
+        """
+        if new.parent != self.record.id:
+            raise Refused(f"record {new.id} follows from {new.parent}, but {self.record.id} is current: superseded")
+        held = require_installed(self.record, self._controllers, j)
+        gain = float(new.values("gain", missing=held.gain)[j])
+        self._controllers.write_calibration(j, gain, float(new.values("offset")[j]), new.number)
+        self._store.activate(new.id, self._arm, by=by, reason=new.note)
+        self.record = new
+
+    def roll_back(self, j: int, by: str, reason: str) -> CalibrationRecord:
+        """Go back to the record before the current one: joint j's pair written, the record made current, returned.
+
+        Raises Refused where the current record has no parent, BusFault.
+        """
+        if self.record.parent is None:
+            raise Refused(f"record {self.record.id} has none before it to go back to")
+        parent = self._store.get(self.record.parent)
+        assert isinstance(parent, CalibrationRecord)
+        held = require_installed(self.record, self._controllers, j)
+        gain = float(parent.values("gain", missing=held.gain)[j])
+        self._controllers.write_calibration(j, gain, float(parent.values("offset")[j]), parent.number)
+        self._store.rollback(self._arm, parent.id, by=by, reason=reason)
+        self.record = parent
+        return parent
 
     def _swept(self, record: CalibrationRecord) -> CalibrationRecord:
         """The last record of this line that the observer did not make: what drift is bounded against."""
