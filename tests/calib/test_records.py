@@ -14,8 +14,9 @@ from pydantic import ValidationError
 
 from armlink.armfile import ArmFile, parse_arm
 from armlink.errors import BadInput, Refused
+from calib.database import default_url
 from calib.records import CalibrationRecord, GravityRecord, JointCalibration, matrix, parse_record, provenance
-from calib.store import RecordStore, default_url, export_yaml
+from calib.store import RecordStore, export_yaml
 
 WHEN = datetime(2026, 11, 21, 2, 0, tzinfo=UTC)
 
@@ -199,13 +200,15 @@ def test_a_process_killed_while_it_writes_leaves_whole_records(tmp_path: Path) -
     """SIGKILL inside the transaction: the record before stands, the one begun is gone."""
     script = (
         "import os, signal, sys, test_records as t\n"
-        "from calib.store import RecordStore, _RECORDS\n"
+        "from calib.database import transaction\n"
+        "from calib.schema import RECORDS\n"
+        "from calib.store import RecordStore\n"
         "store = RecordStore(sys.argv[1])\n"
         "store.put(t.calibration(), t.ARM, by='ann', reason='sweep')\n"
-        "with store._write() as connection:\n"
+        "with transaction(store._engine) as connection:\n"
         "    record = t.calibration(1.05)\n"
         "    row = dict(id=record.id, kind=record.kind, arm='bench', serial='7', created='', body='half')\n"
-        "    connection.execute(_RECORDS.insert().values(row))\n"
+        "    connection.execute(RECORDS.insert().values(row))\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     path = str(tmp_path / "records.db")
