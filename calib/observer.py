@@ -50,17 +50,17 @@ class Observer:
         self.rows = 0
         self.held = False
         """Whether an alarm stands: estimates are held until a verdict."""
-        self._rest = RestDetector(arm.n, self.config)
-        self._filter = SensorFilter(arm.n, self.config)
-        self._cusum = Cusum(arm.n, self.config)
-        self._places = Places(arm.n, self.config.place_size, self.config.places, self.config.place_memory)
-        self._window: list[Row] = []
-        self._fresh = self._repeated = 0
-        self._doubtful = False
-        self._first: _Agreeing | None = None
-        self._said: tuple[str, tuple[int, ...]] | None = None
-        self._reasons: tuple[str, ...] = ()
-        self._learnt = 0
+        self.rest = RestDetector(arm.n, self.config)
+        self.filter = SensorFilter(arm.n, self.config)
+        self.cusum = Cusum(arm.n, self.config)
+        self.places = Places(arm.n, self.config.place_size, self.config.places, self.config.place_memory)
+        self.window: list[Row] = []
+        self.fresh = self.repeated = 0
+        self.doubtful = False
+        self.first: Agreeing | None = None
+        self.said: tuple[str, tuple[int, ...]] | None = None
+        self.reasons: tuple[str, ...] = ()
+        self.learnt = 0
         self._proposed = np.full(arm.n, -np.inf)
 
     @classmethod
@@ -80,7 +80,7 @@ class Observer:
 
     def handle(self, t: float, position: Array, torque: Array) -> list[Event]:
         """Take one sample: readings (n,) in SI units, NaN where missing; returns what there is to say, if anything."""
-        row = self._rest.handle(t, position, torque)
+        row = self.rest.handle(t, position, torque)
         return [] if row is None else self.handle_row(row)
 
     def handle_row(self, row: Row) -> list[Event]:
@@ -97,24 +97,24 @@ class Observer:
             return events
         if not self._is_new(row):
             return self._repeat(row.t)
-        self._window.append(row)
-        self._fresh += 1
-        if self._fresh < (self.config.window if self.held else self.config.audit_rows):
+        self.window.append(row)
+        self.fresh += 1
+        if self.fresh < (self.config.window if self.held else self.config.audit_rows):
             return []
-        self._fresh = 0
+        self.fresh = 0
         return self._test(row.t) if self.held else self._audit(row.t)
 
     def estimate(self) -> Estimate:
         """Gain and offset of every joint against the installed calibration, as known now."""
-        gain_std, offset_std = np.sqrt(np.diagonal(self._filter.covariance, axis1=1, axis2=2)).T
-        gain, offset = self._filter.state.T.copy()
-        return Estimate(gain, gain_std, offset, offset_std, self._filter.accepted.copy())
+        gain_std, offset_std = np.sqrt(np.diagonal(self.filter.covariance, axis1=1, axis2=2)).T
+        gain, offset = self.filter.state.T.copy()
+        return Estimate(gain, gain_std, offset, offset_std, self.filter.accepted.copy())
 
     def install(self, finding: Finding) -> None:
         """The finding was written to the controller: from now on readings are right again, as far as it was known."""
         floor = np.diag([self.config.drift_gain**2, self.config.drift_offset**2])
-        self._filter.restart(finding.joint, covariance=finding.covariance + floor)
-        self._places.forget()
+        self.filter.restart(finding.joint, covariance=finding.covariance + floor)
+        self.places.forget()
         self._resume()
 
     def _watch(self, row: Row) -> list[Event]:
@@ -122,26 +122,26 @@ class Observer:
         q, noise = row.position, self.sigma**2
         torque = self.belief.torque(q[None])[0]
         of_model = self.belief.torque_variance(q, self.config.position_std)
-        expected, left = self._places.expected(q, of_model, noise)
-        alarms = self._cusum.handle(row.torque - torque - expected, torque, noise + left)
+        expected, left = self.places.expected(q, of_model, noise)
+        alarms = self.cusum.handle(row.torque - torque - expected, torque, noise + left)
         if alarms:
             return [self._event(row.t, "alarm", joint, channel=channel) for joint, channel in alarms]
-        if self._places.seen(q) < self.config.place_rows:
-            self._filter.handle(row.torque, torque, noise + of_model)
-        self._places.add(q, row.torque - torque)
-        over = np.flatnonzero(self._filter.rejected >= self.config.outliers_in_a_row)
+        if self.places.seen(q) < self.config.place_rows:
+            self.filter.handle(row.torque, torque, noise + of_model)
+        self.places.add(q, row.torque - torque)
+        over = np.flatnonzero(self.filter.rejected >= self.config.outliers_in_a_row)
         return [self._event(row.t, "outliers", int(joint), rows=self.config.outliers_in_a_row) for joint in over]
 
     def _audit(self, t: float) -> list[Event]:
         """No alarm stands: test the last rows all the same, for what is too small or too slow for an alarm."""
-        del self._window[: -self.config.longest_window]
-        verdict = self._cause_test(self._window).verdict()
+        del self.window[: -self.config.longest_window]
+        verdict = self.cause_test(self.window).verdict()
         if verdict.cause == "none":
-            if self._learnt < self.config.baseline_rows:
-                window = _window(self._window[-self.config.audit_rows :])
+            if self.learnt < self.config.baseline_rows:
+                window = _window(self.window[-self.config.audit_rows :])
                 self.belief.learn(window.position, window.torque, self.sigma)
-                self._places.forget()
-                self._learnt += self.config.audit_rows
+                self.places.forget()
+                self.learnt += self.config.audit_rows
             return []
         if verdict.cause in ("unknown", "ambiguous"):
             return []  # an alarm will come if it lasts
@@ -150,36 +150,36 @@ class Observer:
 
     def _test(self, t: float) -> list[Event]:
         """An alarm stands and its window is full: say what it was, and propose where two windows agree on a drift."""
-        test = self._cause_test(self._window)
+        test = self.cause_test(self.window)
         verdict = test.verdict()
-        if verdict.cause == "ambiguous" and len(self._window) < self.config.longest_window:
+        if verdict.cause == "ambiguous" and len(self.window) < self.config.longest_window:
             return []  # more rows may tell
-        window, self._window = self._window, []
-        doubted, self._doubtful = self._doubtful, verdict.cause == "unknown"
-        if self._doubtful and not doubted:
+        window, self.window = self.window, []
+        doubted, self.doubtful = self.doubtful, verdict.cause == "unknown"
+        if self.doubtful and not doubted:
             return []  # the cause may have changed within this window: one more
         if verdict.cause == "none":
             self._resume()
             return [self._event(t, "verdict", verdict.joint, **verdict_evidence(verdict, self.arm.names))]
         if not verdict.is_drift:
-            self._first = None
+            self.first = None
             return self._say(t, verdict)
         return self._say(t, verdict) + self._confirm(t, window, test, verdict)
 
     def _confirm(self, t: float, window: list[Row], test: CauseTest, verdict: Verdict) -> list[Event]:
         """A window says drift: once another one before it agrees, decide on the rows of all that agree."""
-        first, self._first = self._first, _Agreeing(window, test, frozenset(verdict.joints))
+        first, self.first = self.first, Agreeing(window, test, frozenset(verdict.joints))
         for joint in verdict.joints:
             change, covariance = test.drift(joint, verdict.cause, verdict.other(joint))
-            self._filter.restart(joint, 1 + change[0], change[1], covariance)
-        if first is None or first.joints != self._first.joints:
+            self.filter.restart(joint, 1 + change[0], change[1], covariance)
+        if first is None or first.joints != self.first.joints:
             return []
         for joint in verdict.joints:
             if not agreed(first.test, test, joint, verdict.other(joint), self.config.agreement):
                 return self._undecided(t, joint, "two windows disagree: still drifting")
         rows = (first.rows + window)[-self.config.longest_window :]
-        together = self._cause_test(rows)
-        self._first = _Agreeing(rows, together, first.joints)
+        together = self.cause_test(rows)
+        self.first = Agreeing(rows, together, first.joints)
         verdict = together.verdict()
         if not verdict.is_drift or frozenset(verdict.joints) != first.joints:
             return self._undecided(t, None, "all windows together say something else")
@@ -188,7 +188,7 @@ class Observer:
     def _decide(self, t: float, test: CauseTest, verdict: Verdict, joint: int) -> list[Event]:
         """The estimate from all rows that agree, as a proposal or with what forbids it."""
         finding = decide(test, verdict, joint, self.config)
-        self._filter.restart(joint, finding.gain, finding.offset, finding.covariance)
+        self.filter.restart(joint, finding.gain, finding.offset, finding.covariance)
         if finding.refused:
             return self._undecided(t, joint, *finding.refused)
         if t - self._proposed[joint] < self.config.rest_between_writes:
@@ -198,7 +198,8 @@ class Observer:
         evidence = {"gain": finding.gain, "offset": finding.offset, **std, "rows": finding.rows}
         return [replace(self._event(t, "proposal", joint, **evidence), finding=finding)]
 
-    def _cause_test(self, rows: list[Row]) -> CauseTest:
+    def cause_test(self, rows: list[Row]) -> CauseTest:
+        """The cause test of these rows, by what is believed now."""
         return CauseTest(self.belief, _window(rows), self.sigma, self.config)
 
     def _start_test(self) -> None:
@@ -208,36 +209,36 @@ class Observer:
     def _resume(self) -> None:
         self._clear()
         self.held = False
-        self._cusum.reset()
+        self.cusum.reset()
 
     def _clear(self) -> None:
-        self._said, self._first, self._doubtful, self._reasons = None, None, False, ()
-        self._window, self._fresh, self._repeated = [], 0, 0
+        self.said, self.first, self.doubtful, self.reasons = None, None, False, ()
+        self.window, self.fresh, self.repeated = [], 0, 0
 
     def _is_new(self, row: Row) -> bool:
         """Whether the window has few enough rows of this place that one more would not only wind it up."""
-        away = [np.abs(kept.position - row.position).max() for kept in self._window]
+        away = [np.abs(kept.position - row.position).max() for kept in self.window]
         return sum(bool(far < self.config.place_size) for far in away) < self.config.place_rows
 
     def _repeat(self, t: float) -> list[Event]:
         """One more row of a place that the window knows: too many of them under an alarm, and no test is possible."""
-        self._repeated += self.held
-        if self._repeated < self.config.patience:
+        self.repeated += self.held
+        if self.repeated < self.config.patience:
             return []
         self._clear()
         return self._undecided(t, None, "too few different poses to tell a cause: sweep, or move more")
 
     def _undecided(self, t: float, joint: int | None, *reasons: str) -> list[Event]:
         """Why nothing is proposed, once as long as it stays the same."""
-        before, self._reasons = self._reasons, reasons
+        before, self.reasons = self.reasons, reasons
         return [] if before == reasons else [self._event(t, "undecided", joint, reasons=list(reasons))]
 
     def _say(self, t: float, verdict: Verdict) -> list[Event]:
         """The verdict's event, once as long as it stays the same."""
-        said, self._said = self._said, (verdict.cause, verdict.joints)
+        said, self.said = self.said, (verdict.cause, verdict.joints)
         return (
             []
-            if said == self._said
+            if said == self.said
             else [self._event(t, "verdict", verdict.joint, **verdict_evidence(verdict, self.arm.names))]
         )
 
@@ -246,7 +247,7 @@ class Observer:
 
 
 @dataclass(frozen=True)
-class _Agreeing:
+class Agreeing:
     """Rows that agree on a drift of these joints."""
 
     rows: list[Row]

@@ -32,8 +32,8 @@ class RestDetector:
         self._config = config
         self._anchor = np.full(n, np.nan)
         self._since, self._last = -np.inf, -np.inf
-        self._left = np.full(n, np.nan)
-        self._direction = np.zeros(n)
+        self.left = np.full(n, np.nan)
+        self.direction = np.zeros(n)
         self._samples: list[tuple[float, Array, Array]] = []
         self._done = False
 
@@ -56,10 +56,10 @@ class RestDetector:
     def _restart(self, t: float, position: Array, moved: bool) -> None:
         if moved:
             step = position - self._anchor
-            self._direction = np.where(np.abs(step) > self._config.still_band / 2, np.sign(step), self._direction)
+            self.direction = np.where(np.abs(step) > self._config.still_band / 2, np.sign(step), self.direction)
         self._anchor, self._since = position.copy(), t
         self._samples.clear()
-        away = np.abs(position - self._left).max()
+        away = np.abs(position - self.left).max()
         self._done = self._done and bool(away < self._config.new_pose)
 
     def _complete(self) -> Row:
@@ -68,5 +68,5 @@ class RestDetector:
         half = len(times) // 2
         noise = (torques[:half].mean(axis=0) - torques[half:].mean(axis=0)) / 2
         here: Array = positions.mean(axis=0)
-        self._left, self._done = here, True
-        return Row(float(times.mean()), here, torques.mean(axis=0), self._direction, noise)
+        self.left, self._done = here, True
+        return Row(float(times.mean()), here, torques.mean(axis=0), self.direction, noise)

@@ -25,13 +25,13 @@ class SensorFilter:
         self.accepted = np.zeros(n, dtype=int)
         self.rejected = np.zeros(n, dtype=int)
         """Rows rejected in a row."""
-        self._recent: deque[Array] = deque(maxlen=config.excitation_rows)
+        self.recent: deque[Array] = deque(maxlen=config.excitation_rows)
 
     def handle(self, reading: Array, torque: Array, variance: Array) -> None:
         """One row: reading and model torque (n,) [N·m], variance of their difference (n,)."""
         config = self._config
-        self._recent.append(torque)
-        spread = len(self._recent) * np.var(np.array(self._recent), axis=0)
+        self.recent.append(torque)
+        spread = len(self.recent) * np.var(np.array(self.recent), axis=0)
         excited = spread * config.excitation_std**2 >= variance
         for j in range(len(self.state)):
             self._update(j, reading[j], np.array([torque[j], 1.0]), variance[j], bool(excited[j]))

@@ -39,7 +39,7 @@ class DaemonSection(Section):
     work: bool = False
     """Whether the daemon, where it drives the bus, moves the arm among random poses: a stand-in for ordinary work."""
     recording: RecordingSettings = RecordingSettings()
-    observer: dict[str, FiniteFloat] = {}
+    observer: dict[str, FiniteFloat] = Field(default_factory=dict)
     """Thresholds of the observer (calib/observer_config.py) that differ from their defaults."""
 
     @field_validator("observer")

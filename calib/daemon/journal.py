@@ -1,0 +1,242 @@
+"""The daemon's journal: events, estimates over time, proposals, decisions, the observer's belief; one SQLite file.
+
+Events, proposals and decisions are append-only (SQLite itself refuses changes). What belongs together is one
+transaction: a kill at any moment leaves all of it or none.
+"""
+
+import json
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from armlink.errors import BadInput
+
+SCHEMA = 1
+_TABLES = """
+CREATE TABLE IF NOT EXISTS events (
+    id INTEGER PRIMARY KEY AUTOINCREMENT, time TEXT NOT NULL, t REAL NOT NULL, kind TEXT NOT NULL, joint TEXT,
+    text TEXT NOT NULL, evidence TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS proposals (
+    id INTEGER PRIMARY KEY AUTOINCREMENT, time TEXT NOT NULL, joint TEXT NOT NULL, record TEXT NOT NULL,
+    base TEXT NOT NULL, finding TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS decisions (
+    id INTEGER PRIMARY KEY AUTOINCREMENT, proposal INTEGER NOT NULL REFERENCES proposals(id), time TEXT NOT NULL,
+    state TEXT NOT NULL, by TEXT NOT NULL, note TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS history (
+    id INTEGER PRIMARY KEY AUTOINCREMENT, time TEXT NOT NULL, t REAL NOT NULL, record TEXT, estimate TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS belief (
+    one INTEGER PRIMARY KEY CHECK (one = 1), time TEXT NOT NULL, calibration TEXT, gravity TEXT, state TEXT NOT NULL);
+CREATE INDEX IF NOT EXISTS history_time ON history(time);
+CREATE INDEX IF NOT EXISTS decisions_proposal ON decisions(proposal);
+"""
+_APPEND_ONLY = ("events", "proposals", "decisions")
+
+
+@dataclass(frozen=True)
+class ProposalRow:
+    """A proposal with the newest decision on it."""
+
+    id: int
+    time: datetime
+    joint: str
+    record: str
+    base: str
+    finding: dict[str, Any]
+    state: str
+    by: str | None
+    decided: datetime | None
+    note: str
+
+
+@dataclass(frozen=True)
+class Belief:
+    """The observer's state as it was saved, and the records that it was relative to."""
+
+    calibration: str | None
+    gravity: str | None
+    state: dict[str, Any]
+
+
+class Journal:
+    """One process writes it; any other may read it. Raises sqlite3.Error where the disk fails."""
+
+    def __init__(self, path: Path) -> None:
+        """Open or make it; raises BadInput where that cannot be."""
+        self.path = path
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._db = sqlite3.connect(path, isolation_level=None, timeout=10.0)
+            for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON"):
+                self._db.execute(f"PRAGMA {pragma}")
+            version = self._db.execute("PRAGMA user_version").fetchone()[0]
+            if version not in (0, SCHEMA):
+                raise BadInput(f"{path}: journal of schema {version}, this program has {SCHEMA}: use its own version")
+            with self.transaction():
+                for statement in filter(str.strip, _TABLES.split(";")):
+                    self._db.execute(statement)
+                for table in _APPEND_ONLY:
+                    for change in ("UPDATE", "DELETE"):
+                        self._db.execute(
+                            f"CREATE TRIGGER IF NOT EXISTS {table}_no_{change.lower()} BEFORE {change} ON {table} "
+                            f"BEGIN SELECT RAISE(ABORT, '{table} is append-only'); END"
+                        )
+                self._db.execute(f"PRAGMA user_version={SCHEMA}")
+        except (sqlite3.Error, OSError) as error:
+            raise BadInput(f"{path}: the journal cannot be opened: {error}") from None
+
+    def close(self) -> None:
+        """Close the file."""
+        self._db.close()
+
+    @contextmanager
+    def transaction(self) -> Iterator[None]:
+        """Everything inside is on disk at its end, or nothing is; transactions may stand inside one another."""
+        if self._db.in_transaction:
+            yield
+            return
+        self._db.execute("BEGIN IMMEDIATE")
+        try:
+            yield
+        except BaseException:
+            self._db.execute("ROLLBACK")
+            raise
+        self._db.execute("COMMIT")
+
+    # ---- events
+
+    def add_event(
+        self, time: datetime, t: float, kind: str, joint: str | None, text: str, evidence: dict[str, Any]
+    ) -> int:
+        """Append an event and return its id."""
+        row = (_iso(time), t, kind, joint, text, json.dumps(evidence))
+        with self.transaction():
+            cursor = self._db.execute(
+                "INSERT INTO events(time, t, kind, joint, text, evidence) VALUES (?, ?, ?, ?, ?, ?)", row
+            )
+        assert cursor.lastrowid is not None
+        return cursor.lastrowid
+
+    def events(self, after: int = 0, limit: int = 500) -> list[dict[str, Any]]:
+        """Events with a larger id, oldest first."""
+        rows = self._db.execute(
+            "SELECT id, time, t, kind, joint, text, evidence FROM events WHERE id > ? ORDER BY id LIMIT ?",
+            (max(-(2**63), min(after, 2**63 - 1)), limit),
+        )
+        names = ("id", "time", "t", "kind", "joint", "text", "evidence")
+        return [dict(zip(names, (*row[:6], json.loads(row[6])), strict=True)) for row in rows]
+
+    @property
+    def last_event(self) -> int:
+        """Id of the newest event, 0 where there is none."""
+        return int(self._db.execute("SELECT COALESCE(MAX(id), 0) FROM events").fetchone()[0])
+
+    # ---- proposals
+
+    def add_proposal(self, time: datetime, joint: str, record: str, base: str, finding: dict[str, Any]) -> int:
+        """Append a proposal, pending, and return its id; earlier pending ones of the joint are superseded."""
+        with self.transaction():
+            for earlier in self.proposals():
+                if earlier.joint == joint and earlier.state == "pending":
+                    self.decide(earlier.id, time, "superseded", "daemon", "a newer proposal")
+            cursor = self._db.execute(
+                "INSERT INTO proposals(time, joint, record, base, finding) VALUES (?, ?, ?, ?, ?)",
+                (_iso(time), joint, record, base, json.dumps(finding)),
+            )
+        assert cursor.lastrowid is not None
+        return cursor.lastrowid
+
+    def decide(self, proposal: int, time: datetime, state: str, by: str, note: str = "") -> None:
+        """Append a decision: the newest one is the proposal's state."""
+        with self.transaction():
+            self._db.execute(
+                "INSERT INTO decisions(proposal, time, state, by, note) VALUES (?, ?, ?, ?, ?)",
+                (proposal, _iso(time), state, by, note),
+            )
+
+    def proposals(self, limit: int = 200) -> list[ProposalRow]:
+        """Newest first."""
+        return [_proposal(row) for row in self._db.execute(_PROPOSALS + " ORDER BY p.id DESC LIMIT ?", (limit,))]
+
+    def proposal(self, number: int) -> ProposalRow | None:
+        """The proposal of that id."""
+        if not 0 < number < 2**63:
+            return None
+        row = self._db.execute(_PROPOSALS + " WHERE p.id = ?", (number,)).fetchone()
+        return None if row is None else _proposal(row)
+
+    # ---- belief and history
+
+    def save_belief(self, time: datetime, calibration: str | None, gravity: str | None, state: dict[str, Any]) -> None:
+        """Replace what is kept of the observer, whole or not at all."""
+        with self.transaction():
+            self._db.execute(
+                "INSERT OR REPLACE INTO belief(one, time, calibration, gravity, state) VALUES (1, ?, ?, ?, ?)",
+                (_iso(time), calibration, gravity, json.dumps(state)),
+            )
+
+    def belief(self) -> Belief | None:
+        """What was kept of the observer, None where nothing was or it cannot be read."""
+        row = self._db.execute("SELECT calibration, gravity, state FROM belief").fetchone()
+        try:
+            return None if row is None else Belief(row[0], row[1], json.loads(row[2]))
+        except ValueError:
+            return None
+
+    def add_history(self, time: datetime, t: float, record: str | None, estimate: dict[str, Any]) -> None:
+        """Append the estimates of all joints."""
+        with self.transaction():
+            self._db.execute(
+                "INSERT INTO history(time, t, record, estimate) VALUES (?, ?, ?, ?)",
+                (_iso(time), t, record, json.dumps(estimate)),
+            )
+
+    def history(
+        self, since: datetime | None, until: datetime | None, most: int
+    ) -> list[tuple[datetime, float, str | None, dict[str, Any]]]:
+        """Estimates of a time span, oldest first, thinned evenly to at most `most`; the newest is always there."""
+        span = (_iso(since) if since else "", _iso(until) if until else "9999")
+        ids = [
+            row[0] for row in self._db.execute("SELECT id FROM history WHERE time >= ? AND time <= ? ORDER BY id", span)
+        ]
+        step = -(-len(ids) // max(most, 1)) if ids else 1
+        found = []
+        for wanted in reversed(ids[::-1][::step]):
+            row = self._db.execute("SELECT time, t, record, estimate FROM history WHERE id = ?", (wanted,)).fetchone()
+            found.append((datetime.fromisoformat(row[0]), row[1], row[2], json.loads(row[3])))
+        return found
+
+    def thin_history(self, before: datetime, keep_every: int) -> None:
+        """Of the estimates before a time keep one in `keep_every`."""
+        with self.transaction():
+            self._db.execute("DELETE FROM history WHERE time < ? AND id % ? != 0", (_iso(before), keep_every))
+
+
+_PROPOSALS = (
+    "SELECT p.id, p.time, p.joint, p.record, p.base, p.finding, d.state, d.by, d.time, d.note FROM proposals p "
+    "LEFT JOIN decisions d ON d.id = (SELECT MAX(id) FROM decisions WHERE proposal = p.id)"
+)
+
+
+def _proposal(row: tuple[Any, ...]) -> ProposalRow:
+    number, opened, joint, record, base, finding, state, by, decided, note = row
+    return ProposalRow(
+        id=number,
+        time=datetime.fromisoformat(opened),
+        joint=joint,
+        record=record,
+        base=base,
+        finding=json.loads(finding),
+        state=state or "pending",
+        by=by,
+        decided=None if decided is None else datetime.fromisoformat(decided),
+        note=note or "",
+    )
+
+
+def _iso(time: datetime) -> str:
+    """UTC with microseconds: sorts as text."""
+    return time.astimezone(UTC).isoformat(timespec="microseconds")
