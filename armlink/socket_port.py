@@ -73,7 +73,7 @@ class SocketPort:
         """Frames that the receive queue lost because they were not read in time (SO_RXQ_OVFL)."""
         self._name = bus.channel_info
         self._socket: socket.socket = bus.socket
-        self._number = self._socket.fileno()
+        self._number: int = self._socket.fileno()
         self._layout, self._flags = (_FD, _FD_FLAGS) if fd else (_CLASSIC, 0)
         self._out, self._in = _Batch(self._layout.size), _Batch(self._layout.size)
         self._received = memoryview(self._in.frames)
