@@ -173,11 +173,16 @@ class RecordStore:
 
         Raises BadInput where the file is no record or was changed, Refused where it is of another arm.
         """
-        try:
-            content: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            raise BadInput(f"{path}: cannot be read as YAML: {first_line(error)}") from None
-        return self.add(parse_record(content, str(path)).require(arm))
+        return self.add(load_yaml(path).require(arm))
+
+
+def load_yaml(path: Path) -> AnyRecord:
+    """The record of a YAML file (as `Record.to_yaml` wrote it); raises BadInput where it is none or was changed."""
+    try:
+        content: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise BadInput(f"{path}: cannot be read as YAML: {first_line(error)}") from None
+    return parse_record(content, str(path))
 
 
 def export_yaml(record: Record, path: Path) -> None:

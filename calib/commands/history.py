@@ -1,10 +1,13 @@
-"""Calibration and gravity records kept for an arm, and which were current when."""
+"""Calibration and gravity records kept for an arm, and which were current when, by whom and why."""
 
-import json
+import getpass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from calib.store import Activation, ControllerWrite
 
 
 def history(
@@ -13,22 +16,34 @@ def history(
         str | None, typer.Option(help="Record store: file or database URL; default: state folder.")
     ] = None,
     record: Annotated[str | None, typer.Option(help="Show this record alone, as YAML on standard output.")] = None,
+    import_file: Annotated[
+        Path | None, typer.Option("--import", help="First add the record of this YAML file.")
+    ] = None,
+    activate: Annotated[bool, typer.Option("--activate", help="With --import: also make it the current one.")] = False,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")
     ] = None,
 ) -> None:
-    """List the records of an arm, oldest first, and the log of which was current when.
+    """List the records of an arm, oldest first, and the log of which was current when, by whom and why.
 
     Example: armlink history sarcos --json -
     """
     from armlink.armfile import load_arm
+    from armlink.commands.output import write_json
+    from armlink.errors import BadInput
     from calib.store import RecordStore
 
     arm_file, records = load_arm(arm), RecordStore(store)
+    if activate and import_file is None:
+        raise BadInput("--activate goes with --import FILE; armlink rollback makes a kept record current again")
+    if import_file is not None:
+        imported = records.import_yaml(import_file, arm_file)
+        if activate:
+            records.activate(imported, arm_file, by=getpass.getuser(), reason=f"imported from {import_file.name}")
     if record is not None:
         typer.echo(records.get(record).require(arm_file).to_yaml(), nl=False)
         return
-    log = records.activations(arm_file)
+    log, writes = records.activations(arm_file), records.writes(arm_file)
     current = {line.kind: line.record for line in log}
     rows = [
         {
@@ -40,27 +55,38 @@ def history(
             "confirmed_by": kept.confirmed_by,
             "current": current.get(kept.kind) == kept.id,
             "description_hash": kept.description_hash,
+            "sources": kept.sources,
             "note": kept.note,
         }
         for kept in records.history(arm_file)
     ]
-    _print(f"{arm_file.name} {arm_file.serial} in {records.url}", rows)
-    if json_file is not None:
-        answer = {"arm": arm_file.name, "serial": arm_file.serial, "records": rows}
-        answer["activations"] = [vars(line) for line in log]
-        text = json.dumps(answer, indent=1, ensure_ascii=False) + "\n"
-        if str(json_file) == "-":
-            typer.echo(text, nl=False)
-        else:
-            json_file.write_text(text, encoding="utf-8")
+    title = f"{arm_file.name} {arm_file.serial} in {records.url}"
+    _print(title, rows, log, writes)
+    answer = {"arm": arm_file.name, "serial": arm_file.serial, "records": rows}
+    answer["activations"] = [vars(line) for line in log]
+    answer["controller_writes"] = [vars(line) for line in writes]
+    write_json(json_file, answer)
 
 
-def _print(title: str, rows: list[dict[str, Any]]) -> None:
+def _print(title: str, rows: list[dict[str, Any]], log: "list[Activation]", writes: "list[ControllerWrite]") -> None:
     from rich.console import Console
     from rich.table import Table
 
+    console = Console(stderr=True)
+    if not rows:
+        console.print(f"{title}: no records yet")
+        return
     table = Table("", "record", "kind", "created", "replaces", "confirmed by", "note", title=title)
     for row in rows:
         shown = (row["id"], row["kind"], row["created"], row["parent"] or "", row["confirmed_by"] or "", row["note"])
         table.add_row("current" if row["current"] else "", *shown)
-    Console(stderr=True).print(table if rows else f"{title}: no records yet")
+    console.print(table)
+    lines = Table("when", "what", "record", "by", "why", title="What was current, and what was written to controllers")
+    happened = [(line.at, f"{line.kind} current", line.record, line.by, line.reason) for line in log]
+    happened += [
+        (line.at, f"controllers: {line.stage}", line.record, line.by, str(line.body.get("reason", "")))
+        for line in writes
+    ]
+    for event in sorted(happened, key=lambda each: each[0]):
+        lines.add_row(*event)
+    console.print(lines)

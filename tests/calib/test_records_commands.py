@@ -4,12 +4,13 @@ import json
 from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from armlink.armfile import load_arm
 from armlink.cli import run
-from calib.records import CalibrationRecord, JointCalibration, provenance
-from calib.store import RecordStore
+from calib.records import CalibrationRecord, JointCalibration, matrix, provenance
+from calib.store import RecordStore, export_yaml
 
 
 @pytest.fixture
@@ -84,3 +85,51 @@ def test_rollback_with_apply_writes_the_controllers_first(kept, capsys) -> None:
     assert "written to 7 controllers" in capsys.readouterr().err
     assert run(["rollback", "sarcos", "--to", second, "--store", path, "--apply", "--bus", "socketcan:no_such_bus"]) > 1
     assert [line.record for line in RecordStore(path).activations(load_arm("sarcos"))] == [first, second, first]
+
+
+def with_spread(record: CalibrationRecord, gain_std: float) -> CalibrationRecord:
+    names = tuple(f"{joint.name}.gain" for joint in record.joints)
+    return record.model_copy(update={"covariance_of": names, "covariance": matrix(np.eye(len(names)) * gain_std**2)})
+
+
+def test_diff_counts_changes_in_standard_deviations(kept, capsys) -> None:
+    """Gains 1.0 ± 0.003 and 1.1 ± 0.004: 0.1 is twenty of √(0.003² + 0.004²)."""
+    path, first, second = kept
+    store, arm = RecordStore(path), load_arm("sarcos")
+    a, b = (store.add(with_spread(store.get(each), std)) for each, std in ((first, 0.003), (second, 0.004)))
+    assert run(["diff", a, b, "--store", path, "--json", "-"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert (answer["before"]["id"], answer["after"]["id"]) == (a, b)
+    gains = [row for row in answer["changes"] if row["parameter"] == "gain"]
+    assert [row["joint"] for row in gains] == list(arm.joint_names)
+    assert [row["change"] for row in gains] == [pytest.approx(0.1)] * 7
+    assert [row["deviations"] for row in gains] == [pytest.approx(20.0)] * 7
+    offsets = [row for row in answer["changes"] if row["parameter"] == "offset"]
+    assert [(row["change"], row["deviations"]) for row in offsets] == [(0.0, None)] * 7
+
+
+def test_diff_takes_yaml_files_and_refuses_what_has_nothing_common(kept, capsys, tmp_path) -> None:
+    path, first, second = kept
+    old = RecordStore(path).get(first)
+    export_yaml(old, tmp_path / "old.yaml")
+    assert run(["diff", str(tmp_path / "old.yaml"), second, "--store", path, "--json", "-"]) == 0
+    assert json.loads(capsys.readouterr().out)["before"]["id"] == first
+    export_yaml(old.model_copy(update={"serial": "X-2"}), tmp_path / "other.yaml")
+    assert run(["diff", str(tmp_path / "other.yaml"), second, "--store", path]) == 1
+    assert "serial X-2 and" in capsys.readouterr().err
+
+
+def test_history_imports_a_record_and_says_who_made_it_current(kept, capsys, tmp_path) -> None:
+    path, first, _ = kept
+    export_yaml(RecordStore(path).get(first), tmp_path / "record.yaml")
+    other = str(tmp_path / "other.db")
+    arguments = ["history", "sarcos", "--store", other, "--import", str(tmp_path / "record.yaml")]
+    assert run([*arguments, "--json", "-"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert [(row["id"], row["current"]) for row in answer["records"]] == [(first, False)]
+    assert run([*arguments, "--activate", "--json", "-"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["records"][0]["current"]
+    assert answer["activations"][0]["reason"] == "imported from record.yaml"
+    assert answer["activations"][0]["by"]
+    assert run(["history", "sarcos", "--store", other, "--activate"]) == 2

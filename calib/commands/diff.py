@@ -1,0 +1,73 @@
+"""What changed between two records: per joint, in units and in standard deviations."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from calib.diff import Change
+    from calib.records import CalibrationRecord, GravityRecord
+    from calib.store import RecordStore
+
+STRIKING = 3.0
+"""Standard deviations from which on a change stands out in the table."""
+
+
+def diff(
+    before: Annotated[str, typer.Argument(metavar="A", help="Id of a record, or a record's YAML file.")],
+    after: Annotated[str, typer.Argument(metavar="B", help="The same: what it is compared with A.")],
+    store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")
+    ] = None,
+) -> None:
+    """Compare two calibration or two gravity records of one arm.
+
+    Example: armlink diff 1f0c9a2b 77e01d3c --json -
+    """
+    from armlink.commands.output import write_json
+    from calib.diff import differences
+    from calib.store import RecordStore
+
+    records = RecordStore(store)
+    old, new = (_record(records, each) for each in (before, after))
+    changes = differences(old, new)
+    _show(old, new, changes)
+    rows = [{**vars(each), "change": each.change, "deviations": each.deviations} for each in changes]
+    sides = {
+        side: {"id": each.id, "created": each.created.isoformat(), "sources": each.sources, "software": each.software}
+        for side, each in (("before", old), ("after", new))
+    }
+    write_json(json_file, {"schema": "armlink.diff/1", "kind": old.kind, **sides, "changes": rows})
+
+
+def _record(records: "RecordStore", given: str) -> "CalibrationRecord | GravityRecord":
+    """A record by its id, or out of a YAML file, of whatever arm."""
+    from calib.store import load_yaml
+
+    return load_yaml(Path(given)) if given.endswith((".yaml", ".yml")) else records.get(given)
+
+
+def _show(
+    old: "CalibrationRecord | GravityRecord", new: "CalibrationRecord | GravityRecord", changes: "list[Change]"
+) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    when = [f"{each.id} of {each.created:%Y-%m-%d %H:%M}" for each in (old, new)]
+    title = f"{old.arm} {old.serial}: {old.kind} {' → '.join(when)}"
+    table = Table("joint", "parameter", "unit", old.id, new.id, "change", "in std", title=title)
+    for each in changes:
+        if each.before is None and each.after is None:
+            continue
+        striking = each.deviations is not None and abs(each.deviations) >= STRIKING
+        cells = (_text(each.before, ".5f"), _text(each.after, ".5f"), _text(each.change, "+.5f"))
+        deviations = _text(each.deviations, "+.1f")
+        row = (each.joint, each.parameter.replace("_", " "), each.unit, *cells, deviations)
+        table.add_row(*row, style="bold" if striking else None)
+    Console(stderr=True).print(table)
+
+
+def _text(value: float | None, form: str) -> str:
+    return "–" if value is None else format(value, form)
