@@ -1,0 +1,1 @@
+"""The daemon's API and page: reads through `calib.daemon.view.DaemonView`, commands nothing."""

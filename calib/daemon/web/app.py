@@ -1,0 +1,99 @@
+"""The FastAPI application: routes, page, and one form of error for everything that goes wrong."""
+
+import logging
+from collections.abc import Awaitable, Callable
+from dataclasses import replace
+from importlib.metadata import version
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse, Response
+from starlette.exceptions import HTTPException
+
+from calib.daemon.view import DaemonView
+from calib.daemon.web.description import describe_wholly
+from calib.daemon.web.guard import Access, Guard
+from calib.daemon.web.metrics import metrics_text
+from calib.daemon.web.page import PageFile, page_files
+from calib.daemon.web.peer import App
+from calib.daemon.web.routes import ERRORS, api_router
+from calib.daemon.web.stream import Streams
+
+PURPOSE = "Reads what armlink knows of an arm; decides on proposed recalibrations. Commands neither torque nor motion."
+
+_log = logging.getLogger(__name__)
+
+
+def make_app(view: DaemonView, access: Access | None = None) -> tuple[App, Streams]:
+    """The guarded ASGI application on a view, and its streams (to close at the end)."""
+    streams = Streams(view)
+    files = page_files()
+    app = open_app(view, streams, files)
+    access = replace(access or Access(), open_paths=frozenset(files))
+    return Guard(app, access), streams
+
+
+def open_app(view: DaemonView, streams: Streams, files: dict[str, PageFile]) -> FastAPI:
+    """The application without the guard before it."""
+    app = FastAPI(
+        title="armlink daemon",
+        description=PURPOSE,
+        version=version("armlink"),
+        docs_url=None,
+        redoc_url=None,
+        redirect_slashes=False,
+    )
+    app.include_router(api_router(view, streams, metrics_text(view, streams)))
+    for path, file in files.items():
+        app.add_api_route(path, _sender(file), methods=["GET"], include_in_schema=False)
+    _add_error_handlers(app)
+    describe_wholly(app)
+    return app
+
+
+def _sender(file: PageFile) -> Callable[[Request], Awaitable[Response]]:
+    async def send(request: Request) -> Response:
+        headers = {"etag": file.etag, "cache-control": "no-cache"}
+        if request.headers.get("if-none-match") == file.etag:
+            return Response(status_code=304, headers=headers)
+        return Response(file.content, media_type=file.media_type, headers=headers)
+
+    return send
+
+
+def _add_error_handlers(app: FastAPI) -> None:
+    for kind, status in ERRORS.items():
+        app.add_exception_handler(kind, _as_json(status))
+    app.add_exception_handler(RequestValidationError, _bad_parameter)
+    app.add_exception_handler(HTTPException, _of_http)
+    app.add_exception_handler(Exception, _unexpected)
+
+
+def _as_json(status: int) -> Callable[[Request, Exception], Awaitable[Response]]:
+    async def answer(_: Request, error: Exception) -> Response:
+        return JSONResponse({"error": str(error)}, status)
+
+    return answer
+
+
+async def _bad_parameter(_: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"][1:]) or str(first["loc"][0])
+    if first["type"] == "json_invalid":
+        return JSONResponse({"error": "the body is not JSON"}, 422)
+    if first["type"] == "extra_forbidden":
+        return JSONResponse({"error": f"{where[:80]}: there is no parameter of that name here"}, 422)
+    given = "" if first["type"] == "missing" else f" (got {str(first.get('input'))[:80]!r})"
+    return JSONResponse({"error": f"{where}: {first['msg'].removeprefix('Value error, ')}{given}"}, 422)
+
+
+async def _of_http(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    what = {404: f"there is no {request.url.path[:200]}", 405: f"{request.method} is not possible here"}
+    return JSONResponse({"error": what.get(error.status_code, str(error.detail))}, error.status_code, error.headers)
+
+
+async def _unexpected(request: Request, error: Exception) -> Response:
+    _log.error("%s %s failed", request.method, request.url.path, exc_info=error)
+    return JSONResponse({"error": "this failed inside the daemon; its log says why"}, 500)

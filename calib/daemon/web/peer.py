@@ -1,0 +1,113 @@
+"""Who is at the other end of a connection, and uvicorn's HTTP protocol with limits on what one connection may hold."""
+
+import asyncio
+import json
+import logging
+import pwd
+import socket
+import struct
+from collections.abc import Awaitable, Callable, MutableMapping
+from dataclasses import dataclass
+from typing import Any
+
+import h11
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+Scope = MutableMapping[str, Any]
+Message = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[Message]]
+Send = Callable[[Message], Awaitable[None]]
+App = Callable[[Scope, Receive, Send], Awaitable[None]]
+
+PEER = "armlink.peer"
+"""Key of the ASGI scope that holds the Peer."""
+FIRST_REQUEST_SECONDS = 10.0
+"""A connection that has not sent a whole request head by then is closed."""
+WRITE_BUFFER = 32 * 1024
+"""Bytes that may wait in the process for one client; a stream's item is about 2 kB."""
+_UCRED = struct.Struct("3i")
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Peer:
+    """The other end of one connection."""
+
+    name: str
+    """For the audit trail: "ann (uid 1000) on the socket", "tcp 127.0.0.1"."""
+    address: str
+    """What the rate limit counts by: the address on TCP, empty on the Unix socket."""
+    tcp: bool
+    local: str = ""
+    """Our own address of this connection (TCP): a Host that is right for it."""
+    abort: Callable[[], None] = lambda: None
+    """Cuts the connection at once, unsent bytes included."""
+
+
+UNKNOWN = Peer("unknown", "unknown", tcp=True)
+"""A scope without a peer is taken for the least trusted one."""
+
+
+def peer_of(scope: Scope) -> Peer:
+    """The peer of a request."""
+    found = scope.get(PEER, UNKNOWN)
+    return found if isinstance(found, Peer) else UNKNOWN
+
+
+def describe_peer(transport: asyncio.Transport) -> Peer:
+    """Peer of an accepted connection, by SO_PEERCRED on a Unix socket, by address on TCP."""
+    sock = transport.get_extra_info("socket")
+    if sock is None or sock.family != socket.AF_UNIX:
+        address = str((transport.get_extra_info("peername") or ("unknown",))[0])
+        local = str((transport.get_extra_info("sockname") or ("",))[0])
+        return Peer(f"tcp {address}", address, tcp=True, local=local, abort=transport.abort)
+    _, uid, _ = _UCRED.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _UCRED.size))
+    return Peer(f"{_user(uid)} on the socket", "", tcp=False, abort=transport.abort)
+
+
+class BoundedProtocol(H11Protocol):
+    """uvicorn's protocol, which tells the application its peer, keeps few bytes and does not wait for ever."""
+
+    _deadline: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Note who it is and start the clock for the first request."""
+        super().connection_made(transport)
+        transport.set_write_buffer_limits(high=WRITE_BUFFER)
+        peer, app = describe_peer(transport), self.app
+
+        async def with_peer(scope: Any, receive: Any, send: Any) -> None:
+            scope[PEER] = peer
+            await app(scope, receive, send)
+
+        self.app = with_peer
+        self._deadline = self.loop.call_later(FIRST_REQUEST_SECONDS, self._still_waiting)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Stop the clock."""
+        if self._deadline is not None:
+            self._deadline.cancel()
+        super().connection_lost(exc)
+
+    def send_400_response(self, msg: str) -> None:
+        """What is not HTTP gets the API's form of error too."""
+        body = json.dumps({"error": "this is not a valid HTTP request"}).encode()
+        headers = [("content-type", "application/json"), ("content-length", str(len(body))), ("connection", "close")]
+        try:
+            for event in (h11.Response(status_code=400, headers=headers), h11.Data(data=body), h11.EndOfMessage()):
+                self.transport.write(self.conn.send(event) or b"")
+        except h11.LocalProtocolError:  # it is in the middle of an answer already
+            _log.debug("%s: malformed request during an answer", msg)
+        self.transport.close()
+
+    def _still_waiting(self) -> None:
+        if getattr(self, "cycle", None) is None:
+            self.transport.abort()
+
+
+def _user(uid: int) -> str:
+    try:
+        return f"{pwd.getpwuid(uid).pw_name} (uid {uid})"
+    except KeyError:
+        return f"uid {uid}"

@@ -1,0 +1,146 @@
+"""The API's routes (contract 8). All read, except the two that decide on a proposal; none can command motion."""
+
+from collections.abc import Callable
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Body, Header, Path, Query, Request
+from fastapi.responses import FileResponse, Response
+
+from calib.daemon.view import (
+    DaemonView,
+    EventRecord,
+    HistoryPoint,
+    JointEstimate,
+    JointNow,
+    NoSuch,
+    NotPossible,
+    Proposal,
+    Status,
+)
+from calib.daemon.web.parameters import LARGEST_ID, ApiError, Decision, EventsQuery, HistoryQuery, Id, StreamQuery
+from calib.daemon.web.peer import Peer, peer_of
+from calib.daemon.web.stream import StreamResponse, Streams
+
+REFUSALS: dict[int | str, dict[str, Any]] = {
+    400: {"model": ApiError, "description": "Not HTTP, or the Host header is no name of this daemon"},
+    401: {"model": ApiError, "description": "TCP only: the token is missing or wrong"},
+    408: {"model": ApiError, "description": "The body did not come in time"},
+    413: {"model": ApiError, "description": "The body is too large"},
+    422: {"model": ApiError, "description": "A parameter cannot be used"},
+    429: {"model": ApiError, "description": "Too many requests, or too many clients on the stream"},
+}
+NO_SUCH: dict[int | str, dict[str, Any]] = {404: {"model": ApiError, "description": "There is no such thing"}}
+NOT_NOW: dict[int | str, dict[str, Any]] = {
+    403: {"model": ApiError, "description": "A page of another origin asked"},
+    409: {"model": ApiError, "description": "This cannot be decided now"},
+}
+STREAM: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "Server-sent events: `joints` (a JointsItem, 10 Hz) and `event` (an EventItem, with its id).",
+        "content": {"text/event-stream": {"schema": {"type": "string"}}},
+    }
+}
+REPORT_CSP = (
+    "sandbox allow-scripts allow-downloads; default-src 'none'; script-src 'unsafe-inline';"
+    " style-src 'unsafe-inline'; img-src data: blob:"
+)
+"""The report is one file with its scripts inside; it may neither ask this daemon nor anyone else anything."""
+
+ProposalId = Annotated[int, Path(ge=1, le=LARGEST_ID)]
+OptionalDecision = Annotated[Decision | None, Body()]
+
+
+def api_router(view: DaemonView, streams: Streams, metrics: Callable[[], bytes]) -> APIRouter:
+    """Every route of the API on this view."""
+    router = APIRouter(responses=REFUSALS)
+    _add_now(router, view)
+    _add_past(router, view)
+    _add_proposals(router, view)
+
+    @router.get("/api/stream", response_class=Response, responses=STREAM, tags=["now"])
+    async def stream(
+        query: Annotated[StreamQuery, Query()], last_event_id: Annotated[Id | None, Header()] = None
+    ) -> Response:
+        """Joints at 10 Hz and events as they come; an event that a slow client missed still comes, in order."""
+        if streams.is_full:
+            raise TooMany(f"{streams.clients} clients are on the stream already")
+        return StreamResponse(streams, query.after if last_event_id is None else last_event_id)
+
+    @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}}, tags=["now"])
+    async def prometheus() -> Response:
+        """Numbers for Prometheus."""
+        return Response(metrics(), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+    return router
+
+
+class TooMany(Exception):
+    """No room for one more client (HTTP 429)."""
+
+
+def _add_now(router: APIRouter, view: DaemonView) -> None:
+    @router.get("/api/status", tags=["now"])
+    async def status() -> Status:
+        """State of daemon and bus, records in force."""
+        return view.status()
+
+    @router.get("/api/joints", tags=["now"])
+    async def joints() -> tuple[JointNow, ...]:
+        """Every joint as last heard, base to tip."""
+        return view.joints()
+
+    @router.get("/api/estimates", tags=["now"])
+    async def estimates() -> tuple[JointEstimate, ...]:
+        """Every joint's gain and offset against the installed record, base to tip."""
+        return view.estimates()
+
+
+def _add_past(router: APIRouter, view: DaemonView) -> None:
+    @router.get("/api/events", tags=["past"])
+    async def events(query: Annotated[EventsQuery, Query()]) -> tuple[EventRecord, ...]:
+        """Events after an id, oldest first."""
+        return view.events(after=query.after, limit=query.limit)
+
+    @router.get("/api/history", responses=NO_SUCH, tags=["past"])
+    async def history(query: Annotated[HistoryQuery, Query()]) -> tuple[HistoryPoint, ...]:
+        """Gain and offset over time, oldest first; without a joint, joint after joint."""
+        names = [query.joint] if query.joint else [joint.joint for joint in view.joints()]
+        found = (view.history(name, query.since, query.until, query.limit) for name in names)
+        return tuple(point for points in found for point in points)
+
+    @router.get("/api/report", response_class=FileResponse, responses=NO_SUCH | _HTML, tags=["past"])
+    async def report() -> FileResponse:
+        """The newest sweep's report, one HTML file."""
+        path = view.status().report
+        if path is None or not path.is_file():
+            raise NoSuch("there is no report yet: one is written by each sweep")
+        return FileResponse(path, media_type="text/html", headers={"content-security-policy": REPORT_CSP})
+
+
+_HTML: dict[int | str, dict[str, Any]] = {200: {"content": {"text/html": {}}, "description": "HTML"}}
+
+
+def _add_proposals(router: APIRouter, view: DaemonView) -> None:
+    @router.get("/api/proposals", tags=["proposals"])
+    async def proposals() -> tuple[Proposal, ...]:
+        """Proposed recalibrations, newest first."""
+        return view.proposals()
+
+    @router.post("/api/proposals/{id}/approve", responses=NO_SUCH | NOT_NOW, tags=["proposals"])
+    async def approve(request: Request, id: ProposalId, decision: OptionalDecision = None) -> Proposal:
+        """Let a pending proposal be written to the controller; `applied` or `failed` follows as an event."""
+        return view.approve(id, _who(decision, peer_of(request.scope)))
+
+    @router.post("/api/proposals/{id}/reject", responses=NO_SUCH | NOT_NOW, tags=["proposals"])
+    async def reject(request: Request, id: ProposalId, decision: OptionalDecision = None) -> Proposal:
+        """Drop a pending proposal."""
+        return view.reject(id, _who(decision, peer_of(request.scope)))
+
+
+def _who(decision: Decision | None, peer: Peer) -> str:
+    """For the audit trail: the name given, and always where the request came from."""
+    return peer.name if decision is None or decision.by is None else f"{decision.by} ({peer.name})"
+
+
+ERRORS: dict[type[Exception], int] = {NoSuch: 404, NotPossible: 409, TooMany: 429}
+"""HTTP status of what a route may raise."""

@@ -1,0 +1,136 @@
+"""Serves the API and the page on a Unix socket, and on TCP where that was asked for."""
+
+import asyncio
+import contextlib
+import errno
+import os
+import socket as sockets
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+import uvicorn
+
+from armlink.errors import BadInput
+from calib.daemon.view import DaemonView
+from calib.daemon.web.app import make_app
+from calib.daemon.web.guard import Access, names_of_host
+from calib.daemon.web.peer import BoundedProtocol
+
+SOCKET_MODE = 0o660
+"""Owner and group; everyone else is kept out by the file system."""
+SHORTEST_TOKEN = 16
+MOST_CONNECTIONS = 512
+CLOSING_SECONDS = 2
+
+
+async def serve(view: DaemonView, *, socket: Path | None, tcp: tuple[str, int] | None, token: str | None) -> None:
+    """Serve until cancelled, then remove the socket file. Raises BadInput where it cannot listen.
+
+    On the Unix socket, mode 0660, the file system says who may come; TCP needs a token of at least 16 characters.
+    """
+    if tcp is not None and (token is None or len(token) < SHORTEST_TOKEN):
+        raise BadInput(f"--tcp needs --token-file with a token of at least {SHORTEST_TOKEN} characters")
+    if socket is None and tcp is None:
+        raise BadInput("neither a Unix socket nor a TCP address to serve on")
+    with contextlib.ExitStack() as opened:
+        listening = []
+        if socket is not None:
+            listening.append(opened.enter_context(unix_socket(socket)))
+        if tcp is not None:
+            listening.append(opened.enter_context(tcp_socket(*tcp)))
+        await _run(view, listening, Access(token, names_of_host(tcp[0]) if tcp else frozenset()))
+
+
+@contextlib.contextmanager
+def unix_socket(path: Path) -> Iterator[sockets.socket]:
+    """A bound socket of mode 0660 under any umask, not yet listening; its file is removed at the end.
+
+    The mode is set before bind for what the umask leaves, and after it for the rest; until `listen` nobody can connect.
+    Raises BadInput where the path is taken or cannot be made.
+    """
+    _make_room(path)
+    with sockets.socket(sockets.AF_UNIX, sockets.SOCK_STREAM) as sock:
+        try:
+            os.fchmod(sock.fileno(), SOCKET_MODE)
+            sock.bind(str(path))
+            path.chmod(SOCKET_MODE)
+        except OSError as error:
+            raise BadInput(f"--socket {path}: {error.strerror or error}") from None
+        identity = _identity(path)
+        try:
+            yield sock
+        finally:
+            if _identity(path) == identity:  # not that of another daemon which has replaced ours
+                path.unlink()
+
+
+@contextlib.contextmanager
+def tcp_socket(host: str, port: int) -> Iterator[sockets.socket]:
+    """A bound TCP socket, not yet listening; raises BadInput where the address cannot be used."""
+    try:
+        family, kind, protocol, _, address = sockets.getaddrinfo(host, port, type=sockets.SOCK_STREAM)[0]
+        with sockets.socket(family, kind, protocol) as sock:
+            sock.setsockopt(sockets.SOL_SOCKET, sockets.SO_REUSEADDR, 1)
+            sock.bind(address)
+            yield sock
+    except OSError as error:
+        raise BadInput(f"--tcp {host}:{port}: {error.strerror or error}") from None
+
+
+def _make_room(path: Path) -> None:
+    """Remove the file that a killed daemon left; raises BadInput where it is in use, or no socket at all."""
+    try:
+        if not stat.S_ISSOCK(path.lstat().st_mode):
+            raise BadInput(f"--socket {path}: there is a file of that name which is no socket")
+        with sockets.socket(sockets.AF_UNIX, sockets.SOCK_STREAM) as probe:
+            probe.settimeout(1.0)
+            probe.connect(str(path))
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        if error.errno != errno.ECONNREFUSED:
+            raise BadInput(f"--socket {path}: {error.strerror or error}") from None
+        path.unlink(missing_ok=True)
+        return
+    raise BadInput(f"--socket {path}: another daemon listens there; stop it, or give another path")
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    try:
+        found = path.lstat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
+
+
+class _Server(uvicorn.Server):
+    """uvicorn's server, which leaves the process's signals alone: the service has its own handlers."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+
+async def _run(view: DaemonView, listening: list[sockets.socket], access: Access) -> None:
+    app, streams = make_app(view, access)
+    config = uvicorn.Config(
+        app,
+        http=BoundedProtocol,
+        ws="none",
+        lifespan="off",
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        proxy_headers=False,
+        limit_concurrency=MOST_CONNECTIONS,
+        timeout_graceful_shutdown=CLOSING_SECONDS,
+    )
+    server = _Server(config)
+    running = asyncio.create_task(server.serve(sockets=listening))
+    try:
+        await asyncio.shield(running)
+    finally:
+        server.should_exit = True
+        streams.close()
+        await running

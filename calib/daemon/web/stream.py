@@ -1,0 +1,132 @@
+"""The stream: server-sent events to many clients, each bounded; one that does not read is cut off."""
+
+import asyncio
+import logging
+from contextlib import suppress
+
+from fastapi.responses import StreamingResponse
+
+from calib.daemon.view import DaemonView, EventItem, JointsItem
+from calib.daemon.web.peer import Message, Receive, Scope, Send, peer_of
+
+SEND_SECONDS = 5.0
+"""A client that takes nothing for so long is cut off."""
+IDLE_SECONDS = 5.0
+"""Where there is nothing to say for so long, a comment finds out whether the client is still there."""
+MOST_CLIENTS = 200
+RETRY = b"retry: 2000\n\n"
+"""Browsers come back after two seconds."""
+
+_log = logging.getLogger(__name__)
+
+
+class Streams:
+    """All clients of the stream."""
+
+    def __init__(self, view: DaemonView) -> None:
+        self._view = view
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._item: JointsItem | None = None
+        self._bytes = b""
+        self.cut_off = 0
+        """Clients cut off so far because they did not read."""
+
+    @property
+    def clients(self) -> int:
+        """How many are connected."""
+        return len(self._tasks)
+
+    @property
+    def is_full(self) -> bool:
+        """Whether no further client is taken."""
+        return self.clients >= MOST_CLIENTS
+
+    def close(self) -> None:
+        """End every stream."""
+        for task in self._tasks:
+            task.cancel()
+
+    def encode(self, item: JointsItem) -> bytes:
+        """A joints item as it goes over the wire; encoded once for all clients that get the same one."""
+        if item is not self._item:
+            self._item, self._bytes = item, b"event: joints\ndata: " + item.model_dump_json().encode() + b"\n\n"
+        return self._bytes
+
+    async def run(self, scope: Scope, receive: Receive, send: Send, after: int | None) -> None:
+        """Serve one client until it goes: all events after id `after` (None: only new ones), then what comes."""
+        client = asyncio.create_task(self._send_all(send, after))
+        self._tasks.add(client)
+        gone = asyncio.create_task(_until_gone(receive))
+        try:
+            await asyncio.wait({client, gone}, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            self._tasks.discard(client)
+            for task in (client, gone):
+                task.cancel()
+            results = await asyncio.gather(client, gone, return_exceptions=True)
+        if isinstance(results[0], TimeoutError):
+            self.cut_off += 1
+            peer = peer_of(scope)
+            _log.warning("stream: %s took nothing for %.0f s and was cut off", peer.name, SEND_SECONDS)
+            peer.abort()
+            return
+        if isinstance(results[0], Exception):
+            raise results[0]
+        with suppress(TimeoutError):
+            await _send(send, b"", more=False)
+
+    async def _send_all(self, send: Send, after: int | None) -> None:
+        subscription = self._view.subscribe()
+        try:
+            last = self._view.status().last_event
+            after = last if after is None else min(after, last)
+            await _send(send, RETRY)
+            after = await self._catch_up(send, after)
+            while True:
+                item: JointsItem | EventItem | None = None
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(IDLE_SECONDS):
+                        item = await subscription.get()
+                if item is None:
+                    await _send(send, b": nothing new\n\n")
+                elif isinstance(item, JointsItem):
+                    await _send(send, self.encode(item))
+                elif item.event.id > after:  # also those that a slow client's queue has dropped before it
+                    after = await self._catch_up(send, after)
+        finally:
+            subscription.close()
+
+    async def _catch_up(self, send: Send, after: int) -> int:
+        """Send every event after the id; returns the newest's id."""
+        while events := self._view.events(after=after):
+            for event in events:
+                data = EventItem(event=event).model_dump_json().encode()
+                await _send(send, b"event: event\nid: %d\ndata: %b\n\n" % (event.id, data))
+                after = event.id
+        return after
+
+
+class StreamResponse(StreamingResponse):
+    """Response of GET /api/stream."""
+
+    def __init__(self, streams: Streams, after: int | None) -> None:
+        """Events after id `after` come first; None: only new ones."""
+        super().__init__((), media_type="text/event-stream", headers={"x-accel-buffering": "no"})
+        self._streams, self._after = streams, after
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve until the client goes."""
+        await send({"type": "http.response.start", "status": 200, "headers": self.raw_headers})
+        await self._streams.run(scope, receive, send, self._after)
+
+
+async def _send(send: Send, data: bytes, more: bool = True) -> None:
+    """Raises TimeoutError where the client does not take it."""
+    message: Message = {"type": "http.response.body", "body": data, "more_body": more}
+    async with asyncio.timeout(SEND_SECONDS):
+        await send(message)
+
+
+async def _until_gone(receive: Receive) -> None:
+    while (await receive())["type"] != "http.disconnect":
+        pass
