@@ -18,9 +18,11 @@ class State(Enum):
 
 
 class Mode(IntEnum):
-    """Modes of operation (6060h) that the link uses."""
+    """Modes of operation (6060h) that the link commands."""
 
     OFF = 0
+    PROFILE_POSITION = 1
+    PROFILE_TORQUE = 4
     POSITION = 8  # cyclic synchronous position
     TORQUE = 10  # cyclic synchronous torque
 
@@ -36,8 +38,25 @@ class Control(IntEnum):
     FAULT_RESET = 0x80
 
 
-SUPPORTED_BITS = {Mode.POSITION: 1 << 7, Mode.TORQUE: 1 << 9}
-"""Bits of 6502h."""
+NEEDED_MODES = (Mode.POSITION, Mode.TORQUE)
+"""A controller without them is no controller for the link; the profile modes may be missing."""
+MODE_NAMES = {
+    Mode.OFF: "no mode",
+    Mode.PROFILE_POSITION: "profile position",
+    Mode.PROFILE_TORQUE: "profile torque",
+    Mode.POSITION: "cyclic synchronous position",
+    Mode.TORQUE: "cyclic synchronous torque",
+}
+NEW_SET_POINT, CHANGE_AT_ONCE = 0x10, 0x20
+"""Bits 4 and 5 of the control word in profile position mode."""
+SET_POINT_ACKNOWLEDGED = 0x1000
+"""Bit 12 of the status word in profile position mode."""
+
+
+def supports(supported: int, mode: int) -> bool:
+    """Whether 6502h (`supported`) has a mode of operation: bit mode - 1, and mode 0 always."""
+    return mode == Mode.OFF or (1 <= mode <= 32 and bool(supported >> (mode - 1) & 1))
+
 
 _BY_4F = {
     0x00: State.NOT_READY,
@@ -85,3 +104,13 @@ def next_control(state: State, target: State) -> int:
     if target is State.QUICK_STOP:
         return int(Control.QUICK_STOP)
     raise ValueError(f"no way to {target.value} is defined: targets are enabled, quick stop, switch on disabled")
+
+
+def set_point_control(status_word: int) -> int:
+    """Control word of an enabled drive in profile position mode that is to take its newest target at once.
+
+    The handshake of CiA 402: new set-point (bit 4) rises, the drive acknowledges (status bit 12), bit 4 falls, the
+    drive takes the acknowledgement back, and so on.
+    """
+    acknowledged = status_word & SET_POINT_ACKNOWLEDGED
+    return Control.ENABLE | CHANGE_AT_ONCE | (0 if acknowledged else NEW_SET_POINT)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from armlink import objects, pdo
 from armlink.armfile import DeviceIdentity, LinkJoint, LinkSection
-from armlink.cia402 import SUPPORTED_BITS, state_of
+from armlink.cia402 import MODE_NAMES, NEEDED_MODES, Mode, state_of, supports
 from armlink.errors import BadInput, BusFault, Refused
 from armlink.gate import JointLimits
 from armlink.limits import milliseconds
@@ -120,15 +120,16 @@ def read_units(services: NodeServices, joint: LinkJoint) -> Units:
         raise BusFault(f"{joint.name} (node {joint.node}): no units: {error}") from None
 
 
-def check_modes(services: NodeServices) -> None:
-    """Raise BusFault where the controller has no cyclic synchronous position or torque mode (6502h)."""
+def check_modes(services: NodeServices) -> int:
+    """Supported modes (6502h); raises BusFault where cyclic synchronous position or torque mode is not among them."""
     supported = int(services.read(objects.SUPPORTED_MODES))
-    for mode, bit in SUPPORTED_BITS.items():
-        if not supported & bit:
+    for mode in NEEDED_MODES:
+        if not supports(supported, mode):
             raise BusFault(
-                f"{services.joint} (node {services.node}): mode {int(mode)} (cyclic synchronous {mode.name.lower()}) "
+                f"{services.joint} (node {services.node}): mode {int(mode)} ({MODE_NAMES[mode]}) "
                 f"is not supported: 6502h is {supported:#x}"
             )
+    return supported
 
 
 def configure_pdos(services: NodeServices, deadline_ms: int) -> None:
@@ -148,25 +149,50 @@ def configure_pdos(services: NodeServices, deadline_ms: int) -> None:
 
 
 def configure(
-    services: NodeServices, joint: LinkJoint, unit: Units, limits: JointLimits, period: float, protection: Protection
+    services: NodeServices,
+    joint: LinkJoint,
+    unit: Units,
+    limits: JointLimits,
+    period: float,
+    protection: Protection,
+    supported: int,
 ) -> None:
     """PDOs, and the limits that hold even without this host: torque, position window, quick stop, who is watched.
 
-    All is read back. Raises BusFault naming joint and object.
+    All is read back. The torque offset 60B2h, which adds to every target torque and stays latched, is cleared where the
+    device has one. `supported` is 6502h. Raises BusFault naming joint and object.
     """
-    check_modes(services)
     configure_pdos(services, protection.deadline_ms)
-    check = services.write_checked
-    check(objects.MAX_TORQUE, math.floor(joint.max_torque / unit.torque + 1e-9))
-    check(objects.POSITION_LOWER, math.ceil(limits.lower / unit.position))
-    check(objects.POSITION_UPPER, math.floor(limits.upper / unit.position))
-    check(objects.QUICK_STOP_OPTION, QUICK_STOP_AND_HOLD)
-    check(objects.ABORT_OPTION, ABORT_IS_QUICK_STOP)
+    if services.has(objects.TORQUE_OFFSET):
+        services.write_checked(objects.TORQUE_OFFSET, 0)
+    for entry, value in settings(joint, unit, limits, period, protection, supported):
+        services.write_checked(entry, value)
+
+
+def settings(
+    joint: LinkJoint, unit: Units, limits: JointLimits, period: float, protection: Protection, supported: int
+) -> list[tuple[Entry, int]]:
+    """What one controller is set to besides its PDOs, in this order.
+
+    Profile modes, where the device has them (6502h, `supported`), get the arm file's velocity and torque rate.
+    """
     value, exponent = interpolation(period)
-    check(_INTERPOLATION_VALUE, value)
-    check(_INTERPOLATION_INDEX, exponent)
-    check(objects.HEARTBEAT_PRODUCER, protection.producer_ms)
-    check(objects.HEARTBEAT_CONSUMER, protection.host << 16 | protection.heartbeat_ms)
+    held = [
+        (objects.MAX_TORQUE, math.floor(joint.max_torque / unit.torque + 1e-9)),
+        (objects.POSITION_LOWER, math.ceil(limits.lower / unit.position)),
+        (objects.POSITION_UPPER, math.floor(limits.upper / unit.position)),
+        (objects.QUICK_STOP_OPTION, QUICK_STOP_AND_HOLD),
+        (objects.ABORT_OPTION, ABORT_IS_QUICK_STOP),
+        (_INTERPOLATION_VALUE, value),
+        (_INTERPOLATION_INDEX, exponent),
+        (objects.HEARTBEAT_PRODUCER, protection.producer_ms),
+        (objects.HEARTBEAT_CONSUMER, protection.host << 16 | protection.heartbeat_ms),
+    ]
+    if supports(supported, Mode.PROFILE_POSITION):
+        held.append((objects.PROFILE_VELOCITY, max(1, math.floor(joint.max_velocity / unit.position))))
+    if supports(supported, Mode.PROFILE_TORQUE):
+        held.append((objects.TORQUE_SLOPE, max(1, math.floor(joint.max_torque_rate / unit.torque))))
+    return held
 
 
 def interpolation(period: float) -> tuple[int, int]:

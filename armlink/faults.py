@@ -1,76 +1,143 @@
 """Faults that a cycle shows, in words: which joint, what, and what to do. Pure."""
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 
-from armlink import emcy, objects
-from armlink.cia402 import Mode, State, state_of
-from armlink.gate import MODES, is_fresh
-from armlink.sample import Command, Sample
+from armlink import emcy, gate, objects
+from armlink.bus_watch import BusWatch
+from armlink.cia402 import MODE_NAMES, Mode, State, state_of
+from armlink.gate import JointLimits, Passed, Seen
+from armlink.sample import Command
 
 ENABLED_BITS = 0x27
 _FAULTS = (State.FAULT, State.FAULT_REACTION)
+_MODES = ", ".join(f"{int(mode)} ({name})" for mode, name in MODE_NAMES.items())
 
 
-def find_fault(
-    names: Sequence[str],
-    sample: Sample,
-    modes: Sequence[int],
-    emergencies: Sequence[tuple[int, int, int]],
-    node_states: Mapping[int, int],
-    max_age: float,
-) -> str | None:
-    """The first fault of a cycle in which every joint with a mode was to be enabled, or None.
+@dataclass
+class Known:
+    """What is known of the bus and of n joints at one moment."""
 
-    `emergencies` are (joint, code, error register), `node_states` NMT states by joint, `max_age` [s].
+    names: Sequence[str]
+    statuses: Sequence[int]
+    """Newest status words (6041h)."""
+    displays: Sequence[int]
+    """Newest mode displays (6061h)."""
+    ages: Sequence[float]
+    """Time since position and torque came [s]."""
+    emergencies: Collection[tuple[int, int, int]]
+    """(joint, code, error register)."""
+    node_states: Mapping[int, int]
+    """NMT states by joint, of the newest heartbeat."""
+    restarted: Collection[int]
+    """Joints whose controller has sent its boot-up message."""
+
+
+def find_fault(known: Known, modes: Sequence[int], since_mode: Sequence[float], max_age: float) -> str | None:
+    """The first fault where every joint with a mode was to be enabled in it, or None.
+
+    `since_mode` is the time since each joint's mode was commanded [s]; a mode must be displayed, and a reading come,
+    within `max_age` [s].
     """
-    for joint, code, register in emergencies:
-        if code:
-            meaning = emcy.name_of(code)
-            return f"{names[joint]}: emergency {code:04X}h, {meaning} (error register {register:02X}h)"
-    for joint, state in node_states.items():
-        if state == 0:
-            return f"{names[joint]}: its controller has restarted (boot-up message): calibration and mode are lost"
-        if state != objects.OPERATIONAL:
-            return f"{names[joint]}: NMT state is {objects.NMT_STATES.get(state, state)}, expected operational"
-    for joint, age in enumerate(sample.age.tolist()):
-        if age > max_age:
-            return f"{names[joint]}: no reading for {age * 1e3:.0f} ms, limit {max_age * 1e3:.0f} ms"
-    for joint, status in enumerate(sample.status.tolist()):
+    fault = node_fault(known)
+    if fault:
+        return fault
+    for joint, age in enumerate(known.ages):
+        if not age <= max_age:
+            return f"{known.names[joint]}: no reading for {age * 1e3:.0f} ms, limit {max_age * 1e3:.0f} ms"
+    for joint, (mode, status) in enumerate(zip(modes, known.statuses, strict=True)):
+        if mode != Mode.OFF and known.displays[joint] != mode and not since_mode[joint] <= max_age:
+            return f"{known.names[joint]}: {refused_mode(mode, known.displays[joint])}"
         if status & 0x6F == ENABLED_BITS:
             continue
-        state_402 = state_of(status)
-        if modes[joint] != Mode.OFF or state_402 in _FAULTS:
-            return f"{names[joint]}: {state_402.value} (status word {status:#06x}), expected operation enabled"
+        state = state_of(status)
+        if mode != Mode.OFF or state in _FAULTS:
+            return f"{known.names[joint]}: {state.value} (status word {status:#06x}), expected operation enabled"
     return None
 
 
-def refusal(names: Sequence[str], command: Command, command_age: float, max_age: float) -> str | None:
-    """Why the gate refused a command, in one line; None where the command was not the reason. Ages in [s]."""
-    if not is_fresh(command_age, max_age):
-        return f"the command is {command_age * 1e3:.0f} ms old, expected 0 to {max_age * 1e3:.0f} ms"
-    for name, mode, torque, position in zip(names, command.mode, command.torque, command.position, strict=True):
-        if mode not in MODES:
-            return f"{name}: mode {mode}, expected 0 (off), 8 (position) or 10 (torque)"
-        if mode == Mode.TORQUE and not math.isfinite(torque):
-            return f"{name}: target torque is {torque}, expected a finite number"
-        if mode == Mode.POSITION and not math.isfinite(position):
-            return f"{name}: target position is {position}, expected a finite number"
+def node_fault(known: Known) -> str | None:
+    """The first fault of a node, whatever its drive is doing: emergency, restart, NMT state; or None."""
+    for joint, code, register in known.emergencies:
+        return f"{known.names[joint]}: emergency {code:04X}h, {emcy.name_of(code)} (error register {register:02X}h)"
+    for joint in sorted(known.restarted):
+        return (
+            f"{known.names[joint]}: its controller has restarted (boot-up message): calibration and mode are lost; "
+            "find out why, then start again"
+        )
+    for joint, state in known.node_states.items():
+        if state != objects.OPERATIONAL:
+            found = objects.NMT_STATES.get(state, str(state))
+            return f"{known.names[joint]}: NMT state is {found}, expected operational"
     return None
 
 
-def stuck(
+def refused_mode(mode: int, display: int) -> str:
+    """That a controller does not enter a mode that it was told to."""
+    return (
+        f"refuses mode {mode} ({MODE_NAMES[Mode(mode)]}): its mode display 6061h is {display}; "
+        "look at its error code 603Fh and at what 6502h says it supports"
+    )
+
+
+def refusal(
     names: Sequence[str],
-    states: Sequence[State],
-    target: State,
-    emergencies: Sequence[tuple[int, int, int]],
-    seconds: float,
-) -> str:
-    """Why the joints did not all reach `target` within `seconds`: the first that did not, and its emergency if any."""
-    for joint, code, _ in emergencies:
-        if code and states[joint] is not target:
-            return f"{names[joint]}: {states[joint].value} after emergency {code:04X}h, {emcy.name_of(code)}"
-    for name, state in zip(names, states, strict=True):
+    command: Command,
+    age: float,
+    passed: Sequence[Passed],
+    seen: Sequence[Seen],
+    limits: Sequence[JointLimits],
+) -> str | None:
+    """Why the gate refused a command, in one line; None where a fault of the bus or a joint was the reason."""
+    for joint, name in enumerate(names):
+        why, limit, now = passed[joint].refused, limits[joint], seen[joint]
+        if why == gate.COMMAND_AGE:
+            return f"the command is {age * 1e3:.0f} ms old, expected 0 to {limit.max_age * 1e3:.0f} ms"
+        if why == gate.BAD_MODE:
+            return f"{name}: mode {command.mode[joint]}, expected {_MODES}"
+        if why == gate.BAD_NUMBER and command.mode[joint] in gate.TORQUE_MODES:
+            return f"{name}: target torque is {command.torque[joint]}, expected a finite number"
+        if why == gate.BAD_NUMBER:
+            return f"{name}: target position is {command.position[joint]}, expected a finite number"
+        if why == gate.VELOCITY:
+            return (
+                f"{name}: turns at {now.velocity:.3g} rad/s under torque control, limit {limit.overspeed:.3g} "
+                "(max_velocity and its margin): less torque, or a higher max_velocity"
+            )
+        if why == gate.WINDOW:
+            lower, upper = limit.lower - limit.outside, limit.upper + limit.outside
+            return (
+                f"{name}: reads {now.position:.4g} rad under torque control, expected {lower:.4g} to {upper:.4g}: "
+                "its stop or its position sensor is not where the arm file has it"
+            )
+        if why == gate.ENTRY:
+            return f"{name}: the torque now produced (6077h) is not known, and torque control would start from zero"
+    return None
+
+
+def stuck(known: Known, states: Sequence[State], target: State, modes: Sequence[int], seconds: float) -> str:
+    """Why the joints did not all reach `target` in their `modes` within `seconds`: the first that did not."""
+    for joint, code, _ in known.emergencies:
+        if states[joint] is not target:
+            return f"{known.names[joint]}: {states[joint].value} after emergency {code:04X}h, {emcy.name_of(code)}"
+    for name, state in zip(known.names, states, strict=True):
         if state is not target:
             return f"{name}: stays in {state.value}, expected {target.value} within {seconds} s"
+    for name, mode, display in zip(known.names, modes, known.displays, strict=True):
+        if mode not in (Mode.OFF, display):
+            return f"{name}: {refused_mode(mode, display)}"
     return f"no complete set of readings within {seconds} s of cycles: frames are lost"
+
+
+def bus_fault(names: Sequence[str], watch: BusWatch, dropped: int) -> str | None:
+    """What the bus itself shows: a second host, a duplicated node id, a babbling node, lost frames; or None."""
+    if watch.intruder:
+        return f"another host is on this bus: it sends {watch.intruder}: stop it, only one program may command an arm"
+    doubled = watch.doubled
+    if doubled is not None:
+        return f"{names[doubled]}: two readings in every cycle: a second node has its id: give every node its own"
+    if watch.babbling:
+        return f"more frames than these joints send, the last other one {watch.last}: a node babbles: disconnect it"
+    if dropped:
+        return f"{dropped} frames lost: this host reads too slowly: give it more time or less to do"
+    return None

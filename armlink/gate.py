@@ -1,15 +1,22 @@
 """The gate: limits checked last, just before a command becomes a frame. Pure and scalar: one joint, one cycle.
 
-What it does with what it gets:
+What it limits, and passes on:
 
-- torque beyond the limit or changing faster than the rate: limited;
-- target position outside the window or moving faster than the limit: limited (a joint that stands outside the window
-  is led back into it at the velocity limit, never further out);
-- a number that is not finite where the mode needs it, an unknown mode, a command or reading that is too old: refused.
-  The joint goes to quick stop in this very cycle, and the link raises.
+- a torque beyond the limit, or changing faster than the rate;
+- a target position outside the window, or moving faster than the velocity limit (a joint that stands outside the window
+  is led back into it at that velocity, never further out).
+
+What it refuses, so that it fails closed: the joint goes to quick stop in this very cycle, and the link stops the others
+and raises:
+
+- an unknown mode, a number that is not finite where the mode needs it, a command that is too old or of the future;
+- a reading that is too old or missing, a fault of bus, node or drive;
+- under torque control, where nothing else bounds the motion: a joint that turns faster than its limit allows with the
+  stated margin, or reads a position beyond the window and its margin, or whose velocity is not known;
+- entering torque control where the torque now produced is not known: zero would drop the load.
 
 A joint under torque control follows its measured position with the target position, and a joint under position control
-its produced torque with the target torque, so that a change of mode starts from what is: zero would drop the load.
+its produced torque with the target torque, so that a change of mode starts from what is.
 """
 
 import math
@@ -17,8 +24,16 @@ from typing import NamedTuple
 
 from armlink.cia402 import Mode
 
-OFF, POSITION, TORQUE = int(Mode.OFF), int(Mode.POSITION), int(Mode.TORQUE)
-MODES = (OFF, POSITION, TORQUE)
+OFF = int(Mode.OFF)
+POSITION_MODES = (int(Mode.POSITION), int(Mode.PROFILE_POSITION))
+TORQUE_MODES = (int(Mode.TORQUE), int(Mode.PROFILE_TORQUE))
+MODES = (OFF, *POSITION_MODES, *TORQUE_MODES)
+LOWEST_WIRE, HIGHEST_WIRE = -(2**31), 2**31 - 1
+"""What 607Ah carries."""
+
+BAD_MODE, BAD_NUMBER, COMMAND_AGE = "mode", "number", "command age"
+SAMPLE_AGE, STATE = "sample age", "state"
+VELOCITY, WINDOW, ENTRY = "velocity", "window", "entry"
 
 
 class JointLimits(NamedTuple):
@@ -38,6 +53,27 @@ class JointLimits(NamedTuple):
     """One per mille of the rated torque [N·m]."""
     position_unit: float
     """One user unit [rad]."""
+    overspeed: float
+    """A joint under torque control that turns faster is refused [rad/s]."""
+    outside: float
+    """A joint under torque control that reads a position further outside the window is refused [rad]."""
+    max_age: float
+    """Oldest command and oldest reading that count [s]."""
+
+
+class Seen(NamedTuple):
+    """What is known of one joint when its command is to leave; NaN where a reading is missing or too old."""
+
+    torque: float
+    """Torque now produced, 6077h [N·m]."""
+    position: float
+    """[rad]."""
+    velocity: float
+    """606Ch [rad/s]."""
+    age: float
+    """Time since the position came [s]."""
+    healthy: bool
+    """Neither the bus nor a node nor a drive has a fault."""
 
 
 class Passed(NamedTuple):
@@ -51,51 +87,39 @@ class Passed(NamedTuple):
     """6071h, per mille of the rated torque, rounded towards zero."""
     position_wire: int
     """607Ah, user units, rounded into the window."""
-    refused: bool
-    """The command was refused: the joint must be stopped."""
+    refused: str
+    """Why the command was refused, so that the joint must be stopped; empty where it passed."""
     mode: int
-    """Mode that was commanded."""
+    """Mode that was commanded, 0 where that was refused."""
 
 
 def pass_gate(
-    limits: JointLimits,
-    mode: int,
-    torque: float,
-    position: float,
-    held: Passed,
-    produced_torque: float,
-    measured_position: float,
-    fresh: bool,
+    limits: JointLimits, mode: int, torque: float, position: float, age: float, held: Passed, seen: Seen
 ) -> Passed:
-    """Limit one joint's command (torque [N·m], position [rad]).
+    """Limit one joint's command (torque [N·m], position [rad]), decided `age` seconds ago.
 
-    `held` is what passed in the cycle before; `produced_torque` (6077h) and `measured_position` are the newest
-    readings, NaN where there is none; `fresh` says that neither the command nor the reading is too old.
+    `held` is what passed in the cycle before, `seen` what is known of the joint now.
     """
-    needed = torque if mode == TORQUE else position if mode == POSITION else 0.0
-    refused = not (fresh and mode in MODES and math.isfinite(needed))
+    refused = _refusal(limits, mode, torque, position, age, held, seen)
     start_torque, start_position = held.torque, held.position
-    if held.mode != TORQUE and math.isfinite(produced_torque):
-        start_torque = produced_torque
-    if held.mode != POSITION and math.isfinite(measured_position):
-        start_position = measured_position
+    if held.mode not in TORQUE_MODES and math.isfinite(seen.torque):
+        start_torque = seen.torque
+    if held.mode not in POSITION_MODES and math.isfinite(seen.position):
+        start_position = seen.position
     if refused:
-        next_torque, next_position = start_torque, start_position
-    elif mode == TORQUE:
-        next_torque = _towards(start_torque, torque, limits.torque_step)
-        next_position = measured_position if math.isfinite(measured_position) else start_position
-    elif mode == POSITION:
-        next_torque = produced_torque if math.isfinite(produced_torque) else start_torque
+        return _passed(limits, start_torque, start_position, OFF, refused)
+    if mode in TORQUE_MODES:
+        return _passed(limits, _towards(start_torque, torque, limits.torque_step), seen.position, mode)
+    if mode in POSITION_MODES:
         goal = _within(position, limits.lower, limits.upper)
-        next_position = _towards(start_position, goal, limits.position_step)
-    else:
-        next_torque, next_position = 0.0, start_position
-    return _passed(limits, next_torque, next_position, refused, mode)
+        produced = seen.torque if math.isfinite(seen.torque) else start_torque
+        return _passed(limits, produced, _towards(start_position, goal, limits.position_step), mode)
+    return _passed(limits, 0.0, start_position, mode)
 
 
 def start_from(limits: JointLimits, produced_torque: float, measured_position: float) -> Passed:
-    """What the first cycle starts from: the torque now produced [N·m] and the position now measured [rad]."""
-    return _passed(limits, produced_torque if math.isfinite(produced_torque) else 0.0, measured_position, False, OFF)
+    """What the first cycle starts from: the torque now produced [N·m], 0 where unknown, and the position [rad]."""
+    return _passed(limits, produced_torque if math.isfinite(produced_torque) else 0.0, measured_position, OFF)
 
 
 def is_fresh(age: float, limit: float) -> bool:
@@ -103,23 +127,47 @@ def is_fresh(age: float, limit: float) -> bool:
     return 0.0 <= age <= limit
 
 
-def _passed(limits: JointLimits, torque: float, position: float, refused: bool, mode: int) -> Passed:
+def _refusal(
+    limits: JointLimits, mode: int, torque: float, position: float, age: float, held: Passed, seen: Seen
+) -> str:
+    """Why a command is not passed on, or an empty text."""
+    if mode not in MODES:
+        return BAD_MODE
+    if not math.isfinite(torque if mode in TORQUE_MODES else position if mode in POSITION_MODES else 0.0):
+        return BAD_NUMBER
+    if not is_fresh(age, limits.max_age):
+        return COMMAND_AGE
+    if not (is_fresh(seen.age, limits.max_age) and math.isfinite(seen.position)):
+        return SAMPLE_AGE
+    if not seen.healthy:
+        return STATE
+    if mode not in TORQUE_MODES:
+        return ""
+    if not abs(seen.velocity) <= limits.overspeed:
+        return VELOCITY
+    if not limits.lower - limits.outside <= seen.position <= limits.upper + limits.outside:
+        return WINDOW
+    if held.mode not in TORQUE_MODES and not math.isfinite(seen.torque):
+        return ENTRY
+    return ""
+
+
+def _passed(limits: JointLimits, torque: float, position: float, mode: int, refused: str = "") -> Passed:
     """Quantise; rounding never leads out of the torque limit, nor out of the window from within."""
     torque = _within(torque, -limits.max_torque, limits.max_torque)
-    wire = round(position / limits.position_unit)
+    lowest, highest = LOWEST_WIRE, HIGHEST_WIRE
     if limits.lower <= position <= limits.upper:
-        lowest = math.ceil(limits.lower / limits.position_unit)
-        wire = _within_whole(wire, lowest, math.floor(limits.upper / limits.position_unit))
-    return Passed(torque, position, int(torque / limits.torque_unit), wire, refused, mode)
+        lowest, highest = (
+            math.ceil(limits.lower / limits.position_unit),
+            math.floor(limits.upper / limits.position_unit),
+        )
+    position_wire = max(lowest, min(highest, round(position / limits.position_unit)))
+    return Passed(torque, position, int(torque / limits.torque_unit), position_wire, refused, mode)
 
 
 def _towards(start: float, goal: float, step: float) -> float:
-    return goal if abs(goal - start) <= step else start + math.copysign(step, goal - start)
+    return _within(goal, start - step, start + step)
 
 
 def _within(value: float, lower: float, upper: float) -> float:
-    return lower if value < lower else upper if value > upper else value
-
-
-def _within_whole(value: int, lower: int, upper: int) -> int:
-    return lower if value < lower else upper if value > upper else value
+    return max(lower, min(upper, value))

@@ -12,6 +12,10 @@ POSITION_GAIN_ERROR = 0.02
 """A position sensor may read so much more of its range than is true: the stops are found beyond their nominal place."""
 PRESS_IN = 0.05
 """A target may lie so far behind a stop [rad], so that a joint can be pressed against it."""
+OVERSPEED = 1.5
+"""A joint under torque control may turn so many times as fast as max_velocity before it is stopped."""
+OUTSIDE = 0.1
+"""A joint under torque control may read a position so far outside the target window before it is stopped [rad]."""
 
 
 def joint_ranges(arm: ArmFile) -> tuple[tuple[float, float], ...]:
@@ -41,8 +45,13 @@ def target_window(lower: float, upper: float) -> tuple[float, float]:
     return lower - margin, upper + margin
 
 
-def gate_limits(joint: LinkJoint, window: tuple[float, float], unit: Units, period: float) -> JointLimits:
-    """Limits for the gate of one joint with its target window [rad]; raises BadInput where they fit no frame."""
+def gate_limits(
+    joint: LinkJoint, window: tuple[float, float], unit: Units, period: float, max_age: float
+) -> JointLimits:
+    """Limits for the gate of one joint with its target window [rad] and the oldest reading that counts [s].
+
+    Raises BadInput where they fit no frame.
+    """
     if joint.max_torque / unit.torque > INT16_MAX:
         most = INT16_MAX * unit.torque
         raise BadInput(f"{joint.name}: max_torque {joint.max_torque} N·m: 6071h carries at most {most:.6g} N·m")
@@ -56,6 +65,9 @@ def gate_limits(joint: LinkJoint, window: tuple[float, float], unit: Units, peri
         upper=window[1],
         torque_unit=unit.torque,
         position_unit=unit.position,
+        overspeed=OVERSPEED * joint.max_velocity,
+        outside=OUTSIDE,
+        max_age=max_age,
     )
 
 

@@ -70,7 +70,7 @@ class Listener:
         return self._loop.stats
 
     @property
-    def emergencies(self) -> list[tuple[int, int, int]]:
+    def emergencies(self) -> deque[tuple[int, int, int]]:
         """(Joint, code, error register) of every emergency heard; the caller may clear it."""
         return self._loop.emergencies
 

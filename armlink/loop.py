@@ -65,10 +65,11 @@ class Loop:
         self._torque: list[float] = [math.nan] * self.n
         self._motor: list[float] = [math.nan] * self.n
         self._velocity: list[float] = [math.nan] * self.n
-        self._status: list[int] = [NO_STATUS] * self.n
+        self.statuses: list[int] = [NO_STATUS] * self.n
+        """Newest status word (6041h) of each joint."""
         self.displays: list[int] = [NO_MODE] * self.n
         """Newest mode of operation display (6061h) of each joint."""
-        self._awaited = self._counted = 0
+        self._awaited = self._counted = self._dropped = 0
         self.bits = 0
         """Bits that the frames so far took on the wire, with nominal stuffing."""
         self._slow_came = False
@@ -89,6 +90,12 @@ class Loop:
     def reset_counters(self) -> None:
         """Begin to count anew."""
         self.stats, self.bits, self._first, self._counted = Stats(), 0, None, 0
+        self._dropped = self._port.dropped
+
+    @property
+    def dropped(self) -> int:
+        """Frames that this host lost because it read too slowly, since the counters began."""
+        return self._port.dropped - self._dropped
 
     def set_units(self, units: tuple[Units, ...]) -> None:
         """Scales of the joints."""
@@ -190,10 +197,10 @@ class Loop:
                 self.watch.again(joint)
             self._position[joint], self._torque[joint] = unpack(data)
         elif kind == 1:
-            self._status[joint], self._motor[joint], self._velocity[joint] = unpack(data)
+            self.statuses[joint], self._motor[joint], self._velocity[joint] = unpack(data)
             self._slow_came = True
         else:
-            self._status[joint], self.displays[joint] = unpack(data)
+            self.statuses[joint], self.displays[joint] = unpack(data)
 
     def _take_other(self, can_id: int, data: bytes) -> None:
         self.watch.other(can_id)
@@ -228,7 +235,7 @@ class Loop:
         for joint in self._keep(position, self.latest_position):
             self.seen[joint] = now
         self.stats.cycles += 1
-        status: NDArray[np.int64] = np.array(self._status, np.int64)
+        status: NDArray[np.int64] = np.array(self.statuses, np.int64)
         age: Array = now - np.array(self.seen)
         return Sample(now - (self._first or 0.0), position, velocity, torque, motor, status, age)
 

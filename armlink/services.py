@@ -20,6 +20,11 @@ SDO_TIMEOUT = 0.3
 """[s], for one of SDO_TRIES."""
 SDO_TRIES = 3
 
+ABSENT = (0x06020000, 0x06090011)
+"""SDO abort codes: no such object, no such sub-index (CiA 301, 7.2.4.3.17)."""
+MALFORMED = (struct.error, IndexError, ValueError, TypeError)
+"""What canopen's SDO client raises on frames that are none."""
+
 Send = Callable[[int, bytes], None]
 Pump = Callable[[Callable[[], bool], float], bool]
 """Runs the receive loop until the condition holds (True) or the seconds are over (False)."""
@@ -81,23 +86,42 @@ class NodeServices:
             client.upload(objects.DEVICE_TYPE.index, 0)
         except SdoAbortedError:
             return True
-        except SdoError:
+        except (SdoError, *MALFORMED):
             return False
         finally:
             client.MAX_RETRIES = SDO_TRIES
         return True
 
+    def has(self, entry: Entry) -> bool:
+        """Whether the device has an object; raises BusFault where it does not answer."""
+        try:
+            self._upload(entry)
+        except SdoAbortedError as error:
+            if error.code in ABSENT:
+                return False
+            raise self._fault(entry, f"read refused: {error}") from None
+        return True
+
     def read(self, entry: Entry) -> Any:
         """Value of an object; raises BusFault."""
         try:
-            data = self.remote.sdo.upload(entry.index, entry.sub)
-            return struct.unpack("<" + entry.code, data)[0]
+            data = self._upload(entry)
         except SdoAbortedError as error:
             raise self._fault(entry, f"read refused: {error}") from None
-        except SdoError:
-            raise self._fault(entry, f"no answer within {SDO_TRIES} × {SDO_TIMEOUT} s") from None
-        except struct.error:
-            raise self._fault(entry, f"{len(data)} bytes, expected {entry.bits // 8}") from None
+        if len(data) != entry.bits // 8:
+            raise self._fault(entry, f"{len(data)} bytes, expected {entry.bits // 8}")
+        return struct.unpack("<" + entry.code, data)[0]
+
+    def _upload(self, entry: Entry) -> bytes:
+        """An object's bytes; raises BusFault, or SdoAbortedError where the device refuses."""
+        try:
+            return bytes(self.remote.sdo.upload(entry.index, entry.sub))
+        except SdoAbortedError:
+            raise
+        except SdoError as error:
+            raise self._fault(entry, no_answer(error)) from None
+        except MALFORMED as error:
+            raise self._fault(entry, f"an answer that is no SDO: {error}") from None
 
     def write(self, entry: Entry, value: float) -> None:
         """Set an object; raises BusFault."""
@@ -105,8 +129,10 @@ class NodeServices:
             self.remote.sdo.download(entry.index, entry.sub, struct.pack("<" + entry.code, value))
         except SdoAbortedError as error:
             raise self._fault(entry, f"write of {value} refused: {error}") from None
-        except SdoError:
-            raise self._fault(entry, f"no answer within {SDO_TRIES} × {SDO_TIMEOUT} s") from None
+        except SdoError as error:
+            raise self._fault(entry, no_answer(error)) from None
+        except MALFORMED as error:
+            raise self._fault(entry, f"an answer that is no SDO: {error}") from None
 
     def write_checked(self, entry: Entry, value: float) -> None:
         """Set an object and read it back, bit for bit; raises BusFault."""
@@ -123,7 +149,7 @@ class NodeServices:
         """A visible string, empty where the device has none."""
         try:
             return str(self.remote.sdo.upload(index, 0).decode("ascii", "replace").rstrip("\0"))
-        except SdoError:
+        except (SdoError, *MALFORMED):
             return ""
 
     def _fault(self, entry: Entry, what: str) -> BusFault:
@@ -133,3 +159,8 @@ class NodeServices:
 def load_dictionary() -> Any:
     """The object dictionary of a joint controller from the shipped EDS."""
     return canopen.import_od(objects.eds_path(), 1)
+
+
+def no_answer(error: SdoError) -> str:
+    """What an SDO that failed without an abort code came to, in words."""
+    return f"no answer within {SDO_TRIES} × {SDO_TIMEOUT} s ({error})"

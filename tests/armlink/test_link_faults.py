@@ -45,7 +45,7 @@ def test_a_restarted_node_is_named(enabled, bus):
     bus.out.append((0x703, b"\x00"))
     cycle, says = cycles_until_fault(enabled)
     assert cycle == 0
-    assert says == "joint_3: its controller has restarted (boot-up message): calibration and mode are lost"
+    assert says.startswith("joint_3: its controller has restarted (boot-up message): calibration and mode are lost")
     assert statuses(bus)[:2] == [QUICK_STOP] * 2
 
 
@@ -124,10 +124,13 @@ def test_frames_of_a_wrong_length_are_counted_and_dropped(enabled, bus, data):
 
 def test_frames_of_strangers_are_ignored(enabled, bus):
     rng = np.random.default_rng(5)
-    ours = {0x80, *(base + node for base in (0x80, 0x180, 0x280, 0x380, 0x580, 0x700) for node in (1, 2, 3))}
-    for can_id in set(range(0x800)) - ours:
-        bus.out.append((can_id, rng.bytes(int(rng.integers(0, 9)))))
-    enabled.cycle(hold())
+    bases = (0x80, 0x180, 0x200, 0x280, 0x300, 0x380, 0x580, 0x700)
+    ours = {0x000, 0x080, 0x77F, *(base + node for base in bases for node in (1, 2, 3))}
+    strangers = sorted(set(range(0x800)) - ours)
+    for start in range(0, len(strangers), 20):
+        for can_id in strangers[start : start + 20]:
+            bus.out.append((can_id, rng.bytes(int(rng.integers(0, 9)))))
+        enabled.cycle(hold())
 
 
 def test_the_same_link_can_be_enabled_again_after_a_fault(enabled, bus):

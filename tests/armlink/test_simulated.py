@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+import yaml
 
-from armlink.armfile import load_arm
-from armlink.errors import BusFault
+from armlink.armfile import bundled_arms, load_arm, parse_arm
+from armlink.errors import BusFault, Refused
 from armlink.link import Link
 from armlink.sample import Command
 from sim_bus.bus import LockStepBus
@@ -67,16 +68,40 @@ def test_entering_torque_mode_does_not_drop_the_arm(link):
     assert np.abs(samples[-1].position - hold[-1].position).max() < 5e-3
 
 
-def test_a_bias_torque_presses_a_joint_against_its_stop(link, simulated):
-    sample = link.enable()
-    command = Command.hold(sample.position)
-    last = link.n - 1
-    command.mode[last], command.torque[last] = 10, 3.0
-    samples = run(link, command, 4.0)
+def fast_arm(max_velocity):
+    """The bundled arm, its last joint allowed to turn so fast [rad/s]."""
+    path = bundled_arms()["sarcos"]
+    content = yaml.safe_load(path.read_text())
+    content["link"]["joints"][-1]["max_velocity"] = max_velocity
+    return parse_arm(content, path)
+
+
+def test_a_bias_torque_presses_a_joint_against_its_stop():
+    arm = fast_arm(60.0)
+    simulated = SimulatedArm(arm, Truth.draw(arm, 3), 3)
+    with Link(arm, LockStepBus(arm=simulated)) as link:
+        link.start()
+        sample = link.enable()
+        command = Command.hold(sample.position)
+        last = link.n - 1
+        command.mode[last], command.torque[last] = 10, 3.0
+        samples = run(link, command, 4.0)
     upper = simulated.arm.kinematics.joints[last].upper
     angle = samples[-1].position[last] * simulated.true_sensors.position_gain[last]
     assert angle == pytest.approx(upper, abs=0.05)
     assert abs(samples[-1].position[last] - samples[-250].position[last]) < 1e-3
+
+
+def test_a_joint_that_runs_away_under_a_constant_torque_is_stopped(link, simulated):
+    sample = link.enable()
+    command = Command.hold(sample.position)
+    last = link.n - 1
+    command.mode[last], command.torque[last] = 10, 3.0
+    with pytest.raises(Refused, match=r"gate: joint_7: turns at -?[\d.]+ rad/s under torque control, limit [\d.]+ \("):
+        run(link, command, 4.0)
+    simulated.advance(1.0)
+    assert [node.value(0x6041, 0) & 0x6F for node in simulated.nodes] == [0x07] * link.n
+    assert np.abs(simulated.plant.velocity).max() < 1e-2
 
 
 def test_a_host_that_falls_silent_leaves_quick_stop(link, simulated):
