@@ -42,7 +42,7 @@ class Drives:
         self.on_fault: Callable[[int, int], None] = lambda joint, code: None
         self._words = [0] * n
         self._status = np.full(n, STATUS[State.SWITCH_ON_DISABLED] | REMOTE, np.uint16)
-        self._counts, self._velocity = sensors.position_counts(plant.position), np.zeros(n)
+        self._counts, self._velocity = sensors.position_counts(plant.motor_position), np.zeros(n)
         self._position_out, self._velocity_out = signals[0x6064, 0], signals[0x606C, 0]
         self._reading_out, self._motor_out = signals[0x2100, 1], signals[0x6077, 0]
         self._status_out, self._mode_out = signals[0x6041, 0], signals[0x6061, 0]
@@ -58,7 +58,7 @@ class Drives:
     def sample(self, time: float, elapsed: float) -> None:
         """Read the sensors at `time` [s], `elapsed` after the last time, into the signals."""
         plant = self._plant
-        counts = self._sensors.position_counts(plant.position)
+        counts = self._sensors.position_counts(plant.motor_position)
         if elapsed > 0:
             if elapsed != self._last_elapsed:
                 self._last_elapsed, self._share = elapsed, float(1.0 - np.exp(-elapsed / VELOCITY_FILTER))

@@ -22,6 +22,8 @@ UNIT = 2 * np.pi / FEED
 OFF, TORQUE, POSITION = 0, 1, 2
 PROFILE_POSITION, PROFILE_TORQUE, CSP, CSV, CST = 1, 4, 8, 9, 10
 KINDS = {PROFILE_POSITION: POSITION, PROFILE_TORQUE: TORQUE, CSP: POSITION, CSV: POSITION, CST: TORQUE}
+LATE_SHARE = 0.5
+"""Most of a motor's inertia that damping may amount to, times the motor's lateness."""
 INTEGRAL_SHARE = 0.3
 """Integral action: stiffness · bandwidth · this."""
 TUNING_POSES = 50
@@ -41,15 +43,14 @@ class Loops:
         self._per_mille = self.rated / 1000
         poses = np.random.default_rng(0).uniform(plant.lower, plant.upper, (TUNING_POSES, self.n))
         inertia = np.max([np.diag(plant.inertia(pose)) for pose in poses], axis=0) + self.rated / SPARE_ACCELERATION
-        self._stiffness = inertia * section.bandwidth**2
-        self._damping = 2 * section.damping * inertia * section.bandwidth
+        self._inertia, self._damping_ratio = inertia, section.damping
         self._deadband, self.deceleration = section.deadband, np.full(self.n, section.quick_stop_deceleration)
         self._with_brake, self._bandwidth = section.brake, section.bandwidth
         self.kind, self.mode = np.zeros(self.n, int), np.zeros(self.n, int)
         self.stopping = np.zeros(self.n, bool)
         self.limit = np.zeros(self.n)
         """Max torque in force [N·m]."""
-        self._torque, self._target, self._rate = np.zeros(self.n), plant.position, np.zeros(self.n)
+        self._torque, self._target, self._rate = np.zeros(self.n), plant.motor_position, np.zeros(self.n)
         self._integral = np.zeros(self.n)
         self._fresh: dict[int, NDArray[np.bool_]] = {
             index: np.zeros(self.n, bool) for index in (0x6071, 0x607A, 0x60FF)
@@ -76,21 +77,21 @@ class Loops:
         plant = self._plant
         powered = self.kind[joint] != OFF or not self._with_brake
         torque = float((plant.drive_torque if powered else plant.link_torque)[joint])
-        velocity = float(plant.velocity[joint])
+        velocity = float(plant.motor_velocity[joint])
         self._torque[joint] = torque if kind == TORQUE else 0.0
-        self._target[joint], self._rate[joint] = plant.position[joint], 0.0
-        self._integral[joint] = torque + self._damping[joint] * velocity if kind == POSITION else 0.0
+        self._target[joint], self._rate[joint] = plant.motor_position[joint], 0.0
         self.kind[joint], self.mode[joint], self.stopping[joint] = kind, mode, False
         for waiting in self._fresh.values():
             waiting[joint] = False
         self.reconfigure()
+        self._integral[joint] = torque + self._d[joint] * velocity if kind == POSITION else 0.0
 
     def stop(self, joint: int) -> None:
         """Brake a joint to rest with its quick stop deceleration and hold it there."""
-        velocity = self._plant.velocity[joint]
+        velocity = self._plant.motor_velocity[joint]
         self.start(joint, POSITION, int(self.mode[joint]))
         self._rate[joint] = velocity
-        self._integral[joint] -= self._damping[joint] * velocity
+        self._integral[joint] -= self._d[joint] * velocity
         self.stopping[joint] = True
         self._select()
 
@@ -101,21 +102,29 @@ class Loops:
     @property
     def following_error(self) -> Array:
         """How far position-controlled joints are from their targets [rad]; 0 for the others."""
-        return np.where(self.kind == POSITION, self._target - self._plant.position, 0.0)
+        return np.where(self.kind == POSITION, self._target - self._plant.motor_position, 0.0)
 
     def reconfigure(self) -> None:
         """Pass modes and limits on to the plant."""
         self.limit = self._max_torque_in * self._per_mille
-        closed = self.kind == POSITION
-        self._k, self._d = self._stiffness * closed, self._damping * closed
-        self._ki = INTEGRAL_SHARE * self._bandwidth * self._k
+        closed, bandwidth = self.kind == POSITION, self._stable_bandwidth()
         self._closed = closed.astype(float)
+        self._k = self._inertia * bandwidth**2 * self._closed
+        self._d = 2 * self._damping_ratio * self._inertia * bandwidth * self._closed
+        self._ki = INTEGRAL_SHARE * bandwidth * self._k
         self._powered = self.kind != OFF
         self._fed_forward = self._per_mille * self._powered
         self._plant.set_servo(self._k, self._d, np.where(self._powered, self.limit, 0.0))
         if self._with_brake:
             self._plant.set_brakes(~self._powered)
         self._select()
+
+    def _stable_bandwidth(self) -> Array:
+        """The section's bandwidth, or less where the motor is late for what it turns at least."""
+        turned = np.minimum(self._inertia, self._plant.rotor_inertia)
+        damped = 2 * self._damping_ratio * self._inertia
+        most = LATE_SHARE * turned / (damped * np.maximum(self._plant.lateness, 1e-9))
+        return np.asarray(np.minimum(most, self._bandwidth))
 
     def _select(self) -> None:
         """Which joints follow which target."""
@@ -141,7 +150,7 @@ class Loops:
             self._plant.step(level, level, duration)
             return
         self._plan(duration, synchronous)
-        error = (self._target - self._plant.position) * self._closed
+        error = (self._target - self._plant.motor_position) * self._closed
         error *= np.abs(error) > self._deadband
         self._integral += self._ki * error * duration
         np.minimum(np.maximum(self._integral, -self.limit, out=self._integral), self.limit, out=self._integral)

@@ -8,7 +8,9 @@ import numpy as np
 
 from armlink.armfile import ArmFile
 from armlink.errors import BadInput
+from sim_bus.effects.state import Imperfections
 from sim_bus.section import LinkBody, SimSection, sim_section
+from sim_bus.transmission import rotor_name, tendon_name
 
 STOP_IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)
 FRICTION_IMPEDANCE = (0.9999, 0.9999, 0.001, 0.5, 2.0)
@@ -23,20 +25,26 @@ class BuiltModel:
     model: Any
     """mujoco.MjModel."""
     bodies: tuple[int, ...]
+    """Of the links, base to tip."""
     payload_body: int
     """Body fixed in the last link's bar frame that carries what is attached; almost massless when nothing is."""
 
 
-def build_model(arm: ArmFile) -> BuiltModel:
-    """The arm's chain as a compiled model with a motor a joint. Raises BadInput where a model file does not fit."""
+def build_model(arm: ArmFile, state: Imperfections) -> BuiltModel:
+    """The arm's chain as a compiled model with a motor a joint, geared as `state` says.
+
+    Raises BadInput where a model file does not fit.
+    """
     section = sim_section(arm)
     spec = _from_model(arm, section) if arm.kinematics.model is not None else _from_denavit_hartenberg(arm, section)
     _set_options(spec, arm, section)
     joints = [spec.joint(name) for name in arm.joint_names]
     for joint in joints:
         _set_joint(joint, section)
-        motor = spec.add_actuator(name=f"motor {joint.name}", target=joint.name)
-        motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
+    for place, joint in enumerate(joints):
+        target, kind = _add_gear(spec, place, [each.name for each in joints], state, section)
+        motor = spec.add_actuator(name=f"motor {joint.name}", target=target)
+        motor.trntype = kind
         motor.gaintype, motor.biastype = mujoco.mjtGain.mjGAIN_AFFINE, mujoco.mjtBias.mjBIAS_AFFINE
         motor.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
         motor.forcerange = [-1e9, 1e9]
@@ -106,9 +114,38 @@ def _set_joint(joint: Any, section: SimSection) -> None:
     joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
     joint.solref_limit = [max(section.stops.time_constant, 2 * section.step), 1.0]
     joint.solimp_limit = STOP_IMPEDANCE
-    joint.solref_friction = [2 * section.step, 1.0]
-    joint.solimp_friction = FRICTION_IMPEDANCE
-    joint.frictionloss = 1.0  # so that every joint has its row; the plant sets the level
+    _set_friction(joint, section)
+
+
+def _set_friction(what: Any, section: SimSection) -> None:
+    what.solref_friction = [2 * section.step, 1.0]
+    what.solimp_friction = FRICTION_IMPEDANCE
+    what.frictionloss = 1.0  # so that every motor has its row; the plant sets the level
+
+
+def _add_gear(spec: Any, place: int, names: list[str], state: Imperfections, section: SimSection) -> tuple[str, Any]:
+    """What lies between a joint and its motor (`sim_bus.transmission`); the name and kind of what the motor drives."""
+    name, of_joint, of_tendon = names[place], mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_TENDON
+    others = [(names[other], state.coupling[place, other]) for other in np.flatnonzero(state.coupling[place])]
+    if state.soft[place]:
+        rotor = rotor_name(name)
+        body = spec.worldbody.add_body(name=rotor, mass=TINY_INERTIA, inertia=[TINY_INERTIA] * 3, explicitinertial=True)
+        _set_friction(body.add_joint(name=rotor, type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1]), section)
+        if not others:
+            return rotor, of_joint
+        _add_sum(spec, f"encoder {name}", [(rotor, 1.0), *((other, -turn) for other, turn in others)])
+        return f"encoder {name}", of_tendon
+    if others:
+        _set_friction(_add_sum(spec, tendon_name(name), [(name, 1.0), *others]), section)
+    return name, of_joint
+
+
+def _add_sum(spec: Any, name: str, parts: list[tuple[str, float]]) -> Any:
+    """A weighted sum of joint angles."""
+    tendon = spec.add_tendon(name=name)
+    for joint, weight in parts:
+        tendon.wrap_joint(joint, weight)
+    return tendon
 
 
 def _set_inertial(body: Any, link: LinkBody) -> None:

@@ -2,6 +2,7 @@
 
 A joint's sensor reads what the transmission passes on to the link: motor torque less friction, ripple and rotor
 acceleration. The stops push on the link, beyond the sensor, so a joint pressed on its stop reads the pressing torque.
+A motor is a mass of its own only where its transmission gives (`sim_bus.transmission`); the model is then built anew.
 """
 
 from typing import Any
@@ -11,13 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armlink.armfile import ArmFile
+from sim_bus import statics
 from sim_bus.effects.state import Imperfections
 from sim_bus.inertials import Inertials
 from sim_bus.mjcf import build_model
 from sim_bus.motors import LateMotors
 from sim_bus.section import sim_section
+from sim_bus.transmission import HARD_GEAR_STEP, Transmissions
 
 Array = NDArray[np.float64]
+FRICTION_AT_DOF = int(mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
 BRAKE_SHARE = 3.0
 """What the holding brake holds, in maximal torques."""
 
@@ -27,55 +31,83 @@ class Plant:
 
     def __init__(self, arm: ArmFile, imperfections: Imperfections) -> None:
         """Build it at rest in its start position (mid-range by default). Raises BadInput."""
-        section, link = sim_section(arm), arm.require_link()
-        built = build_model(arm)
-        self.model, self.n = built.model, len(built.bodies)
-        self.data = mujoco.MjData(self.model)
-        self._joints = joints = [self.model.joint(name).id for name in arm.joint_names]
-        self._qpos: NDArray[np.intp] | slice = self.model.jnt_qposadr[joints]
+        self._arm, self._section, link = arm, sim_section(arm), arm.require_link()
+        self.n = n = len(link.joints)
+        self._attached = np.zeros(4)
+        self._brake_torque = BRAKE_SHARE * np.array([joint.max_torque for joint in link.joints])
+        self._braked = np.zeros(n, bool)
+        self._servo = (np.zeros(n), np.zeros(n), np.zeros(n))
+        self._lost = np.zeros(n)
+        self._build(imperfections)
+        start = (self.lower + self.upper) / 2 if self._section.start is None else np.array(self._section.start)
+        self._enter(start, np.zeros(n), self.gravity_torque(start)[0])
+        self.set_imperfections(imperfections)
+
+    def _build(self, state: Imperfections) -> None:
+        """A model with motors geared as `state` says."""
+        built = build_model(self._arm, state)
+        self.model, names = built.model, self._arm.joint_names
+        self.data = data = mujoco.MjData(self.model)
+        self._joints = joints = [self.model.joint(name).id for name in names]
         self._dof: NDArray[np.intp] | slice = self.model.jnt_dofadr[joints]
-        data = self.data
         self._positions: Array = data.qpos
         self._velocities: Array = data.qvel
         self._accelerations: Array = data.qacc
-        self._motor_torques: Array = data.qfrc_actuator
+        self._motor_torques: Array = data.actuator_force
         self._place_of_dof = np.full(self.model.nv, -1)
         self._place_of_dof[self._dof] = np.arange(self.n)
         if (self._dof == np.arange(self.n)).all():
             self._dof = slice(0, self.n)
-        if (self._qpos == np.arange(self.n)).all():
-            self._qpos = slice(0, self.n)
         self.lower, self.upper = self.model.jnt_range[joints].T.copy()
         self._inertials = Inertials(self.model, list(built.bodies), built.payload_body)
         self._gravity: Array = self.model.opt.gravity.copy()
         self._armature = self.model.dof_armature[self._dof].copy()
         self._damping = self.model.dof_damping[self._dof].copy()
-        self._attached = np.zeros(4)
-        self._brake_torque = BRAKE_SHARE * np.array([joint.max_torque for joint in link.joints])
-        self._braked = np.zeros(self.n, bool)
-        self._servo = (np.zeros(self.n), np.zeros(self.n), np.zeros(self.n))
-        self.step_time = section.step
-        start = (self.lower + self.upper) / 2 if section.start is None else np.array(section.start)
-        self.data.qpos[self._qpos] = start
-        self.set_imperfections(imperfections)
+        self._gearing, self._gears = state.gearing, None
+        if state.gearing:
+            inertia = np.diag(self.inertia((self.lower + self.upper) / 2))
+            self._gears = Transmissions(self.model, names, state, inertia)
+
+    def _enter(self, position: Array, velocity: Array, torque: Array) -> None:
+        """Set the joints' motion; motors behind springs carry `torque`."""
+        data = self.data
+        data.qpos[self._dof], data.qvel[self._dof] = position, velocity
+        if self._gears is not None:
+            self._gears.settle(data.qpos, torque)
+            self._gears.settle_speed(data.qvel)
 
     # ---- what it is
 
     def set_imperfections(self, imperfections: Imperfections) -> None:
-        """Take over masses, base and friction of `imperfections`; state and motion stay."""
+        """Take over masses, base, friction and gears of `imperfections`; the joints' motion stays.
+
+        Raises ValueError where they cannot be simulated.
+        """
+        if imperfections.gearing != self._gearing:
+            motion = self.position, self.velocity, self.link_torque
+            self._build(imperfections)
+            self._enter(*motion)
+        elif self._gears is not None:
+            self._gears.configure(self._arm.joint_names, imperfections)
         self._imperfections = imperfections
         self._viscous = self._damping + imperfections.viscous
         self._rotor_inertia = self._armature + imperfections.rotor_inertia
+        self.step_time = self._section.step
+        if self._gears is not None:
+            self._rotor_inertia = np.maximum(self._rotor_inertia, self._gears.rotor_inertia)
+            finest = self._gears.step_time if imperfections.prompt_motors else HARD_GEAR_STEP
+            self.step_time = min(self.step_time, self._gears.step_time, finest)
         self._has_rotors = bool(self._rotor_inertia.any())
-        self.model.dof_armature[self._dof] = self._rotor_inertia
-        self.model.dof_damping[self._dof] = self._viscous
-        self.model.opt.gravity[:] = _tilt(imperfections.tilt).T @ self._gravity
+        self._seat("armature", self._rotor_inertia)
+        self._seat("damping", self._viscous)
+        self.model.opt.gravity[:] = statics.tilt(imperfections.tilt).T @ self._gravity
         self.model.jnt_stiffness[self._joints] = imperfections.spring[:, 0]
-        self.model.qpos_spring[self._qpos] = imperfections.spring[:, 1]
+        self.model.qpos_spring[self._dof] = imperfections.spring[:, 1]
         self._inertials.apply(self._imperfections, self._attached)
         self._steady_friction = imperfections.steady_friction
         self._motors = None if imperfections.prompt_motors else LateMotors(imperfections, self.motor_torque)
-        self._plain = self._steady_friction and self._motors is None
+        self._plain = self._steady_friction and self._motors is None and self._gears is None
+        self._lost = np.zeros(self.n)
         self.data.qfrc_applied[:] = 0.0
         self._set_friction()
         self.set_servo(*self._servo)
@@ -93,31 +125,18 @@ class Plant:
 
     def gravity_torque(self, q: Array) -> Array:
         """True holding torque ∂V/∂q at the angles `q` (K, n) → (K, n), everything attached included."""
-        scratch, q = mujoco.MjData(self.model), np.atleast_2d(np.asarray(q, float))
-        torque = np.empty_like(q)
-        for row, angles in enumerate(q):
-            scratch.qpos[self._qpos] = angles
-            mujoco.mj_kinematics(self.model, scratch)
-            mujoco.mj_comPos(self.model, scratch)
-            mujoco.mj_rne(self.model, scratch, 0, scratch.qfrc_bias)
-            torque[row] = scratch.qfrc_bias[self._dof]
-        return torque
+        return statics.gravity_torque(self.model, self._dof, q)
 
     def inertia(self, q: Array) -> Array:
         """Joint-space inertia matrix at the angles `q` (n,) → (n, n) [kg·m²]."""
-        scratch, full = mujoco.MjData(self.model), np.empty((self.model.nv, self.model.nv))
-        scratch.qpos[self._qpos] = q
-        mujoco.mj_forward(self.model, scratch)
-        mujoco.mj_fullM(self.model, scratch, full)
-        inertia: Array = full[self._dof][:, self._dof]
-        return inertia
+        return statics.inertia(self.model, self._dof, q)
 
     # ---- what it does
 
     @property
     def position(self) -> Array:
         """True joint angles [rad]."""
-        return self._positions[self._qpos].copy()
+        return self._positions[self._dof].copy()
 
     @property
     def velocity(self) -> Array:
@@ -125,9 +144,29 @@ class Plant:
         return self._velocities[self._dof].copy()
 
     @property
+    def motor_position(self) -> Array:
+        """Angles at which the motors stand, counted at the joint: what position sensors turn with."""
+        return self.position if self._gears is None else self._gears.shown(self._positions)
+
+    @property
+    def motor_velocity(self) -> Array:
+        """Velocities of the motors, counted at the joint."""
+        return self.velocity if self._gears is None else self._gears.shown(self._velocities)
+
+    @property
     def motor_torque(self) -> Array:
         """Torque that each motor makes."""
-        return self._motor_torques[self._dof].copy()
+        return self._motor_torques.copy()
+
+    @property
+    def lateness(self) -> Array:
+        """How late the motors make their torque [s]."""
+        return self._imperfections.actuator_delay + self._imperfections.actuator_lag
+
+    @property
+    def rotor_inertia(self) -> Array:
+        """Inertia of the motors that can turn while their link stands [kg·m²], infinite for the others."""
+        return np.where(self._imperfections.soft, self._rotor_inertia, np.inf)
 
     @property
     def drive_torque(self) -> Array:
@@ -137,8 +176,13 @@ class Plant:
     @property
     def link_torque(self) -> Array:
         """Torque that each transmission passes on to its link: what an ideal joint torque sensor reads."""
-        data, dof = self.data, self._dof
-        torque: Array = self._motor_torques[dof] - self._viscous * self._velocities[dof]
+        data, dof, gears = self.data, self._dof, self._gears
+        if gears is not None:
+            speed, acceleration = gears.turned(self._velocities), gears.turned(self._accelerations)
+            made = self._motor_torques
+            passed = made - self._viscous * speed - self._rotor_inertia * acceleration - self._lost
+            return gears.on_links(data, made, passed + gears.friction(data, FRICTION_AT_DOF))
+        torque: Array = self._motor_torques - self._viscous * self._velocities[dof]
         if self._has_rotors:
             torque -= self._rotor_inertia * self._accelerations[dof]
         if self._motors is not None:
@@ -173,12 +217,14 @@ class Plant:
             data.ctrl[:] = end
             mujoco.mj_step(model, data, count)
             return
-        slope = (end - start) / count
+        slope, gears = (end - start) / count, self._gears
         level = start + 0.5 * slope
         for _ in range(count):
             data.ctrl[:] = level if self._motors is None else self._asked(level, duration / count)
             if not self._steady_friction:
                 self._set_friction()
+            if gears is not None:
+                data.qfrc_applied[:] = gears.forces(data, self._lost)
             mujoco.mj_step(model, data)
             level = level + slope
 
@@ -186,9 +232,11 @@ class Plant:
         """What late motors make of the drive's torque; the ripple is taken off on the way to the link."""
         assert self._motors is not None
         stiffness, damping, limit = self._servo
-        wanted = level - stiffness * self.position - damping * self.velocity
+        position = self.motor_position
+        wanted = level - stiffness * position - damping * self.motor_velocity
         amplitude, cycles, phase = self._imperfections.ripple.T
-        self.data.qfrc_applied[self._dof] = -amplitude * np.sin(cycles * self.position + phase)
+        self._lost = amplitude * np.sin(cycles * position + phase)
+        self.data.qfrc_applied[self._dof] = -self._lost
         return self._motors.torque(np.clip(wanted, -limit, limit), duration)
 
     # ---- inside
@@ -198,13 +246,22 @@ class Plant:
         state = self._imperfections
         level = state.coulomb
         if not state.steady_friction:
-            velocity, load = self.velocity, self.link_torque
+            velocity = self.velocity if self._gears is None else self._gears.turned(self._velocities)
+            load = self.link_torque
             level = level + state.breakaway * np.exp(-((velocity / state.stribeck_velocity) ** 2))
             level = level + state.load_friction * np.abs(load)
             resting = np.abs(velocity) < 1e-4
             heading = np.where(resting, np.sign(self.motor_torque - load), np.sign(velocity))
             level = level * (1.0 + state.asymmetry * heading)
-        self.model.dof_frictionloss[self._dof] = np.where(self._braked, self._brake_torque, np.maximum(level, 0.0))
+        self._seat("frictionloss", np.where(self._braked, self._brake_torque, np.maximum(level, 0.0)))
+
+    def _seat(self, quantity: str, values: Array) -> None:
+        """Give the motors their friction, damping or inertia."""
+        on_dofs = getattr(self.model, f"dof_{quantity}")
+        if self._gears is None:
+            on_dofs[self._dof] = values
+        else:
+            self._gears.seat(on_dofs, getattr(self.model, f"tendon_{quantity}"), values)
 
     def _friction_rows(self) -> Any:
         """Places of the joints that have a friction constraint, in the order of the constraints."""
@@ -212,12 +269,3 @@ class Plant:
         if data.nf == self.n:
             return slice(0, self.n)
         return self._place_of_dof[data.efc_id[data.ne : data.ne + data.nf]]
-
-
-def _tilt(angles: Array) -> Array:
-    """Rotation of the base: about its x axis, then about its y axis (3, 3)."""
-    (cx, cy), (sx, sy) = np.cos(angles), np.sin(angles)
-    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-    rotation: Array = about_x @ about_y
-    return rotation

@@ -41,7 +41,10 @@ class SimulatedArm:
         self.default_period = 1.0 / link.rate
         self._entries: tuple[Entry, ...] = section.effects
         state = self._imperfections(self._entries)
-        self.plant = Plant(arm, state)
+        try:
+            self.plant = Plant(arm, state)
+        except ValueError as error:
+            raise BadInput(f"{arm.path}: sim.effects: {error}") from None
         self.sensors = Sensors(arm, truth, state, seed)
         self._signals = Signals(self.n)
         self.drives = Drives(arm, self.plant, self.sensors, self._signals)
@@ -131,10 +134,16 @@ class SimulatedArm:
 
     def set_effects(self, entries: Iterable[Entry]) -> None:
         """Replace the arm's imperfections while it runs. Raises BadInput."""
-        self._entries = tuple(entries)
-        state = self._imperfections(self._entries)
-        self.plant.set_imperfections(state)
+        wanted = tuple(entries)
+        state = self._imperfections(wanted)
+        try:
+            self.plant.set_imperfections(state)
+        except ValueError as error:
+            self.plant.set_imperfections(self._imperfections(self._entries))
+            raise BadInput(f"sim.effects: {error}") from None
         self.sensors.set_imperfections(state)
+        self._entries = wanted
+        self.drives.loops.reconfigure()
 
     @property
     def effects(self) -> tuple[Entry, ...]:

@@ -30,9 +30,9 @@ def _saturation(state: Imperfections, joint: int, values: Mapping[str, Any]) -> 
 
 
 EFFECTS = (
-    Effect("actuator.gain", (Parameter("gain", "1"),), _gain),
-    Effect("actuator.rotor_inertia", (Parameter("inertia", "kg·m²"),), _rotor_inertia),
-    Effect("actuator.lag", (Parameter("time", "s"),), _lag),
-    Effect("actuator.delay", (Parameter("time", "s"),), _delay),
-    Effect("actuator.saturation", (Parameter("limit", "N·m"),), _saturation),
+    Effect("actuator.gain", (Parameter("gain", "1", above=0.0),), _gain),
+    Effect("actuator.rotor_inertia", (Parameter("inertia", "kg·m²", least=0.0),), _rotor_inertia),
+    Effect("actuator.lag", (Parameter("time", "s", least=0.0),), _lag),
+    Effect("actuator.delay", (Parameter("time", "s", least=0.0),), _delay),
+    Effect("actuator.saturation", (Parameter("limit", "N·m", least=0.0),), _saturation),
 )

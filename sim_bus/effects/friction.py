@@ -34,9 +34,13 @@ def _load(state: Imperfections, joint: int, values: Mapping[str, Any]) -> None:
 
 
 EFFECTS = (
-    Effect("friction.coulomb", (Parameter("torque", "N·m"),), _coulomb),
-    Effect("friction.viscous", (Parameter("damping", "N·m·s/rad"),), _viscous),
-    Effect("friction.stribeck", (Parameter("breakaway", "N·m"), Parameter("velocity", "rad/s")), _stribeck),
+    Effect("friction.coulomb", (Parameter("torque", "N·m", least=0.0),), _coulomb),
+    Effect("friction.viscous", (Parameter("damping", "N·m·s/rad", least=0.0),), _viscous),
+    Effect(
+        "friction.stribeck",
+        (Parameter("breakaway", "N·m", least=0.0), Parameter("velocity", "rad/s", above=0.0)),
+        _stribeck,
+    ),
     Effect("friction.asymmetric", (Parameter("ratio", "1"),), _asymmetric),
-    Effect("friction.load", (Parameter("coefficient", "N·m/(N·m)"),), _load),
+    Effect("friction.load", (Parameter("coefficient", "N·m/(N·m)", least=0.0),), _load),
 )

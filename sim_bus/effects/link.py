@@ -28,5 +28,7 @@ def _payload(state: Imperfections, _joint: int, values: Mapping[str, Any]) -> No
 EFFECTS = (
     Effect("link.mass_moment", (Parameter("moment", "kg·m", (3,)),), _mass_moment),
     Effect("link.inertia", (Parameter("inertia", "kg·m²", (3, 6)),), _inertia),
-    Effect("link.payload", (Parameter("mass", "kg"), Parameter("com", "m", (3,))), _payload, per_joint=False),
+    Effect(
+        "link.payload", (Parameter("mass", "kg", above=0.0), Parameter("com", "m", (3,))), _payload, per_joint=False
+    ),
 )

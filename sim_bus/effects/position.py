@@ -21,7 +21,7 @@ def _eccentricity(state: Imperfections, joint: int, values: Mapping[str, Any]) -
 
 EFFECTS = (
     Effect("position.offset", (Parameter("offset", "rad"),), _offset),
-    Effect("position.gain", (Parameter("gain", "1"),), _gain),
+    Effect("position.gain", (Parameter("gain", "1", above=0.0),), _gain),
     Effect(
         "position.eccentricity", (Parameter("amplitude", "rad"), Parameter("phase", "rad", default=0.0)), _eccentricity
     ),

@@ -24,6 +24,18 @@ class Parameter:
     default: float | None = None
     joint: bool = False
     """Whether the value is a joint's name."""
+    least: float | None = None
+    above: float | None = None
+    """The value must be at least `least`, and greater than `above`."""
+
+    @property
+    def bound(self) -> str:
+        """What the value must keep to, in words; empty where it is free."""
+        return f" of at least {self.least:g}" if self.least is not None else f" above {self.above:g}"
+
+    def holds(self, value: float) -> bool:
+        """Whether a number keeps to the bounds."""
+        return (self.least is None or value >= self.least) and (self.above is None or value > self.above)
 
 
 @dataclass(frozen=True)
@@ -83,6 +95,8 @@ def _check_value(effect: Effect, parameter: Parameter, value: Any) -> None:
     numbers = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value]
     size = len(numbers) if isinstance(value, Sequence) else 0
     finite = all(isinstance(number, int | float) and np.isfinite(number) for number in numbers)
+    if finite and not all(parameter.holds(number) for number in numbers):
+        raise ValueError(f"{wanted} a number{parameter.bound}, not {value!r}")
     if not finite or size not in parameter.sizes:
         sizes = " or ".join("one number" if size == 0 else f"{size} numbers" for size in parameter.sizes)
         raise ValueError(f"{wanted} {sizes}, not {value!r}")

@@ -44,6 +44,12 @@ class Imperfections:
     """Amplitude, cycles per rad, phase (n, 3)."""
     spring: Array = field(init=False)
     """Stiffness [N·m/rad] and rest angle [rad] (n, 2)."""
+    elasticity: Array = field(init=False)
+    """Stiffness between motor and link [N·m/rad]; infinite without."""
+    backlash: Array = field(init=False)
+    """Full width of the play between motor and link [rad]."""
+    coupling: Array = field(init=False)
+    """Turn of motor i per turn of joint j, its own aside (n, n)."""
     rotor_inertia: Array = field(init=False)
     """At the joint [kg·m²]."""
     actuator_gain: Array = field(init=False)
@@ -87,9 +93,16 @@ class Imperfections:
         n = len(self.names)
         square, pair = (n, n), (n, 2)
         shapes: dict[str, tuple[int, ...]] = {"ripple": (n, 3), "spring": pair, "tilt": (2,)}
-        shapes |= {"crosstalk": square, "eccentricity": pair, "mass_moment": (n, 3), "inertia": (n, 6), "payload": (4,)}
+        shapes |= {
+            "coupling": square,
+            "crosstalk": square,
+            "eccentricity": pair,
+            "mass_moment": (n, 3),
+            "inertia": (n, 6),
+            "payload": (4,),
+        }
         initial = {"stribeck_velocity": 0.01, "actuator_gain": 1.0, "torque_gain": 1.0, "position_gain": 1.0}
-        initial |= {"actuator_saturation": np.inf, "torque_saturation": np.inf}
+        initial |= {"actuator_saturation": np.inf, "torque_saturation": np.inf, "elasticity": np.inf}
         for item in fields(self):
             if item.name != "names":
                 setattr(self, item.name, np.full(shapes.get(item.name, (n,)), initial.get(item.name, 0.0)))
@@ -98,6 +111,18 @@ class Imperfections:
     def steady_friction(self) -> bool:
         """Whether friction keeps one level whatever the velocity, direction and load."""
         return not (self.breakaway.any() or self.asymmetry.any() or self.load_friction.any())
+
+    @property
+    def soft(self) -> NDArray[np.bool_]:
+        """Joints whose motor can turn while the link stands, (n,)."""
+        return np.isfinite(self.elasticity) | (self.backlash > 0)
+
+    @property
+    def gearing(self) -> bytes:
+        """What tells apart how motors turn with joints; empty where each turns rigidly with its own."""
+        if not (self.soft.any() or self.coupling.any()):
+            return b""
+        return self.soft.tobytes() + self.coupling.tobytes()
 
     @property
     def prompt_motors(self) -> bool:

@@ -11,4 +11,4 @@ def _delay(state: Imperfections, joint: int, values: Mapping[str, Any]) -> None:
     state.torque_delay[joint] += values["delay"]
 
 
-EFFECTS = (Effect("timing.delay", (Parameter("delay", "s"),), _delay),)
+EFFECTS = (Effect("timing.delay", (Parameter("delay", "s", least=0.0),), _delay),)

@@ -50,7 +50,7 @@ EFFECTS = (
         (Parameter("coefficient", "N·m/(N·m)"), Parameter("source", "joint", joint=True)),
         _crosstalk,
     ),
-    Effect("torque.hysteresis", (Parameter("width", "N·m"),), _hysteresis),
-    Effect("torque.deadband", (Parameter("width", "N·m"),), _deadband),
-    Effect("torque.saturation", (Parameter("limit", "N·m"),), _saturation),
+    Effect("torque.hysteresis", (Parameter("width", "N·m", least=0.0),), _hysteresis),
+    Effect("torque.deadband", (Parameter("width", "N·m", least=0.0),), _deadband),
+    Effect("torque.saturation", (Parameter("limit", "N·m", least=0.0),), _saturation),
 )
