@@ -36,8 +36,14 @@ class Estimate:
 
 
 def verdict_evidence(verdict: Verdict, names: tuple[str, ...]) -> dict[str, Any]:
-    """A verdict as an event shows it: cause, confidence, how far behind the other classes are, parameters."""
-    beside = {} if verdict.beside is None else {"beside": names[verdict.beside]}
+    """A verdict as an event shows it: cause, confidence, how far behind the other classes are, parameters.
+
+    A payload has `mass` [kg] and `com`, its centre of mass in the last link's bar frame [m].
+    """
+    beside: dict[str, Any] = {} if verdict.beside is None else {"beside": names[verdict.beside]}
+    if verdict.cause == "payload":  # parameters: mass, and mass times its place
+        mass = float(verdict.values[0])
+        beside = {"mass": mass, "com": (verdict.values[1:] / mass).tolist()}
     return {
         "cause": verdict.cause,
         **beside,

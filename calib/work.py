@@ -34,11 +34,24 @@ def work_targets(
     random: np.random.Generator,
     motion: WorkMotion | None = None,
 ) -> Iterator[Array]:
-    """Position targets (n,) [rad], one a cycle of `period` [s], without end.
+    """Position targets (n,) [rad], one a cycle of `period` [s], without end; as work_pieces has them."""
+    for piece in work_pieces(start, lower, upper, max_velocity, period, random, motion or WorkMotion()):
+        yield from piece
+
+
+def work_pieces(
+    start: Array,
+    lower: Array,
+    upper: Array,
+    max_velocity: Array,
+    period: float,
+    random: np.random.Generator,
+    motion: WorkMotion,
+) -> Iterator[Array]:
+    """Pieces (K, n) of position targets [rad] without end: the way to another pose and the rest there.
 
     `start` is where the arm is; lower and upper (n,) [rad] are its stops, max_velocity (n,) [rad/s].
     """
-    motion = motion or WorkMotion()
     middle, half = (lower + upper) / 2, np.maximum((upper - lower) / 2 - motion.margin, 0.0)
     here = np.array(start, dtype=float)
     while True:
@@ -48,7 +61,6 @@ def work_targets(
         )
         goal = random.uniform(np.minimum(nearest, farthest), np.maximum(nearest, farthest))
         speed, acceleration = motion.speed_share * max_velocity, np.full_like(here, motion.acceleration)
-        yield from trajectory(here, goal, speed, acceleration, period)
-        for _ in range(round(motion.rest / period)):
-            yield goal
+        way = trajectory(here, goal, speed, acceleration, period)
+        yield np.vstack([way, np.repeat(goal[None], round(motion.rest / period), axis=0)])
         here = goal

@@ -1,25 +1,29 @@
 """The bus loop: drives the bus or listens to it, cycle by cycle; knows no web, no database and no observer."""
 
 import math
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from armlink.armfile import ArmFile
-from armlink.errors import ArmlinkError, BusFault
+from armlink.errors import ArmlinkError, BusFault, Refused
 from armlink.link import Link
 from armlink.listener import Listener
 from armlink.sample import Calibration, Command, Sample
 from calib.daemon.messages import Array, Batch, Down, Message, Progress, Reply, Request, Up
 from calib.daemon.settings import daemon_section
+from calib.description import gcomp_arm
+from calib.work import WorkMotion, work_pieces
 
 BATCH_SECONDS = 0.1
 """Samples go to the service so often: the snapshot rate of contract 8."""
 RETRY_SECONDS = 1.0
 """A bus that is not there is tried again after this time."""
+TOUR = WorkMotion(reach=10.0)
+"""A tour's moves may go from one end of a joint's range to the other."""
 SILENCE_SECONDS = 0.5
 """A bus without SYNC, or joints without readings, for so long is reported."""
 
@@ -39,20 +43,16 @@ class LoopOptions:
     """Gives the bus in tests; by default it is opened by name."""
 
 
-class Stopped(Exception):
-    """The service asked the loop to end in the middle of a sweep."""
-
-
 class ArmLoop:
     """`run()` makes cycles for a tenth of a second and returns what there is to say; `handle` does what is asked.
 
     A fault of bus or joint is a message, never an exception: the bus is opened again until it works.
     """
 
-    def __init__(self, options: LoopOptions, report: Callable[[Message], None] | None = None) -> None:
-        """`report` takes progress during a sweep, which no `run()` returns; it may raise Stopped."""
+    def __init__(self, options: LoopOptions) -> None:
         self.options = options
-        self._report = report or (lambda message: None)
+        self._tour: list[int] | None = None
+        self._told = -1
         self._source: Link | Listener | None = None
         self._targets: Iterator[Array] | None = None
         self._shift = 0.0
@@ -81,7 +81,7 @@ class ArmLoop:
 
     def close(self) -> None:
         """Let go of the bus; joints that were enabled are in quick stop, holding."""
-        source, self._source, self._targets = self._source, None, None
+        source, self._source, self._targets, self._tour = self._source, None, None, None
         if source is not None:
             try:
                 source.__exit__(None, None, None)
@@ -108,22 +108,16 @@ class ArmLoop:
         if request.what == "write":
             return source.write_calibration(**arguments)
         if request.what == "sweep":
-            return self._sweep(source, Path(arguments["out"]))
+            return self._sweep(source, arguments["poses"], arguments["seed"])
         raise BusFault(f"the loop knows no request {request.what!r}")
 
-    def _sweep(self, source: Link | Listener, out: Path) -> str:
-        """One pass of sweeps without a reference mass; what it read is in `out`."""
-        from calib.runner import run_sweep
-
+    def _sweep(self, source: Link | Listener, poses: int, seed: int) -> int:
+        """From now on the arm tours so many poses all over its range, then holds; `run` tells how far it is."""
         if not isinstance(source, Link):
-            raise BusFault("a sweep needs the bus: this daemon only listens")
-        self._targets = None
-
-        def progress(done: int, total: int, remaining: float, doing: str) -> None:
-            self._report(Progress(done, total, remaining, doing))
-
-        run_sweep(source, self.options.arm, out, progress=progress)
-        return str(out)
+            raise Refused("a sweep moves the arm, and this daemon only listens: let its controller move it more")
+        self._tour = [0, poses]
+        self._targets = self._touring(source, poses, seed)
+        return poses
 
     def _open(self) -> Message:
         options = self.options
@@ -158,9 +152,17 @@ class ArmLoop:
         source = self._source
         rows = self._listen(source) if isinstance(source, Listener) else self._drive(source)  # type: ignore[arg-type]
         assert source is not None
-        messages: list[Message] = [Batch.of(rows, source.stats)] if rows else []
         if isinstance(source, Listener):
+            heard = tuple(source.emergencies)
+            source.emergencies.clear()
+            messages: list[Message] = [Batch.of(rows, source.stats, heard)] if rows else []
             return messages + self._silence(source, bool(rows))
+        messages = [Batch.of(rows, source.stats)]
+        if self._tour is not None and self._tour[0] != self._told:
+            self._told = self._tour[0]
+            messages.append(Progress(*self._tour))
+            if self._told >= self._tour[1]:
+                self._tour, self._told = None, -1
         return messages
 
     def _drive(self, link: Link) -> list[tuple[float, Sample, Array, Array]]:
@@ -196,24 +198,34 @@ class ArmLoop:
 
     def _motion(self, link: Link) -> Iterator[Array]:
         """Targets, one a cycle: where the arm stands, or ordinary work where that was asked for."""
-        start = link.position_sent
         if self.options.work:
-            from calib.description import gcomp_arm
-            from calib.work import work_targets
-
-            arm = gcomp_arm(self.options.arm)
-            speed = np.array([joint.max_velocity for joint in self.options.arm.require_link().joints])
-            random = np.random.default_rng([self.options.seed, 8])
-            yield from work_targets(start, arm.lower, arm.upper, speed, link.period, random)
+            for pose in self._poses(link, self.options.seed, WorkMotion()):
+                yield from pose
+        here = link.position_sent
         while True:
-            yield start
+            yield here
+
+    def _touring(self, link: Link, poses: int, seed: int) -> Iterator[Array]:
+        """Targets of a tour over the whole range, then back to what it did before."""
+        for done, pose in enumerate(self._poses(link, seed, TOUR), start=1):
+            yield from pose
+            if self._tour is not None:
+                self._tour[0] = done
+            if done >= poses:
+                break
+        yield from self._motion(link)
+
+    def _poses(self, link: Link, seed: int, motion: WorkMotion) -> Iterator[Array]:
+        """Pieces (K, n) of motion without end, each to another pose and a rest there."""
+        arm = gcomp_arm(self.options.arm)
+        speed = np.array([joint.max_velocity for joint in self.options.arm.require_link().joints])
+        random = np.random.default_rng([seed, 8])
+        return work_pieces(link.position_sent, arm.lower, arm.upper, speed, link.period, random, motion)
 
     def _keep_pace(self, link: Link) -> None:
         """An in-process arm's time is as fast as the machine: wait for the machine's clock."""
         if not self.options.pace or getattr(link.bus, "clock", None) is None:
             return
-        import time
-
         now, real = link.clock.now(), time.monotonic()
         if self._real_start is None or real - self._real_start[1] - (now - self._real_start[0]) > 1.0:
             self._real_start = (now, real)  # the machine is slower than the arm: do not make up for it

@@ -1,6 +1,6 @@
 """What passes between the bus loop and the service: samples in batches, answers; never a lock, never a wait."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -25,16 +25,30 @@ class Batch:
     age: Array
     """Time since position and torque last came (n,) [s]."""
     stats: Stats
+    emergencies: tuple[tuple[int, int, int], ...] = ()
+    """(Joint, code, error register) of emergencies heard beside another controller."""
 
     @classmethod
-    def of(cls, rows: list[tuple[float, Sample, Array, Array]], stats: Stats) -> "Batch":
+    def of(
+        cls,
+        rows: list[tuple[float, Sample, Array, Array]],
+        stats: Stats,
+        emergencies: tuple[tuple[int, int, int], ...] = (),
+    ) -> "Batch":
         """From (t, sample, torque command, position command) of K > 0 cycles."""
         samples = [row[1] for row in rows]
         channels = {name: np.array([getattr(sample, name) for sample in samples]) for name in CHANNELS[:4]}
         channels["torque_command"] = np.array([row[2] for row in rows])
         channels["position_command"] = np.array([row[3] for row in rows])
         last = samples[-1]
-        return cls(np.array([row[0] for row in rows]), channels, last.status.copy(), last.age.copy(), stats)
+        return cls(
+            np.array([row[0] for row in rows]),
+            channels,
+            last.status.copy(),
+            last.age.copy(),
+            replace(stats),
+            emergencies,
+        )
 
 
 @dataclass(frozen=True)
@@ -57,7 +71,7 @@ class Request:
     """Something that the service asks of the loop."""
 
     id: int
-    what: Literal["read", "write", "sweep", "check", "stop"]
+    what: Literal["read", "write", "sweep", "stop"]
     arguments: dict[str, Any] = field(default_factory=dict)
 
 
@@ -78,9 +92,7 @@ class Progress:
 
     done: int
     total: int
-    remaining: float
-    """[s]"""
-    doing: str
+    """Poses."""
 
 
 Message = Batch | Up | Down | Reply | Progress

@@ -1,0 +1,279 @@
+"""From findings to records in force: policy, rate limit, approval, write, check, roll-back; every step kept."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+from armlink.armfile import ArmFile
+from armlink.errors import ArmlinkError, Refused
+from calib.after_write import Checked
+from calib.daemon.journal import Journal, ProposalRow
+from calib.daemon.messages import Array
+from calib.daemon.settings import DaemonSection
+from calib.daemon.view import NoSuch, NotPossible, Proposal
+from calib.daemon.wording import clean
+from calib.decision import Finding
+from calib.recalibration import APPLIED_BY, Recalibration, Recalibrator
+from calib.records import CalibrationRecord
+from calib.store import RecordStore
+from calib.writing import Controllers
+
+T = TypeVar("T")
+DAY = 86400.0
+
+Say = Callable[[str, str | None, str, dict[str, Any]], int]
+"""(kind, joint, text, evidence) → id of the event."""
+
+
+class Jobs(Protocol):
+    """Runs work that waits for the bus: aside, and hands the outcome back on the service's own thread."""
+
+    def __call__(self, work: Callable[[], T], done: Callable[[T | Exception], None]) -> None:
+        """`done` gets what `work` returned, or the error that it raised."""
+        ...
+
+
+@dataclass(frozen=True)
+class Outside:
+    """What recalibrations need of the service."""
+
+    say: Say
+    now: Callable[[], datetime]
+    run: Jobs
+    installed: Callable[[CalibrationRecord, Finding], None]
+    """Called when a record is in force and its finding in the controller."""
+
+
+class Recalibrations:
+    """Under one policy, with one set of records; `busy` while something waits for the bus."""
+
+    def __init__(
+        self,
+        arm: ArmFile,
+        settings: DaemonSection,
+        listen_only: bool,
+        store: RecordStore,
+        journal: Journal,
+        controllers: Controllers,
+        outside: Outside,
+    ) -> None:
+        """Raises Refused where the arm has no calibration record."""
+        self.settings, self.names = settings, arm.joint_names
+        self._journal, self._store, self._outside = journal, store, outside
+        self._listen_only = listen_only
+        self.recalibrator = Recalibrator(arm, controllers, store, "propose")
+        self.busy = False
+        self._waiting: list[Finding] = []
+
+    # ---- what the observer found
+
+    def found(self, finding: Finding) -> None:
+        """Make of a finding what the policy says."""
+        if self.settings.policy == "observe":
+            return
+        if self.busy:
+            self._waiting.append(finding)
+            return
+        automatic = self.settings.policy == "apply"
+        by, ask = (APPLIED_BY if automatic else None), not self._listen_only or automatic
+
+        def done(outcome: Recalibration | Exception) -> None:
+            self.busy = False
+            if isinstance(outcome, Exception):
+                self._refused(finding, outcome)
+            else:
+                self._proposed(finding, outcome, automatic)
+            self._next()
+
+        self._start(lambda: self.recalibrator.propose(finding, by, ask), done)
+
+    def _proposed(self, finding: Finding, outcome: Recalibration, automatic: bool) -> None:
+        joint, record = outcome.joint, outcome.record
+        now = self._outside.now()
+        with self._journal.transaction():
+            number = self._journal.add_proposal(now, joint, record.id, record.parent or "", finding_json(finding))
+            std = dict(zip(("gain_std", "offset_std"), finding.std, strict=True))
+            evidence = {"proposal": number, "record": record.id, "gain": finding.gain, "offset": finding.offset, **std}
+            text = f"{joint}: record {record.id} proposed: gain {outcome.gain:.5f}, offset {outcome.offset:.3f} N·m"
+            self._outside.say("proposal", joint, text, evidence)
+        if not automatic:
+            return
+        limit = self._limit(joint, now)
+        if limit:
+            self._outside.say("undecided", joint, f"{joint}: not written by itself: {limit}", {"proposal": number})
+            return
+        try:
+            self.approve(number, APPLIED_BY)
+        except NotPossible as error:
+            self._outside.say("refused", joint, f"not recalibrated: {error}", {"proposal": number})
+
+    def _limit(self, joint: str, now: datetime) -> str:
+        """Which rate limit forbids to write now, empty where none does; a clock that was set back counts as no time."""
+        applied = [row for row in self._journal.proposals() if row.state == "applied" and row.decided is not None]
+        ages = [(row.joint, abs((now - row.decided).total_seconds())) for row in applied if row.decided is not None]
+        settings = self.settings
+        if any(name == joint and age < settings.rest_between_writes for name, age in ages):
+            return f"at most one recalibration of a joint in {settings.rest_between_writes:g} s"
+        if sum(age < DAY for _, age in ages) >= settings.writes_per_day:
+            return f"{settings.writes_per_day} recalibrations in a day already"
+        return ""
+
+    # ---- what a person decides
+
+    def approve(self, number: int, by: str) -> Proposal:
+        """Write a pending proposal and put it in force; raises NoSuch, NotPossible."""
+        row = self._pending(number)
+        if self.busy:
+            raise NotPossible("another recalibration is under way: try again in a moment")
+        if row.base != self.recalibrator.record.id:
+            now = self.recalibrator.record.id
+            raise NotPossible(f"proposal {number} follows from record {row.base}, but {now} is in force by now")
+        with self._journal.transaction():
+            self._journal.decide(number, self._outside.now(), "approved", by)
+            self._outside.say("approved", row.joint, f"{row.joint}: approved by {by}", {"proposal": number, "by": by})
+        finding = finding_of(row.finding)
+
+        def work() -> CalibrationRecord:
+            record = self._store.get(row.record)
+            assert isinstance(record, CalibrationRecord)
+            self.recalibrator.apply(record, finding.joint, by)
+            return record
+
+        def done(outcome: CalibrationRecord | Exception) -> None:
+            self.busy = False
+            if isinstance(outcome, Exception):
+                with self._journal.transaction():
+                    self._journal.decide(number, self._outside.now(), "failed", "daemon", str(outcome))
+                    self._refused(finding, outcome, number)
+            else:
+                self.applied(row, by, outcome)
+            self._next()
+
+        self._start(work, done)
+        return proposal_answer(self._row(number))
+
+    def applied(self, row: ProposalRow, by: str, record: CalibrationRecord, install: bool = True) -> None:
+        """A proposal is in force: keep and say it; with `install` the observer takes it over too."""
+        finding = finding_of(row.finding)
+        joint = record.joints[finding.joint]
+        gain = "as before" if joint.gain is None else f"{joint.gain:.5f}"
+        text = f"{row.joint}: record {record.id} in force: gain {gain}, offset {joint.offset or 0.0:.3f} N·m"
+        evidence = {"proposal": row.id, "record": record.id, "replaces": row.base, "by": by, "applied": True}
+        with self._journal.transaction():
+            self._journal.decide(row.id, self._outside.now(), "applied", by)
+            self._outside.say("recalibration", row.joint, text, evidence)
+            if install:
+                self._outside.installed(record, finding)
+
+    def reject(self, number: int, by: str) -> Proposal:
+        """Drop a pending proposal; raises NoSuch, NotPossible."""
+        row = self._pending(number)
+        with self._journal.transaction():
+            self._journal.decide(number, self._outside.now(), "rejected", by)
+            self._outside.say("rejected", row.joint, f"{row.joint}: rejected by {by}", {"proposal": number, "by": by})
+        return proposal_answer(self._row(number))
+
+    # ---- after a write
+
+    def watch(self, samples: tuple[Array, Array, Array]) -> None:
+        """Give decimated samples to the check after a write; what is worse than before is taken back."""
+        if self.busy:
+            return
+        for t, position, torque in zip(*samples, strict=True):
+            checked = self.recalibrator.sample(float(t), position, torque)
+            if checked is not None:
+                self._checked(checked)
+                return
+
+    def _checked(self, checked: Checked) -> None:
+        joint = self.names[checked.joint]
+        if checked.verdict == "kept":
+            self._outside.say("check", joint, f"{joint}: recalibration holds: {checked.why}", {"kept": True})
+            return
+
+        def done(outcome: Recalibration | Exception) -> None:
+            self.busy = False
+            if isinstance(outcome, Exception):
+                _known(outcome)
+                self._outside.say("refused", joint, f"{joint}: roll-back failed: {outcome}", {})
+            else:
+                text = f"{joint}: rolled back to record {outcome.record.id}: {checked.why}"
+                self._outside.say("roll-back", joint, text, {"record": outcome.record.id, "why": checked.why})
+                assert outcome.undo is not None
+                self._outside.installed(outcome.record, outcome.undo)
+            self._next()
+
+        self._start(lambda: self.recalibrator.undo(checked), done)
+
+    # ---- inside
+
+    def _start(self, work: Callable[[], T], done: Callable[[T | Exception], None]) -> None:
+        self.busy = True
+        self._outside.run(work, done)
+
+    def _next(self) -> None:
+        if self._waiting and not self.busy:
+            self.found(self._waiting.pop(0))
+
+    def _refused(self, finding: Finding, error: Exception, number: int | None = None) -> None:
+        _known(error)
+        joint = self.names[finding.joint]
+        kind = "refused" if isinstance(error, Refused) else "fault"
+        evidence = {} if number is None else {"proposal": number}
+        self._outside.say(kind, joint, f"not recalibrated: {error}", evidence)
+
+    def _pending(self, number: int) -> ProposalRow:
+        row = self._row(number)
+        if row.state != "pending":
+            raise NotPossible(f"proposal {number} is {row.state} already")
+        return row
+
+    def _row(self, number: int) -> ProposalRow:
+        row = self._journal.proposal(number)
+        if row is None:
+            raise NoSuch(f"no proposal {number}")
+        return row
+
+
+def _known(error: Exception) -> None:
+    if not isinstance(error, ArmlinkError):
+        raise error
+
+
+def proposal_answer(row: ProposalRow) -> Proposal:
+    """A proposal as the API shows it."""
+    finding = finding_of(row.finding)
+    gain_std, offset_std = finding.std
+    return Proposal(
+        id=row.id,
+        time=row.time,
+        state=row.state,  # type: ignore[arg-type]
+        joint=row.joint,
+        cause=finding.cause,
+        gain=finding.gain,
+        gain_std=gain_std,
+        offset=finding.offset,
+        offset_std=offset_std,
+        rows=finding.rows,
+        confidence=finding.confidence,
+        record=row.record,
+        base=row.base,
+        decided_at=row.decided,
+        decided_by=row.by,
+        note=row.note,
+    )
+
+
+def finding_json(finding: Finding) -> dict[str, Any]:
+    """A finding as JSON values."""
+    names = ("joint", "cause", "gain", "offset", "rows", "confidence")
+    values: dict[str, Any] = clean({name: getattr(finding, name) for name in names})
+    return values | {"covariance": finding.covariance.tolist()}
+
+
+def finding_of(values: dict[str, Any]) -> Finding:
+    """The finding that finding_json wrote."""
+    return Finding(**{**values, "covariance": np.array(values["covariance"])})

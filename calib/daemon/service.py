@@ -1,0 +1,421 @@
+"""The service: wiring between bus loop, observer, journal, recalibration and view. One thread, no waiting."""
+
+import logging
+import sqlite3
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Protocol
+
+from armlink import emcy
+from armlink.armfile import ArmFile
+from armlink.errors import ArmlinkError, Refused
+from calib.daemon.journal import Journal
+from calib.daemon.messages import Batch, Down, Message, Progress, Reply, Up
+from calib.daemon.recalibrations import Jobs, Outside, Recalibrations, finding_of
+from calib.daemon.recordings import Recordings
+from calib.daemon.settings import DaemonSection
+from calib.daemon.stream import Hub
+from calib.daemon.view import EventItem, EventRecord, State
+from calib.daemon.watcher import Watcher
+from calib.daemon.wording import clean, told
+from calib.decision import Finding
+from calib.events import Event
+from calib.recalibration import write_record
+from calib.records import CalibrationRecord, GravityRecord
+from calib.store import RecordStore
+from calib.writing import Controllers
+
+BELIEF_SECONDS = 5.0
+"""The observer's belief is kept at least so often while there is something new."""
+HISTORY_SECONDS = 60.0
+"""One point of history in this time, and one at each event."""
+RECORDS_SECONDS = 5.0
+"""The record store is looked at so often: other commands may have put another record in force."""
+CLOCK_JUMP = 2.0
+"""A wall clock that moves by so much more or less than the monotonic one was set [s]."""
+FAULT_EVENTS_AN_HOUR = 20
+SWEEP_POSES = 60
+SWEEP_REST = 3600.0
+"""Time between two sweeps that the daemon decides on itself [s]."""
+STALE = 1.0
+"""A joint that is silent for longer is a fault [s]."""
+
+log = logging.getLogger("armlink.daemon")
+
+
+class Port(Protocol):
+    """The way to the bus loop."""
+
+    controllers: Controllers
+    """Reads and writes 2100h; waits, so that it is for jobs."""
+
+    def sweep(self, poses: int, seed: int) -> Reply | None:
+        """Ask for a tour of poses; the reply comes as a message where it is not returned."""
+        ...
+
+
+@dataclass(frozen=True)
+class Around:
+    """What the service is given from outside."""
+
+    monotonic: Callable[[], float]
+    wall: Callable[[], datetime]
+    """With zone."""
+    run: Jobs
+    port: Port
+    quiet: bool = False
+
+
+class Service:
+    """`take` a message of the bus loop; `tick` once a second or oftener. Everything else is asked through the view."""
+
+    def __init__(
+        self, arm: ArmFile, settings: DaemonSection, listen_only: bool, state: Path, store: RecordStore, around: Around
+    ) -> None:
+        """Go on from what `state` (a directory) holds; raises BadInput where that cannot be used."""
+        self.arm, self.settings, self.listen_only, self.directory, self.store = arm, settings, listen_only, state, store
+        self.around, self.version = around, version("armlink")
+        self.names = arm.joint_names
+        self.journal = Journal(state / "journal.db")
+        self.hub = Hub()
+        self.recordings = Recordings(state / "recordings", self.names, settings.recording)
+        self.started = around.monotonic()
+        self.batch: Batch | None = None
+        self.batch_at = -float("inf")
+        self.connected: bool | None = None
+        self.fault = ""
+        self.detail = self.trouble = ""
+        self.sweeping: Progress | None = None
+        self.watcher: Watcher | None = None
+        self.recalibrations: Recalibrations | None = None
+        self.calibration: CalibrationRecord | None = None
+        self.gravity: GravityRecord | None = None
+        self.accepted: dict[str, datetime] = {}
+        self._held: tuple[tuple[float, float, int], ...] | None = None
+        self._kept_rows = 0
+        self._kept_at = self._history_at = self._records_at = self._swept_at = -float("inf")
+        self._offset = around.wall().timestamp() - around.monotonic()
+        self._fault_times: list[float] = []
+        self.say("started", None, f"armlink {self.version} for {arm.name} {arm.serial}", {"policy": settings.policy})
+        self._load_records()
+
+    # ---- state
+
+    @property
+    def state(self) -> State:
+        """What the daemon is doing."""
+        if self.recalibrations is not None and self.recalibrations.busy:
+            return State.RECALIBRATING
+        if self.connected is None or (self.connected and self.watcher is None):
+            return State.STARTING
+        if not self.connected or self.silent:
+            return State.FAULT
+        return State.SWEEPING if self.sweeping is not None else State.OBSERVING
+
+    @property
+    def report(self) -> Path | None:
+        """The newest report in the state directory."""
+        reports = [path for path in self.directory.glob("*.html") if path.is_file()]
+        return max(reports, key=lambda path: path.stat().st_mtime, default=None)
+
+    @property
+    def silent(self) -> str:
+        """The joint that has sent nothing for too long, in words; empty where all send."""
+        if self.batch is None:
+            return ""
+        late = max(self.around.monotonic() - self.batch_at, 0.0) if self.connected else 0.0
+        ages = [float(age) + late for age in self.batch.age]
+        worst = max(range(len(ages)), key=ages.__getitem__)
+        return f"{self.names[worst]}: no reading for {ages[worst]:.1f} s" if ages[worst] > STALE else ""
+
+    def say(self, kind: str, joint: str | None, text: str, evidence: dict[str, Any]) -> int:
+        """Keep an event, tell the stream and the log; returns its id."""
+        now, t = self.around.wall(), self.around.monotonic()
+        text, evidence = " ".join(text.split()), clean(evidence)
+        number = self.journal.add_event(now, t, kind, joint, text, evidence)
+        record = EventRecord(id=number, time=now, t=t, kind=kind, joint=joint, text=text, evidence=evidence)
+        self.hub.publish(EventItem(event=record))
+        level = logging.WARNING if kind in ("fault", "refused", "alarm") else logging.INFO
+        log.log(level, text, extra={"event": number, "kind": kind, "joint": joint})
+        return number
+
+    # ---- messages of the bus loop
+
+    def take(self, message: Message) -> None:
+        """One message of the bus loop; a disk that fails is logged, shown in the status, and does not stop anything."""
+        try:
+            self._take(message)
+            self.trouble = ""
+        except sqlite3.Error as error:
+            self._trouble(error)
+
+    def _trouble(self, error: sqlite3.Error) -> None:
+        if not self.trouble:
+            log.error("journal: %s", error)
+        self.trouble = f"the journal cannot be written: {error}"
+
+    def _take(self, message: Message) -> None:
+        if isinstance(message, Batch):
+            self._batch(message)
+        elif isinstance(message, Up):
+            self._up(message)
+        elif isinstance(message, Down):
+            self._down(message.reason)
+        elif isinstance(message, Progress):
+            self._progress(message)
+        elif message.error is not None:
+            self.say("refused", None, f"sweep: {message.error}", {})
+            self.sweeping = None
+
+    def _batch(self, batch: Batch) -> None:
+        self.batch, self.batch_at = batch, self.around.monotonic()
+        for joint, code, register in batch.emergencies:
+            if code:
+                text = f"{self.names[joint]}: emergency {code:04X}h, {emcy.name_of(code)}"
+                self._fault_event(self.names[joint], text, {"code": code, "register": register})
+        self.recordings.append(batch)
+        watcher, recalibrations = self.watcher, self.recalibrations
+        if watcher is None or recalibrations is None:
+            return
+        samples = watcher.decimated(batch)
+        if recalibrations.busy:
+            return  # the calibration changes under these readings
+        before = watcher.observer.filter.accepted.copy()
+        events = watcher.observe(samples)
+        now = self.around.wall()
+        for name, more in zip(self.names, watcher.observer.filter.accepted > before, strict=True):
+            if more:
+                self.accepted[name] = now
+        if events:
+            self._events(events)
+        if not watcher.observer.held:
+            recalibrations.watch(samples)
+
+    def _events(self, events: list[Event]) -> None:
+        with self.journal.transaction():
+            for event in events:
+                kind, text, evidence = told(event)
+                self.say(kind, event.joint, text, evidence)
+            self.keep(history=True)
+        assert self.recalibrations is not None
+        for event in events:
+            if event.finding is not None:
+                self.recalibrations.found(event.finding)
+            elif event.kind == "undecided":
+                self._wish_sweep("watching alone cannot decide", self.settings.sweep_when_undecided)
+
+    def _up(self, up: Up) -> None:
+        back = self.connected is False
+        self.connected, self.fault = True, ""
+        if back:
+            self._fault_event(None, "the bus is back", {}, kind="recovered")
+        self._held = up.held
+        self._compare()
+
+    def _compare(self) -> None:
+        """What the controllers hold against the record in force; the policy apply writes it where they differ."""
+        if self.watcher is None or self.recalibrations is None:
+            return
+        differ = self.watcher.controllers_hold(self._held)
+        if not differ:
+            return
+        record, watcher = self.watcher.calibration, self.watcher
+        if self.settings.policy != "apply" or self.listen_only:
+            text = f"{', '.join(differ)}: the controllers hold another calibration than record {record.id}"
+            self.say(
+                "configuration", None, f"{text}; readings are converted; armlink history shows how to write it", {}
+            )
+            return
+
+        def done(outcome: tuple[str, ...] | Exception) -> None:
+            assert self.recalibrations is not None
+            self.recalibrations.busy = False
+            if isinstance(outcome, Exception):
+                self._raise_unknown(outcome)
+                self.say("refused", None, f"record {record.id} could not be written: {outcome}", {})
+                return
+            watcher.controllers_hold(None)
+            evidence = {"record": record.id, "joints": differ, "applied": True, "restored": True}
+            self.say("recalibration", None, f"record {record.id} written anew to {', '.join(outcome)}", evidence)
+
+        self.recalibrations.busy = True
+        self.around.run(lambda: write_record(record, self.around.port.controllers), done)
+
+    def _down(self, reason: str) -> None:
+        was, self.connected, self.sweeping = self.connected, False, None
+        changed, self.fault = reason != self.fault, reason
+        if was is not False:
+            self._fault_event(None, reason, {})
+        elif changed:
+            log.warning(reason)
+
+    def _fault_event(self, joint: str | None, text: str, evidence: dict[str, Any], kind: str = "fault") -> None:
+        """A fault or recovery as an event; one that comes and goes all the time goes to the log alone."""
+        now = self.around.monotonic()
+        self._fault_times = [t for t in self._fault_times if now - t < 3600.0]
+        if len(self._fault_times) >= FAULT_EVENTS_AN_HOUR:
+            log.warning(text)
+            return
+        self._fault_times.append(now)
+        self.say(kind, joint, text, evidence)
+
+    # ---- sweeps
+
+    def request_sweep(self, why: str) -> None:
+        """Tour the arm's range, so that the observer gets poses enough; only where the daemon drives the bus."""
+        if self.listen_only or self.state is not State.OBSERVING:
+            self.say("refused", None, f"no sweep ({why}): {'it only listens' if self.listen_only else self.state}", {})
+            return
+        self.sweeping = Progress(0, SWEEP_POSES)
+        self._swept_at = self.around.monotonic()
+        self.say("sweep", None, f"sweeping {SWEEP_POSES} poses: {why}", {"poses": SWEEP_POSES})
+        reply = self.around.port.sweep(SWEEP_POSES, int(self._swept_at))
+        if reply is not None and reply.error is not None:
+            self.take(reply)
+
+    def _wish_sweep(self, why: str, allowed: bool) -> None:
+        if allowed and not self.listen_only and self.around.monotonic() - self._swept_at > SWEEP_REST:
+            self.request_sweep(why)
+
+    def _progress(self, progress: Progress) -> None:
+        self.sweeping = progress
+        if progress.done >= progress.total:
+            self.sweeping = None
+            self.say("sweep", None, f"sweep of {progress.total} poses is done", {"poses": progress.total})
+
+    # ---- once a second
+
+    def tick(self) -> None:
+        """Whatever time alone asks for."""
+        try:
+            self._tick()
+        except sqlite3.Error as error:
+            self._trouble(error)
+
+    def _tick(self) -> None:
+        now = self.around.monotonic()
+        self._watch_clock(now)
+        if now - self._records_at >= RECORDS_SECONDS and not (self.recalibrations and self.recalibrations.busy):
+            self._load_records()
+        if self.watcher is not None:
+            new = self.watcher.observer.rows != self._kept_rows
+            due = now - self._history_at >= HISTORY_SECONDS
+            if new and (now - self._kept_at >= BELIEF_SECONDS or due):
+                self.keep(history=due)
+        hours = self.settings.sweep_every_hours
+        if hours is not None and self.state is State.OBSERVING and not self.listen_only:
+            if self._swept_at == -float("inf"):
+                self._swept_at = now
+            if now - self._swept_at >= hours * 3600.0:
+                self.request_sweep(f"every {hours:g} h")
+
+    def keep(self, history: bool = False) -> None:
+        """Put the observer's belief on disk, and a point of history where asked for, both or neither."""
+        if self.watcher is None:
+            return
+        now, t = self.around.wall(), self.around.monotonic()
+        calibration, gravity = self.watcher.calibration.id, self.watcher.gravity.id
+        with self.journal.transaction():
+            self.journal.save_belief(now, calibration, gravity, self.watcher.save())
+            if history:
+                self.journal.add_history(now, t, calibration, self.watcher.point())
+                self._history_at = t
+        self._kept_at, self._kept_rows = t, self.watcher.observer.rows
+
+    def close(self, why: str) -> None:
+        """Keep everything and end."""
+        try:
+            self.keep()
+            self.say("stopped", None, why, {})
+        except sqlite3.Error as error:
+            log.error("journal: %s", error)
+        self.recordings.close()
+        self.journal.close()
+
+    # ---- records
+
+    def _load_records(self) -> None:
+        """Take over the records in force; another one than before begins a new observer."""
+        self._records_at = self.around.monotonic()
+        try:
+            calibration = self.store.current(CalibrationRecord, self.arm)
+            gravity = self.store.current(GravityRecord, self.arm)
+        except ArmlinkError as error:
+            self.detail = str(error)
+            return
+        if calibration is None or gravity is None:
+            missing = " and ".join(
+                name for name, record in (("calibration", calibration), ("gravity", gravity)) if record is None
+            )
+            self.detail = (
+                f"waits for a {missing} record of {self.arm.name} {self.arm.serial}: armlink sweep, calibrate, identify"
+            )
+            return
+        if self.watcher and (calibration.id, gravity.id) == (self.watcher.calibration.id, self.watcher.gravity.id):
+            return
+        again = self.watcher is not None
+        try:
+            self._begin(calibration, gravity)
+        except Refused as error:
+            self.detail = str(error)
+            return
+        self.detail = ""
+        if again:
+            evidence = {"calibration": calibration.id, "gravity": gravity.id}
+            self.say("configuration", None, "other records are in force: observing anew against them", evidence)
+        self._compare()
+
+    def _begin(self, calibration: CalibrationRecord, gravity: GravityRecord) -> None:
+        watcher = Watcher(self.arm, calibration, gravity, self.settings.observer_config())
+        outside = Outside(self.say, self.around.wall, self.around.run, self._installed)
+        recalibrations = Recalibrations(
+            self.arm, self.settings, self.listen_only, self.store, self.journal, self.around.port.controllers, outside
+        )
+        self.watcher, self.recalibrations = watcher, recalibrations
+        self.calibration, self.gravity = calibration, gravity
+        self._resume(calibration, gravity)
+
+    def _resume(self, calibration: CalibrationRecord, gravity: GravityRecord) -> None:
+        """Go on from the belief on disk; decide what became of an approval that a kill interrupted."""
+        assert self.watcher is not None
+        assert self.recalibrations is not None
+        belief = self.journal.belief()
+        installed: Finding | None = None
+        for row in self.journal.proposals():
+            if row.record == calibration.id and row.state in ("applied", "approved"):
+                installed = finding_of(row.finding)
+            if row.state == "approved":
+                if row.record == calibration.id:
+                    self.recalibrations.applied(row, row.by or "daemon", calibration, install=False)
+                else:
+                    self.journal.decide(
+                        row.id, self.around.wall(), "failed", "daemon", "interrupted before it was in force"
+                    )
+        if belief is None or belief.gravity != gravity.id:
+            return
+        if belief.calibration == calibration.id:
+            self.watcher.restore(belief.state)
+        elif belief.calibration == calibration.parent and installed is not None and self.watcher.restore(belief.state):
+            self.watcher.observer.install(installed)
+
+    def _installed(self, record: CalibrationRecord, finding: Finding) -> None:
+        """A finding is in the controller and its record in force."""
+        if self.watcher is None:
+            return
+        self.calibration = record
+        self.watcher.follow(record)
+        self.watcher.observer.install(finding)
+        self.keep(history=True)
+
+    def _watch_clock(self, now: float) -> None:
+        before, self._offset = self._offset, self.around.wall().timestamp() - now
+        jump = self._offset - before
+        if abs(jump) > CLOCK_JUMP:
+            self.say("clock", None, f"the wall clock was set by {jump:+.1f} s", {"seconds": jump})
+
+    def _raise_unknown(self, error: Exception) -> None:
+        if not isinstance(error, ArmlinkError):
+            raise error
