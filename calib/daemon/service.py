@@ -146,11 +146,35 @@ class Service:
 
     def take(self, message: Message) -> None:
         """One message of the bus loop; a disk that fails is logged, shown in the status, and does not stop anything."""
+        self.guard(lambda: self._take(message))
+
+    def guard(self, act: Callable[[], object]) -> None:
+        """Do something that keeps things in the journal; a disk that fails does not stop anything."""
         try:
-            self._take(message)
-            self.trouble = ""
+            act()
         except sqlite3.Error as error:
             self._trouble(error)
+
+    def reload(self, arm: ArmFile, settings: DaemonSection) -> None:
+        """Another configuration of the same arm: it holds from now on, what the observer has learnt stays."""
+        before, self.arm, self.settings = self.settings, arm, settings
+        self.recordings.settings = settings.recording
+        if self.recalibrations is not None:
+            self.recalibrations.settings = settings
+        evidence = {"policy": settings.policy}
+        self.guard(lambda: self.say("configuration", None, "configuration reloaded", evidence))
+        if self.watcher is not None and settings.observer != before.observer:
+            self.guard(self._observe_anew)
+        self.guard(self._load_records)
+
+    def _observe_anew(self) -> None:
+        """Other thresholds: a new observer that goes on from what the old one knows."""
+        if self.recalibrations is not None and self.recalibrations.busy:
+            return
+        self.keep()
+        if self.calibration is not None and self.gravity is not None:
+            self._begin(self.calibration, self.gravity)
+            self._compare()
 
     def _trouble(self, error: sqlite3.Error) -> None:
         if not self.trouble:
@@ -290,10 +314,8 @@ class Service:
 
     def tick(self) -> None:
         """Whatever time alone asks for."""
-        try:
-            self._tick()
-        except sqlite3.Error as error:
-            self._trouble(error)
+        self.trouble = ""
+        self.guard(self._tick)
 
     def _tick(self) -> None:
         now = self.around.monotonic()
