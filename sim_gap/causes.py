@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sim_gap.confidence import confidence
 from sim_gap.confound import Rivals
-from sim_gap.diagnosis import Cause
+from sim_gap.diagnosis import Cause, Signs
 from sim_gap.effects.registry import Row
 from sim_gap.estimate import Estimate, Value
 from sim_gap.normal import ColumnStore, Normal, Term
@@ -30,12 +31,11 @@ class Step:
         return float(np.max(self.before - self.after))
 
 
-def ordered(estimate: Estimate, heldout: ResidualSet) -> list[Step]:
+def ordered(estimate: Estimate, scorer: "_Scorer") -> list[Step]:
     """Effects in the order in which each, added to those before it, lowers the held-out RMS of some joint most."""
     groups: dict[str, list[Term]] = defaultdict(list)
     for term in estimate.terms:
-        groups[_belongs(term, estimate.terms, heldout.layout.n - 1)].append(term)
-    scorer = _Scorer(estimate, heldout)
+        groups[_belongs(term, estimate.terms, scorer.heldout.layout.n - 1)].append(term)
     chosen: list[Term] = []
     before, steps = scorer.rms([]), []
     while groups:
@@ -61,56 +61,98 @@ class _Scorer:
         self.joint = np.array([row[1] for row in self.normal.rows])
         self.counts = self.normal.count.sum(0) > 0
 
+    def squares(self, terms: list[Term]) -> Array:
+        """Held-out mean square per row after fitting these terms on the training set, (R,)."""
+        return self.normal.mean_square(np.arange(self.normal.size), self.estimate.subset(terms))
+
+    def signs(self, terms: tuple[Term, ...], evidence: float) -> Signs:
+        """What speaks for and against a cause, on the row that rises most without its terms."""
+        data, rows = self.heldout, self.normal.rows
+        final = self.squares(list(self.estimate.terms))
+        without = self.squares([term for term in self.estimate.terms if term not in terms])
+        raw = np.maximum(self.squares([]), final)
+        r = int(np.argmax(np.where(self.counts, np.sqrt(without) - np.sqrt(final), -np.inf)))
+        floor = np.array([data.floor[row] for row in rows])
+        above = np.maximum(final - floor**2, 0.0)
+        gaps = self.counts & (np.sqrt(raw) > np.array([data.margin[row] for row in rows]))
+        elsewhere = float(np.mean(above[gaps] / raw[gaps])) if gaps.any() else 0.0
+        excess = float(np.sqrt(final[r])) / data.care[rows[r]]
+        return Signs(evidence, float(above[r] / max(raw[r], 1e-12)), excess, elsewhere)
+
     def rms(self, terms: list[Term]) -> Array:
         """Held-out RMS per joint after fitting these terms on the training set, (n,)."""
-        squares = self.normal.mean_square(np.arange(self.normal.size), self.estimate.subset(terms))
+        squares = self.squares(terms)
         out = np.zeros(self.heldout.layout.n)
         np.add.at(out, self.joint[self.counts], squares[self.counts])
         return np.asarray(np.sqrt(out))
 
 
-MINOR, MINOR_INNER = 5e-3, 1.5e-3
-"""Share of a joint's largest torque that a cause must lower some joint's RMS by, not to be minor; where the cause shows
+MINOR, MINOR_INNER = 0.012, 0.004
+"""Share of a joint's torque (RMS) that a cause must lower some joint's RMS by, not to be minor; where the cause shows
 against the model, and where only in motor against sensor or command."""
 
 
-def is_minor(step: Step, estimate: Estimate, heldout: ResidualSet) -> bool:
-    """Whether a step lowers no joint's RMS by what a user would care about."""
+def materials(step: Step, estimate: Estimate, heldout: ResidualSet, scorer: "_Scorer") -> tuple[Term, ...]:
+    """Those of a step's terms whose place matters: the rest can go together without a joint's RMS rising by what a
+    user would care about, all else that was found being there."""
     shows = {channel for term in step.terms for channel, _ in estimate.store.columns(term)}
     share = MINOR if heldout.layout.against_model in shows else MINOR_INNER
-    least = np.maximum(share * heldout.largest_torque, CARE_NM)
-    return bool(np.all(step.before - step.after < least))
+    least = np.maximum(share * heldout.usual_torque, CARE_NM)
+    if np.all(step.before - step.after < least):
+        return ()
+    places = {term.place for term in step.terms}
+    if len(places) == 1:
+        return step.terms
+    whole, small = scorer.rms(list(estimate.terms)), set[int]()
+
+    def rise(gone: set[int]) -> Array:
+        left = [term for term in estimate.terms if term not in step.terms or term.place not in gone]
+        return scorer.rms(left) - whole
+
+    for place in sorted(places, key=lambda place: float(np.max(rise({place}) / least))):
+        if np.all(rise({*small, place}) < least):
+            small.add(place)
+    return tuple(term for term in step.terms if term.place not in small) or step.terms
 
 
 def causes(
     estimate: Estimate, heldout: ResidualSet, rivals: Rivals, names: tuple[str, ...]
 ) -> tuple[list[Cause], list[Cause]]:
-    """The causes, most important first, and the minor ones."""
+    """The causes, most important first, and the minor ones: whole effects, and joints at which an effect is small."""
     found: list[Cause] = []
     minor: list[Cause] = []
-    for step in ordered(estimate, heldout):
-        places = sorted({term.place for term in step.terms})
-        whole = rivals.whole_arm(step.effect)
-        joints = names if whole else tuple(names[place] for place in places)
-        touched = np.arange(len(names)) if whole else np.array(places)
-        verdict = rivals.weigh(step.effect, step.terms)
-        parameters: dict[str, dict[str, Value]] = {}
-        for term in sorted(step.terms, key=lambda t: t.place):
-            parameters.setdefault("arm" if whole else names[term.place], {}).update(estimate.parameters(term))
-        (minor if is_minor(step, estimate, heldout) else found).append(
-            Cause(
-                effect=step.effect,
-                joints=joints,
-                parameters=parameters,
-                gap_before=float(np.sqrt(np.mean(step.before[touched] ** 2))),
-                gap_after=float(np.sqrt(np.mean(step.after[touched] ** 2))),
-                confidence=verdict.confidence,
-                fall=step.fall,
-                confounded_with=verdict.confounded_with,
-                separate_by=verdict.separate_by,
-            )
-        )
+    scorer = _Scorer(estimate, heldout)
+    for step in ordered(estimate, scorer):
+        main = materials(step, estimate, heldout, scorer)
+        rest = tuple(term for term in step.terms if term not in main)
+        for terms, out in ((main, found), (rest, minor)):
+            if terms:
+                out.append(_cause(step, terms, scorer, rivals, names))
     return found, minor
+
+
+def _cause(step: Step, terms: tuple[Term, ...], scorer: "_Scorer", rivals: Rivals, names: tuple[str, ...]) -> Cause:
+    """One cause from the terms of a step that belong together."""
+    places = sorted({term.place for term in terms})
+    whole = rivals.whole_arm(step.effect)
+    touched = np.arange(len(names)) if whole else np.array(places)
+    weighed = rivals.weigh(step.effect, terms)
+    signs = scorer.signs(terms, weighed.evidence)
+    parameters: dict[str, dict[str, Value]] = {}
+    for term in sorted(terms, key=lambda t: t.place):
+        parameters.setdefault("arm" if whole else names[term.place], {}).update(scorer.estimate.parameters(term))
+    return Cause(
+        effect=step.effect,
+        joints=names if whole else tuple(names[place] for place in places),
+        parameters=parameters,
+        gap_before=float(np.sqrt(np.mean(step.before[touched] ** 2))),
+        gap_after=float(np.sqrt(np.mean(step.after[touched] ** 2))),
+        confidence=confidence(signs, len(weighed.confounded_with)),
+        fall=step.fall,
+        signs=signs,
+        confounded_with=weighed.confounded_with,
+        separate_by=weighed.separate_by,
+    )
 
 
 def left_over(data: ResidualSet, explained: dict[Row, Array]) -> dict[Row, Array]:

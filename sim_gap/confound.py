@@ -3,16 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from sim_gap.effects.registry import effects
 from sim_gap.normal import Term
 from sim_gap.select import Search, shortlist
 
 AS_GOOD = 0.02
 """A rival is as good where it scores no more than this below the chosen effect (half a log of the mean square)."""
-SURE = 0.03
-"""Evidence (in the same units) that makes a cause e times less doubtful."""
 TRIED = 4
 MOTION = {
     frozenset(
@@ -43,9 +39,9 @@ GENERAL = "each joint alone through its whole range, slow and fast, both ways, w
 
 @dataclass(frozen=True)
 class Weighed:
-    """How sure a cause is, and what could stand in its place."""
+    """What is lost without a cause, and what could stand in its place."""
 
-    confidence: float
+    evidence: float
     confounded_with: tuple[str, ...]
     separate_by: str | None
 
@@ -62,9 +58,9 @@ class Rivals:
         return effects()[effect].whole_arm
 
     def weigh(self, effect: str, terms: Sequence[Term]) -> Weighed:
-        """Confidence of a cause from what is lost without it at its best-founded place, whatever stands in."""
+        """What is lost without a cause at its best-founded place, whatever stands in; and what does as well."""
         search = self.search
-        present = [term for term in search.active if term.effect == effect]
+        present = [term for term in search.active if term in terms and term.effect == effect]
         evidence = 0.0
         rivals: list[str] = []
         for term in present:
@@ -84,8 +80,5 @@ class Rivals:
             if weakest >= evidence or not rivals:
                 evidence, rivals = max(evidence, weakest), own
         confounded = tuple(dict.fromkeys(rivals))
-        confidence = 1.0 - 0.5 * float(np.exp(-max(evidence, 0.0) / SURE))
-        if confounded:
-            confidence = min(confidence, 1.0 / (1 + len(confounded)) + 0.2)
         motion = MOTION.get(frozenset({effect, confounded[0]}), GENERAL) if confounded else None
-        return Weighed(confidence, confounded, f"record {motion}" if motion else None)
+        return Weighed(evidence, confounded, f"record {motion}" if motion else None)

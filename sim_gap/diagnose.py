@@ -1,12 +1,13 @@
 """The diagnosis: recordings and a model in, where, which effect and how far out."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from armlink.errors import BadInput
 from armlink.recording import Recording, default_names, slice_rows
 from sim_gap.causes import causes, left_over
+from sim_gap.confidence import HINT
 from sim_gap.confound import Rivals
 from sim_gap.diagnosis import Cause, Diagnosis
 from sim_gap.effects.registry import effects, layout_of
@@ -82,11 +83,12 @@ def _answer(made: Internals, found: list[Cause], minor: list[Cause], told: str) 
     left, left_fit = (
         left_over(data, estimate.predict(data)) if estimate is not None else data.values for data in (judge, fit)
     )
+    told_verdict = "no_gap" if estimate is None else verdict(found, judge, left)
     return Diagnosis(
-        verdict="no_gap" if estimate is None else verdict(found, judge, left),
+        verdict=told_verdict,
         names=made.model.arm.names,
         where=tuple(places(judge)),
-        causes=tuple(found),
+        causes=tuple(_hints(found) if told_verdict == "unexplained" else found),
         minor=tuple(minor),
         noise_floor=combined(judge, judge.floor),
         train_before=by_joint(fit),
@@ -100,6 +102,11 @@ def _answer(made: Internals, found: list[Cause], minor: list[Cause], told: str) 
         notes=_notes(fit),
         internals=made,
     )
+
+
+def _hints(found: list[Cause]) -> list[Cause]:
+    """Causes as they stand where structure is left that nothing explains: none is blamed."""
+    return [replace(cause, confidence=min(cause.confidence, HINT)) for cause in found]
 
 
 def _names(recording: Recording) -> tuple[str, ...]:

@@ -14,6 +14,20 @@ Verdict = Literal["no_gap", "explained", "ambiguous", "unexplained"]
 
 
 @dataclass(frozen=True)
+class Signs:
+    """What speaks for a cause and against it, on the row where it brings most."""
+
+    evidence: float
+    """What is lost without it, whatever stands in its place: fall of ½ log(R² + floor²)."""
+    left: float
+    """Share of that row's squared gap that is left in the end, above the noise, on motion not fitted."""
+    excess: float
+    """What is left there in the end [RMS], in units of what is not worth explaining."""
+    elsewhere: float
+    """Share of the whole squared gap that is left."""
+
+
+@dataclass(frozen=True)
 class Cause:
     """One effect, the joints it sits on, its parameters, and what adding it to those before it does to the gap."""
 
@@ -25,6 +39,8 @@ class Cause:
     confidence: float
     fall: float
     """Largest fall of a joint's held-out RMS [N·m]."""
+    signs: Signs
+    """What the confidence was made from."""
     confounded_with: tuple[str, ...] = ()
     separate_by: str | None = None
 
@@ -87,6 +103,7 @@ class Diagnosis:
             ],
             "causes": [_cause(cause) for cause in self.causes],
             "minor": [_cause(cause) for cause in self.minor],
+            "signs": [{name: _round(value) for name, value in vars(cause.signs).items()} for cause in self.causes],
             "gap": {
                 "unit": "N·m",
                 "joints": list(self.names),

@@ -8,12 +8,15 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from sim_gap.effects.registry import Row, effects
-from sim_gap.normal import ColumnStore, Normal, Term
+from sim_gap.normal import CORRELATED, ColumnStore, Normal, Term
 from sim_gap.residual import ResidualSet
 from sim_gap.rigid import Array
 from sim_gap.select import Search
 
 SHAPE_STEP = 1e-2
+SYSTEMATIC = 0.3
+"""Share of a row's residual, and of what is not worth explaining, that may pass for any effect however long one
+records."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,8 @@ class Estimate:
 
     @cached_property
     def covariance(self) -> Array:
-        """Of coefficients and smooth shapes, (P + S, P + S): sandwich over blocks of time."""
+        """Of coefficients and smooth shapes, (P + S, P + S): sandwich over blocks of time, and what the rest of the arm
+        being a little wrong adds: an error of SYSTEMATIC times each row's residual that follows the column itself."""
         size = self._jacobian[0][1].shape[1]
         bread, scores = np.zeros((size, size)), np.zeros((int(self.store.data.blocks.max()) + 1, size))
         for weight, x, residual, block in self._jacobian:
@@ -91,7 +95,9 @@ class Estimate:
         scale = 1.0 / np.sqrt(np.maximum(np.diag(bread), 1e-300))
         inverse = np.linalg.pinv(bread * scale * scale[:, None], hermitian=True, rcond=1e-10) * scale * scale[:, None]
         blocks = max(len(scores), 2)
-        return np.asarray(inverse @ (scores.T @ scores) @ inverse * blocks / (blocks - 1))
+        seen = sum(len(residual) for _, _, residual, _ in self._jacobian) / max(len(self._jacobian), 1)
+        systematic = SYSTEMATIC**2 * seen / CORRELATED * inverse
+        return np.asarray(inverse @ (scores.T @ scores) @ inverse * blocks / (blocks - 1) + systematic)
 
     def parameters(self, term: Term) -> dict[str, Value]:
         """Reported parameters with 95 % intervals."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,8 @@ from sim_gap.effects.registry import Columns, Layout, Row, Shape, effects
 from sim_gap.residual import ResidualSet
 from sim_gap.rigid import Array
 
+PRICE = 0.012
+"""What a coefficient must at least lower Σ ½ log(R² + floor²) over all rows by: about 1 % of one row's RMS."""
 CORRELATED = 8.0
 """Samples of one effective observation: residuals of real arms are correlated over a third of a second or more."""
 
@@ -71,6 +74,7 @@ class Normal:
         shape = (self.folds, len(self.rows))
         self.square, self.count = np.zeros(shape), np.zeros(shape)
         self.blocks: list[_Block] = []
+        self._freedom: dict[Term, float] = {}
         self.floor = np.array([data.care[row] for row in self.rows])
         for r, row in enumerate(self.rows):
             self._accumulate(store, r, row)
@@ -79,9 +83,18 @@ class Normal:
         spread = np.concatenate([np.broadcast_to(s, w) for s, w in zip(spreads, widths, strict=True)] or [np.zeros(0)])
         mean_square = np.zeros(self.size)
         for block in self.blocks:
-            mean_square[block.index] += np.diagonal(block.gram.sum(0)) / max(self.count.sum(), 1.0)
+            mean_square[block.index] += np.diagonal(block.whole) / max(self.count.sum(), 1.0)
         self.prior = 1.0 / spread**2 + 1e-9 * mean_square
         self.prior[mean_square == 0.0] += 1.0
+
+    @property
+    def price(self) -> float:
+        """What a coefficient must lower Σ ½ log(R² + floor²) over all rows by: more where there is little data.
+
+        ½ log(N)/N for N effective observations of a row (Schwarz), but at least PRICE.
+        """
+        effective = max(float(self.count.sum(0).max(initial=0.0)) / CORRELATED, 3.0)
+        return max(PRICE, 0.5 * float(np.log(effective)) / effective)
 
     def _accumulate(self, store: ColumnStore, r: int, row: Row) -> None:
         data = store.data
@@ -108,17 +121,41 @@ class Normal:
         return np.concatenate([self.at[term] for term in terms] or [np.zeros(0, np.intp)]).astype(np.intp)
 
     def solve(self, index: NDArray[np.intp], gram: Array, side: Array) -> Array:
-        """Coefficients at `index` from the weighted sums (P, P) and (P,), with the prior."""
-        matrix = gram[np.ix_(index, index)] + np.diag(self.prior[index])
+        """Coefficients at `index` from the weighted sums (p, p) and (p,) of these, with the prior."""
+        matrix = gram + np.diag(self.prior[index])
         scale = 1.0 / np.sqrt(np.diag(matrix))
         return np.asarray(
-            scale * np.linalg.solve(matrix * scale * scale[:, None] + 1e-10 * np.eye(len(index)), scale * side[index])
+            scale * np.linalg.solve(matrix * scale * scale[:, None] + 1e-10 * np.eye(len(index)), scale * side)
         )
 
     def mean_square(self, index: NDArray[np.intp], coefficients: Array) -> Array:
         """Residual's mean square per row after the terms, (R,)."""
         errors = sum((self.errors(index, coefficients, fold) for fold in range(self.folds)), np.zeros(len(self.rows)))
         return np.asarray(errors / np.maximum(self.count.sum(0), 1.0))
+
+    def freedom(self, term: Term) -> float:
+        """How many of a term's coefficients can show: those whose plausible size is worth a parameter."""
+        if term not in self._freedom:
+            at = self.at[term]
+            gram = np.zeros((len(at), len(at)))
+            for weight, block in zip(self.weights(np.zeros(len(self.rows))), self.blocks, strict=True):
+                inside = block.position[at]
+                if np.all(inside >= 0):
+                    gram += weight * block.whole[np.ix_(inside, inside)]
+            spread = 1.0 / np.sqrt(self.prior[at])
+            values = np.maximum(np.linalg.eigvalsh(gram * spread * spread[:, None]), 0.0)
+            self._freedom[term] = max(float(np.sum(values / (1.0 + values))), 1.0)
+        return self._freedom[term]
+
+    def size_of(self, term: Term, index: NDArray[np.intp], coefficients: Array) -> Array:
+        """RMS that a term contributes to each row with these coefficients of all terms (0 where it does not), (R,)."""
+        values = dict(zip(index.tolist(), coefficients.tolist(), strict=True))
+        c, out = np.array([values[i] for i in self.at[term].tolist()]), np.zeros(len(self.rows))
+        for r, block in enumerate(self.blocks):
+            at = block.position[self.at[term]]
+            if np.all(at >= 0):
+                out[r] = np.sqrt(max(float(c @ block.whole[np.ix_(at, at)] @ c), 0.0) / max(self.count[:, r].sum(), 1))
+        return out
 
     def errors(self, index: NDArray[np.intp], coefficients: Array, fold: int) -> Array:
         """Sum of squares per row after the terms over one fold, (R,)."""
@@ -144,49 +181,69 @@ class _Block:
     side: Array
     """(F, p, p) and (F, p)."""
 
+    @cached_property
+    def whole(self) -> Array:
+        """Gram over all folds, (p, p)."""
+        return np.asarray(self.gram.sum(0))
+
 
 class Weighted:
     """Normal equations under given row weights: fits, cross-validates, screens."""
 
     def __init__(self, normal: Normal, mean_square: Array) -> None:
         self.normal = normal
-        weights = normal.weights(mean_square)
-        gram = np.zeros((normal.folds, normal.size, normal.size))
-        side = np.zeros((normal.folds, normal.size))
-        for weight, block in zip(weights, normal.blocks, strict=True):
+        self.weights = normal.weights(mean_square)
+        self.gram, self.side = np.zeros((normal.size, normal.size)), np.zeros(normal.size)
+        for weight, block in zip(self.weights, normal.blocks, strict=True):
             if weight > 0.0 and len(block.index):
-                gram[:, block.index[:, None], block.index] += weight * block.gram
-                side[:, block.index] += weight * block.side
-        self.gram, self.side = gram.sum(0), side.sum(0)
-        self.others_gram, self.others_side = self.gram - gram, self.side - side
+                self.gram[block.index[:, None], block.index] += weight * block.whole
+                self.side[block.index] += weight * block.side.sum(0)
 
     def fit(self, terms: Sequence[Term]) -> tuple[NDArray[np.intp], Array]:
         """Indices and coefficients of the terms on all folds."""
         index = self.normal.index(terms)
-        return index, self.normal.solve(index, self.gram, self.side)
+        return index, self.normal.solve(index, self.gram[np.ix_(index, index)], self.side[index])
 
     def cross_validated(self, terms: Sequence[Term]) -> Array:
         """Mean square per row, each fold predicted from the others, (R,)."""
         normal, index = self.normal, self.normal.index(terms)
+        gram, side = self._without_fold(index)
         errors = np.zeros(len(normal.rows))
         for fold in range(normal.folds):
-            coefficients = normal.solve(index, self.others_gram[fold], self.others_side[fold])
-            errors += normal.errors(index, coefficients, fold)
+            errors += normal.errors(index, normal.solve(index, gram[fold], side[fold]), fold)
         return np.asarray(errors / np.maximum(normal.count.sum(0), 1.0))
+
+    def _without_fold(self, index: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Weighted sums over all folds but each, of the columns `index`, (F, p, p) and (F, p)."""
+        folds, size = self.normal.folds, len(index)
+        gram, side = np.zeros((folds, size, size)), np.zeros((folds, size))
+        for weight, block in zip(self.weights, self.normal.blocks, strict=True):
+            at = block.position[index]
+            there = np.flatnonzero(at >= 0)
+            if weight > 0.0 and len(there):
+                at = at[there]
+                gram[:, there[:, None], there] += weight * block.gram[:, at[:, None], at]
+                side[:, there] += weight * block.side[:, at]
+        return self.gram[np.ix_(index, index)] - gram, self.side[index] - side
 
     def screen(self, terms: Sequence[Term], candidates: Sequence[Term]) -> list[tuple[float, Term]]:
         """Candidates by the fall of the weighted squares that each would bring on top of `terms`, best first."""
         normal, index = self.normal, self.normal.index(terms)
-        full, side = self.gram, self.side
-        matrix = full[np.ix_(index, index)] + np.diag(normal.prior[index])
-        through = np.linalg.solve(matrix, np.column_stack([full[index], side[index]])) if len(index) else None
-        falls = []
-        for candidate in candidates:
-            own = normal.at[candidate]
-            block, left = full[np.ix_(own, own)] + np.diag(normal.prior[own]), side[own]
-            floor = 1e-6 * np.diag(block) + 1e-300
-            if through is not None:
-                onto = full[np.ix_(own, index)]
-                block, left = block - onto @ through[:, own], left - onto @ through[:, -1]
-            falls.append((float(left @ np.linalg.solve(block + np.diag(floor), left)), candidate))
+        matrix, left = self.gram + np.diag(normal.prior), self.side
+        if len(index):
+            onto = self.gram[:, index]
+            through = np.linalg.solve(matrix[np.ix_(index, index)], np.column_stack([onto.T, left[index]]))
+            rest = onto @ through
+            floor = 1e-6 * np.diag(matrix)
+            matrix, left = matrix - rest[:, :-1], left - rest[:, -1]
+        else:
+            floor = 1e-6 * np.diag(matrix)
+        falls: list[tuple[float, Term]] = []
+        widths = np.array([len(normal.at[candidate]) for candidate in candidates], int)
+        for width in np.unique(widths).tolist():
+            same = [candidates[i] for i in np.flatnonzero(widths == width).tolist()]
+            own = np.array([normal.at[candidate] for candidate in same])
+            blocks = matrix[own[:, :, None], own[:, None, :]] + (floor[own] + 1e-300)[:, :, None] * np.eye(width)
+            gains = np.einsum("ki,ki->k", left[own], np.linalg.solve(blocks, left[own][..., None])[..., 0])
+            falls += zip(gains.tolist(), same, strict=True)
         return sorted(falls, key=lambda pair: -pair[0])

@@ -12,16 +12,18 @@ from sim_gap.signals import Signals
 
 MODEL_FLOOR = 1e-3
 """Numerical and geometrical error that every model is granted, as a share of its torque."""
-SMALL, SMALL_INNER, SMALL_NM = 3e-3, 1e-3, 0.01
-"""Residual that is not worth a parameter: share of a joint's largest torque against the model, of motor against sensor
+SMALL, SMALL_INNER, SMALL_NM = 0.01, 0.003, 0.01
+"""Residual that is not worth a parameter: share of a joint's torque (RMS) against the model, of motor against sensor
 or command, and [N·m]."""
 CARE_NM = 0.05
 """Smallest gap that a user would care about [N·m]: every arm has a few hundredths of friction and offset."""
-CARE, CARE_INNER, CARE_COMMAND = 0.01, 0.003, 0.001
-"""A gap that a user would care about, as a share of the largest torque: against the model, motor against sensor,
+CARE, CARE_INNER, CARE_COMMAND = 0.02, 0.008, 0.003
+"""A gap that a user would care about, as a share of the joint's torque (RMS): against the model, motor against sensor,
 command against motor."""
+FAINT = 0.4
+"""Share of that below which there is nothing to search for."""
 FOLDS = 6
-MOVING_SHARE = 0.8
+MOVING_SHARE = 0.95
 """A sample of the motor row counts where the joint moves during this share of the filter's window."""
 BLOCK_S = 2.0
 """Length of the blocks within which errors may be correlated, for confidence intervals [s]."""
@@ -95,13 +97,13 @@ class ResidualSet:
     def care(self) -> dict[Row, float]:
         """What is not worth explaining in each row [N·m]: noise, and a small share of the largest torque."""
         small = {row: SMALL if row[0] == self.layout.against_model else SMALL_INNER for row in self.rows}
-        parts = {row: (self.floor[row], small[row] * self.largest_torque[row[1]], SMALL_NM) for row in self.rows}
+        parts = {row: (self.floor[row], small[row] * self.usual_torque[row[1]], SMALL_NM) for row in self.rows}
         return {row: float(np.linalg.norm(part)) for row, part in parts.items()}
 
     @cached_property
-    def largest_torque(self) -> Array:
-        """Largest model torque of each joint [N·m], (n,)."""
-        return np.asarray(np.max([np.abs(s.model).max(0) for s in self.signals], axis=0))
+    def usual_torque(self) -> Array:
+        """RMS model torque of each joint, in the recording where it is largest [N·m], (n,)."""
+        return np.asarray(np.max([np.sqrt(np.mean(s.model**2, axis=0)) for s in self.signals], axis=0))
 
     def _floor(self, s: Signals, row: Row) -> float:
         channel, joint = row
@@ -144,8 +146,14 @@ class ResidualSet:
         """
         shares = {self.layout.against_model: CARE, self.layout.command: CARE_COMMAND}
         care = {row: shares.get(row[0], CARE_INNER) for row in self.rows}
-        torque = self.largest_torque
+        torque = self.usual_torque
         return {row: 2.0 * self.floor[row] + max(care[row] * torque[row[1]], CARE_NM) for row in self.rows}
+
+    @cached_property
+    def faint(self) -> dict[Row, float]:
+        """Below this a row's RMS holds nothing worth a search [N·m]."""
+        noise = {row: 2.0 * floor for row, floor in self.floor.items()}
+        return {row: noise[row] + max(FAINT * (self.margin[row] - noise[row]), CARE_NM) for row in self.rows}
 
     def spread(self, effect: Effect, place: int) -> Array:
         """Prior standard deviation of the effect's coefficients."""

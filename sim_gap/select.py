@@ -10,12 +10,14 @@ from sim_gap.effects.registry import effects
 from sim_gap.normal import ColumnStore, Normal, Term, Weighted
 from sim_gap.residual import ResidualSet
 
-PRICE = 0.012
-"""What a coefficient must lower Σ ½ log(R² + floor²) over all rows by: about 1 % of one row's RMS."""
 SHORTLIST = 10
 MOST_TERMS = 60
 TRIES = 3
 """How often one effect at one place may come in during a search."""
+OWED = 0.06
+"""What an effect must do better by than the simpler ones it is made of, where it needs some of these besides."""
+BESIDE = 0.3
+"""Size of these, as a share of its own, from which it needs them."""
 
 
 def candidates(data: ResidualSet, library: Sequence[str]) -> list[Term]:
@@ -58,7 +60,7 @@ class Search:
             return float("inf")
         squares = self.weighted.cross_validated(terms)
         fit = 0.5 * np.log(squares + normal.floor**2)[normal.seen].sum()
-        return float(fit + PRICE * sum(self.cost(term) for term in terms))
+        return float(fit + normal.price * sum(self.cost(term) for term in terms))
 
     def _implausible(self, terms: Sequence[Term]) -> Term | None:
         """The first of the terms whose coefficients no such effect can have."""
@@ -78,10 +80,10 @@ class Search:
         self.active = chosen
         self.reweigh()
 
-    def cost(self, term: Term) -> int:
-        """Coefficients and shape parameters of a term, and what a rare effect must earn besides."""
+    def cost(self, term: Term) -> float:
+        """Coefficients that can show and shape parameters of a term, and what a rare effect must earn besides."""
         effect = effects()[term.effect]
-        return len(self.normal.at[term]) + len(term.shape) * (not effect.secant) + effect.rare
+        return self.normal.freedom(term) + len(term.shape) * (not effect.secant) + effect.rare
 
     def with_beneath(self, term: Term, terms: Sequence[Term]) -> list[Term]:
         """`terms` plus `term` plus what it stands upon; another shape of the same effect there gives way."""
@@ -142,6 +144,44 @@ class Search:
         self.accept(chosen)
         return True
 
+    def dissolve(self) -> bool:
+        """Exchange one term for the simpler effects that it could be made of, where those do as well."""
+        best, chosen = self.score - 1e-3, None
+        for term in self.active:
+            parts = effects()[term.effect].made_of(self.normal.layout, term.place, term.shape)
+            if not parts:
+                continue
+            rest = self.without(term, self.active)
+            have = {other.key for other in rest}
+            new = [other for other in self.normal.terms if other.key in parts and other.key not in have]
+            score, trial = self.pruned([*rest, *new], new)
+            if score - self.owed(term) < best:
+                best, chosen = score - self.owed(term), trial
+        if chosen is None:
+            return False
+        self.accept(chosen)
+        return True
+
+    def pruned(self, terms: list[Term], doubtful: Sequence[Term]) -> tuple[float, list[Term]]:
+        """Score and terms after dropping of the doubtful ones those that do not earn their place."""
+        best, kept = self.judge(terms), terms
+        while True:
+            trials = [self.without(term, kept) for term in doubtful if term in kept]
+            scored = [(self.judge(trial), i) for i, trial in enumerate(trials)]
+            if not scored or min(scored)[0] >= best:
+                return best, kept
+            best, kept = min(scored)[0], trials[min(scored)[1]]
+
+    def owed(self, term: Term) -> float:
+        """What a term must do better by than its parts, where some of these are needed beside it."""
+        parts = effects()[term.effect].made_of(self.normal.layout, term.place, term.shape)
+        beside = [other for other in self.active if other.key in parts]
+        if not beside:
+            return 0.0
+        own = self.normal.size_of(term, *self.weighted.fit(self.active))
+        others = [self.normal.size_of(other, *self.weighted.fit(self.active)) for other in beside]
+        return OWED if any(np.any(size > BESIDE * own) for size in others) else 0.0
+
     def run(self) -> list[Term]:
         """Forward and backward until nothing helps, then exchanges, then again."""
         for _ in range(4):
@@ -150,7 +190,8 @@ class Search:
                     pass
             while self.backward():
                 pass
-            if not self.swap():
+            dissolved = self.dissolve()
+            if not self.swap() and not dissolved:
                 break
         return self.active
 

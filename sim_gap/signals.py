@@ -20,6 +20,8 @@ BAND_HZ = 6.0
 """Pass band in which model and recording are compared."""
 SMOOTH_HZ = 20.0
 """Pass band of position and velocity before anything nonlinear is taken of them."""
+CALM_HZ = 8.0
+"""Pass band of the model torque before a play or a clip is taken of it."""
 WORK_HZ = 125.0
 """Highest rate at which columns are computed; faster recordings are low-passed and decimated to it."""
 TRIM_S = 0.3
@@ -71,6 +73,16 @@ class Signals:
     def model(self) -> Array:
         """Nominal rigid-body torque [N·m], (K, n)."""
         return self.arm.torque(self.q, self.v, self.a)
+
+    @cached_property
+    def smooth_model(self) -> Array:
+        """Nominal torque without the noise of the accelerations, which would shake every play and clip (K, n)."""
+        return _low_pass(min(CALM_HZ, 0.4 * self.rate), self.rate)(self.model)
+
+    @cached_property
+    def motor_model(self) -> Array:
+        """Nominal torque at the motor, with the model's own rotors, friction and springs [N·m], (K, n)."""
+        return self.model + self.arm.nominal_joint_torque(self.q, self.v, self.a, self.direction)
 
     @cached_property
     def gravity_columns(self) -> Array:
@@ -151,7 +163,7 @@ def prepare(recording: Recording, arm: RigidArm, label: str = "recording") -> Si
     require_length(recording, label)
     raw_step = float(np.median(np.diff(recording.t)))
     even = np.arange(recording.t[0], recording.t[-1] + 0.5 * raw_step, raw_step)
-    stride = max(1, int(1.0 / raw_step / WORK_HZ + 1e-6))
+    stride = max(1, int(1.0 / raw_step / WORK_HZ + 0.1))
     rate = 1.0 / (raw_step * stride)
     band = min(BAND_HZ, rate / 5.0)
     if band < 0.5:
@@ -225,7 +237,10 @@ def _low_pass(cut: float, rate: float) -> Callable[[Array], Array]:
 
 
 def _band_noise(t: Array, values: Array, band: float) -> float:
-    """Noise within the pass band [N·m], from the channel's own spectrum above twice that band (median: no lines)."""
+    """Noise within the pass band [N·m], from the channel's spectrum above twice that band or just above it (no lines).
+
+    Whichever is quieter: a controller's noise grows with frequency, and a fast motion ends somewhere.
+    """
     there = np.isfinite(values)
     x, own = values[there], t[there]
     if len(x) < 64:
@@ -233,11 +248,19 @@ def _band_noise(t: Array, values: Array, band: float) -> float:
     rate = 1.0 / float(np.median(np.diff(own)))
     frequency, density = _spectrum(x - x.mean(), rate)
     high = frequency > min(2.0 * band, 0.3 * rate)
-    return float(np.sqrt(np.median(density[high]) / 0.69 * band)) if high.any() else 0.0
+    near = (frequency > 1.5 * band) & (frequency < 3.0 * band)
+    levels = [float(np.median(density[part])) for part in (high, near) if part.any()]
+    return float(np.sqrt(min(levels) / 0.69 * band)) if levels else 0.0
 
 
 def _spectrum(x: Array, rate: float) -> tuple[Array, Array]:
-    from scipy.signal import welch
-
-    frequency, density = welch(x, fs=rate, nperseg=min(len(x), 512), detrend="linear")
-    return np.asarray(frequency), np.asarray(density)
+    """Power spectral density (Welch: Hann windows of 512 samples, half overlapping, straight lines taken off each)."""
+    size = min(len(x), 512)
+    pieces = np.lib.stride_tricks.sliding_window_view(x, size)[:: size // 2]
+    line = np.linspace(-1.0, 1.0, size)
+    pieces = pieces - pieces.mean(1, keepdims=True)
+    pieces = pieces - (pieces @ line / (line @ line))[:, None] * line
+    window = np.hanning(size)
+    power = np.abs(np.fft.rfft(pieces * window, axis=1)) ** 2
+    density = 2.0 * power.mean(0) / (rate * (window @ window))
+    return np.asarray(np.fft.rfftfreq(size, 1.0 / rate), float), np.asarray(density)

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sim_gap.confidence import HINT
 from sim_gap.diagnosis import Cause, Verdict
 from sim_gap.effects.registry import Row
 from sim_gap.residual import ResidualSet, root_mean_square
@@ -20,8 +21,8 @@ def row_rms(data: ResidualSet, left: dict[Row, Array] | None = None) -> dict[Row
 
 
 def is_quiet(data: ResidualSet) -> bool:
-    """Whether no row exceeds its margin."""
-    return all(rms <= data.margin[row] for row, rms in row_rms(data).items())
+    """Whether no row exceeds what is worth a search."""
+    return all(rms <= data.faint[row] for row, rms in row_rms(data).items())
 
 
 def share_left(data: ResidualSet, left: dict[Row, Array]) -> float:
@@ -38,10 +39,13 @@ def share_left(data: ResidualSet, left: dict[Row, Array]) -> float:
 
 
 def verdict(found: Sequence[Cause], data: ResidualSet, left: dict[Row, Array]) -> Verdict:
-    """`unexplained` where a gap is left or no cause of it was found, `ambiguous` where the first cause has a rival."""
-    if not found and is_quiet(data):
-        return "no_gap"
-    still = any(rms > data.margin[row] for row, rms in row_rms(data, left).items())
-    if not found or (still and share_left(data, left) > EXPLAINED):
+    """`unexplained` where a gap is left or nothing is well founded, `ambiguous` where the first cause has a rival."""
+    after = row_rms(data, left)
+    quiet = all(rms <= data.margin[row] for row, rms in after.items())
+    if not found:
+        return "no_gap" if quiet else "unexplained"
+    if not quiet and share_left(data, left) > EXPLAINED:
         return "unexplained"
-    return "ambiguous" if found[0].confounded_with else "explained"
+    if found[0].confounded_with:
+        return "ambiguous"
+    return "explained" if max(cause.confidence for cause in found) >= HINT else "unexplained"

@@ -5,7 +5,7 @@ import json
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -47,9 +47,13 @@ def make_cases(
         logs = iter(simulate([run for d in drawings for run in (d.heldout, *d.without)]))
         seen = [_judged(drawing, [next(logs) for _ in range(1 + len(drawing.without))], rate) for drawing in drawings]
         good = [(d, judged) for d, judged in zip(drawings, seen, strict=True) if last or judged.good]
+        done = set()
         for (drawing, judged), train in zip(good, simulate([d.train for d, _ in good]) if good else (), strict=True):
-            _write(drawing, judged, train, out / drawing.recipe.name, labels, rate)
-        done = {d.recipe.name for d, _ in good}
+            steady = _steady(drawing.train.command, train)
+            if last or steady:
+                judged = replace(judged, good=judged.good and steady)
+                _write(drawing, judged, train, out / drawing.recipe.name, labels, rate)
+                done.add(drawing.recipe.name)
         todo = {d.recipe: d.attempt + 1 for d in drawings if d.recipe.name not in done}
         if not todo:
             return
@@ -80,7 +84,7 @@ def _judged(drawing: Drawing, logs: list[Log], rate: float) -> Judged:
 
 def _steady(command: Array, log: Log) -> bool:
     """Whether the controller followed its trajectory without shaking."""
-    shaken = np.abs(np.diff(log.motor, 2, axis=0)).mean(0) > 0.5 * log.motor.std(0) + 0.1
+    shaken = np.abs(np.diff(log.motor, 2, axis=0)).mean(0) > 0.25 * log.motor.std(0) + 0.1
     return bool(np.abs(log.position - command).max() < FOLLOWED and not shaken.any())
 
 

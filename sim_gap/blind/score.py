@@ -20,6 +20,8 @@ def score(answers: Mapping[str, Mapping[str, Any]], labels: Mapping[str, Mapping
     judged = []
     for name, answer in answers.items():
         case, _, withheld = name.partition(WITHHELD)
+        if not labels[case].get("clear", True):
+            continue  # no arm was found that shows its effects and stays under control
         judged.append(judge(answer, labels[case], withheld))
     told = [j for j in judged if not j.withheld]
     blind = [j for j in judged if j.withheld]

@@ -13,7 +13,8 @@ JITTER_S = 4e-4
 LATE_SHARE = 0.003
 """Share of rows that come a good part of a period late."""
 LOST_SHARE = 0.001
-BOUC_WEN_POWER = 4.0
+HALVES, SHARES = (0.4, 1.0, 1.8), (0.35, 0.4, 0.25)
+"""Half widths of the plays of a hysteresis, as shares of its width, and their weights before these are made to fit."""
 SENSOR_BITS = 16
 
 
@@ -76,19 +77,26 @@ def _sensor(truth: Truth, torque: Array, clock: Array) -> Array:
     )
     mixed = late + late @ truth.crosstalk.T
     for j in np.flatnonzero(truth.hysteresis):
-        mixed[:, j] = np.fromiter(_bouc_wen(mixed[:, j], float(truth.hysteresis[j])), float, len(mixed))
+        mixed[:, j] = _stays_behind(mixed[:, j], float(truth.hysteresis[j]))
     mixed = np.sign(mixed) * np.maximum(np.abs(mixed) - truth.deadband, 0.0)
     mixed = np.clip(mixed, -truth.torque_limit, truth.torque_limit)
     return np.asarray(truth.torque_gain * mixed + truth.torque_offset + truth.torque_drift * clock[:, None])
 
 
-def _bouc_wen(torque: Array, width: float) -> Iterator[float]:
-    """Bouc-Wen: reading = τ − width·z, dz = (1 − |z|^n [z dτ > 0]) dτ/width; a smooth play of half width `width`."""
-    z, before = 0.0, float(torque[0])
+def _stays_behind(torque: Array, width: float) -> Array:
+    """Hysteresis of Prandtl and Ishlinskii: plays of several half widths side by side, which add up to `width`.
+
+    It comes gradually, as in real gauges, and small vibration does not wear it off, as it would a Bouc-Wen model.
+    """
+    shares = np.array(SHARES) / np.dot(SHARES, HALVES)
+    read = torque * (1.0 - shares.sum())
+    for share, half in zip(shares, HALVES, strict=True):
+        read = read + share * np.fromiter(_play(torque, half * width), float, len(torque))
+    return np.asarray(read)
+
+
+def _play(torque: Array, half: float) -> Iterator[float]:
+    at = float(torque[0])
     for now in torque.tolist():
-        rise = (now - before) / width
-        for _ in range(2):  # small steps where the torque jumps
-            z += 0.5 * rise * (1.0 - (abs(z) ** BOUC_WEN_POWER if z * rise > 0.0 else 0.0))
-        z = min(1.0, max(-1.0, z))
-        before = now
-        yield now - width * z
+        at = min(max(at, now - half), now + half)
+        yield at

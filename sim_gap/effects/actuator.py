@@ -19,7 +19,8 @@ class Gain(Effect):
         return range(layout.n if layout.motor else 0)
 
     def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
-        return {(layout.motor_side, place): signals.model[:, place, None]}
+        """The whole motor torque that the nominal model asks for: rotor and friction that it knows are scaled too."""
+        return {(layout.motor_side, place): signals.motor_model[:, place, None]}
 
     def spread(self, signals: Signals, place: int) -> Array:
         return np.full(1, 0.5)

@@ -9,12 +9,12 @@ from sim_gap.rigid import Array
 from sim_gap.signals import Signals
 
 PLAY_HZ = 50.0
-"""Rate at which a play is followed; torques are smooth at this rate."""
+"""Rate at which a play is followed; smooth torques change little from one sample to the next."""
 
 
-def largest(signals: Sequence[Signals], joint: int) -> float:
-    """Largest model torque of a joint [N·m]."""
-    return max(float(np.abs(s.model[:, joint]).max()) for s in signals)
+def largest(signals: Sequence[Signals], joint: int, share: float = 0.98) -> float:
+    """Model torque of a joint that is exceeded only in the rest of the time [N·m]."""
+    return float(np.quantile(np.concatenate([np.abs(s.model[:, joint]) for s in signals]), share))
 
 
 class Crosstalk(Effect):
@@ -44,7 +44,7 @@ class _Bent(Effect):
     """An effect whose one parameter is its shape; its coefficient is what the shape says, or near it."""
 
     shares: tuple[float, ...]
-    """Starting shapes as shares of the joint's largest torque."""
+    """Starting shapes as shares of the joint's usual largest torque."""
 
     def places(self, layout: Layout) -> range:
         return range(layout.n if layout.sensor else 0)
@@ -57,7 +57,7 @@ class _Bent(Effect):
         raise NotImplementedError
 
     def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
-        bent = self.missing(signals.model[:, place], shape[0], signals.rate)
+        bent = self.missing(signals.smooth_model[:, place], shape[0], signals.rate)
         return layout.sensor_columns(place, bent[:, None])
 
     def plausible(self, coefficients: Array, shape: Shape) -> bool:
@@ -77,6 +77,10 @@ class Hysteresis(_Bent):
     def missing(self, torque: Array, level: float, rate: float) -> Array:
         return play(torque, level, rate) - torque
 
+    def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
+        """How far it stays behind after a long way: real hysteresis comes there less abruptly than a play."""
+        return np.array([coefficients[0] * shape[0]])
+
 
 class Deadband(_Bent):
     """Torques smaller than the half width do not show, larger ones show less by it."""
@@ -94,7 +98,11 @@ class Saturation(_Bent):
 
     id = "torque.saturation"
     parameters = (Parameter("limit", "N·m"),)
-    shares = (0.4, 0.55, 0.7, 0.8, 0.9, 0.97)
+    shares = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995)
+
+    def grid(self, signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
+        """Levels that the torque exceeds during some of the time."""
+        return tuple((largest(signals, place, share),) for share in self.shares)
 
     def missing(self, torque: Array, level: float, rate: float) -> Array:
         return np.clip(torque, -level, level) - torque

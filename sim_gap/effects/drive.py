@@ -63,8 +63,10 @@ class Lag(_Late):
     id = "actuator.lag"
 
     def missing(self, command: Array, shape: float, rate: float) -> Array:
-        keep = np.exp(-1.0 / (rate * shape))
-        follow, _ = lfilter([1.0 - keep], [1.0, -keep], command, zi=[keep * command[0]])
+        """By the trapezoidal rule, whose lag is exactly the shape however few samples it spans."""
+        pole = (2.0 * rate * shape - 1.0) / (2.0 * rate * shape + 1.0)
+        gain = 0.5 * (1.0 - pole)
+        follow, _ = lfilter([gain, gain], [1.0, -pole], command, zi=[(1.0 - gain) * command[0]])
         return np.asarray(command - follow)
 
 

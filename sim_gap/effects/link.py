@@ -13,6 +13,9 @@ LEVER = 0.15
 LIGHTEST = 0.2
 """A link counts as at least this heavy [kg] where the plausible error of its inertials is judged."""
 
+SHOWS = 0.3
+"""A mass moment's own torque must be at least this share of that of the inertia which comes with it."""
+
 FARTHEST = 0.6
 """A payload's centre of mass is no farther from the last joint than this [m]."""
 
@@ -31,10 +34,11 @@ class MassMoment(Effect):
     rare = 0
 
     def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
+        """Where nothing but the inertia that comes with it would show, it is an error of the inertia, not of this."""
         own = signals.regressor[:, :, place]
-        return _rows(
-            signals, layout, place, own[..., 1:4] + own[..., 4:] @ moment_to_inertia(signals.arm.inertial[place])
-        )
+        moved, along = own[..., 1:4], own[..., 4:] @ moment_to_inertia(signals.arm.inertial[place])
+        shows = np.mean(moved**2, axis=(0, 1)) > SHOWS**2 * np.mean(along**2, axis=(0, 1))
+        return _rows(signals, layout, place, (moved + along) * shows)
 
     def spread(self, signals: Signals, place: int) -> Array:
         return np.full(3, LEVER * max(signals.arm.inertial[place, 0], LIGHTEST))
@@ -70,6 +74,10 @@ class Payload(Effect):
 
     def covers(self, layout: Layout, place: int) -> tuple[tuple[str, int], ...]:
         return (("link.mass_moment", layout.n - 1),)
+
+    def made_of(self, layout: Layout, place: int, shape: Shape) -> tuple[tuple[str, int], ...]:
+        """Every link's own mass moment."""
+        return tuple(("link.mass_moment", link) for link in range(layout.n))
 
     def plausible(self, coefficients: Array, shape: Shape) -> bool:
         mass = float(coefficients[0])

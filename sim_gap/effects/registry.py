@@ -125,6 +125,10 @@ class Effect(ABC):
         """Effects and places whose columns this one contains: they do not stand beside it."""
         return ()
 
+    def made_of(self, layout: Layout, place: int, shape: Shape) -> tuple[tuple[str, int], ...]:
+        """Simpler effects and places that together could stand in its place; it must do better than they."""
+        return ()
+
     @abstractmethod
     def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
         """Its columns at the work rate."""

@@ -74,6 +74,11 @@ class Coupling(Effect):
     def places(self, layout: Layout) -> range:
         return range(layout.n)
 
+    def made_of(self, layout: Layout, place: int, shape: Shape) -> tuple[tuple[str, int], ...]:
+        """Each joint's own rotor and friction."""
+        own = ("friction.coulomb", "friction.viscous", "actuator.rotor_inertia")
+        return tuple((effect, joint) for joint in (place, int(shape[0]) - 1) for effect in own)
+
     def plausible(self, coefficients: Array, shape: Shape) -> bool:
         return bool(np.all(coefficients >= 0.0))
 

@@ -18,7 +18,7 @@ from sim_gap.blind.motion import KINDS, RATE, Limits, derivatives, trajectory
 from sim_gap.blind.plant import Log, Run, simulate
 from sim_gap.blind.recipe import Recipe
 from sim_gap.blind.scene import Scene
-from sim_gap.blind.sensors import _bouc_wen, record
+from sim_gap.blind.sensors import _stays_behind, record
 from sim_gap.blind.truth import ordinary
 
 CONTRACT = {
@@ -186,7 +186,7 @@ def test_friction_does_not_creep_at_rest() -> None:
 
 def test_hysteresis_stays_behind_by_its_width() -> None:
     torque = 5.0 * np.sin(np.linspace(0, 6 * np.pi, 6000))
-    read = np.fromiter(_bouc_wen(torque, 0.5), float)
+    read = _stays_behind(torque, 0.5)
     rising = np.gradient(torque) > 0
     late = torque - read
     assert np.abs(late).max() <= 0.5
