@@ -34,6 +34,14 @@ class FitRows:
     """Standard deviation of one torque sample (n,) [N·m]."""
     position_sigma: Array
     """Standard deviation of a position reading from its resolution (n,) [rad]."""
+    resolution: Array
+    """Smallest step seen in each joint's position reading (n,) [rad]; 0 where it is not known."""
+    time: Array
+    """When each was taken, passes one after the other (K,) [s]."""
+    motor_torque: Array
+    """The drives' own estimates (K, n) [N·m]; NaN where missing."""
+    target: Array
+    """Where the plan wanted the joints under position control (K, n) [rad]; NaN for the others."""
 
     @property
     def own(self) -> Flags:
@@ -79,7 +87,37 @@ def fit_rows(data: Sequence[SweepData]) -> FitRows:
         tuple(f"{each.path.name}/{reading.sweep}" for each, reading in rows),
         noise,
         _rounding(position, resolution),
+        resolution,
+        _time(data),
+        np.array([reading.motor_torque for _, reading in rows]),
+        np.concatenate([_targets(each) for each in data if each.readings]),
     )
+
+
+def _time(data: Sequence[SweepData]) -> Array:
+    """Seconds (K,) since the first reading; a pass begins where the one before it ended."""
+    parts, before = [], 0.0
+    for each in data:
+        if each.readings:
+            t = each.array("t")
+            parts.append(t - t.min() + before)
+            before = float(parts[-1].max())
+    return np.concatenate(parts)
+
+
+def _targets(data: SweepData) -> Array:
+    """Positions (K, n) [rad] that the plan asked for; NaN for joints pressed on stops."""
+    targets = np.full((len(data.readings), len(data.manifest.names)), np.nan)
+    if data.plan is None:
+        return targets
+    sweeps = {sweep.name: sweep for sweep in data.plan.sweeps}
+    for row, reading in enumerate(data.readings):
+        sweep = sweeps.get(reading.sweep)
+        if sweep is None or reading.index >= sweep.readings:
+            continue
+        targets[row] = np.where(sweep.servo, sweep.rest, np.nan)
+        targets[row, sweep.joint] = sweep.target(reading.index)[0]
+    return targets
 
 
 def _rounding(position: Array, resolution: Array) -> Array:

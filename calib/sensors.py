@@ -11,17 +11,14 @@ from armlink.armfile import ArmFile
 from calib.dataset import SweepData
 from calib.description import gcomp_arm
 from calib.fit_rows import FitRows, fit_rows
+from calib.goodness import Finding, Goodness, examine
 from calib.records import PARAMETERS, CalibrationRecord, JointCalibration, Parameter, matrix, provenance
 from calib.section import sweep_section
 from gcomp.global_fit import GlobalFit, identify_global
 from gcomp.parameters import Prior
-from gcomp.readings import Readings
+from gcomp.sensor_model import predict
 
 Array = npt.NDArray[np.float64]
-NOISE_ROUNDS = 3
-"""Rounds in which each joint's noise is brought to the scatter that is really there."""
-FEWEST = 10
-"""Free readings of a joint from which its scatter is judged."""
 WORDY = 6
 """Parameters that a reason names one by one."""
 
@@ -37,6 +34,11 @@ class SensorFit:
     """Scatter of the readings over what their samples' noise explains (n,); at least 1."""
     hysteresis: Array
     """Half the mean difference between readings approached upwards and downwards (n,) [N·m]."""
+    friction: Array
+    """Friction still locked at rest: half the mean difference of the drives' own torque between the directions, less
+    that of the sensors (n,) [N·m]; NaN where the drives report none."""
+    goodness: Goodness
+    """Whether the model holds, and what speaks against it."""
     quantile: float
     """Student quantile of a 95 % interval."""
     reasons: dict[tuple[str, Parameter], str]
@@ -62,6 +64,17 @@ class SensorFit:
         """95 % intervals (n, 2), NaN where not identifiable."""
         half = self.quantile * self.std(parameter)
         return np.stack([self.value(parameter) - half, self.value(parameter) + half], axis=1)
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What the readings show that the model does not have, in words."""
+        return self.goodness.findings
+
+    @property
+    def doubtful(self) -> tuple[str, ...]:
+        """Joints at which the model does not hold, so that their values must not be relied on."""
+        broken = {finding.joint for finding in self.findings if finding.breaks_model}
+        return tuple(name for name in self.names if name in broken)
 
     @property
     def residual_rms(self) -> Array:
@@ -104,24 +117,26 @@ def fit_sensors(arm: ArmFile, data: Sequence[SweepData]) -> SensorFit:
     that cannot be fitted, Refused on data of another arm.
     """
     rows = fit_rows([each.require(arm) for each in data])
-    fit, factor = _fit(arm, rows)
-    reasons = _reasons(fit, rows)
+    good = _fit(arm, rows)
+    fit = good.refined.fit
     loaded = any(rows.masses)
     return SensorFit(
         names=arm.joint_names,
         fit=fit,
         rows=rows,
-        noise_factor=factor,
-        hysteresis=_hysteresis(fit, rows),
+        noise_factor=good.refined.factor,
+        hysteresis=_half_difference(rows.readings.torque - _modelled(arm, fit, rows), rows),
+        friction=_friction(fit, rows),
+        goodness=good,
         quantile=float(stats.t.ppf(0.975, max(fit.dof, 1))),
-        reasons=reasons,
+        reasons=_reasons(fit, rows),
         gain_ratio=None if loaded else _gain_ratio(arm, rows),
         sources={each.path.name: each.digest for each in data},
     )
 
 
-def _fit(arm: ArmFile, rows: FitRows, **extra: Prior) -> tuple[GlobalFit, Array]:
-    """The global fit, with each joint's noise raised to what its residuals show; and the factors (n,)."""
+def _fit(arm: ArmFile, rows: FitRows, **extra: Prior) -> Goodness:
+    """The global fit, then refined and examined."""
     described, zero_std = gcomp_arm(arm), sweep_section(arm).position_offset_std
     unknown = {"gain", "offset", "position_gain", "beta"}
     priors = dict(extra)
@@ -130,34 +145,33 @@ def _fit(arm: ArmFile, rows: FitRows, **extra: Prior) -> tuple[GlobalFit, Array]
         priors["position_offset"] = Prior(0.0, zero_std)
     if any(rows.masses):
         unknown.add("rho")
-    readings, factor = rows.readings, np.ones(described.n)
-    for _ in range(NOISE_ROUNDS):
-        scaled = Readings(readings.position, readings.torque, readings.sigma * factor, readings.load)
-        fit = identify_global(described, scaled, unknown=unknown, priors=priors, position_sigma=rows.position_sigma)
-        factor = np.maximum(factor * _scatter(fit, scaled), 1.0)
-    return fit, factor
+    fit = identify_global(described, rows.readings, unknown=unknown, priors=priors, position_sigma=rows.position_sigma)
+    rated = np.array([joint.rated_torque for joint in arm.require_link().joints])
+    return examine(described, rows, fit, priors, rated)
 
 
-def _scatter(fit: GlobalFit, readings: Readings) -> Array:
-    """Scatter of each joint's residuals over what was expected of them (n,); 1 for a joint with too few readings."""
-    counted = readings.counted
-    free = max(fit.dof, 1) / max(int(counted.sum()), 1)  # share of the readings that the parameters leave free
-    score = np.where(counted, fit.residual / readings.sigma, 0.0)
-    dof = counted.sum(axis=0) * free
-    ratio = (score**2).sum(axis=0) / np.maximum(dof, 1.0)
-    return np.where(dof >= FEWEST, np.sqrt(ratio), 1.0)
+def _modelled(arm: ArmFile, fit: GlobalFit, rows: FitRows) -> Array:
+    """Torque readings (K, n) by the fitted sensors and moments alone [N·m]."""
+    return predict(gcomp_arm(arm), fit.complete, rows.readings)
 
 
-def _hysteresis(fit: GlobalFit, rows: FitRows) -> Array:
-    """Half the mean difference of the own sensor's residual between the two directions (n,) [N·m]."""
-    own = np.where(rows.own, fit.residual, np.nan)
+def _friction(fit: GlobalFit, rows: FitRows) -> Array:
+    """Half difference (n,) between the directions of motor torque less sensor torque [N·m]."""
+    gain = np.where(np.abs(fit.complete.gain) > 1e-6, fit.complete.gain, 1.0)
+    sensed = (rows.readings.torque - fit.complete.offset) / gain
+    return _half_difference(rows.motor_torque - sensed, rows)
+
+
+def _half_difference(values: Array, rows: FitRows) -> Array:
+    """Half the mean difference (n,) between upward and downward approach of each swept joint's own values (K, n)."""
+    own = np.where(rows.own, values, np.nan)
     up, down = own[rows.direction > 0], own[rows.direction < 0]
     return np.array([_mean(up[:, j]) - _mean(down[:, j]) for j in range(own.shape[1])]) / 2
 
 
 def _mean(values: Array) -> float:
     kept = values[~np.isnan(values)]
-    return float(kept.mean()) if len(kept) else 0.0
+    return float(kept.mean()) if len(kept) else float("nan")
 
 
 def _reasons(fit: GlobalFit, rows: FitRows) -> dict[tuple[str, Parameter], str]:
@@ -192,7 +206,7 @@ def _gain_ratio(arm: ArmFile, rows: FitRows) -> Array:
     n = len(arm.joint_names)
     std = np.full(n, np.inf)
     std[-1] = 1e-4
-    fit, _ = _fit(arm, rows, gain=Prior(1.0, std))
+    fit = _fit(arm, rows, gain=Prior(1.0, std)).refined.fit
     ratio: Array = fit.values.gain
     return np.where(fit.std.gain < 0.2, ratio, np.nan)
 

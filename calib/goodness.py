@@ -1,0 +1,250 @@
+"""Does the sensor model hold? Where it does not, at which joint, and why: goodness of fit, outliers, left-out poses."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from calib.encoder_bits import stuck_bits
+from calib.fit_rows import FitRows
+from calib.misfit import Effect, strongest
+from calib.refine import Extra, Refined, refine
+from gcomp.arm import Arm
+from gcomp.global_fit import GlobalFit
+from gcomp.parameters import Prior
+from gcomp.readings import Readings
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+Kind = Literal[
+    "spring",
+    "direction",
+    "hysteresis",
+    "nonlinear",
+    "saturation",
+    "drift",
+    "eccentricity",
+    "encoder",
+    "outliers",
+    "scatter",
+]
+MOST_EFFECTS = 6
+"""Effects that are looked for one after the other."""
+OUTLIER = 6.0
+"""Robust standard deviations, its own pull on the fit taken out, from which a reading is an outlier."""
+MOST_OUTLIERS = 0.15
+"""Share of a joint's readings that may be left out as outliers; where there are more, the model is at fault."""
+SCATTER, MATERIAL_SCATTER = 3.0, 0.002
+"""Scatter that is no longer noise: this many times what the samples explain, and this share of rated torque."""
+HOLDING: tuple[Kind, ...] = ("direction", "hysteresis")
+"""Effects that the fit takes out completely: the model holds with them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """Something that the sensor model does not have and the readings show."""
+
+    joint: str
+    kind: Kind
+    size: float
+    """In `unit`; NaN where there is no one number."""
+    unit: str
+    text: str
+    """One sentence for a person."""
+
+    @property
+    def breaks_model(self) -> bool:
+        """Whether the joint's values must not be relied on as they are."""
+        return self.kind not in HOLDING
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """How well one sweep is told by all others."""
+
+    sweep: str
+    joint: int
+    """The swept joint."""
+    rms: float
+    """Of its readings minus what a fit without it says [N·m]."""
+    ratio: float
+    """That over what is to be expected."""
+
+
+@dataclass(frozen=True, eq=False)
+class Goodness:
+    """The fit at its end, and what was found on the way."""
+
+    refined: Refined
+    findings: tuple[Finding, ...]
+    outliers: Flags
+    """Readings left out (K, n)."""
+    left_out: tuple[LeftOut, ...]
+
+
+def examine(arm: Arm, rows: FitRows, fit: GlobalFit, priors: Mapping[str, Prior], rated: Array) -> Goodness:
+    """Refine a global fit, one effect after another that its residuals ask for, without outliers. rated (n,) [N·m]."""
+    readings, effects, findings = rows.readings, list[Effect](), list[Finding]()
+
+    def fitted() -> Refined:
+        extras = tuple(extra for effect in effects for extra in effect.extras)
+        return refine(arm, readings, fit, priors, rows.resolution, extras)
+
+    refined = fitted()
+    outliers = np.zeros(readings.torque.shape, dtype=bool)
+    for _ in range(MOST_EFFECTS):
+        strange = _outliers(refined, outliers, rows)
+        if strange.any():
+            cleaned = _without(readings, strange)
+            if len(effects):
+                effects = [_shortened(effect, readings, strange) for effect in effects]
+            outliers |= strange
+            readings = cleaned
+            refined = fitted()
+        found = strongest(arm, rows, readings, refined, rated)
+        if found is None and not strange.any():
+            break
+        if found is not None:
+            effects.append(found)
+            refined = fitted()
+    place = 0
+    for effect in effects:
+        coefficient = refined.coefficients[place : place + len(effect.extras)]
+        place += len(effect.extras)
+        findings.append(_said(arm.names, effect, coefficient, refined, rated))
+    findings += _encoders(arm.names, rows)
+    findings += _outliers_said(arm.names, rows, outliers)
+    findings += _scattered(arm.names, refined, rated, {finding.joint for finding in findings})
+    return Goodness(refined, tuple(findings), outliers, leave_out(refined, rows))
+
+
+def leave_out(refined: Refined, rows: FitRows) -> tuple[LeftOut, ...]:
+    """Each sweep's readings against a fit of all others, by the block form of the leave-one-out residual."""
+    linear, found = refined.linear, []
+    count = len(linear.row)
+    sweeps = np.array(rows.sweep)[linear.row]
+    own = rows.swept[linear.row] == linear.joint
+    for name in dict.fromkeys(rows.sweep):
+        here = np.flatnonzero((sweeps == name) & own)
+        if not len(here):
+            continue
+        part = linear.basis[:count][here]
+        rest = np.eye(len(here)) - part @ part.T
+        size, turn = np.linalg.eigh(rest)
+        kept = size > 1e-8
+        residual = linear.residual[here]
+        outside = turn[:, kept] @ ((turn[:, kept].T @ residual) / size[kept])
+        expected = float(residual @ outside) / max(int(kept.sum()), 1)
+        rms = float(np.sqrt(np.mean((outside * linear.sigma[here]) ** 2)))
+        found.append(LeftOut(name, int(linear.joint[here[0]]), rms, float(np.sqrt(max(expected, 0.0)))))
+    return tuple(found)
+
+
+def _outliers(refined: Refined, before: Flags, rows: FitRows) -> Flags:
+    """Readings (K, n) that no noise explains: deleted residuals, in robust standard deviations of their joint."""
+    linear, flags = refined.linear, np.zeros_like(before)
+    count = len(linear.row)
+    deleted = linear.residual[:count] / np.sqrt(np.maximum(1 - linear.leverage, 1e-3))
+    for joint in range(before.shape[1]):
+        here = np.flatnonzero(linear.joint == joint)
+        if len(here) < 8:
+            continue
+        size = np.abs(deleted[here])
+        robust = max(1.4826 * float(np.median(size)), 1e-9)
+        noise = 1 / max(refined.factor[joint], 1.0)  # sigma has been raised by the factor, which outliers raise
+        bound = OUTLIER * max(robust, noise)
+        strange = here[size > bound]
+        gone = int(before[:, joint].sum())
+        if len(strange) and len(strange) + gone <= MOST_OUTLIERS * (len(here) + gone):
+            worst = strange[size[size > bound] >= 0.5 * size.max()]
+            flags[linear.row[worst], joint] = True
+    return flags
+
+
+def _without(readings: Readings, strange: Flags) -> Readings:
+    return replace(readings, torque=np.where(strange, np.nan, readings.torque))
+
+
+def _shortened(effect: Effect, readings: Readings, strange: Flags) -> Effect:
+    """The effect's columns without the readings that are left out."""
+    kept = ~strange[readings.counted]
+    return replace(effect, extras=tuple(Extra(each.joint, each.kind, each.column[kept]) for each in effect.extras))
+
+
+def _said(names: tuple[str, ...], effect: Effect, coefficient: Array, refined: Refined, rated: Array) -> Finding:
+    """One effect in words."""
+    name, gain = names[effect.joint], float(refined.fit.complete.gain[effect.joint]) or 1.0
+    value = float(coefficient[0])
+    if effect.kind == "spring":
+        text = (
+            f"{name}: torque linear in position that gravity does not explain, {value / gain:+.3g} N·m/rad: a cable or"
+            " spring over the joint? It is taken out; its pull at 0 rad is part of the offset"
+        )
+        return Finding(name, "spring", value / gain, "N·m/rad", text)
+    if effect.kind == "direction":
+        text = f"{name}: readings differ by {2 * abs(value):.3g} N·m with the side of approach; taken out"
+        return Finding(name, "direction", abs(value), "N·m", text)
+    if effect.kind == "hysteresis":
+        text = (
+            f"{name}: the torque sensor lags by {abs(value):.3g} N·m behind changes of torque (hysteresis); taken out"
+        )
+        return Finding(name, "hysteresis", abs(value), "N·m", text)
+    if effect.kind == "saturation":
+        text = f"{name}: the torque sensor flattens beyond {effect.knee:.3g} N·m: does it saturate?"
+        return Finding(name, "saturation", effect.knee, "N·m", text)
+    if effect.kind == "drift":
+        text = f"{name}: the torque reading drifts by {value * 3600:+.3g} N·m an hour: warm up, then sweep again"
+        return Finding(name, "drift", value * 3600, "N·m/h", text)
+    if effect.kind == "eccentricity":
+        size = float(np.hypot(*coefficient))
+        text = f"{name}: the position reading is wrong by {size:.3g} rad once a turn: an eccentric encoder disc?"
+        return Finding(name, "eccentricity", size, "rad", text)
+    text = f"{name}: the torque sensor's gain changes with the load (by {2 * value / gain:+.2%} at the largest)"
+    return Finding(name, "nonlinear", value / gain, "1", text)
+
+
+def _encoders(names: tuple[str, ...], rows: FitRows) -> list[Finding]:
+    """Position sensors with a bit that never changes."""
+    found = []
+    for joint, bit, step in stuck_bits(rows.readings.position, rows.resolution, rows.target):
+        text = (
+            f"{names[joint]}: bit {bit} of the position reading ({step:.3g} rad) never changes: the encoder or its"
+            " transmission is faulty; nothing found with this joint's positions holds"
+        )
+        found.append(Finding(names[joint], "encoder", step, "rad", text))
+    return found
+
+
+def _outliers_said(names: tuple[str, ...], rows: FitRows, outliers: Flags) -> list[Finding]:
+    """Outliers by joint and sweep, with what a run of them looks like."""
+    found = []
+    for joint in np.flatnonzero(outliers.any(axis=0)):
+        at = np.flatnonzero(outliers[:, joint])
+        where = ", ".join(f"{rows.sweep[row]} at {rows.readings.position[row, joint]:.3f} rad" for row in at[:4])
+        more = f" and {len(at) - 4} more" if len(at) > 4 else ""
+        run = len(at) >= 2 and len({rows.sweep[row] for row in at}) == 1
+        cause = "it touched something there, or a resting joint slipped" if run else "a knock or a bad contact"
+        text = f"{names[joint]}: {len(at)} readings left out, {where}{more}: {cause}?"
+        found.append(Finding(names[joint], "outliers", float(len(at)), "readings", text))
+    return found
+
+
+def _scattered(names: tuple[str, ...], refined: Refined, rated: Array, named: set[str]) -> list[Finding]:
+    """Joints whose readings scatter far more than their samples' noise, with nothing found that explains it."""
+    linear, found = refined.linear, []
+    count = len(linear.row)
+    rest = linear.residual[:count] * linear.sigma
+    for joint, name in enumerate(names):
+        here = linear.joint == joint
+        if name in named or not here.any():
+            continue
+        rms = float(np.sqrt(np.mean(rest[here] ** 2)))
+        if refined.factor[joint] > SCATTER and rms > MATERIAL_SCATTER * rated[joint]:
+            text = (
+                f"{name}: readings scatter by {rms:.3g} N·m, {refined.factor[joint]:.0f} times what their noise"
+                " explains, and no known effect accounts for it: the model does not hold here"
+            )
+            found.append(Finding(name, "scatter", rms, "N·m", text))
+    return found

@@ -1,0 +1,127 @@
+"""Effects that the sensor model does not have, as columns: which of them the residuals of a fit ask for."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+
+from calib.fit_rows import FitRows
+from calib.refine import Extra, Refined
+from gcomp.arm import Arm
+from gcomp.readings import Readings
+from gcomp.sensor_model import predict, predict_and_jacobian
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+CHANCE = 1e-7
+"""Probability of an F ratio at which an effect is held for real: some fifty are tried on each fit."""
+MATERIAL = 0.0005
+"""Root mean square of an effect, as a share of rated torque, below which nobody need know of it."""
+KNEES = (0.6, 0.7, 0.8, 0.9, 0.95)
+"""Shares of the largest torque at which a sensor is tried for beginning to saturate."""
+PATH = 12
+"""Points of the way from one reading to the next at which the torque is computed for hysteresis."""
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """An effect found: its columns, in the kind's own units, and what it explains."""
+
+    joint: int
+    kind: str
+    extras: tuple[Extra, ...]
+    p_value: float
+    knee: float = np.nan
+    """Torque at which a sensor begins to saturate [N·m]."""
+
+
+def strongest(arm: Arm, rows: FitRows, readings: Readings, refined: Refined, rated: Array) -> Effect | None:
+    """The effect that explains most beyond chance of what `refined` left over, None where there is no material one.
+
+    rated (n,) [N·m]. The readings may be fewer than the rows' own: outliers made NaN.
+    """
+    linear, best, most = refined.linear, None, 0.0
+    count = len(linear.row)
+    squares = np.bincount(linear.joint, linear.residual[:count] ** 2, minlength=arm.n)
+    for effect in _candidates(arm, rows, readings, refined):
+        columns = np.column_stack([extra.column for extra in effect.extras]) / linear.sigma[:, None]
+        if not np.abs(columns).max(initial=0.0) > 0:
+            continue
+        rest = linear.left_over(columns)
+        norm = np.linalg.norm(rest, axis=0)
+        if np.any(norm < 1e-3 * np.linalg.norm(columns, axis=0)):
+            continue  # the parameters can do nearly the same
+        basis, triangle = np.linalg.qr(rest / norm)
+        along = basis.T @ linear.residual
+        gain, m = float(along @ along), len(effect.extras)
+        touched = np.unique(linear.joint[np.abs(columns).max(axis=1) > 1e-3 * np.abs(columns).max()])
+        free = float(refined.freedom[touched].sum()) - m
+        if free < 4:
+            continue
+        left = max(float(squares[touched].sum()) - gain, 1e-6 * float(squares[touched].sum()) + 1e-9)
+        ratio = (gain / m) / (left / free)
+        p_value = float(stats.f.sf(ratio, m, free))
+        coefficient = np.linalg.lstsq(triangle, along, rcond=None)[0] / norm
+        own = linear.joint == effect.joint
+        shape = (columns * linear.sigma[:, None] @ coefficient)[own]
+        size = float(np.std(shape)) if len(shape) else 0.0
+        if p_value < CHANCE and size > MATERIAL * rated[effect.joint] and gain > most:
+            best, most = Effect(effect.joint, effect.kind, effect.extras, p_value, effect.knee), gain
+    return best
+
+
+def _candidates(arm: Arm, rows: FitRows, readings: Readings, refined: Refined) -> Iterator[Effect]:
+    """Every effect that is tried, a joint at a time."""
+    linear, complete = refined.linear, refined.fit.complete
+    _, _, slope = predict_and_jacobian(arm, complete, readings)
+    torque = predict(arm, complete, readings) - complete.offset
+    for joint in range(arm.n):
+        here = linear.joint == joint
+        if here.sum() < 6:
+            continue
+        angle = readings.position[linear.row, joint]
+        side = np.where(rows.swept[linear.row] == joint, rows.direction[linear.row], 0).astype(float)
+        yield _one(joint, "spring", here * angle)
+        yield _one(joint, "direction", here * side)
+        yield _one(joint, "hysteresis", here * lag(arm, rows, readings, refined, joint)[linear.row])
+        own = torque[linear.row, linear.joint]
+        largest = float(np.abs(own[here]).max())
+        yield _one(joint, "nonlinear", here * own * np.abs(own) / max(largest, 1e-9))
+        for share in KNEES:
+            bent = here * np.sign(own) * np.maximum(np.abs(own) - share * largest, 0.0)
+            if np.count_nonzero(bent) >= 3:
+                yield _one(joint, "saturation", bent, share * largest / abs(complete.gain[joint]))
+        yield _one(joint, "drift", here * (rows.time[linear.row] - rows.time[linear.row].mean()))
+        turn = [slope[:, joint] * np.sin(angle), slope[:, joint] * np.cos(angle)]
+        span = float(np.ptp(angle[here]))
+        if span > 2.0:
+            yield Effect(joint, "eccentricity", tuple(Extra(joint, "eccentricity", each) for each in turn), 1.0)
+
+
+def _one(joint: int, kind: str, column: Array, knee: float = np.nan) -> Effect:
+    return Effect(joint, kind, (Extra(joint, kind, column),), 1.0, knee)
+
+
+def lag(arm: Arm, rows: FitRows, readings: Readings, refined: Refined, joint: int) -> Array:
+    """Where in its play (K,), -1 to 1, a joint's torque sensor stands at each reading, the way to it being straight.
+
+    The play is as wide as the residuals say (half their robust range), so that small changes of torque leave it where
+    it was. Rows where the joint was neither swept nor held stand at 0.
+    """
+    position, load = readings.position, readings.load
+    shares = np.linspace(0, 1, PATH + 1)[1:]
+    way = position[:-1, None] + shares[:, None] * (position[1:] - position[:-1])[:, None]
+    way = np.concatenate([np.repeat(position[:1, None], PATH, axis=1), way])
+    flat = Readings.of(way.reshape(-1, arm.n), np.zeros((len(position) * PATH, arm.n)), 1.0, np.repeat(load, PATH))
+    torque = predict(arm, refined.fit.complete, flat)[:, joint].reshape(-1, PATH)
+    counted = readings.counted[:, joint]
+    residual = refined.fit.residual[counted, joint]
+    width = max(float(np.median(np.abs(residual))) * 1.5, 1e-9)
+    held, place = float(torque[0, 0]), np.zeros(len(position))
+    for row, values in enumerate(torque):
+        for value in values:
+            held = min(max(held, value - width), value + width)
+        place[row] = (held - torque[row, -1]) / width
+    return place
