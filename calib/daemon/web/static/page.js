@@ -1,0 +1,143 @@
+// The page: what the daemon says, at a glance. Everything it knows comes from the API; it sends nothing but decisions.
+
+import { blob, forgetToken, get, stream, token } from "./api.js";
+import { addEvent, drawIfChanged, fetchAll, fetchNew, initRanges, setLive, setNow } from "./drift.js";
+import { showEvent } from "./events.js";
+import { by, clock, duration, put, whole } from "./format.js";
+import { showEstimates, showJoints, verdict } from "./joints.js";
+import { fetchProposals } from "./proposals.js";
+
+const SLOW = 2000; // ms between looks at what changes slowly
+let status = null;
+let connected = false;
+let said = "";
+
+function showState(state, detail) {
+  const shown = connected ? (state === "observing" && status?.held ? "alarm" : state) : "lost";
+  const words = { lost: "NO CONNECTION", fault: "FAULT", alarm: "ALARM" };
+  document.body.dataset.state = shown;
+  put(by("state-word"), words[shown] ?? shown);
+  const calm = !detail && shown === "observing";
+  put(by("detail"), shown === "alarm" ? "Something has changed: its cause is being found, estimates are held." : detail || (calm ? said : ""));
+  by("detail").classList.toggle("calm", calm);
+  document.title = `${words[shown] ?? shown} · ${status?.arm ?? "armlink"}`;
+}
+
+function showBus(bus) {
+  const cell = (name, text, bad, good) => {
+    const box = document.querySelector(`[data-bus=${name}]`);
+    put(box.querySelector("dd"), text);
+    box.classList.toggle("is-bad", Boolean(bad));
+    box.classList.toggle("is-good", Boolean(good));
+  };
+  cell("connected", bus.connected ? "answering" : "silent", !bus.connected, bus.connected);
+  cell("rate_hz", `${bus.rate_hz.toFixed(0)} Hz`);
+  cell("load", `${(100 * bus.load).toFixed(0)} %`, bus.load > 0.8);
+  cell("frames", whole(bus.frames));
+  for (const name of ["missed", "late", "errors"]) cell(name, whole(bus[name]), bus[name] > 0);
+}
+
+function showStatus() {
+  put(by("arm"), status.arm);
+  put(by("serial"), status.serial);
+  put(by("version"), `armlink ${status.version}`);
+  const { calibration, gravity } = status.records;
+  put(by("records"), calibration ? ` (record ${calibration}, gravity ${gravity ?? "none"})` : ": there is none, sweep and calibrate first");
+  showState(status.state, status.detail || status.bus.fault || "");
+  showBus(status.bus);
+  showLink();
+  by("forget").hidden = token() === null;
+  if (status.report && !by("report").dataset.there) showReport();
+}
+
+function showLink() {
+  if (!status || !connected) return;
+  const listens = status.listen_only ? "listens only" : "drives the bus";
+  put(by("link"), `live · policy ${status.policy} · ${listens} · running for ${duration(status.uptime_s)} · ${whole(status.rows)} rests seen`);
+}
+
+function showReport() {
+  const paragraph = by("report");
+  paragraph.dataset.there = "yes";
+  const link = Object.assign(document.createElement("a"), { href: "/api/report", target: "_blank", rel: "noopener", textContent: "Open the last sweep's report" });
+  link.addEventListener("click", async (event) => {
+    if (token() === null) return; // the Unix socket asks for none: an ordinary link
+    event.preventDefault();
+    const file = Object.assign(document.createElement("a"), { href: URL.createObjectURL(await blob("/api/report")), download: "armlink-report.html" });
+    file.click();
+    URL.revokeObjectURL(file.href);
+  });
+  paragraph.replaceChildren(link);
+}
+
+const on = {
+  open() {
+    connected = true;
+    if (status) showStatus();
+  },
+  lost(why) {
+    connected = false;
+    showState("lost", `No connection to the daemon: ${why}. What stands below is old. Trying again.`);
+    put(by("link"), status ? `last heard ${clock(status.time)}` : "");
+  },
+  joints(item) {
+    setNow(item.time);
+    status = { ...status, state: item.state, bus: item.bus, time: item.time };
+    showJoints(item.joints);
+    showBus(item.bus);
+    const detail = item.state === "fault" ? item.bus.fault || status.detail || "" : status.detail || "";
+    showState(item.state, detail);
+  },
+  event({ event }) {
+    addEvent(event);
+    showEvent(event);
+    slowly();
+  },
+};
+
+async function slowly() {
+  const [now, estimates] = await Promise.all([get("/api/status"), get("/api/estimates"), fetchProposals(), fetchNew()]);
+  status = now;
+  said = verdict(estimates);
+  setNow(status.time);
+  showStatus();
+  showEstimates(estimates);
+  setLive(estimates, status);
+  drawIfChanged();
+}
+
+async function forEver() {
+  for (;;) {
+    await new Promise((wake) => setTimeout(wake, SLOW));
+    if (connected && !document.hidden) await slowly().catch(() => {}); // the stream says when the daemon is gone
+  }
+}
+
+async function start() {
+  by("forget").addEventListener("click", () => { forgetToken(); location.reload(); });
+  initRanges();
+  status = await get("/api/status");
+  connected = true;
+  setNow(status.time);
+  const [joints, estimates, events] = await Promise.all([
+    get("/api/joints"), get("/api/estimates"), get(`/api/events?after=${Math.max(0, status.last_event - 500)}`), fetchProposals()]);
+  said = verdict(estimates);
+  showStatus();
+  showJoints(joints);
+  showEstimates(estimates);
+  setLive(estimates, status);
+  for (const event of events) { addEvent(event); showEvent(event); }
+  await fetchAll();
+  performance.mark("armlink-shown");
+  stream(on, events.at(-1)?.id ?? status.last_event);
+  forEver();
+}
+
+function startUntilItWorks() {
+  start().catch((error) => {
+    on.lost(error.message);
+    setTimeout(startUntilItWorks, 2000);
+  });
+}
+
+startUntilItWorks();

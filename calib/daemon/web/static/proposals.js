@@ -1,0 +1,67 @@
+// Proposals: those that wait for a decision, the dialog that asks twice, and those that are decided.
+
+import { get, post } from "./api.js";
+import { by, clock, make, number, signed } from "./format.js";
+
+const NAME = "armlink-name";
+
+const change = (one) =>
+  `gain ${signed(100 * (one.gain - 1), 2)} ± ${number(196 * one.gain_std, 2)} %, `
+  + `offset ${signed(one.offset, 3)} ± ${number(1.96 * one.offset_std, 3)} N·m`;
+
+function pending(one) {
+  const button = (verb, title, className) => {
+    const made = make("button", { className, textContent: title });
+    made.addEventListener("click", () => decide(one, verb));
+    return made;
+  };
+  const card = make("div", { className: "proposal" },
+    make("div", {},
+      make("p", { className: "what" }, `${one.joint}: ${one.cause} has drifted: ${change(one)}`),
+      make("p", { className: "quiet" }, `from ${one.rows} rests, confidence ${(100 * one.confidence).toFixed(1)} %; `
+        + `record ${one.record} would replace ${one.base}; found ${clock(one.time)}`)),
+    make("div", { className: "row" }, button("approve", "Approve", "main"), button("reject", "Reject", "")));
+  card.dataset.proposal = one.id;
+  return card;
+}
+
+function decide(one, verb) {
+  const dialog = by("ask-decision");
+  by("decision-title").textContent = verb === "approve" ? `Write the new calibration to ${one.joint}?` : `Drop the proposal for ${one.joint}?`;
+  by("decision-text").textContent = verb === "approve"
+    ? `Record ${one.record} goes to the controller and is read back: ${change(one)}. The arm is not moved. armlink rollback goes back.`
+    : `${change(one)} stays as it is measured now; nothing is written.`;
+  by("decision-yes").textContent = verb === "approve" ? "Approve" : "Reject";
+  by("decision-error").textContent = "";
+  by("by").value = localStorage.getItem(NAME) ?? "";
+  by("decision-yes").onclick = async (event) => {
+    event.preventDefault();
+    const name = by("by").value.trim();
+    if (name) localStorage.setItem(NAME, name);
+    try {
+      await post(`/api/proposals/${one.id}/${verb}`, name ? { by: name } : {});
+      dialog.close();
+      await fetchProposals();
+    } catch (error) {
+      by("decision-error").textContent = error.message;
+    }
+  };
+  by("decision-no").onclick = () => dialog.close();
+  dialog.showModal();
+}
+
+export async function fetchProposals() {
+  const all = await get("/api/proposals");
+  const open = all.filter((one) => one.state === "pending");
+  by("proposals").hidden = open.length === 0;
+  by("proposal-list").replaceChildren(...open.map(pending));
+  const done = all.filter((one) => one.state !== "pending").slice(0, 10);
+  by("decided").hidden = done.length === 0;
+  by("decided-list").replaceChildren(...done.map((one) => {
+    const who = one.decided_by ? ` by ${one.decided_by}, ${clock(one.decided_at)}` : "";
+    const line = make("li", {}, make("b", {}, one.state), `${who}: ${one.joint}, ${change(one)}${one.note ? ` (${one.note})` : ""}`);
+    line.dataset.proposal = one.id;
+    return line;
+  }));
+  return open.length;
+}
