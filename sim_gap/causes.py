@@ -95,6 +95,8 @@ against the model, and where only in motor against sensor or command."""
 def materials(step: Step, estimate: Estimate, heldout: ResidualSet, scorer: "_Scorer") -> tuple[Term, ...]:
     """Those of a step's terms whose place matters: the rest can go together without a joint's RMS rising by what a
     user would care about, all else that was found being there."""
+    if any(term.bound for term in step.terms):
+        return step.terms
     shows = {channel for term in step.terms for channel, _ in estimate.store.columns(term)}
     share = MINOR if heldout.layout.against_model in shows else MINOR_INNER
     least = np.maximum(share * heldout.usual_torque, CARE_NM)
@@ -122,12 +124,14 @@ def causes(
     found: list[Cause] = []
     minor: list[Cause] = []
     scorer = _Scorer(estimate, heldout)
+    fitted = _Scorer(estimate, estimate.store.data)
     for step in ordered(estimate, scorer):
         main = materials(step, estimate, heldout, scorer)
         rest = tuple(term for term in step.terms if term not in main)
         for terms, out in ((main, found), (rest, minor)):
             if terms:
-                out.append(_cause(step, terms, scorer, rivals, names))
+                bound = any(term.bound for term in terms)
+                out.append(_cause(step, terms, fitted if bound else scorer, rivals, names))
     return found, minor
 
 

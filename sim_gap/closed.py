@@ -44,7 +44,7 @@ def with_effects(sim: SimModel, estimate: Estimate | None) -> Closed:
     model = copy.copy(sim.mujoco_model)
     if estimate is None:
         return Closed(model, (), ())
-    held = tuple(term for term in estimate.terms if term.effect in HELD)
+    held = tuple(term for term in estimate.terms if term.effect in HELD and not term.bound)
     for term in held:
         c, joint = estimate.of(term), sim.joints[-1 if term.effect == "link.payload" else term.place]
         if term.effect == "link.mass_moment":
@@ -157,9 +157,8 @@ def _gains(sim: SimModel, estimate: Estimate | None) -> dict[str, float]:
 
 def _line(sim: SimModel, estimate: Estimate, term: Term) -> str:
     values = estimate.parameters(term)
-    return f"{term.effect} {sim.arm.names[term.place]} " + ", ".join(
-        f"{k} {v.value:.6g} {v.unit}" for k, v in values.items()
-    )
+    where = f"in recording {term.bound}" if term.bound else sim.arm.names[term.place]
+    return f"{term.effect} {where} " + ", ".join(f"{k} {v.value:.6g} {v.unit}" for k, v in values.items())
 
 
 def _set_inertial(body: Any, model: Any) -> None:

@@ -61,9 +61,13 @@ def diagnose(
     for recording, label in zip([*train, *heldout], labels, strict=False):
         require_length(recording, label)
     told = "the recordings given" if heldout else f"the last {OWN_HELDOUT:.0%} of each training recording"
+    numbers = [*range(1, len(train) + 1), *([0] * len(heldout))]
     if not heldout:
-        train, heldout, labels = *_split(train), labels * 2
-    ready = [prepare(r, sim.arm, label) for r, label in zip([*train, *heldout], labels, strict=False)]
+        train, heldout, labels, numbers = *_split(train), labels * 2, numbers * 2
+    ready = [
+        replace(prepare(r, sim.arm, label), number=number)
+        for r, label, number in zip([*train, *heldout], labels, numbers, strict=False)
+    ]
     layout = layout_of(ready)
     fit, judge = (ResidualSet(tuple(part), layout) for part in (ready[: len(train)], ready[len(train) :]))
     _refuse_rest(fit)
@@ -99,7 +103,7 @@ def _answer(made: Internals, found: list[Cause], minor: list[Cause], told: str) 
         margin=combined(judge, judge.margin),
         heldout_is=told,
         rollout=roll_out(made.model, judge, estimate),
-        notes=_notes(fit),
+        notes=(*_notes(fit), *_bound(estimate, fit)),
         internals=made,
     )
 
@@ -130,6 +134,13 @@ def _notes(data: ResidualSet) -> tuple[str, ...]:
         if channel == data.layout.motor and data.valid[channel, joint].sum() <= 25
     ]
     return tuple(still)
+
+
+def _bound(estimate: Estimate | None, data: ResidualSet) -> tuple[str, ...]:
+    """A line for what is in one recording alone."""
+    terms = () if estimate is None else estimate.terms
+    labels = {s.number: s.label for s in data.signals}
+    return tuple(f"{term.effect} is in {labels[term.bound]} alone" for term in terms if term.bound)
 
 
 def _refuse_rest(data: ResidualSet) -> None:

@@ -39,6 +39,11 @@ class Term:
         return effects()[self.effect].covers(layout, self.place)
 
     @property
+    def bound(self) -> int:
+        """The one training recording that it is in, from 1; 0 where it belongs to the arm."""
+        return effects()[self.effect].bound_to(self.shape)
+
+    @property
     def beneath(self) -> tuple[tuple[str, int], ...]:
         """Keys of the terms that it stands upon."""
         return tuple((name, self.place) for name in effects()[self.effect].needs)

@@ -58,6 +58,8 @@ class Signals:
     """Standard deviation of each channel's noise within the pass band [N·m], (n,)."""
     arm: RigidArm
     temperature: Array | None = None
+    number: int = 0
+    """Which of the training recordings this is (or the rest of), from 1; 0 is another."""
 
     @property
     def n(self) -> int:

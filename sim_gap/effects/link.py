@@ -1,6 +1,6 @@
 """Links that weigh otherwise than the model says: they show at every joint from the base to that link."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -13,6 +13,8 @@ LEVER = 0.15
 LIGHTEST = 0.2
 """A link counts as at least this heavy [kg] where the plausible error of its inertials is judged."""
 
+SEVERAL = 6
+"""Up to so many training recordings a payload may be in one of them alone."""
 SHOWS = 0.3
 """A mass moment's own torque must be at least this share of that of the inertia which comes with it."""
 
@@ -58,16 +60,28 @@ class Inertia(Effect):
 
 
 class Payload(Effect):
-    """A mass fixed to the tip; its centre of mass is in the last link's frame, whose origin is on that joint's axis."""
+    """A mass fixed to the tip; its centre of mass is in the last link's frame, whose origin is on that joint's axis.
+
+    Of several training recordings one alone may have been made with it: the shape then holds that recording's number.
+    """
 
     id = "link.payload"
     parameters = (Parameter("mass", "kg"), Parameter("x", "m"), Parameter("y", "m"), Parameter("z", "m"))
     rare = 0
     whole_arm = True
+    counted = frozenset({0})
+
+    def grid(self, signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
+        several = len(signals) if 1 < len(signals) <= SEVERAL else 0
+        return ((), *((float(number),) for number in range(1, several + 1)))
+
+    def bound_to(self, shape: Shape) -> int:
+        return int(shape[0]) if shape else 0
 
     def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
         tip = signals.n - 1
-        return _rows(signals, layout, tip, signals.regressor[:, :, tip, :4])
+        there = not shape or signals.number == int(shape[0])
+        return _rows(signals, layout, tip, signals.regressor[:, :, tip, :4] * there)
 
     def spread(self, signals: Signals, place: int) -> Array:
         return np.array([20.0, 4.0, 4.0, 4.0])

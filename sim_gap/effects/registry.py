@@ -125,6 +125,10 @@ class Effect(ABC):
         """Effects and places whose columns this one contains: they do not stand beside it."""
         return ()
 
+    def bound_to(self, shape: Shape) -> int:
+        """The one training recording (from 1) that it is in, 0 where it belongs to the arm for good."""
+        return 0
+
     def made_of(self, layout: Layout, place: int, shape: Shape) -> tuple[tuple[str, int], ...]:
         """Simpler effects and places that together could stand in its place; it must do better than they."""
         return ()
