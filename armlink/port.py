@@ -59,9 +59,19 @@ class LockStepPort:
     """In-process bus that never blocks (`put`, `take`); waiting lets simulated time go on."""
 
     def __init__(self, bus: Any) -> None:
-        self.errors = self.dropped = 0
+        self._bus = bus
         self.send: Callable[[int, bytes], None] = bus.put
         self.receive: Callable[[float], Frame | None] = bus.take
+
+    @property
+    def errors(self) -> int:
+        """Error frames so far, where the bus has any."""
+        return int(getattr(self._bus, "errors", 0))
+
+    @property
+    def dropped(self) -> int:
+        """Frames lost so far because they were not taken in time, where the bus tells."""
+        return int(getattr(self._bus, "dropped", 0))
 
     def send_all(self, frames: Sequence[Frame]) -> None:
         """Send the frames in this order."""
