@@ -4,7 +4,6 @@ from dataclasses import dataclass, field
 from itertools import combinations, pairwise, product
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from calib.belief import ModelBelief
 from calib.dictionary import DRIFT, Entry, Window, class_of, dictionary, kin
@@ -68,7 +67,7 @@ class CauseTest:
         covariance[np.diag_indices_from(covariance)] += noise**2
         self.entries = list(dictionary(belief.arm, belief.beta, window))
         stacked = np.column_stack([residual.ravel(), *(entry.columns for entry in self.entries)])
-        white = solve_triangular(np.linalg.cholesky(covariance), stacked, lower=True)
+        white: Array = np.linalg.solve(np.linalg.cholesky(covariance), stacked)  # scipy would take longer to load
         self._white: Array = white[:, 0]
         ends = np.cumsum([1, *(entry.columns.shape[1] for entry in self.entries)])
         self._columns: list[Array] = [white[:, start:end] for start, end in pairwise(ends)]

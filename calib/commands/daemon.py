@@ -1,6 +1,101 @@
 """The long-running service: watches the arm, keeps its torque sensors true, serves a page and an API."""
 
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
 
-def daemon() -> None:
-    """Being built."""
-    raise NotImplementedError
+import typer
+
+
+class Policies(StrEnum):
+    """What becomes of a drift that was found."""
+
+    observe = "observe"
+    propose = "propose"
+    apply = "apply"
+
+
+def daemon(
+    arm: Annotated[str, typer.Argument(help="A bundled arm's name, or the path of an arm file.")],
+    bus: Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE]; default the arm file's.")] = None,
+    listen_only: Annotated[
+        bool,
+        typer.Option(
+            "--listen-only",
+            help="Another controller commands the bus: send no SYNC and no commands. A recalibration that is applied"
+            " still writes object 2100h by SDO.",
+        ),
+    ] = False,
+    socket: Annotated[
+        Path | None, typer.Option(help="Unix socket of API and page; default api.sock in the state directory.")
+    ] = None,
+    tcp: Annotated[str | None, typer.Option(help="Serve on HOST:PORT too; needs --token-file.")] = None,
+    token_file: Annotated[Path | None, typer.Option(help="File with the token that TCP clients must send.")] = None,
+    policy: Annotated[Policies | None, typer.Option(help="Instead of the arm file's daemon.policy.")] = None,
+    state: Annotated[
+        Path | None, typer.Option(help="Directory of journal and recordings; default the user's state directory.")
+    ] = None,
+    store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
+    work: Annotated[
+        bool, typer.Option("--work", help="Move the arm among random poses: for trying it on a simulated arm.")
+    ] = False,
+) -> int:
+    """Watch an arm for months, until SIGTERM; SIGHUP reads the arm file anew, SIGUSR1 asks for a sweep.
+
+    Example: armlink daemon sarcos --bus socketcan:can0 --listen-only --policy propose
+    """
+    from armlink.armfile import load_arm
+    from armlink.bus import resolve_bus
+    from armlink.errors import BadInput
+    from calib.daemon.logs import log_as_json
+    from calib.daemon.run import Options, run_daemon, state_directory
+
+    described = load_arm(arm)
+    resolve_bus(bus, described.require_link().bus)
+    directory = state_directory(state, described)
+    try:
+        directory.mkdir(parents=True, exist_ok=True, mode=0o750)
+    except OSError as error:
+        raise BadInput(f"--state {directory}: cannot be made: {error.strerror}") from None
+    token = _token(token_file)
+    address = None if tcp is None else _address(tcp, token)
+    options = Options(
+        arm=arm,
+        bus=bus,
+        listen_only=listen_only,
+        socket=socket or directory / "api.sock",
+        tcp=address,
+        token=token,
+        policy=None if policy is None else policy.value,
+        state=directory,
+        store=store,
+        work=work,
+    )
+    log_as_json()
+    run_daemon(options, described, directory)
+    return 0
+
+
+def _token(path: Path | None) -> str | None:
+    from armlink.errors import BadInput
+
+    if path is None:
+        return None
+    try:
+        token = path.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise BadInput(f"--token-file {path}: cannot be read: {error}") from None
+    if not token:
+        raise BadInput(f"--token-file {path}: it is empty; expected one line with the token")
+    return token
+
+
+def _address(text: str, token: str | None) -> tuple[str, int]:
+    from armlink.errors import BadInput
+
+    host, colon, port = text.rpartition(":")
+    if not (colon and host and port.isdigit() and 0 < int(port) < 65536):
+        raise BadInput(f"--tcp {text}: expected HOST:PORT, for example 127.0.0.1:8080")
+    if token is None:
+        raise BadInput("--tcp needs --token-file: whoever has the token may decide on proposals")
+    return host.strip("[]"), int(port)

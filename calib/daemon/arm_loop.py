@@ -2,19 +2,16 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from armlink.armfile import ArmFile
 from armlink.errors import ArmlinkError, BusFault, Refused
 from armlink.link import Link
 from armlink.listener import Listener
 from armlink.sample import Calibration, Command, Sample
-from calib.daemon.messages import Array, Batch, Down, Message, Progress, Reply, Request, Up
-from calib.daemon.settings import daemon_section
+from calib.daemon.messages import Array, Batch, Down, LoopOptions, Message, Progress, Reply, Request, Up
 from calib.description import gcomp_arm
 from calib.work import WorkMotion, work_pieces
 
@@ -26,21 +23,6 @@ TOUR = WorkMotion(reach=10.0)
 """A tour's moves may go from one end of a joint's range to the other."""
 SILENCE_SECONDS = 0.5
 """A bus without SYNC, or joints without readings, for so long is reported."""
-
-
-@dataclass
-class LoopOptions:
-    """What the loop needs to know."""
-
-    arm: ArmFile
-    bus: str | None = None
-    listen_only: bool = False
-    work: bool = False
-    pace: bool = True
-    """In-process simulated arm: keep to the machine's time. Without, simulated time passes as fast as it can."""
-    seed: int = 0
-    open_bus: Callable[[], Any] | None = field(default=None, repr=False)
-    """Gives the bus in tests; by default it is opened by name."""
 
 
 class ArmLoop:
@@ -232,8 +214,3 @@ class ArmLoop:
         ahead = (now - self._real_start[0]) - (real - self._real_start[1])
         if ahead > 0:
             time.sleep(ahead)
-
-
-def loop_options(arm: ArmFile, bus: str | None, listen_only: bool) -> LoopOptions:
-    """Options of an arm file's daemon section; `bus` as --bus has it."""
-    return LoopOptions(arm, bus, listen_only, work=daemon_section(arm).work)

@@ -13,8 +13,7 @@ from typing import Any
 
 from armlink.errors import ArmlinkError, BadInput, BusFault, Refused
 from armlink.sample import Calibration
-from calib.daemon.arm_loop import ArmLoop, LoopOptions
-from calib.daemon.messages import Message, Reply, Request
+from calib.daemon.messages import LoopOptions, Message, Reply, Request
 
 ANSWER_SECONDS = 10.0
 """A request that the loop has not answered by then has failed [s]."""
@@ -60,6 +59,8 @@ class InlineHost:
     """The loop in this thread: `pump` makes a tenth of a second of cycles."""
 
     def __init__(self, options: LoopOptions) -> None:
+        from calib.daemon.arm_loop import ArmLoop
+
         self.loop = ArmLoop(options)
         self.controllers = LoopControllers(self.loop.handle)
 
@@ -163,6 +164,8 @@ def _child(connection: Connection, options: LoopOptions) -> None:
     """The process: cycles until it is told to stop, or nobody listens any more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the whole group: the service ends us
     signal.signal(signal.SIGTERM, lambda number, frame: _raise_end())
+    from calib.daemon.arm_loop import ArmLoop  # what it loads, the service does not need
+
     loop = ArmLoop(options)
     gc.collect()
     gc.freeze()

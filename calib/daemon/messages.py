@@ -1,15 +1,32 @@
 """What passes between the bus loop and the service: samples in batches, answers; never a lock, never a wait."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from armlink.armfile import ArmFile
 from armlink.sample import Sample, Stats
 
 Array = NDArray[np.float64]
 CHANNELS = ("position", "velocity", "torque", "motor_torque", "torque_command", "position_command")
+
+
+@dataclass
+class LoopOptions:
+    """What the loop needs to know."""
+
+    arm: ArmFile
+    bus: str | None = None
+    listen_only: bool = False
+    work: bool = False
+    pace: bool = True
+    """In-process simulated arm: keep to the machine's time. Without, simulated time passes as fast as it can."""
+    seed: int = 0
+    open_bus: Callable[[], Any] | None = field(default=None, repr=False)
+    """Gives the bus in tests; by default it is opened by name."""
 
 
 @dataclass(frozen=True)

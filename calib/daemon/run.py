@@ -1,6 +1,7 @@
 """The daemon's one event loop: bus process, timers, signals, systemd and the web, wired together; nothing else."""
 
 import asyncio
+import importlib
 import logging
 import signal
 import time
@@ -12,19 +13,22 @@ from typing import Any, TypeVar
 
 from armlink.armfile import ArmFile, load_arm
 from armlink.errors import ArmlinkError, BadInput
+from armlink.sample import Calibration
 from calib.daemon.answers import ServiceView
-from calib.daemon.arm_loop import LoopOptions
 from calib.daemon.host import ChildHost
-from calib.daemon.messages import Down
+from calib.daemon.messages import Down, LoopOptions
 from calib.daemon.notify import Notifier, watchdog_seconds
 from calib.daemon.service import Around, Service
 from calib.daemon.settings import DaemonSection, Policy, daemon_section
 from calib.store import RecordStore
+from calib.writing import Controllers
 
 T = TypeVar("T")
 SNAPSHOT_SECONDS = 0.1
 SILENT_SECONDS = 5.0
 """A bus process that has said nothing for so long hangs: it is killed and begun anew."""
+BEGIN_SECONDS = 30.0
+"""A new bus process may take so long to say its first word."""
 log = logging.getLogger("armlink.daemon")
 
 
@@ -62,25 +66,31 @@ class Daemon:
         self.options, self.arm, self.host = options, arm, host
         self._loop = asyncio.get_running_loop()
         self._ended = asyncio.Event()
-        self._heard = time.monotonic()
+        self._heard = time.monotonic() + BEGIN_SECONDS
         self._notify, self._watchdog = Notifier(), watchdog_seconds()
         self._tasks: set[asyncio.Future[Any]] = set()
         around = Around(time.monotonic, lambda: datetime.now(UTC), self._job, self)
         settings = options.settings(arm)
         self.service = Service(arm, settings, options.listen_only, state, RecordStore(options.store), around)
         self.view = ServiceView(self.service)
-        self.controllers = self
         self._why = "stopped"
 
     # ---- the service's way to the bus (Port), whichever process it is
 
-    def read_calibration(self, joint: int) -> Any:
+    @property
+    def controllers(self) -> Controllers:
+        """This, whose calls go to the bus process of the moment."""
+        return self
+
+    def read_calibration(self, joint: int) -> Calibration:
         """See LoopControllers."""
         return self.host.controllers.read_calibration(joint)
 
-    def write_calibration(self, joint: int, gain: float, offset: float, record_id: int, **rest: Any) -> Any:
+    def write_calibration(
+        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
+    ) -> Calibration:
         """See LoopControllers."""
-        return self.host.controllers.write_calibration(joint, gain, offset, record_id, **rest)
+        return self.host.controllers.write_calibration(joint, gain, offset, record_id, date, store)
 
     def sweep(self, poses: int, seed: int) -> Any:
         """See ChildHost."""
@@ -90,8 +100,6 @@ class Daemon:
 
     async def run(self) -> None:
         """Until SIGTERM or SIGINT; leaves the joints safe."""
-        from calib.daemon.web.server import serve
-
         for number, act in {
             signal.SIGTERM: lambda: self._end("SIGTERM"),
             signal.SIGINT: lambda: self._end("SIGINT"),
@@ -100,9 +108,7 @@ class Daemon:
         }.items():
             self._loop.add_signal_handler(number, act)
         self._loop.add_reader(self.host.fileno(), self._messages)
-        web = asyncio.create_task(
-            serve(self.view, socket=self.options.socket, tcp=self.options.tcp, token=self.options.token)
-        )
+        web = asyncio.create_task(self._serve())
         timer = asyncio.create_task(self._timer())
         ended = asyncio.create_task(self._ended.wait())
         self._notify("READY=1", "STATUS=starting")
@@ -119,6 +125,12 @@ class Daemon:
                 task.cancel()
             await asyncio.gather(web, timer, ended, return_exceptions=True)
             self.service.close(self._why)
+
+    async def _serve(self) -> None:
+        """API and page; what they need is loaded aside, while the arm is observed already."""
+        server = await asyncio.to_thread(importlib.import_module, "calib.daemon.web.server")
+        given = self.options
+        await server.serve(self.view, socket=given.socket, tcp=given.tcp, token=given.token)
 
     def _end(self, why: str) -> None:
         self._why = why
@@ -160,7 +172,7 @@ class Daemon:
         self.host.close()
         self.service.take(Down(why))
         self.host = ChildHost(self.options.loop(self.arm))
-        self._heard = time.monotonic() + SILENT_SECONDS
+        self._heard = time.monotonic() + BEGIN_SECONDS
         self._loop.add_reader(self.host.fileno(), self._messages)
 
     def _reload(self) -> None:

@@ -49,8 +49,10 @@ log = logging.getLogger("armlink.daemon")
 class Port(Protocol):
     """The way to the bus loop."""
 
-    controllers: Controllers
-    """Reads and writes 2100h; waits, so that it is for jobs."""
+    @property
+    def controllers(self) -> Controllers:
+        """Reads and writes 2100h; waits, so that it is for jobs."""
+        ...
 
     def sweep(self, poses: int, seed: int) -> Reply | None:
         """Ask for a tour of poses; the reply comes as a message where it is not returned."""

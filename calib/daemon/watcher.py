@@ -7,7 +7,6 @@ import numpy as np
 
 from armlink.armfile import ArmFile
 from armlink.cia402 import state_of
-from armlink.loop import NO_STATUS
 from calib.daemon.messages import Array, Batch
 from calib.daemon.view import JointNow
 from calib.description import gcomp_arm
@@ -17,6 +16,8 @@ from calib.observer_config import ObserverConfig
 from calib.observer_state import restore_observer, save_observer
 from calib.records import CalibrationRecord, GravityRecord
 
+NO_STATUS = 0xFFFF
+"""Stands for the status word of a joint that has sent none."""
 OBSERVED_RATE = 50.0
 """Samples a second that the observer sees, each the mean of those in between: rests last tenths of a second."""
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from armlink.armfile import ArmFile, load_arm
 from calib.daemon.answers import ServiceView
-from calib.daemon.arm_loop import LoopOptions
 from calib.daemon.host import InlineHost
+from calib.daemon.messages import LoopOptions
 from calib.daemon.service import Around, Service
 from calib.daemon.settings import DaemonSection
 from calib.description import gcomp_arm
@@ -26,9 +26,7 @@ START = datetime(2026, 1, 1, tzinfo=UTC)
 
 def good_records(arm: ArmFile, truth: Truth) -> tuple[CalibrationRecord, GravityRecord]:
     """What a good sweep would have found on this simulated arm."""
-    columns = zip(
-        arm.joint_names, truth.gain, truth.offset, truth.position_gain, truth.position_offset, strict=True
-    )
+    columns = zip(arm.joint_names, truth.gain, truth.offset, truth.position_gain, truth.position_offset, strict=True)
     joints = tuple(
         JointCalibration(name=name, gain=g, offset=o, position_gain=p, position_offset=z)
         for name, g, o, p, z in columns

@@ -81,7 +81,9 @@ class FastArm:
             nearest = np.maximum(middle - half, self.q - motion.reach)
             farthest = np.minimum(middle + half, self.q + motion.reach)
             goal = self.random.uniform(np.minimum(nearest, farthest), np.maximum(nearest, farthest))
-            way = trajectory(self.q, goal, motion.speed_share * self.speed, np.full(self.n, motion.acceleration), PERIOD)
+            way = trajectory(
+                self.q, goal, motion.speed_share * self.speed, np.full(self.n, motion.acceleration), PERIOD
+            )
             rest = np.repeat(goal[None], round(motion.rest / PERIOD), axis=0)
             position = np.vstack([way, rest])
             position[:, :] += 2e-4 * self.random.normal(size=self.n) * (position != goal).any(axis=1)[:, None]
