@@ -1,33 +1,22 @@
 """Recalibration: from a finding of the observer to a new record, and from a record to the controllers."""
 
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
 from armlink.armfile import ArmFile
 from armlink.errors import Refused
 from armlink.sample import Calibration
+from calib.after_write import AfterWrite, Checked
 from calib.decision import Finding
-from calib.records import Array, CalibrationRecord, matrix, provenance
+from calib.records import Array, CalibrationRecord, GravityRecord, matrix, provenance
 from calib.store import RecordStore
+from calib.writing import Controllers, install, mend, same_real32
 
 Policy = Literal["observe", "propose", "apply"]
 APPLIED_BY = "observer, policy apply"
-SAME_REAL32 = 1e-6
-"""Relative difference that REAL32 in the controller may make to a value of a record."""
-
-
-class Controllers(Protocol):
-    """What recalibration needs of the link (`armlink.link.Link`)."""
-
-    def read_calibration(self, joint: int) -> Calibration:
-        """Active gain and offset [N·m] of joint j."""
-        ...
-
-    def write_calibration(self, joint: int, gain: float, offset: float, record_id: int) -> Calibration:
-        """Stage, read back and make active gain and offset [N·m] of a joint; raises BusFault."""
-        ...
+CHECKED_BY = "check after recalibration"
 
 
 @dataclass(frozen=True)
@@ -51,6 +40,8 @@ class Recalibration:
     offset: float
     """New offset [N·m]."""
     applied: bool
+    undo: Finding | None = None
+    """Where an earlier recalibration was taken back: the change that this was, for `Observer.install`."""
 
 
 def compose(gain: float, offset: float, finding: Finding) -> tuple[float, float]:
@@ -124,6 +115,7 @@ class Recalibrator:
         self._arm, self._controllers, self._store, self._policy = arm, controllers, store, policy
         self._bounds = bounds or Plausibility()
         self._reference = self._swept(current)
+        self._check: AfterWrite | None = None
 
     def handle(self, finding: Finding) -> Recalibration | None:
         """Make of a finding what the policy says; None under observe. Raises Refused, as propose and apply do."""
@@ -152,35 +144,50 @@ class Recalibrator:
         return Recalibration(new.joints[j].name, new, gain, offset, False)
 
     def apply(self, new: CalibrationRecord, j: int, by: str) -> None:
-        """Write joint j of a kept record to its controller and make the record current.
+        """Write joint j of a kept record to its controller and make the record current (`calib.writing.install`).
 
-        In this order, so that a crash in between leaves a controller that holds a kept record, never an unknown pair.
-        Raises Refused where the record does not follow from the current one or the controller holds something else,
-        BusFault.
+        From then on `sample` checks it. Raises Refused where the record does not follow from the current one or the
+        controller holds something else, BusFault.
         """
         if new.parent != self.record.id:
             raise Refused(f"record {new.id} follows from {new.parent}, but {self.record.id} is current: superseded")
-        held = require_installed(self.record, self._controllers, j)
-        gain = float(new.values("gain", missing=held.gain)[j])
-        self._controllers.write_calibration(j, gain, float(new.values("offset")[j]), new.number)
-        self._store.activate(new.id, self._arm, by=by, reason=new.note)
+        mend(self._arm, self._store, self._controllers)
+        old = require_installed(self.record, self._controllers, j)
+        install(new, self._arm, self._store, self._controllers, by=by, reason=new.note, joints=(j,))
         self.record = new
+        gravity = self._store.current(GravityRecord, self._arm)
+        if gravity is not None:
+            held = self._controllers.read_calibration(j)
+            self._check = AfterWrite(self._arm, gravity, new, j, old, held)
 
-    def roll_back(self, j: int, by: str, reason: str) -> CalibrationRecord:
-        """Go back to the record before the current one: joint j's pair written, the record made current, returned.
+    def sample(self, t: float, position: Array, torque: Array) -> Checked | None:
+        """After `apply`, take each sample (as sent, (n,), SI); the check's outcome once it has its rests, else None.
 
-        Raises Refused where the current record has no parent, BusFault.
+        Reads and writes nothing; what is worse is taken back by `undo`.
+        """
+        outcome = None if self._check is None else self._check.handle(t, position, torque)
+        if outcome is not None:
+            self._check = None
+        return outcome
+
+    def undo(self, checked: Checked) -> Recalibration:
+        """Take the last recalibration back: the old pair written, its record current again.
+
+        Raises Refused where the current record has none before it, BusFault.
         """
         if self.record.parent is None:
             raise Refused(f"record {self.record.id} has none before it to go back to")
-        parent = self._store.get(self.record.parent)
+        parent, j = self._store.get(self.record.parent), checked.joint
         assert isinstance(parent, CalibrationRecord)
-        held = require_installed(self.record, self._controllers, j)
-        gain = float(parent.values("gain", missing=held.gain)[j])
-        self._controllers.write_calibration(j, gain, float(parent.values("offset")[j]), parent.number)
-        self._store.rollback(self._arm, parent.id, by=by, reason=reason)
-        self.record = parent
-        return parent
+        mend(self._arm, self._store, self._controllers)
+        was = require_installed(self.record, self._controllers, j)
+        install(parent, self._arm, self._store, self._controllers, by=CHECKED_BY, reason=checked.why, joints=(j,))
+        now = self._controllers.read_calibration(j)
+        self.record, self._check = parent, None
+        change = Finding(
+            j, "drift", now.gain / was.gain, (now.offset - was.offset) / was.gain, np.zeros((2, 2)), 0, 1.0
+        )
+        return Recalibration(parent.joints[j].name, parent, now.gain, now.offset, applied=True, undo=change)
 
     def _swept(self, record: CalibrationRecord) -> CalibrationRecord:
         """The last record of this line that the observer did not make: what drift is bounded against."""
@@ -195,7 +202,7 @@ def require_installed(record: CalibrationRecord, controllers: Controllers, j: in
     """What joint j's controller holds; raises Refused where that is another pair than the record's."""
     joint, held = record.joints[j], controllers.read_calibration(j)
     for what, wanted, found in (("gain", joint.gain, held.gain), ("offset", joint.offset, held.offset)):
-        if wanted is not None and abs(found - wanted) > SAME_REAL32 * max(1.0, abs(wanted)):
+        if wanted is not None and not same_real32(found, wanted):
             raise Refused(
                 f"{joint.name}: the controller holds {what} {found:.6g}, record {record.id} has {wanted:.6g}:"
                 " write the record first (armlink calibrate --apply)"

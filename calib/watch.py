@@ -63,6 +63,8 @@ def watch(
             history.events.append(event)
             if event.finding is not None and recalibrator is not None:
                 _recalibrate(event, observer, recalibrator, history)
+        if recalibrator is not None:
+            _check(sample, observer, recalibrator, history)
         if observer.rows > rows:
             _keep(sample.t, observer, history)
         if sample.t >= end or (on_sample is not None and on_sample(sample, history)):
@@ -84,6 +86,19 @@ def _recalibrate(event: Event, observer: Observer, recalibrator: Recalibrator, h
     history.events.append(Event(event.t, "recalibration", event.joint, evidence))
     if outcome.applied:
         observer.install(event.finding)
+
+
+def _check(sample: Sample, observer: Observer, recalibrator: Recalibrator, history: WatchHistory) -> None:
+    """After a recalibration: what made the readings worse is taken back."""
+    checked = recalibrator.sample(sample.t, sample.position, sample.torque)
+    if checked is None or checked.verdict == "kept":
+        return
+    outcome = recalibrator.undo(checked)
+    history.events.append(
+        Event(sample.t, "roll-back", outcome.joint, {"record": outcome.record.id, "why": checked.why})
+    )
+    if outcome.undo is not None:
+        observer.install(outcome.undo)
 
 
 def _keep(t: float, observer: Observer, history: WatchHistory) -> None:

@@ -1,12 +1,12 @@
 """Torque and position sensor gains and offsets from sweeps; writes a calibration record."""
 
+import getpass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
-    from armlink.armfile import ArmFile
     from calib.records import CalibrationRecord, Parameter
     from calib.sensors import SensorFit
 
@@ -16,6 +16,13 @@ def calibrate(
     arm: Annotated[str | None, typer.Option(help="Arm file, where it is no longer where the sweep had it.")] = None,
     apply: Annotated[bool, typer.Option("--apply", help="Also write gains and offsets to the controllers.")] = False,
     bus: Annotated[str | None, typer.Option(help="With --apply: INTERFACE:CHANNEL[@BITRATE].")] = None,
+    check: Annotated[
+        bool, typer.Option(help="With --apply: a small motion of every joint before and after; worse is taken back.")
+    ] = True,
+    flash: Annotated[bool, typer.Option("--flash", help="With --apply: also store to the controllers' flash.")] = False,
+    replaced: Annotated[
+        list[str] | None, typer.Option(help="With --apply: a joint whose sensor was exchanged since the last record.")
+    ] = None,
     store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")
@@ -25,8 +32,12 @@ def calibrate(
 
     Example: armlink calibrate unloaded loaded --json calibration.json
     """
+    import numpy as np
+
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
+    from calib.applying import Apply, apply_calibration
+    from calib.commands.screen import print_lines
     from calib.dataset import load_data
     from calib.records import CalibrationRecord
     from calib.sensors import fit_sensors
@@ -41,9 +52,15 @@ def calibrate(
     current = records.current(CalibrationRecord, arm_file)
     record = fit.record(arm_file).model_copy(update={"parent": None if current is None else current.id})
     _show(fit)
-    records.put(record, arm_file, by="armlink calibrate", reason="sweeps")
     if apply:
-        _apply(arm_file, record, bus)
+        user = getpass.getuser()
+        record = record.model_copy(update={"confirmed_by": user})
+        how = Apply(by=user, bus=bus, replaced=tuple(replaced or ()), check=check, flash=flash)
+        beta = None if np.isnan(fit.value("gain")).all() else fit.fit.complete.beta
+        written = apply_calibration(record, arm_file, records, data, beta, how)
+        print_lines([f"record {record.id} written to {len(written)} controllers, read back and current"])
+    else:
+        records.put(record, arm_file, by="armlink calibrate", reason="sweeps")
     write_json(json_file, _answer(fit, record, apply))
 
 
@@ -79,16 +96,3 @@ def _show(fit: "SensorFit") -> None:
         ratios = ", ".join(f"{name} {ratio:.4f}" for name, ratio in zip(fit.names, fit.gain_ratio, strict=True))
         lines.append(f"gains as multiples of the last joint's: {ratios}")
     print_lines(lines)
-
-
-def _apply(arm_file: "ArmFile", record: "CalibrationRecord", bus: str | None) -> None:
-    """Write every gain and offset that is known to its controller, read back; the joints are not enabled."""
-    from armlink.errors import Refused
-    from armlink.link import Link
-    from calib.recalibration import write_record
-
-    if all(joint.offset is None for joint in record.joints):
-        raise Refused("--apply: no joint has a gain or an offset, so nothing is written")
-    with Link.open(arm_file, bus) as link:
-        link.start()
-        write_record(record, link)

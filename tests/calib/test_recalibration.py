@@ -9,6 +9,7 @@ import pytest
 from armlink.armfile import ArmFile, parse_arm
 from armlink.errors import BusFault, Refused
 from armlink.sample import Calibration
+from calib.after_write import Checked
 from calib.decision import Finding
 from calib.recalibration import Recalibrator, compose, recalibrated, write_record
 from calib.records import CalibrationRecord, JointCalibration, matrix, provenance
@@ -58,7 +59,9 @@ class Controllers:
     def read_calibration(self, joint: int) -> Calibration:
         return self.held[joint]
 
-    def write_calibration(self, joint: int, gain: float, offset: float, record_id: int) -> Calibration:
+    def write_calibration(
+        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
+    ) -> Calibration:
         if self.broken:
             raise BusFault("no answer")
         self.held[joint] = Calibration(float(np.float32(gain)), float(np.float32(offset)), record_id, 0, 0)
@@ -122,6 +125,21 @@ def test_apply_writes_record_and_controller(store: RecordStore) -> None:
     assert controllers.held[1].offset == pytest.approx(-0.4 + 0.33, rel=1e-6)
     assert controllers.held[1].record_id == done.record.number
     assert done.record.confirmed_by == "observer, policy apply"
+
+
+def test_what_the_check_finds_worse_is_undone(store: RecordStore) -> None:
+    """The old pair is back in the controller, the old record current, and the change is told as a finding."""
+    controllers = Controllers()
+    recalibrator = Recalibrator(ARM, controllers, store, "apply")
+    recalibrator.handle(finding(1.03, 0.3))
+    outcome = recalibrator.undo(Checked("worse", 1, "elbow: RMS 0.9 N·m, 0.2 with the old pair"))
+    assert outcome.record == recalibrator.record == store.current(CalibrationRecord, ARM) == record()
+    assert (controllers.held[1].gain, controllers.held[1].record_id) == (pytest.approx(1.1), record().number)
+    assert store.activations(ARM)[-1].reason.startswith("elbow: RMS 0.9")
+    assert outcome.undo is not None
+    np.testing.assert_allclose(compose(1.1 * 1.03, -0.4 + 1.1 * 0.3, outcome.undo), (1.1, -0.4), atol=1e-6)
+    with pytest.raises(Refused, match="none before it"):
+        recalibrator.undo(Checked("worse", 1, "again"))
 
 
 def test_propose_keeps_the_record_and_touches_nothing(store: RecordStore) -> None:

@@ -101,7 +101,9 @@ class MadeUpLink:
     def read_calibration(self, joint: int) -> Calibration:
         return self.held[joint]
 
-    def write_calibration(self, joint: int, gain: float, offset: float, record_id: int) -> Calibration:
+    def write_calibration(
+        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
+    ) -> Calibration:
         self.held[joint] = Calibration(float(np.float32(gain)), float(np.float32(offset)), record_id, 0, 0)
         return self.held[joint]
 
