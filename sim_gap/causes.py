@@ -87,7 +87,7 @@ class _Scorer:
         return np.asarray(np.sqrt(out))
 
 
-MINOR, MINOR_INNER = 0.012, 0.004
+MINOR, MINOR_INNER = 0.009, 0.004
 """Share of a joint's torque (RMS) that a cause must lower some joint's RMS by, not to be minor; where the cause shows
 against the model, and where only in motor against sensor or command."""
 

@@ -88,6 +88,8 @@ def _answer(made: Internals, found: list[Cause], minor: list[Cause], told: str) 
         left_over(data, estimate.predict(data)) if estimate is not None else data.values for data in (judge, fit)
     )
     told_verdict = "no_gap" if estimate is None else verdict(found, judge, left)
+    if fit.struck and not any(cause.effect == "transmission.backlash" for cause in found):
+        told_verdict = "unexplained"
     return Diagnosis(
         verdict=told_verdict,
         names=made.model.arm.names,
@@ -103,7 +105,7 @@ def _answer(made: Internals, found: list[Cause], minor: list[Cause], told: str) 
         margin=combined(judge, judge.margin),
         heldout_is=told,
         rollout=roll_out(made.model, judge, estimate),
-        notes=(*_notes(fit), *_bound(estimate, fit)),
+        notes=(*_notes(fit), *_bound(estimate, fit), *_hits(fit)),
         internals=made,
     )
 
@@ -141,6 +143,14 @@ def _bound(estimate: Estimate | None, data: ResidualSet) -> tuple[str, ...]:
     terms = () if estimate is None else estimate.terms
     labels = {s.number: s.label for s in data.signals}
     return tuple(f"{term.effect} is in {labels[term.bound]} alone" for term in terms if term.bound)
+
+
+def _hits(data: ResidualSet) -> tuple[str, ...]:
+    return tuple(
+        f"{data.signals[0].arm.names[joint]}: the torque jumps where it changes sign, as a gear with play does; "
+        f"these moments ({near.mean():.0%} of the time) are left out of the comparison"
+        for joint, near in data.struck.items()
+    )
 
 
 def _refuse_rest(data: ResidualSet) -> None:

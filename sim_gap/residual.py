@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_gap.effects.registry import Columns, Effect, Layout, Row, Shape
+from sim_gap.hits import hits
 from sim_gap.rigid import Array
 from sim_gap.signals import Signals
 
@@ -17,10 +18,10 @@ SMALL, SMALL_INNER, SMALL_NM = 0.01, 0.003, 0.01
 or command, and [N·m]."""
 CARE_NM = 0.05
 """Smallest gap that a user would care about [N·m]: every arm has a few hundredths of friction and offset."""
-CARE, CARE_INNER, CARE_COMMAND = 0.02, 0.008, 0.003
+CARE, CARE_INNER, CARE_COMMAND = 0.016, 0.007, 0.003
 """A gap that a user would care about, as a share of the joint's torque (RMS): against the model, motor against sensor,
 command against motor."""
-FAINT = 0.4
+FAINT = 0.5
 """Share of that below which there is nothing to search for."""
 FOLDS = 6
 MOVING_SHARE = 0.95
@@ -74,8 +75,21 @@ class ResidualSet:
         return out
 
     @cached_property
+    def struck(self) -> dict[int, NDArray[np.bool_]]:
+        """Joints whose gear hits at torque reversals, and the samples near these, (K,) each."""
+        sensor, out = self.layout.sensor, dict[int, NDArray[np.bool_]]()
+        first = 0
+        for s, length in zip(self.signals if sensor else (), self.lengths, strict=False):
+            part = slice(first, first + length)
+            rest = np.stack([self.values[str(sensor), j][part] for j in range(self.layout.n)], axis=1)
+            for joint, near in hits(s, str(sensor), rest).items():
+                out.setdefault(joint, np.zeros(sum(self.lengths), bool))[part] = near
+            first += length
+        return out
+
+    @cached_property
     def valid(self) -> dict[Row, NDArray[np.bool_]]:
-        """Samples that count: really read, and for the motor row with the joint in motion."""
+        """Samples that count: really read, no gear hitting, and for the motor row with the joint in motion."""
         out: dict[Row, list[NDArray[np.bool_]]] = {row: [] for row in self.rows}
         for s in self.signals:
             moving = s.filtered(s.moving) > MOVING_SHARE
@@ -86,7 +100,8 @@ class ResidualSet:
                 if channel == self.layout.motor_side:
                     there &= moving[:, joint] if self.layout.motor else True
                 out[channel, joint].append(there)
-        return {row: np.concatenate(parts) for row, parts in out.items()}
+        calm = ~np.any([np.zeros(sum(self.lengths), bool), *self.struck.values()], axis=0)
+        return {row: np.concatenate(parts) & calm for row, parts in out.items()}
 
     @cached_property
     def floor(self) -> dict[Row, float]:

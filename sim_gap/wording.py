@@ -39,7 +39,9 @@ PLAIN = {
 def sentence(answer: Diagnosis) -> str:
     """The verdict in a sentence, without a full stop."""
     if answer.verdict == "no_gap":
-        return "nothing exceeds twice the noise floor by a margin worth caring about (2 % of the joint's usual torque)"
+        return (
+            "nothing exceeds twice the noise floor by a margin worth caring about (1.6 % of the joint's usual torque)"
+        )
     if answer.verdict == "unexplained":
         return f"{answer.unexplained:.0%} of the gap is left that no effect of the library accounts for"
     first = answer.causes[0]
