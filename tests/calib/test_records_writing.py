@@ -256,10 +256,10 @@ def test_a_controller_that_does_not_use_its_new_pair_is_found(simulated: Simulat
         motion = CheckMotion(link, simulated.arm, true_record(simulated), None)
         motion.before()
         assert motion.after() is None
+        gain = link.read_calibration(0).gain
         link.claimed = True
         complaint = str(motion.after())
         assert complaint.startswith("joint_1: sends ")
-        gain = float(simulated.true_sensors.gain[0])  # of the record in force since the test before
         assert float(complaint.split()[2]) == pytest.approx(3.0 / gain, abs=0.05)
 
 
