@@ -1,4 +1,4 @@
-"""One cycle of the link: wait for its time, gate, frames, what came back, faults; and the ways into and out of power."""
+"""One cycle of the link: wait for its time, gate, frames, what came back, faults; the ways into and out of power."""
 
 import contextlib
 import math
@@ -10,7 +10,7 @@ from armlink.cia402 import Control, Mode, State, next_control, set_point_control
 from armlink.clock import Clock
 from armlink.errors import BusFault, Refused
 from armlink.faults import Known, bus_fault, find_fault, node_fault, refusal, stuck
-from armlink.gate import POSITION_MODES, JointLimits, Passed, Seen, pass_gate, start_from
+from armlink.gate import JointLimits, Passed, Seen, pass_gate, start_from
 from armlink.loop import Loop
 from armlink.pdo import STATUS_DECIMATION
 from armlink.sample import Command, Sample
@@ -33,7 +33,7 @@ class Commander:
         self.limits: list[JointLimits] = []
         self.passed: list[Passed] = []
         """What the last frames carried."""
-        self._loop, self._lock_step = loop, lock_step
+        self.loop, self._lock_step = loop, lock_step
         self._slow_age = max_age + STATUS_DECIMATION * period
         self._supported: list[int] = []
         self._modes = [OFF] * self.n
@@ -50,7 +50,7 @@ class Commander:
         """One cycle of a command; raises Refused where the gate refuses it, BusFault for a fault."""
         modes, torques, positions = self._numbers(command)
         self._await_turn()
-        loop, passed, now = self._loop, self.passed, self.clock.now()
+        loop, passed, now = self.loop, self.passed, self.clock.now()
         age = 0.0 if command.t is None else now - command.t
         fault = self._fault(now, self._commanded)
         seen = self._seen(now, fault is None)
@@ -82,7 +82,7 @@ class Commander:
         A joint that is enabled keeps the target position that it has: one that followed the reading would sag.
         """
         self._await_turn()
-        loop = self._loop
+        loop = self.loop
         for joint, (limits, passed) in enumerate(zip(self.limits, self.passed, strict=True)):
             position, mode = loop.latest_position[joint], OFF
             if state_of(loop.statuses[joint]) is State.ENABLED or not math.isfinite(position):
@@ -98,14 +98,14 @@ class Commander:
         To be enabled also takes that the joint displays position control and has told the torque that it now produces.
         Raises BusFault naming the joint that does not get there.
         """
-        loop, start = self._loop, self.clock.now()
+        loop, start = self.loop, self.clock.now()
         for joint in range(self.n):
             loop.send_mode(joint, Mode.POSITION)
             self._modes[joint] = int(Mode.POSITION)
             self._mode_since[joint] = start
         self._commanded = modes = self._modes.copy() if target is State.ENABLED else [OFF] * self.n
         states, since = [State.UNKNOWN] * self.n, [math.inf] * self.n
-        control = [int(Control.DISABLE_VOLTAGE)] * self.n
+        control = [self._first_word(status, target) for status in loop.statuses]
         for _ in range(max(int(ENABLE_SECONDS / self.period), STOP_CYCLES)):
             sample = self.stand(control)
             now = self.clock.now()
@@ -125,6 +125,14 @@ class Commander:
         raise BusFault(
             bus_fault(self.names, loop.watch, 0) or restarted or stuck(known, states, target, modes, ENABLE_SECONDS)
         )
+
+    @staticmethod
+    def _first_word(status: int, target: State) -> int:
+        """A word that changes nothing yet, so that the next one is an edge; a joint with power keeps it."""
+        state = state_of(status)
+        if state is State.QUICK_STOP:
+            return int(Control.QUICK_STOP)
+        return next_control(state, target) if state is State.ENABLED else int(Control.DISABLE_VOLTAGE)
 
     def quick_stop(self) -> None:
         """Quick stop of every joint, repeated until all report it, as far as the bus still carries it."""
@@ -153,7 +161,7 @@ class Commander:
         return modes, command.torque.tolist(), command.position.tolist()
 
     def _seen(self, now: float, healthy: bool) -> list[Seen]:
-        loop, seen = self._loop, []
+        loop, seen = self.loop, []
         for joint in range(self.n):
             known = now - loop.slow_seen[joint] <= self._slow_age
             torque = loop.latest_motor_torque[joint] if known else math.nan
@@ -163,11 +171,11 @@ class Commander:
 
     def _select(self, joint: int, mode: int, now: float) -> None:
         if mode != self._modes[joint]:
-            self._loop.send_mode(joint, mode)
+            self.loop.send_mode(joint, mode)
             self._modes[joint], self._mode_since[joint] = mode, now
 
     def _known(self, now: float) -> Known:
-        loop = self._loop
+        loop = self.loop
         ages = [now - seen for seen in loop.seen]
         return Known(
             self.names,
@@ -180,7 +188,7 @@ class Commander:
         )
 
     def _fault(self, now: float, modes: Sequence[int]) -> str | None:
-        loop = self._loop
+        loop = self.loop
         since = [now - since for since in self._mode_since]
         return find_fault(self._known(now), modes, since, self.max_age) or bus_fault(
             self.names, loop.watch, loop.dropped
@@ -190,6 +198,6 @@ class Commander:
         if not self._lock_step:
             self.clock.sleep_until(self._due)
             now = self.clock.now()
-            self._loop.stats.late += now - self._due > 0.1 * self.period
+            self.loop.stats.late += now - self._due > 0.1 * self.period
             self._due = max(self._due, now - self.period) + self.period
-        self._loop.drain()
+        self.loop.drain()

@@ -11,6 +11,7 @@ from armlink.errors import BadInput, BusFault, Refused
 from armlink.gate import JointLimits
 from armlink.limits import milliseconds
 from armlink.objects import Entry
+from armlink.pdo import Pdo
 from armlink.sample import Identity
 from armlink.services import NodeServices
 from armlink.units import Units, units_from
@@ -132,8 +133,11 @@ def check_modes(services: NodeServices) -> int:
     return supported
 
 
-def configure_pdos(services: NodeServices, deadline_ms: int) -> None:
-    """Map every PDO of the link and read the mapping back; raises BusFault naming the joint."""
+def configure_pdo(services: NodeServices, each: Pdo, deadline_ms: int) -> None:
+    """Map one PDO of the link and read the mapping back; raises BusFault naming the joint.
+
+    RPDO1 gets the deadline [ms]: a joint that hears none for so long stops by itself.
+    """
 
     def write(entry: Entry, value: int) -> None:
         services.write(entry, value)
@@ -141,11 +145,10 @@ def configure_pdos(services: NodeServices, deadline_ms: int) -> None:
     def read(entry: Entry) -> int:
         return int(services.read(entry))
 
-    for each in pdo.LINK_PDOS:
-        try:
-            pdo.configure(each, services.node, write, read, deadline_ms if each is pdo.RPDO1 else 0)
-        except pdo.MappingRefused as error:
-            raise BusFault(f"{services.joint} (node {services.node}): {error}") from None
+    try:
+        pdo.configure(each, services.node, write, read, deadline_ms if each is pdo.RPDO1 else 0)
+    except pdo.MappingRefused as error:
+        raise BusFault(f"{services.joint} (node {services.node}): {error}") from None
 
 
 def configure(
@@ -162,7 +165,8 @@ def configure(
     All is read back. The torque offset 60B2h, which adds to every target torque and stays latched, is cleared where the
     device has one. `supported` is 6502h. Raises BusFault naming joint and object.
     """
-    configure_pdos(services, protection.deadline_ms)
+    for each in pdo.LINK_PDOS:
+        configure_pdo(services, each, protection.deadline_ms)
     if services.has(objects.TORQUE_OFFSET):
         services.write_checked(objects.TORQUE_OFFSET, 0)
     for entry, value in settings(joint, unit, limits, period, protection, supported):

@@ -42,9 +42,9 @@ class Link:
         own_clock: Clock | None = getattr(bus, "clock", None)
         self._lock_step = own_clock is not None
         self.clock: Clock = clock or own_clock or MonotonicClock()
-        self._windows = [target_window(*limits) for limits in joint_ranges(arm)]
-        self._protection = device.protection_of(section)
-        self._loop = Loop(open_port(bus), self.clock, self.nodes, self._protection.host, self.period, self._lock_step)
+        self.windows = [target_window(*limits) for limits in joint_ranges(arm)]
+        self.protection = device.protection_of(section)
+        self._loop = Loop(open_port(bus), self.clock, self.nodes, self.protection.host, self.period, self._lock_step)
         self._loop.heartbeat_cycles = max(1, int(section.deadline / 2 * self.rate))
         self.commander = Commander(self._loop, self.clock, self.names, self.period, section.deadline, self._lock_step)
         self._cycling = self._enabled = False
@@ -92,7 +92,7 @@ class Link:
         """Identity and state of each joint's controller; one that does not answer is there with `present` false."""
         return [
             device.identify(services) if services.present() else Identity(services.joint, services.node, present=False)
-            for services in self._services
+            for services in self.services
         ]
 
     def start(self) -> None:
@@ -100,7 +100,7 @@ class Link:
 
         Raises Refused for another controller than the arm file states, BusFault, BadInput.
         """
-        missing = [f"{each.joint} (node {each.node})" for each in self._services if not each.present()]
+        missing = [f"{each.joint} (node {each.node})" for each in self.services if not each.present()]
         if missing:
             channel = self.bus.channel_info
             raise BusFault(f"no answer from {', '.join(missing)} on {channel}: is it powered, and its node id right?")
@@ -110,9 +110,9 @@ class Link:
         if not self._lock_step:
             loop.listen(max(LISTEN_PERIODS * self.period, LISTEN_SECONDS))
         self._alone()
-        for services, joint in zip(self._services, self.section.joints, strict=True):
+        for services, joint in zip(self.services, self.section.joints, strict=True):
             device.check_identity(services, joint)
-        loop.send(objects.NMT_ID, bytes([objects.NMT_PRE_OPERATIONAL, 0]))
+        self.send_nmt(objects.NMT_PRE_OPERATIONAL)
         self._configure()
         loop.drain()
         self._alone()
@@ -121,7 +121,7 @@ class Link:
         loop.reset_counters()
         self._since = self.clock.now()
         for node in self.nodes:
-            loop.send(objects.NMT_ID, bytes([objects.NMT_START, node]))
+            self.send_nmt(objects.NMT_START, node)
         self._cycling = True
 
     def _alone(self) -> None:
@@ -137,19 +137,24 @@ class Link:
     def _configure(self) -> None:
         """Set every controller up and read it back; what the first cycle starts from."""
         limits, passed, units, supported = [], [], [], []
-        for joint, services in enumerate(self._services):
-            row, window = self.section.joints[joint], self._windows[joint]
+        for joint, services in enumerate(self.services):
+            row, window = self.section.joints[joint], self.windows[joint]
             unit = device.read_units(services, row)
             limit = gate_limits(row, window, unit, self.period, self.section.deadline)
             supported.append(device.check_modes(services))
-            device.configure(services, row, unit, limit, self.period, self._protection, supported[-1])
+            device.configure(services, row, unit, limit, self.period, self.protection, supported[-1])
             torque = services.read(objects.MOTOR_TORQUE) * unit.torque
             passed.append(start_from(limit, torque, services.read(objects.POSITION) * unit.position))
             self._loop.displays[joint] = services.read(objects.MODE_DISPLAY)
+            self._loop.statuses[joint] = services.read(objects.STATUS_WORD)
             limits.append(limit)
             units.append(unit)
         self._loop.set_units(tuple(units))
         self.commander.begin(limits, passed, supported)
+
+    def send_nmt(self, command: int, node: int = 0) -> None:
+        """An NMT command (CiA 301) to one node, or to all."""
+        self._loop.send(objects.NMT_ID, bytes([command, node]))
 
     def enable(self) -> Sample:
         """Walk every joint to operation enabled under position control where it stands, and return the last sample.
@@ -199,7 +204,7 @@ class Link:
 
     def read_calibration(self, joint: int) -> Calibration:
         """The torque sensor record (2100h) that joint 0 … n−1 works with; raises BusFault."""
-        return calibration.read_record(self._services[joint])
+        return calibration.read_record(self.services[joint])
 
     def write_calibration(
         self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
@@ -208,10 +213,11 @@ class Link:
 
         While the joints are enabled the cycle goes on with the last command.
         """
-        return calibration.write_record(self._services[joint], gain, offset, record_id, date, store)
+        return calibration.write_record(self.services[joint], gain, offset, record_id, date, store)
 
     @cached_property
-    def _services(self) -> tuple[NodeServices, ...]:
+    def services(self) -> tuple[NodeServices, ...]:
+        """SDO access to each joint's controller, in joint order."""
         network = PumpedNetwork(self._loop.send)
         self._loop.on_other = lambda can_id, data: network.notify(can_id, bytearray(data), 0.0)
         dictionary = load_dictionary()

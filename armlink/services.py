@@ -99,7 +99,7 @@ class NodeServices:
         except SdoAbortedError as error:
             if error.code in ABSENT:
                 return False
-            raise self._fault(entry, f"read refused: {error}") from None
+            raise self.fault(entry, f"read refused: {error}") from None
         return True
 
     def read(self, entry: Entry) -> Any:
@@ -107,9 +107,9 @@ class NodeServices:
         try:
             data = self._upload(entry)
         except SdoAbortedError as error:
-            raise self._fault(entry, f"read refused: {error}") from None
+            raise self.fault(entry, f"read refused: {error}") from None
         if len(data) != entry.bits // 8:
-            raise self._fault(entry, f"{len(data)} bytes, expected {entry.bits // 8}")
+            raise self.fault(entry, f"{len(data)} bytes, expected {entry.bits // 8}")
         return struct.unpack("<" + entry.code, data)[0]
 
     def _upload(self, entry: Entry) -> bytes:
@@ -119,20 +119,20 @@ class NodeServices:
         except SdoAbortedError:
             raise
         except SdoError as error:
-            raise self._fault(entry, no_answer(error)) from None
+            raise self.fault(entry, no_answer(error)) from None
         except MALFORMED as error:
-            raise self._fault(entry, f"an answer that is no SDO: {error}") from None
+            raise self.fault(entry, f"an answer that is no SDO: {error}") from None
 
     def write(self, entry: Entry, value: float) -> None:
         """Set an object; raises BusFault."""
         try:
             self.remote.sdo.download(entry.index, entry.sub, struct.pack("<" + entry.code, value))
         except SdoAbortedError as error:
-            raise self._fault(entry, f"write of {value} refused: {error}") from None
+            raise self.fault(entry, f"write of {value} refused: {error}") from None
         except SdoError as error:
-            raise self._fault(entry, no_answer(error)) from None
+            raise self.fault(entry, no_answer(error)) from None
         except MALFORMED as error:
-            raise self._fault(entry, f"an answer that is no SDO: {error}") from None
+            raise self.fault(entry, f"an answer that is no SDO: {error}") from None
 
     def write_checked(self, entry: Entry, value: float) -> None:
         """Set an object and read it back, bit for bit; raises BusFault."""
@@ -143,7 +143,7 @@ class NodeServices:
         """Read an object and compare it with `value`, bit for bit; raises BusFault."""
         held = self.read(entry)
         if struct.pack("<" + entry.code, held) != struct.pack("<" + entry.code, value):
-            raise self._fault(entry, f"wrote {value}, the device holds {held}")
+            raise self.fault(entry, f"wrote {value}, the device holds {held}")
 
     def read_text(self, index: int) -> str:
         """A visible string, empty where the device has none."""
@@ -152,7 +152,8 @@ class NodeServices:
         except (SdoError, *MALFORMED):
             return ""
 
-    def _fault(self, entry: Entry, what: str) -> BusFault:
+    def fault(self, entry: Entry, what: str) -> BusFault:
+        """A fault of this node, in words: joint, node, object, what."""
         return BusFault(f"{self.joint} (node {self.node}): {entry}: {what}")
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from armlink.cia402 import Control, State, next_control, state_of
+from armlink.cia402 import Control, Mode, State, next_control, set_point_control, state_of, supports
 
 # CiA 402, table of the status word: bits 6, 5, 3..0 as the standard prints them (x: does not matter).
 PATTERNS = {
@@ -42,11 +42,74 @@ def matches(pattern, word):
     return all(bit == "x" or int(bit) == word >> (7 - place) & 1 for place, bit in enumerate(bits))
 
 
+# By the low byte, which alone tells the state; the other bits of the status word do not matter to the standard.
+BY_STANDARD = [[state for state, pattern in PATTERNS.items() if matches(pattern, low)] for low in range(256)]
+
+
 def test_every_status_word_means_what_the_standard_says():
+    assert max(map(len, BY_STANDARD)) == 1
     for word in range(1 << 16):
-        by_standard = [state for state, pattern in PATTERNS.items() if matches(pattern, word)]
-        assert len(by_standard) <= 1
+        by_standard = BY_STANDARD[word & 0xFF]
         assert state_of(word) is (by_standard[0] if by_standard else State.UNKNOWN)
+
+
+# What the link may command from each state towards each target, written down once more by hand.
+WORDS = {
+    State.ENABLED: {
+        State.SWITCH_ON_DISABLED: 0x06,
+        State.READY: 0x07,
+        State.SWITCHED_ON: 0x0F,
+        State.ENABLED: 0x0F,
+        State.QUICK_STOP: 0x0F,
+        State.FAULT: 0x80,
+    },
+    State.SWITCH_ON_DISABLED: {State.FAULT: 0x80},
+    State.QUICK_STOP: dict.fromkeys(State, 0x02),
+}
+
+
+@pytest.mark.parametrize("target", WORDS)
+def test_every_status_word_leads_to_the_one_command_of_the_table(target):
+    for word in range(1 << 16):
+        by_standard = BY_STANDARD[word & 0xFF]
+        expected = WORDS[target].get(by_standard[0], 0x00) if by_standard else WORDS[target].get(State.UNKNOWN, 0x00)
+        assert next_control(state_of(word), target) == expected
+
+
+def command_of(control):
+    """CiA 402, table of the control word: which command bits 7, 3, 2, 1, 0 are."""
+    if control & 0x80:
+        return Control.FAULT_RESET
+    patterns = {"xx0x": 0x00, "x01x": 0x02, "x110": 0x06, "0111": 0x07, "1111": 0x0F}
+    for pattern, command in patterns.items():
+        if all(bit == "x" or int(bit) == control >> (3 - place) & 1 for place, bit in enumerate(pattern)):
+            return Control(command)
+    raise AssertionError(control)
+
+
+def test_every_status_word_and_every_command_keeps_to_the_drives_own_state_machine():
+    """Whatever command follows whatever state, the link recognises where the drive then is."""
+    bits = {state: int(pattern.replace(" ", "").replace("x", "0"), 2) for state, pattern in PATTERNS.items()}
+    for word in range(256):
+        state = state_of(word)
+        for control in range(256):
+            after = BY_ITSELF.get(state) or TRANSITIONS.get((state, command_of(control)), state)
+            assert (state is State.UNKNOWN) == (after is State.UNKNOWN)
+            if after is not State.UNKNOWN:
+                assert state_of(bits[after]) is after
+
+
+def test_supported_modes_are_bits_of_6502h():
+    assert [mode for mode in Mode if supports(0x0209, mode)] == [0, 1, 4, 10]
+    assert [mode for mode in Mode if supports(0x0080, mode)] == [0, 8]
+    assert not supports(0xFFFFFFFF, -1)
+    assert not supports(0xFFFFFFFF, 33)
+    assert supports(0xFFFFFFFF, 32)
+
+
+def test_a_new_set_point_is_handed_over_by_its_handshake():
+    assert set_point_control(0x0027) == 0x3F  # enable, new set-point, change at once
+    assert set_point_control(0x1027) == 0x2F  # acknowledged: the bit falls, the target stays
 
 
 @pytest.mark.parametrize("target", [State.ENABLED, State.SWITCH_ON_DISABLED, State.QUICK_STOP])

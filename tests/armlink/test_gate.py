@@ -240,7 +240,7 @@ def test_a_refused_command_moves_nothing():
 
 
 def test_what_the_first_cycle_starts_from():
-    assert START == Passed(8.0, 0.5, 200, round(0.5 / LIMITS.position_unit), "", OFF)
+    assert Passed(8.0, 0.5, 200, round(0.5 / LIMITS.position_unit), "", OFF) == START
     assert start_from(LIMITS, math.nan, 0.5).torque == 0.0
     assert start_from(LIMITS, math.inf, 0.5).torque == 0.0
 

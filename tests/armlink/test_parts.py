@@ -40,13 +40,38 @@ def test_a_zero_among_the_scales_is_an_error(place):
         (0x0000, "no error"),
         (0x8130, "heartbeat of the host missing"),
         (0x7305, "incremental sensor"),
-        (0x8612, "monitoring"),
+        (0x2213, "over-current in ramp function"),
+        (0x2331, "earth leakage at the motor, phase U"),
+        (0x3222, "DC link under-voltage, no. 2"),
+        (0x5445, "contact 5 (manufacturer specific)"),
+        (0x630F, "data record no. 15"),
+        (0x8612, "reference limit"),
+        (0x8699, "positioning controller"),
+        (0x8F00, "monitoring"),
+        (0x4501, "temperature"),
+        (0x9010, "external error"),
+        (0xF004, "control function"),
         (0xFF01, "manufacturer specific (torque sensor)"),
         (0xB000, "unknown error"),
     ],
 )
 def test_emergency_names(code, name):
     assert name_of(code) == name
+
+
+# CiA 301, table of emergency error code classes: every one must have a name of its own.
+CLASSES = (
+    0x10, 0x20, 0x21, 0x22, 0x23, 0x30, 0x31, 0x32, 0x33, 0x40, 0x41, 0x42, 0x50, 0x60, 0x61, 0x62, 0x63, 0x70,
+    0x80, 0x81, 0x82, 0x90, 0xF0, 0xFF,
+)  # fmt: skip
+
+
+def test_every_class_of_error_codes_has_its_name():
+    names = [name_of(each << 8 | 0x9A) for each in CLASSES]
+    assert len(set(names)) == len(CLASSES)
+    assert "unknown error" not in names
+    for code in range(1 << 16):
+        assert name_of(code)
 
 
 def test_emergency_frames():

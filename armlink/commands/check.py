@@ -1,0 +1,114 @@
+"""Tests an arm's controllers: what they are, hold, and do when their host falls silent."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from armlink.selftest import Result
+
+SCHEMA = "armlink.check/1"
+WARNING = (
+    "This test enables every joint of {arm} and lets it hold where it stands (at most its max_torque). One after the "
+    "other is then quick-stopped, and left without commands for {deadline:.0f} ms; then all are left without the "
+    "host's heartbeat for {heartbeat:.0f} ms. Nothing is moved on purpose, but a controller that does something else "
+    "than quick stop and hold may let its joint fall: put the arm where none can fall, keep clear, and keep a hand on "
+    "the emergency stop. In the end the joints are in quick stop, holding."
+)
+
+
+def check(
+    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
+    bus: Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the joints are enabled.")] = False,
+    passive: Annotated[bool, typer.Option("--passive", help="Only what needs no power: read, configure.")] = False,
+    json: Annotated[Path | None, typer.Option(help="Write the answer here; - is standard output.")] = None,
+) -> int:
+    """Check identity, objects, PDO mapping, limits, calibration; then, with power, quick stop, deadline and heartbeat.
+
+    It shows that each controller stops by itself when its host falls silent, and how long it takes. It says what it
+    does to the joints and asks first, unless --yes or on a simulated arm in this process. Exit status 1 where a check
+    fails; the joints are left in quick stop, holding.
+
+    Example: armlink check sarcos --bus socketcan:vcan0 --yes --json -
+    """
+    from rich.console import Console
+
+    from armlink.armfile import load_arm
+    from armlink.commands.output import write_json
+    from armlink.errors import BadInput, BusFault, Refused
+    from armlink.link import Link
+    from armlink.selftest import SelfTest
+
+    console = Console(stderr=True)
+    described = load_arm(arm)
+    with Link.open(described, bus) as link:
+        simulated = hasattr(link.bus, "clock")
+        if not (passive or yes or simulated):
+            protection = link.protection
+            times = {"deadline": protection.deadline_ms, "heartbeat": protection.heartbeat_ms}
+            console.print(WARNING.format(arm=described.name, **times), highlight=False)
+            if not console.is_terminal:
+                raise BadInput("check: nobody to ask: give --yes, or --passive for what needs no power")
+            typer.confirm("Go on?", abort=True, err=True)
+        with console.status("check") as status:
+            results = SelfTest(link, status.update).run(power=not passive)
+        channel = str(link.bus.channel_info)
+    console.print(_table(f"{described.name} on {channel}", link.names, results))
+    for each in results:
+        if each.outcome in ("failed", "absent"):
+            console.print(f"{each.joint}: {each.check}: {each.found}", markup=False, highlight=False)
+    failed = [each for each in results if each.outcome == "failed"]
+    write_json(json, _answer(described.name, described.serial, channel, results))
+    if any(each.check == "answers" for each in failed):
+        raise BusFault(
+            f"no answer from {', '.join(each.joint for each in failed if each.check == 'answers')} on {channel}"
+        )
+    if failed:
+        first = failed[0]
+        raise Refused(
+            f"check: {len(failed)} of {len(results)} failed, first {first.joint}: {first.check}: {first.found}"
+        )
+    return 0
+
+
+def _answer(arm: str, serial: str, bus: str, results: "list[Result]") -> dict[str, Any]:
+    return {
+        "schema": SCHEMA,
+        "arm": arm,
+        "serial": serial,
+        "bus": bus,
+        "passed": all(each.outcome != "failed" for each in results),
+        "checks": [vars(each) for each in results],
+        "does_not": [f"{each.joint}: {each.found}" for each in results if each.outcome in ("absent", "failed")],
+    }
+
+
+def _table(title: str, names: tuple[str, ...], results: "list[Result]") -> "Table":
+    """Groups of checks as rows, joints as columns; a time where one was measured."""
+    from rich.box import SIMPLE
+    from rich.table import Table
+
+    groups: dict[str, dict[str, list[Result]]] = {}
+    for each in results:
+        groups.setdefault(each.check.partition(":")[0], {}).setdefault(each.joint, []).append(each)
+    table = Table(box=SIMPLE, title=title)
+    table.add_column("check", no_wrap=True)
+    for name in names:
+        table.add_column(name, justify="right")
+    for group, joints in groups.items():
+        table.add_row(group, *(_cell(joints.get(name, [])) for name in names))
+    return table
+
+
+def _cell(results: "list[Result]") -> str:
+    outcomes = {each.outcome for each in results}
+    if "failed" in outcomes:
+        return "[red]FAILED[/red]"
+    times = [each.seconds for each in results if each.seconds is not None]
+    if times:
+        return f"[green]{max(times) * 1e3:.0f} ms[/green]"
+    return "[green]ok[/green]" if "passed" in outcomes else "–"
