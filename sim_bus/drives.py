@@ -36,6 +36,8 @@ class Drives:
         self.quick_stop_option = [6] * n
         self.following_window = np.full(n, np.inf)
         """6065h [rad]."""
+        self.refused_modes: list[set[int]] = [set() for _ in range(n)]
+        """Modes that each drive does not enter."""
         self.gain, self.offset = np.ones(n), np.zeros(n)
         """Calibration in force (2100h)."""
         self.on_state: Callable[[int], None] = lambda joint: None
@@ -143,7 +145,7 @@ class Drives:
     def _select_mode(self, joint: int) -> None:
         """Enter the mode asked for; an unsupported one is displayed as 0 and holds the position."""
         asked = int(self._mode_in[joint])
-        mode = asked if asked in KINDS else 0
+        mode = asked if asked in KINDS and asked not in self.refused_modes[joint] else 0
         self._mode_out[joint] = mode
         self.loops.mode[joint] = mode
         if self.state[joint] is State.ENABLED:

@@ -30,6 +30,8 @@ class Node:
         """Values that differ from the EDS's defaults, whatever is restored."""
         self.record = TorqueRecord()
         self.nmt = INITIALISING
+        self.unplugged = False
+        """Cut off from the bus: it hears nothing."""
         self.errors: list[int] = []
         self.on_write: Callable[[Key], None] = lambda key: None
         self.on_pdo_change: Callable[[], None] = lambda: None

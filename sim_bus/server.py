@@ -8,13 +8,19 @@ from types import FrameType
 import can
 
 from armlink.errors import BusFault
+from sim_bus.control import ControlPipe
+from sim_bus.fault_kinds import Fault
+from sim_bus.injector import ERROR_FLAG, Injector
 from sim_bus.options import Drift
 from sim_bus.simulated_arm import SYNC_ID, SimulatedArm
+from sim_bus.wire import Line
 
 LARGEST_LAG = 0.25
 """What the physics lags behind the clock by more than this is dropped, as after a stopped process [s]."""
 TICK = 0.002
 """Longest wait for a frame: timers and physics go on meanwhile [s]."""
+LOCKSTEP_PATIENCE = 1.0
+"""In lock-step, so long without a SYNC and time goes on by itself, so that nodes notice a host that died [s]."""
 SEND_PATIENCE = 0.1
 """How long a full transmit queue is waited for [s]; a frame that still does not go is lost, as on a dead bus."""
 INTERRUPTED, TERMINATED = 130, 0
@@ -30,9 +36,20 @@ class Server:
         drifts: Sequence[Drift] = (),
         lockstep: bool = False,
         now: Callable[[], float] = time.monotonic,
+        faults: Sequence[Fault] = (),
+        control: ControlPipe | None = None,
     ) -> None:
-        """`now` is the clock that the physics follows unless `lockstep`."""
+        """`now` is the clock that the physics follows unless `lockstep`; `control` gives orders while it runs."""
         self._arm, self._bus, self._lockstep, self._now = arm, bus, lockstep, now
+        self._line: Line = arm
+        self._control, self._injector = control, None if control is None and not faults else Injector(arm)
+        if self._injector is not None:
+            self._line = self._injector
+            for fault in faults:
+                self._injector.inject(fault)
+        self.on_wrong: Callable[[str], None] = lambda wrong: None
+        """Takes what was wrong with an order."""
+        self._synced = now()
         self._drifts = sorted(drifts, key=lambda drift: drift.time)
         self._offset = now() - arm.time
         self._ended: int | None = None
@@ -62,6 +79,9 @@ class Server:
         except OSError as error:
             raise BusFault(f"bus {self._bus.channel_info}: {error.strerror or error}") from None
         self._let_time_pass()
+        if self._control is not None and self._injector is not None:
+            for wrong in self._control.poll(self._injector):
+                self.on_wrong(wrong)
         self._flush()
 
     def _frame(self, message: can.Message) -> None:
@@ -69,30 +89,38 @@ class Server:
             return
         if not self._lockstep:
             self._let_time_pass()
-        self._arm.on_frame(message.arbitration_id, bytes(message.data))
+        self._line.on_frame(message.arbitration_id, bytes(message.data))
         if self._lockstep and message.arbitration_id == SYNC_ID:
-            self._arm.advance(self._arm.period)
+            self._synced = self._now()
+            self._line.advance(self._arm.period)
         self._flush()
 
     def _let_time_pass(self) -> None:
-        """Bring the physics up to the clock; in lock-step time rests between SYNCs once nodes are operational."""
-        if self._lockstep and self._arm.operational:
+        """Bring the physics up to the clock; in lock-step time rests while SYNCs come to operational nodes."""
+        if self._lockstep and self._arm.operational and self._now() - self._synced < LOCKSTEP_PATIENCE:
             self._offset = self._now() - self._arm.time
         lag = self._now() - self._offset - self._arm.time
         if lag > LARGEST_LAG:
             self._offset += lag - LARGEST_LAG
             lag = LARGEST_LAG
         if lag > 0:
-            self._arm.advance(lag)
+            self._line.advance(lag)
         while self._drifts and self._drifts[0].time <= self._arm.time:
             drift = self._drifts.pop(0)
             self._arm.drift(drift.joint, drift.gain, drift.offset)
 
     def _flush(self) -> None:
-        outbox = self._arm.outbox
+        outbox = self._line.outbox
         while outbox:
             can_id, data = outbox.popleft()
-            message = can.Message(arbitration_id=can_id, data=data, is_extended_id=False, check=False)
+            is_error = bool(can_id & ERROR_FLAG)
+            message = can.Message(
+                arbitration_id=can_id & ~ERROR_FLAG,
+                data=data,
+                is_extended_id=False,
+                is_error_frame=is_error,
+                check=False,
+            )
             try:
                 self._bus.send(message, timeout=SEND_PATIENCE)
             except can.CanOperationError:

@@ -2,7 +2,8 @@
 
 import struct
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +12,9 @@ from armlink.armfile import ArmFile
 from armlink.errors import BadInput
 from sim_bus.cia402 import State
 from sim_bus.drives import Drives
-from sim_bus.effects.state import Entry, Imperfections, imperfections
-from sim_bus.node import OPERATIONAL, PRE_OPERATIONAL, STOPPED, Node
+from sim_bus.effects.state import Entry, imperfections
+from sim_bus.nmt import RESET_NODE, NetworkManagement
+from sim_bus.node import Node
 from sim_bus.pdo import Frame, PdoGroup, PdoTable
 from sim_bus.plant import Plant
 from sim_bus.section import sim_section
@@ -40,21 +42,21 @@ class SimulatedArm:
         self.outbox: deque[Frame] = deque()
         self.default_period = 1.0 / link.rate
         self._entries: tuple[Entry, ...] = section.effects
-        state = self._imperfections(self._entries)
-        try:
+        with self._effects_checked():
+            state = imperfections(self.names, self._entries)
             self.plant = Plant(arm, state)
-        except ValueError as error:
-            raise BadInput(f"{arm.path}: sim.effects: {error}") from None
         self.sensors = Sensors(arm, truth, state, seed)
         self._signals = Signals(self.n)
         self.drives = Drives(arm, self.plant, self.sensors, self._signals)
-        self._operational = bytearray(self.n)
-        self._pdos = PdoTable(self._signals, self._operational, self.outbox.append)
         self._sampled = 0.0
         self._synchronous = self._watching = False
-        self.nodes = [Node(j, joint.node, self._signals, self.outbox.append) for j, joint in enumerate(link.joints)]
+        self.nodes = [Node(j, joint.node, self._signals, self._send) for j, joint in enumerate(link.joints)]
+        self.place_of = {node.node_id: node.place for node in self.nodes}
         self._sdo = {0x600 + node.node_id: node for node in self.nodes}
-        self.supervision = Supervision(self.nodes, self.drives, self.outbox.append)
+        self.supervision = Supervision(self.nodes, self.drives, self._send)
+        self._nmt = NetworkManagement(self.nodes, self.drives, self.supervision, self._apply)
+        self._operational = self._nmt.operational
+        self._pdos = PdoTable(self._signals, self._operational, self._send)
         for node, joint in zip(self.nodes, link.joints, strict=True):
             node.identity = power_on_values(arm, joint, int(self.sensors.increments[node.place]))
             node.reset()
@@ -82,7 +84,8 @@ class SimulatedArm:
             self.drives.take_commands()
             self._pdos.send_events()
         elif can_id == 0:
-            self._nmt(data)
+            self._nmt.frame(data, self.time)
+            self._pdos.send_events()
         elif 0x700 < can_id < 0x780 and data:
             self.supervision.heartbeat(can_id - 0x700, self.time)
 
@@ -97,12 +100,16 @@ class SimulatedArm:
             remaining -= piece
             if self.supervision.due <= self.time:
                 self.supervision.check(self.time)
-                self._operational[:] = bytes(node.nmt == OPERATIONAL for node in self.nodes)
+                self._nmt.update()
             if self._watching:
                 self.drives.watch()
             if remaining > 1e-9:
                 self._sample()
             self._pdos.send_events()
+
+    def reboot(self, joint: int) -> None:
+        """Power cycle of one joint's controller: what is not stored is lost."""
+        self._nmt.command(self.nodes[joint], RESET_NODE, self.time)
 
     @property
     def period(self) -> float:
@@ -135,12 +142,13 @@ class SimulatedArm:
     def set_effects(self, entries: Iterable[Entry]) -> None:
         """Replace the arm's imperfections while it runs. Raises BadInput."""
         wanted = tuple(entries)
-        state = self._imperfections(wanted)
-        try:
-            self.plant.set_imperfections(state)
-        except ValueError as error:
-            self.plant.set_imperfections(self._imperfections(self._entries))
-            raise BadInput(f"sim.effects: {error}") from None
+        with self._effects_checked():
+            state = imperfections(self.names, wanted)
+            try:
+                self.plant.set_imperfections(state)
+            except ValueError:
+                self.plant.set_imperfections(imperfections(self.names, self._entries))
+                raise
         self.sensors.set_imperfections(state)
         self._entries = wanted
         self.drives.loops.reconfigure()
@@ -160,9 +168,13 @@ class SimulatedArm:
 
     # ---- inside
 
-    def _imperfections(self, entries: tuple[Entry, ...]) -> Imperfections:
+    def _send(self, frame: Frame) -> None:
+        self.outbox.append(frame)
+
+    @contextmanager
+    def _effects_checked(self) -> Iterator[None]:
         try:
-            return imperfections(self.names, entries)
+            yield
         except ValueError as error:
             raise BadInput(f"{self.arm.path}: sim.effects: {error}") from None
 
@@ -240,24 +252,3 @@ class SimulatedArm:
             [pdo for node in self.nodes for pdo in node.pdos(receive=True)],
             [pdo for node in self.nodes for pdo in node.pdos(receive=False)],
         )
-
-    def _nmt(self, data: bytes) -> None:
-        if len(data) < 2:
-            return
-        for node in self.nodes:
-            if data[1] in (0, node.node_id):
-                self._nmt_command(node, data[0])
-        self._pdos.send_events()
-
-    def _nmt_command(self, node: Node, asked: int) -> None:
-        if asked in (0x81, 0x82):
-            if asked == 0x81:
-                self.drives.enter(node.place, State.SWITCH_ON_DISABLED)
-            node.reset(communication_only=asked == 0x82)
-            self._apply(node)
-            self.drives.take_commands()
-        elif asked in (0x01, 0x02, 0x80):
-            node.nmt = {0x01: OPERATIONAL, 0x02: STOPPED, 0x80: PRE_OPERATIONAL}[asked]
-        self._operational[node.place] = node.nmt == OPERATIONAL
-        if node.nmt != OPERATIONAL:
-            self.supervision.left_operational(node, self.time)

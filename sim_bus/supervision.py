@@ -56,8 +56,8 @@ class Supervision:
 
     def heartbeat(self, master: int, time: float) -> None:
         """A heartbeat of node id `master`: arms, or puts off, the consumers that wait for it."""
-        for consumed, due in zip(self._consume, self._consume_due, strict=True):
-            if master in consumed:
+        for node, consumed, due in zip(self._nodes, self._consume, self._consume_due, strict=True):
+            if master in consumed and not node.unplugged:
                 due[master] = time + consumed[master]
         self._schedule()
 
@@ -70,7 +70,9 @@ class Supervision:
     def sync(self, time: float) -> None:
         """A SYNC came."""
         if any(self._sync):
-            self._sync_due = [time + period if period else math.inf for period in self._sync]
+            for node, period in zip(self._nodes, self._sync, strict=True):
+                if not node.unplugged:
+                    self._sync_due[node.place] = time + period if period else math.inf
             self.due = min(self.due, *self._sync_due)
 
     def left_operational(self, node: Node, time: float) -> None:

@@ -1,5 +1,6 @@
 """Runs a simulated arm on a CAN bus, in real time, until stopped."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -16,6 +17,16 @@ def sim(
         list[str] | None,
         typer.Option(help="JOINT:GAIN:OFFSET@T: at T s the torque sensor changes, by a factor and by N·m."),
     ] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(help="ID:JOINT[:VALUE][@T] or ID::VALUE[@T]: a fault at T s; docs/faults.md lists them."),
+    ] = None,
+    control: Annotated[
+        Path | None,
+        typer.Option(
+            help="Named pipe to make: lines such as 'effect friction.coulomb:joint_2:1' or 'fault …' change it."
+        ),
+    ] = None,
     seed: Annotated[
         int | None, typer.Option(help="Draw the sensors' truth from this seed; default is what the arm file states.")
     ] = None,
@@ -25,7 +36,8 @@ def sim(
 ) -> int:
     """Run a simulated arm on a CAN bus until SIGINT or SIGTERM.
 
-    Example: armlink sim sarcos --bus socketcan:vcan0 --effect friction.coulomb:joint_2:1.5 --seed 1
+    Example: armlink sim sarcos --bus socketcan:vcan0 --effect friction.coulomb:joint_2:1.5 --seed 1 --control arm.pipe
+    Then, from another shell: echo "fault node.silent:joint_2" > arm.pipe
     """
     import mujoco
     from rich.console import Console
@@ -33,6 +45,8 @@ def sim(
     from armlink.armfile import load_arm
     from armlink.bus import open_bus, resolve_bus
     from armlink.errors import BadInput
+    from sim_bus.control import ControlPipe
+    from sim_bus.fault_kinds import parse_fault
     from sim_bus.options import parse_drift, parse_effect
     from sim_bus.server import Server
     from sim_bus.simulated_arm import SimulatedArm
@@ -44,17 +58,25 @@ def sim(
     described = load_arm(arm)
     entries = [parse_effect(text, described.joint_names) for text in effect or ()]
     drifts = [parse_drift(text, described.joint_names) for text in drift or ()]
+    faults = [parse_fault(text, described.joint_names) for text in fault or ()]
     truth = Truth.of(described) if seed is None else Truth.draw(described, seed)
     simulated = SimulatedArm(described, truth, seed or 0)
     simulated.set_effects([*simulated.effects, *entries])
     if resolve_bus(bus or None, described.require_link().bus).interface == "armlink_sim":
         raise BadInput("sim: bus armlink_sim is a simulated arm itself; give --bus socketcan:vcan0, for example")
     endpoint = open_bus(bus or None, described.require_link().bus)
+    pipe = None
     try:
-        Console(stderr=True).print(
+        pipe = None if control is None else ControlPipe(control)
+        console = Console(stderr=True)
+        console.print(
             f"{described.name}: {simulated.n} joints, nodes {', '.join(str(node.node_id) for node in simulated.nodes)} "
             f"on {endpoint.channel_info}; stop with Ctrl-C"
         )
-        return Server(simulated, endpoint, drifts, lockstep).run()
+        server = Server(simulated, endpoint, drifts, lockstep, faults=faults, control=pipe)
+        server.on_wrong = lambda wrong: console.print(f"sim: {wrong}", markup=False)
+        return server.run()
     finally:
+        if pipe is not None:
+            pipe.close()
         endpoint.shutdown()

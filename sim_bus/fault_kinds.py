@@ -1,0 +1,87 @@
+"""Which faults can be injected, as text: `ID:JOINT:VALUE`, `ID::VALUE` where no joint is concerned, `…@T` for later."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from armlink.errors import BadInput
+
+FORM = "ID:JOINT[:VALUE][@T] or ID::VALUE[@T], for example node.silent:joint_2 or bus.off::0.5@3"
+
+
+@dataclass(frozen=True)
+class FaultKind:
+    """One kind of fault: whether it concerns a joint's node, what its value means, and what happens."""
+
+    id: str
+    per_joint: bool
+    value: str
+    """Meaning and unit of the value; empty where it takes none."""
+    default: float
+    does: str
+
+
+KINDS = {
+    kind.id: kind
+    for kind in (
+        FaultKind("node.silent", True, "duration [s]", math.inf, "the node is cut off: it neither hears nor sends"),
+        FaultKind("node.reboot", True, "", 0.0, "power cycle: mode and unsaved calibration are lost, boot-up message"),
+        FaultKind("node.babbling", True, "frames/s", 5000.0, "the node sends frames of identifier 001h"),
+        FaultKind("node.duplicate", True, "", 0.0, "a second node has the same id: every frame comes twice"),
+        FaultKind("bus.off", False, "restart time [s]", 0.1, "the host's controller is bus-off and then restarts"),
+        FaultKind("bus.full", False, "duration [s]", math.inf, "nobody acknowledges: the transmit queue stays full"),
+        FaultKind("link.down", False, "duration [s]", math.inf, "the interface is down"),
+        FaultKind("reader.slow", False, "frames", 4.0, "the host's receive queue holds only so many frames"),
+        FaultKind("frame.short", True, "share of frames", 1.0, "position and torque come in frames of three bytes"),
+        FaultKind("frame.corrupt", True, "share of frames", 1.0, "the node's frames are destroyed by error frames"),
+        FaultKind("emcy.storm", True, "frames/s", 1000.0, "the node sends emergency 7305h again and again"),
+        FaultKind("sdo.abort", True, "", 0.0, "every SDO request is aborted (0800 0022h)"),
+        FaultKind("sdo.timeout", True, "", 0.0, "no SDO request is answered"),
+        FaultKind("mode.refused", True, "mode", 10.0, "the controller does not enter this mode of operation"),
+        FaultKind("clock.jump", False, "jump [s]", 1.0, "time jumps: as if the host had slept"),
+    )
+}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault to inject."""
+
+    id: str
+    joint: str = ""
+    value: float = math.nan
+    """NaN: the kind's default."""
+    time: float = 0.0
+    """When, by the simulated time [s]; at once where that is past."""
+
+    @property
+    def kind(self) -> FaultKind:
+        """What it is."""
+        return KINDS[self.id]
+
+    @property
+    def amount(self) -> float:
+        """The value, or the kind's default."""
+        return self.kind.default if math.isnan(self.value) else self.value
+
+
+def parse_fault(text: str, joints: Sequence[str]) -> Fault:
+    """One `--fault`. Raises BadInput."""
+    what, at, time = text.partition("@")
+    parts = what.split(":")
+    kind = KINDS.get(parts[0])
+    if kind is None:
+        raise BadInput(f"fault {text!r}: no fault {parts[0]!r}; there are {', '.join(KINDS)}")
+    joint, value = [*parts[1:], "", ""][:2]
+    if len(parts) > 3 or bool(joint) != kind.per_joint:
+        raise BadInput(f"fault {text!r}: {'name a joint' if kind.per_joint else 'it has no joint'}; expected {FORM}")
+    if joint and joint not in joints:
+        raise BadInput(f"fault {text!r}: no joint {joint!r}; there are {', '.join(joints)}")
+    try:
+        amount = float(value) if value else math.nan
+        instant = float(time) if at else 0.0
+        if amount < 0 or math.isinf(amount) or not math.isfinite(instant) or (value and not kind.value):
+            raise ValueError
+    except ValueError:
+        raise BadInput(f"fault {text!r}: value {kind.value or 'none'}; expected {FORM}") from None
+    return Fault(kind.id, joint, amount, instant)
