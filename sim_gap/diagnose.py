@@ -19,6 +19,7 @@ from sim_gap.residual import ResidualSet
 from sim_gap.rollout import roll_out
 from sim_gap.select import compete
 from sim_gap.signals import prepare, require_length
+from sim_gap.stuck import Stuck, without_stuck
 from sim_gap.verdict import is_quiet, share_left, verdict
 
 OWN_HELDOUT = 0.3
@@ -68,6 +69,9 @@ def diagnose(
         replace(prepare(r, sim.arm, label), number=number)
         for r, label, number in zip([*train, *heldout], labels, numbers, strict=False)
     ]
+    checked = [without_stuck(s, r) for s, r in zip(ready, [*train, *heldout], strict=True)]
+    ready = [s for s, _ in checked]
+    stuck = tuple(one for _, found in checked for one in found)
     layout = layout_of(ready)
     fit, judge = (ResidualSet(tuple(part), layout) for part in (ready[: len(train)], ready[len(train) :]))
     _refuse_rest(fit)
@@ -79,16 +83,16 @@ def diagnose(
         search = compete(store, [name for name in effects() if name not in withhold])
         estimate = Estimate(store, search.active)
         found, minor = causes(estimate, judge, Rivals(search), sim.arm.names)
-    return _answer(Internals(sim, fit, judge, estimate), found, minor, told)
+    return _answer(Internals(sim, fit, judge, estimate), found, minor, told, stuck)
 
 
-def _answer(made: Internals, found: list[Cause], minor: list[Cause], told: str) -> Diagnosis:
+def _answer(made: Internals, found: list[Cause], minor: list[Cause], told: str, stuck: Sequence[Stuck]) -> Diagnosis:
     fit, judge, estimate = made.train, made.heldout, made.estimate
     left, left_fit = (
         left_over(data, estimate.predict(data)) if estimate is not None else data.values for data in (judge, fit)
     )
     told_verdict = "no_gap" if estimate is None else verdict(found, judge, left)
-    if fit.struck and not any(cause.effect == "transmission.backlash" for cause in found):
+    if stuck or (fit.struck and not any(cause.effect == "transmission.backlash" for cause in found)):
         told_verdict = "unexplained"
     return Diagnosis(
         verdict=told_verdict,
@@ -105,7 +109,7 @@ def _answer(made: Internals, found: list[Cause], minor: list[Cause], told: str) 
         margin=combined(judge, judge.margin),
         heldout_is=told,
         rollout=roll_out(made.model, judge, estimate),
-        notes=(*_notes(fit), *_bound(estimate, fit), *_hits(fit)),
+        notes=(*_stuck(stuck, fit), *_hits(fit), *_bound(estimate, fit), *_notes(fit)),
         internals=made,
     )
 
@@ -133,7 +137,7 @@ def _notes(data: ResidualSet) -> tuple[str, ...]:
     still = [
         f"{data.signals[0].arm.names[joint]} hardly moves: its {channel} tells nothing of friction here"
         for channel, joint in data.rows
-        if channel == data.layout.motor and data.valid[channel, joint].sum() <= 25
+        if channel == data.layout.motor and not any(s.moving[:, joint].mean() > 0.02 for s in data.signals)
     ]
     return tuple(still)
 
@@ -151,6 +155,16 @@ def _hits(data: ResidualSet) -> tuple[str, ...]:
         f"these moments ({near.mean():.0%} of the time) are left out of the comparison"
         for joint, near in data.struck.items()
     )
+
+
+def _stuck(stuck: Sequence[Stuck], data: ResidualSet) -> tuple[str, ...]:
+    names = data.signals[0].arm.names
+    told = (
+        f"{names[one.joint]}: {one.channel} repeats one number for {one.seconds:.3g} s while the arm moves: stuck "
+        "sensor or channel; this recording cannot tell what it should read, and those moments are left out"
+        for one in stuck
+    )
+    return tuple(dict.fromkeys(told))
 
 
 def _refuse_rest(data: ResidualSet) -> None:

@@ -42,6 +42,8 @@ def sentence(answer: Diagnosis) -> str:
         return (
             "nothing exceeds twice the noise floor by a margin worth caring about (1.6 % of the joint's usual torque)"
         )
+    if answer.verdict == "unexplained" and answer.unexplained < 0.01 and answer.notes:
+        return answer.notes[0]
     if answer.verdict == "unexplained":
         return f"{answer.unexplained:.0%} of the gap is left that no effect of the library accounts for"
     first = answer.causes[0]
