@@ -1,6 +1,79 @@
 """Gravity-compensated float: the arm stays where a hand leaves it."""
 
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
-def hold_afloat() -> None:
-    """Being built."""
-    raise NotImplementedError
+import typer
+
+if TYPE_CHECKING:
+    from armlink.armfile import ArmFile
+    from calib.records import Array, CalibrationRecord
+
+
+def hold_afloat(
+    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
+    bus: Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")] = None,
+    seconds: Annotated[float, typer.Option(min=0.0, help="End after so long; 0 is until Ctrl-C [s].")] = 0.0,
+    record: Annotated[
+        str | None, typer.Option(help="Id of a gravity record; default: the current one, else the model's inertials.")
+    ] = None,
+    store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write how it went here; - is standard output.")
+    ] = None,
+) -> None:
+    """Feed the gravity torque forward until Ctrl-C; then every joint holds where it is.
+
+    Stops have soft ends; no frame exceeds the arm file's limits. Keep a hand on the arm the first time.
+
+    Example: armlink float sarcos --bus socketcan:can0
+    """
+    from rich.console import Console
+
+    from armlink.armfile import load_arm
+    from armlink.commands.output import write_json
+    from armlink.link import Link
+    from calib.float_run import run_float
+
+    arm_file = load_arm(arm)
+    beta, calibration, source = _model(arm_file, record, store)
+    screen = Console(stderr=True)
+    with Link.open(arm_file, bus) as link:
+        link.start()
+        link.enable()
+        screen.print(f"{arm_file.name}: floating by {source}; Ctrl-C ends it, the joints hold then")
+        result = run_float(link, arm_file, beta, calibration, seconds=seconds or float("inf"))
+    screen.print(f"floated {result.seconds:.1f} s; the joints hold")
+    write_json(
+        json_file,
+        {
+            "schema": "armlink.float/1",
+            "joints": list(arm_file.joint_names),
+            "model": source,
+            "seconds": result.seconds,
+            "largest_torque": result.largest_torque.tolist(),
+            "largest_speed": result.largest_speed.tolist(),
+            "moved": result.moved.tolist(),
+        },
+    )
+
+
+def _model(arm_file: "ArmFile", record: str | None, store: str | None) -> "tuple[Array, CalibrationRecord | None, str]":
+    """Mass moments (2n,) [kg·m], the calibration record if any, and where the moments come from; raises Refused."""
+    import numpy as np
+
+    from armlink.errors import BadInput, Refused
+    from calib.description import model_arm
+    from calib.records import CalibrationRecord, GravityRecord
+    from calib.store import RecordStore
+
+    records = RecordStore(store)
+    calibration = records.current(CalibrationRecord, arm_file)
+    kept = records.current(GravityRecord, arm_file) if record is None else records.get(record).require(arm_file)
+    if kept is None and arm_file.model_path is not None:
+        return model_arm(arm_file).beta, calibration, f"the inertials of {arm_file.model_path.name}"
+    if kept is None:
+        raise Refused(f"{arm_file.name} {arm_file.serial}: no gravity record yet: armlink identify makes one")
+    if not isinstance(kept, GravityRecord):
+        raise BadInput(f"--record {record}: that is a {kept.kind} record, expected a gravity record")
+    return np.array(kept.beta), calibration, f"gravity record {kept.id}"
