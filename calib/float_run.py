@@ -1,5 +1,6 @@
 """Floats an arm on the bus: sensors compared with the model, torque control, back to holding by position at the end."""
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from armlink.armfile import ArmFile
 from armlink.cia402 import Mode
-from armlink.errors import Refused
+from armlink.errors import ArmlinkError, Refused
 from armlink.link import Link
 from armlink.sample import Command, Sample
 from calib.description import gcomp_arm
@@ -64,7 +65,10 @@ def run_float(
         while run.cycles * link.period < seconds:
             run.cycle()
     except KeyboardInterrupt:
-        run.hold()
+        with contextlib.suppress(
+            ArmlinkError
+        ):  # interrupted within a cycle, the link is in quick stop already: it holds
+            run.hold()
         raise
     run.hold()
     return run.result()
