@@ -7,7 +7,7 @@ import numpy as np
 
 from sim_gap.diagnosis import Signs
 
-WEIGHTS = {"constant": 3.0, "evidence": 0.6, "left": -0.8, "excess": -1.0, "elsewhere": -6.0}
+WEIGHTS = {"constant": -3.6, "evidence": 0.5, "left": -1.3, "excess": -0.2, "elsewhere": -6.0}
 """Of 1, log evidence, log left, log excess, and what is left elsewhere."""
 MOST = 0.99
 HINT = 0.5

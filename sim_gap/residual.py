@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d
 
 from sim_gap.effects.registry import Columns, Effect, Layout, Row, Shape
 from sim_gap.hits import hits
@@ -26,6 +27,8 @@ FAINT = 0.5
 FOLDS = 6
 MOVING_SHARE = 0.95
 """A sample of the motor row counts where the joint moves during this share of the filter's window."""
+SETTLE_S, SETTLED_LEAST = 0.12, 0.4
+"""Left out before and after rest and reversal, if at least this share of the motion is left."""
 BLOCK_S = 2.0
 """Length of the blocks within which errors may be correlated, for confidence intervals [s]."""
 
@@ -92,7 +95,7 @@ class ResidualSet:
         """Samples that count: really read, no gear hitting, and for the motor row with the joint in motion."""
         out: dict[Row, list[NDArray[np.bool_]]] = {row: [] for row in self.rows}
         for s in self.signals:
-            moving = s.filtered(s.moving) > MOVING_SHARE
+            moving = sliding(s)
             for channel, joint in self.rows:
                 there = s.filtered(s.known[channel][:, joint]) > 0.9
                 if channel == self.layout.motor and self.layout.sensor:
@@ -173,6 +176,18 @@ class ResidualSet:
     def spread(self, effect: Effect, place: int) -> Array:
         """Prior standard deviation of the effect's coefficients."""
         return effect.spread(self.signals[0], place)
+
+
+def sliding(s: Signals) -> NDArray[np.bool_]:
+    """Samples at which each joint has been, and goes on, sliding: friction is that of the model, (k, n).
+
+    Around rest and reversals it builds up over some way first. Where a joint does hardly anything else they stay.
+    """
+    moving = s.filtered(s.moving) > MOVING_SHARE
+    width = 2 * round(SETTLE_S * s.rate / s.step) + 1
+    settled = minimum_filter1d(moving.astype(np.uint8), width, axis=0, mode="nearest") > 0
+    enough = settled.mean(0) >= SETTLED_LEAST * moving.mean(0)
+    return np.where(enough, settled, moving)
 
 
 def _filtered(s: Signals, columns: Columns) -> Columns:

@@ -13,6 +13,8 @@ from sim_gap.rigid import Array
 from sim_gap.signals import Signals
 
 EPSILON = 1e-4
+WORST_GAIN = 0.15
+"""No position sensor's angles are further off than this share."""
 
 
 def _response(
@@ -64,6 +66,9 @@ class Gain(Effect):
 
     def spread(self, signals: Signals, place: int) -> Array:
         return np.full(1, 0.2)
+
+    def plausible(self, coefficients: Array, shape: Shape) -> bool:
+        return bool(abs(coefficients[0]) < WORST_GAIN)
 
     def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
         return 1.0 + coefficients
