@@ -104,12 +104,8 @@ class Link:
         if missing:
             channel = self.bus.channel_info
             raise BusFault(f"no answer from {', '.join(missing)} on {channel}: is it powered, and its node id right?")
+        self.require_alone()
         loop = self._loop
-        loop.drain()
-        loop.watch.clear()
-        if not self._lock_step:
-            loop.listen(max(LISTEN_PERIODS * self.period, LISTEN_SECONDS))
-        self._alone()
         for services, joint in zip(self.services, self.section.joints, strict=True):
             device.check_identity(services, joint)
         self.send_nmt(objects.NMT_PRE_OPERATIONAL)
@@ -124,8 +120,16 @@ class Link:
             self.send_nmt(objects.NMT_START, node)
         self._cycling = True
 
+    def require_alone(self) -> None:
+        """Listen before anything is set; raises BusFault where another host is on the bus."""
+        self._loop.drain()
+        self._loop.watch.clear()
+        if not self._lock_step:
+            self._loop.listen(max(LISTEN_PERIODS * self.period, LISTEN_SECONDS))
+        self._alone()
+
     def _alone(self) -> None:
-        """Raise BusFault where another host is on the bus or a controller restarts."""
+        """Raise BusFault where another host was heard or a controller has restarted."""
         watch = self._loop.watch
         restarts = [self.names[joint] for joint in sorted(watch.restarted)]
         if restarts:

@@ -13,7 +13,9 @@ from armlink.link import Link
 from armlink.sample import Sample
 
 CYCLES = 50
-"""So many SYNCs must be answered in a row."""
+"""SYNCs that are sent to see whether each is answered."""
+ANSWERED = 0.9
+"""Share of them whose answer must come in its cycle; a busy host misses some."""
 HOLD_SECONDS = 0.3
 """A stopped joint is watched for so long: does it stay in quick stop, holding?"""
 MOVED = 0.05
@@ -106,7 +108,12 @@ class PowerTest:
         for _ in range(cycles):
             came += np.isfinite(self._cycle(off).position)
         for joint in range(link.n):
-            self._tell(joint, "answers SYNC", bool(came[joint] == cycles), f"{came[joint]} of {cycles} SYNCs answered")
+            self._tell(
+                joint,
+                "answers SYNC",
+                bool(came[joint] >= ANSWERED * cycles),
+                f"{came[joint]} of {cycles} SYNCs answered",
+            )
             heard = joint in loop.node_states
             found = (
                 f"heard, period {link.protection.producer_ms} ms" if heard else f"not heard within {beat * 1e3:.0f} ms"

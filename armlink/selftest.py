@@ -54,10 +54,11 @@ class SelfTest:
     def run(self, power: bool) -> list[Result]:
         """All checks; those with power only where `power`, and where all before them passed.
 
-        Raises BusFault where a controller does not answer at all.
+        Raises BusFault where another host is on the bus.
         """
         link = self.link
         missing = [each.joint for each in link.services if not each.present()]
+        link.require_alone()
         for services, row in zip(link.services, link.section.joints, strict=True):
             self.progress(f"{services.joint}: identity, objects, settings")
             if services.joint in missing:

@@ -1,5 +1,6 @@
 """Real SocketCAN and real processes: a simulated arm, a host with the link, and a listener that watches both."""
 
+import json
 import signal
 import struct
 import subprocess
@@ -31,7 +32,7 @@ link:
   deadline: 0.5
   joints:
     - {name: joint_1, node: 11, rated_torque: 40.0, max_torque: 30.0}
-    - {name: joint_2, node: 12, rated_torque: 40.0, max_torque: 30.0}
+    - {name: joint_2, node: 12, rated_torque: 40.0, max_torque: 30.0, max_velocity: 60.0}
 sim:
   links:
     - {mass: 2.0, com: [0.0, 0.0, 0.05], inertia: [0.01, 0.01, 0.01]}
@@ -152,3 +153,24 @@ def test_scan_and_monitor_see_the_arm(simulated, arm_file):
     monitor = armlink("monitor", arm_file, "--once", "--sync", "--json", "-")
     assert monitor.returncode == 0, monitor.stderr
     assert '"nmt": "operational"' in monitor.stdout
+
+
+def test_the_self_test_shows_that_the_joints_stop_without_their_host(simulated, arm_file):
+    check = armlink("check", arm_file, "--yes", "--json", "-")
+    answer = json.loads(check.stdout)
+    assert check.returncode == 0, check.stderr
+    silent = [each for each in answer["checks"] if each["check"] == "RPDO deadline"]
+    assert [each["outcome"] for each in silent] == ["passed"] * 2
+    assert all(0.4 < each["seconds"] < 0.85 for each in silent)
+    alone = [each for each in answer["checks"] if each["check"] == "heartbeat of the host"]
+    assert all(0.9 < each["seconds"] < 1.6 for each in alone)
+
+
+def test_a_second_host_is_noticed(simulated, arm_file):
+    process = host(arm_file, 100_000)
+    assert process.stdout.readline() == "pushing\n"
+    second = armlink("check", arm_file, "--yes")
+    assert second.returncode == 3, second.stderr
+    assert "another host is on this bus: it sends " in second.stderr
+    process.send_signal(signal.SIGINT)
+    process.wait(timeout=30)
