@@ -1,6 +1,7 @@
 """The one owner of the bus: raw frames out and in, by the fastest way that the interface offers, counted."""
 
 import select
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
@@ -10,6 +11,8 @@ from armlink.errors import BusFault
 
 Frame = tuple[int, bytes]
 
+ECHOING = ("UdpMulticastBus",)
+"""Interfaces of python-can on which a bus hears its own frames."""
 _SLICE = 0.001  # [s] that one of several buses is waited for where the operating system cannot wait for all at once
 
 
@@ -85,11 +88,15 @@ class MessagePort:
     def __init__(self, bus: Any, fd: bool = False) -> None:
         self.errors = self.dropped = 0
         self._bus, self._fd = bus, fd
+        self._echoes: Counter[Frame] | None = Counter() if type(bus).__name__ in ECHOING else None
+        """Frames of our own that come back to us."""
 
     def send(self, can_id: int, data: bytes) -> None:
         """Send one frame; raises BusFault where python-can does."""
         fd = self._fd
         message = can.Message(arbitration_id=can_id, data=data, is_extended_id=False, is_fd=fd, bitrate_switch=fd)
+        if self._echoes is not None:
+            self._echoes[can_id, data] += 1
         try:
             self._bus.send(message)
         except (can.CanError, OSError) as error:
@@ -112,7 +119,10 @@ class MessagePort:
             if message.is_error_frame:
                 self.errors += 1
             elif not (message.is_extended_id or message.is_remote_frame):
-                return message.arbitration_id, bytes(message.data)
+                frame = message.arbitration_id, bytes(message.data)
+                if not self._echoes or not self._echoes[frame]:
+                    return frame
+                self._echoes[frame] -= 1
 
 
 class GroupPort:
