@@ -5,6 +5,7 @@ import hmac
 import ipaddress
 import json
 import math
+import re
 import socket
 import time
 from collections.abc import Callable
@@ -15,6 +16,8 @@ from calib.daemon.web.rate import Rate, RateLimit
 
 BODY_LIMIT = 4096
 """Bytes; the only bodies are names and reasons."""
+HEAD_LIMIT = 16384
+"""Bytes of the request line and headers together."""
 BODY_SECONDS = 10.0
 """A body that has not come by then is given up."""
 REQUESTS = Rate(burst=60, per_second=20)
@@ -34,6 +37,8 @@ HEADERS = {
     "cross-origin-resource-policy": "same-origin",
     "cache-control": "no-store",
 }
+
+_LABEL = re.compile(r"[a-z0-9_-]+")
 
 
 @dataclass(frozen=True)
@@ -82,6 +87,8 @@ class Guard:
 
     def _check(self, scope: Scope, peer: Peer) -> None:
         headers = _headers(scope)
+        if len(scope["query_string"]) + sum(len(name) + len(value) for name, value in scope["headers"]) > HEAD_LIMIT:
+            raise Denied(431, f"request line and headers may have {HEAD_LIMIT} bytes", {"connection": "close"})
         if peer.tcp and (wait := self._requests.take(peer.address, self.access.now())):
             raise Denied(429, f"too many requests: wait {math.ceil(wait)} s", {"retry-after": str(math.ceil(wait))})
         host = _host_name(headers.get("host", ""))
@@ -99,7 +106,7 @@ class Guard:
             return not peer.tcp or _is_loopback(peer.local) or host in self.access.hosts
         if peer.tcp:
             return host in self.access.hosts or (peer.local != "" and host == peer.local)
-        return host != "" and "." not in host and ":" not in host  # a single label, which no other domain can own
+        return _LABEL.fullmatch(host) is not None  # a single label, which no other domain can own
 
     def _check_token(self, authorization: str, peer: Peer) -> None:
         scheme, _, given = authorization.partition(" ")

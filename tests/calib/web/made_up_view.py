@@ -47,9 +47,13 @@ class MadeUpView:
     """Seven joints at rest; `tick()` publishes one item, `happen()` an event."""
 
     def __init__(self) -> None:
+        self.clients: set[MadeUpSubscription] = set()
+        self.begin()
+
+    def begin(self) -> None:
+        """As it is at the start."""
         self.state, self.fault, self.t = State.OBSERVING, None, 0.0
         self.report = None
-        self.clients: set[MadeUpSubscription] = set()
         self.log: list[EventRecord] = []
         self.points: list[HistoryPoint] = []
         self.offered: list[Proposal] = []

@@ -36,11 +36,11 @@ export async function fetchAll() {
   draw();
 }
 
+// The caller draws.
 export async function fetchNew() {
   const newest = Math.max(0, ...[...history.values()].map((points) => points.at(-1).at));
   if (!newest || [...history.values()].some((points) => points.length > MOST)) return fetchAll();
   take(await get(`/api/history?from=${new Date(newest).toISOString()}`));
-  draw();
 }
 
 function take(points) {
