@@ -37,7 +37,7 @@ class ServiceView:
         pending = sum(row.state == "pending" for row in service.journal.proposals())
         return Status(
             state=service.state,
-            detail=service.trouble or service.fault or service.silent or service.detail,
+            detail=service.trouble or service.fault or service.detail or service.silent,
             arm=service.arm.name,
             serial=service.arm.serial,
             version=service.version,

@@ -1,5 +1,6 @@
 """From findings to records in force: policy, rate limit, approval, write, check, roll-back; every step kept."""
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
@@ -23,6 +24,8 @@ from calib.writing import Controllers
 
 T = TypeVar("T")
 DAY = 86400.0
+WAITING = 1000
+"""Batches that wait for an alarm to be explained: a hundred seconds."""
 
 Say = Callable[[str, str | None, str, dict[str, Any]], int]
 """(kind, joint, text, evidence) → id of the event."""
@@ -67,6 +70,8 @@ class Recalibrations:
         self.recalibrator = Recalibrator(arm, controllers, store, "propose")
         self.busy = False
         self._waiting: list[Finding] = []
+        self._checking: str | None = None
+        self._unexplained: deque[tuple[Array, Array, Array]] = deque(maxlen=WAITING)
 
     # ---- what the observer found
 
@@ -158,6 +163,7 @@ class Recalibrations:
     def applied(self, row: ProposalRow, by: str, record: CalibrationRecord, install: bool = True) -> None:
         """A proposal is in force: keep and say it; with `install` the observer takes it over too."""
         finding = finding_of(row.finding)
+        self._checking = row.joint
         joint = record.joints[finding.joint]
         gain = "as before" if joint.gain is None else f"{joint.gain:.5f}"
         text = f"{row.joint}: record {record.id} in force: gain {gain}, offset {joint.offset or 0.0:.3f} N·m"
@@ -178,13 +184,32 @@ class Recalibrations:
 
     # ---- after a write
 
-    def watch(self, samples: tuple[Array, Array, Array]) -> None:
-        """Give decimated samples to the check after a write; what is worse than before is taken back."""
-        if self.busy:
+    def watch(self, samples: tuple[Array, Array, Array], held: bool) -> None:
+        """Give decimated samples to the check after a write; what is worse than before is taken back.
+
+        While an alarm stands (`held`) they wait until its cause is `explained`: a payload says nothing of the sensor.
+        """
+        if self._checking is None or self.busy:
             return
+        if held:
+            self._unexplained.append(samples)
+            return
+        self._unexplained.clear()
+        self._check(samples)
+
+    def explained(self, kind: str, joint: str | None) -> None:
+        """An alarm's cause is known: samples that waited count where it is a drift of the joint just recalibrated."""
+        waiting, self._unexplained = list(self._unexplained), deque(maxlen=WAITING)
+        if kind != "drift" or joint != self._checking:
+            return
+        for samples in waiting:
+            self._check(samples)
+
+    def _check(self, samples: tuple[Array, Array, Array]) -> None:
         for t, position, torque in zip(*samples, strict=True):
             checked = self.recalibrator.sample(float(t), position, torque)
             if checked is not None:
+                self._checking = None
                 self._checked(checked)
                 return
 

@@ -138,6 +138,7 @@ class Service:
         now, t = self.around.wall(), self.around.monotonic()
         text, evidence = " ".join(text.split()), clean(evidence)
         number = self.journal.add_event(now, t, kind, joint, text, evidence)
+        self.trouble = ""
         record = EventRecord(id=number, time=now, t=t, kind=kind, joint=joint, text=text, evidence=evidence)
         self.hub.publish(EventItem(event=record))
         level = logging.WARNING if kind in ("fault", "refused", "alarm") else logging.INFO
@@ -217,14 +218,15 @@ class Service:
                 self.accepted[name] = now
         if events:
             self._events(events)
-        if not watcher.observer.held:
-            recalibrations.watch(samples)
+        recalibrations.watch(samples, watcher.observer.held)
 
     def _events(self, events: list[Event]) -> None:
         with self.journal.transaction():
             for event in events:
                 kind, text, evidence = told(event)
                 self.say(kind, event.joint, text, evidence)
+                if event.kind == "verdict" and self.recalibrations is not None:
+                    self.recalibrations.explained(kind, event.joint)
             self.keep(history=True)
         assert self.recalibrations is not None
         for event in events:
@@ -235,7 +237,7 @@ class Service:
 
     def _up(self, up: Up) -> None:
         back = self.connected is False
-        self.connected, self.fault = True, ""
+        self.connected, self.fault, self.batch_at = True, "", self.around.monotonic()
         if back:
             self._fault_event(None, "the bus is back", {}, kind="recovered")
         self._held = up.held
@@ -316,7 +318,6 @@ class Service:
 
     def tick(self) -> None:
         """Whatever time alone asks for."""
-        self.trouble = ""
         self.guard(self._tick)
 
     def _tick(self) -> None:
@@ -347,7 +348,7 @@ class Service:
             if history:
                 self.journal.add_history(now, t, calibration, self.watcher.point())
                 self._history_at = t
-        self._kept_at, self._kept_rows = t, self.watcher.observer.rows
+        self._kept_at, self._kept_rows, self.trouble = t, self.watcher.observer.rows, ""
 
     def close(self, why: str) -> None:
         """Keep everything and end."""

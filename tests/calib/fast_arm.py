@@ -29,7 +29,7 @@ INERTIA = 0.05
 
 
 class FastArm:
-    """Works, drifts and carries as told; `samples` yields pieces of (t (K,), position (K, n), torque reading (K, n))."""
+    """Works, drifts and carries as told; `samples` yields pieces: t (K,), position (K, n), torque reading (K, n)."""
 
     def __init__(self, arm: str | ArmFile = "sarcos", seed: int = 0) -> None:
         self.file = load_arm(arm) if isinstance(arm, str) else arm
@@ -46,7 +46,9 @@ class FastArm:
         self.model = (self.beta + model_std * self.random.normal(size=self.beta.size)) * scale
         self.covariance = np.diag(model_std**2) + 4e-6 * np.outer(self.beta, self.beta)
         self.gain, self.offset = np.ones(self.n), np.zeros(self.n)
-        """What has become of the sensors against what is installed (n,)."""
+        """The sensors: v = gain·τ + offset (n,)."""
+        self.held_gain, self.held_offset = np.ones(self.n), np.zeros(self.n)
+        """What the controllers hold: they send (v − offset) / gain."""
         self.load = np.zeros(self.beta.size)
         """What is carried, as mass moments [kg·m] (2n,)."""
         self.push: Callable[[np.ndarray], np.ndarray] | None = None
@@ -54,7 +56,6 @@ class FastArm:
         self.q = (self.arm.lower + self.arm.upper) / 2
         self.t = 0.0
         self.motion = WorkMotion()
-        self.each_piece: Callable[[], None] = lambda: None
 
     def observer(self, config: ObserverConfig | None = None) -> Observer:
         config = config or ObserverConfig()
@@ -89,9 +90,8 @@ class FastArm:
             position[:, :] += 2e-4 * self.random.normal(size=self.n) * (position != goal).any(axis=1)[:, None]
             acceleration = np.gradient(np.gradient(np.vstack([way, rest]), PERIOD, axis=0), PERIOD, axis=0)
             t = self.t + PERIOD * np.arange(1, len(position) + 1)
-            yield t, position, self.read(position, acceleration)
             self.q, self.t = goal, float(t[-1])
-            self.each_piece()
+            yield t, position, self.read(position, acceleration)
 
     def read(self, q: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
         torque = gravity_regressor(self.arm, q) @ (self.beta + self.load) + INERTIA * self.rated * acceleration
@@ -100,7 +100,16 @@ class FastArm:
         noise = NOISE_SHARE / np.sqrt(DECIMATED) * self.rated * self.random.normal(size=q.shape)
         step = 4 * self.rated / 2**BITS
         raw = np.round((self.gain * self.scale * torque + self.offset + noise) / step) * step
-        return np.asarray(raw)
+        return np.asarray((raw - self.held_offset) / self.held_gain)
+
+    def install(self, joint: int, gain: float, offset: float) -> None:
+        """A finding, relative to what is held, written to the controller."""
+        self.held_offset[joint] += self.held_gain[joint] * offset
+        self.held_gain[joint] *= gain
+
+    def error(self) -> tuple[np.ndarray, np.ndarray]:
+        """What is wrong with the readings: gain and offset [N·m] (n,)."""
+        return self.gain / self.held_gain - 1, (self.offset - self.held_offset) / self.held_gain
 
     def run(self, observer: Observer, seconds: float, apply: bool = True) -> list:
         """Feed the observer; with `apply` every proposal is written at once. Returns the events."""
@@ -110,8 +119,6 @@ class FastArm:
                 for event in observer.handle(float(t[k]), position[k], torque[k]):
                     said.append(event)
                     if event.finding is not None and apply:
-                        j = event.finding.joint
-                        self.gain[j] /= event.finding.gain
-                        self.offset[j] = (self.offset[j] - event.finding.offset) / event.finding.gain
+                        self.install(event.finding.joint, event.finding.gain, event.finding.offset)
                         observer.install(event.finding)
         return said

@@ -1,0 +1,144 @@
+"""The daemon's service on the fast arm: batches at 50 Hz, no bus, controllers that are a table; for long times."""
+
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from daemon_bench import run_now
+from fast_arm import PERIOD, FastArm
+
+from armlink.armfile import ArmFile, load_arm
+from armlink.errors import BusFault
+from armlink.sample import Calibration, Stats
+from calib.daemon.answers import ServiceView
+from calib.daemon.messages import Batch, Progress, Reply, Up
+from calib.daemon.service import Around, Service
+from calib.daemon.settings import DaemonSection
+from calib.records import CalibrationRecord, GravityRecord, JointCalibration, matrix, provenance
+from calib.store import RecordStore
+
+START = datetime(2026, 1, 1, tzinfo=UTC)
+QUIET = {"enabled": False}
+
+
+def slow(arm: ArmFile) -> ArmFile:
+    """The same arm at the rate of the fast arm's samples, so that the service takes them as they are."""
+    return arm.model_copy(update={"link": arm.require_link().model_copy(update={"rate": 1 / PERIOD})})
+
+
+class FastDaemon:
+    """`run(seconds)`; the arm is `fast`, the daemon's answers are `view`."""
+
+    def __init__(
+        self,
+        directory: Path,
+        seed: int = 0,
+        settings: DaemonSection | None = None,
+        arm: str = "sarcos",
+        listen_only: bool = False,
+        records: bool = True,
+    ) -> None:
+        self.arm = slow(load_arm(arm))
+        self.fast = FastArm(self.arm, seed)
+        self.directory, self.listen_only = directory, listen_only
+        self.settings = settings or DaemonSection(policy="apply", recording=QUIET)
+        self.wall_shift, self.clock_shift = timedelta(), 0.0
+        self.store = RecordStore(str(directory / "records.db"))
+        self.controllers, self.port = self, self
+        self.ids = [0] * self.fast.n
+        self.sdo: list[str] = []
+        self.on_write: Callable[[int], None] = lambda joint: None
+        self.touring = 0
+        if records:
+            for record in self.good_records():
+                self.store.put(record, self.arm, by="ann", reason="sweep")
+        self.start()
+
+    def good_records(self) -> tuple[CalibrationRecord, GravityRecord]:
+        fast, names = self.fast, self.arm.joint_names
+        joints = tuple(
+            JointCalibration(name=name, gain=1.0, offset=0.0, position_gain=1.0, position_offset=0.0) for name in names
+        )
+        gravity = GravityRecord(
+            **provenance(self.arm, created=START),
+            names=names,
+            beta=tuple(fast.model.tolist()),
+            covariance=matrix(fast.covariance),
+            identifiable=(True,) * fast.model.size,
+            gravity=self.arm.kinematics.gravity,
+        )
+        return CalibrationRecord(**provenance(self.arm, created=START), joints=joints), gravity
+
+    def start(self, up: bool = True) -> None:
+        around = Around(self.now, self.wall, run_now, self)
+        state = self.directory / "state"
+        self.service = Service(self.arm, self.settings, self.listen_only, state, self.store, around)
+        self.view = ServiceView(self.service)
+        if up:
+            self.service.take(Up(None if self.listen_only else self.held()))
+
+    def held(self) -> tuple[tuple[float, float, int], ...]:
+        return tuple(zip(self.fast.held_gain, self.fast.held_offset, self.ids, strict=True))
+
+    def now(self) -> float:
+        return self.fast.t + self.clock_shift
+
+    def wall(self) -> datetime:
+        return START + timedelta(seconds=self.fast.t) + self.wall_shift
+
+    # ---- what the service asks of the bus loop
+
+    def read_calibration(self, joint: int) -> Calibration:
+        self.sdo.append(f"read {joint}")
+        return Calibration(
+            float(self.fast.held_gain[joint]), float(self.fast.held_offset[joint]), self.ids[joint], 0, 0
+        )
+
+    def write_calibration(
+        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
+    ) -> Calibration:
+        self.sdo.append(f"write {joint}")
+        self.on_write(joint)
+        self.fast.held_gain[joint], self.fast.held_offset[joint] = np.float32(gain), np.float32(offset)
+        self.ids[joint] = record_id
+        return self.read_calibration(joint)
+
+    def sweep(self, poses: int, seed: int) -> Reply | None:
+        self.touring = poses
+        return None
+
+    # ---- time
+
+    def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
+        """Let the arm work for so long, or less."""
+        ticked = self.fast.t
+        for t, position, torque in self.fast.samples(seconds):
+            self.service.take(self.batch(t + self.clock_shift, position, torque))
+            if self.touring:
+                self.touring -= 1
+                self.service.take(Progress(60 - self.touring, 60))
+            if self.fast.t - ticked >= 1.0:
+                ticked = self.fast.t
+                self.service.tick()
+            if until():
+                break
+
+    def batch(self, t: np.ndarray, position: np.ndarray, torque: np.ndarray) -> Batch:
+        nothing = np.full_like(position, np.nan)
+        channels = {"position": position, "torque": torque, "torque_command": torque, "position_command": position}
+        channels |= {"velocity": nothing, "motor_torque": torque}
+        status = np.full(self.fast.n, 0x27)
+        return Batch(t, channels, status, np.zeros(self.fast.n), Stats(frames=1, rate_hz=250.0))
+
+    def kill(self) -> None:
+        """As SIGKILL does."""
+        self.service.journal.close()
+
+    def of_kind(self, *kinds: str) -> list[Any]:
+        return [event for event in self.view.events(limit=100_000) if event.kind in kinds]
+
+    def broken(self, joint: int) -> None:
+        """For on_write: the bus fails."""
+        raise BusFault("joint gone")
