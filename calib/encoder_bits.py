@@ -12,32 +12,53 @@ CHANCE = 1e-4
 """Probability that a sound bit looks stuck by chance, above which nothing is said."""
 SPAN = 1.5
 """How many times a bit's own step the joint must have moved for it to be judged."""
+AWAY, OFTEN = 3.0, 0.15
+"""Counts by which a reading may lie off where the joint was sent; share of readings that must lie a bit's step off."""
 
 
 def stuck_bits(position: Array, resolution: Array, target: Array) -> Iterator[tuple[int, int, float]]:
     """(joint, bit, its step [rad]) of each stuck bit in readings (K, n) of given resolution (n,).
 
-    A bit of weight w that is stuck keeps the reading, taken round a circle of 2w, within one half of it. `target`
-    (K, n) [rad] says where the joint should have been, NaN where not known: a circle half that even the targets leave
-    empty tells nothing.
+    `target` (K, n) [rad] says where the joint should have been, NaN where not known. Raises nothing: where too little
+    is known it yields nothing.
     """
     for joint in np.flatnonzero(resolution > 0):
-        step = resolution[joint]
-        distinct = np.unique(np.rint(position[:, joint] / step))
-        asked = target[:, joint]
-        asked = np.unique(np.rint(asked[np.isfinite(asked)] / step))
-        if len(distinct) < FEWEST or len(asked) < FEWEST:
-            continue
-        bit = 1
-        while 2**bit * SPAN < np.ptp(distinct):
-            weight = 2.0**bit
-            gap, points = _largest_gap(distinct, 2 * weight)
-            expected, _ = _largest_gap(asked, 2 * weight)
-            chance = points * 0.5 ** (points - 1)
-            if gap >= weight + 0.5 and expected < 0.8 * weight and chance < CHANCE:
-                yield int(joint), bit, float(weight * step)
-                break
-            bit += 1
+        counts = np.rint(position[:, joint] / resolution[joint])
+        asked = target[:, joint] / resolution[joint]
+        bit = _by_target(counts, asked)
+        if bit is None:
+            bit = _by_gap(counts, asked)
+        if bit is not None:
+            yield int(joint), bit, float(2.0**bit * resolution[joint])
+
+
+def _by_target(counts: Array, asked: Array) -> int | None:
+    """The bit by whose weight many readings lie off their targets, and the others not at all."""
+    off = np.abs(counts - asked)[np.isfinite(asked)]
+    strange = off[off > AWAY]
+    if len(off) < FEWEST or len(strange) < max(3, OFTEN * len(off)):
+        return None
+    bit = round(float(np.log2(np.median(strange))))
+    return bit if np.mean(np.abs(strange - 2.0**bit) <= AWAY) > 0.8 else None
+
+
+def _by_gap(counts: Array, asked: Array) -> int | None:
+    """The bit that keeps the readings, taken round a circle of twice its weight, within one half of it.
+
+    A half that even the targets leave empty tells nothing.
+    """
+    distinct, wanted = np.unique(counts), np.unique(np.rint(asked[np.isfinite(asked)]))
+    if len(distinct) < FEWEST or len(wanted) < FEWEST:
+        return None
+    bit = 1
+    while 2**bit * SPAN < np.ptp(distinct):
+        weight = 2.0**bit
+        gap, points = _largest_gap(distinct, 2 * weight)
+        expected, _ = _largest_gap(wanted, 2 * weight)
+        if gap >= weight + 0.5 and expected < 0.8 * weight and points * 0.5 ** (points - 1) < CHANCE:
+            return bit
+        bit += 1
+    return None
 
 
 def _largest_gap(counts: Array, circle: float) -> tuple[float, int]:

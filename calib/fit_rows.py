@@ -111,7 +111,11 @@ def _targets(data: SweepData) -> Array:
     if data.plan is None:
         return targets
     sweeps = {sweep.name: sweep for sweep in data.plan.sweeps}
+    scouted = iter(data.plan.scout)
     for row, reading in enumerate(data.readings):
+        if reading.joint is None:
+            targets[row] = next(scouted, np.nan)
+            continue
         sweep = sweeps.get(reading.sweep)
         if sweep is None or reading.index >= sweep.readings:
             continue

@@ -14,7 +14,7 @@ from calib.refine import Extra, Refined, refine
 from gcomp.arm import Arm
 from gcomp.global_fit import GlobalFit
 from gcomp.parameters import Prior
-from gcomp.readings import Readings
+from gcomp.sensor_model import predict
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -34,12 +34,18 @@ MOST_EFFECTS = 6
 """Effects that are looked for one after the other."""
 OUTLIER = 6.0
 """Robust standard deviations, its own pull on the fit taken out, from which a reading is an outlier."""
+FEWEST = 8
+"""Readings of a joint from which outliers are told from noise."""
 MOST_OUTLIERS = 0.15
 """Share of a joint's readings that may be left out as outliers; where there are more, the model is at fault."""
+PLATEAU, PLATEAU_POSES = 4.0, 4
+"""Standard deviations within which readings count as equal; different poses at one extreme from which it is a limit."""
+SWING = 800.0
+"""Standard deviations that a joint's torque must range over: else a sinusoid's own peak is as flat as a limit."""
 SCATTER, MATERIAL_SCATTER = 3.0, 0.002
 """Scatter that is no longer noise: this many times what the samples explain, and this share of rated torque."""
-HOLDING: tuple[Kind, ...] = ("direction", "hysteresis")
-"""Effects that the fit takes out completely: the model holds with them."""
+HOLDING: tuple[Kind, ...] = ("direction", "hysteresis", "outliers")
+"""What the fit takes out completely: the model holds without it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +92,9 @@ class Goodness:
 
 def examine(arm: Arm, rows: FitRows, fit: GlobalFit, priors: Mapping[str, Prior], rated: Array) -> Goodness:
     """Refine a global fit, one effect after another that its residuals ask for, without outliers. rated (n,) [N·m]."""
-    readings, effects, findings = rows.readings, list[Effect](), list[Finding]()
+    rows, findings = _without_plateaus(arm.names, rows)
+    encoders = _encoders(arm.names, rows)
+    effects, readings = list[Effect](), rows.readings
 
     def fitted() -> Refined:
         extras = tuple(extra for effect in effects for extra in effect.extras)
@@ -95,29 +103,46 @@ def examine(arm: Arm, rows: FitRows, fit: GlobalFit, priors: Mapping[str, Prior]
     refined = fitted()
     outliers = np.zeros(readings.torque.shape, dtype=bool)
     for _ in range(MOST_EFFECTS):
-        strange = _outliers(refined, outliers, rows)
-        if strange.any():
-            cleaned = _without(readings, strange)
-            if len(effects):
-                effects = [_shortened(effect, readings, strange) for effect in effects]
-            outliers |= strange
-            readings = cleaned
+        strange = _outliers(arm, refined, rows, [extra for effect in effects for extra in effect.extras])
+        if (strange != outliers).any():
+            outliers = strange
+            readings = replace(rows.readings, torque=np.where(outliers, np.nan, rows.readings.torque))
             refined = fitted()
         found = strongest(arm, rows, readings, refined, rated)
-        if found is None and not strange.any():
+        if found is None:
             break
-        if found is not None:
-            effects.append(found)
-            refined = fitted()
+        effects.append(found)
+        refined = fitted()
     place = 0
     for effect in effects:
         coefficient = refined.coefficients[place : place + len(effect.extras)]
         place += len(effect.extras)
         findings.append(_said(arm.names, effect, coefficient, refined, rated))
-    findings += _encoders(arm.names, rows)
     findings += _outliers_said(arm.names, rows, outliers)
     findings += _scattered(arm.names, refined, rated, {finding.joint for finding in findings})
-    return Goodness(refined, tuple(findings), outliers, leave_out(refined, rows))
+    said = encoders or findings  # what a wrong position does elsewhere is no finding of its own
+    return Goodness(refined, tuple(said), outliers, leave_out(refined, rows))
+
+
+def _without_plateaus(names: tuple[str, ...], rows: FitRows) -> tuple[FitRows, list[Finding]]:
+    """The rows without readings at a torque beyond which a sensor never went though the arm moved: it saturates."""
+    torque, flat, found = rows.readings.torque, np.zeros(rows.readings.torque.shape, dtype=bool), []
+    for joint, name in enumerate(names):
+        counted = np.flatnonzero(rows.readings.counted[:, joint])
+        for side in (1.0, -1.0):
+            value = side * torque[counted, joint]
+            if len(value) < FEWEST or np.ptp(value) < SWING * np.median(rows.readings.sigma[counted, joint]):
+                continue
+            near = counted[value > value.max() - PLATEAU * rows.readings.sigma[counted, joint]]
+            poses = np.round(rows.readings.position[near], 1)
+            distinct = np.unique(np.column_stack([poses, rows.readings.load[near]]), axis=0)
+            if len(distinct) >= max(PLATEAU_POSES, 0.1 * len(counted)):
+                flat[near, joint] = True
+                limit = float(side * value.max())
+                text = f"{name}: {len(near)} readings at different poses stand at {limit:.4g} N·m: the sensor saturates"
+                found.append(Finding(name, "saturation", limit, "N·m", text))
+    readings = replace(rows.readings, torque=np.where(flat, np.nan, torque))
+    return (replace(rows, readings=readings) if found else rows), found
 
 
 def leave_out(refined: Refined, rows: FitRows) -> tuple[LeftOut, ...]:
@@ -142,35 +167,31 @@ def leave_out(refined: Refined, rows: FitRows) -> tuple[LeftOut, ...]:
     return tuple(found)
 
 
-def _outliers(refined: Refined, before: Flags, rows: FitRows) -> Flags:
-    """Readings (K, n) that no noise explains: deleted residuals, in robust standard deviations of their joint."""
-    linear, flags = refined.linear, np.zeros_like(before)
+def _outliers(arm: Arm, refined: Refined, rows: FitRows, extras: list[Extra]) -> Flags:
+    """Readings (K, n) that no noise explains: deleted residuals, in robust standard deviations of their joint.
+
+    Those left out before are judged again, for an effect found since may explain them.
+    """
+    linear, counted = refined.linear, rows.readings.counted
+    error = rows.readings.torque - predict(arm, refined.fit.complete, rows.readings)
+    error -= sum((value * extra.column for value, extra in zip(refined.coefficients, extras, strict=True)), 0.0 * error)
+    deleted = error / (rows.readings.sigma * refined.factor)
+    inside = np.zeros(counted.shape, dtype=bool)
+    inside[linear.row, linear.joint] = True
     count = len(linear.row)
-    deleted = linear.residual[:count] / np.sqrt(np.maximum(1 - linear.leverage, 1e-3))
-    for joint in range(before.shape[1]):
-        here = np.flatnonzero(linear.joint == joint)
-        if len(here) < 8:
+    deleted[linear.row, linear.joint] = linear.residual[:count] / np.sqrt(np.maximum(1 - linear.leverage, 1e-3))
+    flags = np.zeros(counted.shape, dtype=bool)
+    for joint in range(arm.n):
+        used = np.abs(deleted[inside[:, joint], joint])
+        if len(used) < FEWEST:
             continue
-        size = np.abs(deleted[here])
-        robust = max(1.4826 * float(np.median(size)), 1e-9)
+        size = np.where(counted[:, joint], np.abs(deleted[:, joint]), 0.0)
         noise = 1 / max(refined.factor[joint], 1.0)  # sigma has been raised by the factor, which outliers raise
-        bound = OUTLIER * max(robust, noise)
-        strange = here[size > bound]
-        gone = int(before[:, joint].sum())
-        if len(strange) and len(strange) + gone <= MOST_OUTLIERS * (len(here) + gone):
-            worst = strange[size[size > bound] >= 0.5 * size.max()]
-            flags[linear.row[worst], joint] = True
+        bound = OUTLIER * max(1.4826 * float(np.median(used)), noise)
+        strange = (size > bound) & (~inside[:, joint] | (size > 0.5 * size[inside[:, joint]].max()))
+        if strange.sum() <= MOST_OUTLIERS * counted[:, joint].sum():
+            flags[:, joint] = strange
     return flags
-
-
-def _without(readings: Readings, strange: Flags) -> Readings:
-    return replace(readings, torque=np.where(strange, np.nan, readings.torque))
-
-
-def _shortened(effect: Effect, readings: Readings, strange: Flags) -> Effect:
-    """The effect's columns without the readings that are left out."""
-    kept = ~strange[readings.counted]
-    return replace(effect, extras=tuple(Extra(each.joint, each.kind, each.column[kept]) for each in effect.extras))
 
 
 def _said(names: tuple[str, ...], effect: Effect, coefficient: Array, refined: Refined, rated: Array) -> Finding:

@@ -21,6 +21,10 @@ MATERIAL = 0.0005
 """Root mean square of an effect, as a share of rated torque, below which nobody need know of it."""
 KNEES = (0.6, 0.7, 0.8, 0.9, 0.95)
 """Shares of the largest torque at which a sensor is tried for beginning to saturate."""
+FEWEST = 6
+"""Readings of a joint from which effects on it are looked for."""
+TURN = 2.0
+"""Range of a joint from which an error once a turn can be told from a gain [rad]."""
 PATH = 12
 """Points of the way from one reading to the next at which the torque is computed for hysteresis."""
 
@@ -45,8 +49,8 @@ def strongest(arm: Arm, rows: FitRows, readings: Readings, refined: Refined, rat
     linear, best, most = refined.linear, None, 0.0
     count = len(linear.row)
     squares = np.bincount(linear.joint, linear.residual[:count] ** 2, minlength=arm.n)
-    for effect in _candidates(arm, rows, readings, refined):
-        columns = np.column_stack([extra.column for extra in effect.extras]) / linear.sigma[:, None]
+    for effect in _candidates(arm, rows, refined):
+        columns = np.column_stack([extra.column[readings.counted] for extra in effect.extras]) / linear.sigma[:, None]
         if not np.abs(columns).max(initial=0.0) > 0:
             continue
         rest = linear.left_over(columns)
@@ -72,53 +76,55 @@ def strongest(arm: Arm, rows: FitRows, readings: Readings, refined: Refined, rat
     return best
 
 
-def _candidates(arm: Arm, rows: FitRows, readings: Readings, refined: Refined) -> Iterator[Effect]:
+def _candidates(arm: Arm, rows: FitRows, refined: Refined) -> Iterator[Effect]:
     """Every effect that is tried, a joint at a time."""
-    linear, complete = refined.linear, refined.fit.complete
-    _, _, slope = predict_and_jacobian(arm, complete, readings)
+    complete, readings = refined.fit.complete, rows.readings
+    counted = readings.counted
+    _, _, flat = predict_and_jacobian(arm, complete, readings)
+    slope = np.zeros((*counted.shape, arm.n))
+    slope[counted] = flat
     torque = predict(arm, complete, readings) - complete.offset
     for joint in range(arm.n):
-        here = linear.joint == joint
-        if here.sum() < 6:
+        here = counted[:, joint]
+        if here.sum() < FEWEST:
             continue
-        angle = readings.position[linear.row, joint]
-        side = np.where(rows.swept[linear.row] == joint, rows.direction[linear.row], 0).astype(float)
-        yield _one(joint, "spring", here * angle)
-        yield _one(joint, "direction", here * side)
-        yield _one(joint, "hysteresis", here * lag(arm, rows, readings, refined, joint)[linear.row])
-        own = torque[linear.row, linear.joint]
+        angle, own = readings.position[:, joint], torque[:, joint]
+        yield _one(arm.n, joint, "spring", here * angle)
+        yield _one(arm.n, joint, "direction", np.where(rows.swept == joint, rows.direction, 0) * here)
+        yield _one(arm.n, joint, "hysteresis", here * lag(arm, rows, refined, joint))
         largest = float(np.abs(own[here]).max())
-        yield _one(joint, "nonlinear", here * own * np.abs(own) / max(largest, 1e-9))
+        yield _one(arm.n, joint, "nonlinear", here * own * np.abs(own) / max(largest, 1e-9))
         for share in KNEES:
             bent = here * np.sign(own) * np.maximum(np.abs(own) - share * largest, 0.0)
-            if np.count_nonzero(bent) >= 3:
-                yield _one(joint, "saturation", bent, share * largest / abs(complete.gain[joint]))
-        yield _one(joint, "drift", here * (rows.time[linear.row] - rows.time[linear.row].mean()))
-        turn = [slope[:, joint] * np.sin(angle), slope[:, joint] * np.cos(angle)]
-        span = float(np.ptp(angle[here]))
-        if span > 2.0:
+            if np.count_nonzero(bent) >= FEWEST // 2:
+                yield _one(arm.n, joint, "saturation", bent, share * largest / max(abs(complete.gain[joint]), 1e-9))
+        yield _one(arm.n, joint, "drift", here * (rows.time - rows.time.mean()))
+        if float(np.ptp(angle[here])) > TURN:
+            turn = (slope[..., joint] * np.sin(angle)[:, None], slope[..., joint] * np.cos(angle)[:, None])
             yield Effect(joint, "eccentricity", tuple(Extra(joint, "eccentricity", each) for each in turn), 1.0)
 
 
-def _one(joint: int, kind: str, column: Array, knee: float = np.nan) -> Effect:
+def _one(n: int, joint: int, kind: str, values: Array, knee: float = np.nan) -> Effect:
+    """An effect that shows in one joint's sensor alone, `values` (K,)."""
+    column = np.zeros((len(values), n))
+    column[:, joint] = values
     return Effect(joint, kind, (Extra(joint, kind, column),), 1.0, knee)
 
 
-def lag(arm: Arm, rows: FitRows, readings: Readings, refined: Refined, joint: int) -> Array:
+def lag(arm: Arm, rows: FitRows, refined: Refined, joint: int) -> Array:
     """Where in its play (K,), -1 to 1, a joint's torque sensor stands at each reading, the way to it being straight.
 
     The play is as wide as the residuals say (half their robust range), so that small changes of torque leave it where
     it was. Rows where the joint was neither swept nor held stand at 0.
     """
-    position, load = readings.position, readings.load
+    position, load = rows.readings.position, rows.readings.load
     shares = np.linspace(0, 1, PATH + 1)[1:]
     way = position[:-1, None] + shares[:, None] * (position[1:] - position[:-1])[:, None]
     way = np.concatenate([np.repeat(position[:1, None], PATH, axis=1), way])
     flat = Readings.of(way.reshape(-1, arm.n), np.zeros((len(position) * PATH, arm.n)), 1.0, np.repeat(load, PATH))
     torque = predict(arm, refined.fit.complete, flat)[:, joint].reshape(-1, PATH)
-    counted = readings.counted[:, joint]
-    residual = refined.fit.residual[counted, joint]
-    width = max(float(np.median(np.abs(residual))) * 1.5, 1e-9)
+    residual = refined.fit.residual[:, joint]
+    width = max(float(np.nanmedian(np.abs(residual))) * 1.5, 1e-9)
     held, place = float(torque[0, 0]), np.zeros(len(position))
     for row, values in enumerate(torque):
         for value in values:

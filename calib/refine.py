@@ -37,7 +37,7 @@ class Extra:
     """Index of the joint whose sensor shows it."""
     kind: str
     column: Array
-    """(P,) over the counted readings, in row order, then joint order."""
+    """By reading (K, n)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +154,7 @@ class _Problem:
         self.mean, self.std = (values[self.free] for values in prior_vectors(arm.n, priors))
         self.row, self.joint = np.nonzero(readings.counted)
         count = len(self.row)
-        self.columns = np.column_stack([np.zeros((count, 0)), *(extra.column for extra in extras)])
+        self.columns = np.column_stack([np.zeros((count, 0)), *(extra.column[readings.counted] for extra in extras)])
         torque = float(np.abs(readings.torque[readings.counted]).max())
         sizes = torque / np.maximum(np.abs(self.columns).max(axis=0, initial=0.0), 1e-9)
         self.scale = np.concatenate([natural_units(arm, readings, fit.complete)[self.free], sizes])
