@@ -8,7 +8,8 @@ from numpy.typing import ArrayLike
 
 from gcomp.arm import Arm, bar_frames
 from gcomp.arrays import Array, as_array, as_batch, as_poses
-from gcomp.kernel import GravityModel, regressor
+from gcomp.kernel import GravityModel
+from gcomp.levers import regressor
 
 
 def gravity_torque(arm: Arm, beta: ArrayLike, q: ArrayLike) -> Array:
@@ -20,7 +21,10 @@ def gravity_torque(arm: Arm, beta: ArrayLike, q: ArrayLike) -> Array:
 
 
 def gravity_regressor(arm: Arm, q: ArrayLike) -> Array:
-    """Regressor Y (…, n, 2n) [m/s²] at poses q (…, n) [rad], with τ = Y β; equation (Y)."""
+    """Regressor Y (…, n, 2n) [m/s²] at poses q (…, n) [rad], with τ = Y β; equation (Y).
+
+    It is laid out column by column, as LAPACK has its matrices: Y[:, i, c] is contiguous, Y[k] is not.
+    """
     poses, leading = as_poses("q", q, arm.n)
     return as_batch(regressor(arm, poses), leading)
 

@@ -5,6 +5,7 @@ Two passes along the arm: composite mass moments inwards, gravity outwards into 
 number, so that turning about the axis by θ is a product with e^{iθ}.
 """
 
+import threading
 from collections.abc import Callable
 from functools import cached_property
 
@@ -15,20 +16,15 @@ from gcomp.arm import Arm
 from gcomp.arrays import Array, as_array, as_batch, as_poses
 from gcomp.unrolled import compile_single_pose, without_rounding
 
-BLOCK = 2048
-"""Poses worked on at a time: about half a megabyte of work space for seven joints."""
-
-REGRESSOR_BLOCK = 1024
-"""The same for the regressor, which is larger."""
+BLOCK = 2000
+"""Poses worked on at a time: about half a megabyte of work space for seven joints. Not a power of two: rows that begin
+at the same place of a memory page push each other out of the cache."""
 
 ComplexArray = NDArray[np.complex128]
 
 
 class GravityModel:
-    """The gravity torque of one arm with one set of mass moments, prepared for many calls.
-
-    Not for several threads at once: calls share their work space.
-    """
+    """The gravity torque of one arm with one set of mass moments, prepared for many calls."""
 
     def __init__(self, arm: Arm, beta: ArrayLike) -> None:
         """Prepare for mass moments β (2n,) [kg·m]; raises BadArray on a wrong shape."""
@@ -36,7 +32,6 @@ class GravityModel:
         self.beta = as_array("beta", beta, (2 * arm.n,), finite=False)
         self._moments = self.beta[::2] + 1j * self.beta[1::2]
         self._twists = [without_rounding(alpha) for alpha in arm.alpha]
-        self._space: _Space | None = None
 
     @cached_property
     def one(self) -> Callable[[Array], Array]:
@@ -49,18 +44,12 @@ class GravityModel:
         torque = np.empty(poses.shape)
         for begin in range(0, len(poses), BLOCK):
             block = slice(begin, begin + BLOCK)
-            space = self._space_for(len(poses[block]))
-            _turn(self.arm, poses[block], 1.0, space.tangent, space.square, space.turn)
+            space = _space_for(self.arm.n, len(poses[block]))
+            _turn(self.arm, poses[block], space.tangent, space.square, space.turn)
             self._moments_inwards(space)
             self._gravity_outwards(space)
             np.copyto(torque[block], space.moment.imag.T)
         return as_batch(torque, leading)
-
-    def _space_for(self, size: int) -> "_Space":
-        """Work space for a block, kept for the next one of that size."""
-        if self._space is None or self._space.size != size:
-            self._space = _Space(self.arm.n, size)
-        return self._space
 
     def _moments_inwards(self, space: "_Space") -> None:
         """Composite mass moments N_i = n_i + Rx(α_i) Rz(θ_{i+1}) N_{i+1} into space.moment."""
@@ -86,67 +75,32 @@ class GravityModel:
             z, next_z = next_z, z
 
 
-def regressor(arm: Arm, q: Array) -> Array:
-    """Regressor Y (K, n, 2n) [m/s²] at poses q (K, n) [rad], equation (Y): each w_i = z_{i-1} × g, frame by frame."""
-    n, (size, _) = arm.n, q.shape
-    regressor = np.empty((size, n, n), dtype=np.complex128)
-    twists = [without_rounding(alpha) for alpha in arm.alpha]
-    rows = np.zeros((n, n, min(size, REGRESSOR_BLOCK)), dtype=np.complex128)
-    scratch = np.empty((3, n + 1, rows.shape[2]))
-    turn, stack = np.empty((2, n + 1, rows.shape[2]), dtype=np.complex128)
-    for begin in range(0, size, REGRESSOR_BLOCK):
-        block = regressor[begin : begin + REGRESSOR_BLOCK]
-        count = len(block)
-        if count < rows.shape[2]:
-            rows, scratch, turn, stack = (space[..., :count].copy() for space in (rows, scratch, turn, stack))
-        _turn(arm, q[begin : begin + count], -1.0, scratch[0, :n], scratch[1, :n], turn[:n])
-        _levers_outwards(arm, twists, turn, rows, stack, scratch)
-        np.copyto(block.reshape(count, n * n), rows.reshape(n * n, count).T)
-    return regressor.view(np.float64)
-
-
-def _levers_outwards(
-    arm: Arm,
-    twists: list[tuple[float, float]],
-    turn: ComplexArray,
-    rows: ComplexArray,
-    stack: ComplexArray,
-    scratch: Array,
-) -> None:
-    """w_i in bar frame j into rows[i, j], i ≤ j; gravity itself goes along in the stack until it becomes w_j."""
-    z, next_z, spare = scratch
-    stack[0].fill(complex(arm.gravity[0], arm.gravity[1]))
-    z[0].fill(arm.gravity[2])
-    for j, (ca, sa) in enumerate(twists):
-        frame, gravity = rows[: j + 1, j], stack[j + 1]
-        np.multiply(turn[j], stack[: j + 1], out=frame)
-        np.copyto(gravity, frame[j])
-        np.multiply(gravity, 1j, out=frame[j])
-        np.copyto(z[j + 1], z[j])
-        z[j].fill(0.0)
-        if j + 1 < arm.n:
-            np.copyto(stack[: j + 1].real, frame.real)
-            _turn_about_x(ca, -sa, frame.imag, z[: j + 1], stack[: j + 1].imag, next_z[: j + 1], spare[: j + 1])
-            _turn_about_x(ca, -sa, gravity.imag, z[j + 1], gravity.imag, next_z[j + 1], spare[j + 1])
-            z, next_z = next_z, z
-
-
 class _Space:
     """Work space for `size` poses of n joints, one row a joint."""
 
     def __init__(self, n: int, size: int) -> None:
-        self.size = size
         self.tangent, self.square = np.empty((2, n, size))
         self.turn, self.moment = np.empty((2, n, size), dtype=np.complex128)
         self.gravity: ComplexArray = np.empty(size, dtype=np.complex128)
         self.along, self.spare = np.empty((2, size)), np.empty(size)
 
 
-def _turn(arm: Arm, q: Array, sign: float, tangent: Array, square: Array, turn: ComplexArray) -> None:
-    """e^{± iθ} (n, K) from t = tan(± θ/2): numpy's tan is vectorised where its sin and cos are not."""
-    np.multiply(q.T, 0.5 * sign, out=tangent)
+_kept = threading.local()
+
+
+def _space_for(n: int, size: int) -> _Space:
+    """Work space for a block, kept by each thread for its next: new memory costs as much as the computation."""
+    space: _Space | None = getattr(_kept, "space", None)
+    if space is None or space.turn.shape != (n, size):
+        space = _kept.space = _Space(n, size)
+    return space
+
+
+def _turn(arm: Arm, q: Array, tangent: Array, square: Array, turn: ComplexArray) -> None:
+    """e^{iθ} (n, K) from t = tan(θ/2): numpy's tan is vectorised where its sin and cos are not."""
+    np.multiply(q.T, 0.5, out=tangent)
     if arm.theta_offset.any():
-        np.add(tangent, arm.theta_offset[:, None] * (0.5 * sign), out=tangent)
+        np.add(tangent, 0.5 * arm.theta_offset[:, None], out=tangent)
     np.tan(tangent, out=tangent)
     np.multiply(tangent, tangent, out=square)
     np.add(square, 1.0, out=square)

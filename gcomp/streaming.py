@@ -59,7 +59,7 @@ class MomentAccumulator:
     def _add_block(self, positions: Array, torques: Array) -> None:
         regressor = gravity_regressor(self.arm, positions)
         counted = ~np.isnan(torques)
-        rows = np.ones((len(positions), 2 * self.arm.n + 2))
+        rows = np.ones((2 * self.arm.n + 2, len(positions))).T  # column by column, as the regressor is
         for i in range(self.arm.n):
             felt = slice(2 * i, None)  # row i of Y is zero before column 2i
             rows[:, 2 * i : -2] = regressor[:, i, felt]
