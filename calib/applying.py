@@ -1,14 +1,17 @@
-"""`armlink calibrate --apply`: gates, the check motion before, the write, the check motion after."""
+"""`--apply` of `armlink calibrate` and `recalibrate`: gates, check motion, write, check motion again."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from armlink.armfile import ArmFile
-from armlink.errors import Refused
+from armlink.errors import BadInput, Refused
 from armlink.link import Link
 from calib.check_motion import CheckMotion
 from calib.dataset import SweepData
-from calib.gates import check_gates
+from calib.field import FieldFit
+from calib.field_record import check_field_heldout
+from calib.field_rows import FieldRows
+from calib.gates import check_bounds, check_change, check_gates, past_changes
 from calib.records import Array, CalibrationRecord
 from calib.store import RecordStore
 from calib.writing import install, mend
@@ -38,18 +41,49 @@ def apply_calibration(
     beta: Array | None,
     how: Apply,
 ) -> tuple[str, ...]:
-    """Write a record that was fitted to `data` to the controllers and make it current; returns the joints written.
+    """Write a record that was fitted to sweeps to the controllers and make it current; returns the joints written.
 
-    `beta` (2n,) [kg·m] is the gravity model that the check motion is judged by. The record is kept in any case. Raises
+    `data` are those sweeps, `beta` (2n,) [kg·m] is the gravity model that the check motion is judged by. The record is kept in any case. Raises
     Refused where a gate or the check says no, BusFault; the controllers then hold what they held.
     """
+    _require(record, arm, store, how)
+    check_gates(record, arm, store, data, how.replaced)
+    return _write(record, arm, store, beta, how, "sweeps")
+
+
+def apply_field(
+    record: CalibrationRecord,
+    arm: ArmFile,
+    store: RecordStore,
+    rows: FieldRows,
+    fit: FieldFit,
+    beta: Array,
+    how: Apply,
+) -> tuple[str, ...]:
+    """The same for a record of `armlink recalibrate`, from slow rows."""
+    _require(record, arm, store, how)
+    check_bounds(record, arm)
+    old = store.current(CalibrationRecord, arm)
+    if old is not None:
+        check_change(record, old, past_changes(store, arm), arm, how.replaced)
+        check_field_heldout(rows, fit, old)
+    return _write(record, arm, store, beta, how, "slow motion")
+
+
+def _require(record: CalibrationRecord, arm: ArmFile, store: RecordStore, how: Apply) -> None:
+    """Keep the record; raise Refused where there is nothing to write, BadInput on an unknown joint."""
+    unknown = sorted(set(how.replaced) - set(arm.joint_names))
+    if unknown:
+        raise BadInput(f"--replaced {unknown[0]}: no such joint; the arm has {', '.join(arm.joint_names)}")
     store.add(record.require(arm))
     if all(joint.offset is None for joint in record.joints):
         raise Refused("--apply: no joint has a gain or an offset, so nothing is written")
-    unknown = sorted(set(how.replaced) - set(arm.joint_names))
-    if unknown:
-        raise Refused(f"--replaced {unknown[0]}: no such joint; the arm has {', '.join(arm.joint_names)}")
-    check_gates(record, arm, store, data, how.replaced)
+
+
+def _write(
+    record: CalibrationRecord, arm: ArmFile, store: RecordStore, beta: Array | None, how: Apply, source: str
+) -> tuple[str, ...]:
+    exchanged = f"; sensor exchanged: {', '.join(how.replaced)}" if how.replaced else ""
     with Link.open(arm, how.bus) as link:
         link.start()
         mend(arm, store, link)
@@ -58,9 +92,4 @@ def apply_calibration(
             link.enable()
             motion.before()
         after = None if motion is None else motion.after
-        return install(record, arm, store, link, by=how.by, reason=_reason(how), check=after, flash=how.flash)
-
-
-def _reason(how: Apply) -> str:
-    exchanged = f"; sensor exchanged: {', '.join(how.replaced)}" if how.replaced else ""
-    return f"sweeps{exchanged}"
+        return install(record, arm, store, link, by=how.by, reason=source + exchanged, check=after, flash=how.flash)

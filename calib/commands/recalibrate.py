@@ -1,0 +1,139 @@
+"""Torque sensor gains and offsets in the field, without a mass: from slow motion and the gravity record."""
+
+import getpass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+if TYPE_CHECKING:
+    from armlink.armfile import ArmFile
+    from calib.field import FieldFit
+    from calib.field_rows import FieldRows
+    from calib.records import CalibrationRecord
+
+
+def recalibrate(
+    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
+    data: Annotated[list[Path], typer.Argument(help="Recordings of slow motion or rests, or sweep directories.")],
+    held: Annotated[
+        Literal["record", "raw"],
+        typer.Option(
+            help="What the controllers held while recording: the current record's pairs, or gain 1, offset 0."
+        ),
+    ] = "record",
+    apply: Annotated[bool, typer.Option("--apply", help="Also write them to the controllers.")] = False,
+    bus: Annotated[str | None, typer.Option(help="With --apply: INTERFACE:CHANNEL[@BITRATE].")] = None,
+    check: Annotated[
+        bool, typer.Option(help="With --apply: a small motion of every joint before and after; worse is taken back.")
+    ] = True,
+    flash: Annotated[bool, typer.Option("--flash", help="With --apply: also store to the controllers' flash.")] = False,
+    replaced: Annotated[
+        list[str] | None, typer.Option(help="With --apply: a joint whose sensor was exchanged since the last record.")
+    ] = None,
+    store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")
+    ] = None,
+) -> None:
+    """Find gains and offsets against the current gravity record, and keep them; --apply also makes them current.
+
+    The arm carries nothing, and every joint moves slowly (below 0.1 rad/s) or rests, in both directions.
+
+    Example: armlink recalibrate sarcos slow.mcap --json -
+    """
+    from armlink.armfile import load_arm
+    from armlink.commands.output import write_json
+    from armlink.errors import Refused
+    from calib.field import fit_field
+    from calib.field_record import field_record
+    from calib.records import CalibrationRecord, GravityRecord
+    from calib.store import RecordStore
+
+    arm_file, records = load_arm(arm), RecordStore(store)
+    gravity, before = records.current(GravityRecord, arm_file), records.current(CalibrationRecord, arm_file)
+    if gravity is None:
+        raise Refused(f"{arm_file.name} {arm_file.serial}: no gravity record yet: armlink identify makes one")
+    rows, sources = _rows(arm_file, data, before if held == "record" else None)
+    fit = fit_field(arm_file, rows, gravity, before)
+    record = field_record(arm_file, fit, before, {**sources, f"gravity record {gravity.id}": gravity.id})
+    _show(fit)
+    if apply:
+        import numpy as np
+
+        from calib.applying import Apply, apply_field
+
+        user = getpass.getuser()
+        record = record.model_copy(update={"confirmed_by": user})
+        how = Apply(by=user, bus=bus, replaced=tuple(replaced or ()), check=check, flash=flash)
+        apply_field(record, arm_file, records, rows, fit, np.array(gravity.beta), how)
+    else:
+        records.add(record)
+        typer.echo(f"record {record.id} is kept; the controllers hold what they held (--apply writes it)", err=True)
+    write_json(json_file, _answer(fit, record, gravity.id, apply))
+
+
+def _rows(
+    arm_file: "ArmFile", data: list[Path], held: "CalibrationRecord | None"
+) -> "tuple[FieldRows, dict[str, str]]":
+    """Rows of all recordings and sweeps, and the SHA-256 of each."""
+    import hashlib
+
+    import numpy as np
+
+    from armlink.errors import BadInput
+    from armlink.recording import load_recording
+    from calib.dataset import load_data
+    from calib.field_rows import join, rows_of_recording, rows_of_sweeps
+
+    n = len(arm_file.joint_names)
+    gain, offset = (np.ones(n), np.zeros(n)) if held is None else (held.values("gain", 1.0), held.values("offset", 0.0))
+    parts, sources = [], {}
+    for number, path in enumerate(data):
+        if path.is_dir():
+            sweeps = load_data(path).require(arm_file)
+            parts.append(rows_of_sweeps(sweeps, number))
+            sources[path.name] = sweeps.digest
+            continue
+        recording = load_recording(path)
+        if recording.n != n:
+            raise BadInput(f"{path}: {recording.n} joints, but {arm_file.name} has {n}")
+        parts.append(rows_of_recording(recording, gain, offset, number, str(path)))
+        sources[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return join(parts), sources
+
+
+def _answer(fit: "FieldFit", record: "CalibrationRecord", gravity: str, applied: bool) -> dict[str, Any]:
+    return {
+        "schema": "armlink.field/1",
+        "record": record.id,
+        "gravity_record": gravity,
+        "applied": applied,
+        "joints": list(fit.names),
+        "gain": {"estimated": fit.gain.tolist(), "ci95": fit.ci95("gain").tolist()},
+        "offset": {"estimated": fit.offset.tolist(), "ci95": fit.ci95("offset").tolist()},
+        "hysteresis": fit.hysteresis.tolist(),
+        "common_scale_std": fit.common_scale_std,
+        "not_separable": [
+            {"joint": joint, "parameter": parameter, "reason": reason}
+            for (joint, parameter), reason in fit.reasons.items()
+        ],
+        "rows": fit.rows.tolist(),
+    }
+
+
+def _show(fit: "FieldFit") -> None:
+    from calib.commands.screen import print_intervals, print_lines
+
+    columns = {
+        "gain": (fit.gain, 1.96 * fit.std("gain")),
+        "offset [N·m]": (fit.offset, 1.96 * fit.std("offset")),
+        "hysteresis [N·m]": (fit.hysteresis, 0 * fit.hysteresis),
+    }
+    print_intervals("Sensors in the field, ± half of the 95 % interval", fit.names, columns)
+    lines = [f"{joint} {parameter}: {reason}" for (joint, parameter), reason in fit.reasons.items()]
+    lines.append(
+        f"a factor common to all gains is known to ± {1.96 * fit.common_scale_std:.2%} only (within the intervals):"
+        " these readings cannot tell it from the scale of the gravity record"
+    )
+    print_lines(lines)
