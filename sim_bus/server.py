@@ -47,6 +47,8 @@ class Server:
             self._line = self._injector
             for fault in faults:
                 self._injector.inject(fault)
+        self._fd = False
+        """Nodes answer as they are spoken to: in classical frames or in CAN FD's."""
         self.on_wrong: Callable[[str], None] = lambda wrong: None
         """Takes what was wrong with an order."""
         self._synced = now()
@@ -85,8 +87,9 @@ class Server:
         self._flush()
 
     def _frame(self, message: can.Message) -> None:
-        if message.is_error_frame or message.is_remote_frame or message.is_extended_id or message.is_fd:
+        if message.is_error_frame or message.is_remote_frame or message.is_extended_id:
             return
+        self._fd = message.is_fd
         if not self._lockstep:
             self._let_time_pass()
         self._line.on_frame(message.arbitration_id, bytes(message.data))
@@ -119,6 +122,8 @@ class Server:
                 data=data,
                 is_extended_id=False,
                 is_error_frame=is_error,
+                is_fd=self._fd and not is_error,
+                bitrate_switch=self._fd and not is_error,
                 check=False,
             )
             try:

@@ -1,15 +1,21 @@
 """`armlink sim`: the arm in a process of its own, on a bus that others share."""
 
+import os
 import signal
+import struct
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import can
 import pytest
 from rig import one_joint
 
 from armlink.cli import run
+from armlink.errors import BadInput
+from sim_bus.cia402 import State
+from sim_bus.control import ControlPipe
 from sim_bus.options import Drift
 from sim_bus.server import Server
 from sim_bus.simulated_arm import SimulatedArm
@@ -93,8 +99,10 @@ def test_in_lock_step_a_sync_is_a_period(ends: tuple[can.BusABC, can.BusABC]) ->
 def test_a_process_answers_until_it_is_signalled(number: int, status: int) -> None:
     group = "239.74.163.29"
     command = ["-c", "from armlink.cli import main; main()", "sim", "sarcos", "--bus", f"udp_multicast:{group}"]
-    with can.Bus(group, interface="udp_multicast") as host:
-        process = subprocess.Popen([sys.executable, *command], stderr=subprocess.PIPE, text=True)
+    port = 44200 + os.getpid() % 1000  # of one's own: all groups on one port hear each other
+    environment = {**os.environ, "CAN_CONFIG": f'{{"port": {port}}}'}
+    with can.Bus(group, interface="udp_multicast", port=port) as host:
+        process = subprocess.Popen([sys.executable, *command], stderr=subprocess.PIPE, text=True, env=environment)
         try:
             assert process.stderr is not None
             assert "nodes 1, 2, 3, 4, 5, 6, 7" in process.stderr.readline()
@@ -106,3 +114,64 @@ def test_a_process_answers_until_it_is_signalled(number: int, status: int) -> No
         finally:
             process.send_signal(number)
             assert process.wait(20) == status
+
+
+def test_in_lock_step_a_host_that_died_is_noticed(ends: tuple[can.BusABC, can.BusABC]) -> None:
+    arm_end, host_end = ends
+    described, hand = one_joint(), Hand()
+    arm = SimulatedArm(described, Truth.of(described))
+    server = Server(arm, arm_end, lockstep=True, now=hand.now)
+
+    def send(can_id: int, data: bytes) -> None:
+        host_end.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+        hand.time += 0.01
+        server.turn()
+
+    send(0x605, struct.pack("<BHBI", 0x23, 0x1016, 1, 0x7E << 16 | 50))
+    send(0x605, struct.pack("<BHBh2x", 0x2B, 0x6007, 0, 3))
+    send(0, b"\1\0")
+    for word in (0x06, 0x07, 0x0F, 0x0F):
+        send(0x205, struct.pack("<Hhi", word, 0, 0))
+        send(0x77E, b"\5")
+        send(0x80, b"")
+    assert arm.drives.state == [State.ENABLED]
+    hand.time += 0.5  # a host that thinks: time rests
+    server.turn()
+    assert arm.drives.state == [State.ENABLED]
+    for _ in range(10):
+        hand.time += 0.2
+        server.turn()
+    assert arm.drives.state == [State.QUICK_STOP]
+
+
+def test_orders_through_a_pipe_change_the_running_arm(ends: tuple[can.BusABC, can.BusABC], tmp_path: Path) -> None:
+    described, hand, wrong = one_joint(), Hand(), []
+    arm = SimulatedArm(described, Truth.of(described))
+    pipe = ControlPipe(tmp_path / "arm.pipe")
+    server = Server(arm, ends[0], now=hand.now, control=pipe)
+    server.on_wrong = wrong.append
+
+    def order(*lines: str) -> None:
+        pipe.path.write_text("".join(f"{line}\n" for line in lines))
+        server.turn()
+
+    order("effect friction.coulomb:hinge:1.5", "drift hinge:1.1:0.2", "mass 0.5")
+    assert [entry.effect for entry in arm.effects] == ["friction.coulomb"]
+    assert arm.true_sensors.gain[0] == pytest.approx(1.1)
+    assert arm.gravity_torque(arm.plant.position)[0, 0] == pytest.approx(9.81 * 0.2)  # at the flange, on the axis
+    order("effects none", "fault node.silent:hinge")
+    assert arm.effects == ()
+    assert arm.nodes[0].unplugged
+    order("faults none")
+    assert not arm.nodes[0].unplugged
+    order("dance", "effect nothing:hinge:1", "mass heavy", "fault node.silent")
+    assert len(wrong) == 4
+    assert "effect ID:JOINT:VALUE" in wrong[0]
+    pipe.close()
+    assert not pipe.path.exists()
+
+
+def test_a_file_is_no_pipe(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BadInput, match="no named pipe"):
+        ControlPipe(tmp_path / "file")

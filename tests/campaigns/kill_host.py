@@ -1,0 +1,67 @@
+"""Kill, or stop, the host while a bias torque is on, again and again: is every joint safe within its deadline?
+
+`kill_host.py [--tries 100] [--bus udp_multicast:239.74.163.77] [--stop]`; a try is one host process. Exit status 0
+where every joint was in quick stop or without power within the deadline in every try.
+"""
+
+import argparse
+import json
+import os
+import signal
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "faults"))
+
+from processes import ENABLED, SAFE, Ear, simulated, start_host, write_arm
+
+RATE, DEADLINE = 50.0, 0.25
+SLACK = 0.1
+"""What this script and the simulated arm's process may add to the deadline: both share the machine [s]."""
+
+
+def one_try(arm: Path, bus: str, ear: Ear, number: int) -> float:
+    """Seconds from the signal until every joint was safe; infinite where one was not within ten deadlines."""
+    ear.forget()
+    host = start_host(arm, bus)
+    try:
+        assert host.stdout is not None
+        said = host.stdout.readline().strip()
+        if said != "pushing" or not ear.listen(ENABLED, 10.0):
+            raise RuntimeError(f"the host does not get the joints enabled: {said}")
+        time.sleep(0.013 * (number % 20) / 20)  # so that the signal strikes anywhere in the cycle
+        struck = time.monotonic()
+        os.kill(host.pid, signal.SIGSTOP if number < 0 else signal.SIGKILL)
+        safe = ear.listen(SAFE, 10 * DEADLINE)
+        return max(ear.when.values()) - struck if safe else float("inf")
+    finally:
+        host.kill()
+        host.wait()
+
+
+def main() -> int:
+    """Run the campaign and say what it saw."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--tries", type=int, default=100)
+    parser.add_argument("--bus", default="udp_multicast:239.74.163.77")
+    parser.add_argument("--stop", action="store_true", help="SIGSTOP in place of SIGKILL")
+    chosen = parser.parse_args()
+    if chosen.bus.startswith("udp_multicast"):  # a port of one's own: all groups on one port hear each other
+        os.environ["CAN_CONFIG"] = json.dumps({"port": 43200 + os.getpid() % 1000})
+    with tempfile.TemporaryDirectory() as folder:
+        arm, ear = write_arm(Path(folder), RATE, DEADLINE), Ear(chosen.bus)
+        with simulated(arm, chosen.bus):
+            numbers = range(-chosen.tries, 0) if chosen.stop else range(chosen.tries)
+            times = [one_try(arm, chosen.bus, ear, number) for number in numbers]
+        ear.bus.shutdown()
+    within = sum(seconds <= DEADLINE + SLACK for seconds in times)
+    verb = "stopped" if chosen.stop else "killed"
+    print(f"{verb}: every joint safe within {DEADLINE} s (+ {SLACK} s of the scheduler's) in {within} of {len(times)}")
+    print(f"median {sorted(times)[len(times) // 2]:.3f} s, longest {max(times):.3f} s, on {chosen.bus}")
+    return 0 if within == len(times) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
