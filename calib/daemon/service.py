@@ -26,7 +26,7 @@ from calib.events import Event
 from calib.recalibration import write_record
 from calib.records import CalibrationRecord, GravityRecord
 from calib.store import RecordStore
-from calib.writing import Controllers
+from calib.writing import Controllers, mend
 
 BELIEF_SECONDS = 5.0
 """The observer's belief is kept at least so often while there is something new."""
@@ -241,7 +241,34 @@ class Service:
         if back:
             self._fault_event(None, "the bus is back", {}, kind="recovered")
         self._held = up.held
-        self._compare()
+        if self.store.unfinished_write(self.arm) is None or self.recalibrations is None:
+            self._compare()
+        else:
+            self._mend()
+
+    def _mend(self) -> None:
+        """A write to the controllers was cut off (by a kill, say): they get back what they held before it."""
+        controllers, names = self.around.port.controllers, self.names
+
+        def work() -> tuple[tuple[float, float, int], ...]:
+            mend(self.arm, self.store, controllers)
+            held = [controllers.read_calibration(joint) for joint in range(len(names))]
+            return tuple((each.gain, each.offset, each.record_id) for each in held)
+
+        def done(outcome: tuple[tuple[float, float, int], ...] | Exception) -> None:
+            assert self.recalibrations is not None
+            self.recalibrations.busy = False
+            if isinstance(outcome, Exception):
+                self._raise_unknown(outcome)
+                self.say("fault", None, f"a write that was cut off could not be undone: {outcome}", {})
+                return
+            self.say("roll-back", None, "a write to the controllers that was cut off is undone", {})
+            self._held = outcome
+            self._compare()
+
+        assert self.recalibrations is not None
+        self.recalibrations.busy = True
+        self.around.run(work, done)
 
     def _compare(self) -> None:
         """What the controllers hold against the record in force; the policy apply writes it where they differ."""

@@ -1,0 +1,202 @@
+"""Campaign: the daemon over simulated days: quiet, drifts, payloads, slow drift, two joints at once; speed and memory.
+
+python tests/campaigns/daemon_days.py [--hours 24] [--payloads 100] [--seeds 3] [--only quiet …]
+Exit status 1 if a bound fails. The service as it is on a simulated seven-joint arm in ordinary motion, sample by
+sample (noise of 0.2 % of rated torque, quantisation, dynamics while it moves), without frames.
+"""
+
+import argparse
+import gc
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
+
+from fast_daemon import QUIET, FastDaemon
+
+from calib.daemon.settings import DaemonSection
+
+FOUND_SECONDS, GAIN_LEFT, OFFSET_LEFT, FOLLOWED, TOLD, GROWTH = 60.0, 0.003, 0.05, 0.002, 0.98, 0.01
+"""Bounds: median time to find, errors after recalibration, error while following, payloads told, memory."""
+HEAVY = 3.0
+"""A gain drift is asked for on joints whose gravity torque varies by more [N·m]."""
+
+
+def daemon(seed: int, policy: str = "apply") -> FastDaemon:
+    folder = Path(tempfile.mkdtemp(prefix="armlink-days-"))
+    return FastDaemon(folder, seed, DaemonSection.model_validate({"policy": policy, "recording": QUIET}))
+
+
+def memory() -> float:
+    """Resident memory now [MB]."""
+    gc.collect()
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 1e6
+
+
+def quiet(given: argparse.Namespace) -> list[str]:
+    """No drift: nothing is recalibrated, memory stays, faster than real time."""
+    there = daemon(1)
+    there.run(3600)
+    before, began = memory(), time.monotonic()
+    there.run((given.hours - 1) * 3600)
+    spent, growth = time.monotonic() - began, memory() / before - 1
+    alarms, written = len(there.of_kind("alarm")), len(there.of_kind("recalibration", "proposal"))
+    print(
+        f"quiet: {given.hours:g} h, {there.view.status().rows} stops, {alarms} alarms, {written} recalibrations, "
+        f"memory {before:.1f} MB {growth:+.2%}, {(given.hours - 1) * 3600 / spent:.0f} times real time",
+        flush=True,
+    )
+    wrong = ["a false recalibration"] * bool(written) + [f"memory grew by {growth:.2%}"] * (growth >= GROWTH)
+    return wrong + ["slower than real time"] * (spent > given.hours * 3600)
+
+
+def drifts(given: argparse.Namespace) -> list[str]:
+    """One joint's sensor changes: found, put right."""
+    wrong, heavy = [], daemon(0).fast.rms_torque() > HEAVY
+    for kind in ("offset", "gain"):
+        for joint in range(len(heavy)):
+            results = [drift(kind, joint, 100 * joint + seed) for seed in range(given.seeds)]
+            found = [result["found"] for result in results]
+            gain = max(result["gain"] for result in results)
+            offset = max(result["offset"] for result in results)
+            others = max(result["others"] for result in results)
+            written = [result["written"] for result in results]
+            name = f"{kind} of joint_{joint + 1}"
+            print(
+                f"drift: {name}: found after {np.median(found):.0f} s, written after {np.median(written):.0f} s, "
+                f"left {gain:.3%} and {offset:.3f} N·m, other joints written {others}",
+                flush=True,
+            )
+            if kind == "gain" and not heavy[joint]:
+                continue
+            wrong += [f"{name}: found after {np.median(found):.0f} s"] * bool(np.median(found) > FOUND_SECONDS)
+            wrong += [f"{name}: left {gain:.3%}, {offset:.3f} N·m"] * bool(gain > GAIN_LEFT or offset > OFFSET_LEFT)
+            wrong += [f"{name}: another joint was written"] * bool(others)
+    return wrong
+
+
+def drift(kind: str, joint: int, seed: int) -> dict[str, Any]:
+    there = daemon(seed)
+    there.run(120)
+    sign = 1 if seed % 2 else -1
+    if kind == "offset":
+        there.fast.offset[joint] += 0.2 * sign
+    else:
+        there.fast.gain[joint] *= 1 + 0.01 * sign
+    at, name = there.now(), f"joint_{joint + 1}"
+    there.run(900, until=lambda: bool(there.of_kind("recalibration")))
+    found = [event.t - at for event in there.of_kind("alarm", "drift") if event.joint == name and event.t >= at]
+    written = there.of_kind("recalibration")
+    gain, offset = (float(np.abs(error[joint])) for error in there.fast.error())
+    others = sum(event.joint != name for event in written)
+    first = written[0].t - at if written else np.inf
+    return {"found": min(found, default=np.inf), "written": first, "gain": gain, "offset": offset, "others": others}
+
+
+def payloads(given: argparse.Namespace) -> list[str]:
+    """Picked up, carried, put down: told from drift, mass and centre of mass reported, nothing written."""
+    told, written, masses, centres = 0, 0, [], []
+    random = np.random.default_rng(7)
+    there = daemon(500)
+    there.run(120)
+    for _ in range(given.payloads):
+        mass, point = random.uniform(0.5, 3.0), random.uniform(-0.15, 0.15, 3)
+        last = there.service.journal.last_event
+        there.fast.carry(mass, point)
+        there.run(float(random.uniform(60, 120)))
+        there.fast.put_down()
+        there.run(60)
+        events = [event for event in there.view.events(after=last) if event.kind in ("payload", "proposal", "drift")]
+        seen = [event for event in events if event.kind == "payload"]
+        told += bool(seen) and not any(event.kind == "drift" for event in events)
+        written += sum(event.kind == "proposal" for event in events)
+        if seen:
+            masses.append(seen[0].evidence["mass"] - mass)
+            centres.append(np.abs(np.array(seen[0].evidence["com"]) - point).max())
+    print(
+        f"payloads: {told} of {given.payloads} told from drift, {written} written, mass within "
+        f"{np.abs(masses).max() * 1e3:.1f} g, centre of mass within {max(centres) * 1e3:.1f} mm",
+        flush=True,
+    )
+    return ["payloads taken for drift"] * (told < TOLD * given.payloads) + ["a payload was written"] * bool(written)
+
+
+def slow(given: argparse.Namespace) -> list[str]:
+    """0.5 % an hour on one joint for six hours, the daemon recalibrating by itself."""
+    wrong = []
+    for joint, seed in ((1, 600), (3, 601)):
+        there, worst, estimate = daemon(seed), 0.0, 0.0
+        there.run(300)
+        for minute in range(360):
+            for _ in range(4):
+                there.fast.gain[joint] *= 1 + 0.005 / 240
+                there.run(15)
+            left = there.fast.error()[0][joint]
+            worst = max(worst, abs(left))
+            believed = there.view.estimates()[joint].gain - 1
+            estimate = max(estimate, abs(believed - left)) if minute > 10 else estimate
+        writes = len(there.of_kind("recalibration"))
+        others = {event.joint for event in there.of_kind("recalibration")} - {f"joint_{joint + 1}"}
+        print(
+            f"slow: 0.5 %/h on joint_{joint + 1}: readings within {worst:.3%}, estimate within {estimate:.3%}, "
+            f"{writes} recalibrations, of other joints {sorted(others)}",
+            flush=True,
+        )
+        wrong += [f"slow drift of joint_{joint + 1}: {worst:.3%}"] * bool(min(worst, estimate) > FOLLOWED)
+    return wrong
+
+
+def two(given: argparse.Namespace) -> list[str]:
+    """A step on one joint and a ramp on another at the same time."""
+    wrong = []
+    for seed in range(given.seeds):
+        there = daemon(700 + seed)
+        there.run(120)
+        there.fast.offset[1] += 0.5
+        for _ in range(60):
+            there.fast.gain[2] *= 1 + 0.03 / 60
+            there.run(3)
+        there.run(1500)
+        gain, offset = (np.abs(error).max() for error in there.fast.error())
+        print(f"two: a step on joint_2, a ramp on joint_3: left {gain:.3%} and {offset:.3f} N·m", flush=True)
+        wrong += [f"two at once: {gain:.3%}, {offset:.3f} N·m"] * bool(gain > GAIN_LEFT or offset > OFFSET_LEFT)
+    return wrong
+
+
+SCENARIOS: dict[str, Callable[[argparse.Namespace], list[str]]] = {
+    "drifts": drifts,
+    "payloads": payloads,
+    "slow": slow,
+    "two": two,
+    "quiet": quiet,
+}
+
+
+def main() -> int:
+    """Run, tell, judge."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--hours", type=float, default=24.0)
+    parser.add_argument("--payloads", type=int, default=100)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--only", nargs="*", choices=sorted(SCENARIOS), default=list(SCENARIOS))
+    given = parser.parse_args()
+    import logging
+
+    logging.getLogger("armlink.daemon").setLevel(logging.CRITICAL)
+    wrong = [line for name in given.only for line in SCENARIOS[name](given)]
+    for line in wrong:
+        print(f"FAILED: {line}")
+    print("passed" if not wrong else f"{len(wrong)} bounds failed")
+    return int(bool(wrong))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,232 @@
+"""Campaign: the daemon killed (SIGKILL) at random moments; nothing kept is lost, nothing is left half done.
+
+python tests/campaigns/daemon_kills.py [--kills 100] [--bus-kills 10] [--seed 0]
+Exit status 1 if a bound fails. Two parts. In the first the service runs as fast as it can on an arm whose sensors keep
+drifting, policy apply, so that kills fall into writes too; controllers are a table in a file. In the second the whole
+`armlink daemon` drives `armlink sim` over a bus (udp_multicast, no root), and the joints are looked at after each kill.
+"""
+
+import argparse
+import json
+import os
+import random
+import signal
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
+
+LOST_ROWS = 8
+"""Stops of the arm that the observer may have to see again: five seconds of work, and one moved on meanwhile."""
+HOLDING = {"quick stop active", "operation enabled"}
+STILL = 0.02
+"""How far a joint may move after a kill, once it has stopped [rad]."""
+
+
+def life(folder: Path, seed: int) -> None:
+    """One life of the service, until it is killed: says on stdout what is on disk."""
+    import logging
+
+    from fast_daemon import QUIET, FastDaemon
+
+    from calib.daemon.settings import DaemonSection
+    from calib.records import CalibrationRecord
+
+    logging.disable(logging.CRITICAL)
+    given = {"policy": "apply", "recording": QUIET, "rest_between_writes": 1.0, "writes_per_day": 100000}
+    world = np.memmap(folder / "world", dtype=float, mode="r+", shape=(6, 7))  # survives the kill, as an arm does
+    fresh = world[5, 0] == 0
+
+    class Daemon(FastDaemon):
+        def start(self, up: bool = True) -> None:
+            fast = self.fast
+            fast.random = np.random.default_rng([seed, 3])
+            self.clock_shift = float(world[5, 0])
+            if fresh:
+                world[0], world[2] = 1.0, 1.0
+            fast.gain, fast.offset, fast.held_gain, fast.held_offset = world[0], world[1], world[2], world[3]
+            self.ids = [int(number) for number in world[4]]
+            super().start(up)
+
+        def write_calibration(self, joint: int, *args: Any, **kwargs: Any) -> Any:
+            answer = super().write_calibration(joint, *args, **kwargs)
+            world[4, joint] = self.ids[joint]
+            return answer
+
+    daemon = Daemon(folder, 1, DaemonSection.model_validate(given), records=fresh)
+    current = daemon.store.current(CalibrationRecord, daemon.arm)
+    right = np.allclose(daemon.fast.held_gain, current.values("gain"), rtol=1e-6)
+    right &= np.allclose(daemon.fast.held_offset, current.values("offset"), atol=1e-5)
+    tell(start=daemon.view.status().rows, right=bool(right), record=current.id)
+    drifts = np.random.default_rng([seed, 4])
+    while True:
+        joint = int(drifts.integers(7))
+        if np.abs(daemon.fast.error()[1]).max() < 0.1:
+            daemon.fast.offset[joint] += float(drifts.choice([-0.3, 0.3]))
+        daemon.run(2.0)
+        world[5, 0] = daemon.now()
+        kept = daemon.service.journal.belief()
+        rows = kept.state["rows"] if kept else 0
+        proposals = [[row.id, row.state] for row in daemon.service.journal.proposals(5)]
+        tell(event=daemon.service.journal.last_event, rows=rows, proposals=proposals)
+
+
+def tell(**what: Any) -> None:
+    print(json.dumps(what), flush=True)
+
+
+def check_disk(folder: Path, acknowledged: dict[str, Any]) -> list[str]:
+    """What is wrong with the files after a kill."""
+    wrong = []
+    for name in ("state/journal.db", "records.db"):
+        with sqlite3.connect(folder / name) as db:
+            if db.execute("PRAGMA integrity_check").fetchone()[0] != "ok":
+                wrong.append(f"{name} is torn")
+    with sqlite3.connect(folder / "state" / "journal.db") as db:
+        ids = [row[0] for row in db.execute("SELECT id FROM events ORDER BY id")]
+        proposals = {row[0] for row in db.execute("SELECT id FROM proposals")}
+        records = [row[0] for row in db.execute("SELECT record FROM proposals")]
+    if ids != list(range(1, len(ids) + 1)) or len(ids) < acknowledged.get("event", 0):
+        wrong.append(f"events lost: {len(ids)} of {acknowledged.get('event')}")
+    if not {number for number, _ in acknowledged.get("proposals", [])} <= proposals:
+        wrong.append("a proposal is lost")
+    with sqlite3.connect(folder / "records.db") as db:
+        kept = {row[0] for row in db.execute("SELECT id FROM records")}
+    return wrong + ["a proposal without its record"] * (not set(records) <= kept)
+
+
+def kill_service(given: argparse.Namespace) -> list[str]:
+    """The first part."""
+    folder = Path(tempfile.mkdtemp(prefix="armlink-kills-"))
+    np.zeros((6, 7)).tofile(folder / "world")
+    choose, wrong, written, acknowledged = random.Random(given.seed), list[str](), 0, dict[str, Any]()
+    for number in range(given.kills):
+        command = [sys.executable, __file__, "--life", str(folder), "--seed", str(number)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+            assert process.stdout is not None
+            started = json.loads(process.stdout.readline() or "{}")
+            if not started.get("right"):
+                wrong.append(f"kill {number}: after it the controllers do not hold the record in force: {started}")
+            if started.get("start", 0) < acknowledged.get("rows", 0) - LOST_ROWS:
+                wrong.append(f"kill {number}: the observer went back from {acknowledged} to {started}")
+            os.set_blocking(process.stdout.fileno(), True)
+            time.sleep(choose.expovariate(1 / 2.0))
+            process.send_signal(signal.SIGKILL)
+            for line in process.stdout:
+                if line.endswith("\n"):
+                    acknowledged = json.loads(line)
+        wrong += [f"kill {number}: {what}" for what in check_disk(folder, acknowledged)]
+    with sqlite3.connect(folder / "state" / "journal.db") as db:
+        states = dict(db.execute("SELECT state, COUNT(*) FROM decisions GROUP BY state").fetchall())
+        written = states.get("applied", 0)
+        undone = db.execute("SELECT COUNT(*) FROM events WHERE kind = 'roll-back' AND joint IS NULL").fetchone()[0]
+    print(
+        f"service: {given.kills} kills, {acknowledged.get('event')} events, {written} recalibrations, "
+        f"{undone} cut-off writes undone, {len(wrong)} wrong",
+        flush=True,
+    )
+    return wrong
+
+
+def kill_daemon(given: argparse.Namespace) -> list[str]:
+    """The second part: the joints hold after each kill, whichever process it hits."""
+    from daemon_bench import good_records
+
+    from armlink.armfile import load_arm
+    from calib.store import RecordStore
+    from sim_bus.simulated_arm import SimulatedArm
+    from sim_bus.truth import Truth
+
+    folder, armlink = Path(tempfile.mkdtemp(prefix="armlink-kills-")), Path(sys.executable).with_name("armlink")
+    bus, choose, wrong, starts = given.bus, random.Random(given.seed), list[str](), list[float]()
+    arm = load_arm("sarcos")
+    store = RecordStore(str(folder / "records.db"))
+    for record in good_records(arm, SimulatedArm(arm, Truth.of(arm), 0).true_sensors):
+        store.put(record, arm, by="ann", reason="sweep")
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen([armlink, "sim", "sarcos", "--bus", bus], **quiet) as simulated:
+        time.sleep(5)
+        daemon = [armlink, "daemon", "sarcos", "--bus", bus, "--work", "--store", folder / "records.db"]
+        daemon += ["--state", folder / "state"]
+        for number in range(given.bus_kills):
+            began = time.monotonic()
+            process = subprocess.Popen([str(part) for part in daemon], start_new_session=True, **quiet)
+            while state(folder) != "observing" and time.monotonic() - began < 60:
+                time.sleep(0.1)
+            starts.append(time.monotonic() - began)
+            time.sleep(choose.uniform(0.0, 3.0))
+            both = choose.random() < 0.5
+            if both:
+                os.killpg(process.pid, signal.SIGKILL)
+            else:
+                process.kill()  # its bus process sees that and stops the arm itself
+            process.wait()
+            time.sleep(1.0)
+            before = joints(armlink, bus)
+            after = joints(armlink, bus)
+            states = {joint["state"] for joint in after}
+            moved = max(abs(a["position"] - b["position"]) for a, b in zip(before, after, strict=True))
+            if not states <= HOLDING or not moved < STILL:
+                wrong.append(f"bus kill {number}: {states}, moved {moved:.3f} rad")
+        simulated.terminate()
+    print(
+        f"daemon: {given.bus_kills} kills, observing after {np.median(starts):.1f} s (median), "
+        f"{max(starts):.1f} s at most, {len(wrong)} wrong",
+        flush=True,
+    )
+    return wrong
+
+
+def state(folder: Path) -> str:
+    """State of the daemon by its API, empty where it does not answer."""
+    command = [
+        "curl",
+        "-s",
+        "--max-time",
+        "1",
+        "--unix-socket",
+        folder / "state" / "api.sock",
+        "http://localhost/api/status",
+    ]
+    done = subprocess.run([str(part) for part in command], capture_output=True, text=True, check=False)
+    try:
+        return str(json.loads(done.stdout)["state"])
+    except (ValueError, KeyError):
+        return ""
+
+
+def joints(armlink: Path, bus: str) -> list[dict[str, Any]]:
+    """The joints as another host sees them."""
+    command = [armlink, "monitor", "sarcos", "--bus", bus, "--sync", "--cycles", "3", "--json", "-"]
+    done = subprocess.run([str(part) for part in command], capture_output=True, text=True, check=False)
+    return list(json.loads(done.stdout)["joints"])
+
+
+def main() -> int:
+    """Run, tell, judge."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=100)
+    parser.add_argument("--bus-kills", type=int, default=10)
+    parser.add_argument("--bus", default="udp_multicast:239.74.163.9")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--life", type=Path, help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.life is not None:
+        life(given.life, given.seed)
+    wrong = kill_service(given) if given.kills else []
+    wrong += kill_daemon(given) if given.bus_kills else []
+    for line in wrong:
+        print(f"FAILED: {line}")
+    print("passed" if not wrong else f"{len(wrong)} bounds failed")
+    return int(bool(wrong))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
