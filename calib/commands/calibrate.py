@@ -23,6 +23,7 @@ def calibrate(
     replaced: Annotated[
         list[str] | None, typer.Option(help="With --apply: a joint whose sensor was exchanged since the last record.")
     ] = None,
+    report: Annotated[Path | None, typer.Option(help="Also write a page to file: one self-contained HTML.")] = None,
     store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")
@@ -55,6 +56,11 @@ def calibrate(
     if apply:
         user = getpass.getuser()
         record = record.model_copy(update={"confirmed_by": user})
+    if report is not None:
+        from calib.report.calibration import Calibrated, write_report
+
+        write_report(Calibrated(arm_file, data, fit, record, current), report)
+    if apply:
         how = Apply(by=user, bus=bus, replaced=tuple(replaced or ()), check=check, flash=flash)
         beta = None if np.isnan(fit.value("gain")).all() else fit.fit.complete.beta
         written = apply_calibration(record, arm_file, records, data, beta, how)

@@ -19,6 +19,7 @@ def verify(
     store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
     poses: Annotated[int, typer.Option(min=1, help="Poses to drive to.")] = 24,
     seed: Annotated[int, typer.Option(min=0, help="Draws other poses.")] = 0,
+    report: Annotated[Path | None, typer.Option(help="Also write a page to file: one self-contained HTML.")] = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")
     ] = None,
@@ -42,6 +43,10 @@ def verify(
             link.enable()
             result = run_verify(link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=screen.count)
     _show(result)
+    if report is not None:
+        from calib.report.verification import write_report
+
+        write_report(result, arm_file, gravity, calibration, report)
     write_json(json_file, _answer(result, gravity, calibration))
     return 0 if result.passed else 1
 

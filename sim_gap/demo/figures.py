@@ -7,21 +7,14 @@ import numpy.typing as npt
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
+from calib.report.figures import COLOURS, GREY, PANEL, add_sweeps
 from calib.sensors import SensorFit
-from calib.verify import Verification
 from gcomp.arm import Arm
-from gcomp.readings import Readings
-from gcomp.sensor_model import predict
 from sim_gap.demo.drift import Drift
 
 Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
 
-COLOURS = ("#1f5fa8", "#d9622b", "#3c8d5a", "#8a4fa3", "#b8912b", "#4f7f95", "#a83248", "#5b6b7a")
-GREY, RED = "#9aa7b3", "#a83248"
-CURVE_POINTS = 60
-PANEL = 230
-"""Height of a row of panels [px]."""
+RED = "#a83248"
 
 
 def sweep_figure(arm: Arm, fit: SensorFit) -> Any:
@@ -30,57 +23,9 @@ def sweep_figure(arm: Arm, fit: SensorFit) -> Any:
     titles = [title for name in fit.names for title in (f"{name}: sensor [N·m]", f"{name}: residual [N·m]")]
     figure = make_subplots(rows=n, cols=2, column_widths=[0.62, 0.38], subplot_titles=titles, vertical_spacing=0.25 / n)
     for row in range(n):
-        _sweeps_of_joint(figure, arm, fit, row)
+        add_sweeps(figure, arm, fit, row, row=row + 1, intervals=False)
     figure.update_xaxes(title_text="position reading [rad]", row=n)
     return figure.update_layout(height=PANEL * n + 80, showlegend=False)
-
-
-def _sweeps_of_joint(figure: Any, arm: Arm, fit: SensorFit, joint: int) -> None:
-    rows = fit.rows
-    for colour, sweep in enumerate(dict.fromkeys(np.array(rows.sweep)[rows.swept == joint].tolist())):
-        at = np.flatnonzero((rows.swept == joint) & (np.array(rows.sweep) == sweep))
-        at = at[np.argsort(rows.readings.position[at, joint])]
-        x, y = rows.readings.position[at, joint], rows.readings.torque[at, joint]
-        left, up = fit.fit.residual[at, joint], rows.direction[at] > 0
-        place = {"name": sweep, "row": joint + 1}
-        paint = COLOURS[colour % len(COLOURS)]
-        marker = {"color": paint, "size": 7, "symbol": np.where(up, "triangle-right", "triangle-left")}
-        angle, reading = _curve(arm, fit, at, joint)
-        figure.add_scatter(x=angle, y=reading, mode="lines", line={"color": paint, "width": 1.5}, col=1, **place)
-        figure.add_scatter(x=x, y=y, mode="markers", marker=marker, col=1, **place)
-        figure.add_scatter(x=x, y=left, mode="markers", marker=marker, col=2, **place)
-
-
-def _curve(arm: Arm, fit: SensorFit, rows: Indices, joint: int) -> tuple[Array, Array]:
-    """(Position, reading) of the fitted model between the first and the last of one sweep's rows."""
-    readings = fit.rows.readings
-    position = np.repeat(readings.position[rows].mean(axis=0)[None], CURVE_POINTS, axis=0)
-    position[:, joint] = np.linspace(
-        readings.position[rows[0], joint], readings.position[rows[-1], joint], CURVE_POINTS
-    )
-    asked = Readings.of(position, np.zeros_like(position), 1.0, readings.load[rows[0]])
-    return position[:, joint], predict(arm, fit.fit.complete, asked)[:, joint]
-
-
-def verify_figure(check: Verification) -> Any:
-    """The paper's Figure 6: pose number against torque, model solid, sensor dashed, a panel a joint."""
-    n = len(check.names)
-    titles = [f"{name}, RMS {rms:.3f} N·m" for name, rms in zip(check.names, check.rms, strict=True)]
-    rows = (n + 1) // 2
-    figure = make_subplots(rows=rows, cols=2, subplot_titles=titles, vertical_spacing=0.3 / rows)
-    number = np.arange(1, len(check.position) + 1)
-    for joint in range(n):
-        place = {"row": joint // 2 + 1, "col": joint % 2 + 1}
-        for name, y, dash, colour in (
-            ("model", check.model, "solid", COLOURS[0]),
-            ("sensor", check.sensor, "dash", COLOURS[1]),
-        ):
-            line = {"color": colour, "width": 2, "dash": dash}
-            first = {"legendgroup": name, "showlegend": joint == 0}
-            figure.add_scatter(x=number, y=y[:, joint], name=name, line=line, **first, **place)
-    figure.update_xaxes(title_text="pose number", row=rows)
-    figure.update_yaxes(title_text="N·m", col=1)
-    return figure.update_layout(height=PANEL * rows + 90, legend={"orientation": "h", "y": 1.06, "x": 0})
 
 
 def drift_figure(drift: Drift) -> Any:

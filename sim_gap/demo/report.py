@@ -5,8 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.report.figures import verify_figure
 from calib.report.page import ReportTable, Section, paragraph, render
-from sim_gap.demo.figures import drift_figure, error_bars, sweep_figure, verify_figure
+from sim_gap.demo.figures import drift_figure, error_bars, sweep_figure
 from sim_gap.demo.show import drift_line, gap_line
 from sim_gap.demo.summary import SHOWN, DemoResult
 from sim_gap.report import sections as gap_sections

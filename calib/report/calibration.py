@@ -1,0 +1,218 @@
+"""The report of a calibration as one page to file: what, from what, per joint and sweep, before and after."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from armlink.armfile import ArmFile
+from calib.dataset import SweepData
+from calib.description import gcomp_arm
+from calib.diff import differences
+from calib.gates import heldout_scores
+from calib.records import Array, CalibrationRecord, Parameter
+from calib.report.figures import before_after_figure, joint_figure, left_out_figure, sweep_rows, sweeps_of
+from calib.report.page import ReportTable, Section, paragraph, render
+from calib.sensors import SensorFit
+from gcomp.gravity import gravity_torque
+
+PARAMETERS: tuple[tuple[Parameter, str, str], ...] = (
+    ("gain", "gain", "1"),
+    ("offset", "offset", "N·m"),
+    ("position_gain", "position gain", "1"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrated:
+    """What a report is made of."""
+
+    arm: ArmFile
+    data: Sequence[SweepData]
+    fit: SensorFit
+    record: CalibrationRecord
+    before: CalibrationRecord | None
+    """The record in force until now."""
+
+
+def write_report(done: Calibrated, path: Path) -> None:
+    """Write one self-contained HTML file; raises OSError."""
+    record = done.record
+    sections = [_identity(done), _sensors(done), _comparison(done), *_sweeps(done), _left_out(done)]
+    title = f"Calibration {record.id}: {record.arm} {record.serial}"
+    render(path, title, sections, f"{record.created:%Y-%m-%d %H:%M} UTC, {record.software}")
+
+
+def _identity(done: Calibrated) -> Section:
+    record, findings = done.record, done.fit.goodness.findings
+    broken = sorted({each.joint for each in findings if each.breaks_model})
+    verdict = f"the model does not hold: {', '.join(broken)}" if broken else "the model holds"
+    html = f'<p><span class="verdict">{escape(verdict)}</span></p>'
+    html += "".join(paragraph(f"{each.joint}: {each.text}") for each in findings)
+    rows = [
+        ["arm", escape(f"{record.arm}, serial {record.serial}")],
+        ["description (SHA-256)", f"<small>{record.description_hash}</small>"],
+        ["record", record.id + (f", replaces {record.parent}" if record.parent else ", the first of this arm")],
+        ["confirmed by", escape(record.confirmed_by or "nobody yet: kept, not written to controllers")],
+        [
+            "readings",
+            f"{len(done.fit.rows.swept)}, χ² {done.fit.fit.chi2:.0f} at {done.fit.fit.dof} degrees of freedom",
+        ],
+    ]
+    for data in done.data:
+        load = f"{data.manifest.reference_mass:g} kg attached" if data.manifest.reference_mass else "no mass"
+        when = f"{data.manifest.created:%Y-%m-%d %H:%M} UTC"
+        rows.append([f"sweeps {escape(data.path.name)}", f"{load}, {when}<br><small>SHA-256 {data.digest}</small>"])
+    return Section("What was calibrated", html, (), [ReportTable(("", ""), rows, texts=2)])
+
+
+def _sensors(done: Calibrated) -> Section:
+    fit = done.fit
+    header = [
+        "joint",
+        *(f"{title} [{unit}]" for _, title, unit in PARAMETERS),
+        "residual RMS [N·m]",
+        "hysteresis [N·m]",
+    ]
+    rows = []
+    for j, name in enumerate(fit.names):
+        cells = [_interval(fit.value(key)[j], fit.quantile * fit.std(key)[j]) for key, _, _ in PARAMETERS]
+        rows.append([escape(name), *cells, f"{fit.residual_rms[j]:.4f}", f"{fit.hysteresis[j]:.4f}"])
+    table = ReportTable(header, rows, "Estimates ± half of the 95 % interval; reading = gain · torque + offset.")
+    reasons = [f"{joint}, {parameter.replace('_', ' ')}: {why}." for (joint, parameter), why in fit.reasons.items()]
+    return Section("Sensors", "".join(paragraph(each) for each in reasons), (), [table])
+
+
+def _comparison(done: Calibrated) -> Section:
+    """Before and after: pairs in force until now against the new ones, on the same readings."""
+    before, record, names = done.before, done.record, done.fit.names
+    n = len(names)
+    if before is None:
+        manifest = done.data[0].manifest
+        old, label = (
+            (np.array(manifest.installed_gain), np.array(manifest.installed_offset)),
+            "as the controllers had it",
+        )
+    else:
+        old, label = (before.values("gain", 1.0), before.values("offset", 0.0)), f"record {before.id}"
+    new = record.values("gain"), record.values("offset")
+    rms = [_rms_of_pair(done, *pair) for pair in (old, new)]
+    shown = np.isfinite(rms[0]) & np.isfinite(rms[1])
+    text = (
+        "Calibrated torque less model torque over all readings without load: with the pairs in force until now, and"
+        " with the new ones."
+    )
+    figures = []
+    if shown.any():
+        figures.append(before_after_figure(tuple(np.array(names)[shown].tolist()), rms[0][shown], rms[1][shown], label))
+    header = ("joint", f"RMS with {label} [N·m]", "RMS now [N·m]")
+    rows = [[escape(names[j]), _number(rms[0][j], ".4f"), _number(rms[1][j], ".4f")] for j in range(n)]
+    tables = [ReportTable(header, rows)]
+    if before is not None:
+        tables.append(_changes(before, record))
+    else:
+        text += " This arm had no record before, so there is none to compare with."
+    return Section("Before and after", paragraph(text), figures, tables)
+
+
+def _changes(before: CalibrationRecord, record: CalibrationRecord) -> ReportTable:
+    rows = [
+        [
+            escape(each.joint),
+            each.parameter.replace("_", " ") + f" [{each.unit}]",
+            _number(each.before, ".5f"),
+            _number(each.after, ".5f"),
+            _number(each.change, "+.5f"),
+            _number(each.deviations, "+.1f"),
+        ]
+        for each in differences(before, record)
+        if each.before is not None or each.after is not None
+    ]
+    header = ("joint", "parameter", before.id, record.id, "change", "in standard deviations")
+    return ReportTable(header, rows, f"Against record {before.id} of {before.created:%Y-%m-%d %H:%M} UTC.", texts=2)
+
+
+def _rms_of_pair(done: Calibrated, gain: Array, offset: Array) -> Array:
+    """RMS (n,) of torque by a pair less model over own readings without load [N·m]; NaN where there is none."""
+    fit, rows = done.fit, done.fit.rows
+    complete = fit.fit.complete
+    counted = np.isfinite(rows.readings.torque) & (rows.readings.load == 0)[:, None]
+    q = rows.readings.position * complete.position_gain + complete.position_offset
+    model = gravity_torque(gcomp_arm(done.arm), complete.beta, q)
+    left = np.where(counted, (rows.readings.torque - offset) / gain - model, np.nan)
+    total = np.where(counted, left, 0.0)
+    rms: Array = np.sqrt((total**2).sum(axis=0) / np.maximum(counted.sum(axis=0), 1))
+    return np.where(counted.any(axis=0), rms, np.nan)
+
+
+def _sweeps(done: Calibrated) -> list[Section]:
+    arm, fit = gcomp_arm(done.arm), done.fit
+    text = (
+        "Up (▸) and down (◂), a colour a sweep. The line is the fit of all sweeps of all joints together; bars are the"
+        " 95 % interval of one reading."
+    )
+    left_out = {each.sweep: each for each in fit.goodness.left_out}
+    sections = []
+    for joint in reversed(range(len(fit.names))):
+        rows = []
+        for sweep in sweeps_of(fit, joint):
+            at = sweep_rows(fit, joint, sweep)
+            residual = fit.fit.residual[at, joint]
+            told = left_out.get(sweep)
+            angle = fit.rows.readings.position[at, joint]
+            rows.append(
+                [
+                    escape(sweep),
+                    f"{fit.rows.readings.load[at[0]]:g}",
+                    str(len(at)),
+                    f"{angle.min():.2f} … {angle.max():.2f}",
+                    _number(float(np.sqrt(np.nanmean(residual**2))), ".4f"),
+                    _number(float(np.nanmax(np.abs(residual))), ".4f"),
+                    "–" if told is None else f"{told.rms:.4f} ({told.ratio:.1f} ×)",
+                ]
+            )
+        header = (
+            "sweep",
+            "mass [kg]",
+            "readings",
+            "range [rad]",
+            "residual RMS [N·m]",
+            "largest [N·m]",
+            "told by the others [N·m]",
+        )
+        caption = "“Told by the others”: RMS of this sweep less a fit without it, and that over what is to be expected."
+        figures = [joint_figure(arm, fit, joint)] if rows else []
+        sections.append(
+            Section(f"Sweeps of {fit.names[joint]}", paragraph(text), figures, [ReportTable(header, rows, caption)])
+        )
+        text = ""
+    return sections
+
+
+def _left_out(done: Calibrated) -> Section:
+    """The paper's Figure 6 on steps that the fit has not seen."""
+    rows, fit = done.fit.rows, done.fit
+    score = heldout_scores(done.record, done.arm, rows, refit=True)
+    own = rows.own & (rows.readings.load == 0)[:, None]
+    complete = fit.fit.complete
+    sensor = np.where(own, (rows.readings.torque - complete.offset) / complete.gain, np.nan)
+    model = sensor - np.where(own, score * rows.readings.sigma, np.nan) / complete.gain
+    text = (
+        "Torque at steps that were left out (every second step of each sweep, then the others): the model fitted"
+        " without them, solid, and the sensor, dashed. Poses that no sweep has: armlink verify --report."
+    )
+    return Section(
+        "Model against sensor (the paper's Figure 6)", paragraph(text), [left_out_figure(fit.names, sensor, model)]
+    )
+
+
+def _interval(value: float, half: float) -> str:
+    if not np.isfinite(value):
+        return "not observable"
+    return f"{value:.4f} ± {half:.4f}" if half > 0 else f"{value:.4f}"
+
+
+def _number(value: float | None, form: str) -> str:
+    return "–" if value is None or not np.isfinite(value) else format(value, form)

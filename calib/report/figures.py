@@ -1,0 +1,126 @@
+"""Figures of the calibration report: sweeps with their fits, before and after, changes, and the paper's Figure 6."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import plotly.graph_objects as go
+from plotly.subplots import make_subplots
+
+from calib.sensors import SensorFit
+from calib.verify import Verification
+from gcomp.arm import Arm
+from gcomp.readings import Readings
+from gcomp.sensor_model import predict
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
+
+COLOURS = ("#1f5fa8", "#d9622b", "#3c8d5a", "#8a4fa3", "#b8912b", "#4f7f95", "#a83248", "#5b6b7a")
+GREY = "#9aa7b3"
+CURVE_POINTS = 60
+PANEL = 230
+"""Height of a row of panels [px]."""
+
+
+def sweeps_of(fit: SensorFit, joint: int) -> list[str]:
+    """Names of a joint's sweeps, as PASS/sweep, in the order they were taken."""
+    names = np.array(fit.rows.sweep)[fit.rows.swept == joint]
+    return list(dict.fromkeys(names.tolist()))
+
+
+def sweep_rows(fit: SensorFit, joint: int, sweep: str) -> Indices:
+    """Rows of one sweep, by position."""
+    at = np.flatnonzero((fit.rows.swept == joint) & (np.array(fit.rows.sweep) == sweep))
+    return at[np.argsort(fit.rows.readings.position[at, joint])]
+
+
+def joint_figure(arm: Arm, fit: SensorFit, joint: int) -> Any:
+    """One joint's sweeps: readings over position with the fitted curve, and residuals with their 95 % intervals."""
+    titles = ("sensor reading [N·m]", "reading less fit [N·m]")
+    figure = make_subplots(rows=1, cols=2, column_widths=[0.58, 0.42], subplot_titles=titles, horizontal_spacing=0.1)
+    add_sweeps(figure, arm, fit, joint, row=1, intervals=True)
+    figure.update_xaxes(title_text="position reading [rad]")
+    figure.update_layout(height=330, legend={"orientation": "h", "y": -0.28, "x": 0}, margin={"t": 40})
+    return figure
+
+
+def add_sweeps(figure: Any, arm: Arm, fit: SensorFit, joint: int, row: int, *, intervals: bool) -> None:
+    """Put a joint's sweeps into both columns of a row, up (▸) and down (◂)."""
+    readings = fit.rows.readings
+    for colour, sweep in enumerate(sweeps_of(fit, joint)):
+        at = sweep_rows(fit, joint, sweep)
+        x, y, left = readings.position[at, joint], readings.torque[at, joint], fit.fit.residual[at, joint]
+        place = {"name": sweep, "legendgroup": sweep, "row": row}
+        paint = COLOURS[colour % len(COLOURS)]
+        symbol = np.where(fit.rows.direction[at] > 0, "triangle-right", "triangle-left")
+        marker = {"color": paint, "size": 7, "symbol": symbol}
+        angle, reading = curve(arm, fit, at, joint)
+        line = {"color": paint, "width": 1.5}
+        figure.add_scatter(x=angle, y=reading, mode="lines", line=line, col=1, showlegend=False, **place)
+        figure.add_scatter(x=x, y=y, mode="markers", marker=marker, col=1, **place)
+        half = 1.96 * readings.sigma[at, joint] * fit.noise_factor[joint]
+        bars = {"type": "data", "array": half, "thickness": 1, "width": 2} if intervals else None
+        figure.add_scatter(x=x, y=left, error_y=bars, mode="markers", marker=marker, col=2, showlegend=False, **place)
+
+
+def curve(arm: Arm, fit: SensorFit, rows: Indices, joint: int) -> tuple[Array, Array]:
+    """(Position, reading) of the fitted model between the first and the last of one sweep's rows."""
+    readings = fit.rows.readings
+    position = np.repeat(readings.position[rows].mean(axis=0)[None], CURVE_POINTS, axis=0)
+    position[:, joint] = np.linspace(
+        readings.position[rows[0], joint], readings.position[rows[-1], joint], CURVE_POINTS
+    )
+    asked = Readings.of(position, np.zeros_like(position), 1.0, readings.load[rows[0]])
+    return position[:, joint], predict(arm, fit.fit.complete, asked)[:, joint]
+
+
+def before_after_figure(names: tuple[str, ...], before: Array, after: Array, label: str) -> Any:
+    """RMS of calibrated torque less model per joint (n,) [N·m], with the pairs before and with the new ones."""
+    figure = go.Figure()
+    figure.add_bar(x=list(names), y=before, name=label, marker_color=GREY)
+    figure.add_bar(x=list(names), y=after, name="this calibration", marker_color=COLOURS[0])
+    figure.update_yaxes(title_text="RMS [N·m], logarithmic", type="log", dtick=1, exponentformat="none")
+    return figure.update_layout(
+        barmode="group", height=330, legend={"orientation": "h", "y": 1.12, "x": 0}, margin={"t": 40}
+    )
+
+
+def left_out_figure(names: tuple[str, ...], sensor: Array, model: Array) -> Any:
+    """As the paper's Figure 6: number of the reading against torque (K, n) [N·m], NaN left out."""
+    rms = [_rms(sensor[:, j] - model[:, j]) for j in range(len(names))]
+    columns = [np.isfinite(sensor[:, j] - model[:, j]) for j in range(len(names))]
+    return _panels(
+        [f"{name}, RMS {value:.3f} N·m" for name, value in zip(names, rms, strict=True)],
+        [(model[keep, j], sensor[keep, j]) for j, keep in enumerate(columns)],
+        "number of the reading",
+    )
+
+
+def verify_figure(check: Verification) -> Any:
+    """The paper's Figure 6: pose number against torque, model solid, sensor dashed, a panel a joint."""
+    return _panels(
+        [f"{name}, RMS {rms:.3f} N·m" for name, rms in zip(check.names, check.rms, strict=True)],
+        [(check.model[:, j], check.sensor[:, j]) for j in range(len(check.names))],
+        "pose number",
+    )
+
+
+def _panels(titles: list[str], pairs: list[tuple[Array, Array]], along: str) -> Any:
+    rows = (len(pairs) + 1) // 2
+    figure = make_subplots(rows=rows, cols=2, subplot_titles=titles, vertical_spacing=0.3 / rows)
+    for joint, pair in enumerate(pairs):
+        place = {"row": joint // 2 + 1, "col": joint % 2 + 1}
+        for name, y, dash, colour in zip(("model", "sensor"), pair, ("solid", "dash"), COLOURS, strict=False):
+            line = {"color": colour, "width": 2, "dash": dash}
+            first = {"legendgroup": name, "showlegend": joint == 0}
+            number = np.arange(1, len(y) + 1)
+            figure.add_scatter(x=number, y=y, mode="lines", name=name, line=line, **first, **place)
+    figure.update_xaxes(title_text=along, row=rows)
+    figure.update_yaxes(title_text="N·m", col=1)
+    return figure.update_layout(height=PANEL * rows + 90, legend={"orientation": "h", "y": 1.06, "x": 0})
+
+
+def _rms(values: Array) -> float:
+    kept = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(kept**2))) if len(kept) else float("nan")

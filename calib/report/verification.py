@@ -1,0 +1,42 @@
+"""The report of a verification: the paper's Figure 6 and its figures, as one page to file."""
+
+from html import escape
+from pathlib import Path
+
+from armlink.armfile import ArmFile
+from calib.records import CalibrationRecord, GravityRecord
+from calib.report.figures import verify_figure
+from calib.report.page import ReportTable, Section, paragraph, render
+from calib.verify import Verification
+
+
+def write_report(
+    result: Verification, arm: ArmFile, gravity: GravityRecord, calibration: CalibrationRecord | None, path: Path
+) -> None:
+    """Write one self-contained HTML file; raises OSError."""
+    verdict = "passed" if result.passed else "not passed"
+    sensors = "the controllers' own" if calibration is None else f"record {calibration.id}"
+    skipped = f" {result.skipped} poses were out of the drives' reach and left out." if result.skipped else ""
+    html = f'<p><span class="verdict">{verdict}</span></p>' + paragraph(
+        f"Gravity record {gravity.id} against the sensors calibrated by {sensors}, at {len(result.sensor)} random poses"
+        f" that no fit has seen.{skipped}"
+    )
+    header = ("joint", "RMS [N·m]", "allowed RMS", "largest [N·m]", "model's own standard deviation", "largest torque")
+    numbers = (
+        result.rms,
+        result.tolerance,
+        result.max_error,
+        result.model_std.mean(axis=0),
+        abs(result.model).max(axis=0),
+    )
+    rows = [[escape(name), *(f"{column[joint]:.4f}" for column in numbers)] for joint, name in enumerate(result.names)]
+    section = Section(
+        "Model against sensor (the paper's Figure 6)", html, [verify_figure(result)], [ReportTable(header, rows)]
+    )
+    title = f"Verification: {arm.name} {arm.serial}"
+    render(
+        path,
+        title,
+        [section],
+        f"gravity record {gravity.id} of {gravity.created:%Y-%m-%d %H:%M} UTC, {gravity.software}",
+    )
