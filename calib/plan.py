@@ -24,7 +24,7 @@ DEAD_LEVER = 0.005
 """Γ/g below which a joint feels no gravity: its offset is still swept, at one combination."""
 SLOWEST = 0.3
 """Acceleration that every planned sweep must allow [rad/s²]."""
-MASS_SHARES = (0.3, 0.5)
+MASS_SHARES = (0.3, 0.5, 0.7)
 """Shares of the torque left over gravity that the reference mass may take; the least that is precise enough."""
 ASSUMED_GRAVITY = 0.6
 """Share of max_torque that gravity is assumed to take while nothing has been measured."""
@@ -32,6 +32,8 @@ SERVO_GAP = 0.05
 """Distance from the stop at which a servo-held joint rests [rad]."""
 HAND = 0.15
 """How far from the flange the reference mass may hang [m]."""
+MORE_POSES = 2
+"""Stop combinations per joint that may be added to those asked for, to reach the gains' precision."""
 FINEST = 3.0
 """How many times finer than asked readings may be averaged to reach the gains' precision."""
 FASTEST = 2.0
@@ -39,11 +41,18 @@ FASTEST = 2.0
 
 
 def plan_sweep(
-    arm: ArmFile, guess: GravityGuess | None = None, *, seed: int = 0, reference_mass: float = 0.0
+    arm: ArmFile,
+    guess: GravityGuess | None = None,
+    *,
+    seed: int = 0,
+    reference_mass: float = 0.0,
+    resolution: Array | None = None,
 ) -> SweepPlan:
     """The plan of one pass over all joints, tip to base.
 
-    `reference_mass` [kg] is what hangs on the arm during this pass, 0 for nothing.
+    `reference_mass` [kg] is what hangs on the arm during this pass, 0 for nothing; `resolution` (n,) [rad] that of the
+    position readings, where known. Where two combinations a joint would not give the gains as exactly as asked,
+    up to `MORE_POSES` more are swept.
     Without `guess` nothing is known of the masses and no bias torque is set. With the scout's guess, combinations
     that cannot be held within max_torque are left out and the others get their bias torques. Raises BadInput where
     a joint's range is too short to sweep or no combination can be held.
@@ -61,23 +70,28 @@ def plan_sweep(
     masses = [given] if given else _reference_masses(described, limits, options, guess)
     mass = masses[-1]
     poses = section.loaded_poses if reference_mass else section.poses
-    counts = [1 if each.lever.max() < DEAD_LEVER else poses for each in options]
-    picks = choose(described, options, counts, moments, sigma, mass)
-    sweeps = [
-        _sweep(described.names[each.joint], number, each, pick, section, limits, guess)
-        for each, chosen in zip(options, picks, strict=True)
-        for number, pick in enumerate(chosen, start=1)
-    ]
     scout = scout_poses(described, section, limits, seed)
+    rounding = np.zeros(described.n) if resolution is None else resolution / np.sqrt(12.0)
     gain_std, finer = None, 1.0
-    if guess is not None:
+    for more in range(MORE_POSES + 1):
+        counts = [1 if each.lever.max() < DEAD_LEVER else poses + more for each in options]
+        picks = choose(described, options, counts, moments, sigma, mass)
+        sweeps = [
+            _sweep(described.names[each.joint], number, each, pick, section, limits, guess)
+            for each, chosen in zip(options, picks, strict=True)
+            for number, pick in enumerate(chosen, start=1)
+        ]
+        if guess is None:
+            break
         for mass in masses:
-            std = predicted_gain_std(guess, sweeps, np.array(scout), mass, sigma, section.position_offset_std)
+            std = predicted_gain_std(guess, sweeps, np.array(scout), mass, sigma, section.position_offset_std, rounding)
             gain_std = worst_gain_std(std)
             if gain_std <= section.gain_std:
                 break
         assert gain_std is not None
         finer = float(np.clip(gain_std / section.gain_std, 1.0, FINEST))
+        if gain_std <= FINEST * section.gain_std:
+            break
     return SweepPlan(
         sweeps=tuple(sweeps),
         scout=scout,

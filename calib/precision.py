@@ -14,7 +14,9 @@ from gcomp.readings import Readings
 Array = npt.NDArray[np.float64]
 SIDE = 0.05
 """Lateral place at which the reference mass is assumed to hang [m]."""
-HOPELESS = 0.05
+SCATTER = 1.3
+"""By how much readings scatter more than their samples' noise, for the joints never stand quite still."""
+HOPELESS = 0.15
 """A gain predicted worse than this is not one that more averaging could save."""
 
 
@@ -25,10 +27,12 @@ def predicted_gain_std(
     mass: float,
     sigma: Array,
     position_offset_std: float,
+    position_sigma: Array | float = 0.0,
 ) -> Array:
     """Standard deviations (n,) of the torque gains after passes without and with `mass` [kg]; inf if not observable.
 
-    scout (P, n) [rad] are poses at which all sensors count; sigma (n,) [N·m] is that of one reading.
+    scout (P, n) [rad] are poses at which all sensors count; sigma (n,) [N·m] is that of one reading, position_sigma
+    (n,) [rad] that of its positions.
     """
     arm = guess.arm
     positions, counted = [scout], [np.ones(scout.shape, dtype=bool)]
@@ -45,7 +49,7 @@ def predicted_gain_std(
     both = Readings.of(
         np.concatenate([position, position]),
         np.concatenate([torque, torque]),
-        sigma,
+        SCATTER * sigma,
         np.repeat([0.0, mass], rows),
     )
     unknown = {"gain", "offset", "position_gain", "beta", "rho"}
@@ -55,7 +59,9 @@ def predicted_gain_std(
         priors["position_offset"] = Prior(0.0, position_offset_std)
     tip = np.array([arm.a[-1] + SIDE, SIDE, arm.d[-1]])
     start = Parameters.nominal(arm.n, beta=guess.beta, rho=tip)
-    std: Array = predict_covariance(arm, both, start, unknown=unknown, priors=priors).std.gain
+    std: Array = predict_covariance(
+        arm, both, start, unknown=unknown, priors=priors, position_sigma=position_sigma
+    ).std.gain
     return std
 
 

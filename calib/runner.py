@@ -59,8 +59,8 @@ def run_sweep(
             first = plan_sweep(arm, seed=seed, reference_mass=reference_mass)
             run.total = first.readings
             run.scout(first)
-            plan = _final_plan(arm, first, run.readings, reference_mass, seed)
             resolution = np.where(np.isfinite(mover.resolution), mover.resolution, 0.0)
+            plan = _final_plan(arm, first, run.readings, reference_mass, seed, resolution)
             writer.append(PlanLine(plan=plan, resolution=tuple(resolution.tolist())))
         else:
             plan = data.plan
@@ -75,9 +75,11 @@ def run_sweep(
     return load_data(out)
 
 
-def _final_plan(arm: ArmFile, first: SweepPlan, readings: list[Reading], mass: float, seed: int) -> SweepPlan:
+def _final_plan(
+    arm: ArmFile, first: SweepPlan, readings: list[Reading], mass: float, seed: int, resolution: Array
+) -> SweepPlan:
     """The plan with bias torques, and the scout poses that were reached."""
-    plan = plan_sweep(arm, rough_model(arm, readings), seed=seed, reference_mass=mass)
+    plan = plan_sweep(arm, rough_model(arm, readings), seed=seed, reference_mass=mass, resolution=resolution)
     reached = tuple(first.scout[reading.index] for reading in readings if reading.sweep == SCOUT)
     return plan.model_copy(update={"scout": reached})
 

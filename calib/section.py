@@ -33,7 +33,7 @@ class SweepSection(Section):
     """Torque that presses each joint against its stop [N·m]; by default what the scout finds necessary."""
     bias_margin: Share = 0.05
     """Margin of the bias torque over gravity, friction and model error, as a share of max_torque."""
-    friction: Share = 0.03
+    friction: Share = 0.06
     """Allowance for friction of the drives, as a share of rated torque."""
     gain_tolerance: Share = 0.15
     """Allowance for error of the torque scale before anything is calibrated."""
@@ -47,7 +47,7 @@ class SweepSection(Section):
     """A step that has not settled by then is taken as it is, and marked [s]."""
     standard_error: Share = 0.00035
     """Standard error of the torque average asked for, as a share of rated torque; less where `gain_std` needs it."""
-    gain_std: Share = 0.0015
+    gain_std: Share = 0.001
     """Standard deviation of the torque gains aimed at: where the plan predicts more, it averages longer."""
     max_samples: Annotated[int, Field(ge=10)] = 200
     """Samples averaged at most."""
