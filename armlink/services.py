@@ -25,6 +25,9 @@ ABSENT = (0x06020000, 0x06090011)
 MALFORMED = (struct.error, IndexError, ValueError, TypeError)
 """What canopen's SDO client raises on frames that are none."""
 
+SDO_LENGTH = 8
+"""[bytes]; CiA 301 7.2.4.3: an SDO has no other length."""
+
 Send = Callable[[int, bytes], None]
 Pump = Callable[[Callable[[], bool], float], bool]
 """Runs the receive loop until the condition holds (True) or the seconds are over (False)."""
@@ -40,6 +43,11 @@ class PumpedNetwork(canopen.Network):  # type: ignore[misc]
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
         """Send one frame."""
         self._send(can_id, bytes(data))
+
+    def notify(self, can_id: int, data: bytearray, timestamp: float) -> None:
+        """Take in an SDO response; other frames are not for canopen, whose handlers raise on those cut short."""
+        if 0x580 < can_id < 0x600 and len(data) == SDO_LENGTH:
+            super().notify(can_id, data, timestamp)
 
 
 class PumpedResponses:

@@ -29,7 +29,7 @@ class FakeNode:
     def __init__(self, node, rated_mnm=40_000):
         self.node, self.values = node, {}
         self.status, self.mode, self.operational = SWITCH_ON_DISABLED, 0, False
-        self.position, self.torque, self.motor = 0, 2_000_000, 50
+        self.position, self.torque, self.motor, self.velocity = 0, 2_000_000, 50, 0
         self.control = (0, 0, 0)
         self.previous_control = 0
         self.syncs = 0
@@ -158,7 +158,7 @@ class FakeBus:
             return
         self.out.append((0x180 + node.node, struct.pack("<ii", node.position, node.torque)))
         if node.syncs % 4 == 0:
-            self.out.append((0x280 + node.node, struct.pack("<Hhi", node.status, node.motor, 0)))
+            self.out.append((0x280 + node.node, struct.pack("<Hhi", node.status, node.motor, node.velocity)))
         if changed or node.shown != node.display:
             node.shown = node.display
             self.out.append((0x380 + node.node, struct.pack("<Hb", node.status, node.display)))

@@ -1,0 +1,194 @@
+"""Campaign: mutants of the gate. Each changes one thing in the source; the tests must notice every one.
+
+python tests/campaigns/mutants.py [--only gate.py] [--jobs 1] [--list]
+Exit status 1 if a mutant survives that EXPLAINED does not name. A mutant that hangs counts as noticed.
+
+Operators: comparisons, arithmetic, signs, and/or, not, conditions negated and fixed, numbers, empty texts, min/max,
+ceil/floor, round/int, abs left out, returned and assigned values replaced by None.
+"""
+
+import argparse
+import ast
+import copy
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent.parent
+TARGETS = {
+    "armlink/gate.py": ["tests/armlink/test_gate.py"],
+    "armlink/limits.py": ["tests/armlink/test_limits.py"],
+    "armlink/cia402.py": ["tests/armlink/test_cia402.py"],
+}
+EXPLAINED = {
+    # Source line → why no test can tell this mutant from the original; docs/safety.md explains them.
+}
+SECONDS = 120
+SWAPS: dict[type, tuple[type, ...]] = {
+    ast.Lt: (ast.LtE, ast.GtE),
+    ast.LtE: (ast.Lt, ast.Gt),
+    ast.Gt: (ast.GtE, ast.LtE),
+    ast.GtE: (ast.Gt, ast.Lt),
+    ast.Eq: (ast.NotEq,),
+    ast.NotEq: (ast.Eq,),
+    ast.In: (ast.NotIn,),
+    ast.NotIn: (ast.In,),
+    ast.Is: (ast.IsNot,),
+    ast.IsNot: (ast.Is,),
+    ast.Add: (ast.Sub,),
+    ast.Sub: (ast.Add,),
+    ast.Mult: (ast.Div,),
+    ast.Div: (ast.Mult,),
+    ast.Pow: (ast.Mult,),
+    ast.RShift: (ast.LShift,),
+    ast.LShift: (ast.RShift,),
+    ast.BitAnd: (ast.BitOr,),
+    ast.BitOr: (ast.BitAnd,),
+    ast.And: (ast.Or,),
+    ast.Or: (ast.And,),
+}
+CALLS = {"max": "min", "min": "max", "ceil": "floor", "floor": "ceil", "round": "int", "int": "round"}
+PLUGIN = '''
+import importlib.abc, importlib.util, sys
+class Mutated(importlib.abc.MetaPathFinder, importlib.abc.SourceLoader):
+    def find_spec(self, name, path=None, target=None):
+        return importlib.util.spec_from_loader(name, self) if name == {name!r} else None
+    def get_filename(self, name):
+        return {path!r}
+    def get_data(self, path):
+        return {source!r}.encode()
+sys.meta_path.insert(0, Mutated())
+'''
+
+
+def edits(node: ast.AST) -> Iterator[tuple[str, Callable[[ast.AST], ast.AST]]]:
+    """What can be changed in one node: description and the change, which returns the node or another in its place."""
+
+    def put(field: str, value: object) -> Callable[[ast.AST], ast.AST]:
+        def change(target: ast.AST) -> ast.AST:
+            setattr(target, field, value)
+            return target
+
+        return change
+
+    if isinstance(node, ast.Compare):
+        for place, op in enumerate(node.ops):
+            for other in SWAPS.get(type(op), ()):
+                ops = [*node.ops[:place], other(), *node.ops[place + 1 :]]
+                yield f"{type(op).__name__} becomes {other.__name__}", put("ops", ops)
+    elif isinstance(node, ast.BinOp | ast.BoolOp):
+        for other in SWAPS.get(type(node.op), ()):
+            yield f"{type(node.op).__name__} becomes {other.__name__}", put("op", other())
+    elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.Not):
+        yield f"{type(node.op).__name__} left out", lambda target: target.operand  # type: ignore[attr-defined]
+    elif isinstance(node, ast.Constant) and isinstance(node.value, int | float) and not isinstance(node.value, bool):
+        yield f"{node.value} becomes {node.value + 1}", put("value", node.value + 1)
+    elif isinstance(node, ast.Constant) and node.value == "":
+        yield "empty text becomes another", put("value", "mutant")
+    elif isinstance(node, ast.Call):
+        name = node.func.id if isinstance(node.func, ast.Name) else getattr(node.func, "attr", "")
+        if name in CALLS:
+            field = "id" if isinstance(node.func, ast.Name) else "attr"
+            yield f"{name} becomes {CALLS[name]}", lambda t: setattr(t.func, field, CALLS[name]) or t  # type: ignore[attr-defined,func-returns-value]
+        if name == "abs":
+            yield "abs left out", lambda target: target.args[0]  # type: ignore[attr-defined]
+    elif isinstance(node, ast.If | ast.IfExp):
+        yield "condition negated", put("test", ast.UnaryOp(ast.Not(), node.test))
+        yield "condition always true", put("test", ast.Constant(True))
+        yield "condition always false", put("test", ast.Constant(False))
+    elif isinstance(node, ast.Return) and node.value is not None:
+        yield "returns None", put("value", ast.Constant(None))
+    elif isinstance(node, ast.Assign):
+        yield "assigns None", put("value", ast.Constant(None))
+
+
+class Changed(ast.NodeTransformer):
+    """Puts one change at one place."""
+
+    def __init__(self, place: int, change: Callable[[ast.AST], ast.AST]) -> None:
+        self.place, self.change, self.at = place, change, -1
+
+    def visit(self, node: ast.AST) -> ast.AST:
+        """Count nodes in the order of visit; change the one."""
+        self.at += 1
+        if self.at == self.place:
+            self.at += 10**6
+            return self.change(node)
+        return self.generic_visit(node)
+
+
+def ordered(tree: ast.AST) -> list[ast.AST]:
+    """Nodes in the order in which Changed visits them."""
+    seen: list[ast.AST] = []
+
+    class Seen(ast.NodeTransformer):
+        def visit(self, node: ast.AST) -> ast.AST:
+            seen.append(node)
+            return self.generic_visit(node)
+
+    Seen().visit(copy.deepcopy(tree))
+    return seen
+
+
+def mutants(path: Path) -> Iterator[tuple[str, str]]:
+    """(where and what, source) of every mutant of a module; docstrings and annotations stay."""
+    text = path.read_text(encoding="utf-8")
+    tree, lines = ast.parse(text), text.splitlines()
+    for place, node in enumerate(ordered(tree)):
+        for what, change in edits(node):
+            line = getattr(node, "lineno", 0)
+            mutated = Changed(place, change).visit(copy.deepcopy(tree))
+            source = ast.unparse(ast.fix_missing_locations(mutated))
+            if source != ast.unparse(tree):
+                yield f"{path.name}:{line}: {lines[line - 1].strip()!r}: {what}", source
+
+
+def noticed(target: str, source: str, tests: list[str]) -> bool:
+    """Whether the tests fail, or hang, on a mutant's source."""
+    name = target.removesuffix(".py").replace("/", ".")
+    start = PLUGIN.format(name=name, path=str(ROOT / target), source=source)
+    start += f"import pytest; sys.exit(pytest.main(['-x', '-q', '-p', 'no:cacheprovider', *{tests!r}]))"
+    try:
+        done = subprocess.run([sys.executable, "-c", start], cwd=ROOT, capture_output=True, timeout=SECONDS, check=False)
+    except subprocess.TimeoutExpired:
+        return True
+    return done.returncode != 0
+
+
+def main() -> int:
+    """Run, tell, judge."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default="", help="file name, such as gate.py")
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--list", action="store_true", help="say what the mutants are, and end")
+    given = parser.parse_args()
+    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", PYTHONDONTWRITEBYTECODE="1")
+    unexplained, start = 0, time.monotonic()
+    for target, tests in TARGETS.items():
+        if given.only and Path(target).name != given.only:
+            continue
+        found = list(mutants(ROOT / target))
+        if given.list:
+            print("\n".join(what for what, _ in found))
+            continue
+        if noticed(target, (ROOT / target).read_text(encoding="utf-8"), tests):
+            print(f"{target}: its tests fail without a mutant")
+            return 1
+        with ThreadPoolExecutor(given.jobs) as pool:
+            killed = list(pool.map(lambda each: noticed(target, each[1], tests), found))  # noqa: B023
+        alive = [what for (what, _), gone in zip(found, killed, strict=True) if not gone]
+        for what in alive:
+            why = next((why for part, why in EXPLAINED.items() if part in what), "")
+            unexplained += not why
+            print(f"survives: {what}{f' (explained: {why})' if why else ''}", flush=True)
+        print(f"{target}: {len(found)} mutants, {len(found) - len(alive)} noticed, {len(alive)} survive", flush=True)
+    print(f"{unexplained} survive unexplained; {time.monotonic() - start:.0f} s")
+    return int(unexplained > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
