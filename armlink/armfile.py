@@ -74,6 +74,10 @@ class Bus(Section):
     interface: str = "socketcan"
     channel: str = "can0"
     bitrate: Annotated[int, Field(gt=0)] = 1_000_000
+    fd: bool = False
+    """Frames go as CAN FD with bit-rate switch, where the interface has it; the load is counted as classical CAN's."""
+    options: dict[str, str | int | float | bool] = {}
+    """Further options of python-can's interface, such as data_bitrate or serial."""
 
 
 U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
@@ -103,12 +107,16 @@ class LinkJoint(Section):
     """[rad/s]."""
     identity: DeviceIdentity = DeviceIdentity()
     """Another controller than this one at the joint's node is refused at the start."""
+    bus: str = ""
+    """Name of its bus in link.buses; empty: link.bus."""
 
 
 class LinkSection(Section):
     """The link: bus, rate and joint controllers in joint order."""
 
     bus: Bus = Bus()
+    buses: dict[str, Bus] = {}
+    """Further buses by name, for joints that name one; node ids are unique over all of them."""
     rate: Annotated[FiniteFloat, Field(gt=0, le=1000)] = 250.0
     """SYNC rate [Hz]."""
     deadline: Annotated[FiniteFloat, Field(ge=0.01, le=10)] = 0.1
@@ -119,6 +127,10 @@ class LinkSection(Section):
     def _nodes_are_unique(self) -> "LinkSection":
         _no_twins([joint.name for joint in self.joints])
         _no_twins([joint.node for joint in self.joints])
+        for joint in self.joints:
+            if joint.bus and joint.bus not in self.buses:
+                known = ", ".join(self.buses) or "none"
+                raise ValueError(f"{joint.name} is on bus {joint.bus!r}, which link.buses does not have ({known})")
         return self
 
 

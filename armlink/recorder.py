@@ -2,7 +2,7 @@
 
 import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,8 @@ class Recorder:
         nodes = tuple(joint.node for joint in section.joints)
         own_clock: Clock | None = getattr(bus, "clock", None)
         self.clock: Clock = own_clock or MonotonicClock()
+        self._stamp: Callable[[], float] = getattr(bus, "stamp", self.clock.now)
+        self._bus = bus
         self._loop = Loop(open_port(bus), self.clock, nodes, 0, 1.0 / section.rate, own_clock is not None)
         units = assumed_units(arm)
         self._loop.set_units(units)
@@ -45,9 +47,9 @@ class Recorder:
         self._forget()
 
     def rows(self, seconds: float) -> Iterator[Row]:
-        """Rows that are complete within `seconds`; raises BusFault where the bus fails."""
+        """Rows that are complete within `seconds`, or in a whole log (LogBus); raises BusFault where the bus fails."""
         end = self.clock.now() + seconds
-        while (remaining := end - self.clock.now()) > 0:
+        while (remaining := end - self.clock.now()) > 0 and not getattr(self._bus, "ended", False):
             self._loop.receive(min(remaining, WAIT_SECONDS))
             yield from self._rows
             self._rows.clear()
@@ -55,7 +57,7 @@ class Recorder:
     def _take(self, can_id: int, data: bytes) -> None:
         joint = self._joint_of.get(can_id)
         if can_id == objects.SYNC_ID:
-            self._complete(self.clock.now())
+            self._complete(self._stamp())
         elif joint is not None and len(data) == RPDO1.layout.size:
             _, self._next_torque[joint], self._next_position[joint] = struct.unpack("<Hhi", data)
 

@@ -31,13 +31,13 @@ def monitor(
     from rich.live import Live
 
     from armlink.armfile import load_arm
-    from armlink.bus import open_bus
+    from armlink.bus import open_link_bus
     from armlink.commands.output import write_json
     from armlink.errors import BusFault
     from armlink.monitor import Monitor
 
     arm_file = load_arm(arm)
-    opened = open_bus(bus, arm_file.require_link().bus)
+    opened = open_link_bus(bus, arm_file.require_link())
     console = Console(stderr=True)
     answer: dict[str, Any] = {}
     title = f"{arm_file.name} on {opened.channel_info}"

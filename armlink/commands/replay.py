@@ -1,0 +1,62 @@
+"""Replays a raw frame log or a recording: as a live table, into another recording, or onto a virtual bus."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def replay(
+    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
+    source: Annotated[
+        Path, typer.Argument(help="Raw frames (.asc, .blf, .log) or a recording (.mcap, .parquet, .csv, .csv.gz).")
+    ],
+    target: Annotated[
+        Path | None, typer.Argument(help="Recording to write; its suffix says the format.", show_default=False)
+    ] = None,
+    bus: Annotated[
+        str | None, typer.Option(help="Play onto this bus instead: virtual:…, udp_multicast:… or socketcan:vcan….")
+    ] = None,
+    speed: Annotated[float, typer.Option(min=0.0, help="Times as fast as it was; 0: as fast as it goes.")] = 1.0,
+    json: Annotated[Path | None, typer.Option(help="Write what was replayed here; - is standard output.")] = None,
+) -> int:
+    """Decode a raw log or a recording again; with neither TARGET nor --bus, show it as a live table at --speed.
+
+    A raw log goes through the same decoding as live frames: its samples are those that armlink record --frames wrote,
+    bit for bit. A log or recording that was cut is read up to the cut, which is said. On a bus go only the joints' own
+    frames and SYNC, never a command, an SDO or NMT, and only on a virtual bus: for a listener such as
+    armlink daemon --listen-only or armlink monitor. Nothing is ever replayed as torque or motion.
+
+    Example: armlink replay sarcos run.blf run.csv
+    """
+    from rich.console import Console
+
+    from armlink.armfile import load_arm
+    from armlink.commands.output import write_json
+    from armlink.errors import BadInput
+    from armlink.frames import is_log
+    from armlink.recording import load_recording, save_recording
+    from armlink.replay import play_onto, recording_of_log, show
+
+    arm_file = load_arm(arm)
+    console = Console(stderr=True)
+    if bus is not None and target is not None:
+        raise BadInput("replay: give a file to write or --bus, not both")
+    recording = recording_of_log(arm_file, source) if is_log(source) else load_recording(source)
+    if recording.warning:
+        console.print(f"{source}: {recording.warning}", markup=False, highlight=False)
+    if bus is not None:
+        sent = play_onto(arm_file, source, recording, bus, speed)
+        console.print(f"{source}: {sent} frames onto {bus}", markup=False)
+    elif target is not None:
+        try:
+            save_recording(recording, target)
+        except OSError as error:
+            raise BadInput(f"{target}: cannot write it: {error.strerror}") from None
+        console.print(f"{target}: {recording.t.size} rows", markup=False)
+    else:
+        show(recording, console, speed)
+    answer = {"rows": int(recording.t.size), "seconds": float(recording.t[-1] - recording.t[0])}
+    answer |= {"joints": list(recording.names), "channels": list(recording.channels())}
+    write_json(json, {**answer, "warning": recording.warning})
+    return 0

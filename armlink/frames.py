@@ -1,0 +1,239 @@
+"""Raw CAN frames in the files of python-can's own loggers: Vector ASC and BLF, and candump's log.
+
+Times are kept to the microsecond, the finest that all three keep. Frames go from a bus into a log and from a log into
+whatever decodes a bus (`TappedBus`, `LogBus`), with the same times, so that both give the same samples bit for bit.
+"""
+
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import can
+from can.io.blf import BLFParseError
+
+from armlink.clock import Clock, MonotonicClock
+from armlink.errors import BadInput, BusFault
+
+LOG_SUFFIXES = (".asc", ".blf", ".log")
+FLUSH_MICROSECONDS = 500_000
+"""A killed recorder loses at most this and what the operating system had not written."""
+_CONTAINER = 8192  # bytes that BLF keeps back until it writes them
+_ASC_END = "end triggerblock"
+_BLF_SIZE = struct.Struct("<16xQ")  # file size as the header states it
+_BAD_CONTENT = (BLFParseError, ValueError, IndexError, TypeError, OverflowError, struct.error, zlib.error)
+
+
+def is_log(path: Path) -> bool:
+    """Whether a file is a raw frame log by its suffix."""
+    return path.suffix.lower() in LOG_SUFFIXES
+
+
+class FrameLog:
+    """Writes every message of a bus to a log; a context manager that ends the file properly."""
+
+    def __init__(self, path: Path) -> None:
+        """Create the file; raises BadInput for a suffix that is no log's, or a file that cannot be written."""
+        if not is_log(path):
+            raise BadInput(f"{path}: not a frame log by its suffix, expected {', '.join(LOG_SUFFIXES)}")
+        try:
+            self._writer = can.Logger(str(path))
+        except OSError as error:
+            raise BadInput(f"{path}: cannot write it: {error.strerror}") from None
+        if hasattr(self._writer, "max_container_size"):
+            self._writer.max_container_size = _CONTAINER
+        self._flushed = 0
+
+    def __enter__(self) -> Self:
+        """The log itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        """End the file."""
+        self._writer.stop()
+
+    def write(self, message: can.Message, stamp: int) -> None:
+        """Add a message that came at `stamp` [µs]."""
+        message.timestamp = stamp / 1e6
+        self._writer.on_message_received(message)
+        if stamp - self._flushed > FLUSH_MICROSECONDS:
+            self._writer.file.flush()
+            self._flushed = stamp
+
+
+class TappedBus:
+    """A bus whose messages are all written to a log as they are received; sends nothing."""
+
+    def __init__(self, bus: Any, log: FrameLog) -> None:
+        """Take python-can's `bus`, which is closed with this one."""
+        self.bus, self.log = bus, log
+        self.clock: Clock = getattr(bus, "clock", None) or MonotonicClock()
+        self.channel_info = bus.channel_info
+        self._first: int | None = None
+        self._newest = 0
+
+    def stamp(self) -> float:
+        """When the newest frame came, since the first [s], as the interface stamped it."""
+        return self._newest / 1e6
+
+    def take(self, timeout: float = 0.0) -> tuple[int, bytes] | None:
+        """The next data frame with an 11-bit identifier, or None after `timeout` seconds; raises BusFault."""
+        while True:
+            try:
+                message = self.bus.recv(timeout=timeout)
+            except (can.CanError, OSError) as error:
+                raise BusFault(f"bus {self.channel_info}: cannot receive: {error}") from None
+            if message is None:
+                return None
+            stamp = round((message.timestamp or self.clock.now()) * 1e6)
+            self._first = stamp if self._first is None else self._first
+            self._newest = stamp - self._first
+            self.log.write(message, stamp)
+            if is_ours(message):
+                return message.arbitration_id, bytes(message.data)
+
+    def put(self, can_id: int, data: bytes) -> None:
+        """Refuse: a recorder sends nothing."""
+        raise BusFault(f"bus {self.channel_info}: a recorder sends nothing")
+
+    def shutdown(self) -> None:
+        """Close the bus."""
+        self.bus.shutdown()
+
+
+class LogBus:
+    """A log as a bus that somebody listens to: each frame at its time, then silence; its clock is the log's."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the log; raises BadInput where it is none."""
+        self.reader = LogReader(path)
+        self.clock = self
+        self.channel_info = str(path)
+        self._frames = self.reader.frames()
+        self._next = next(self._frames, None)
+        self._time = 0.0
+
+    @property
+    def ended(self) -> bool:
+        """Whether every frame was taken."""
+        return self._next is None
+
+    def now(self) -> float:
+        """When the newest frame came, since the first [s]."""
+        return self._time
+
+    stamp = now
+
+    def sleep_until(self, instant: float) -> None:
+        """Let time go on, to `instant` [s]."""
+        self._time = max(self._time, instant)
+
+    def take(self, timeout: float = 0.0) -> tuple[int, bytes] | None:
+        """The next frame, whenever it comes, or None where there is none."""
+        if self._next is None:
+            self._time += max(0.0, timeout)
+            return None
+        stamp, can_id, data = self._next
+        self._time = stamp / 1e6
+        self._next = next(self._frames, None)
+        return can_id, data
+
+    def put(self, can_id: int, data: bytes) -> None:
+        """Refuse: nobody hears it."""
+        raise BusFault(f"{self.channel_info}: a log takes no frames")
+
+    def shutdown(self) -> None:
+        """Nothing to close."""
+
+
+class LogReader:
+    """Reads a log as far as it is sound; `warning` says afterwards where it was not."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises BadInput where there is no such file, or not by its suffix."""
+        if not is_log(path):
+            raise BadInput(f"{path}: not a frame log by its suffix, expected {', '.join(LOG_SUFFIXES)}")
+        if not path.is_file():
+            raise BadInput(f"no frame log {path}: give a {', '.join(LOG_SUFFIXES)} file")
+        self._path = path
+        self.count = 0
+        """Frames read so far."""
+        self.warning = ""
+        """What was cut or could not be read; empty while all is sound."""
+
+    def frames(self) -> Iterator[tuple[int, int, bytes]]:
+        """Time since the first message [µs], identifier and data of each data frame with an 11-bit identifier."""
+        first = None
+        for message in self._messages():
+            stamp = round(message.timestamp * 1e6)
+            first = stamp if first is None else first
+            if is_ours(message):
+                self.count += 1
+                yield stamp - first, message.arbitration_id, bytes(message.data)
+
+    def _messages(self) -> Iterator[can.Message]:
+        why = ""
+        try:
+            if self._path.suffix.lower() == ".blf":
+                why = yield from self._from_blf()
+            else:
+                why = yield from self._from_lines()
+        except _BAD_CONTENT:
+            why = "what follows is not readable"
+        except OSError as error:
+            raise BadInput(f"{self._path}: cannot read it: {error.strerror}") from None
+        if why:
+            self.warning = f"cut frame log, {why}: loaded {self.count} frames up to there"
+
+    def _from_blf(self) -> Iterator[can.Message]:
+        size = self._path.stat().st_size
+        with self._path.open("rb") as stream:
+            stated = stream.read(_BLF_SIZE.size)
+            stream.seek(0)
+            yield from can.BLFReader(stream)
+        return "" if _BLF_SIZE.unpack(stated)[0] == size else "the file ends early"
+
+    def _from_lines(self) -> Iterator[can.Message]:
+        with self._path.open(encoding="utf-8", errors="replace") as stream:
+            lines = _WholeLines(stream)
+            yield from (can.ASCReader if self._path.suffix.lower() == ".asc" else can.CanutilsLogReader)(lines)
+        if lines.cut:
+            return "its last line is not complete"
+        if self._path.suffix.lower() == ".asc" and not lines.last.strip().lower().startswith(_ASC_END):
+            return "it has no End TriggerBlock"
+        return ""
+
+
+class _WholeLines:
+    """Lines of a text file up to the first that is not ended, in the form that python-can's readers take."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+        self.cut, self.last = False, ""
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> str:
+        line = next(self._stream)
+        if not line.endswith("\n"):
+            self.cut = True
+            raise StopIteration
+        if line.strip():
+            self.last = line
+        return str(line)
+
+    def read(self, size: int = -1) -> str:
+        """Only so that python-can takes it for a file."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Close the file."""
+        self._stream.close()
+
+
+def is_ours(message: can.Message) -> bool:
+    """Whether a message is a data frame with an 11-bit identifier."""
+    return not (message.is_error_frame or message.is_extended_id or message.is_remote_frame)
