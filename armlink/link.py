@@ -54,9 +54,9 @@ class Link:
     @classmethod
     def open(cls, arm: ArmFile, bus: str | None = None) -> "Link":
         """Open the bus `INTERFACE:CHANNEL[@BITRATE]`, by default the arm file's; raises BadInput or BusFault."""
-        from armlink.bus import open_bus
+        from armlink.bus import open_link_bus
 
-        return cls(arm, open_bus(bus, arm.require_link().bus))
+        return cls(arm, open_link_bus(bus, arm.require_link()))
 
     def __enter__(self) -> Self:
         """The link itself."""
