@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import shutil
 import socket
 import sys
 import threading
@@ -16,6 +17,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 
 from made_up_view import MadeUpView
+from playwright.sync_api import Browser, Page, sync_playwright
 
 from calib.daemon.view import DaemonView
 from calib.daemon.web.server import serve
@@ -60,24 +62,23 @@ def free_port() -> int:
 
 @contextlib.contextmanager
 def served(
-    view: DaemonView, path: Path, beside: Callable[[], Awaitable[None]] | None = None, tcp: bool = True
+    make_view: Callable[[], DaemonView], path: Path, beside: Callable[[], Awaitable[None]] | None = None
 ) -> Iterator[Served]:
-    """Serve a view until the end of the block; `beside` runs on the same event loop."""
+    """Serve a view, made on the event loop's thread, until the end of the block; `beside` runs on the same loop."""
     loop, port, ready = asyncio.new_event_loop(), free_port(), threading.Event()
 
     async def main() -> None:
-        web = asyncio.create_task(
-            serve(view, socket=path, tcp=("127.0.0.1", port) if tcp else None, token=TOKEN if tcp else None)
-        )
-        while not web.done():
-            with contextlib.suppress(OSError):
-                _, writer = await asyncio.open_unix_connection(str(path))
-                writer.close()
-                break
-            await asyncio.sleep(0)
-        ready.set()
-        work = [web] if beside is None else [web, asyncio.create_task(beside())]
+        web = asyncio.create_task(serve(make_view(), socket=path, tcp=("127.0.0.1", port), token=TOKEN))
+        work = [web]
         try:
+            while not web.done():
+                with contextlib.suppress(OSError):
+                    _, writer = await asyncio.open_unix_connection(str(path))
+                    writer.close()
+                    break
+                await asyncio.sleep(0)
+            ready.set()
+            work += [] if beside is None else [asyncio.create_task(beside())]
             await asyncio.gather(*work)
         finally:
             for task in work:
@@ -94,18 +95,18 @@ def served(
     thread = threading.Thread(target=run)
     thread.start()
     try:
-        assert ready.wait(30)
+        assert ready.wait(300)
         yield Served(path, port, loop)
     finally:
         loop.call_soon_threadsafe(running.cancel)
-        thread.join(30)
+        thread.join(60)
     assert not thread.is_alive()
 
 
 @pytest.fixture(scope="module")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[MadeUpView, Served]]:
     view = MadeUpView()
-    with served(view, tmp_path_factory.mktemp("api") / "api.sock") as server:
+    with served(lambda: view, tmp_path_factory.mktemp("api") / "api.sock") as server:
         yield view, server
 
 
@@ -120,3 +121,28 @@ def server(running: tuple[MadeUpView, Served]) -> Served:
 @pytest.fixture
 def view(running: tuple[MadeUpView, Served]) -> MadeUpView:
     return running[0]
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    """A real Chromium without a window."""
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if chromium is None:
+        pytest.skip("no Chromium: scripts/install-system installs it where that is allowed")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
+        yield browser
+        browser.close()
+
+
+def open_page(browser: Browser, server: Served, width: int = 1200, token: str = TOKEN, **options: Any) -> Page:
+    """The page over TCP, its token given; `page.complaints` is what its scripts complained of."""
+    context = browser.new_context(viewport={"width": width, "height": 900}, timezone_id="UTC", **options)
+    page = context.new_page()
+    page.complaints = []  # type: ignore[attr-defined]
+    page.on("pageerror", lambda error: page.complaints.append(str(error)))  # type: ignore[attr-defined]
+    page.on("console", lambda m: m.type == "error" and "401" not in m.text and page.complaints.append(m.text))  # type: ignore[attr-defined]
+    page.goto(server.url)
+    page.fill("#token", token)
+    page.click("#ask-token button")
+    return page

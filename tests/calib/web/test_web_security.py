@@ -243,7 +243,7 @@ def test_rate_of_wrong_tokens_is_limited_more() -> None:
 
 def test_rate_limit_answers_over_a_real_connection(view: MadeUpView, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(guard_module, "REQUESTS", Rate(burst=3, per_second=1e-3))
-    with served(MadeUpView(), tmp_path / "api.sock") as server:
+    with served(MadeUpView, tmp_path / "api.sock") as server:
         answers = [server.tcp().get("/api/status") for _ in range(5)]
         assert [answer.status_code for answer in answers] == [200, 200, 200, 429, 429]
         assert int(answers[-1].headers["retry-after"]) > 0

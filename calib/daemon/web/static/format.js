@@ -41,7 +41,7 @@ const CATEGORIES = {
   fault: ["fault", "refused", "failed"],
   drift: ["drift", "alarm", "outliers", "undecided", "proposal"],
   load: ["payload", "contact", "effect"],
-  change: ["recalibration", "approved", "rejected", "roll-back", "sweep", "recovered"],
+  change: ["recalibration", "approved", "rejected", "roll-back", "check", "sweep", "recovered"],
 };
 
 // Which of the four colours an event has; empty for the others (started, stopped, clear, configuration, clock).

@@ -12,15 +12,28 @@ let status = null;
 let connected = false;
 let said = "";
 
+const WORDS = { lost: "NO CONNECTION", fault: "FAULT", alarm: "ALARM", decide: "DECISION NEEDED" };
+
+// The daemon's own state; while it observes, also whether an alarm stands and whether somebody must decide.
+function shownState(state) {
+  if (!connected) return "lost";
+  if (state !== "observing") return state;
+  if (status?.pending_proposals) return "decide";
+  return status?.held ? "alarm" : state;
+}
+
 function showState(state, detail) {
-  const shown = connected ? (state === "observing" && status?.held ? "alarm" : state) : "lost";
-  const words = { lost: "NO CONNECTION", fault: "FAULT", alarm: "ALARM" };
+  const shown = shownState(state);
+  const own = {
+    alarm: "Something has changed: its cause is being found, estimates are held.",
+    decide: `${said} A new calibration waits for your decision.`,
+    observing: said,
+  };
   document.body.dataset.state = shown;
-  put(by("state-word"), words[shown] ?? shown);
-  const calm = !detail && shown === "observing";
-  put(by("detail"), shown === "alarm" ? "Something has changed: its cause is being found, estimates are held." : detail || (calm ? said : ""));
-  by("detail").classList.toggle("calm", calm);
-  document.title = `${words[shown] ?? shown} · ${status?.arm ?? "armlink"}`;
+  put(by("state-word"), WORDS[shown] ?? shown);
+  put(by("detail"), detail || own[shown] || "");
+  by("detail").classList.toggle("calm", !detail && shown === "observing");
+  document.title = `${WORDS[shown] ?? shown} · ${status?.arm ?? "armlink"}`;
 }
 
 function showBus(bus) {
