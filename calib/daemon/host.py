@@ -13,7 +13,7 @@ from typing import Any
 
 from armlink.errors import ArmlinkError, BadInput, BusFault, Refused
 from armlink.sample import Calibration
-from calib.daemon.messages import LoopOptions, Message, Reply, Request
+from calib.daemon.messages import Alive, LoopOptions, Message, Reply, Request
 
 ANSWER_SECONDS = 10.0
 """A request that the loop has not answered by then has failed [s]."""
@@ -171,7 +171,7 @@ def _child(connection: Connection, options: LoopOptions) -> None:
     gc.freeze()
     try:
         while True:
-            for message in loop.run():
+            for message in loop.run() or [Alive()]:
                 _tell(connection, message)
             while connection.poll(loop.wait()):
                 request = connection.recv()

@@ -112,4 +112,9 @@ class Progress:
     """Poses."""
 
 
-Message = Batch | Up | Down | Reply | Progress
+@dataclass(frozen=True)
+class Alive:
+    """The loop runs and has nothing else to say."""
+
+
+Message = Alive | Batch | Up | Down | Reply | Progress

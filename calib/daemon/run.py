@@ -25,7 +25,7 @@ from calib.writing import Controllers
 
 T = TypeVar("T")
 SNAPSHOT_SECONDS = 0.1
-SILENT_SECONDS = 5.0
+SILENT_SECONDS = 15.0
 """A bus process that has said nothing for so long hangs: it is killed and begun anew."""
 BEGIN_SECONDS = 30.0
 """A new bus process may take so long to say its first word."""

@@ -193,7 +193,7 @@ class Service:
             self._down(message.reason)
         elif isinstance(message, Progress):
             self._progress(message)
-        elif message.error is not None:
+        elif isinstance(message, Reply) and message.error is not None:
             self.say("refused", None, f"sweep: {message.error}", {})
             self.sweeping = None
 
