@@ -60,7 +60,9 @@ def play_onto(arm: ArmFile, source: Path, recording: Recording, spec: str, speed
     described = parse_bus(spec)
     virtual = described.interface == "socketcan" and described.channel.startswith("vcan")
     if not virtual and described.interface not in VIRTUAL_INTERFACES:
-        raise BadInput(f"bus {spec}: replay goes onto a virtual bus only: virtual:…, udp_multicast:… or socketcan:vcan…")
+        raise BadInput(
+            f"bus {spec}: replay goes onto a virtual bus only: virtual:…, udp_multicast:… or socketcan:vcan…"
+        )
     bus = open_bus(spec, arm.require_link().bus)
     try:
         frames = frames_of_log(source) if is_log(source) else frames_of_recording(arm, recording)

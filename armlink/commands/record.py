@@ -11,7 +11,8 @@ SUFFIX = ".mcap"
 def record(
     arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
     out: Annotated[
-        Path | None, typer.Argument(help="File to write, .mcap; armlink convert makes others of it.", show_default=False)
+        Path | None,
+        typer.Argument(help="File to write, .mcap; armlink convert makes others of it.", show_default=False),
     ] = None,
     frames: Annotated[
         Path | None, typer.Option(help="Write every frame here as it is: .asc, .blf or .log, by suffix.")
