@@ -126,6 +126,8 @@ class Loop:
         self._take_what_is_there()
         self.watch.cycle_ends(self.stats.frames - self._counted)
         self._counted = self.stats.frames
+        if self._slow_came:
+            self._keep_slow(self._clock.now())
         self.drop_readings()
 
     def _take_what_is_there(self) -> None:
@@ -223,11 +225,7 @@ class Loop:
         position = np.array(self._position) * self._position_unit
         torque = np.array(self._torque) * TORQUE_PER_MICRO
         if self._slow_came:
-            motor = np.array(self._motor) * self._torque_unit
-            velocity = np.array(self._velocity) * self._position_unit
-            for joint in self._keep(motor, self.latest_motor_torque):
-                self.slow_seen[joint] = now
-            self._keep(velocity, self.latest_velocity)
+            motor, velocity = self._keep_slow(now)
             self._motor, self._velocity = [math.nan] * self.n, [math.nan] * self.n
             self._slow_came = False
         else:
@@ -238,6 +236,15 @@ class Loop:
         status: NDArray[np.int64] = np.array(self.statuses, np.int64)
         age: Array = now - np.array(self.seen)
         return Sample(now - (self._first or 0.0), position, velocity, torque, motor, status, age)
+
+    def _keep_slow(self, now: float) -> tuple[Array, Array]:
+        """Motor torque and velocity that came, also kept as the newest known."""
+        motor = np.array(self._motor) * self._torque_unit
+        velocity = np.array(self._velocity) * self._position_unit
+        for joint in self._keep(motor, self.latest_motor_torque):
+            self.slow_seen[joint] = now
+        self._keep(velocity, self.latest_velocity)
+        return motor, velocity
 
     def _keep(self, values: Array, latest: list[float]) -> list[int]:
         """Put the values that came into `latest`; the joints that they came from."""

@@ -52,7 +52,7 @@ SWAPS: dict[type, tuple[type, ...]] = {
     ast.Or: (ast.And,),
 }
 CALLS = {"max": "min", "min": "max", "ceil": "floor", "floor": "ceil", "round": "int", "int": "round"}
-PLUGIN = '''
+PLUGIN = """
 import importlib.abc, importlib.util, sys
 class Mutated(importlib.abc.MetaPathFinder, importlib.abc.SourceLoader):
     def find_spec(self, name, path=None, target=None):
@@ -62,7 +62,7 @@ class Mutated(importlib.abc.MetaPathFinder, importlib.abc.SourceLoader):
     def get_data(self, path):
         return {source!r}.encode()
 sys.meta_path.insert(0, Mutated())
-'''
+"""
 
 
 def edits(node: ast.AST) -> Iterator[tuple[str, Callable[[ast.AST], ast.AST]]]:
@@ -153,7 +153,9 @@ def noticed(target: str, source: str, tests: list[str]) -> bool:
     start = PLUGIN.format(name=name, path=str(ROOT / target), source=source)
     start += f"import pytest; sys.exit(pytest.main(['-x', '-q', '-p', 'no:cacheprovider', *{tests!r}]))"
     try:
-        done = subprocess.run([sys.executable, "-c", start], cwd=ROOT, capture_output=True, timeout=SECONDS, check=False)
+        done = subprocess.run(
+            [sys.executable, "-c", start], cwd=ROOT, capture_output=True, timeout=SECONDS, check=False
+        )
     except subprocess.TimeoutExpired:
         return True
     return done.returncode != 0
