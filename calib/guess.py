@@ -12,6 +12,8 @@ Array = npt.NDArray[np.float64]
 
 GAIN_STD = 0.3
 """What is assumed of an uncalibrated torque gain: 1 ± 0.3."""
+MODEL_ERROR = 0.1
+"""Share by which mass moments of a model file are assumed to be wrong."""
 SIGMAS = 3.0
 """Standard deviations of the rough model that bounds take in."""
 
@@ -43,6 +45,12 @@ class GravityGuess:
         moment = np.linalg.norm(self.beta.reshape(-1, 2), axis=1)[::-1].cumsum()[::-1]
         size: Array = moment * reach(self.arm)
         return size
+
+
+def guess_of_model(arm: Arm, beta: Array) -> GravityGuess:
+    """What a model file's own inertials (2n,) [kg·m] are worth for planning: each mass moment to a tenth."""
+    size = np.maximum(np.abs(beta), np.abs(beta).max(initial=0.0) / 20)
+    return GravityGuess(arm, beta, np.diag((MODEL_ERROR * size) ** 2))
 
 
 def reach(arm: Arm, hand: float = 0.15) -> Array:

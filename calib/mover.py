@@ -146,6 +146,16 @@ class Mover:
             self._check_stop(int(joint), int(stops[joint]))
         self._contact = self.position.copy()
 
+    def touch(self, stops: npt.NDArray[np.int64]) -> Array:
+        """Creep the joints with stops ±1 onto them and leave them there under position control; positions (n,) [rad].
+
+        Raises Refused where a stop is not at the arm file's place.
+        """
+        self._creep(stops, stops != 0)
+        for joint in np.flatnonzero(stops):
+            self._check_stop(int(joint), int(stops[joint]))
+        return self.position.copy()
+
     def before_stop(self, joint: int, side: int, gap: float) -> float:
         """Position [rad] a gap before a stop: where it was found last, else where the arm file has it."""
         found = self.contacts.get((joint, side))

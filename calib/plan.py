@@ -7,6 +7,7 @@ from armlink.armfile import ArmFile
 from armlink.errors import BadInput
 from calib.description import gcomp_arm
 from calib.design import Candidates, choose, guessed_moments, reachable, stop_combinations
+from calib.geometry import Collided, Geometry
 from calib.guess import GravityGuess, reach
 from calib.plan_limits import Limits
 from calib.plan_model import Sweep, SweepPlan
@@ -59,9 +60,10 @@ def plan_sweep(
     """
     section, limits, described = sweep_section(arm), Limits.of(arm), gcomp_arm(arm)
     require_range(section, limits, described)
+    geometry = None if arm.model_path is None else Geometry(arm)
     options, notes = [], []
     for joint in reversed(range(described.n)):
-        found, remarks = _options(joint, section, limits, described, guess)
+        found, remarks = _options(joint, section, limits, described, guess, geometry)
         options.append(found)
         notes += remarks
     moments = guessed_moments(described, seed) if guess is None else [guess.beta]
@@ -70,7 +72,7 @@ def plan_sweep(
     masses = [given] if given else _reference_masses(described, limits, options, guess)
     mass = masses[-1]
     poses = section.loaded_poses if reference_mass else section.poses
-    scout = scout_poses(described, section, limits, seed)
+    scout = scout_poses(described, section, limits, seed, None if geometry is None else geometry.free)
     rounding = np.zeros(described.n) if resolution is None else resolution / np.sqrt(12.0)
     gain_std, finer = None, 1.0
     for more in range(MORE_POSES + 1):
@@ -125,11 +127,18 @@ def required_bias(
 
 
 def _options(
-    joint: int, section: SweepSection, limits: Limits, described: Arm, guess: GravityGuess | None
+    joint: int,
+    section: SweepSection,
+    limits: Limits,
+    described: Arm,
+    guess: GravityGuess | None,
+    geometry: Geometry | None,
 ) -> tuple[Candidates, list[str]]:
     """The combinations from which a joint's sweeps are chosen, and what had to be given up."""
     swept = sweep_range(section, limits, joint)
     everything = stop_combinations(described, joint, limits.lower, limits.upper, swept)
+    if geometry is not None:
+        everything = _clear(everything, geometry, described.names[joint])
     if guess is None:
         return reachable(everything), []
     least, largest, allowance = hold_torque(guess, section, limits, everything.poses)
@@ -149,6 +158,19 @@ def _options(
         )
     note = f"{name}: too few stop combinations can be pressed within max_torque: some joints are servo-held instead"
     return reachable(everything.kept(pressed | holdable)), [note]
+
+
+def _clear(candidates: Candidates, geometry: Geometry, name: str) -> Candidates:
+    """The combinations along which nothing touches; raises Collided where there is none."""
+    flat = candidates.poses.reshape(-1, candidates.poses.shape[-1])
+    free: Flags = geometry.free(flat).reshape(candidates.poses.shape[:2]).all(axis=1)
+    if free.any():
+        return candidates.kept(free)
+    first, second = next(found for pose in flat for found in geometry.contacts(pose)).bodies
+    raise Collided(
+        f"joint {name}: in every combination of stops something touches, as {first} does {second}: narrow lower and"
+        " upper in the arm file"
+    )
 
 
 def _pressable(guess: GravityGuess, section: SweepSection, limits: Limits, candidates: Candidates) -> Flags:

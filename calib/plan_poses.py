@@ -1,5 +1,7 @@
 """Where the arm goes: range of each sweep, poses of the scout, and the order of poses for short ways."""
 
+from collections.abc import Callable
+
 import numpy as np
 import numpy.typing as npt
 
@@ -21,14 +23,27 @@ def sweep_range(section: SweepSection, limits: Limits, joint: int) -> tuple[floa
     return low + margin + 0.02 * abs(low), high - margin - 0.02 * abs(high)
 
 
-def scout_poses(described: Arm, section: SweepSection, limits: Limits, seed: int) -> tuple[tuple[float, ...], ...]:
-    """n + 3 poses (n,) that determine mass moments and sensor offsets well, ordered for short ways between them."""
+def scout_poses(
+    described: Arm,
+    section: SweepSection,
+    limits: Limits,
+    seed: int,
+    free: Callable[[Array], npt.NDArray[np.bool_]] | None = None,
+) -> tuple[tuple[float, ...], ...]:
+    """n + 3 poses (n,) that determine mass moments and sensor offsets well, ordered for short ways between them.
+
+    `free` tells which of poses (K, n) are without collision. Raises BadInput where too few are.
+    """
     n = described.n
     ends = np.array([sweep_range(section, limits, joint) for joint in range(n)])
     generator = np.random.default_rng(seed)
     poses = ends[:, 0] + generator.random((SCOUT_CANDIDATES, n)) * (ends[:, 1] - ends[:, 0])
+    if free is not None:
+        poses = poses[free(poses)]
+        if len(poses) < 2 * (n + 3):
+            raise BadInput("almost every pose within the joint range collides: narrow lower and upper in the arm file")
     regressor = gravity_regressor(described, poses)
-    offsets = np.broadcast_to(np.eye(n), (SCOUT_CANDIDATES, n, n))
+    offsets = np.broadcast_to(np.eye(n), (len(poses), n, n))
     rows = np.concatenate([regressor, 10 * offsets], axis=2) / limits.rated[:, None]
     information = np.einsum("kip,kiq->kpq", rows, rows)
     total = np.eye(3 * n) * 1e-6

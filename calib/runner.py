@@ -1,7 +1,7 @@
 """Runs one pass of sweeps through the link and writes each reading to disk before the next is begun."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from armlink.armfile import ArmFile
 from armlink.errors import Refused
 from armlink.link import Link
 from calib.dataset import DataWriter, Manifest, PlanLine, Reading, SweepData, load_data
+from calib.geometry import check_plan
 from calib.mover import Mover, Rest, Slipped, Stalled
 from calib.plan import plan_sweep
 from calib.plan_limits import Limits
@@ -28,6 +29,7 @@ GAP = 0.02
 """Distance from a stop at which creeping begins [rad]."""
 SLOWER = 0.4
 """Factor on the acceleration after a joint did not follow."""
+BARS = "▁▂▃▄▅▆▇█"
 RETRIES = 3
 """How often a joint that slipped or stalled is tried again before the sweep gives up."""
 
@@ -57,10 +59,12 @@ def run_sweep(
         run = _Pass(mover, writer, list(data.readings), progress or (lambda *_: None), clock)
         if data.plan is None:
             first = plan_sweep(arm, seed=seed, reference_mass=reference_mass)
+            check_plan(arm, first)
             run.total = first.readings
             run.scout(first)
             resolution = np.where(np.isfinite(mover.resolution), mover.resolution, 0.0)
             plan = _final_plan(arm, first, run.readings, reference_mass, seed, resolution)
+            check_plan(arm, plan)
             writer.append(PlanLine(plan=plan, resolution=tuple(resolution.tolist())))
         else:
             plan = data.plan
@@ -82,6 +86,13 @@ def _final_plan(
     plan = plan_sweep(arm, rough_model(arm, readings), seed=seed, reference_mass=mass, resolution=resolution)
     reached = tuple(first.scout[reading.index] for reading in readings if reading.sweep == SCOUT)
     return plan.model_copy(update={"scout": reached})
+
+
+def sparkline(values: Sequence[float]) -> str:
+    """A curve of one character a value."""
+    low, high = min(values), max(values)
+    steps = (len(BARS) - 1) / max(high - low, 1e-12)
+    return "".join(BARS[round((value - low) * steps)] for value in values)
 
 
 class _Pass:
@@ -108,7 +119,14 @@ class _Pass:
         self.readings.append(reading)
         made = len(self.readings) - self._at_start
         left = (self._clock() - self._began) / made * max(self.total - len(self.readings), 0)
-        self._progress(len(self.readings), self.total, left, f"{reading.sweep} {reading.index + 1}")
+        self._progress(len(self.readings), self.total, left, self._text(reading))
+
+    def _text(self, reading: Reading) -> str:
+        """What is being done, with a plot of the swept joint's torque in the sweep so far."""
+        if reading.joint is None:
+            return f"{reading.sweep} {reading.index + 1}"
+        curve = [each.torque[reading.joint] for each in self.readings if each.sweep == reading.sweep]
+        return f"{reading.sweep} {reading.index + 1} {sparkline(curve)}"
 
     def scout(self, plan: SweepPlan) -> None:
         """Take the scout poses that are still to be taken."""

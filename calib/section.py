@@ -72,3 +72,12 @@ def sweep_section(arm: ArmFile) -> SweepSection:
             f"{arm.path}: key sweep.bias_torque: {len(section.bias_torque)} values, expected {n}, one per joint"
         )
     return section
+
+
+def with_hold(arm: ArmFile, hold: str | None) -> ArmFile:
+    """The arm with its resting joints held on `stops` or by `servo`; None leaves the arm file's. Raises BadInput."""
+    if hold is None:
+        return arm
+    if hold not in ("stops", "servo"):
+        raise BadInput(f"--hold {hold}: expected stops or servo")
+    return arm.model_copy(update={"sweep": sweep_section(arm).model_copy(update={"hold": hold})})

@@ -1,15 +1,20 @@
 """What the sweep commands show to people: progress with time left, plans and results as tables on standard error."""
 
+import sys
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
+import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from armlink.armfile import ArmFile
 from calib.plan_model import SweepPlan
+
+if TYPE_CHECKING:
+    from calib.preflight import Preflight
 
 _CONSOLE = Console(stderr=True)
 
@@ -51,6 +56,26 @@ class SweepScreen:
         self._progress.stop()
 
 
+def confirm(question: str) -> None:
+    """Ask a person at the terminal; without a terminal nobody is asked. Raises typer.Abort where the answer is no."""
+    if sys.stdin is not None and sys.stdin.isatty():
+        typer.confirm(question, abort=True, err=True)
+
+
+def print_preflight(found: "Preflight") -> None:
+    """What the pre-flight found, a row a joint."""
+    table = Table(
+        "joint", "torque noise [N·m]", "torque at rest [N·m]", "lower stop", "upper stop [rad]", title="Pre-flight"
+    )
+    for joint, name in enumerate(found.names):
+        stops = [
+            "not pushed" if np.isnan(at) else f"{at:.3f} (arm file {wanted:.3f})"
+            for at, wanted in zip(found.stops[joint], found.expected[joint], strict=True)
+        ]
+        table.add_row(name, f"{found.noise[joint]:.3g}", f"{found.torque[joint]:.3g}", *stops)
+    _CONSOLE.print(table)
+
+
 def print_plan(arm: ArmFile, plan: SweepPlan) -> None:
     """The sweeps of a plan as a table: where each joint rests, what presses it, range and lever of gravity."""
     table = Table("sweep", "from … to [rad]", "Γ/g", *arm.joint_names, title=f"{arm.name}: {len(plan.sweeps)} sweeps")
@@ -69,6 +94,8 @@ def print_plan(arm: ArmFile, plan: SweepPlan) -> None:
     if plan.sweeps[0].bias is None:
         _CONSOLE.print("Bias torques [N·m] are set by the scout, which weighs the arm first.", highlight=False)
     _CONSOLE.print(f"{plan.readings} readings; reference mass {plan.reference_mass:g} kg", highlight=False)
+    if plan.gain_std:
+        _CONSOLE.print(f"torque gains will be known to ± {2 * plan.gain_std:.2%} (95 %)", highlight=False)
     for note in plan.notes:
         _CONSOLE.print(f"[yellow]{note}[/yellow]", highlight=False)
 

@@ -1,9 +1,13 @@
 """Single-joint sweeps of an arm, planned, checked and run; continues after an interruption."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from armlink.armfile import ArmFile
+    from armlink.link import Link
 
 
 def sweep(
@@ -15,8 +19,19 @@ def sweep(
     ] = 0.0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the data set in --out.")] = False,
     plan: Annotated[
-        bool, typer.Option("--plan", help="Print the plan from the arm file alone; nothing moves.")
+        bool, typer.Option("--plan", help="Print and draw the plan from the arm file alone; nothing moves.")
     ] = False,
+    picture: Annotated[
+        Path | None, typer.Option(help="Where --plan draws the poses; default NAME-plan.html in this directory.")
+    ] = None,
+    hold: Annotated[str | None, typer.Option(help="stops or servo: how resting joints are held.")] = None,
+    check_stops: Annotated[
+        bool, typer.Option(help="Before the pass without load, push every joint slowly onto both its stops.")
+    ] = True,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Run the whole plan on the simulated arm of the arm file's sim section.")
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the arm moves.")] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the plan's search.")] = 0,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write plan or outcome here; - is standard output.")
@@ -32,25 +47,46 @@ def sweep(
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
     from armlink.link import Link
-    from calib.commands.screen import SweepScreen, print_plan
+    from calib.commands.screen import SweepScreen, confirm, print_lines, print_plan, print_preflight
+    from calib.description import model_arm
+    from calib.geometry import check_plan
+    from calib.guess import guess_of_model
     from calib.plan import plan_sweep
+    from calib.plan_picture import draw_plan, seconds
+    from calib.preflight import find_stops, listen
     from calib.runner import run_sweep
+    from calib.section import with_hold
 
-    arm_file = load_arm(arm)
+    arm_file = with_hold(load_arm(arm), hold)
     if plan:
-        planned = plan_sweep(arm_file, seed=seed)
+        model = None if arm_file.model_path is None else model_arm(arm_file)
+        planned = plan_sweep(arm_file, None if model is None else guess_of_model(model.arm, model.beta), seed=seed)
         print_plan(arm_file, planned)
-        write_json(json_file, planned.model_dump(mode="json"))
+        drawing = picture or (out or Path()) / f"{arm_file.name}-plan.html"
+        draw_plan(arm_file, planned, drawing)
+        took = seconds(arm_file, planned)
+        checked = check_plan(arm_file, planned)
+        print_lines([f"about {took / 60:.0f} min a pass; {checked}; drawn in {drawing}"])
+        write_json(
+            json_file,
+            {**planned.model_dump(mode="json"), "seconds": took, "collisions": checked, "picture": str(drawing)},
+        )
         return
     if out is None:
         raise BadInput("sweep: give --out DIR for the data set, or --plan to print the plan alone")
-    with Link.open(arm_file, bus) as link:
+    if not dry_run and not yes:
+        confirm(f"{arm_file.name} will move through its whole range, {reference_mass:g} kg attached. Is it clear?")
+    with _dry_link(arm_file, reference_mass) if dry_run else Link.open(arm_file, bus) as link:
         link.start()
         with SweepScreen(f"{arm_file.name}, {reference_mass:g} kg attached") as screen:
             link.enable()
+            found = listen(link, arm_file)
+            if check_stops and not resume and not reference_mass:
+                found = find_stops(link, arm_file, found, screen.count)
             data = run_sweep(
                 link, arm_file, out, reference_mass=reference_mass, resume=resume, progress=screen.update, seed=seed
             )
+    print_preflight(found)
     assert data.plan is not None
     print_plan(arm_file, data.plan)
     if not reference_mass:
@@ -70,3 +106,13 @@ def sweep(
         "plan": data.plan.model_dump(mode="json"),
     }
     write_json(json_file, answer)
+
+
+def _dry_link(arm_file: "ArmFile", reference_mass: float) -> "Link":
+    """A link to the simulated arm that the arm file describes, with the mass attached where there is one."""
+    from armlink.link import Link
+
+    link = Link.open(arm_file, f"armlink_sim:{arm_file.path}")
+    if reference_mass:
+        link.bus.arm.attach_mass(reference_mass)
+    return link
