@@ -1,5 +1,6 @@
 """A simulated arm on a bus of python-can's, in a process of its own: real time, or in lock-step with SYNC."""
 
+import errno
 import signal
 import time
 from collections.abc import Callable, Sequence
@@ -77,7 +78,8 @@ class Server:
                 self._frame(message)
                 message = self._bus.recv(0)
         except can.CanError as error:
-            raise BusFault(f"bus {self._bus.channel_info}: {error}") from None
+            if error.error_code != errno.ENETDOWN:  # else it may come up again, and until then nodes hear nothing
+                raise BusFault(f"bus {self._bus.channel_info}: {error}") from None
         except OSError as error:
             raise BusFault(f"bus {self._bus.channel_info}: {error.strerror or error}") from None
         self._let_time_pass()

@@ -92,12 +92,18 @@ class Ear:
         """Take frames in until `done(states)`, or the time is over."""
         end = time.monotonic() + seconds
         while not done(self.states):
-            message = self.bus.recv(max(0.0, min(0.1, end - time.monotonic())))
+            message = self._next(max(0.0, min(0.1, end - time.monotonic())))
             if message is not None:
                 self._hear(message.arbitration_id & 0x7F, message.arbitration_id & 0x780, bytes(message.data))
             elif time.monotonic() >= end:
                 return False
         return True
+
+    def _next(self, timeout: float) -> can.Message | None:
+        try:
+            return self.bus.recv(timeout)
+        except can.CanError:  # the interface is, or was, down
+            return None
 
     def _hear(self, node: int, service: int, data: bytes) -> None:
         if service == 0x580:
@@ -114,9 +120,18 @@ class Ear:
             request = b"\x40" + STATUS_READ[1:] + bytes(4)
             self.bus.send(can.Message(arbitration_id=0x600 + node, data=request, is_extended_id=False))
 
+    def see(self, done: Callable[[dict[int, State]], bool]) -> bool:
+        """Ask until `done(states)`; what came so far, and may have been too much to keep, does not count."""
+        self.forget()
+        for _ in range(5):
+            self.ask()
+            if self.listen(done, 1.0):
+                return True
+        return False
+
     def forget(self) -> None:
         """Drop what came so far."""
-        while self.bus.recv(0) is not None:
+        while self._next(0.0) is not None:
             pass
         self.states.clear()
 
