@@ -16,6 +16,8 @@ TRIES = 3
 """How often one effect at one place may come in during a search."""
 OWED = 0.06
 """What an effect must do better by than the simpler ones it is made of, where it needs some of these besides."""
+MUCH = 3.0
+"""What a fit leaves, in units of what is not worth explaining, from which on another start of the search is tried."""
 BESIDE = 0.3
 """Size of these, as a share of its own, from which it needs them."""
 
@@ -162,6 +164,13 @@ class Search:
         self.accept(chosen)
         return True
 
+    def leaves_much(self, term: Term) -> bool:
+        """Whether a row that the term touches is left with more than a few times what is not worth explaining."""
+        normal = self.normal
+        left = np.sqrt(normal.mean_square(*self.weighted.fit(self.active)))
+        touched = np.array([np.all(block.position[normal.at[term]] >= 0) for block in normal.blocks])
+        return bool(np.any(left[touched & normal.seen] > MUCH * normal.floor[touched & normal.seen]))
+
     def pruned(self, terms: list[Term], doubtful: Sequence[Term]) -> tuple[float, list[Term]]:
         """Score and terms after dropping of the doubtful ones those that do not earn their place."""
         best, kept = self.judge(terms), terms
@@ -176,7 +185,7 @@ class Search:
         """What a term must do better by than its parts, where some of these are needed beside it."""
         parts = effects()[term.effect].made_of(self.normal.layout, term.place, term.shape)
         beside = [other for other in self.active if other.key in parts]
-        if not beside:
+        if not beside or not effects()[term.effect].whole_arm:
             return 0.0
         own = self.normal.size_of(term, *self.weighted.fit(self.active))
         others = [self.normal.size_of(other, *self.weighted.fit(self.active)) for other in beside]
@@ -199,12 +208,34 @@ class Search:
 def compete(store: ColumnStore, library: Sequence[str]) -> Search:
     """Search the library, refine the shapes of what was chosen, and drop what no longer earns its place."""
     offered = candidates(store.data, library)
-    chosen = refine(store, Search(Normal(store, offered)).run())
+    first = Search(Normal(store, offered))
+    first.run()
+    chosen = refine(store, without_doubtful(first).active)
     keys = {term.key for term in chosen}
     search = Search(Normal(store, [*chosen, *(term for term in offered if term.key not in keys)]), chosen)
     while search.backward():
         pass
     return search
+
+
+def without_doubtful(search: Search) -> Search:
+    """Search again from where terms that leave much on their rows have given way to the simpler ones they are made of.
+
+    One step at a time does not get there where these need company to do better.
+    """
+    layout, library = search.normal.layout, effects()
+    made = {t: library[t.effect].made_of(layout, t.place, t.shape) for t in search.active}
+    doubtful = [term for term, parts in made.items() if parts and search.leaves_much(term)]
+    if not doubtful:
+        return search
+    rest = search.active
+    for term in doubtful:
+        rest = search.without(term, rest)
+    wanted = {key for term in doubtful for key in made[term]} - {other.key for other in rest}
+    again = Search(search.normal, [*rest, *(other for other in search.normal.terms if other.key in wanted)])
+    again.added.update({term.key: TRIES - 1 for term in doubtful})
+    again.run()
+    return again if again.score < search.score - 1e-3 else search
 
 
 def shortlist(screened: list[tuple[float, Term]]) -> list[tuple[float, Term]]:

@@ -69,6 +69,10 @@ class Stribeck(_Friction):
     def column(self, s: Signals, joint: int, shape: Shape) -> Array:
         return s.direction[:, joint] * np.exp(-((s.v[:, joint] / shape[0]) ** 2))
 
+    def made_of(self, layout: Layout, place: int, shape: Shape) -> tuple[tuple[str, int], ...]:
+        """Friction that grows with speed, or with load where speed goes with it."""
+        return ("friction.viscous", place), ("friction.load", place)
+
     def plausible(self, coefficients: Array, shape: Shape) -> bool:
         return True
 

@@ -1,6 +1,7 @@
 """Real arms: the gap closes on motion that was not fitted, for the reasons that are known."""
 
 import numpy as np
+import pytest
 
 from armlink.recording import load_recording, slice_rows
 from sim_gap.diagnose import diagnose
@@ -27,12 +28,31 @@ def test_ur10e(realdata):
     assert joints(answer, "friction.load") == {"joint_2", "joint_3"}
     assert np.all(answer.heldout_after <= [3.0, 4.0, 1.6, 0.40, 0.50, 0.35])
     assert np.all(answer.rollout.after < 0.2 * answer.rollout.before)
+    assert joints(answer, "link.mass_moment") >= {"joint_3"}
+    assert not joints(answer, "link.payload")
+
+
+def test_the_payload_of_one_recording_is_found_beside_what_is_wrong_with_the_arm(realdata):
+    folder = realdata / "ur10e"
+    load = lambda name: load_recording(folder / f"{name}.csv.gz")  # noqa: E731
+    answer = diagnose(folder / "sim.xml", [load("train_a"), load("train_b"), load("payload")], [load("heldout")])
+    (payload,) = [cause for cause in answer.causes if cause.effect == "link.payload"]
+    mass = payload.parameters["arm"]["mass"]
+    assert mass.value == pytest.approx(2.6, rel=0.1)
+    assert mass.low < 2.6 < mass.high
+    assert payload.confidence > 0.8
+    assert any("is in recording 3 alone" in note for note in answer.notes)
 
 
 def test_panda_is_wrong_in_its_masses(realdata):
     answer = split(realdata / "panda", 0.6)
     assert answer.causes[0].effect == "link.mass_moment"
     assert joints(answer, "link.mass_moment") & {"joint_2", "joint_3", "joint_4"}
+    assert not {joint for c in answer.causes if c.effect.startswith("friction") for joint in c.joints} & {
+        "joint_2",
+        "joint_3",
+        "joint_4",
+    }
     assert np.all(answer.heldout_after[1:4] <= [0.6, 0.6, 0.7])
 
 
@@ -48,6 +68,7 @@ def test_tx40_has_rotors_and_a_coupled_wrist(realdata):
     assert joints(answer, "actuator.rotor_inertia")
     assert joints(answer, "transmission.coupling") & {"joint_5", "joint_6"}
     assert np.all(answer.heldout_after[4:] <= 1.3)
+    assert answer.heldout_after[2] <= 1.5
 
 
 def test_lwr4_is_not_made_worse_on_another_trajectory(realdata):
