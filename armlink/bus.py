@@ -72,7 +72,8 @@ def open_link_bus(spec: str | None, section: LinkSection) -> Any:
     members: list[Any] = []
     try:
         for name in names:
-            members.append(open_bus(None, section.buses[name] if name else section.bus))
+            member = open_bus(None, section.buses[name] if name else section.bus)
+            members.append(member)
     except Exception:
         for member in members:
             member.shutdown()

@@ -6,7 +6,7 @@ whatever decodes a bus (`TappedBus`, `LogBus`), with the same times, so that bot
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -64,11 +64,14 @@ class FrameLog:
 
 
 class TappedBus:
-    """A bus whose messages are all written to a log as they are received; sends nothing."""
+    """A bus whose messages all go to somebody else too, with the time at which they came."""
 
-    def __init__(self, bus: Any, log: FrameLog) -> None:
-        """Take python-can's `bus`, which is closed with this one."""
-        self.bus, self.log = bus, log
+    def __init__(self, bus: Any, tap: Callable[[can.Message, int], None], sends: bool = False) -> None:
+        """Take python-can's `bus`, closed with this one; `tap` gets each message and its time [µs].
+
+        That is the interface's own time stamp, or, where we send too, `clock`, so that what was sent has a time too.
+        """
+        self.bus, self._tap, self._sends = bus, tap, sends
         self.clock: Clock = getattr(bus, "clock", None) or MonotonicClock()
         self.channel_info = bus.channel_info
         self._first: int | None = None
@@ -87,20 +90,30 @@ class TappedBus:
                 raise BusFault(f"bus {self.channel_info}: cannot receive: {error}") from None
             if message is None:
                 return None
-            stamp = round((message.timestamp or self.clock.now()) * 1e6)
-            self._first = stamp if self._first is None else self._first
-            self._newest = stamp - self._first
-            self.log.write(message, stamp)
+            self._hand_on(message, 0.0 if self._sends else message.timestamp)
             if is_ours(message):
                 return message.arbitration_id, bytes(message.data)
 
     def put(self, can_id: int, data: bytes) -> None:
-        """Refuse: a recorder sends nothing."""
-        raise BusFault(f"bus {self.channel_info}: a recorder sends nothing")
+        """Send a frame; raises BusFault where it cannot be sent, or where this bus only listens."""
+        if not self._sends:
+            raise BusFault(f"bus {self.channel_info}: only listened to")
+        message = can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+        self._hand_on(message, 0.0)
+        try:
+            self.bus.send(message)
+        except (can.CanError, OSError) as error:
+            raise BusFault(f"bus {self.channel_info}: cannot send: {error}") from None
 
     def shutdown(self) -> None:
         """Close the bus."""
         self.bus.shutdown()
+
+    def _hand_on(self, message: can.Message, time: float) -> None:
+        stamp = round((time or self.clock.now()) * 1e6)
+        self._first = stamp if self._first is None else self._first
+        self._newest = stamp - self._first
+        self._tap(message, stamp)
 
 
 class LogBus:
@@ -187,7 +200,7 @@ class LogReader:
         if why:
             self.warning = f"cut frame log, {why}: loaded {self.count} frames up to there"
 
-    def _from_blf(self) -> Iterator[can.Message]:
+    def _from_blf(self) -> Generator[can.Message, None, str]:
         size = self._path.stat().st_size
         with self._path.open("rb") as stream:
             stated = stream.read(_BLF_SIZE.size)
@@ -195,7 +208,7 @@ class LogReader:
             yield from can.BLFReader(stream)
         return "" if _BLF_SIZE.unpack(stated)[0] == size else "the file ends early"
 
-    def _from_lines(self) -> Iterator[can.Message]:
+    def _from_lines(self) -> Generator[can.Message, None, str]:
         with self._path.open(encoding="utf-8", errors="replace") as stream:
             lines = _WholeLines(stream)
             yield from (can.ASCReader if self._path.suffix.lower() == ".asc" else can.CanutilsLogReader)(lines)

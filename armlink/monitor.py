@@ -4,10 +4,14 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import can
+
 from armlink import emcy, objects
 from armlink.armfile import ArmFile
 from armlink.cia402 import state_of
 from armlink.clock import Clock, MonotonicClock
+from armlink.cycle_stats import CycleStats
+from armlink.frames import TappedBus, is_ours
 from armlink.loop import NO_STATUS, Loop
 from armlink.port import open_port
 from armlink.sample import Sample
@@ -31,13 +35,19 @@ class View:
 class Monitor:
     """Listens to an arm's joints. With `sync` it is the bus's host: starts the nodes (NMT) and sends SYNC itself."""
 
-    def __init__(self, arm: ArmFile, bus: Any, sync: bool = False) -> None:
+    def __init__(self, arm: ArmFile, bus: Any, sync: bool = False, stats: bool = False) -> None:
+        """`stats`: measure the cycle too, from every frame's time stamp, which costs more than listening alone."""
         self.section = section = arm.require_link()
         self.names = tuple(joint.name for joint in section.joints)
         self.nodes = tuple(joint.node for joint in section.joints)
         own_clock: Clock | None = getattr(bus, "clock", None)
         self.clock: Clock = own_clock or MonotonicClock()
         self._sync, self._period = sync, 1.0 / section.rate
+        self.cycle_stats: CycleStats | None = None
+        """Figures of the cycle so far, None where they were not asked for."""
+        if stats:
+            self.cycle_stats = CycleStats(self.nodes, self._period, section.bus.bitrate)
+            bus = TappedBus(bus, self._count_cycle, sends=sync)
         self._loop = Loop(open_port(bus), self.clock, self.nodes, 0, self._period, own_clock is not None)
         self._loop.set_units(assumed_units(arm))
         self._loop.on_other = self._count
@@ -64,14 +74,17 @@ class Monitor:
         return View(sample, rate, (self._loop.bits - bits) / (self.section.bus.bitrate * elapsed))
 
     def describe(self, view: View) -> dict[str, Any]:
-        """A view as JSON: joints with readings [rad, rad/s, N·m], states and age [s]; bus with rate and load."""
+        """A view as JSON: joints with readings [rad, rad/s, N·m], states and age [s]; bus with rate and load; cycle."""
+        cycle = {} if self.cycle_stats is None else {"cycle": self.cycle_stats.as_json()}
         return {
+            **cycle,
             "joints": [self._joint(view.sample, joint) for joint in range(len(self.names))],
             "emergencies": [
                 {"joint": self.names[joint], "code": f"{code:04X}h", "meaning": emcy.name_of(code)}
                 for joint, code, _ in self._loop.emergencies
             ],
-            "bus": {"rate_hz": view.rate_hz, "load": view.load, "frames": self.frames, "errors": self.errors},
+            "bus": {"rate_hz": view.rate_hz, "load": view.load, "frames": self.frames, "errors": self.errors}
+            | {"dropped": self._loop.dropped},
         }
 
     def _joint(self, sample: Sample, joint: int) -> dict[str, Any]:
@@ -100,9 +113,13 @@ class Monitor:
             end = start + (cycle + 1) * self._period
             while (remaining := end - self.clock.now()) > 0:
                 self._loop.receive(remaining)
-        while self._loop.receive(0.0):
-            pass
+            while self._loop.receive(0.0):
+                pass
         return self._loop.sample(self.clock.now())
+
+    def _count_cycle(self, message: can.Message, stamp: int) -> None:
+        if self.cycle_stats and is_ours(message):
+            self.cycle_stats.take(stamp / 1e6, message.arbitration_id, bytes(message.data))
 
     def _count(self, can_id: int, data: bytes) -> None:
         self._syncs += can_id == objects.SYNC_ID

@@ -19,13 +19,18 @@ def monitor(
     once: Annotated[bool, typer.Option("--once", help="Show one table and end.")] = False,
     cycles: Annotated[int, typer.Option(min=0, help="End after so many refreshes (5 a second); 0: Ctrl-C.")] = 0,
     sync: Annotated[bool, typer.Option("--sync", help="Start the nodes and send SYNC, where no host does.")] = False,
+    stats: Annotated[
+        bool, typer.Option("--stats", help="Period, jitter, latency (p50, p99, p99.9), missed cycles, exact bus load.")
+    ] = False,
     json: Annotated[Path | None, typer.Option(help="Write the last state here; - is standard output.")] = None,
 ) -> int:
     """Show what an arm's joints send; exit status 3 where no joint is heard.
 
-    It listens beside the host that runs the arm. Scales are the arm file's rated torques and 2^20 units a turn.
+    It listens beside the host that runs the arm. Scales are the arm file's rated torques and 2^20 units a turn. With
+    --stats every frame's time stamp counts (the interface's own; the monitor's clock with --sync): latency is from SYNC
+    to the last joint's reading, and the load has its stuff bits.
 
-    Example: armlink monitor sarcos --bus socketcan:vcan0
+    Example: armlink monitor sarcos --bus socketcan:vcan0 --stats
     """
     from rich.console import Console
     from rich.live import Live
@@ -42,7 +47,7 @@ def monitor(
     answer: dict[str, Any] = {}
     title = f"{arm_file.name} on {opened.channel_info}"
     try:
-        watcher = Monitor(arm_file, opened, sync)
+        watcher = Monitor(arm_file, opened, sync, stats)
         refreshes = 1 if once else cycles
         shown = 0
         with Live(console=console, auto_refresh=False, transient=True) as live:
@@ -83,7 +88,29 @@ def _table(title: str, answer: dict[str, Any]) -> "Group":
     bus = answer["bus"]
     line = f"SYNC {bus['rate_hz']:.1f} Hz, load {bus['load']:.1%}, {bus['frames']} frames, {bus['errors']} errors"
     emergencies = [f"{each['joint']}: {each['code']} {each['meaning']}" for each in answer["emergencies"][-5:]]
-    return Group(table, line, *emergencies)
+    if bus["dropped"]:
+        line += f", {bus['dropped']} lost because this process read too slowly"
+    return Group(table, line, *emergencies, *_cycle(answer.get("cycle")))
+
+
+def _cycle(cycle: dict[str, Any] | None) -> list[str]:
+    """Figures of the cycle and the histogram of its latency, as lines."""
+    if cycle is None:
+        return []
+    if not cycle["cycles"]:
+        return ["no whole cycle yet"]
+    lines = [
+        f"{cycle['cycles']} cycles, {cycle['missed']} missed ({cycle['missed'] / cycle['cycles']:.3%}); period "
+        f"{cycle['period_ms']:.3f} ms, jitter {cycle['jitter_ms']:.3f} ms, longest {cycle['longest_period_ms']:.3f} ms",
+        f"SYNC to the last reading: p50 {cycle['latency_p50_ms']:.3f}, p99 {cycle['latency_p99_ms']:.3f}, "
+        f"p99.9 {cycle['latency_p999_ms']:.3f}, longest {cycle['latency_max_ms']:.3f} ms",
+        f"bus {cycle['load']:.1%} busy with stuff bits: {cycle['bus_ms_per_cycle']:.3f} ms of each cycle is the wire's",
+    ]
+    most = max((count for _, count in cycle["histogram"]), default=1)
+    return lines + [
+        f"{f'≤ {edge:g} ms' if edge < float('inf') else 'more':>10} {count:8d} {'█' * round(40 * count / most)}"
+        for edge, count in cycle["histogram"]
+    ]
 
 
 def _number(value: float, form: str) -> str:

@@ -51,7 +51,7 @@ def record(
         log = stack.enter_context(FrameLog(frames)) if frames else None
         opened = open_link_bus(bus, arm_file.require_link())
         stack.callback(opened.shutdown)
-        recorder = Recorder(arm_file, TappedBus(opened, log) if log else opened)
+        recorder = Recorder(arm_file, TappedBus(opened, log.write) if log else opened)
         try:
             with contextlib.suppress(KeyboardInterrupt), contextlib.ExitStack() as files:
                 writer = files.enter_context(RecordingWriter(out, recorder.names)) if out else None

@@ -56,7 +56,7 @@ def replay(
         console.print(f"{target}: {recording.t.size} rows", markup=False)
     else:
         show(recording, console, speed)
-    answer = {"rows": int(recording.t.size), "seconds": float(recording.t[-1] - recording.t[0])}
-    answer |= {"joints": list(recording.names), "channels": list(recording.channels())}
-    write_json(json, {**answer, "warning": recording.warning})
+    counts = {"rows": int(recording.t.size), "seconds": float(recording.t[-1] - recording.t[0])}
+    content = {"joints": list(recording.names), "channels": list(recording.channels())}
+    write_json(json, {**counts, **content, "warning": recording.warning})
     return 0

@@ -85,3 +85,13 @@ def test_convert_says_in_one_line_what_it_cannot_read_or_write(tmp_path, capsys)
     (tmp_path / "a.csv").write_text("t,q_1,tau_1\n0,1,2\n1,1,2\n")
     assert run(["convert", str(tmp_path / "a.csv"), str(tmp_path / "none" / "b.parquet")]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_monitor_stats_reports_the_cycle(capsys):
+    assert run(["monitor", "sarcos", "--bus", BUS, "--sync", "--stats", "--cycles", "2", "--json", "-"]) == 0
+    captured = capsys.readouterr()
+    cycle = json.loads(captured.out)["cycle"]
+    assert (cycle["cycles"], cycle["missed"]) == (99, 0)
+    assert cycle["period_ms"] == pytest.approx(4.0)
+    assert cycle["load"] == pytest.approx(0.25, rel=0.15)
+    assert "p99.9" in captured.err

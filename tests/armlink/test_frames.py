@@ -56,7 +56,7 @@ class Conversation:
 
 def record(arm, path, cycles=60):
     with FrameLog(path) as log:
-        return list(Recorder(arm, TappedBus(Conversation(cycles), log)).rows(1.0))
+        return list(Recorder(arm, TappedBus(Conversation(cycles), log.write)).rows(1.0))
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -84,7 +84,7 @@ def test_every_message_is_in_the_log(arm_of, tmp_path, suffix):
 def whole(request, tmp_path_factory):
     path = tmp_path_factory.mktemp("logs") / f"run{request.param}"
     with FrameLog(path) as log:
-        bus = TappedBus(Conversation(250), log)
+        bus = TappedBus(Conversation(250), log.write)
         while bus.take(0.0):
             pass
     return path, path.read_bytes(), list(LogReader(path).frames())
