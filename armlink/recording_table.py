@@ -3,6 +3,8 @@
 import csv
 import gzip
 import json
+import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +16,20 @@ import pyarrow.parquet as pa_parquet
 from armlink.errors import BadInput
 from armlink.recording import Array, Recording, channels_of, columns_of, default_names, is_channel, joint_count
 
+_LOOK_BACK = 20_000  # bytes at the end of a CSV file that tell how long its numbers are
 NAMES_KEY = b"armlink.names"
 """Parquet schema metadata: joint names as JSON."""
 
 
 def load_csv(path: Path) -> Recording:
-    """Load `.csv` or `.csv.gz` with a header row of contract 2's names; raises BadInput."""
-    header = _header(path)
+    """Load `.csv` or `.csv.gz` with a header row of contract 2's names, up to where it was cut; raises BadInput."""
+    content, cut = _content(path)
+    header = _header(path, content)
     joint_count(header, str(path))
     wanted = [column for column in header if is_channel(column)]
     try:
         table = pa_csv.read_csv(
-            path,
+            pa.BufferReader(content),
             read_options=pa_csv.ReadOptions(column_names=header, skip_rows=1),
             convert_options=pa_csv.ConvertOptions(
                 include_columns=wanted, column_types=dict.fromkeys(wanted, pa.float64())
@@ -33,7 +37,11 @@ def load_csv(path: Path) -> Recording:
         )
     except (pa.ArrowInvalid, OSError, EOFError) as error:
         raise BadInput(f"{path}: {_first_line(error)}") from None
-    return _recording(table, header, str(path), ())
+    loaded = _recording(table, header, str(path), ())
+    if cut:
+        cut = f"cut recording, {cut}: loaded {loaded.t.size} rows"
+        loaded = replace(loaded, warning="; ".join(filter(None, (cut, loaded.warning))))
+    return loaded
 
 
 def load_parquet(path: Path) -> Recording:
@@ -86,12 +94,68 @@ def _table(recording: Recording) -> Any:
     return pa.table({name: pa.array(values, from_pandas=True) for name, values in columns_of(recording).items()})
 
 
-def _header(path: Path) -> list[str]:
-    opener = gzip.open if path.name.lower().endswith(".gz") else open
+def _content(path: Path) -> tuple[bytes, str]:
+    """The file's whole lines, unpacked, and what to say where it was cut."""
     try:
-        with opener(path, "rt", encoding="utf-8-sig", newline="") as stream:
-            header = [column.strip() for column in next(csv.reader([stream.readline()]), [])]
-    except (OSError, UnicodeDecodeError, EOFError) as error:
+        content = path.read_bytes()
+        cut = ""
+        if path.name.lower().endswith(".gz"):
+            content, ended = _unpacked(content)
+            cut = "" if ended else "the file ends early"
+    except (OSError, zlib.error) as error:
+        raise BadInput(f"{path}: not a readable CSV file: {_first_line(error)}") from None
+    if content.endswith((b"\n", b"\r")) or not content:
+        return content, cut
+    whole = content.rfind(b"\n") + 1
+    if not cut and _looks_whole(content):
+        return content, ""
+    return content[:whole], cut or "its last line is not complete"
+
+
+def _unpacked(packed: bytes) -> tuple[bytes, bool]:
+    """What gzip members hold as far as they go, and whether the last one is whole."""
+    parts, ended = [], False
+    while packed:
+        member = zlib.decompressobj(wbits=31)
+        parts.append(member.decompress(packed))
+        ended, packed = member.eof, member.unused_data.lstrip(b"\0")
+        if not ended:
+            break
+    return b"".join(parts), ended
+
+
+def _looks_whole(content: bytes) -> bool:
+    """Whether a last line without its end is nevertheless whole: all columns, its last number as long as any before it.
+
+    A number that is cut has fewer digits behind the point than the others of its column, or is shorter.
+    """
+    lines = content[-_LOOK_BACK:].decode("utf-8", "replace").splitlines()
+    *before, last = (line.split(",") for line in lines)
+    if len(content) > _LOOK_BACK:
+        before = before[1:]
+    before = [cells for cells in before if len(cells) == len(last)]
+    rest = [cells[-1] for cells in before if _is_number(cells[-1])]
+    if not before or len(last) < 2 or not (_is_number(last[-1]) or not rest):
+        return False
+    digits = [len(cell.partition(".")[2]) for cell in (*rest, last[-1])]
+    if any(digits):
+        return digits[-1] >= max(digits[:-1], default=0)
+    return len(last[-1]) >= max(map(len, rest), default=0)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _header(path: Path, content: bytes) -> list[str]:
+    try:
+        line = content.partition(b"\n")[0].decode("utf-8-sig")
+        header = [column.strip() for column in next(csv.reader([line]), [])]
+    except (UnicodeDecodeError, csv.Error) as error:
         raise BadInput(f"{path}: not a readable CSV file: {_first_line(error)}") from None
     twins = sorted({column for column in header if header.count(column) > 1})
     if twins:

@@ -1,9 +1,12 @@
 """Recordings: what is written comes back, and what cannot be used is said in one line."""
 
-import gzip
+import contextlib
+import zlib
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from armlink.errors import BadInput
 from armlink.recording import Recording, load_recording, save_recording, slice_rows
@@ -95,13 +98,39 @@ def test_files_that_are_no_recordings(tmp_path):
             load_recording(csv(tmp_path, "not what the suffix says", name))
 
 
-def test_a_cut_gzip_is_refused(recording, tmp_path):
-    save_recording(recording, tmp_path / "r.csv.gz")
-    packed = (tmp_path / "r.csv.gz").read_bytes()
-    assert gzip.decompress(packed)
-    (tmp_path / "r.csv.gz").write_bytes(packed[: len(packed) // 2])
-    with pytest.raises(BadInput, match=r"r\.csv\.gz"):
-        load_recording(tmp_path / "r.csv.gz")
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(data=st.data(), suffix=st.sampled_from((".csv", ".csv.gz")))
+def test_a_table_cut_at_any_byte_loads_up_to_the_cut_and_says_so(recording, tmp_path, data, suffix):
+    save_recording(recording, tmp_path / f"r{suffix}")
+    whole = (tmp_path / f"r{suffix}").read_bytes()
+    cut = data.draw(st.integers(0, len(whole) - 1))
+    (tmp_path / f"c{suffix}").write_bytes(whole[:cut])
+    text = zlib.decompressobj(31).decompress(whole[:cut]) if suffix == ".csv.gz" else whole[:cut]
+    rows = max(0, text.count(b"\n") - 1)
+    if rows < 2:
+        with contextlib.suppress(BadInput):
+            assert load_recording(tmp_path / f"c{suffix}").t.size <= 2
+        return
+    loaded = load_recording(tmp_path / f"c{suffix}")
+    assert loaded.t.size in (rows, rows + 1)  # a last line that is whole but for its end counts
+    np.testing.assert_allclose(loaded.position, recording.position[: loaded.t.size], rtol=1e-12)
+    np.testing.assert_allclose(loaded.torque, recording.torque[: loaded.t.size], rtol=1e-12)
+    line_is_whole = text.endswith(b"\n") or loaded.t.size == rows + 1
+    assert f"loaded {loaded.t.size} rows" in loaded.warning or (suffix == ".csv" and line_is_whole)
+
+
+def test_a_table_written_without_a_last_line_end_is_whole(tmp_path):
+    assert load_recording(csv(tmp_path, "t,q_1,tau_1\n0,1.25,2.125\n0.5,1.5,3.250")).t.size == 2
+    loaded = load_recording(csv(tmp_path, "t,q_1,tau_1\n0,1.25,2.125\n0.5,1.5,3.25\n1,1,3.2"))
+    assert loaded.t.size == 2
+    assert "its last line is not complete" in loaded.warning
+
+
+def test_a_cut_parquet_is_refused_since_its_index_is_at_its_end(recording, tmp_path):
+    save_recording(recording, tmp_path / "r.parquet")
+    (tmp_path / "r.parquet").write_bytes((tmp_path / "r.parquet").read_bytes()[:-20])
+    with pytest.raises(BadInput, match=r"r\.parquet"):
+        load_recording(tmp_path / "r.parquet")
 
 
 def test_a_recording_of_wrong_shape_is_not_saved(recording, tmp_path):
