@@ -6,12 +6,12 @@ from armlink.armfile import ArmFile
 from armlink.errors import Refused
 from calib.field import FieldFit
 from calib.field_rows import FieldRows
+from calib.gates import FEWEST, worse_by
 from calib.records import Array, CalibrationRecord, JointCalibration, Parameter, matrix, provenance
 
 PAIR: tuple[Parameter, Parameter] = ("gain", "offset")
 BLOCK = 24
 """Neighbouring rows that are held out together: they are alike."""
-WORSE = 1.05
 
 
 def field_record(
@@ -51,15 +51,16 @@ def check_field_heldout(rows: FieldRows, fit: FieldFit, before: CalibrationRecor
         new, old = [], []
         for held in (0, 1):
             train, test = counted & (block != held), counted & (block == held)
-            if train.sum() < 4 or not test.any():
+            if train.sum() < FEWEST or not test.any():
                 continue
             line = np.polyfit(fit.torque[train, j], rows.torque[train, j], 1)
             new.append(rows.torque[test, j] - np.polyval(line, fit.torque[test, j]))
             old.append(rows.torque[test, j] - gain[j] * fit.torque[test, j] - offset[j])
-        if new and _rms(np.concatenate(new)) > WORSE * _rms(np.concatenate(old)):
+        ratio = worse_by(np.concatenate(new), np.concatenate(old)) if new else None
+        if ratio is not None:
             raise Refused(
-                f"{name}: rows left out of the fit are {_rms(np.concatenate(new)):.3f} N·m RMS off with the new pair,"
-                f" {_rms(np.concatenate(old)):.3f} with record {before.id}: nothing is gained; nothing was written"
+                f"{name}: rows left out of the fit are {ratio:.2f} times as far off with the new pair as with record"
+                f" {before.id}: they do not agree with one another; nothing was written"
             )
 
 

@@ -11,7 +11,7 @@ from armlink.errors import Refused
 from calib.dataset import SweepData
 from calib.description import gcomp_arm
 from calib.fit_rows import FitRows, fit_rows
-from calib.records import Array, CalibrationRecord, Parameter
+from calib.records import Array, CalibrationRecord, GravityRecord, Parameter
 from calib.store import RecordStore
 from gcomp.errors import GcompError
 from gcomp.global_fit import identify_global
@@ -28,11 +28,12 @@ USUAL_COUNTS = 4
 """Past changes that the usual one counts for."""
 DEVIATIONS = 5.0
 """A change beyond so many standard deviations of covariance and history is refused: 10 % of gain without history."""
-NOT_BY_CHANCE = 4.0
+NOT_BY_CHANCE = 3.0
 """Standard errors by which the held-out residual must be worse to be called worse."""
 WORSE = 1.05
 """Ratio of held-out RMS, new over old, below which it is not worse."""
-
+FEWEST = 6
+"""Readings of a joint from which that is judged."""
 LOOSE = 0.2
 """Prior of a gain that is estimated anew: it only fixes the scale where no mass does, which no prediction shows."""
 
@@ -51,7 +52,7 @@ def check_gates(
         return
     check_change(record, old, past_changes(store, arm), arm, replaced)
     if not replaced:
-        check_heldout(record, old, arm, data)
+        check_heldout(record, old, arm, data, store.current(GravityRecord, arm))
 
 
 def check_bounds(record: CalibrationRecord, arm: ArmFile) -> None:
@@ -115,52 +116,74 @@ def history_std(past: Array, usual: float) -> Array:
     return std
 
 
-def check_heldout(new: CalibrationRecord, old: CalibrationRecord, arm: ArmFile, data: Sequence[SweepData]) -> None:
+def check_heldout(
+    new: CalibrationRecord,
+    old: CalibrationRecord,
+    arm: ArmFile,
+    data: Sequence[SweepData],
+    gravity: GravityRecord | None = None,
+) -> None:
     """Raise Refused where a joint's readings that were left out of the fit are predicted worse than by the old record.
 
-    Every second step is left out: new gains, offsets and mass moments are estimated without it, the old record's pairs
-    are held and only mass moments estimated; both predict it. Then the other half is left out.
+    Every second step is left out: new gains, offsets and mass moments are estimated without it. The old record's pairs
+    are held, and the mass moments of `gravity` with them; without it those are estimated too. Both predict the steps
+    left out; then the other half is left out.
     """
     rows = fit_rows([each.require(arm) for each in data])
-    scores = {each.id: heldout_scores(each, arm, rows, refit=each is new) for each in (new, old)}
-    difference = scores[new.id] ** 2 - scores[old.id] ** 2
+    fresh = heldout_scores(new, arm, rows, refit=True)
+    beta = None if gravity is None else np.array(gravity.require(arm).beta)
+    stale = heldout_scores(old, arm, rows, refit=False, beta=beta)
     for j, joint in enumerate(new.joints):
-        counted = np.isfinite(difference[:, j])
-        if counted.sum() < 4:
-            continue
-        mean, std = float(difference[counted, j].mean()), float(difference[counted, j].std(ddof=1))
-        ratio = float(np.sqrt(np.nanmean(scores[new.id][:, j] ** 2) / np.nanmean(scores[old.id][:, j] ** 2)))
-        if ratio > WORSE and mean > NOT_BY_CHANCE * std / np.sqrt(counted.sum()):
+        ratio = worse_by(fresh[:, j], stale[:, j])
+        if ratio is not None:
             raise Refused(
                 f"{joint.name}: readings left out of the fit are {ratio:.2f} times as far off with record {new.id} as"
                 f" with {old.id}: the sweeps do not agree with one another; nothing was written"
             )
 
 
-def heldout_scores(record: CalibrationRecord, arm: ArmFile, rows: FitRows, refit: bool) -> Array:
+def worse_by(new: Array, old: Array) -> float | None:
+    """RMS of new errors (K,) over that of old ones where they are worse beyond chance; else None. NaN is left out."""
+    counted = np.isfinite(new) & np.isfinite(old)
+    if counted.sum() < FEWEST:
+        return None
+    difference = new[counted] ** 2 - old[counted] ** 2
+    ratio = float(np.sqrt(np.mean(new[counted] ** 2) / max(float(np.mean(old[counted] ** 2)), 1e-300)))
+    chance = NOT_BY_CHANCE * float(difference.std(ddof=1)) / np.sqrt(len(difference))
+    return ratio if ratio > WORSE and float(difference.mean()) > chance else None
+
+
+def heldout_scores(
+    record: CalibrationRecord, arm: ArmFile, rows: FitRows, refit: bool, beta: Array | None = None
+) -> Array:
     """Prediction errors (K, n) of steps that were left out, over their standard deviation; NaN where none counts.
 
-    With `refit` gains and offsets are estimated on the other steps, else the record's are held.
+    With `refit` gains and offsets are estimated on the other steps, else the record's are held; likewise mass moments
+    where `beta` (2n,) is given.
     """
     described, score = gcomp_arm(arm), np.full(rows.readings.torque.shape, np.nan)
+    known = {} if beta is None else {"beta": beta}
     start = Parameters.nominal(
         described.n,
         gain=record.values("gain", 1.0),
         offset=record.values("offset", 0.0),
         position_gain=record.values("position_gain", 1.0),
         position_offset=record.values("position_offset", 0.0),
+        **known,
     )
     priors = {"gain": Prior(start.gain, LOOSE)} if refit else {}
     fold = _folds(rows)
-    unknown = {"beta"} | ({"rho"} if any(rows.masses) else set()) | ({"gain", "offset"} if refit else set())
+    unknown = {"rho"} if any(rows.masses) else set[str]()
+    unknown |= ({"gain", "offset"} if refit else set()) | ({"beta"} if beta is None else set())
     for left_out in (0, 1):
+        kept, complete = rows.readings.rows(fold != left_out), start
         try:
-            kept = rows.readings.rows(fold != left_out)
-            fit = identify_global(described, kept, unknown=unknown, start=start, priors=priors)
+            if unknown:
+                complete = identify_global(described, kept, unknown=unknown, start=start, priors=priors).complete
         except GcompError:
             continue
         held: Readings = rows.readings.rows(fold == left_out)
-        score[fold == left_out] = (held.torque - predict(described, fit.complete, held)) / held.sigma
+        score[fold == left_out] = (held.torque - predict(described, complete, held)) / held.sigma
     return score
 
 

@@ -97,7 +97,7 @@ def _comparison(done: Calibrated) -> Section:
         )
     else:
         old, label = (before.values("gain", 1.0), before.values("offset", 0.0)), f"record {before.id}"
-    new = record.values("gain"), record.values("offset")
+    new = _or(record.values("gain"), old[0]), _or(record.values("offset"), old[1])
     rms = [_rms_of_pair(done, *pair) for pair in (old, new)]
     shown = np.isfinite(rms[0]) & np.isfinite(rms[1])
     text = (
@@ -167,7 +167,7 @@ def _sweeps(done: Calibrated) -> list[Section]:
                     escape(sweep),
                     f"{fit.rows.readings.load[at[0]]:g}",
                     str(len(at)),
-                    f"{angle.min():.2f} … {angle.max():.2f}",
+                    f"{angle.min():.2f}\u202f…\u202f{angle.max():.2f}".replace("-", "\u2212"),
                     _number(float(np.sqrt(np.nanmean(residual**2))), ".4f"),
                     _number(float(np.nanmax(np.abs(residual))), ".4f"),
                     "–" if told is None else f"{told.rms:.4f} ({told.ratio:.1f} ×)",
@@ -208,10 +208,15 @@ def _left_out(done: Calibrated) -> Section:
     )
 
 
+def _or(found: Array, held: Array) -> Array:
+    """What was found, and what is held where nothing was."""
+    return np.where(np.isnan(found), held, found)
+
+
 def _interval(value: float, half: float) -> str:
     if not np.isfinite(value):
         return "not observable"
-    return f"{value:.4f} ± {half:.4f}" if half > 0 else f"{value:.4f}"
+    return f"{value:.4f}\u00a0±\u00a0{half:.4f}" if half > 0 else f"{value:.4f}"
 
 
 def _number(value: float | None, form: str) -> str:

@@ -118,7 +118,10 @@ def _panels(titles: list[str], pairs: list[tuple[Array, Array]], along: str) -> 
             figure.add_scatter(x=number, y=y, mode="lines", name=name, line=line, **first, **place)
     figure.update_xaxes(title_text=along, row=rows)
     figure.update_yaxes(title_text="N·m", col=1)
-    return figure.update_layout(height=PANEL * rows + 90, legend={"orientation": "h", "y": 1.06, "x": 0})
+    above = 1 + 55 / (PANEL * rows)  # over the first row's titles
+    return figure.update_layout(
+        height=PANEL * rows + 120, legend={"orientation": "h", "y": above, "x": 0}, margin={"t": 80}
+    )
 
 
 def _rms(values: Array) -> float:

@@ -61,7 +61,7 @@ def style(figure: Any) -> None:
         template="plotly_white",
         font={"family": "system-ui, sans-serif", "size": 13, "color": "#1c2733"},
         colorway=["#1f5fa8", "#d9622b", "#3c8d5a", "#8a4fa3", "#b8912b", "#4f7f95", "#a83248"],
-        margin={"l": 60, "r": 20, "t": 48, "b": 48},
+        margin={"l": 60, "r": 20, "t": figure.layout.margin.t or 48, "b": 48},
         paper_bgcolor="white",
         hoverlabel={"font_size": 12},
     )
