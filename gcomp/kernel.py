@@ -16,8 +16,8 @@ from gcomp.arm import Arm
 from gcomp.arrays import Array, as_array, as_batch, as_poses
 from gcomp.unrolled import compile_single_pose, without_rounding
 
-BLOCK = 2000
-"""Poses worked on at a time: about half a megabyte of work space for seven joints. Not a power of two: rows that begin
+BLOCK = 5000
+"""Poses worked on at a time: about two megabytes of work space for seven joints. Not a power of two: rows that begin
 at the same place of a memory page push each other out of the cache."""
 
 ComplexArray = NDArray[np.complex128]

@@ -10,7 +10,8 @@ from gcomp.arrays import Array
 from gcomp.design import stop_combinations
 from gcomp.global_fit import GlobalFit, identify_global
 from gcomp.gravity import gravity_regressor, torque_covariance
-from gcomp.parameters import Parameters, family_slices, free_mask
+from gcomp.linear_start import linear_start
+from gcomp.parameters import Parameters, Prior, family_slices, free_mask
 from gcomp.readings import Readings
 from gcomp.recursive import identify_recursive
 from gcomp.sensor_model import predict_and_jacobian
@@ -27,8 +28,9 @@ GAINS_UNKNOWN = GAINS_KNOWN | {
 CHECKED = np.random.default_rng(9).uniform(make_sarcos().lower, make_sarcos().upper, (400, 7))
 MOMENTS = ("offset", "beta")
 CALIBRATION = ("gain", "offset", "position_offset", "beta", "rho")
-GUESS = Parameters.nominal(7, beta=SARCOS_BETA, rho=[0.08, -0.05, 0.1])
-"""The note does not print where the 2 kg are: ρ_xy of 0.09 m is what its gain errors of joints 5 to 7 speak for."""
+GUESS = Parameters.nominal(7, beta=SARCOS_BETA, rho=[0.06, 0.12, -0.2])
+"""The note does not print where the 2 kg are: at this point the covariances of its weighted rows and of its unweighted one
+agree with what it prints to 15 %, joint by joint."""
 
 
 def sweep(joint: int, pose: Array) -> tuple[Array, Array]:
@@ -101,7 +103,7 @@ def trials(stops: dict[int, str], poses: int, count: int, sensors: str = "own"):
 
 
 def unweighted(rows: Readings) -> Readings:
-    return Readings(rows.position, rows.torque, np.full_like(rows.sigma, 0.06), rows.load)
+    return Readings(rows.position, rows.torque, np.full_like(rows.sigma, 0.1), rows.load)
 
 
 def without_void(stops: dict[int, str]) -> dict[int, list[str]]:
@@ -222,3 +224,54 @@ def test_gains_offsets_and_position_offsets_unknown_with_a_mass_of_two_kilograms
     spread = np.std(scores, axis=0)
     assert np.all((spread > 0.8) & (spread < 1.22))
     assert np.mean(np.abs(scores) < 1.96) == pytest.approx(0.95, abs=0.012)
+
+
+def test_equation_l_that_takes_positions_for_right() -> None:
+    free, found, gains = free_mask(7, ("gain", "offset", "beta", "rho")), [], []
+    for true, rows in calibrations(2, 200):
+        fit = linear_start(make_sarcos(), rows, Parameters.nominal(7), free)
+        found.append(fit.beta)
+        gains.append(100 * (fit.gain - true.gain))
+    assert torque_rms(found) == pytest.approx([0.48, 0.46, 0.25, 0.19, 0.057, 0.093, 0.026], rel=0.2)
+    rms = np.sqrt(np.mean(np.square(gains), axis=0))
+    assert (rms.min(), rms.max()) == pytest.approx((1.1, 2.7), rel=0.2)
+
+
+@pytest.mark.slow
+def test_without_weights_distal_joints_take_the_noise_of_proximal_sensors() -> None:
+    betas, gains = [], []
+    for true, rows in calibrations(2, 100):
+        found = identify_global(make_sarcos(), unweighted(rows), unknown=CALIBRATION)
+        betas.append(found.values.beta)
+        gains.append(100 * (found.values.gain - true.gain))
+    assert torque_rms(betas) == pytest.approx([0.127, 0.114, 0.056, 0.052, 0.017, 0.025, 0.0079], rel=0.2)
+    rms = np.sqrt(np.mean(np.square(gains), axis=0))
+    assert (rms.min(), rms.max()) == pytest.approx((0.32, 0.60), rel=0.2)
+
+
+def reading(values: Parameters) -> Array:
+    """Sensor readings (400, 7) [N·m] that the parameters predict at 400 position readings."""
+    regressor = gravity_regressor(make_sarcos(), CHECKED + values.position_offset)
+    return values.gain * (regressor @ values.beta) + values.offset
+
+
+@pytest.mark.slow
+def test_without_a_mass_a_gain_prior_leaves_only_the_common_scale_in_doubt() -> None:
+    """Readings are predicted to hundredths of a newton-metre, gain ratios known to parts in a thousand."""
+    arm = make_sarcos()
+    readings, ratios, scales = [], [], []
+    for true, rows in calibrations(4, 100):
+        bare = rows.load == 0
+        rows = Readings(rows.position[bare], rows.torque[bare], rows.sigma[bare], rows.load[bare])
+        found = identify_global(
+            arm, rows, unknown=("gain", "offset", "position_offset", "beta"), priors={"gain": Prior(1.0, 0.03)}
+        ).values
+        readings.append(reading(found) - reading(true))
+        ratio = found.gain / true.gain
+        scales.append(np.exp(np.mean(np.log(ratio))) - 1)
+        ratios.append(100 * (ratio / np.exp(np.mean(np.log(ratio))) - 1))
+    expected = [0.045, 0.036, 0.022, 0.023, 0.0097, 0.018, 0.005]
+    assert np.sqrt(np.mean(np.square(readings), axis=(0, 1))) == pytest.approx(expected, rel=0.2)
+    rms = np.sqrt(np.mean(np.square(ratios), axis=0))
+    assert (rms.min(), rms.max()) == pytest.approx((0.12, 0.35), rel=0.2)
+    assert 100 * np.sqrt(np.mean(np.square(scales))) == pytest.approx(1.05, rel=0.2)
