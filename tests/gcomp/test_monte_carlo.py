@@ -29,8 +29,8 @@ CHECKED = np.random.default_rng(9).uniform(make_sarcos().lower, make_sarcos().up
 MOMENTS = ("offset", "beta")
 CALIBRATION = ("gain", "offset", "position_offset", "beta", "rho")
 GUESS = Parameters.nominal(7, beta=SARCOS_BETA, rho=[0.06, 0.12, -0.2])
-"""The note does not print where the 2 kg are: at this point the covariances of its weighted rows and of its unweighted one
-agree with what it prints to 15 %, joint by joint."""
+"""The note does not print where the 2 kg are: at this point the covariances of its weighted rows and of its unweighted
+one agree with what it prints to 15 %, joint by joint."""
 
 
 def sweep(joint: int, pose: Array) -> tuple[Array, Array]:
