@@ -5,6 +5,7 @@ import numpy as np
 from calib.records import Array
 from gcomp.arm import Arm
 from gcomp.gravity import gravity_regressor, gravity_stiffness
+from gcomp.moments import payload_columns
 
 
 class ModelBelief:
@@ -20,6 +21,8 @@ class ModelBelief:
         values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
         kept = values > 1e-12 * max(values[-1], 1e-300)
         self.factor: Array = vectors[:, kept] * np.sqrt(values[kept])
+        self.mass = 0.0
+        """Mass of what was taken for a tool [kg]."""
 
     def torque(self, q: Array) -> Array:
         """Gravity torque (K, n) [N·m] at poses q (K, n)."""
@@ -39,6 +42,14 @@ class ModelBelief:
         stiffness = gravity_stiffness(self.arm, self.beta, q) * position_std
         variance: Array = (spread**2).sum(axis=1) + (stiffness**2).sum(axis=1)
         return variance
+
+    def carry(self, values: Array, covariance: Array) -> None:
+        """From now on the arm carries this: mass and mass times place (4,) as a payload's verdict has them."""
+        at_origin, by_point = payload_columns(self.arm)
+        columns = np.column_stack([at_origin, by_point])
+        self.beta = self.beta + columns @ values
+        self.factor = np.hstack([self.factor, columns @ np.linalg.cholesky(covariance)])
+        self.mass += float(values[0])
 
     def learn(self, q: Array, torque: Array, sigma: Array) -> None:
         """Take over rows (K, n) without drift; sigma (n,) [N·m] is the standard deviation of one."""

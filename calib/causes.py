@@ -17,7 +17,7 @@ class Verdict:
     """What the window says. `values` and `covariance` are the parameters of the winning entry."""
 
     cause: str
-    """none, unknown, ambiguous or the winning entry's cause."""
+    """none, unknown, ambiguous, temperature (several zeros at once) or the winning entry's cause."""
     joint: int | None
     """Index of the joint, None where it concerns the arm."""
     confidence: float
@@ -98,8 +98,8 @@ class CauseTest:
             return answer("unknown" if misfit > config.misfit else "none", None, "none")
         winner, name = best.entry, class_of(best.entry)
         evidence["misfit"] = self._misfit(best.chi2, winner.columns.shape[1])
-        if evidence["misfit"] > config.misfit or (winner.cause == "payload" and best.values[0] <= 0):
-            return self._two_drifts() or answer("unknown", None, name)
+        if evidence["misfit"] > config.misfit or (winner.cause == "payload" and not self._weighs(best)):
+            return self._two_drifts() or self._all_zeros() or answer("unknown", None, name)
         near = [fit.entry for fit in fits[1:] if fit.bic - best.bic < config.evidence]
         rivals = tuple(dict.fromkeys(class_of(entry) for entry in near if not kin(entry, winner)))
         if rivals:
@@ -145,6 +145,19 @@ class CauseTest:
         evidence = {"next": round(float(above.min()), 1), "misfit": self._misfit(fit.chi2, 4)}
         first, second = (self.entries[index].joint for index in best)
         return Verdict("drift", first, confidence, fit.values, fit.covariance, evidence, beside=second)
+
+    def _weighs(self, payload: _Fit) -> bool:
+        """Whether a payload's mass can be: positive, or what the model believes to be carried taken off."""
+        return bool(payload.values[0] > min(0.0, -1.2 * self.belief.mass))
+
+    def _all_zeros(self) -> Verdict | None:
+        """The zeros of several sensors moved together, where that alone explains the window: as temperature does it."""
+        zeros = [self._index("offset", joint) for joint in range(self.belief.arm.n)]
+        fit = self._fit(*zeros)
+        misfit = self._misfit(fit.chi2, len(zeros))
+        if not np.isfinite(fit.bic) or misfit > self._config.misfit:
+            return None
+        return Verdict("temperature", None, 1.0, fit.values, fit.covariance, {"misfit": misfit})
 
     def drift(self, joint: int, cause: str, beside: int | None = None) -> tuple[Array, Array]:
         """Gain and offset change of a joint (2,), as `cause` (gain, offset or drift) has it, and covariance (2, 2).

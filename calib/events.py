@@ -41,7 +41,7 @@ def verdict_evidence(verdict: Verdict, names: tuple[str, ...]) -> dict[str, Any]
     A payload has `mass` [kg] and `com`, its centre of mass in the last link's bar frame [m].
     """
     beside: dict[str, Any] = {} if verdict.beside is None else {"beside": names[verdict.beside]}
-    if verdict.cause == "payload":  # parameters: mass, and mass times its place
+    if verdict.cause in ("payload", "tool"):  # parameters: mass, and mass times its place
         mass = float(verdict.values[0])
         beside = {"mass": mass, "com": (verdict.values[1:] / mass).tolist()}
     return {

@@ -60,7 +60,7 @@ class Observer:
         self.first: Agreeing | None = None
         self.said: tuple[str, tuple[int, ...]] | None = None
         self.reasons: tuple[str, ...] = ()
-        self.learnt = 0
+        self.learnt = self.carrying = 0
         self._proposed = np.full(arm.n, -np.inf)
 
     @classmethod
@@ -163,8 +163,24 @@ class Observer:
             return [self._event(t, "verdict", verdict.joint, **verdict_evidence(verdict, self.arm.names))]
         if not verdict.is_drift:
             self.first = None
-            return self._say(t, verdict)
+            return self._carried(t, verdict) or self._say(t, verdict)
+        self.carrying = 0
         return self._say(t, verdict) + self._confirm(t, window, test, verdict)
+
+    def _carried(self, t: float, verdict: Verdict) -> list[Event]:
+        """A payload that stays is a tool, one taken off again was none: the model takes it over, watching goes on."""
+        self.carrying = self.carrying + 1 if verdict.cause == "payload" else 0
+        if not self.carrying:
+            return []
+        mass, std = float(verdict.values[0]), float(np.sqrt(verdict.covariance[0, 0]))
+        off = self.belief.mass > 0 and abs(mass + self.belief.mass) < 0.05 * self.belief.mass + 5 * std
+        if self.carrying < self.config.tool_windows and not off:
+            return []
+        self.belief.carry(verdict.values, verdict.covariance)
+        self.places.forget()
+        self._resume()
+        evidence = verdict_evidence(replace(verdict, cause="tool"), self.arm.names)
+        return [self._event(t, "verdict", None, **evidence)]
 
     def _confirm(self, t: float, window: list[Row], test: CauseTest, verdict: Verdict) -> list[Event]:
         """A window says drift: once another one before it agrees, decide on the rows of all that agree."""
@@ -214,6 +230,7 @@ class Observer:
     def _clear(self) -> None:
         self.said, self.first, self.doubtful, self.reasons = None, None, False, ()
         self.window, self.fresh, self.repeated = [], 0, 0
+        self.carrying = 0
 
     def _is_new(self, row: Row) -> bool:
         """Whether the window has few enough rows of this place that one more would not only wind it up."""

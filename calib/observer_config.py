@@ -84,6 +84,9 @@ class ObserverConfig:
     baseline_rows: int = 40
     """Rows without drift from which the model takes over what the sensors, as installed, read."""
 
+    tool_windows: int = 60
+    """Windows that one and the same payload is carried before it counts as a tool: half an hour of stops."""
+
     # decision
     gain_std: float = 3e-3
     """A gain is written only if known better (0.3 %)."""

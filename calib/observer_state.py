@@ -22,6 +22,8 @@ def save_observer(observer: Observer) -> dict[str, Any]:
         "rows": observer.rows,
         "held": observer.held,
         "learnt": observer.learnt,
+        "carrying": observer.carrying,
+        "mass": known.mass,
         "doubtful": observer.doubtful,
         "beta": known.beta.tolist(),
         "factor": known.factor.tolist(),
@@ -61,7 +63,8 @@ def restore_observer(observer: Observer, state: dict[str, Any]) -> bool:
         kept = (np.array(position).reshape(-1, n), np.array(mean).reshape(-1, n), np.array(count, dtype=int))
         recent = [np.array(row, dtype=float) for row in state["recent"]]
         left = np.array([np.nan if q is None else q for q in state["left"]])
-        whole = {name: int(state[name]) for name in ("rows", "learnt", "fresh", "repeated")}
+        whole = {name: int(state[name]) for name in ("rows", "learnt", "fresh", "repeated", "carrying")}
+        mass = float(state["mass"])
         said = None if state["said"] is None else (str(state["said"][0]), tuple(state["said"][1]))
         reasons = tuple(state["reasons"])
     except (KeyError, TypeError, ValueError):
@@ -76,6 +79,7 @@ def restore_observer(observer: Observer, state: dict[str, Any]) -> bool:
     observer.rest.direction, observer.rest.left = numbers["direction"], left
     observer.rows, observer.learnt = whole["rows"], whole["learnt"]
     observer.window, observer.fresh, observer.repeated = window, whole["fresh"], whole["repeated"]
+    observer.carrying, observer.belief.mass = whole["carrying"], mass
     observer.held, observer.doubtful = bool(state["held"]), bool(state["doubtful"])
     observer.said, observer.reasons = said, reasons
     if agreeing is not None:

@@ -20,7 +20,7 @@ from calib.daemon.settings import DaemonSection
 from calib.daemon.stream import Hub
 from calib.daemon.view import EventItem, EventRecord, State
 from calib.daemon.watcher import Watcher
-from calib.daemon.wording import clean, told
+from calib.daemon.wording import clean, one_alarm_a_joint, told
 from calib.decision import Finding
 from calib.events import Event
 from calib.recalibration import write_record
@@ -222,7 +222,7 @@ class Service:
 
     def _events(self, events: list[Event]) -> None:
         with self.journal.transaction():
-            for event in events:
+            for event in one_alarm_a_joint(events):
                 kind, text, evidence = told(event)
                 self.say(kind, event.joint, text, evidence)
                 if event.kind == "verdict" and self.recalibrations is not None:

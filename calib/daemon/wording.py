@@ -1,6 +1,7 @@
 """What the observer says, as the event log has it: kind, one line for people, evidence as JSON."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 from calib.dictionary import DRIFT
@@ -34,6 +35,21 @@ def told(event: Event) -> Told:
     return _verdict(joint, evidence)
 
 
+def one_alarm_a_joint(events: list[Event]) -> list[Event]:
+    """The same events, several alarms of one joint at one time as one: all its channels."""
+    channels: dict[str | None, list[str]] = {}
+    for event in events:
+        if event.kind == "alarm":
+            channels.setdefault(event.joint, []).append(event.evidence["channel"])
+    merged = []
+    for event in events:
+        if event.kind != "alarm":
+            merged.append(event)
+        elif event.joint in channels:
+            merged.append(replace(event, evidence={"channel": ", ".join(channels.pop(event.joint))}))
+    return merged
+
+
 def clean(value: Any) -> Any:
     """A value that JSON can carry: numbers that are not finite become None."""
     if isinstance(value, dict):
@@ -56,10 +72,7 @@ def _verdict(joint: str, evidence: dict[str, Any]) -> Told:
     if cause == "none":
         return "clear", "sensors and model agree again: what it was is over (a collision, a contact, a load)", evidence
     if cause in ("payload", "tool"):
-        mass, com = evidence["mass"], ", ".join(f"{x:.3f}" for x in evidence["com"])
-        what = "payload" if cause == "payload" else "changed tool"
-        doing = "estimates are held" if cause == "payload" else "taken into the model from now on"
-        return "payload", f"{what} of {mass:.3f} kg at ({com}) m of the last link; {sure}; {doing}", evidence
+        return "payload", f"{_load(cause, evidence)}; {sure}", evidence
     if cause == "ambiguous":
         return "undecided", f"cannot be told apart yet: {', '.join(evidence['rivals'])}; {sure}", evidence
     if cause == "unknown":
@@ -69,6 +82,14 @@ def _verdict(joint: str, evidence: dict[str, Any]) -> Told:
             evidence,
         )
     return "effect", f"{joint}: {_EFFECTS.get(cause, cause)}; {sure}; estimates are held", evidence
+
+
+def _load(cause: str, evidence: dict[str, Any]) -> str:
+    mass, place = evidence["mass"], ", ".join(f"{x:.3f}" for x in evidence["com"])
+    if mass < 0:
+        return f"{-mass:.3f} kg taken off at ({place}) m of the last link"
+    held = "estimates are held" if cause == "payload" else "it stays: a tool, in the model from now on"
+    return f"payload of {mass:.3f} kg at ({place}) m of the last link; {held}"
 
 
 def _change(evidence: dict[str, Any]) -> str:

@@ -1,5 +1,6 @@
 """The observer on synthetic stops: drift found and measured, everything else held, nothing invented."""
 
+import json
 from collections.abc import Callable
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from calib.events import Event
 from calib.observer import Observer
 from calib.observer_config import ObserverConfig
+from calib.observer_state import restore_observer, save_observer
 from calib.rest import Row
 from gcomp.arm import Arm
 from gcomp.gravity import gravity_regressor, gravity_torque
@@ -251,3 +253,70 @@ def test_position_gain_and_offset_are_applied(sarcos, sarcos_beta) -> None:
         q = random.uniform(sarcos.lower, sarcos.upper)
         reading = gravity_torque(sarcos, sarcos_beta, q) + SIGMA * random.normal(size=7)
         assert observer.handle_row(Row(2.0 * k, (q - offset) / gain, reading, random.choice([-1.0, 1.0], 7))) == []
+
+
+def test_a_payload_that_stays_becomes_a_tool_and_drift_is_seen_again(sarcos, sarcos_beta) -> None:
+    at_origin, by_point = payload_columns(sarcos)
+    bench = Bench(sarcos, sarcos_beta, 130, ObserverConfig(tool_windows=5))
+    bench.work(60)
+    moment = 1.2 * (at_origin + by_point @ [0.05, -0.1, 0.1])
+    bench.extra = lambda q: gravity_regressor(sarcos, q) @ moment
+    verdicts = [event.evidence for event in bench.work(140) if event.kind == "verdict"]
+    assert [verdict["cause"] for verdict in verdicts] == ["payload", "tool"]
+    assert verdicts[1]["com"] == pytest.approx([0.05, -0.1, 0.1], abs=0.01)
+    assert not bench.observer.held
+    bench.drift(2, gain=1.03, offset=0.3)
+    bench.work(120)
+    assert bench.error(2)[0] <= 0.003
+    assert bench.error(2)[1] <= 0.05
+    bench.extra = lambda q: np.zeros(7)  # and when it is taken off
+    verdicts = [event.evidence for event in bench.work(80) if event.kind == "verdict"]
+    assert verdicts[0]["cause"] == "tool"
+    assert verdicts[0]["mass"] == pytest.approx(-1.2, abs=0.03)
+    assert not bench.observer.held
+    assert "proposal" not in kinds(bench.work(200))
+
+
+def test_zeros_that_move_together_are_temperature_and_not_written(sarcos, sarcos_beta) -> None:
+    bench = Bench(sarcos, sarcos_beta, 140)
+    bench.work(60)
+    held = bench.observer.estimate()
+    for joint, offset in enumerate([0.6, -0.5, 0.4, 0.3, -0.2, 0.2, 0.1]):
+        bench.drift(joint, offset=offset)
+    events = bench.work(100)
+    assert "temperature" in [event.evidence["cause"] for event in events if event.kind == "verdict"]
+    assert "proposal" not in kinds(events)
+    np.testing.assert_array_equal(bench.observer.estimate().offset, held.offset)
+    for joint in range(7):
+        bench.offset[joint] = 0.0
+    assert bench.work(60)[-1].evidence["cause"] == "none"
+
+
+@pytest.mark.parametrize("rows", [15, 75, 95])
+def test_a_restored_observer_goes_on_as_if_nothing_had_been(sarcos, sarcos_beta, rows) -> None:
+    """In quiet work, under an alarm, and between two windows that agree."""
+
+    def run(restart: bool) -> list[tuple[float, str]]:
+        bench = Bench(sarcos, sarcos_beta, 150)
+        bench.work(60)
+        bench.drift(2, gain=1.03, offset=0.3)
+        bench.work(rows - 60 if rows > 60 else 0)
+        if restart:
+            saved = json.loads(json.dumps(save_observer(bench.observer)))
+            again = Observer(sarcos, sarcos_beta, np.zeros((14, 14)), SIGMA)
+            assert restore_observer(again, saved)
+            bench.observer = again
+        bench.work(80)
+        return [(event.t, event.kind) for event in bench.events]
+
+    assert run(True) == run(False)
+
+
+def test_a_state_that_does_not_fit_changes_nothing(sarcos, sarcos_beta) -> None:
+    bench = Bench(sarcos, sarcos_beta, 160)
+    bench.work(30)
+    good = save_observer(bench.observer)
+    for change in ({"schema": 99}, {"sigma": [1.0]}, {"state": [[float("nan"), 0.0]] * 7}, {"window": [[1.0]]}):
+        assert not restore_observer(bench.observer, {**good, **change})
+    assert not restore_observer(bench.observer, {})
+    assert save_observer(bench.observer) == good

@@ -29,17 +29,17 @@ export function addEvent(event) {
 
 const since = () => (seconds ? new Date(now - 1000 * seconds).toISOString() : "");
 
-export async function fetchAll() {
+// All of the time range anew; the caller draws.
+export async function fetchHistory() {
   const points = await get(`/api/history?limit=${POINTS}&from=${encodeURIComponent(since())}`);
   history.clear();
   take(points);
-  draw();
 }
 
 // The caller draws.
 export async function fetchNew() {
   const newest = Math.max(0, ...[...history.values()].map((points) => points.at(-1).at));
-  if (!newest || [...history.values()].some((points) => points.length > MOST)) return fetchAll();
+  if (!newest || [...history.values()].some((points) => points.length > MOST)) return fetchHistory();
   take(await get(`/api/history?from=${new Date(newest).toISOString()}`));
 }
 
@@ -109,10 +109,11 @@ export const drawIfChanged = () => drawn || draw();
 export function initRanges() {
   for (const button of by("ranges").children) {
     button.setAttribute("aria-pressed", String(Number(button.dataset.seconds) === seconds));
-    button.addEventListener("click", () => {
+    button.addEventListener("click", async () => {
       seconds = Number(button.dataset.seconds);
       for (const other of by("ranges").children) other.setAttribute("aria-pressed", String(other === button));
-      fetchAll();
+      await fetchHistory();
+      draw();
     });
   }
   new ResizeObserver(() => draw()).observe(by("charts"));

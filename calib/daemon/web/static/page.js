@@ -1,7 +1,7 @@
 // The page: what the daemon says, at a glance. Everything it knows comes from the API; it sends nothing but decisions.
 
 import { blob, forgetToken, get, stream, token } from "./api.js";
-import { addEvent, drawIfChanged, fetchAll, fetchNew, initRanges, setLive, setNow } from "./drift.js";
+import { addEvent, draw, drawIfChanged, fetchHistory, fetchNew, initRanges, setLive, setNow } from "./drift.js";
 import { showEvent } from "./events.js";
 import { by, clock, duration, put, whole } from "./format.js";
 import { showEstimates, showJoints, verdict } from "./joints.js";
@@ -95,16 +95,16 @@ const on = {
   },
   joints(item) {
     setNow(item.time);
+    if (status.state !== item.state) status.detail = ""; // it was said of another state
     status = { ...status, state: item.state, bus: item.bus, time: item.time };
     showJoints(item.joints);
     showBus(item.bus);
-    const detail = item.state === "fault" ? item.bus.fault || status.detail || "" : status.detail || "";
-    showState(item.state, detail);
+    showState(item.state, item.bus.fault || status.detail || "");
   },
   event({ event }) {
     addEvent(event);
     showEvent(event);
-    slowly();
+    slowly().catch(() => {});
   },
 };
 
@@ -128,20 +128,23 @@ async function forEver() {
 
 async function start() {
   by("forget").addEventListener("click", () => { forgetToken(); location.reload(); });
-  initRanges();
+  const now = Promise.all([get("/api/joints"), get("/api/estimates"), fetchProposals()]);
+  now.catch(() => {}); // the status would say so first
   status = await get("/api/status");
   connected = true;
   setNow(status.time);
-  const [joints, estimates, events] = await Promise.all([
-    get("/api/joints"), get("/api/estimates"), get(`/api/events?after=${Math.max(0, status.last_event - 500)}`), fetchProposals()]);
+  const past = Promise.all([get(`/api/events?after=${Math.max(0, status.last_event - 500)}`), fetchHistory()]);
+  const [joints, estimates] = await now;
   said = verdict(estimates);
   showStatus();
   showJoints(joints);
   showEstimates(estimates);
   setLive(estimates, status);
+  const [events] = await past;
   for (const event of events) { addEvent(event); showEvent(event); }
-  await fetchAll();
-  performance.mark("armlink-shown");
+  draw();
+  initRanges();
+  document.body.dataset.shown = Math.round(performance.now()); // ms until everything stood here
   stream(on, events.at(-1)?.id ?? status.last_event);
   forEver();
 }
