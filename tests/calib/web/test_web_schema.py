@@ -1,0 +1,64 @@
+"""schemathesis against the description that the daemon gives of itself: no 5xx, and every answer as described."""
+
+import pytest
+import schemathesis
+from conftest import TOKEN, Served
+from hypothesis import HealthCheck, Phase, given, settings
+from made_up_view import MadeUpView
+from schemathesis.checks import not_a_server_error
+from schemathesis.specs.openapi.checks import (
+    content_type_conformance,
+    response_schema_conformance,
+    status_code_conformance,
+)
+
+from calib.daemon.web.rate import RateLimit
+
+CHECKS = [not_a_server_error, content_type_conformance, response_schema_conformance, status_code_conformance]
+EXAMPLES = 8
+"""Generated requests of each kind, valid and not, to each route; tests/campaigns/web.py sends many more."""
+SETTINGS = settings(
+    max_examples=EXAMPLES,
+    deadline=None,
+    derandomize=True,
+    database=None,
+    phases=[Phase.explicit, Phase.generate],
+    suppress_health_check=list(HealthCheck),
+)
+
+
+def check_all(server: Served, settings: settings) -> set[str]:
+    """Generated requests to every route but the stream, which does not end; returns the routes."""
+    headers = {"Authorization": f"Bearer {TOKEN}"}
+    schema = schemathesis.openapi.from_dict(server.client().get("/openapi.json").json())
+    checked = set()
+    for found in schema.exclude(path="/api/stream").get_all_operations():
+        operation = found.ok()
+        checked.add(f"{operation.method.upper()} {operation.path}")
+        for mode in schemathesis.GenerationMode:
+            if mode is schemathesis.GenerationMode.NEGATIVE and not takes_anything(operation):
+                continue
+
+            @settings
+            @given(case=operation.as_strategy(generation_mode=mode))
+            def check(case: schemathesis.Case) -> None:
+                case.call_and_validate(server.url, headers=headers, checks=CHECKS)
+
+            check()
+    return checked
+
+
+def takes_anything(operation: schemathesis.APIOperation) -> bool:
+    return any(len(list(part)) for part in (operation.query, operation.path_parameters, operation.headers)) or bool(
+        operation.body
+    )
+
+
+def test_generated_requests_find_no_5xx(server: Served, view: MadeUpView, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(RateLimit, "take", lambda *_: 0.0)
+    server.do(view.propose)
+    server.do(lambda: view.happen("drift", "joint_2", "gain", value=float("inf")))
+    checked = check_all(server, SETTINGS)
+    wanted = {f"GET /api/{name}" for name in ("status", "joints", "estimates", "events", "history", "proposals")}
+    decisions = {f"POST /api/proposals/{{id}}/{verb}" for verb in ("approve", "reject")}
+    assert checked == wanted | decisions | {"GET /api/report", "GET /metrics"}
