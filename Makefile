@@ -4,7 +4,7 @@ BIN := .venv/bin
 export PYTHON
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint format bench soak blind docs constraints clean
+.PHONY: help venv demo test lint format bench soak blind mutants docs constraints clean
 
 help: ## Say what can be done
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
@@ -42,6 +42,9 @@ soak: .venv/.dev ## Long campaigns outside make test: the demo over ten hidden t
 
 blind: .venv/.dev ## Long campaign outside make test: the diagnosis against sealed cases (ARGS="--cases 20")
 	$(BIN)/armlink gap bench $(ARGS)
+
+mutants: .venv/.dev ## Long campaign outside make test: each change of the gate's source must make a test fail
+	$(BIN)/python tests/campaigns/mutants.py $(ARGS)
 
 docs: .venv/.dev ## Check the documentation: links, and that its commands run
 	$(BIN)/python -m pytest -q tests/house/test_docs.py
