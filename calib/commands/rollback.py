@@ -8,6 +8,7 @@ import typer
 if TYPE_CHECKING:
     from armlink.armfile import ArmFile
     from calib.records import CalibrationRecord
+    from calib.store import RecordStore
 
 
 def rollback(
@@ -31,24 +32,30 @@ def rollback(
     from calib.records import CalibrationRecord
     from calib.store import RecordStore
 
-    arm_file, records = load_arm(arm), RecordStore(store)
-    record = records.former(arm_file, to)
+    arm_file, records, user = load_arm(arm), RecordStore(store), getpass.getuser()
     if apply:
+        record = records.get(to).require(arm_file)
         if not isinstance(record, CalibrationRecord):
             raise BadInput(f"--apply: record {to} is a {record.kind} record; controllers hold calibrations only")
-        _apply(arm_file, record, bus)
-    line = records.rollback(arm_file, to, by=getpass.getuser(), reason=reason)
+        if record != records.current(CalibrationRecord, arm_file):  # what is current may be written once more
+            records.former(arm_file, to)
+        _apply(arm_file, record, records, bus, user, reason)
+    else:
+        records.rollback(arm_file, to, by=user, reason=reason)
+    line = records.activations(arm_file)[-1]
     typer.echo(f"{line.kind} record {to} is current on {arm_file.name} {arm_file.serial} since {line.at}", err=True)
-    if isinstance(record, CalibrationRecord) and not apply:
+    if line.kind == "calibration" and not apply:
         typer.echo("the joint controllers keep what they hold; --apply writes it to them", err=True)
 
 
-def _apply(arm_file: "ArmFile", record: "CalibrationRecord", bus: str | None) -> None:
-    """Write the record to every controller, read back; the joints need not be enabled."""
+def _apply(
+    arm_file: "ArmFile", record: "CalibrationRecord", records: "RecordStore", bus: str | None, user: str, reason: str
+) -> None:
+    """Write the record to every controller, read back, and make it current; the joints need not be enabled."""
     from armlink.link import Link
-    from calib.recalibration import write_record
+    from calib.writing import install
 
     with Link.open(arm_file, bus) as link:
         link.start()
-        written = write_record(record, link)
+        written = install(record, arm_file, records, link, by=user, reason=reason)
     typer.echo(f"written to {len(written)} controllers and read back", err=True)
