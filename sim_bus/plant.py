@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from armlink.armfile import ArmFile
 from sim_bus import statics
 from sim_bus.effects.state import Imperfections
+from sim_bus.friction import dry_friction
 from sim_bus.inertials import Inertials
 from sim_bus.mjcf import build_model
 from sim_bus.motors import LateMotors
 from sim_bus.section import sim_section
-from sim_bus.transmission import HARD_GEAR_STEP, Transmissions
+from sim_bus.transmission import HARD_GEAR_STEP, Transmissions, rotor_inertia
 
 Array = NDArray[np.float64]
 FRICTION_AT_DOF = int(mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
@@ -38,9 +39,10 @@ class Plant:
         self._braked = np.zeros(n, bool)
         self._servo = (np.zeros(n), np.zeros(n), np.zeros(n))
         self._lost = np.zeros(n)
-        self._build(imperfections)
+        self._build(Imperfections(arm.joint_names))
+        self._joint_inertia = np.diag(self.inertia((self.lower + self.upper) / 2)).copy()
         start = (self.lower + self.upper) / 2 if self._section.start is None else np.array(self._section.start)
-        self._enter(start, np.zeros(n), self.gravity_torque(start)[0])
+        self._enter(start, np.zeros(n), np.zeros(n))
         self.set_imperfections(imperfections)
 
     def _build(self, state: Imperfections) -> None:
@@ -63,10 +65,8 @@ class Plant:
         self._gravity: Array = self.model.opt.gravity.copy()
         self._armature = self.model.dof_armature[self._dof].copy()
         self._damping = self.model.dof_damping[self._dof].copy()
-        self._gearing, self._gears = state.gearing, None
-        if state.gearing:
-            inertia = np.diag(self.inertia((self.lower + self.upper) / 2))
-            self._gears = Transmissions(self.model, names, state, inertia)
+        self._gearing = state.gearing
+        self._gears = Transmissions(self.model, names, state) if state.gearing else None
 
     def _enter(self, position: Array, velocity: Array, torque: Array) -> None:
         """Set the joints' motion; motors behind springs carry `torque`."""
@@ -83,18 +83,23 @@ class Plant:
 
         Raises ValueError where they cannot be simulated.
         """
+        rotors = rotor_inertia(self._arm.joint_names, imperfections, self._joint_inertia)
         if imperfections.gearing != self._gearing:
-            motion = self.position, self.velocity, self.link_torque
+            position, moved = self.position, self.data.time > 0.0
+            torque = self.link_torque if moved else self.gravity_torque(position)[0]
+            motion = position, self.velocity, torque
             self._build(imperfections)
+        else:
+            motion = None
+        if self._gears is not None:
+            self._gears.configure(imperfections, rotors)
+        if motion is not None:
             self._enter(*motion)
-        elif self._gears is not None:
-            self._gears.configure(self._arm.joint_names, imperfections)
         self._imperfections = imperfections
         self._viscous = self._damping + imperfections.viscous
-        self._rotor_inertia = self._armature + imperfections.rotor_inertia
+        self._rotor_inertia = np.maximum(self._armature + imperfections.rotor_inertia, rotors)
         self.step_time = self._section.step
         if self._gears is not None:
-            self._rotor_inertia = np.maximum(self._rotor_inertia, self._gears.rotor_inertia)
             finest = self._gears.step_time if imperfections.prompt_motors else HARD_GEAR_STEP
             self.step_time = min(self.step_time, self._gears.step_time, finest)
         self._has_rotors = bool(self._rotor_inertia.any())
@@ -247,13 +252,8 @@ class Plant:
         level = state.coulomb
         if not state.steady_friction:
             velocity = self.velocity if self._gears is None else self._gears.turned(self._velocities)
-            load = self.link_torque
-            level = level + state.breakaway * np.exp(-((velocity / state.stribeck_velocity) ** 2))
-            level = level + state.load_friction * np.abs(load)
-            resting = np.abs(velocity) < 1e-4
-            heading = np.where(resting, np.sign(self.motor_torque - load), np.sign(velocity))
-            level = level * (1.0 + state.asymmetry * heading)
-        self._seat("frictionloss", np.where(self._braked, self._brake_torque, np.maximum(level, 0.0)))
+            level = dry_friction(state, velocity, self.link_torque, self._motor_torques)
+        self._seat("frictionloss", np.where(self._braked, self._brake_torque, level))
 
     def _seat(self, quantity: str, values: Array) -> None:
         """Give the motors their friction, damping or inertia."""

@@ -144,11 +144,7 @@ class SimulatedArm:
         wanted = tuple(entries)
         with self._effects_checked():
             state = imperfections(self.names, wanted)
-            try:
-                self.plant.set_imperfections(state)
-            except ValueError:
-                self.plant.set_imperfections(imperfections(self.names, self._entries))
-                raise
+            self.plant.set_imperfections(state)
         self.sensors.set_imperfections(state)
         self._entries = wanted
         self.drives.loops.reconfigure()

@@ -31,8 +31,8 @@ HARD_GEAR_STEP = 2.5e-4
 class Transmissions:
     """Of one built model; arrays (n,) over joints, (s,) over those with springs."""
 
-    def __init__(self, model: Any, names: tuple[str, ...], state: Imperfections, inertia: Array) -> None:
-        """`inertia` of each joint [kg·m²]. Raises ValueError where a spring is too stiff to be simulated."""
+    def __init__(self, model: Any, names: tuple[str, ...], state: Imperfections) -> None:
+        """Of a model that was built for `state`; configure() comes next."""
         self._n, nv = len(names), model.nv
         self._links = np.array([model.joint(name).dofadr[0] for name in names])
         self.soft = np.flatnonzero(state.soft)
@@ -48,24 +48,13 @@ class Transmissions:
         self._twist = unit[self.rotors] - self._turn[self.soft]
         self._turn[self.soft] = unit[self.rotors]
         self._reading[self.soft] = unit[self.rotors] - by_links[self.soft]
-        self._least_rotor = ROTOR_SHARE * inertia
         self._owner = {(True, int(d)): j for j, d in enumerate(self._links)}
         self._owner |= {(True, int(d)): int(j) for j, d in zip(self.soft, self.rotors, strict=True)}
         self._owner |= {(False, int(t)): int(j) for j, t in zip(self._shared, self._tendons, strict=True)}
-        self.configure(names, state)
 
-    def configure(self, names: tuple[str, ...], state: Imperfections) -> None:
-        """Take over stiffness and play of the same joints. Raises ValueError."""
-        self.rotor_inertia = np.where(state.soft, np.maximum(state.rotor_inertia, self._least_rotor), 0.0)
-        rotor = self.rotor_inertia[self.soft]
-        given = state.elasticity[self.soft]
-        stiffest = rotor * (PHASE_A_STEP / FINEST_STEP) ** 2
-        for joint, stiffness, most in zip(self.soft, given, stiffest, strict=True):
-            if np.isfinite(stiffness) and stiffness > most:
-                raise ValueError(
-                    f"transmission.elasticity: {names[joint]}: {stiffness:g} N·m/rad is as good as rigid, at most "
-                    f"{most:.3g} can be simulated: leave the effect out"
-                )
+    def configure(self, state: Imperfections, rotors: Array) -> None:
+        """Take over stiffness and play; `rotors` (n,) as rotor_inertia() says."""
+        rotor, given = rotors[self.soft], state.elasticity[self.soft]
         self.stiffness = np.where(np.isfinite(given), given, rotor * (PHASE_A_STEP / HARD_GEAR_STEP) ** 2)
         self._half_play = state.backlash[self.soft] / 2
         self._damping = 2 * DAMPING_RATIO * np.sqrt(self.stiffness * rotor)
@@ -132,6 +121,22 @@ class Transmissions:
         own = passed.copy()
         own[self.soft] = self.spring(data)
         return own + self._coupling.T @ (own - made)
+
+
+def rotor_inertia(names: tuple[str, ...], state: Imperfections, inertia: Array) -> Array:
+    """Inertia of the motors behind springs, 0 for the others, where the joints have `inertia` (n,) [kg·m²].
+
+    Raises ValueError where a spring is too stiff to be simulated.
+    """
+    rotors = np.where(state.soft, np.maximum(state.rotor_inertia, ROTOR_SHARE * inertia), 0.0)
+    stiffest = rotors * (PHASE_A_STEP / FINEST_STEP) ** 2
+    for name, stiffness, most in zip(names, state.elasticity, stiffest, strict=True):
+        if np.isfinite(stiffness) and stiffness > most:
+            raise ValueError(
+                f"transmission.elasticity: {name}: {stiffness:g} N·m/rad is as good as rigid, at most "
+                f"{most:.3g} can be simulated: leave the effect out"
+            )
+    return np.asarray(rotors)
 
 
 def rotor_name(joint: str) -> str:

@@ -62,6 +62,7 @@ def node(simulated: None) -> Iterator[BaseNode402]:
     node.TIMEOUT_SWITCH_STATE_FINAL = node.TIMEOUT_SWITCH_STATE_SINGLE = node.TIMEOUT_SWITCH_OP_MODE = 5.0
     node.TIMEOUT_CHECK_TPDO = 2.0
     yield node
+    network.sync.stop()
     network.disconnect()
 
 
@@ -107,8 +108,8 @@ def test_nmt_sdo_heartbeat_pdo_and_cia_402(node: BaseNode402) -> None:
     map_for_canopen(node)
     node.setup_402_state_machine(read_pdos=False)
     node.nmt.state = "OPERATIONAL"
-    node.nmt.wait_for_heartbeat(10.0)
-    assert node.nmt.state == "OPERATIONAL"
+    assert wait_for(lambda: node.nmt.wait_for_heartbeat(10.0) == "OPERATIONAL")
+    node.network.sync.start(0.05)  # TPDO1 and 2 are synchronous
     node.op_mode = "PROFILED POSITION"
     for state in ("READY TO SWITCH ON", "SWITCHED ON", "OPERATION ENABLED"):
         node.state = state
@@ -118,7 +119,6 @@ def test_nmt_sdo_heartbeat_pdo_and_cia_402(node: BaseNode402) -> None:
     node.rpdo[1]["Target position"].raw = start + 40_000
     node.rpdo[1].transmit()
     assert wait_for(lambda: abs(node.sdo["Position actual value"].raw - start - 40_000) < 500)
-    node.network.sync.transmit()
     assert node.tpdo[1].wait_for_reception(10.0) is not None
     assert node.tpdo[1]["Position actual value"].raw == pytest.approx(start + 40_000, abs=500)
     node.state = "QUICK STOP ACTIVE"
