@@ -130,12 +130,12 @@ def payloads(given: argparse.Namespace) -> list[str]:
 
 
 def slow(given: argparse.Namespace) -> list[str]:
-    """0.5 % an hour on one joint for six hours, the daemon recalibrating by itself."""
+    """0.5 % an hour on one joint for hours, the daemon recalibrating by itself."""
     wrong = []
-    for joint, seed in ((1, 600), (3, 601)):
+    for joint, seed in ((1, 600), (3, 601))[: given.seeds]:
         there, worst, estimate = daemon(seed), 0.0, 0.0
         there.run(300)
-        for minute in range(360):
+        for minute in range(round(given.slow_hours * 60)):
             for _ in range(4):
                 there.fast.gain[joint] *= 1 + 0.005 / 240
                 there.run(15)
@@ -186,6 +186,7 @@ def main() -> int:
     parser.add_argument("--hours", type=float, default=24.0)
     parser.add_argument("--payloads", type=int, default=100)
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--slow-hours", type=float, default=6.0)
     parser.add_argument("--only", nargs="*", choices=sorted(SCENARIOS), default=list(SCENARIOS))
     given = parser.parse_args()
     import logging

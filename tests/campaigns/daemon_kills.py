@@ -7,7 +7,10 @@ drifting, policy apply, so that kills fall into writes too; controllers are a ta
 """
 
 import argparse
+import contextlib
 import json
+import logging
+import multiprocessing
 import os
 import random
 import signal
@@ -16,12 +19,18 @@ import subprocess
 import sys
 import tempfile
 import time
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
+
+from fast_daemon import QUIET, FastDaemon
+
+from calib.daemon.settings import DaemonSection
+from calib.records import CalibrationRecord
 
 LOST_ROWS = 8
 """Stops of the arm that the observer may have to see again: five seconds of work, and one moved on meanwhile."""
@@ -30,15 +39,8 @@ STILL = 0.02
 """How far a joint may move after a kill, once it has stopped [rad]."""
 
 
-def life(folder: Path, seed: int) -> None:
-    """One life of the service, until it is killed: says on stdout what is on disk."""
-    import logging
-
-    from fast_daemon import QUIET, FastDaemon
-
-    from calib.daemon.settings import DaemonSection
-    from calib.records import CalibrationRecord
-
+def life(folder: Path, seed: int, told: Connection) -> None:
+    """One life of the service, until it is killed: tells what is on disk."""
     logging.disable(logging.CRITICAL)
     given = {"policy": "apply", "recording": QUIET, "rest_between_writes": 1.0, "writes_per_day": 100000}
     world = np.memmap(folder / "world", dtype=float, mode="r+", shape=(6, 7))  # survives the kill, as an arm does
@@ -64,7 +66,7 @@ def life(folder: Path, seed: int) -> None:
     current = daemon.store.current(CalibrationRecord, daemon.arm)
     right = np.allclose(daemon.fast.held_gain, current.values("gain"), rtol=1e-6)
     right &= np.allclose(daemon.fast.held_offset, current.values("offset"), atol=1e-5)
-    tell(start=daemon.view.status().rows, right=bool(right), record=current.id)
+    told.send({"start": daemon.view.status().rows, "right": bool(right), "record": current.id})
     drifts = np.random.default_rng([seed, 4])
     while True:
         joint = int(drifts.integers(7))
@@ -75,21 +77,17 @@ def life(folder: Path, seed: int) -> None:
         kept = daemon.service.journal.belief()
         rows = kept.state["rows"] if kept else 0
         proposals = [[row.id, row.state] for row in daemon.service.journal.proposals(5)]
-        tell(event=daemon.service.journal.last_event, rows=rows, proposals=proposals)
-
-
-def tell(**what: Any) -> None:
-    print(json.dumps(what), flush=True)
+        told.send({"event": daemon.service.journal.last_event, "rows": rows, "proposals": proposals})
 
 
 def check_disk(folder: Path, acknowledged: dict[str, Any]) -> list[str]:
     """What is wrong with the files after a kill."""
     wrong = []
     for name in ("state/journal.db", "records.db"):
-        with sqlite3.connect(folder / name) as db:
+        with contextlib.closing(sqlite3.connect(folder / name)) as db:
             if db.execute("PRAGMA integrity_check").fetchone()[0] != "ok":
                 wrong.append(f"{name} is torn")
-    with sqlite3.connect(folder / "state" / "journal.db") as db:
+    with contextlib.closing(sqlite3.connect(folder / "state" / "journal.db")) as db:
         ids = [row[0] for row in db.execute("SELECT id FROM events ORDER BY id")]
         proposals = {row[0] for row in db.execute("SELECT id FROM proposals")}
         records = [row[0] for row in db.execute("SELECT record FROM proposals")]
@@ -97,7 +95,7 @@ def check_disk(folder: Path, acknowledged: dict[str, Any]) -> list[str]:
         wrong.append(f"events lost: {len(ids)} of {acknowledged.get('event')}")
     if not {number for number, _ in acknowledged.get("proposals", [])} <= proposals:
         wrong.append("a proposal is lost")
-    with sqlite3.connect(folder / "records.db") as db:
+    with contextlib.closing(sqlite3.connect(folder / "records.db")) as db:
         kept = {row[0] for row in db.execute("SELECT id FROM records")}
     return wrong + ["a proposal without its record"] * (not set(records) <= kept)
 
@@ -106,24 +104,28 @@ def kill_service(given: argparse.Namespace) -> list[str]:
     """The first part."""
     folder = Path(tempfile.mkdtemp(prefix="armlink-kills-"))
     np.zeros((6, 7)).tofile(folder / "world")
+    context = multiprocessing.get_context("fork")
     choose, wrong, written, acknowledged = random.Random(given.seed), list[str](), 0, dict[str, Any]()
     for number in range(given.kills):
-        command = [sys.executable, __file__, "--life", str(folder), "--seed", str(number)]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
-            assert process.stdout is not None
-            started = json.loads(process.stdout.readline() or "{}")
-            if not started.get("right"):
-                wrong.append(f"kill {number}: after it the controllers do not hold the record in force: {started}")
-            if started.get("start", 0) < acknowledged.get("rows", 0) - LOST_ROWS:
-                wrong.append(f"kill {number}: the observer went back from {acknowledged} to {started}")
-            os.set_blocking(process.stdout.fileno(), True)
-            time.sleep(choose.expovariate(1 / 2.0))
-            process.send_signal(signal.SIGKILL)
-            for line in process.stdout:
-                if line.endswith("\n"):
-                    acknowledged = json.loads(line)
+        ours, theirs = context.Pipe()
+        process = context.Process(
+            target=life, args=(folder, number, theirs)
+        )
+        process.start()
+        theirs.close()
+        started = ours.recv()
+        if not started["right"]:
+            wrong.append(f"kill {number}: after it the controllers do not hold the record in force: {started}")
+        if started["start"] < acknowledged.get("rows", 0) - LOST_ROWS:
+            wrong.append(f"kill {number}: the observer went back from {acknowledged} to {started}")
+        time.sleep(choose.expovariate(1 / given.life))
+        process.kill()
+        process.join()
+        with contextlib.suppress(EOFError):
+            while ours.poll():
+                acknowledged = ours.recv()
         wrong += [f"kill {number}: {what}" for what in check_disk(folder, acknowledged)]
-    with sqlite3.connect(folder / "state" / "journal.db") as db:
+    with contextlib.closing(sqlite3.connect(folder / "state" / "journal.db")) as db:
         states = dict(db.execute("SELECT state, COUNT(*) FROM decisions GROUP BY state").fetchall())
         written = states.get("applied", 0)
         undone = db.execute("SELECT COUNT(*) FROM events WHERE kind = 'roll-back' AND joint IS NULL").fetchone()[0]
@@ -216,10 +218,8 @@ def main() -> int:
     parser.add_argument("--bus-kills", type=int, default=10)
     parser.add_argument("--bus", default="udp_multicast:239.74.163.9")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--life", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--life", type=float, default=1.0, help="Mean seconds from a start to the kill.")
     given = parser.parse_args()
-    if given.life is not None:
-        life(given.life, given.seed)
     wrong = kill_service(given) if given.kills else []
     wrong += kill_daemon(given) if given.bus_kills else []
     for line in wrong:
