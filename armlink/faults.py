@@ -1,5 +1,6 @@
 """Faults that a cycle shows, in words: which joint, what, and what to do. Pure."""
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -99,6 +100,8 @@ def refusal(
             return f"{name}: target torque is {command.torque[joint]}, expected a finite number"
         if why == gate.BAD_NUMBER:
             return f"{name}: target position is {command.position[joint]}, expected a finite number"
+        if why == gate.VELOCITY and math.isnan(now.velocity):
+            return f"{name}: no velocity (606Ch, TPDO2) has come of late, and torque control needs to know it"
         if why == gate.VELOCITY:
             return (
                 f"{name}: turns at {now.velocity:.3g} rad/s under torque control, limit {limit.overspeed:.3g} "

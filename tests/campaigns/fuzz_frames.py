@@ -73,7 +73,7 @@ def fuzz_decoder(rng: random.Random, frames: int) -> int:
 
 
 def fuzz_link(rng: random.Random, frames: int) -> tuple[int, int]:
-    """Mutated frames and arbitrary commands into a whole link; frames taken in, commands that were refused or faulted."""
+    """Mutated frames and arbitrary commands into a whole link; frames taken in, commands refused or faulted."""
     done = refused = 0
     bus = Observed(range(1, N + 1))
     for node in bus.nodes.values():
