@@ -95,7 +95,8 @@ against the model, and where only in motor against sensor or command."""
 def materials(step: Step, estimate: Estimate, heldout: ResidualSet, scorer: "_Scorer") -> tuple[Term, ...]:
     """Those of a step's terms whose place matters: the rest can go together without a joint's RMS rising by what a
     user would care about, all else that was found being there."""
-    if any(term.bound for term in step.terms):
+    hit = heldout.struck | estimate.store.data.struck
+    if any(term.bound or (term.effect == "transmission.backlash" and term.place in hit) for term in step.terms):
         return step.terms
     shows = {channel for term in step.terms for channel, _ in estimate.store.columns(term)}
     share = MINOR if heldout.layout.against_model in shows else MINOR_INNER

@@ -70,7 +70,10 @@ class Rivals:
             others = [
                 other
                 for other in search.normal.terms
-                if other.key != term.key and other not in rest and term.key not in other.beneath
+                if other.key != term.key
+                and other not in rest
+                and term.key not in other.beneath
+                and not (term.effect == other.effect == "transmission.coupling")
             ]
             for _, other in shortlist(search.weighted.screen(rest, others))[:TRIED]:
                 worse = search.judge(search.with_beneath(other, rest)) - search.score

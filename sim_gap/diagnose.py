@@ -78,7 +78,7 @@ def diagnose(
     estimate = None
     found: list[Cause] = []
     minor: list[Cause] = []
-    if not (is_quiet(judge) and is_quiet(fit)):
+    if fit.struck or not (is_quiet(judge) and is_quiet(fit)):
         store = ColumnStore(fit)
         search = compete(store, [name for name in effects() if name not in withhold])
         estimate = Estimate(store, search.active)

@@ -27,7 +27,7 @@ FAINT = 0.5
 FOLDS = 6
 MOVING_SHARE = 0.95
 """A sample of the motor row counts where the joint moves during this share of the filter's window."""
-SETTLE_S, SETTLED_LEAST = 0.04, 0.4
+SETTLE_S, SETTLED_LEAST = 0.08, 0.4
 """Left out before and after rest and reversal, if at least this share of the motion is left."""
 BLOCK_S = 2.0
 """Length of the blocks within which errors may be correlated, for confidence intervals [s]."""

@@ -210,12 +210,17 @@ def compete(store: ColumnStore, library: Sequence[str]) -> Search:
     offered = candidates(store.data, library)
     first = Search(Normal(store, offered))
     first.run()
-    chosen = refine(store, without_doubtful(first).active)
+    chosen = refine(store, [named(term) for term in without_doubtful(first).active])
     keys = {term.key for term in chosen}
     search = Search(Normal(store, [*chosen, *(term for term in offered if term.key not in keys)]), chosen)
     while search.backward():
         pass
     return search
+
+
+def named(term: Term) -> Term:
+    """The term by which one is named that shows exactly alike."""
+    return Term(term.effect, *effects()[term.effect].settled(term.place, term.shape))
 
 
 def without_doubtful(search: Search) -> Search:
@@ -270,7 +275,8 @@ def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
             return float(0.5 * np.log(squares + normal.floor**2)[normal.seen].sum())
 
         value = golden(fit, low, high)
-        out[out.index(term)] = term.reshaped(free, value)
+        if fit(value) < fit(term.shape[free]):
+            out[out.index(term)] = term.reshaped(free, value)
     return out
 
 
@@ -283,7 +289,8 @@ def _between(data: ResidualSet, term: Term) -> tuple[int, float, float] | None:
     grid = sorted({shape[free[0]] for shape in effect.grid(data.signals, term.place)})
     value = term.shape[free[0]]
     lower, upper = [x for x in grid if x < value - 1e-9], [x for x in grid if x > value + 1e-9]
-    return free[0], (lower[-1] if lower else 0.5 * value), (upper[0] if upper else 1.5 * value)
+    beyond = sorted((0.5 * value, 1.5 * value))
+    return free[0], (lower[-1] if lower else beyond[0]), (upper[0] if upper else beyond[1])
 
 
 def secants(store: ColumnStore, active: list[Term]) -> list[Term]:

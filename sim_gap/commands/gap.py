@@ -6,6 +6,9 @@ from typing import Annotated
 import typer
 
 from sim_gap.commands.gap_bench import bench
+from sim_gap.commands.gap_collect import collect
+from sim_gap.commands.gap_fleet import diagnose_fleet
+from sim_gap.commands.gap_plan import plan
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True, help=__doc__)
 
@@ -16,6 +19,9 @@ def gap() -> None:
 
 
 app.command()(bench)
+app.command()(plan)
+app.command()(collect)
+app.command()(diagnose_fleet)
 
 
 @app.command()

@@ -125,6 +125,10 @@ class Effect(ABC):
         """Effects and places whose columns this one contains: they do not stand beside it."""
         return ()
 
+    def settled(self, place: int, shape: Shape) -> tuple[int, Shape]:
+        """Place and shape by which it is named, where two show exactly alike."""
+        return place, shape
+
     def bound_to(self, shape: Shape) -> int:
         """The one training recording (from 1) that it is in, 0 where it belongs to the arm for good."""
         return 0

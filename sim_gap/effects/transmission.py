@@ -64,6 +64,11 @@ class Coupling(Effect):
         neighbours = [place + step for step in (-1, 1) if 0 <= place + step < signals[0].n]
         return tuple((float(other + 1), lever) for other in neighbours for lever in (-1.0, -0.6, 0.6, 1.0))
 
+    def settled(self, place: int, shape: Shape) -> tuple[int, Shape]:
+        """At a lever of ±1 either joint's motor shows alike: it is then called the outer joint's, as in wrists."""
+        other, lever = int(shape[0]) - 1, shape[1]
+        return (other, (float(place + 1), lever)) if abs(lever) == 1.0 and other > place else (place, shape)
+
     def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
         other, lever = int(shape[0]) - 1, shape[1]
         speed = signals.v[:, place] + lever * signals.v[:, other]

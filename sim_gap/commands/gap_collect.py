@@ -1,0 +1,47 @@
+"""Runs a planned motion on the arm through the link, and records it for a diagnosis."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def collect(
+    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
+    motion: Annotated[Path, typer.Option(help="Motion with columns t and q_cmd_i, as armlink gap plan writes it.")],
+    out: Annotated[Path, typer.Option(help="Recording to write (.mcap).")],
+    bus: Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write rows and seconds here; - is standard output.")
+    ] = None,
+) -> int:
+    """Move the arm along a planned motion under position control, every cycle recorded; Ctrl-C leaves it safe.
+
+    Example: armlink gap collect sarcos --motion settle.csv --out settle.mcap --bus socketcan:can0
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from armlink.armfile import load_arm
+    from armlink.commands.output import write_json
+    from armlink.errors import BadInput
+    from armlink.link import Link
+    from armlink.recording_mcap import SUFFIX
+    from sim_gap.collect import collect as run
+    from sim_gap.collect import load_motion
+
+    if out.suffix != SUFFIX or not out.resolve().parent.is_dir():
+        raise BadInput(f"--out {out}: expected a {SUFFIX} file in a folder that is there")
+    arm_file = load_arm(arm)
+    target = load_motion(motion, arm_file)
+    console = Console(stderr=True)
+    with Link.open(arm_file, bus) as link, Progress(console=console) as bars:
+        task = bars.add_task(f"{arm_file.name}: {motion.name}", total=len(target))
+        link.start()
+        link.enable()
+        rows = run(link, target, out, lambda k, _: bars.update(task, completed=k) if k % 50 == 0 else None)
+        bars.update(task, completed=rows)
+        link.disable()
+    console.print(f"{out}: {rows} rows, {rows / link.rate:.1f} s", markup=False)
+    write_json(json_file, {"file": str(out), "rows": rows, "seconds": rows / link.rate})
+    return 0

@@ -1,0 +1,88 @@
+"""Diagnoses every recording of a fleet on a cluster of workers, and gathers a table by arm and effect."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+
+def diagnose_fleet(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of cases, or of recordings with --sim.")],
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a dask scheduler; without it workers are started here.")
+    ] = None,
+    sim: Annotated[Path | None, typer.Option(help="Nominal model of cases that have none of their own.")] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Workers of the local cluster.")] = 2,
+    out: Annotated[
+        Path | None, typer.Option(help="Answers, one JSON line each; what it holds already is not done again.")
+    ] = None,
+    table: Annotated[Path | None, typer.Option(help="Also write the table by case and effect here (.parquet).")] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write all answers here; - is standard output.")
+    ] = None,
+) -> int:
+    """Map the diagnosis over thousands of recordings; exit status 1 where a case could not be diagnosed.
+
+    Example: armlink gap diagnose-fleet fleet/ --out answers.jsonl --table causes.parquet --scheduler tcp://127.0.0.1:8786
+    """
+    from rich.console import Console
+    from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
+
+    from armlink.commands.output import write_json
+    from sim_gap.cluster import cluster
+    from sim_gap.fleet import Answers, diagnose_fleet, find_cases
+    from sim_gap.fleet import table as table_of
+
+    cases = find_cases(folder, sim)
+    answers = Answers(out or folder / "answers.jsonl")
+    left = [case for case in cases if case.name not in answers.found]
+    console = Console(stderr=True)
+    if len(left) < len(cases):
+        console.print(f"{answers.path}: {len(cases) - len(left)} of {len(cases)} are there already")
+    columns = (*Progress.get_default_columns()[:2], MofNCompleteColumn(), TimeRemainingColumn())
+    if left:
+        with cluster(scheduler, min(workers, len(left))) as client, Progress(*columns, console=console) as bars:
+            task = bars.add_task("diagnosing", total=len(left))
+            for name, answer in diagnose_fleet(left, client):
+                answers.add(name, answer)
+                bars.advance(task)
+    found = {case.name: answers.found[case.name] for case in cases}
+    rows = table_of(found)
+    _show(rows, console)
+    if table is not None:
+        _write_table(rows, table)
+    write_json(json_file, {"schema": "armlink.gap-fleet/1", "answers": found})
+    return int(any("error" in answer for answer in found.values()))
+
+
+def _show(rows: list[dict[str, Any]], console: Any) -> None:
+    """How often each effect was found, and on how many arms; then what could not be diagnosed."""
+    from rich.table import Table
+
+    cases = {row["case"]: row["verdict"] for row in rows}
+    verdicts = ", ".join(f"{list(cases.values()).count(v)} {v}" for v in sorted(set(cases.values())))
+    shown = Table("effect", "arms", "cases", "median shrink", title=f"{len(cases)} cases: {verdicts}")
+    effects = sorted({row["effect"] for row in rows if row["effect"]})
+    counts = {e: [row for row in rows if row["effect"] == e] for e in effects}
+    for effect in sorted(effects, key=lambda e: -len(counts[e])):
+        shrinks = sorted(row["shrink"] or 0.0 for row in counts[effect])
+        arms = str(len({row["arm"] for row in counts[effect]}))
+        shown.add_row(
+            effect, arms, str(len({row["case"] for row in counts[effect]})), f"{shrinks[len(shrinks) // 2]:.2f}"
+        )
+    console.print(shown)
+    for row in rows:
+        if row["error"]:
+            console.print(f"{row['case']}: {row['error']}", style="yellow", markup=False)
+
+
+def _write_table(rows: list[dict[str, Any]], path: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    from armlink.errors import BadInput
+
+    try:
+        pq.write_table(pa.Table.from_pylist(rows), path)
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be written: {error}") from None

@@ -1,0 +1,46 @@
+"""Writes the motion that would settle what a diagnosis leaves open."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def plan(
+    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file: ranges and speeds.")],
+    out: Annotated[Path, typer.Option(help="Write the motion here: .csv, .parquet or .mcap with q_cmd_i.")],
+    answer: Annotated[
+        Path | None, typer.Option(help="Answer of armlink gap diagnose --json: its open joints are moved.")
+    ] = None,
+    joint: Annotated[list[str] | None, typer.Option(help="Joint to move alone; may repeat. Default: all.")] = None,
+    poses: Annotated[int, typer.Option(min=1, help="Poses of the other joints: loads to move under.")] = 2,
+    seed: Annotated[int, typer.Option(min=0, help="Draws other poses and sines, for held-out motion.")] = 0,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write length and pieces here; - is standard output.")
+    ] = None,
+) -> int:
+    """Plan motion within the arm's limits that tells effects apart; nothing moves.
+
+    Example: armlink gap plan sarcos --answer gap.json --out settle.csv
+    """
+    from rich.console import Console
+
+    from armlink.armfile import load_arm
+    from armlink.commands.output import write_json
+    from armlink.recording import save_recording
+    from sim_gap.motion import joints_in_doubt, plan_motion
+
+    joints, sentences = joints_in_doubt(answer) if answer else ([], [])
+    motion = plan_motion(load_arm(arm), [*joints, *(joint or [])], poses, seed)
+    save_recording(motion.recording(), out)
+    console = Console(stderr=True)
+    for sentence in sentences:
+        console.print(f"asked for: {sentence}", markup=False)
+    for piece in motion.pieces:
+        console.print(piece, markup=False)
+    console.print(f"{out}: {motion.seconds:.0f} s; run it with armlink gap collect {arm} --motion {out}", markup=False)
+    write_json(
+        json_file,
+        {"file": str(out), "seconds": motion.seconds, "pieces": list(motion.pieces), "asked_for": sentences},
+    )
+    return 0
