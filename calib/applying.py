@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from armlink.armfile import ArmFile
 from armlink.errors import BadInput, Refused
 from armlink.link import Link
@@ -11,8 +13,9 @@ from calib.dataset import SweepData
 from calib.field import FieldFit
 from calib.field_record import check_field_heldout
 from calib.field_rows import FieldRows
-from calib.gates import check_bounds, check_change, check_gates, past_changes
+from calib.gates import check_bounds, check_change, check_gates, check_holds, past_changes
 from calib.records import Array, CalibrationRecord
+from calib.sensors import SensorFit
 from calib.store import RecordStore
 from calib.writing import install, mend
 
@@ -38,16 +41,18 @@ def apply_calibration(
     arm: ArmFile,
     store: RecordStore,
     data: Sequence[SweepData],
-    beta: Array | None,
+    fit: SensorFit,
     how: Apply,
 ) -> tuple[str, ...]:
     """Write a record that was fitted to sweeps to the controllers and make it current; returns the joints written.
 
-    `data` are those sweeps, `beta` (2n,) [kg·m] is the gravity model that the check motion is judged by. The record is kept in any case. Raises
-    Refused where a gate or the check says no, BusFault; the controllers then hold what they held.
+    `data` are those sweeps, `fit` their fit, whose gravity model the check motion is judged by. The record is kept in
+    any case. Raises Refused where a gate or the check says no, BusFault; the controllers then hold what they held.
     """
     _require(record, arm, store, how)
+    check_holds(fit.goodness.findings)
     check_gates(record, arm, store, data, how.replaced)
+    beta = None if np.isnan(fit.value("gain")).all() else fit.fit.complete.beta
     return _write(record, arm, store, beta, how, "sweeps")
 
 

@@ -11,6 +11,7 @@ from armlink.errors import Refused
 from calib.dataset import SweepData
 from calib.description import gcomp_arm
 from calib.fit_rows import FitRows, fit_rows
+from calib.goodness import Finding
 from calib.records import Array, CalibrationRecord, GravityRecord, Parameter
 from calib.store import RecordStore
 from gcomp.errors import GcompError
@@ -53,6 +54,16 @@ def check_gates(
     check_change(record, old, past_changes(store, arm), arm, replaced)
     if not replaced:
         check_heldout(record, old, arm, data, store.current(GravityRecord, arm))
+
+
+def check_holds(findings: Sequence[Finding]) -> None:
+    """Raise Refused where the fit says that the sensor model does not hold on a joint."""
+    broken = next((each for each in findings if each.breaks_model), None)
+    if broken is not None:
+        raise Refused(
+            f"{broken.joint}: the sensor model does not hold: {broken.text.rstrip('.')}: mend that and sweep again;"
+            " nothing was written"
+        )
 
 
 def check_bounds(record: CalibrationRecord, arm: ArmFile) -> None:

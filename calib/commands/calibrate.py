@@ -33,8 +33,6 @@ def calibrate(
 
     Example: armlink calibrate unloaded loaded --json calibration.json
     """
-    import numpy as np
-
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
     from calib.applying import Apply, apply_calibration
@@ -62,8 +60,7 @@ def calibrate(
         write_report(Calibrated(arm_file, data, fit, record, current), report)
     if apply:
         how = Apply(by=user, bus=bus, replaced=tuple(replaced or ()), check=check, flash=flash)
-        beta = None if np.isnan(fit.value("gain")).all() else fit.fit.complete.beta
-        written = apply_calibration(record, arm_file, records, data, beta, how)
+        written = apply_calibration(record, arm_file, records, data, fit, how)
         print_lines([f"record {record.id} written to {len(written)} controllers, read back and current"])
     else:
         records.put(record, arm_file, by="armlink calibrate", reason="sweeps")

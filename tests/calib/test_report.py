@@ -12,7 +12,8 @@ from calib.diff import differences
 from calib.field import fit_field
 from calib.field_record import check_field_heldout, field_record
 from calib.field_rows import rows_of_sweeps
-from calib.gates import check_gates, check_heldout, heldout_scores
+from calib.gates import check_gates, check_heldout, check_holds, heldout_scores
+from calib.goodness import Finding
 from calib.identify import identify_gravity
 from calib.records import CalibrationRecord, JointCalibration
 from calib.report.calibration import Calibrated, write_report
@@ -95,6 +96,14 @@ def test_the_gates_let_a_right_calibration_pass_and_name_what_is_wrong(record, t
     jumped = changed(record, 0, gain=1.3)
     with pytest.raises(Refused, match=f"{ARM.joint_names[0]}: gain .* covariance and history allow"):
         check_gates(jumped, ARM, store, DATA)
+
+
+def test_a_joint_on_which_the_model_does_not_hold_is_not_written() -> None:
+    cable = Finding("j2", "spring", 0.8, "N·m/rad", "a spring of 0.8 N·m/rad pulls on it: is a cable caught?")
+    outlier = Finding("j1", "outliers", 2.0, "1", "2 readings were left out")
+    check_holds([outlier])
+    with pytest.raises(Refused, match="j2: the sensor model does not hold: a spring of"):
+        check_holds([outlier, cable])
 
 
 def test_sweeps_that_disagree_with_one_another_do_not_replace_a_good_record(fit, record) -> None:
