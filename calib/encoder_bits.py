@@ -12,7 +12,7 @@ CHANCE = 1e-4
 """Probability that a sound bit looks stuck by chance, above which nothing is said."""
 SPAN = 1.5
 """How many times a bit's own step the joint must have moved for it to be judged."""
-AWAY, OFTEN = 3.0, 0.15
+AWAY, OFTEN = 6.0, 0.15
 """Counts by which a reading may lie off where the joint was sent; share of readings that must lie a bit's step off."""
 
 
@@ -39,6 +39,8 @@ def _by_target(counts: Array, asked: Array) -> int | None:
     if len(off) < FEWEST or len(strange) < max(3, OFTEN * len(off)):
         return None
     bit = round(float(np.log2(np.median(strange))))
+    if 2.0**bit < 4 * AWAY:
+        return None
     return bit if np.mean(np.abs(strange - 2.0**bit) <= AWAY) > 0.8 else None
 
 

@@ -163,7 +163,7 @@ def _options(
 def _clear(candidates: Candidates, geometry: Geometry, name: str) -> Candidates:
     """The combinations along which nothing touches; raises Collided where there is none."""
     flat = candidates.poses.reshape(-1, candidates.poses.shape[-1])
-    free: Flags = geometry.free(flat).reshape(candidates.poses.shape[:2]).all(axis=1)
+    free = np.all(geometry.free(flat).reshape(candidates.poses.shape[:2]), axis=1)
     if free.any():
         return candidates.kept(free)
     first, second = next(found for pose in flat for found in geometry.contacts(pose)).bodies

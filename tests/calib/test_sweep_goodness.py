@@ -1,0 +1,192 @@
+"""Hard cases, one at a time: the fit names joint and cause, or its intervals still hold; sound data raise nothing."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rank_test import undetermined
+from sweep_arms import random_arm, synthetic_pass
+
+from armlink.armfile import ArmFile, load_arm
+from calib.dataset import Reading, SweepData
+from calib.description import gcomp_arm
+from calib.encoder_bits import stuck_bits
+from calib.identify import identify_gravity
+from calib.plan import plan_sweep
+from calib.scout import rough_model
+from calib.sensors import SensorFit, fit_sensors
+from gcomp.gravity import gravity_torque
+from sim_bus.simulated_arm import SimulatedArm
+from sim_bus.truth import Truth
+
+PUBLISHED = np.array([0.64, 1.01, 0.77, 0.65, 0.42, 0.20, 0.16])
+"""RMS of a real arm's best model, joint by joint [N·m]."""
+JOINT = 1
+
+
+def swept(arm: ArmFile, truth: Truth, seed: int) -> list[SweepData]:
+    """Both passes, drawn from MuJoCo's gravity."""
+    random, mass, found = np.random.default_rng(seed), 0.0, []
+    for _ in range(2):
+        scouted = synthetic_pass(arm, truth, plan_sweep(arm, reference_mass=mass), mass, random)
+        plan = plan_sweep(arm, rough_model(arm, scouted.readings), reference_mass=mass)
+        found.append(synthetic_pass(arm, truth, plan, mass, random))
+        mass = found[0].plan.reference_mass
+    return found
+
+
+@pytest.fixture(scope="module")
+def sound() -> tuple[ArmFile, Truth, list[SweepData]]:
+    arm = random_arm(51, 3)
+    truth = Truth.draw(arm, 51)
+    return arm, truth, swept(arm, truth, 51)
+
+
+def bent(data: list[SweepData], change: Callable[[Reading, np.ndarray, np.ndarray], None]) -> list[SweepData]:
+    """The same data with position and torque of each reading changed in place."""
+    passes = []
+    for each in data:
+        readings = []
+        for reading in each.readings:
+            position, torque = np.array(reading.position), np.array(reading.torque)
+            change(reading, position, torque)
+            readings.append(reading.model_copy(update={"position": tuple(position), "torque": tuple(torque)}))
+        passes.append(replace(each, readings=tuple(readings)))
+    return passes
+
+
+def rated(arm: ArmFile) -> float:
+    return arm.require_link().joints[JOINT].rated_torque
+
+
+def z_scores(fit: SensorFit, truth: Truth, parameter: str) -> np.ndarray:
+    return (fit.value(parameter) - getattr(truth, parameter)) / fit.std(parameter)
+
+
+def test_sound_data_raise_nothing(sound) -> None:
+    arm, truth, data = sound
+    fit = fit_sensors(arm, data)
+    assert fit.findings == ()
+    assert fit.doubtful == ()
+    assert np.abs(z_scores(fit, truth, "gain")).max() < 4
+    assert all(each.ratio < 3 for each in fit.goodness.left_out)
+    assert {each.sweep for each in fit.goodness.left_out} >= {f"pass-0/{sweep.name}" for sweep in data[0].plan.sweeps}
+    assert {key for key in fit.reasons if key[1] != "position_offset"} == undetermined(arm, data)
+
+
+def test_a_cable_spring_is_named_and_taken_out(sound) -> None:
+    arm, truth, data = sound
+    stiffness = 0.04 * rated(arm)
+
+    def pull(_: Reading, position: np.ndarray, torque: np.ndarray) -> None:
+        torque[JOINT] += truth.gain[JOINT] * stiffness * position[JOINT]
+
+    fit = fit_sensors(arm, bent(data, pull))
+    assert fit.doubtful == ("j2",)
+    (spring,) = fit.findings
+    assert (spring.joint, spring.kind) == ("j2", "spring")
+    assert spring.size == pytest.approx(stiffness, rel=0.1)
+    assert np.abs(z_scores(fit, truth, "gain")).max() < 4
+
+
+def test_hysteresis_is_measured_and_the_intervals_hold(sound) -> None:
+    arm, truth, data = sound
+    width = 0.03 * rated(arm)
+
+    def lag(reading: Reading, _: np.ndarray, torque: np.ndarray) -> None:
+        if reading.joint == JOINT:
+            torque[JOINT] -= reading.direction * width
+
+    fit = fit_sensors(arm, bent(data, lag))
+    assert fit.doubtful == ()
+    assert fit.findings[0].joint == "j2"
+    assert fit.findings[0].kind in ("direction", "hysteresis")
+    assert fit.hysteresis[JOINT] == pytest.approx(-width, rel=0.05)
+    assert np.abs(z_scores(fit, truth, "gain")).max() < 4
+    assert np.abs(z_scores(fit, truth, "offset")).max() < 4
+
+
+def test_a_saturated_sensor_is_named(sound) -> None:
+    arm, _, data = sound
+    limit = 0.6 * max(
+        abs(reading.torque[JOINT]) for each in data for reading in each.readings if reading.joint == JOINT
+    )
+
+    def clip(_: Reading, __: np.ndarray, torque: np.ndarray) -> None:
+        torque[JOINT] = np.clip(torque[JOINT], -limit, limit)
+
+    fit = fit_sensors(arm, bent(data, clip))
+    assert "j2" in fit.doubtful
+    assert "saturation" in {finding.kind for finding in fit.findings if finding.joint == "j2"}
+
+
+def test_what_was_touched_is_left_out_and_named(sound) -> None:
+    arm, truth, data = sound
+    name = next(sweep.name for sweep in data[0].plan.sweeps if sweep.joint == JOINT)
+
+    def knock(reading: Reading, _: np.ndarray, torque: np.ndarray) -> None:
+        if reading.sweep == name and reading.index == 2:
+            torque[JOINT] += 0.08 * rated(arm)
+
+    fit = fit_sensors(arm, bent(data[:1], knock) + data[1:])
+    (finding,) = fit.findings
+    assert (finding.joint, finding.kind) == ("j2", "outliers")
+    assert name in finding.text
+    assert np.abs(z_scores(fit, truth, "gain")).max() < 4
+
+
+@pytest.mark.parametrize(("bit", "level"), [(6, 0), (9, 1), (11, 0)])
+def test_a_stuck_encoder_bit_is_named(sound, bit: int, level: int) -> None:
+    arm, _, data = sound
+    step = data[0].resolution[JOINT]
+
+    def stick(_: Reading, position: np.ndarray, __: np.ndarray) -> None:
+        count = round(position[JOINT] / step)
+        count = count | (1 << bit) if level else count & ~(1 << bit)
+        position[JOINT] = count * step
+
+    fit = fit_sensors(arm, bent(data, stick))
+    (finding,) = fit.findings
+    assert (finding.joint, finding.kind) == ("j2", "encoder")
+    assert f"bit {bit}" in finding.text
+
+
+def test_a_sound_encoder_has_no_stuck_bit() -> None:
+    random = np.random.default_rng(0)
+    for _ in range(50):
+        position = random.uniform(-1, 1, (40, 1))
+        assert not list(stuck_bits(np.round(position, 4), np.array([1e-4]), position))
+
+
+def test_a_range_of_sixty_degrees_leaves_the_intervals_true() -> None:
+    arm = random_arm(52, 3)
+    kinematics = arm.kinematics.model_copy(
+        update={
+            "joints": tuple(
+                joint.model_copy(update={"upper": joint.lower + np.pi / 3}) if joint.name == "j2" else joint
+                for joint in arm.kinematics.joints
+            )
+        }
+    )
+    short = arm.model_copy(update={"kinematics": kinematics})
+    truth = Truth.draw(short, 52)
+    fit = fit_sensors(short, swept(short, truth, 52))
+    assert fit.doubtful == ()
+    for parameter in ("gain", "offset", "position_gain"):
+        assert np.nanmax(np.abs(z_scores(fit, truth, parameter))) < 4
+
+
+def test_held_out_torque_of_the_papers_arm_is_three_times_better_than_published() -> None:
+    arm = load_arm("sarcos")
+    truth = Truth.draw(arm, 7)
+    data = swept(arm, truth, 7)
+    fit = fit_sensors(arm, data)
+    described = gcomp_arm(arm)
+    poses = np.random.default_rng(8).uniform(described.lower, described.upper, (200, 7))
+    reading = truth.gain * SimulatedArm(arm, truth).gravity_torque(poses) + truth.offset
+    sensor = (reading - fit.value("offset")) / fit.value("gain")
+    shown = poses / truth.position_gain * fit.value("position_gain") + fit.fit.complete.position_offset
+    model = gravity_torque(described, identify_gravity(arm, data, fit).beta, shown)
+    rms = np.sqrt(((sensor - model) ** 2).mean(axis=0))
+    assert np.all(rms < PUBLISHED / 3)
