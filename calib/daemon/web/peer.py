@@ -21,8 +21,8 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 PEER = "armlink.peer"
 """Key of the ASGI scope that holds the Peer."""
-FIRST_REQUEST_SECONDS = 10.0
-"""A connection that has not sent a whole request head by then is closed."""
+HEAD_SECONDS = 10.0
+"""A connection that has not sent the whole head of a request by then, since it was made or began one, is cut."""
 WRITE_BUFFER = 32 * 1024
 """Bytes that may wait in the process for one client; a stream's item is about 2 kB."""
 _UCRED = struct.Struct("3i")
@@ -82,12 +82,16 @@ class BoundedProtocol(H11Protocol):
             await app(scope, receive, send)
 
         self.app = with_peer
-        self._deadline = self.loop.call_later(FIRST_REQUEST_SECONDS, self._still_waiting)
+        self._mind_the_clock()
+
+    def data_received(self, data: bytes) -> None:
+        """As uvicorn's, which would wait for the rest of a head for ever."""
+        super().data_received(data)
+        self._mind_the_clock()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Stop the clock."""
-        if self._deadline is not None:
-            self._deadline.cancel()
+        self._stop_the_clock()
         super().connection_lost(exc)
 
     def send_400_response(self, msg: str) -> None:
@@ -101,8 +105,24 @@ class BoundedProtocol(H11Protocol):
             _log.debug("%s: malformed request during an answer", msg)
         self.transport.close()
 
-    def _still_waiting(self) -> None:
-        if getattr(self, "cycle", None) is None:
+    def _awaits_head(self) -> bool:
+        cycle = getattr(self, "cycle", None)
+        return cycle is None or bool(cycle.response_complete)
+
+    def _mind_the_clock(self) -> None:
+        if not self._awaits_head():
+            self._stop_the_clock()
+        elif self._deadline is None:
+            self._deadline = self.loop.call_later(HEAD_SECONDS, self._cut_if_waiting)
+
+    def _stop_the_clock(self) -> None:
+        if self._deadline is not None:
+            self._deadline.cancel()
+            self._deadline = None
+
+    def _cut_if_waiting(self) -> None:
+        self._deadline = None
+        if self._awaits_head():
             self.transport.abort()
 
 

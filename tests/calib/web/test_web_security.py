@@ -12,6 +12,7 @@ from made_up_view import MadeUpView
 
 from armlink.errors import BadInput
 from calib.daemon.web import guard as guard_module
+from calib.daemon.web import peer as peer_module
 from calib.daemon.web.guard import BODY_LIMIT, REQUESTS, WRONG_TOKENS, Access, Guard
 from calib.daemon.web.peer import PEER, Peer
 from calib.daemon.web.rate import Rate, RateLimit
@@ -185,6 +186,26 @@ def test_a_request_whose_body_ends_early_decides_nothing(server: Served, view: M
     server.do(view.propose)
     exchange(server, b"POST /api/proposals/1/approve HTTP/1.1\r\nHost: localhost\r\nContent-Length: 10\r\n\r\n")
     assert server.client().get("/api/proposals").json()[0]["state"] == "pending"
+
+
+@pytest.mark.parametrize("before", [b"", b"GET /nothing HTTP/1.1\r\nHost: localhost\r\n\r\n"], ids=["first", "second"])
+@pytest.mark.parametrize("part", [b"", b"GET /api/status HTTP/1.1\r\nHost: local"], ids=["nothing", "half a head"])
+def test_a_connection_that_sends_no_whole_request_is_cut(
+    server: Served, monkeypatch: pytest.MonkeyPatch, before: bytes, part: bytes
+) -> None:
+    monkeypatch.setattr(peer_module, "HEAD_SECONDS", 0.2)
+    with socket.socket(socket.AF_UNIX) as raw:
+        raw.settimeout(60)
+        raw.connect(str(server.path))
+        if before:
+            raw.sendall(before)
+            assert raw.recv(65536).startswith(b"HTTP/1.1 404")
+        raw.sendall(part)
+        try:
+            rest = b"".join(iter(lambda: raw.recv(65536), b""))
+        except ConnectionResetError:
+            rest = b""
+    assert b"HTTP/1.1" not in rest
 
 
 def test_rate_limit_is_a_bucket_for_each_address() -> None:

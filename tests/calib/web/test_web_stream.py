@@ -5,13 +5,17 @@ import json
 import socket
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
-from conftest import Served
+from conftest import Served, served
+from daemon_bench import DaemonBench
 from made_up_view import NAMES, MadeUpView
+from small_arm import small_arm
 
+from calib.daemon.answers import ServiceView
 from calib.daemon.web import stream as stream_module
 from calib.daemon.web.stream import Streams
 
@@ -106,6 +110,39 @@ def test_fifty_clients_get_every_item_and_it_is_encoded_once(server: Served, vie
     seen = asyncio.run(run())
     assert all(times == pytest.approx([0, 0.1, 0.2, 0.3, 0.4, 0.5]) for times in seen)
     assert len({id(data) for data in encoded[-50:]}) == 1
+
+
+def test_fifty_clients_cost_the_bus_no_cycle(tmp_path: Path) -> None:
+    """The whole daemon on the simulated arm: what the link counts as missed or late, with all of them listening."""
+    found: list[DaemonBench] = []
+
+    def begin() -> ServiceView:
+        found.append(DaemonBench(tmp_path, small_arm()))
+        return found[0].view
+
+    async def listen(server: Served) -> list[dict[str, Any]]:
+        async def read() -> dict[str, Any]:
+            reader, writer = await asyncio.open_unix_connection(str(server.path))
+            writer.write(b"GET /api/stream HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            while line := await reader.readline():
+                if line.startswith(b"data: ") and (item := json.loads(line[6:]))["t"] > 3.0:
+                    writer.close()
+                    return item
+            raise AssertionError("the stream ended")
+
+        return await asyncio.gather(*(read() for _ in range(50)))
+
+    async def go_on() -> None:
+        while True:
+            if len(found[0].service.hub.clients) == 50 or found[0].now() > 0.5:
+                found[0].run(0.1)
+            await asyncio.sleep(0)
+
+    with served(begin, tmp_path / "api.sock", go_on) as server:
+        items = asyncio.run(listen(server))
+    assert {item["bus"]["missed"] for item in items} == {0}
+    assert {item["bus"]["late"] for item in items} == {0}
+    assert all(item["bus"]["frames"] > 1000 and item["bus"]["connected"] for item in items)
 
 
 def until(server: Served, wanted: Any) -> None:
