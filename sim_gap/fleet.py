@@ -36,8 +36,8 @@ def find_cases(folder: Path, sim: Path | None = None) -> list[Case]:
         cases += [Case(path.name, sim, (path,)) for path in _recordings(folder)]
     if not cases:
         raise BadInput(
-            f"{folder}: holds no case: expected folders with one of {', '.join(MODELS)}, a train*.csv or .parquet and a "
-            "heldout*, or recordings and --sim MODEL for all of them"
+            f"{folder}: holds no case: expected folders with one of {', '.join(MODELS)}, train* and heldout* "
+            "recordings, or recordings and --sim MODEL for all of them"
         )
     return cases
 

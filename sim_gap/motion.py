@@ -11,7 +11,6 @@ import numpy.typing as npt
 
 from armlink.armfile import ArmFile
 from armlink.errors import BadInput
-from armlink.recording import Recording
 from calib.description import gcomp_arm
 from calib.motion import trajectory
 
@@ -48,11 +47,6 @@ class Motion:
     def seconds(self) -> float:
         """How long it takes [s]."""
         return len(self.target) / self.rate
-
-    def recording(self) -> Recording:
-        """As a file holds it: time and commanded positions; positions are those, too."""
-        t = np.arange(len(self.target)) / self.rate
-        return Recording(t=t, position=self.target, position_command=self.target, names=self.names)
 
 
 def plan_motion(arm: ArmFile, joints: Iterable[str] = (), poses: int = 2, seed: int = 0) -> Motion:

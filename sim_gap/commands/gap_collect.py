@@ -26,12 +26,11 @@ def collect(
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
     from armlink.link import Link
-    from armlink.recording_mcap import SUFFIX
     from sim_gap.collect import collect as run
-    from sim_gap.collect import load_motion
+    from sim_gap.motion_file import load_motion
 
-    if out.suffix != SUFFIX or not out.resolve().parent.is_dir():
-        raise BadInput(f"--out {out}: expected a {SUFFIX} file in a folder that is there")
+    if out.suffix != ".mcap" or not out.resolve().parent.is_dir():
+        raise BadInput(f"--out {out}: expected a .mcap file in a folder that is there")
     arm_file = load_arm(arm)
     target = load_motion(motion, arm_file)
     console = Console(stderr=True)

@@ -8,7 +8,7 @@ import typer
 
 def plan(
     arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file: ranges and speeds.")],
-    out: Annotated[Path, typer.Option(help="Write the motion here: .csv, .parquet or .mcap with q_cmd_i.")],
+    out: Annotated[Path, typer.Option(help="Write the motion here (.csv with t and q_cmd_i).")],
     answer: Annotated[
         Path | None, typer.Option(help="Answer of armlink gap diagnose --json: its open joints are moved.")
     ] = None,
@@ -27,12 +27,12 @@ def plan(
 
     from armlink.armfile import load_arm
     from armlink.commands.output import write_json
-    from armlink.recording import save_recording
     from sim_gap.motion import joints_in_doubt, plan_motion
+    from sim_gap.motion_file import save_motion
 
     joints, sentences = joints_in_doubt(answer) if answer else ([], [])
     motion = plan_motion(load_arm(arm), [*joints, *(joint or [])], poses, seed)
-    save_recording(motion.recording(), out)
+    save_motion(motion, out)
     console = Console(stderr=True)
     for sentence in sentences:
         console.print(f"asked for: {sentence}", markup=False)

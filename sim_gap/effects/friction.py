@@ -3,13 +3,16 @@
 F(v) = (Fc + Fb·exp(−(v/vs)²) + μ·|τ|)·(1 ± ratio) + d·|v|, opposing v; τ is the transmitted torque.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from sim_gap.effects.registry import Columns, Effect, Layout, Parameter, Shape
 from sim_gap.rigid import Array
 from sim_gap.signals import Signals
+
+WITHIN = 0.5
+"""A Stribeck velocity is below this share of the fastest usual speed."""
 
 
 def dry(beneath: Mapping[str, Array]) -> float:
@@ -68,6 +71,11 @@ class Stribeck(_Friction):
 
     def column(self, s: Signals, joint: int, shape: Shape) -> Array:
         return s.direction[:, joint] * np.exp(-((s.v[:, joint] / shape[0]) ** 2))
+
+    def grid(self, signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
+        """Velocities well within those that were seen: beyond, it is friction that varies with speed, no more."""
+        fastest = float(np.quantile(np.concatenate([np.abs(s.v[:, place]) for s in signals]), 0.95))
+        return tuple(shape for shape in self.shapes if shape[0] < WITHIN * fastest) or self.shapes[:1]
 
     def made_of(self, layout: Layout, place: int, shape: Shape) -> tuple[tuple[str, int], ...]:
         """Friction that grows with speed, or with load where speed goes with it."""

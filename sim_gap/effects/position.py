@@ -4,7 +4,7 @@ True angle θ = gain·φ + offset + amplitude·sin(φ + phase), φ the reading. 
 finite difference, taken through position, velocity and acceleration together.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -13,6 +13,8 @@ from sim_gap.rigid import Array
 from sim_gap.signals import Signals
 
 EPSILON = 1e-4
+PART_OF_TURN = 2.0
+"""Range [rad] that shows whether an error comes once a turn."""
 WORST_GAIN = 0.15
 """No position sensor's angles are further off than this share."""
 
@@ -75,10 +77,14 @@ class Gain(Effect):
 
 
 class Eccentricity(Effect):
-    """A sensor ring out of centre: an error once a turn."""
+    """A sensor ring out of centre: an error once a turn. On a small part of a turn it is an offset and a gain."""
 
     id = "position.eccentricity"
     parameters = (Parameter("amplitude", "rad"), Parameter("phase", "rad"))
+
+    def grid(self, signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
+        seen = max(float(np.ptp(s.q[:, place])) for s in signals)
+        return self.shapes if seen > PART_OF_TURN else ()
 
     def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
         sine = _response(signals, layout, place, lambda q: (np.sin(q), np.cos(q), -np.sin(q)))
