@@ -1,18 +1,22 @@
 """Calibration in the field without a mass: intervals that hold, and no number where nothing can be separated."""
 
+import json
 from datetime import UTC, datetime
+from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import BETA
 
 from armlink.armfile import ArmFile, load_arm
+from armlink.cli import run
 from armlink.errors import BadInput, Refused
-from armlink.recording import Recording
+from armlink.recording import Recording, save_recording
 from calib.description import gcomp_arm
 from calib.field import fit_field
 from calib.field_rows import FieldRows, rows_of_recording
 from calib.records import CalibrationRecord, GravityRecord, JointCalibration, matrix, provenance
+from calib.store import RecordStore
 from gcomp.gravity import gravity_torque
 from gcomp.moments import payload_columns
 
@@ -159,8 +163,8 @@ def test_a_payload_is_not_taken_for_new_gains() -> None:
 
 
 def recording(random: np.random.Generator, gain: np.ndarray, offset: np.ndarray, speed: float) -> Recording:
-    """Slow sinusoids of all joints at 100 Hz, at most `speed` [rad/s], ten minutes."""
-    t = np.arange(0.0, 600.0, 0.01)
+    """Slow sinusoids of all joints at 33 Hz, at most `speed` [rad/s], ten minutes."""
+    t = np.arange(0.0, 600.0, 0.03)
     middle, half = (DESCRIBED.lower + DESCRIBED.upper) / 2, 0.4 * (DESCRIBED.upper - DESCRIBED.lower)
     rate = speed / half * random.uniform(0.7, 1.0, N)
     q = middle + half * np.sin(rate * t[:, None] + random.uniform(0, 6, N))
@@ -197,3 +201,63 @@ def test_fast_motion_and_missing_torque_are_refused_in_one_line() -> None:
     without = Recording(t=fast.t, position=fast.position, motor_torque=fast.torque, names=fast.names)
     with pytest.raises(BadInput, match="no joint torque"):
         rows_of_recording(without, np.ones(N), np.zeros(N), 0, "x")
+
+
+@pytest.fixture
+def kept(tmp_path: Path) -> tuple[str, CalibrationRecord, GravityRecord]:
+    """A store with both records of the bundled arm; its path."""
+    path = str(tmp_path / "records.db")
+    store, installed, moments = RecordStore(path), calibration(), gravity(np.array(BETA))
+    store.put(installed, ARM, by="ann", reason="sweeps")
+    store.put(moments, ARM, by="ann", reason="sweeps")
+    return path, installed, moments
+
+
+def test_the_command_keeps_a_record_and_says_what_it_could_not_separate(kept, tmp_path, capsys) -> None:
+    """Joint 7 stands still: its gain and offset have a reason and no number; its values are carried over."""
+    path, installed, moments = kept
+    random, gain = np.random.default_rng(10), np.array([1.03, 0.98, 1.02, 0.97, 1.0, 1.01, 1.0])
+    moving = recording(random, gain, np.full(N, 0.2), 0.08)
+    position = moving.position.copy()
+    position[:, 6] = 0.1
+    torque = gain * gravity_torque(DESCRIBED, np.array(BETA), position) + 0.2 + random.normal(0, 0.2, position.shape)
+    save_recording(
+        Recording(t=moving.t, position=position, torque=torque, names=moving.names), tmp_path / "slow.csv.gz"
+    )
+    arguments = ["recalibrate", "sarcos", str(tmp_path / "slow.csv.gz"), "--store", path, "--json", "-"]
+    assert run(arguments) == 0
+    out = capsys.readouterr()
+    answer = json.loads(out.out)
+    for found, (low, high), true in zip(answer["gain"]["estimated"][:4], answer["gain"]["ci95"], gain, strict=False):
+        assert found == pytest.approx(true, abs=0.01)
+        assert low - 0.002 < true < high + 0.002
+    assert answer["offset"]["estimated"][6] is None
+    assert ("joint_7", "offset") in {(each["joint"], each["parameter"]) for each in answer["not_separable"]}
+    assert "factor common to all gains" in out.err
+    store = RecordStore(path)
+    new = store.get(answer["record"])
+    assert isinstance(new, CalibrationRecord)
+    assert new.joints[6].offset == installed.joints[6].offset
+    assert "joint_7 offset" in new.note
+    assert new.parent == installed.id
+    assert list(new.sources) == ["slow.csv.gz", f"gravity record {moments.id}"]
+    assert store.current(CalibrationRecord, ARM) == installed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "said"),
+    [
+        (["recalibrate", "sarcos", "nowhere.csv"], 2, "nowhere.csv"),
+        (["recalibrate", "nowhere", "x.csv"], 2, "no arm file nowhere"),
+    ],
+)
+def test_what_cannot_be_used_is_one_line(kept, capsys, arguments, status, said) -> None:
+    assert run([*arguments, "--store", kept[0]]) == status
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+
+
+def test_without_a_gravity_record_it_says_how_to_make_one(tmp_path, capsys) -> None:
+    assert run(["recalibrate", "sarcos", "x.csv", "--store", str(tmp_path / "empty.db")]) == 1
+    assert "armlink identify makes one" in capsys.readouterr().err
