@@ -59,7 +59,8 @@ export function showJoints(joints) {
 
 function interval(cell, value, std, digits, off) {
   cell.classList.toggle("off", off);
-  cell.replaceChildren(signed(value, digits), make("span", { className: "pm" }, ` ± ${number(1.96 * std, digits)}`));
+  const around = std > 0 ? ` ± ${number(1.96 * std, digits)}` : ""; // 0: left as it was, since only the other one drifts
+  cell.replaceChildren(signed(value, digits), make("span", { className: "pm" }, around));
 }
 
 // What the estimates say in one line.

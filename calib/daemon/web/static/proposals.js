@@ -5,9 +5,14 @@ import { by, clock, make, number, signed } from "./format.js";
 
 const NAME = "armlink-name";
 
-const change = (one) =>
-  `gain ${signed(100 * (one.gain - 1), 2)} ± ${number(196 * one.gain_std, 2)} %, `
-  + `offset ${signed(one.offset, 3)} ± ${number(1.96 * one.offset_std, 3)} N·m`;
+// What changes; a drift of the gain alone leaves the offset, and the other way round, with a standard deviation of 0.
+function change(one) {
+  const gain = `gain ${signed(100 * (one.gain - 1), 2)} ± ${number(196 * one.gain_std, 2)} %`;
+  const offset = `offset ${signed(one.offset, 3)} ± ${number(1.96 * one.offset_std, 3)} N·m`;
+  return [one.gain_std > 0 && gain, one.offset_std > 0 && offset].filter(Boolean).join(", ");
+}
+
+const percent = (share) => (share > 0.999 ? "above 99.9 %" : `${(100 * share).toFixed(1)} %`);
 
 function pending(one) {
   const button = (verb, title, className) => {
@@ -17,8 +22,8 @@ function pending(one) {
   };
   const card = make("div", { className: "proposal" },
     make("div", {},
-      make("p", { className: "what" }, `${one.joint}: ${one.cause} has drifted: ${change(one)}`),
-      make("p", { className: "quiet" }, `from ${one.rows} rests, confidence ${(100 * one.confidence).toFixed(1)} %; `
+      make("p", { className: "what" }, `${one.joint} has drifted: ${change(one)}`),
+      make("p", { className: "quiet" }, `from ${one.rows} rests, confidence ${percent(one.confidence)}; `
         + `record ${one.record} would replace ${one.base}; found ${clock(one.time)}`)),
     make("div", { className: "row" }, button("approve", "Approve", "main"), button("reject", "Reject", "")));
   card.dataset.proposal = one.id;
