@@ -76,7 +76,7 @@ def wait_for(condition, seconds: float = 10.0) -> bool:
 
 
 def map_for_canopen(node: BaseNode402) -> None:
-    """The stock profile wants control word and mode in RPDOs, status word and mode display in TPDOs, event-driven."""
+    """The stock profile wants control word and mode in RPDOs, status word and mode display in TPDOs."""
     node.rpdo.read()
     node.tpdo.read()
     node.rpdo[1].clear()
@@ -86,7 +86,7 @@ def map_for_canopen(node: BaseNode402) -> None:
     node.tpdo[3].clear()
     for name in ("Statusword", "Modes of operation display"):
         node.tpdo[3].add_variable(name)
-    node.tpdo[3].trans_type, node.tpdo[3].enabled = 255, True
+    node.tpdo[3].trans_type, node.tpdo[3].enabled = 1, True  # the stock profile takes what came twice for periodic
     node.tpdo[1].trans_type, node.tpdo[1].enabled = 1, True
     node.rpdo[1].save()
     node.tpdo[3].save()
@@ -143,11 +143,11 @@ def test_candump_and_cansend(simulated: None) -> None:
         pytest.skip("no can-utils: scripts/install-system installs them where that is allowed")
     candump, cansend = tools
     listening = subprocess.Popen(
-        [candump, "-n", "2", "-T", "10000", "vcan0,585:7FF,605:7FF"], stdout=subprocess.PIPE, text=True
+        [candump, "-n", "2", "-T", "60000", "vcan0,585:7FF,605:7FF"], stdout=subprocess.PIPE, text=True
     )
-    time.sleep(0.5)
+    time.sleep(2.0)
     subprocess.run([cansend, "vcan0", "605#4000100000000000"], check=True)
-    seen, _ = listening.communicate(timeout=30)
+    seen, _ = listening.communicate(timeout=90)
     assert "605   [8]  40 00 10 00 00 00 00 00" in seen
     assert "585   [8]  43 00 10 00 92 01 02 00" in seen
 
