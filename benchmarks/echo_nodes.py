@@ -10,6 +10,7 @@ import socket
 import struct
 import sys
 from pathlib import Path
+from typing import Any
 
 import can
 
@@ -60,14 +61,17 @@ def remove_gateway() -> None:
 
 def start_nodes(channel: str) -> multiprocessing.Process:
     """The process of the tests' nodes on SocketCAN `channel`; SYNC reaches it until hear_no_sync."""
-    process = multiprocessing.Process(target=_serve, args=(channel,), daemon=True)
+    listens = multiprocessing.Event()
+    process = multiprocessing.Process(target=_serve, args=(channel, listens), daemon=True)
     process.start()
+    listens.wait()
     return process
 
 
-def _serve(channel: str) -> None:
+def _serve(channel: str, listens: Any) -> None:
     bus = can.Bus(interface="socketcan", channel=channel)
     port, nodes = SocketPort(bus), FakeBus(NODES)
+    listens.set()
     for node in NODES:
         nodes.nodes[node].position, nodes.nodes[node].torque = struct.unpack("<ii", readings(node))
     while True:
