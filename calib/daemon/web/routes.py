@@ -110,10 +110,12 @@ def _add_past(router: APIRouter, view: DaemonView) -> None:
 
     @router.get("/api/report", response_class=FileResponse, responses=NO_SUCH | _HTML, tags=["past"])
     async def report() -> FileResponse:
-        """The newest sweep's report, one HTML file."""
+        """The newest report in the state directory, one HTML file."""
         path = view.status().report
         if path is None or not path.is_file():
-            raise NoSuch("there is no report yet: one is written by each sweep")
+            raise NoSuch(
+                "there is no report yet: the newest HTML file in the state directory is shown (armlink calibrate --report)"
+            )
         return FileResponse(path, media_type="text/html", headers={"content-security-policy": REPORT_CSP})
 
 

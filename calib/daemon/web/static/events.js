@@ -12,11 +12,11 @@ export function showEvent(event) {
   const line = make("li", { className: category(event.kind) },
     make("time", { dateTime: event.time }, clock(event.time)),
     make("span", { className: "kind" }, event.joint ? `${event.kind} · ${event.joint}` : event.kind),
-    make("span", { className: "text" }, event.text));
+    make("div", { className: "text" }, event.text));
   line.dataset.kind = event.kind;
   line.dataset.id = event.id;
   if (Object.keys(event.evidence).length) {
-    line.append(make("details", {}, make("summary", {}, "evidence"), make("pre", {}, JSON.stringify(event.evidence, null, 1))));
+    line.lastChild.append(make("details", {}, make("summary", {}, "evidence"), make("pre", {}, JSON.stringify(event.evidence, null, 1))));
   }
   const list = by("events");
   list.prepend(line);

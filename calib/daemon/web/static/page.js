@@ -60,6 +60,7 @@ function showStatus() {
   showBus(status.bus);
   showLink();
   by("forget").hidden = token() === null;
+  by("openapi").hidden = token() !== null; // a link cannot send the token
   if (status.report && !by("report").dataset.there) showReport();
 }
 
@@ -72,7 +73,7 @@ function showLink() {
 function showReport() {
   const paragraph = by("report");
   paragraph.dataset.there = "yes";
-  const link = Object.assign(document.createElement("a"), { href: "/api/report", target: "_blank", rel: "noopener", textContent: "Open the last sweep's report" });
+  const link = Object.assign(document.createElement("a"), { href: "/api/report", target: "_blank", rel: "noopener", textContent: "Open the newest report" });
   link.addEventListener("click", async (event) => {
     if (token() === null) return; // the Unix socket asks for none: an ordinary link
     event.preventDefault();
