@@ -14,9 +14,10 @@ def nominal_model(path: Path) -> Any:
     """
     arm = load_arm(str(path))
     if arm.sim is not None:
+        from sim_bus.effects.state import Imperfections
         from sim_bus.mjcf import build_model
 
-        model = build_model(arm).model
+        model = build_model(arm, Imperfections(arm.joint_names)).model
         model.dof_frictionloss[:] = 0.0  # the plant sets its friction as it runs
         return model
     if arm.model_path is None:
