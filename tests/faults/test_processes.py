@@ -9,8 +9,10 @@ import pytest
 ROOT = Path(__file__).parent.parent.parent
 
 
-@pytest.mark.parametrize("options", [["--tries", "2"], ["--tries", "1", "--stop"]], ids=["SIGKILL", "SIGSTOP"])
+@pytest.mark.parametrize("options", [["--tries", "3"], ["--tries", "1", "--stop"]], ids=["SIGKILL", "SIGSTOP"])
 def test_a_host_that_dies_under_a_bias_torque_leaves_every_joint_safe(options: list[str]) -> None:
     campaign = ROOT / "tests" / "campaigns" / "kill_host.py"
-    run = subprocess.run([sys.executable, str(campaign), *options], capture_output=True, text=True, timeout=300)
+    run = subprocess.run(
+        [sys.executable, str(campaign), *options, "--slack", "5"], capture_output=True, text=True, timeout=300
+    )
     assert run.returncode == 0, run.stdout + run.stderr

@@ -59,8 +59,8 @@ def node(simulated: None) -> Iterator[BaseNode402]:
     node = BaseNode402(NODE, EDS)
     network.add_node(node)
     node.sdo.RESPONSE_TIMEOUT = 3.0  # a user-mode kernel has one slow core
-    node.TIMEOUT_SWITCH_STATE_FINAL = node.TIMEOUT_SWITCH_STATE_SINGLE = node.TIMEOUT_SWITCH_OP_MODE = 5.0
-    node.TIMEOUT_CHECK_TPDO = 2.0
+    node.TIMEOUT_SWITCH_STATE_FINAL = node.TIMEOUT_SWITCH_STATE_SINGLE = node.TIMEOUT_SWITCH_OP_MODE = 20.0
+    node.TIMEOUT_CHECK_TPDO = 5.0
     yield node
     network.sync.stop()
     network.disconnect()
@@ -109,7 +109,7 @@ def test_nmt_sdo_heartbeat_pdo_and_cia_402(node: BaseNode402) -> None:
     node.setup_402_state_machine(read_pdos=False)
     node.nmt.state = "OPERATIONAL"
     assert wait_for(lambda: node.nmt.wait_for_heartbeat(10.0) == "OPERATIONAL")
-    node.network.sync.start(0.05)  # TPDO1 and 2 are synchronous
+    node.network.sync.start(0.1)  # TPDO1 and 2 are synchronous
     node.op_mode = "PROFILED POSITION"
     for state in ("READY TO SWITCH ON", "SWITCHED ON", "OPERATION ENABLED"):
         node.state = state
