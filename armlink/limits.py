@@ -41,7 +41,7 @@ def joint_ranges(arm: ArmFile) -> tuple[tuple[float, float], ...]:
 
 def target_window(lower: float, upper: float) -> tuple[float, float]:
     """Where a position target may lie [rad]: the stops, the position sensor's error, and some press-in."""
-    margin = POSITION_GAIN_ERROR * max(abs(lower), abs(upper)) + PRESS_IN
+    margin = POSITION_GAIN_ERROR * max(-lower, upper) + PRESS_IN
     return lower - margin, upper + margin
 
 

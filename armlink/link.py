@@ -234,11 +234,11 @@ class Link:
         """Run the loop until `done` or the time is over; enabled joints get their last command in every cycle."""
         end = self.clock.now() + timeout
         while not done():
-            if self._loop.receive(0.0):
-                continue
             remaining = end - self.clock.now()
             if remaining <= 0:
                 return False
+            if self._loop.receive(0.0):
+                continue
             if self._enabled and self._last is not None:
                 self.cycle(replace(self._last, t=None))
             elif not self._loop.receive(remaining):

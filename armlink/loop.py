@@ -159,7 +159,9 @@ class Loop:
         self.stats.frames += len(frames)
         self.bits += sum(FRAME_BITS + 8 * len(data) for _, data in frames)
         end = now + self._patience
-        while self._awaited > 0:
+        for _ in range(MOST_FRAMES):
+            if self._awaited <= 0:
+                break
             if not self.receive(0.0):
                 remaining = end - self._clock.now()
                 if remaining <= 0 or not self.receive(remaining):

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 
 from armlink import device
 from armlink.clock import Clock
@@ -26,7 +25,7 @@ def scan_bus(port: Port, clock: Clock, joints: Mapping[int, str]) -> list[Identi
         end = clock.now() + timeout
         while not done():
             frame = port.receive(max(0.0, end - clock.now()))
-            if frame is None:
+            if frame is None or clock.now() > end + SEARCH_SECONDS:  # a node that babbles must not hold the search
                 return False
             network.notify(frame[0], bytearray(frame[1]), 0.0)
         return True
@@ -36,9 +35,10 @@ def scan_bus(port: Port, clock: Clock, joints: Mapping[int, str]) -> list[Identi
     identities = []
     for node in sorted({*+found, *joints}):
         name = joints.get(node, "")
-        if found[node]:
-            identity = device.identify(NodeServices(network, name, node, dictionary, pump))
-            identities.append(replace(identity, answers=found[node]))
+        if found[node] > 1:  # whatever one of them is asked, the other answers too
+            identities.append(Identity(name, node, present=True, answers=found[node]))
+        elif found[node]:
+            identities.append(device.identify(NodeServices(network, name, node, dictionary, pump)))
         else:
             identities.append(Identity(name, node, present=False))
     return identities

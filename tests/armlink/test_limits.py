@@ -34,6 +34,8 @@ def test_the_window_has_room_for_the_sensor_and_for_pressing():
     assert target_window(-2.0, 1.0) == pytest.approx((-2.0 - 0.09, 1.0 + 0.09))
     assert target_window(-1.0, 3.0) == pytest.approx((-1.0 - 0.11, 3.0 + 0.11))
     assert target_window(0.0, 0.0) == (-0.05, 0.05)
+    assert target_window(-3.0, -1.0) == pytest.approx((-3.0 - 0.11, -1.0 + 0.11))
+    assert target_window(1.0, 3.0) == pytest.approx((1.0 - 0.11, 3.0 + 0.11))
 
 
 def test_a_torque_that_no_frame_carries_is_refused():
@@ -49,7 +51,7 @@ def test_a_window_that_no_frame_carries_is_refused(side):
     window = (min(far, 0.0), max(far, 0.0))
     units = Units(0.04, 0.5, 1e-6)
     assert gate_limits(joint(), window, units, 0.004, 0.1).lower == window[0]
-    beyond = (window[0] * 1.001, window[1] * 1.001)
+    beyond = (window[0] + min(side, 0) * 0.5, window[1] + max(side, 0) * 0.5)  # one user unit more
     with pytest.raises(BadInput, match=r"elbow: its range is more than 607Ah carries at 0\.5 rad a user unit"):
         gate_limits(joint(), beyond, units, 0.004, 0.1)
 
