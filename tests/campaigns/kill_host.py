@@ -80,9 +80,7 @@ def main() -> int:
         ear.bus.shutdown()
     within = sum(seconds <= DEADLINE + chosen.slack for seconds in times)
     verb = "stopped" if chosen.stop else "killed"
-    print(
-        f"{verb}: every joint safe within {DEADLINE} s (+ {chosen.slack} s of the scheduler's) in {within} of {len(times)}"
-    )
+    print(f"{verb}: every joint safe within {DEADLINE} s (+ {chosen.slack} s slack) in {within} of {len(times)}")
     middle = sorted(times)[len(times) // 2]
     print(f"median {middle:.3f} s, longest {max(times):.3f} s, on {chosen.bus}; {again} tries made again")
     return 0 if within == len(times) else 1
