@@ -1,17 +1,21 @@
 """schemathesis against the description that the daemon gives of itself: no 5xx, and every answer as described."""
 
+from pathlib import Path
+
 import pytest
 import schemathesis
-from conftest import TOKEN, Served
+from conftest import TOKEN, Served, served
+from daemon_bench import DaemonBench
 from hypothesis import HealthCheck, Phase, given, settings
-from made_up_view import MadeUpView
 from schemathesis.checks import not_a_server_error
 from schemathesis.specs.openapi.checks import (
     content_type_conformance,
     response_schema_conformance,
     status_code_conformance,
 )
+from small_arm import small_arm
 
+from calib.daemon.answers import ServiceView
 from calib.daemon.web.rate import RateLimit
 
 CHECKS = [not_a_server_error, content_type_conformance, response_schema_conformance, status_code_conformance]
@@ -54,11 +58,19 @@ def takes_anything(operation: schemathesis.APIOperation) -> bool:
     )
 
 
-def test_generated_requests_find_no_5xx(server: Served, view: MadeUpView, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.slow
+def test_generated_requests_to_a_whole_daemon_find_no_5xx(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(RateLimit, "take", lambda *_: 0.0)
-    server.do(view.propose)
-    server.do(lambda: view.happen("drift", "joint_2", "gain", value=float("inf")))
-    checked = check_all(server, SETTINGS)
+
+    def begin() -> ServiceView:
+        bench = DaemonBench(tmp_path, small_arm())
+        bench.run(3.0)
+        bench.service.keep(history=True)
+        bench.service.say("drift", "elbow", "gain", {"value": float("inf")})
+        return bench.view
+
+    with served(begin, tmp_path / "api.sock") as server:
+        checked = check_all(server, SETTINGS)
     wanted = {f"GET /api/{name}" for name in ("status", "joints", "estimates", "events", "history", "proposals")}
     decisions = {f"POST /api/proposals/{{id}}/{verb}" for verb in ("approve", "reject")}
     assert checked == wanted | decisions | {"GET /api/report", "GET /metrics"}
