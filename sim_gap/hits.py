@@ -11,7 +11,7 @@ from sim_gap.signals import Signals
 
 BEFORE_S, AFTER_S = 0.4, 0.6
 """Left out before and after a change of sign of the torque."""
-SHARP = 10.0
+SHARP = 25.0
 """So many times sharper (second difference, RMS) than elsewhere the residual must be near these changes."""
 LEAST_LEFT = 0.2
 """Share of a recording that must be left."""

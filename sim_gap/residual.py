@@ -86,7 +86,8 @@ class ResidualSet:
             part = slice(first, first + length)
             rest = np.stack([self.values[str(sensor), j][part] for j in range(self.layout.n)], axis=1)
             for joint, near in hits(s, str(sensor), rest).items():
-                if root_mean_square(rest[near, joint]) < self.margin[str(sensor), joint]:
+                row = (str(sensor), joint)
+                if root_mean_square(rest[near, joint]) < self.margin[row] - 2.0 * self.floor[row]:
                     continue
                 out.setdefault(joint, np.zeros(sum(self.lengths), bool))[part] = near
             first += length
