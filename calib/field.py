@@ -22,7 +22,7 @@ Flags = npt.NDArray[np.bool_]
 
 GAIN_STD = 0.02
 """A gain known no better than this, as a ratio, is not told from the offset."""
-OFFSET_STD = 0.02
+OFFSET_STD = 0.005
 """Likewise an offset, as a share of rated torque."""
 DRIFT = 0.05
 """Standard deviation of the drift that a gain may have had which these rows do not show, as a ratio."""

@@ -93,7 +93,7 @@ def _comparison(done: Calibrated) -> Section:
         manifest = done.data[0].manifest
         old, label = (
             (np.array(manifest.installed_gain), np.array(manifest.installed_offset)),
-            "as the controllers had it",
+            "the controllers' pairs",
         )
     else:
         old, label = (before.values("gain", 1.0), before.values("offset", 0.0)), f"record {before.id}"
