@@ -30,12 +30,13 @@ class BusWatch:
         self._double_cycles = [0] * len(nodes)
         self._crowded_cycles = 0
         self._last: int | None = None
+        self.restarted: set[int] = set()
+        """Joints whose controller has sent its boot-up message."""
         self.clear()
 
     def clear(self) -> None:
         """Forget what was seen: the link starts anew."""
-        self.restarted: set[int] = set()
-        """Joints whose controller has sent its boot-up message."""
+        self.restarted.clear()
         self.intruder = ""
         """A frame that only we should send, in words; empty where none came."""
         self.flooded = False
@@ -63,10 +64,8 @@ class BusWatch:
     @property
     def doubled(self) -> int | None:
         """The joint whose node id a second node has, or None."""
-        for joint, count in enumerate(self._double_cycles):
-            if count >= DOUBLE_CYCLES:
-                return joint
-        return None
+        most = max(self._double_cycles)
+        return self._double_cycles.index(most) if most >= DOUBLE_CYCLES else None
 
     @property
     def babbling(self) -> bool:

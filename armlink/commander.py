@@ -19,7 +19,9 @@ ENABLE_SECONDS = 3.0
 """The joints must reach a commanded CiA 402 state within this time."""
 STOP_CYCLES = 25
 """Cycles in which a quick stop is repeated until every joint reports it."""
-OFF = int(Mode.OFF)
+OFF, PROFILE_POSITION, PROFILE_TORQUE = int(Mode.OFF), int(Mode.PROFILE_POSITION), int(Mode.PROFILE_TORQUE)
+ENABLE, QUICK_STOP = int(Control.ENABLE), int(Control.QUICK_STOP)
+DISABLE_VOLTAGE = int(Control.DISABLE_VOLTAGE)
 
 
 class Commander:
@@ -39,6 +41,16 @@ class Commander:
         self._modes = [OFF] * self.n
         self._commanded = [OFF] * self.n
         self._mode_since = [-math.inf] * self.n
+        self._known = Known(
+            names,
+            loop.statuses,
+            loop.displays,
+            loop.seen,
+            self._mode_since,
+            loop.emergencies,
+            loop.node_states,
+            loop.watch.restarted,
+        )
         self._due = 0.0
 
     def begin(self, limits: list[JointLimits], passed: list[Passed], supported: list[int]) -> None:
@@ -54,21 +66,22 @@ class Commander:
         age = 0.0 if command.t is None else now - command.t
         fault = self._fault(now, self._commanded)
         seen = self._seen(now, fault is None)
-        control = [int(Control.ENABLE)] * self.n
+        control, stopped = [ENABLE] * self.n, False
         for joint, mode in enumerate(modes):
             limits, held = self.limits[joint], passed[joint]
             passed[joint] = pass_gate(limits, mode, torques[joint], positions[joint], age, held, seen[joint])
             if passed[joint].refused:
-                control[joint] = int(Control.QUICK_STOP)
+                control[joint], stopped = QUICK_STOP, True
             elif mode == OFF:
-                control[joint] = int(Control.DISABLE_VOLTAGE)
+                control[joint] = DISABLE_VOLTAGE
             else:
-                self._select(joint, mode, now)
-                if mode == Mode.PROFILE_POSITION:
+                if mode != self._modes[joint]:
+                    self._select(joint, mode, now)
+                if mode == PROFILE_POSITION:
                     control[joint] = set_point_control(loop.statuses[joint])
         self._commanded = modes
         sample = loop.exchange(control, [each.torque_wire for each in passed], [each.position_wire for each in passed])
-        why = refusal(self.names, command, age, passed, seen, self.limits)
+        why = stopped and refusal(self.names, command, age, passed, seen, self.limits)
         if why:
             raise Refused(f"gate: {why}")
         fault = fault or self._fault(now, modes)
@@ -119,8 +132,8 @@ class Commander:
                 break
             for joint, state in enumerate(states):
                 reset_again = state is State.FAULT and control[joint] == Control.FAULT_RESET
-                control[joint] = int(Control.DISABLE_VOLTAGE) if reset_again else next_control(state, target)
-        known = self._known(self.clock.now())
+                control[joint] = DISABLE_VOLTAGE if reset_again else next_control(state, target)
+        known = self._known
         restarted = node_fault(known) if known.restarted and not known.emergencies else None
         raise BusFault(
             bus_fault(self.names, loop.watch, 0) or restarted or stuck(known, states, target, modes, ENABLE_SECONDS)
@@ -131,12 +144,12 @@ class Commander:
         """A word that changes nothing yet, so that the next one is an edge; a joint with power keeps it."""
         state = state_of(status)
         if state is State.QUICK_STOP:
-            return int(Control.QUICK_STOP)
-        return next_control(state, target) if state is State.ENABLED else int(Control.DISABLE_VOLTAGE)
+            return QUICK_STOP
+        return next_control(state, target) if state is State.ENABLED else DISABLE_VOLTAGE
 
     def quick_stop(self) -> None:
         """Quick stop of every joint, repeated until all report it, as far as the bus still carries it."""
-        control = [int(Control.QUICK_STOP)] * self.n
+        control = [QUICK_STOP] * self.n
         with contextlib.suppress(BusFault):
             for _ in range(STOP_CYCLES):
                 sample = self.stand(control)
@@ -155,7 +168,7 @@ class Commander:
                 )
         modes: list[int] = command.mode.tolist()
         for joint, mode in enumerate(modes):
-            if mode in (Mode.PROFILE_POSITION, Mode.PROFILE_TORQUE) and not supports(self._supported[joint], mode):
+            if mode in (PROFILE_POSITION, PROFILE_TORQUE) and not supports(self._supported[joint], mode):
                 held = self._supported[joint]
                 raise Refused(f"gate: {self.names[joint]}: mode {mode} is not supported: 6502h is {held:#x}")
         return modes, command.torque.tolist(), command.position.tolist()
@@ -170,29 +183,12 @@ class Commander:
         return seen
 
     def _select(self, joint: int, mode: int, now: float) -> None:
-        if mode != self._modes[joint]:
-            self.loop.send_mode(joint, mode)
-            self._modes[joint], self._mode_since[joint] = mode, now
-
-    def _known(self, now: float) -> Known:
-        loop = self.loop
-        ages = [now - seen for seen in loop.seen]
-        return Known(
-            self.names,
-            loop.statuses,
-            loop.displays,
-            ages,
-            loop.emergencies,
-            loop.node_states,
-            loop.watch.restarted,
-        )
+        self.loop.send_mode(joint, mode)
+        self._modes[joint], self._mode_since[joint] = mode, now
 
     def _fault(self, now: float, modes: Sequence[int]) -> str | None:
-        loop = self.loop
-        since = [now - since for since in self._mode_since]
-        return find_fault(self._known(now), modes, since, self.max_age) or bus_fault(
-            self.names, loop.watch, loop.dropped
-        )
+        fault = find_fault(self._known, now, modes, self.max_age)
+        return fault or bus_fault(self.names, self.loop.watch, self.loop.dropped)
 
     def _await_turn(self) -> None:
         if not self._lock_step:

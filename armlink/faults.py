@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from armlink import emcy, gate, objects
 from armlink.bus_watch import BusWatch
 from armlink.cia402 import MODE_NAMES, Mode, State, state_of
-from armlink.gate import JointLimits, Passed, Seen
+from armlink.gate import OFF, JointLimits, Passed, Seen
 from armlink.sample import Command
 
 ENABLED_BITS = 0x27
@@ -17,15 +17,17 @@ _MODES = ", ".join(f"{int(mode)} ({name})" for mode, name in MODE_NAMES.items())
 
 @dataclass
 class Known:
-    """What is known of the bus and of n joints at one moment."""
+    """What is known of the bus and of n joints: the lists are the loop's own, so that it stays what is known now."""
 
     names: Sequence[str]
     statuses: Sequence[int]
     """Newest status words (6041h)."""
     displays: Sequence[int]
     """Newest mode displays (6061h)."""
-    ages: Sequence[float]
-    """Time since position and torque came [s]."""
+    seen: Sequence[float]
+    """When position and torque came, by the clock [s]."""
+    mode_since: Sequence[float]
+    """When each joint's mode was commanded, by the clock [s]."""
     emergencies: Collection[tuple[int, int, int]]
     """(joint, code, error register)."""
     node_states: Mapping[int, int]
@@ -34,25 +36,27 @@ class Known:
     """Joints whose controller has sent its boot-up message."""
 
 
-def find_fault(known: Known, modes: Sequence[int], since_mode: Sequence[float], max_age: float) -> str | None:
-    """The first fault where every joint with a mode was to be enabled in it, or None.
+def find_fault(known: Known, now: float, modes: Sequence[int], max_age: float) -> str | None:
+    """The first fault at time `now` where every joint with a mode was to be enabled in it, or None.
 
-    `since_mode` is the time since each joint's mode was commanded [s]; a mode must be displayed, and a reading come,
-    within `max_age` [s].
+    A mode must be displayed, and a reading come, within `max_age` [s].
     """
-    fault = node_fault(known)
-    if fault:
-        return fault
-    for joint, age in enumerate(known.ages):
+    if known.emergencies or known.restarted or known.node_states:
+        fault = node_fault(known)
+        if fault:
+            return fault
+    for joint, seen in enumerate(known.seen):
+        age = now - seen
         if not age <= max_age:
             return f"{known.names[joint]}: no reading for {age * 1e3:.0f} ms, limit {max_age * 1e3:.0f} ms"
-    for joint, (mode, status) in enumerate(zip(modes, known.statuses, strict=True)):
-        if mode != Mode.OFF and known.displays[joint] != mode and not since_mode[joint] <= max_age:
-            return f"{known.names[joint]}: {refused_mode(mode, known.displays[joint])}"
+    for joint, mode in enumerate(modes):
+        status, display = known.statuses[joint], known.displays[joint]
+        if mode != OFF and display != mode and not now - known.mode_since[joint] <= max_age:
+            return f"{known.names[joint]}: {refused_mode(mode, display)}"
         if status & 0x6F == ENABLED_BITS:
             continue
         state = state_of(status)
-        if mode != Mode.OFF or state in _FAULTS:
+        if mode != OFF or state in _FAULTS:
             return f"{known.names[joint]}: {state.value} (status word {status:#06x}), expected operation enabled"
     return None
 
