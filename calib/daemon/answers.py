@@ -4,7 +4,7 @@ from datetime import datetime
 from typing import Any
 
 from calib.daemon.messages import Batch
-from calib.daemon.recalibrations import proposal_answer
+from calib.daemon.proposal import proposal_answer
 from calib.daemon.service import Service
 from calib.daemon.stream import Client
 from calib.daemon.view import (

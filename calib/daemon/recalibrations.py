@@ -6,16 +6,14 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Protocol, TypeVar
 
-import numpy as np
-
 from armlink.armfile import ArmFile
 from armlink.errors import ArmlinkError, Refused
 from calib.after_write import Checked
 from calib.daemon.journal import Journal, ProposalRow
 from calib.daemon.messages import Array
+from calib.daemon.proposal import finding_json, finding_of, proposal_answer
 from calib.daemon.settings import DaemonSection
 from calib.daemon.view import NoSuch, NotPossible, Proposal
-from calib.daemon.wording import clean
 from calib.decision import Finding
 from calib.recalibration import APPLIED_BY, Recalibration, Recalibrator
 from calib.records import CalibrationRecord
@@ -266,39 +264,3 @@ class Recalibrations:
 def _known(error: Exception) -> None:
     if not isinstance(error, ArmlinkError):
         raise error
-
-
-def proposal_answer(row: ProposalRow) -> Proposal:
-    """A proposal as the API shows it."""
-    finding = finding_of(row.finding)
-    gain_std, offset_std = finding.std
-    return Proposal(
-        id=row.id,
-        time=row.time,
-        state=row.state,  # type: ignore[arg-type]
-        joint=row.joint,
-        cause=finding.cause,
-        gain=finding.gain,
-        gain_std=gain_std,
-        offset=finding.offset,
-        offset_std=offset_std,
-        rows=finding.rows,
-        confidence=finding.confidence,
-        record=row.record,
-        base=row.base,
-        decided_at=row.decided,
-        decided_by=row.by,
-        note=row.note,
-    )
-
-
-def finding_json(finding: Finding) -> dict[str, Any]:
-    """A finding as JSON values."""
-    names = ("joint", "cause", "gain", "offset", "rows", "confidence")
-    values: dict[str, Any] = clean({name: getattr(finding, name) for name in names})
-    return values | {"covariance": finding.covariance.tolist()}
-
-
-def finding_of(values: dict[str, Any]) -> Finding:
-    """The finding that finding_json wrote."""
-    return Finding(**{**values, "covariance": np.array(values["covariance"])})

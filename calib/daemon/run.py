@@ -104,7 +104,7 @@ class Daemon:
             signal.SIGTERM: lambda: self._end("SIGTERM"),
             signal.SIGINT: lambda: self._end("SIGINT"),
             signal.SIGHUP: self._reload,
-            signal.SIGUSR1: lambda: self.service.request_sweep("asked for by signal"),
+            signal.SIGUSR1: lambda: self.service.tours.request("asked for by signal"),
         }.items():
             self._loop.add_signal_handler(number, act)
         self._loop.add_reader(self.host.fileno(), self._messages)

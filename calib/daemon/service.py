@@ -11,35 +11,29 @@ from typing import Any, Protocol
 
 from armlink import emcy
 from armlink.armfile import ArmFile
-from armlink.errors import ArmlinkError, Refused
+from calib.daemon.in_force import InForce
 from calib.daemon.journal import Journal
 from calib.daemon.messages import Batch, Down, Message, Progress, Reply, Up
-from calib.daemon.recalibrations import Jobs, Outside, Recalibrations, finding_of
+from calib.daemon.recalibrations import Jobs, Recalibrations
 from calib.daemon.recordings import Recordings
 from calib.daemon.settings import DaemonSection
 from calib.daemon.stream import Hub
+from calib.daemon.tours import Tours
 from calib.daemon.view import EventItem, EventRecord, State
 from calib.daemon.watcher import Watcher
 from calib.daemon.wording import clean, one_alarm_a_joint, told
-from calib.decision import Finding
 from calib.events import Event
-from calib.recalibration import write_record
 from calib.records import CalibrationRecord, GravityRecord
 from calib.store import RecordStore
-from calib.writing import Controllers, mend
+from calib.writing import Controllers
 
 BELIEF_SECONDS = 5.0
 """The observer's belief is kept at least so often while there is something new."""
 HISTORY_SECONDS = 60.0
 """One point of history in this time, and one at each event."""
-RECORDS_SECONDS = 5.0
-"""The record store is looked at so often: other commands may have put another record in force."""
 CLOCK_JUMP = 2.0
 """A wall clock that moves by so much more or less than the monotonic one was set [s]."""
 FAULT_EVENTS_AN_HOUR = 20
-SWEEP_POSES = 60
-SWEEP_REST = 3600.0
-"""Time between two sweeps that the daemon decides on itself [s]."""
 STALE = 1.0
 """A joint that is silent for longer is a fault [s]."""
 
@@ -68,7 +62,6 @@ class Around:
     """With zone."""
     run: Jobs
     port: Port
-    quiet: bool = False
 
 
 class Service:
@@ -90,19 +83,19 @@ class Service:
         self.connected: bool | None = None
         self.fault = ""
         self.detail = self.trouble = ""
-        self.sweeping: Progress | None = None
         self.watcher: Watcher | None = None
         self.recalibrations: Recalibrations | None = None
         self.calibration: CalibrationRecord | None = None
         self.gravity: GravityRecord | None = None
         self.accepted: dict[str, datetime] = {}
-        self._held: tuple[tuple[float, float, int], ...] | None = None
         self._kept_rows = 0
-        self._kept_at = self._history_at = self._records_at = self._swept_at = -float("inf")
+        self._kept_at = self._history_at = -float("inf")
         self._offset = around.wall().timestamp() - around.monotonic()
         self._fault_times: list[float] = []
         self.say("started", None, f"armlink {self.version} for {arm.name} {arm.serial}", {"policy": settings.policy})
-        self._load_records()
+        self.in_force = InForce(self)
+        self.tours = Tours(self)
+        self.in_force.load()
 
     # ---- state
 
@@ -115,7 +108,7 @@ class Service:
             return State.STARTING
         if not self.connected or self.silent:
             return State.FAULT
-        return State.SWEEPING if self.sweeping is not None else State.OBSERVING
+        return State.SWEEPING if self.tours.now is not None else State.OBSERVING
 
     @property
     def report(self) -> Path | None:
@@ -167,17 +160,8 @@ class Service:
         evidence = {"policy": settings.policy}
         self.guard(lambda: self.say("configuration", None, "configuration reloaded", evidence))
         if self.watcher is not None and settings.observer != before.observer:
-            self.guard(self._observe_anew)
-        self.guard(self._load_records)
-
-    def _observe_anew(self) -> None:
-        """Other thresholds: a new observer that goes on from what the old one knows."""
-        if self.recalibrations is not None and self.recalibrations.busy:
-            return
-        self.keep()
-        if self.calibration is not None and self.gravity is not None:
-            self._begin(self.calibration, self.gravity)
-            self._compare()
+            self.guard(self.in_force.observe_anew)
+        self.guard(self.in_force.load)
 
     def _trouble(self, error: sqlite3.Error) -> None:
         if not self.trouble:
@@ -192,10 +176,9 @@ class Service:
         elif isinstance(message, Down):
             self._down(message.reason)
         elif isinstance(message, Progress):
-            self._progress(message)
+            self.tours.progress(message)
         elif isinstance(message, Reply) and message.error is not None:
-            self.say("refused", None, f"sweep: {message.error}", {})
-            self.sweeping = None
+            self.tours.refused(message.error)
 
     def _batch(self, batch: Batch) -> None:
         self.batch, self.batch_at = batch, self.around.monotonic()
@@ -233,74 +216,17 @@ class Service:
             if event.finding is not None:
                 self.recalibrations.found(event.finding)
             elif event.kind == "undecided":
-                self._wish_sweep("watching alone cannot decide", self.settings.sweep_when_undecided)
+                self.tours.wish("watching alone cannot decide")
 
     def _up(self, up: Up) -> None:
         back = self.connected is False
         self.connected, self.fault, self.batch_at = True, "", self.around.monotonic()
         if back:
             self._fault_event(None, "the bus is back", {}, kind="recovered")
-        self._held = up.held
-        if self.store.unfinished_write(self.arm) is None or self.recalibrations is None:
-            self._compare()
-        else:
-            self._mend()
-
-    def _mend(self) -> None:
-        """A write to the controllers was cut off (by a kill, say): they get back what they held before it."""
-        controllers, names = self.around.port.controllers, self.names
-
-        def work() -> tuple[tuple[float, float, int], ...]:
-            mend(self.arm, self.store, controllers)
-            held = [controllers.read_calibration(joint) for joint in range(len(names))]
-            return tuple((each.gain, each.offset, each.record_id) for each in held)
-
-        def done(outcome: tuple[tuple[float, float, int], ...] | Exception) -> None:
-            assert self.recalibrations is not None
-            self.recalibrations.busy = False
-            if isinstance(outcome, Exception):
-                self._raise_unknown(outcome)
-                self.say("fault", None, f"a write that was cut off could not be undone: {outcome}", {})
-                return
-            self.say("roll-back", None, "a write to the controllers that was cut off is undone", {})
-            self._held = outcome
-            self._compare()
-
-        assert self.recalibrations is not None
-        self.recalibrations.busy = True
-        self.around.run(work, done)
-
-    def _compare(self) -> None:
-        """What the controllers hold against the record in force; the policy apply writes it where they differ."""
-        if self.watcher is None or self.recalibrations is None:
-            return
-        differ = self.watcher.controllers_hold(self._held)
-        if not differ:
-            return
-        record, watcher = self.watcher.calibration, self.watcher
-        if self.settings.policy != "apply" or self.listen_only:
-            text = f"{', '.join(differ)}: the controllers hold another calibration than record {record.id}"
-            self.say(
-                "configuration", None, f"{text}; readings are converted; armlink history shows how to write it", {}
-            )
-            return
-
-        def done(outcome: tuple[str, ...] | Exception) -> None:
-            assert self.recalibrations is not None
-            self.recalibrations.busy = False
-            if isinstance(outcome, Exception):
-                self._raise_unknown(outcome)
-                self.say("refused", None, f"record {record.id} could not be written: {outcome}", {})
-                return
-            watcher.controllers_hold(None)
-            evidence = {"record": record.id, "joints": differ, "applied": True, "restored": True}
-            self.say("recalibration", None, f"record {record.id} written anew to {', '.join(outcome)}", evidence)
-
-        self.recalibrations.busy = True
-        self.around.run(lambda: write_record(record, self.around.port.controllers), done)
+        self.in_force.held(up.held)
 
     def _down(self, reason: str) -> None:
-        was, self.connected, self.sweeping = self.connected, False, None
+        was, self.connected, self.tours.now = self.connected, False, None
         changed, self.fault = reason != self.fault, reason
         if was is not False:
             self._fault_event(None, reason, {})
@@ -317,30 +243,6 @@ class Service:
         self._fault_times.append(now)
         self.say(kind, joint, text, evidence)
 
-    # ---- sweeps
-
-    def request_sweep(self, why: str) -> None:
-        """Tour the arm's range, so that the observer gets poses enough; only where the daemon drives the bus."""
-        if self.listen_only or self.state is not State.OBSERVING:
-            self.say("refused", None, f"no sweep ({why}): {'it only listens' if self.listen_only else self.state}", {})
-            return
-        self.sweeping = Progress(0, SWEEP_POSES)
-        self._swept_at = self.around.monotonic()
-        self.say("sweep", None, f"sweeping {SWEEP_POSES} poses: {why}", {"poses": SWEEP_POSES})
-        reply = self.around.port.sweep(SWEEP_POSES, int(self._swept_at))
-        if reply is not None and reply.error is not None:
-            self.take(reply)
-
-    def _wish_sweep(self, why: str, allowed: bool) -> None:
-        if allowed and not self.listen_only and self.around.monotonic() - self._swept_at > SWEEP_REST:
-            self.request_sweep(why)
-
-    def _progress(self, progress: Progress) -> None:
-        self.sweeping = progress
-        if progress.done >= progress.total:
-            self.sweeping = None
-            self.say("sweep", None, f"sweep of {progress.total} poses is done", {"poses": progress.total})
-
     # ---- once a second
 
     def tick(self) -> None:
@@ -350,19 +252,13 @@ class Service:
     def _tick(self) -> None:
         now = self.around.monotonic()
         self._watch_clock(now)
-        if now - self._records_at >= RECORDS_SECONDS and not (self.recalibrations and self.recalibrations.busy):
-            self._load_records()
+        self.in_force.tick(now)
+        self.tours.tick(now)
         if self.watcher is not None:
             new = self.watcher.observer.rows != self._kept_rows
             due = now - self._history_at >= HISTORY_SECONDS
             if new and (now - self._kept_at >= BELIEF_SECONDS or due):
                 self.keep(history=due)
-        hours = self.settings.sweep_every_hours
-        if hours is not None and self.state is State.OBSERVING and not self.listen_only:
-            if self._swept_at == -float("inf"):
-                self._swept_at = now
-            if now - self._swept_at >= hours * 3600.0:
-                self.request_sweep(f"every {hours:g} h")
 
     def keep(self, history: bool = False) -> None:
         """Put the observer's belief on disk, and a point of history where asked for, both or neither."""
@@ -387,87 +283,8 @@ class Service:
         self.recordings.close()
         self.journal.close()
 
-    # ---- records
-
-    def _load_records(self) -> None:
-        """Take over the records in force; another one than before begins a new observer."""
-        self._records_at = self.around.monotonic()
-        try:
-            calibration = self.store.current(CalibrationRecord, self.arm)
-            gravity = self.store.current(GravityRecord, self.arm)
-        except ArmlinkError as error:
-            self.detail = str(error)
-            return
-        if calibration is None or gravity is None:
-            missing = " and ".join(
-                name for name, record in (("calibration", calibration), ("gravity", gravity)) if record is None
-            )
-            self.detail = (
-                f"waits for a {missing} record of {self.arm.name} {self.arm.serial}: armlink sweep, calibrate, identify"
-            )
-            return
-        if self.watcher and (calibration.id, gravity.id) == (self.watcher.calibration.id, self.watcher.gravity.id):
-            return
-        again = self.watcher is not None
-        try:
-            self._begin(calibration, gravity)
-        except Refused as error:
-            self.detail = str(error)
-            return
-        self.detail = ""
-        if again:
-            evidence = {"calibration": calibration.id, "gravity": gravity.id}
-            self.say("configuration", None, "other records are in force: observing anew against them", evidence)
-        self._compare()
-
-    def _begin(self, calibration: CalibrationRecord, gravity: GravityRecord) -> None:
-        watcher = Watcher(self.arm, calibration, gravity, self.settings.observer_config())
-        outside = Outside(self.say, self.around.wall, self.around.run, self._installed)
-        recalibrations = Recalibrations(
-            self.arm, self.settings, self.listen_only, self.store, self.journal, self.around.port.controllers, outside
-        )
-        self.watcher, self.recalibrations = watcher, recalibrations
-        self.calibration, self.gravity = calibration, gravity
-        self._resume(calibration, gravity)
-
-    def _resume(self, calibration: CalibrationRecord, gravity: GravityRecord) -> None:
-        """Go on from the belief on disk; decide what became of an approval that a kill interrupted."""
-        assert self.watcher is not None
-        assert self.recalibrations is not None
-        belief = self.journal.belief()
-        installed: Finding | None = None
-        for row in self.journal.proposals():
-            if row.record == calibration.id and row.state in ("applied", "approved"):
-                installed = finding_of(row.finding)
-            if row.state == "approved":
-                if row.record == calibration.id:
-                    self.recalibrations.applied(row, row.by or "daemon", calibration, install=False)
-                else:
-                    self.journal.decide(
-                        row.id, self.around.wall(), "failed", "daemon", "interrupted before it was in force"
-                    )
-        if belief is None or belief.gravity != gravity.id:
-            return
-        if belief.calibration == calibration.id:
-            self.watcher.restore(belief.state)
-        elif belief.calibration == calibration.parent and installed is not None and self.watcher.restore(belief.state):
-            self.watcher.observer.install(installed)
-
-    def _installed(self, record: CalibrationRecord, finding: Finding) -> None:
-        """A finding is in the controller and its record in force."""
-        if self.watcher is None:
-            return
-        self.calibration = record
-        self.watcher.follow(record)
-        self.watcher.observer.install(finding)
-        self.keep(history=True)
-
     def _watch_clock(self, now: float) -> None:
         before, self._offset = self._offset, self.around.wall().timestamp() - now
         jump = self._offset - before
         if abs(jump) > CLOCK_JUMP:
             self.say("clock", None, f"the wall clock was set by {jump:+.1f} s", {"seconds": jump})
-
-    def _raise_unknown(self, error: Exception) -> None:
-        if not isinstance(error, ArmlinkError):
-            raise error

@@ -110,8 +110,7 @@ class DaemonBench:
         for message in self.host.pump():
             self.service.take(message)
         write_record(record, self.host.controllers)
-        self.service._held = None
-        self.service._compare()
+        self.service.in_force.held(None)
 
     def now(self) -> float:
         return self.simulated.time

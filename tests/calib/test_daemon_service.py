@@ -296,7 +296,7 @@ def test_sweeps_are_by_schedule_or_request_and_only_where_the_bus_is_driven(tmp_
     daemon.run(120, until=lambda: daemon.view.status().state is State.OBSERVING)
     assert [event.kind for event in daemon.of_kind("sweep")][:2] == ["sweep", "sweep"]
     listening = FastDaemon(tmp_path / "listening", 1, settings(), listen_only=True)
-    listening.service.request_sweep("asked for")
+    listening.service.tours.request("asked for")
     assert "only listens" in listening.of_kind("refused")[0].text
 
 
