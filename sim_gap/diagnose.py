@@ -7,6 +7,7 @@ from typing import Any
 from armlink.errors import BadInput
 from armlink.recording import Recording, default_names, slice_rows
 from sim_gap.causes import causes, left_over
+from sim_gap.compete import compete
 from sim_gap.confidence import HINT
 from sim_gap.confound import Rivals
 from sim_gap.diagnosis import Cause, Diagnosis
@@ -17,7 +18,6 @@ from sim_gap.normal import ColumnStore
 from sim_gap.regime import by_joint, combined, places
 from sim_gap.residual import ResidualSet
 from sim_gap.rollout import roll_out
-from sim_gap.select import compete
 from sim_gap.signals import prepare, require_length
 from sim_gap.stuck import Stuck, without_stuck
 from sim_gap.verdict import is_quiet, share_left, verdict

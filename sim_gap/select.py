@@ -1,14 +1,13 @@
 """Which effects: every term of the library competes, judged on motion left out of its fit, at a price per parameter."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from sim_gap.effects.registry import effects
-from sim_gap.normal import ColumnStore, Normal, Term, Weighted
-from sim_gap.residual import ResidualSet
+from sim_gap.normal import Normal, Term, Weighted
 
 SHORTLIST = 10
 MOST_TERMS = 60
@@ -20,17 +19,6 @@ MUCH = 3.0
 """What a fit leaves, in units of what is not worth explaining, from which on another start of the search is tried."""
 BESIDE = 0.3
 """Size of these, as a share of its own, from which it needs them."""
-
-
-def candidates(data: ResidualSet, library: Sequence[str]) -> list[Term]:
-    """Every effect of the library at every place and starting shape that these channels can show."""
-    layout = data.layout
-    return [
-        Term(name, place, shape)
-        for name in library
-        for place in effects()[name].places(layout)
-        for shape in effects()[name].grid(data.signals, place)
-    ]
 
 
 @dataclass
@@ -205,44 +193,6 @@ class Search:
         return self.active
 
 
-def compete(store: ColumnStore, library: Sequence[str]) -> Search:
-    """Search the library, refine the shapes of what was chosen, and drop what no longer earns its place."""
-    offered = candidates(store.data, library)
-    first = Search(Normal(store, offered))
-    first.run()
-    chosen = refine(store, [named(term) for term in without_doubtful(first).active])
-    keys = {term.key for term in chosen}
-    search = Search(Normal(store, [*chosen, *(term for term in offered if term.key not in keys)]), chosen)
-    while search.backward():
-        pass
-    return search
-
-
-def named(term: Term) -> Term:
-    """The term by which one is named that shows exactly alike."""
-    return Term(term.effect, *effects()[term.effect].settled(term.place, term.shape))
-
-
-def without_doubtful(search: Search) -> Search:
-    """Search again from where terms that leave much on their rows have given way to the simpler ones they are made of.
-
-    One step at a time does not get there where these need company to do better.
-    """
-    layout, library = search.normal.layout, effects()
-    made = {t: library[t.effect].made_of(layout, t.place, t.shape) for t in search.active}
-    doubtful = [term for term, parts in made.items() if parts and search.leaves_much(term)]
-    if not doubtful:
-        return search
-    rest = search.active
-    for term in doubtful:
-        rest = search.without(term, rest)
-    wanted = {key for term in doubtful for key in made[term]} - {other.key for other in rest}
-    again = Search(search.normal, [*rest, *(other for other in search.normal.terms if other.key in wanted)])
-    again.added.update({term.key: TRIES - 1 for term in doubtful})
-    again.run()
-    return again if again.score < search.score - 1e-3 else search
-
-
 def shortlist(screened: list[tuple[float, Term]]) -> list[tuple[float, Term]]:
     """The first few, no effect at one place more than twice."""
     seen: dict[tuple[str, int], int] = {}
@@ -254,73 +204,3 @@ def shortlist(screened: list[tuple[float, Term]]) -> list[tuple[float, Term]]:
         if len(out) == SHORTLIST:
             break
     return out
-
-
-def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
-    """Move each shape between its neighbours of the starting grid to where the fit is best (golden section)."""
-    out = list(active)
-    for _ in range(3):
-        out = secants(store, out)
-    for term in list(out):
-        found = _between(store.data, term)
-        if found is None:
-            continue
-        free, low, high = found
-
-        def fit(value: float, term: Term = term, free: int = free) -> float:
-            trial = [term.reshaped(free, value) if other == term else other for other in out]
-            normal = Normal(store, trial)
-            start = normal.square.sum(0) / np.maximum(normal.count.sum(0), 1.0)
-            squares = normal.mean_square(*Weighted(normal, start).fit(normal.terms))
-            return float(0.5 * np.log(squares + normal.floor**2)[normal.seen].sum())
-
-        value = golden(fit, low, high)
-        if fit(value) < fit(term.shape[free]):
-            out[out.index(term)] = term.reshaped(free, value)
-    return out
-
-
-def _between(data: ResidualSet, term: Term) -> tuple[int, float, float] | None:
-    """The free entry of a term's shape and its neighbours on the starting grid; None where there is none."""
-    effect = effects()[term.effect]
-    free = [i for i in range(len(term.shape)) if i not in effect.counted]
-    if effect.secant or len(free) != 1:
-        return None
-    grid = sorted({shape[free[0]] for shape in effect.grid(data.signals, term.place)})
-    value = term.shape[free[0]]
-    lower, upper = [x for x in grid if x < value - 1e-9], [x for x in grid if x > value + 1e-9]
-    beyond = sorted((0.5 * value, 1.5 * value))
-    return free[0], (lower[-1] if lower else beyond[0]), (upper[0] if upper else beyond[1])
-
-
-def secants(store: ColumnStore, active: list[Term]) -> list[Term]:
-    """Take the secant of every curved effect at its fitted size."""
-    if not any(effects()[term.effect].secant for term in active):
-        return active
-    normal = Normal(store, active)
-    search = Search(normal, list(normal.terms))
-    _, values = search.weighted.fit(normal.terms)
-
-    def settled(term: Term) -> Term:
-        effect = effects()[term.effect]
-        shape = effect.resized(values[normal.at[term]], term.shape) if effect.secant else term.shape
-        return Term(term.effect, term.place, shape)
-
-    return [settled(term) for term in normal.terms]
-
-
-def golden(function: Callable[[float], float], low: float, high: float, steps: int = 10) -> float:
-    """Minimum of a function between two values by golden-section search."""
-    ratio = 0.5 * (np.sqrt(5.0) - 1.0)
-    a, b = high - ratio * (high - low), low + ratio * (high - low)
-    fa, fb = function(a), function(b)
-    for _ in range(steps):
-        if fa < fb:
-            high, b, fb = b, a, fa
-            a = high - ratio * (high - low)
-            fa = function(a)
-        else:
-            low, a, fa = a, b, fb
-            b = low + ratio * (high - low)
-            fb = function(b)
-    return float(0.5 * (low + high))
