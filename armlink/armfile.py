@@ -135,7 +135,7 @@ class LinkSection(Section):
 
 
 class ArmFile(Section):
-    """A whole arm file. `sweep`, `sim`, `daemon` hold the models that their packages registered in `armlink.sections`."""
+    """A whole arm file. `sweep`, `sim`, `daemon` hold the models that packages registered in `armlink.sections`."""
 
     name: str
     serial: str = "unknown"

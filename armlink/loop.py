@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armlink import emcy, objects
+from armlink.bus_load import FIXED_BITS
 from armlink.bus_watch import MOST_FRAMES, BusWatch
 from armlink.clock import Clock
 from armlink.pdo import RPDO1, RPDO2, TPDO1, TPDO2, decoding_table
@@ -16,8 +17,6 @@ from armlink.port import Port
 from armlink.sample import Array, Sample, Stats
 from armlink.units import TORQUE_PER_MICRO, Units
 
-FRAME_BITS = 47
-"""Bits of a frame without data, interframe space and nominal stuffing included; 8 more a byte."""
 COLLECT_SHARE = 0.8
 """Share of a period after SYNC in which TPDOs of this cycle are waited for."""
 
@@ -71,7 +70,7 @@ class Loop:
         """Newest mode of operation display (6061h) of each joint."""
         self._awaited = self._counted = self._dropped = 0
         self.bits = 0
-        """Bits that the frames so far took on the wire, with nominal stuffing."""
+        """Bits that the frames so far took on the wire, without stuff bits (bus_load.frame_bits has them)."""
         self._slow_came = False
         self._nothing = np.full(self.n, math.nan)
         self.seen = [-math.inf] * self.n
@@ -106,7 +105,7 @@ class Loop:
         """Send one frame and count it."""
         self._port.send(can_id, data)
         self.stats.frames += 1
-        self.bits += FRAME_BITS + 8 * len(data)
+        self.bits += FIXED_BITS + 8 * len(data)
 
     def send_mode(self, joint: int, mode: int) -> None:
         """RPDO2: the mode of one joint."""
@@ -157,7 +156,7 @@ class Loop:
         self._awaited = self.n
         self._port.send_all(frames)
         self.stats.frames += len(frames)
-        self.bits += sum(FRAME_BITS + 8 * len(data) for _, data in frames)
+        self.bits += sum(FIXED_BITS + 8 * len(data) for _, data in frames)
         end = now + self._patience
         for _ in range(MOST_FRAMES):
             if self._awaited <= 0:
@@ -186,7 +185,7 @@ class Loop:
 
     def _take(self, can_id: int, data: bytes) -> None:
         self.stats.frames += 1
-        self.bits += FRAME_BITS + 8 * len(data)
+        self.bits += FIXED_BITS + 8 * len(data)
         entry = self._table.get(can_id)
         if entry is None:
             self._take_other(can_id, data)

@@ -98,4 +98,4 @@ class Stats:
     rate_hz: float = 0.0
     """Cycles a second, measured."""
     load: float = 0.0
-    """Share of the bus that the frames take at its bit rate, with nominal stuffing."""
+    """Share of the bus that the frames take at its bit rate, without stuff bits, which are a tenth more."""

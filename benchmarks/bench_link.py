@@ -10,7 +10,7 @@ from typing import Any
 from side_by_side import Case
 
 HERE = Path(__file__).parent
-RUNS, SECONDS = 5, 2.0
+RUNS, SECONDS = 7, 1.5
 PEER = "canopen RemoteNode, PDO variables"
 
 

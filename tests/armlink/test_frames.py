@@ -113,7 +113,7 @@ def test_content_that_is_none_is_said_in_one_line(arm_of, tmp_path):
             recording_of_log(arm_of(2), tmp_path / f"a{suffix}")
     with pytest.raises(BadInput, match="no frame log"):
         LogReader(tmp_path / "none.log")
-    with pytest.raises(BadInput, match="expected .asc, .blf, .log"):
+    with pytest.raises(BadInput, match=r"expected \.asc, \.blf, \.log"):
         FrameLog(tmp_path / "a.txt")
 
 
