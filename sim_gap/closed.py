@@ -97,8 +97,14 @@ def _body(model: Any, joint: int, added: Array) -> None:
     values, axes = np.linalg.eigh(about)
     axes[:, 2] *= np.sign(np.linalg.det(axes))
     model.body_mass[body], model.body_ipos[body] = mass, anchor + centre
-    model.body_inertia[body] = np.maximum(values, SMALLEST_INERTIA)
+    model.body_inertia[body] = possible(values)
     mujoco.mju_mat2Quat(model.body_iquat[body], axes.ravel())
+
+
+def possible(principal: Array) -> Array:
+    """Principal moments of inertia that some distribution of mass has (none exceeds the other two together), (3,)."""
+    spread = np.maximum(0.5 * principal.sum() - principal, SMALLEST_INERTIA)
+    return np.asarray(spread.sum() - spread)
 
 
 def split(inertial: Array) -> tuple[float, Array, Array]:
