@@ -86,7 +86,7 @@ def test_status_is_sent_when_it_changes_and_only_then(rig: Rig) -> None:
     rig.run(0.1)
     rig.word = 0x02
     status = [data for can_id, data in rig.cycle() if can_id == 0x385]
-    assert [struct.unpack("<H", data)[0] & 0x6F for data in status] == [0x07]
+    assert [(word & 0x6F, mode) for word, mode in (struct.unpack("<Hb", data) for data in status)] == [(0x07, 8)]
     assert not [data for can_id, data in rig.cycle() if can_id == 0x385]
 
 
