@@ -45,9 +45,7 @@ def recording_of_log(arm: ArmFile, path: Path) -> Recording:
         cut = f"; {warning}" if warning else ""
         raise BadInput(f"{path}: {len(times)} whole cycles in {bus.reader.count} frames: no SYNCs of {arm.name}?{cut}")
     stacked = {name: np.array(rows) for name, rows in channels.items()}
-    found = {name: rows for name, rows in stacked.items() if name == "position" or not np.isnan(rows).all()}
-    found.setdefault("torque", stacked["torque"])
-    return Recording(t=np.array(times), names=recorder.names, warning=warning, **found).check(str(path))
+    return Recording(t=np.array(times), names=recorder.names, warning=warning, **stacked).check(str(path))
 
 
 def play_onto(arm: ArmFile, source: Path, recording: Recording, spec: str, speed: float) -> int:
