@@ -78,8 +78,8 @@ def replay(name: str) -> list[str]:
     assert recording.torque is not None
     lines, told = [f"# {name}: {RUNS[name][0].__doc__}"], 30.0
     for t, position, torque in zip(recording.t.tolist(), recording.position, recording.torque, strict=True):
-        for event in observer.handle(t, position, torque):
-            lines.append(f"{event.t:.2f} {event.kind} {event.joint or '-'} {text(event.evidence)}")
+        said = observer.handle(t, position, torque)
+        lines += [f"{event.t:.2f} {event.kind} {event.joint or '-'} {text(event.evidence)}" for event in said]
         if t >= told:
             told += 30.0
             known = observer.estimate()

@@ -108,9 +108,7 @@ def kill_service(given: argparse.Namespace) -> list[str]:
     choose, wrong, written, acknowledged = random.Random(given.seed), list[str](), 0, dict[str, Any]()
     for number in range(given.kills):
         ours, theirs = context.Pipe()
-        process = context.Process(
-            target=life, args=(folder, number, theirs)
-        )
+        process = context.Process(target=life, args=(folder, number, theirs))
         process.start()
         theirs.close()
         started = ours.recv()
