@@ -123,9 +123,9 @@ def view(running: tuple[MadeUpView, Served]) -> MadeUpView:
     return running[0]
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    """A real Chromium without a window."""
+    """A real Chromium without a window; while it is there, Playwright's own event loop runs in this thread."""
     chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if chromium is None:
         pytest.skip("no Chromium: scripts/install-system installs it where that is allowed")
