@@ -181,3 +181,20 @@ def test_emergencies_without_end_are_not_kept_without_end(bench: Bench) -> None:
 def test_what_cannot_be_injected_is_said(text: str) -> None:
     with pytest.raises(BadInput, match="fault"):
         parse_fault(text, ("joint_1",))
+
+
+def test_by_the_joints_own_clock_a_hundred_dead_hosts_of_a_hundred_are_noticed_within_the_deadline(
+    bench: Bench,
+) -> None:
+    arm, random = bench.bus.arm, np.random.default_rng(4)
+    for _ in range(100):
+        bench.link.start()
+        command = Command.hold(bench.link.enable().position)
+        command.mode[0], command.torque[0] = 10, BIAS
+        for _ in range(int(random.integers(3, 20))):
+            bench.link.cycle(command)
+        died = arm.time
+        while any(state not in SAFE for state in arm.drives.state):
+            arm.advance(0.001)
+            assert arm.time - died <= DEADLINE + 0.001
+        arm.advance(float(random.uniform(0.0, 0.05)))
