@@ -147,8 +147,8 @@ def test_the_window_ends_the_way_and_rounding_stays_inside(mode):
     assert low.position == -2.0
     assert low.position_wire == math.ceil(-2.0 / LIMITS.position_unit)
     # at the very ends too, whose nearest user unit lies outside
-    odd = LIMITS._replace(lower=0.6 * LIMITS.position_unit, upper=2.6 * LIMITS.position_unit)
-    assert start_from(odd, 0.0, odd.lower).position_wire == 1
+    odd = LIMITS._replace(lower=1.4 * LIMITS.position_unit, upper=2.6 * LIMITS.position_unit)
+    assert start_from(odd, 0.0, odd.lower).position_wire == 2
     assert start_from(odd, 0.0, odd.upper).position_wire == 2
 
 

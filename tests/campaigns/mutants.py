@@ -36,8 +36,11 @@ TARGETS = {
     "armlink/cia402.py": ["tests/armlink/test_cia402.py"],
 }
 EXPLAINED = {
-    # Source line → why no test can tell this mutant from the original; docs/safety.md explains them.
+    "int becomes round": "a mode is a whole number, and round() of one is that number",
+    "0.0 becomes 1.0": "stands for a mode that needs no number; any finite one does",
+    "'return \"\"': returns None": "asked only whether it is true; the field of Passed has its own default",
 }
+"""Part of a mutant's description → why no test can tell it from the original."""
 SLOW = "whoever_calls"
 """Tests by this name run only on mutants that the others did not notice."""
 SECONDS = 120
