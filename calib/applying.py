@@ -30,6 +30,8 @@ class Apply:
     """INTERFACE:CHANNEL[@BITRATE]; None is the arm file's."""
     replaced: Sequence[str] = ()
     """Joints whose sensor was exchanged: their change is not judged by their history."""
+    accepted: Sequence[str] = ()
+    """Joints that are written although the model does not hold there."""
     check: bool = True
     """Make the check motion before and after."""
     flash: bool = False
@@ -50,7 +52,7 @@ def apply_calibration(
     any case. Raises Refused where a gate or the check says no, BusFault; the controllers then hold what they held.
     """
     _require(record, arm, store, how)
-    check_holds(fit.goodness.findings)
+    check_holds(fit.goodness.findings, how.accepted)
     check_gates(record, arm, store, data, how.replaced)
     beta = None if np.isnan(fit.value("gain")).all() else fit.fit.complete.beta
     return _write(record, arm, store, beta, how, "sweeps")

@@ -56,9 +56,9 @@ def check_gates(
         check_heldout(record, old, arm, data, store.current(GravityRecord, arm))
 
 
-def check_holds(findings: Sequence[Finding]) -> None:
-    """Raise Refused where the fit says that the sensor model does not hold on a joint."""
-    broken = next((each for each in findings if each.breaks_model), None)
+def check_holds(findings: Sequence[Finding], accepted: Sequence[str] = ()) -> None:
+    """Raise Refused where the fit says that the sensor model does not hold on a joint that was not `accepted` so."""
+    broken = next((each for each in findings if each.breaks_model and each.joint not in accepted), None)
     if broken is not None:
         raise Refused(
             f"{broken.joint}: the sensor model does not hold: {broken.text.rstrip('.')}: mend that and sweep again;"
