@@ -122,7 +122,7 @@ class Observed(FakeBus):
 
 
 def check(frame_mode, now, before, told):
-    """One RPDO1 that enables a joint: `now` is (control, torque, position), `before` the mode and the same one earlier."""
+    """One RPDO1 that enables a joint: `now` is (control, torque, position), `before` the mode and the one earlier."""
     _, torque, position = now
     old_mode, (old_control, old_torque, old_position) = before
     running = old_control & ENABLE == ENABLE
