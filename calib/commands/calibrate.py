@@ -23,6 +23,10 @@ def calibrate(
     replaced: Annotated[
         list[str] | None, typer.Option(help="With --apply: a joint whose sensor was exchanged since the last record.")
     ] = None,
+    accept: Annotated[
+        list[str] | None,
+        typer.Option(help="With --apply: a joint to be written although the model does not hold there."),
+    ] = None,
     report: Annotated[Path | None, typer.Option(help="Also write a page to file: one self-contained HTML.")] = None,
     store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
     json_file: Annotated[
@@ -59,12 +63,24 @@ def calibrate(
 
         write_report(Calibrated(arm_file, data, fit, record, current), report)
     if apply:
+        _refuse_doubtful(fit, accept or [])
         how = Apply(by=user, bus=bus, replaced=tuple(replaced or ()), check=check, flash=flash)
         written = apply_calibration(record, arm_file, records, data, fit, how)
         print_lines([f"record {record.id} written to {len(written)} controllers, read back and current"])
     else:
         records.put(record, arm_file, by="armlink calibrate", reason="sweeps")
     write_json(json_file, _answer(fit, record, apply))
+
+
+def _refuse_doubtful(fit: "SensorFit", accepted: list[str]) -> None:
+    """Raise Refused, naming the first joint at which the model does not hold and that nobody has accepted."""
+    from armlink.errors import Refused
+
+    for finding in fit.findings:
+        if finding.breaks_model and finding.joint not in accepted:
+            raise Refused(
+                f"nothing is written: {finding.text}; mend it and sweep again, or give --accept {finding.joint}"
+            )
 
 
 def _answer(fit: "SensorFit", record: "CalibrationRecord", applied: bool) -> dict[str, Any]:
@@ -83,6 +99,16 @@ def _answer(fit: "SensorFit", record: "CalibrationRecord", applied: bool) -> dic
         "gain_ratio": None if fit.gain_ratio is None else fit.gain_ratio.tolist(),
         "residual_rms": fit.residual_rms.tolist(),
         "hysteresis": fit.hysteresis.tolist(),
+        "friction": fit.friction.tolist(),
+        "findings": [
+            {"joint": found.joint, "kind": found.kind, "size": found.size, "unit": found.unit, "text": found.text}
+            for found in fit.findings
+        ],
+        "doubtful": list(fit.doubtful),
+        "left_out": [
+            {"sweep": each.sweep, "joint": fit.names[each.joint], "rms": each.rms, "ratio": each.ratio}
+            for each in fit.goodness.left_out
+        ],
         "chi2": fit.fit.chi2,
         "dof": fit.fit.dof,
     }
@@ -93,9 +119,16 @@ def _show(fit: "SensorFit") -> None:
 
     headings: dict[Parameter, str] = {"gain": "gain", "offset": "offset [N·m]", "position_gain": "position gain"}
     columns = {heading: (fit.value(name), fit.quantile * fit.std(name)) for name, heading in headings.items()}
+    columns["locked friction [N·m]"] = (fit.friction, 0 * fit.friction)
     print_intervals("Sensors, ± half of the 95 % interval", fit.names, columns)
     lines = [f"{joint} {parameter}: {reason}" for (joint, parameter), reason in fit.reasons.items()]
     if fit.gain_ratio is not None:
         ratios = ", ".join(f"{name} {ratio:.4f}" for name, ratio in zip(fit.names, fit.gain_ratio, strict=True))
         lines.append(f"gains as multiples of the last joint's: {ratios}")
+    lines += [f"[yellow]{finding.text}[/yellow]" for finding in fit.findings]
+    worst = max(fit.goodness.left_out, key=lambda each: each.ratio, default=None)
+    if worst is not None:
+        lines.append(
+            f"each sweep told by all others: within {worst.ratio:.1f} times its expected error at worst ({worst.sweep})"
+        )
     print_lines(lines)
