@@ -2,7 +2,17 @@
 
 import pytest
 
-from armlink.cia402 import Control, Mode, State, next_control, set_point_control, state_of, supports
+from armlink.cia402 import (
+    MODE_NAMES,
+    NEEDED_MODES,
+    Control,
+    Mode,
+    State,
+    next_control,
+    set_point_control,
+    state_of,
+    supports,
+)
 
 # CiA 402, table of the status word: bits 6, 5, 3..0 as the standard prints them (x: does not matter).
 PATTERNS = {
@@ -145,3 +155,19 @@ def test_an_unknown_state_is_commanded_nothing():
 def test_there_is_no_way_to_other_targets():
     with pytest.raises(ValueError, match="no way to fault"):
         next_control(State.READY, State.FAULT)
+
+
+def test_states_and_modes_have_the_names_that_users_read():
+    assert [state.value for state in State] == [
+        "not ready to switch on",
+        "switch on disabled",
+        "ready to switch on",
+        "switched on",
+        "operation enabled",
+        "quick stop active",
+        "fault reaction active",
+        "fault",
+        "unknown",
+    ]
+    assert set(MODE_NAMES) == set(Mode)
+    assert set(NEEDED_MODES) == {8, 10}

@@ -37,6 +37,10 @@ TARGETS = {
 }
 EXPLAINED = {
     "int becomes round": "a mode is a whole number, and round() of one is that number",
+    "0x10, 0x20': 16 becomes 17": "bit 0 is set by enable already",
+    "0x10, 0x20': 32 becomes 33": "bit 0 is set by enable already",
+    "(0 if acknowledged else NEW_SET_POINT)': 0 becomes 1": "bit 0 is set by enable already",
+    "bool(supported >> (mode - 1) & 1))': 32 becomes 33": "6502h has 32 bits: there is none for mode 33",
     "0.0 becomes 1.0": "stands for a mode that needs no number; any finite one does",
     "'return \"\"': returns None": "asked only whether it is true; the field of Passed has its own default",
 }
