@@ -2,6 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 export PYTHON
+CAMPAIGNS ?= demo_seeds random_arms kill_sweep kill_records kill_host daemon_days daemon_kills fuzz_frames web
 
 .DEFAULT_GOAL := help
 .PHONY: help venv demo test lint format bench soak blind mutants docs constraints clean
@@ -37,8 +38,10 @@ format: .venv/.dev ## Put the code in shape
 bench: .venv/.dev ## Measure side by side with peers; writes benchmarks/latest.json
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python benchmarks/run.py
 
-soak: .venv/.dev ## Long campaigns outside make test: the demo over ten hidden truths
-	$(BIN)/python tests/campaigns/demo_seeds.py $(ARGS)
+soak: .venv/.dev ## Long campaigns outside make test: kills, faults, simulated days, random arms (CAMPAIGNS="kill_host web", ARGS)
+	@status=0; for name in $(CAMPAIGNS); do \
+	  echo "soak: $$name" >&2; $(BIN)/python tests/campaigns/$$name.py $(ARGS) || { status=1; echo "soak: $$name failed" >&2; }; \
+	done; exit $$status
 
 blind: .venv/.dev ## Long campaign outside make test: the diagnosis against sealed cases (ARGS="--cases 20")
 	$(BIN)/armlink gap bench $(ARGS)
