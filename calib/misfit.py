@@ -95,7 +95,7 @@ def _candidates(arm: Arm, rows: FitRows, refined: Refined) -> Iterator[Effect]:
         largest = float(np.abs(own[here]).max())
         yield _one(arm.n, joint, "nonlinear", here * own * np.abs(own) / max(largest, 1e-9))
         for share in KNEES:
-            bent = here * np.sign(own) * np.maximum(np.abs(own) - share * largest, 0.0)
+            bent = np.where(here, np.sign(own) * np.maximum(np.abs(own) - share * largest, 0.0), 0.0)
             if np.count_nonzero(bent) >= FEWEST // 2:
                 yield _one(arm.n, joint, "saturation", bent, share * largest / max(abs(complete.gain[joint]), 1e-9))
         yield _one(arm.n, joint, "drift", here * (rows.time - rows.time.mean()))

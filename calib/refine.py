@@ -184,13 +184,14 @@ class _Problem:
         basis = np.hstack([taken, left[:, keep]])
         solution = self.scale * (right[keep].T @ ((left[:, keep].T @ target) / values[keep]))
         linear = Linear(self.row, self.joint, sigma, basis, target - basis @ (basis.T @ target))
-        return _Step(solution, free, np.linalg.qr(rest, mode="r"), self.scale, linear)
+        triangle: Array = np.asarray(np.linalg.qr(rest, mode="r"), dtype=np.float64)
+        return _Step(solution, free, triangle, self.scale, linear)
 
 
 def _scatter(linear: Linear, n: int) -> tuple[Array, Array]:
     """(Each joint's scatter over what was expected of it, NaN where too few readings are free; free readings) (n,)."""
     count = len(linear.row)
-    free = np.bincount(linear.joint, 1 - linear.leverage, minlength=n)
+    free: Array = np.bincount(linear.joint, 1 - linear.leverage, minlength=n).astype(np.float64)
     total = np.bincount(linear.joint, linear.residual[:count] ** 2, minlength=n)
     ratio: Array = np.where(free >= FEWEST, np.sqrt(total / np.maximum(free, 1e-9)), np.nan)
     return ratio, free
