@@ -31,7 +31,10 @@ class Signed(NamedTuple):
 def regressor(arm: Arm, q: Array) -> Array:
     """Regressor Y (K, n, 2n) [m/s²] at poses q (K, n) [rad], equation (Y), each column Y[:, i, c] contiguous."""
     n, (size, _) = arm.n, q.shape
-    columns = np.zeros((2 * n, n, size))
+    columns = np.empty((2 * n, n, size))  # np.zeros gets its memory in small pages: half a millisecond more
+    columns[:, 0] = 0.0
+    for j in range(n - 1):
+        columns[2 * j : 2 * j + 2, j + 1 :] = 0.0
     space = _Space(n, min(size, BLOCK))
     for begin in range(0, size, BLOCK):
         poses = q[begin : begin + BLOCK]
