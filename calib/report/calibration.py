@@ -50,7 +50,7 @@ def _identity(done: Calibrated) -> Section:
     broken = sorted({each.joint for each in findings if each.breaks_model})
     verdict = f"the model does not hold: {', '.join(broken)}" if broken else "the model holds"
     html = f'<p><span class="verdict">{escape(verdict)}</span></p>'
-    html += "".join(paragraph(f"{each.joint}: {each.text}") for each in findings)
+    html += "".join(paragraph(each.text) for each in findings)
     rows = [
         ["arm", escape(f"{record.arm}, serial {record.serial}")],
         ["description (SHA-256)", f"<small>{record.description_hash}</small>"],
