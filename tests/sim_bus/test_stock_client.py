@@ -94,9 +94,11 @@ def map_for_canopen(node: BaseNode402) -> None:
 
 
 def test_nmt_sdo_heartbeat_pdo_and_cia_402(node: BaseNode402) -> None:
-    # NMT and boot-up
+    # NMT and boot-up; canopen's own wait_for_bootup misses one that comes before it begins to wait
+    boot_ups: list[bytes] = []
+    node.network.subscribe(0x700 + NODE, lambda _id, data, _time: boot_ups.append(bytes(data)))
     node.nmt.state = "RESET"
-    node.nmt.wait_for_bootup(10.0)
+    assert wait_for(lambda: b"\0" in boot_ups)
     # SDO
     assert node.sdo["Manufacturer device name"].raw == "armlink joint"
     node.sdo["Quick stop option code"].raw = 6
