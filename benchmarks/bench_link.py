@@ -15,7 +15,7 @@ PEER = "canopen RemoteNode, PDO variables"
 
 
 def cases() -> list[Case]:
-    """Cycles a second and CPU a frame; none where no vcan0 can be had, which is said."""
+    """Cycles a second and CPU a frame; with-vcan's reason is raised where no vcan0 can be had."""
     return [
         _case("link_cycle_vs_canopen", "cycles/s", "cycles", less_is_better=False),
         _case("link_cpu_per_frame_vs_canopen", "µs", "cpu", less_is_better=True),
@@ -24,7 +24,7 @@ def cases() -> list[Case]:
 
 def _case(name: str, unit: str, key: str, less_is_better: bool) -> Case:
     """A case whose runs were taken in turn by link_cycle.py in one session; the first pair is the warm-up."""
-    ours, peer = ((run[side][key] for run in _session()) for side in ("ours", "peer"))
+    ours, peer = (iter([run[side][key] for run in _session()]) for side in ("ours", "peer"))
     return Case(name, unit, lambda: next(ours), lambda: next(peer), PEER, less_is_better, RUNS)
 
 
