@@ -20,7 +20,7 @@ from armlink.limits import gate_limits, joint_ranges, target_window
 from armlink.loop import Loop
 from armlink.port import open_port
 from armlink.sample import Array, Calibration, Command, Identity, Sample, Stats
-from armlink.services import NodeServices, PumpedNetwork, load_dictionary
+from armlink.services import NodeServices, PumpedNetwork, joint_services
 
 LISTEN_PERIODS, LISTEN_SECONDS = 2, 0.02
 """Before anything is sent to the nodes, another host is listened for: so many periods, and at least so long [s]."""
@@ -224,11 +224,7 @@ class Link:
         """SDO access to each joint's controller, in joint order."""
         network = PumpedNetwork(self._loop.send)
         self._loop.on_other = lambda can_id, data: network.notify(can_id, bytearray(data), 0.0)
-        dictionary = load_dictionary()
-        return tuple(
-            NodeServices(network, name, node, dictionary, self._pump)
-            for name, node in zip(self.names, self.nodes, strict=True)
-        )
+        return joint_services(network, self.names, self.nodes, self._pump)
 
     def _pump(self, done: Callable[[], bool], timeout: float) -> bool:
         """Run the loop until `done` or the time is over; enabled joints get their last command in every cycle."""

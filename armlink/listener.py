@@ -20,7 +20,7 @@ from armlink.monitor import assumed_units
 from armlink.pdo import RPDO1
 from armlink.port import open_port
 from armlink.sample import Array, Calibration, Sample, Stats
-from armlink.services import NodeServices, PumpedNetwork, load_dictionary
+from armlink.services import NodeServices, PumpedNetwork, joint_services
 
 COMMAND_LAYOUT = struct.Struct("<Hhi")
 """RPDO1: control word, target torque, target position."""
@@ -133,11 +133,7 @@ class Listener:
     def _services(self) -> tuple[NodeServices, ...]:
         network = PumpedNetwork(self._loop.send)
         self._notify = network.notify
-        dictionary = load_dictionary()
-        return tuple(
-            NodeServices(network, name, node, dictionary, self._pump)
-            for name, node in zip(self.names, self.nodes, strict=True)
-        )
+        return joint_services(network, self.names, self.nodes, self._pump)
 
     def _pump(self, done: Callable[[], bool], timeout: float) -> bool:
         """Go on listening until `done` or the time is over."""

@@ -4,7 +4,7 @@ import logging
 import queue
 import struct
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import canopen
@@ -168,6 +168,14 @@ class NodeServices:
 def load_dictionary() -> Any:
     """The object dictionary of a joint controller from the shipped EDS."""
     return canopen.import_od(objects.eds_path(), 1)
+
+
+def joint_services(
+    network: PumpedNetwork, names: Sequence[str], nodes: Sequence[int], pump: Pump
+) -> tuple[NodeServices, ...]:
+    """SDO access to every joint's controller, in joint order."""
+    dictionary = load_dictionary()
+    return tuple(NodeServices(network, name, node, dictionary, pump) for name, node in zip(names, nodes, strict=True))
 
 
 def no_answer(error: SdoError) -> str:

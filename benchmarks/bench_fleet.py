@@ -44,7 +44,7 @@ def cases() -> list[Case]:
         return RECORDINGS / taken
 
     name, peer = "fleet_2_workers_vs_1", "the same on one worker"
-    return [Case(name, "recordings/s", lambda: on(2), lambda: on(1), peer, less_is_better=False, runs=1)]
+    return [Case(name, "recordings/s", lambda: on(2), lambda: on(1), peer, less_is_better=False, runs=1, warm_up=False)]
 
 
 def _recording(seed: int) -> Recording:

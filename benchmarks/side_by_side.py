@@ -20,6 +20,8 @@ class Case:
     peer_name: str
     less_is_better: bool = True
     runs: int = 15
+    warm_up: bool = True
+    """Whether each is run once before it counts; not where the figure already leaves its own start out."""
 
 
 def seconds(work: Callable[[], Any], repeat: int = 1, scale: float = 1.0) -> Figure:
@@ -36,7 +38,8 @@ def seconds(work: Callable[[], Any], repeat: int = 1, scale: float = 1.0) -> Fig
 
 def measure(case: Case) -> dict[str, Any]:
     """Run a case; ratio is above 1 where ours is better."""
-    case.ours(), case.peer()
+    if case.warm_up:
+        case.ours(), case.peer()
     taken = [(case.ours(), case.peer()) for _ in range(case.runs)]
     ours, peer = (statistics.median(figures) for figures in zip(*taken, strict=True))
     return {

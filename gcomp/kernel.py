@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gcomp.arm import Arm
 from gcomp.arrays import Array, as_array, as_batch, as_poses
+from gcomp.half_angle import half_angles
 from gcomp.unrolled import compile_single_pose, without_rounding
 
 BLOCK = 5000
@@ -45,7 +46,7 @@ class GravityModel:
         for begin in range(0, len(poses), BLOCK):
             block = slice(begin, begin + BLOCK)
             space = _space_for(self.arm.n, len(poses[block]))
-            _turn(self.arm, poses[block], space.tangent, space.square, space.turn)
+            _turn(self.arm, poses[block], space.tangent, space.double, space.turn)
             self._moments_inwards(space)
             self._gravity_outwards(space)
             np.copyto(torque[block], space.moment.imag.T)
@@ -79,7 +80,7 @@ class _Space:
     """Work space for `size` poses of n joints, one row a joint."""
 
     def __init__(self, n: int, size: int) -> None:
-        self.tangent, self.square = np.empty((2, n, size))
+        self.tangent, self.double = np.empty((2, n, size))
         self.turn, self.moment = np.empty((2, n, size), dtype=np.complex128)
         self.gravity: ComplexArray = np.empty(size, dtype=np.complex128)
         self.along, self.spare = np.empty((2, size)), np.empty(size)
@@ -96,17 +97,11 @@ def _space_for(n: int, size: int) -> _Space:
     return space
 
 
-def _turn(arm: Arm, q: Array, tangent: Array, square: Array, turn: ComplexArray) -> None:
-    """e^{iθ} (n, K) from t = tan(θ/2): numpy's tan is vectorised where its sin and cos are not."""
-    np.multiply(q.T, 0.5, out=tangent)
-    if arm.theta_offset.any():
-        np.add(tangent, 0.5 * arm.theta_offset[:, None], out=tangent)
-    np.tan(tangent, out=tangent)
-    np.multiply(tangent, tangent, out=square)
-    np.add(square, 1.0, out=square)
-    np.divide(2.0, square, out=square)
-    np.multiply(tangent, square, out=turn.imag)
-    np.subtract(square, 1.0, out=turn.real)
+def _turn(arm: Arm, q: Array, tangent: Array, double: Array, turn: ComplexArray) -> None:
+    """e^{iθ} (n, K) at poses q (K, n) [rad]."""
+    half_angles(arm, q, tangent, double)
+    np.multiply(tangent, double, out=turn.imag)
+    np.subtract(double, 1.0, out=turn.real)
 
 
 def _turn_about_x(ca: float, sa: float, y: Array, z: Array, to_y: Array, to_z: Array, spare: Array) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from gcomp.arm import Arm
 from gcomp.arrays import Array
+from gcomp.half_angle import half_angles
 from gcomp.unrolled import without_rounding
 
 BLOCK = 10_000
@@ -98,16 +99,10 @@ class _Space:
         self.g_y, self.g_z = np.zeros((2, size))
 
     def turn_by(self, arm: Arm, q: Array) -> None:
-        """Take the turns at poses q (K, n) from t = tan(θ/2): numpy's tan is vectorised where its sin, cos are not."""
-        tangent, cos = self.tangent, self.cos
-        np.multiply(q.T, 0.5, out=tangent)
-        if arm.theta_offset.any():
-            np.add(tangent, 0.5 * arm.theta_offset[:, None], out=tangent)
-        np.tan(tangent, out=tangent)
-        np.multiply(tangent, tangent, out=cos)
-        np.add(cos, 1.0, out=cos)
-        np.divide(2.0, cos, out=cos)
-        np.multiply(tangent, cos, out=self.sin)
+        """Take the turns at poses q (K, n) [rad]."""
+        cos = self.cos
+        half_angles(arm, q, self.tangent, cos)
+        np.multiply(self.tangent, cos, out=self.sin)
         np.subtract(1.0, cos, out=self.minus_cos)
         np.subtract(cos, 1.0, out=cos)
 

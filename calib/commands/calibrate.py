@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from calib.commands.options import Bus, Check, Flash, JsonFile, Replaced, Store
+
 if TYPE_CHECKING:
     from calib.records import CalibrationRecord, Parameter
     from calib.sensors import SensorFit
@@ -15,23 +17,17 @@ def calibrate(
     directories: Annotated[list[Path], typer.Argument(help="Data sets of armlink sweep, without and with load.")],
     arm: Annotated[str | None, typer.Option(help="Arm file, where it is no longer where the sweep had it.")] = None,
     apply: Annotated[bool, typer.Option("--apply", help="Also write gains and offsets to the controllers.")] = False,
-    bus: Annotated[str | None, typer.Option(help="With --apply: INTERFACE:CHANNEL[@BITRATE].")] = None,
-    check: Annotated[
-        bool, typer.Option(help="With --apply: a small motion of every joint before and after; worse is taken back.")
-    ] = True,
-    flash: Annotated[bool, typer.Option("--flash", help="With --apply: also store to the controllers' flash.")] = False,
-    replaced: Annotated[
-        list[str] | None, typer.Option(help="With --apply: a joint whose sensor was exchanged since the last record.")
-    ] = None,
+    bus: Bus = None,
+    check: Check = True,
+    flash: Flash = False,
+    replaced: Replaced = None,
     accept: Annotated[
         list[str] | None,
         typer.Option(help="With --apply: a joint to be written although the model does not hold there."),
     ] = None,
     report: Annotated[Path | None, typer.Option(help="Also write a page to file: one self-contained HTML.")] = None,
-    store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")
-    ] = None,
+    store: Store = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Fit every sensor to sweeps, all directories in one problem, and keep the result as a calibration record.
 

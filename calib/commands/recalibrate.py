@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from calib.commands.options import Bus, Check, Flash, JsonFile, Replaced, Store
+
 if TYPE_CHECKING:
     from armlink.armfile import ArmFile
     from calib.field import FieldFit
@@ -23,18 +25,12 @@ def recalibrate(
         ),
     ] = "record",
     apply: Annotated[bool, typer.Option("--apply", help="Also write them to the controllers.")] = False,
-    bus: Annotated[str | None, typer.Option(help="With --apply: INTERFACE:CHANNEL[@BITRATE].")] = None,
-    check: Annotated[
-        bool, typer.Option(help="With --apply: a small motion of every joint before and after; worse is taken back.")
-    ] = True,
-    flash: Annotated[bool, typer.Option("--flash", help="With --apply: also store to the controllers' flash.")] = False,
-    replaced: Annotated[
-        list[str] | None, typer.Option(help="With --apply: a joint whose sensor was exchanged since the last record.")
-    ] = None,
-    store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")
-    ] = None,
+    bus: Bus = None,
+    check: Check = True,
+    flash: Flash = False,
+    replaced: Replaced = None,
+    store: Store = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Find gains and offsets against the current gravity record, and keep them; --apply also makes them current.
 
