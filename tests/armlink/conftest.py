@@ -1,6 +1,7 @@
 """Arm files, and a tiny lock-step arm: nodes that answer from a dictionary and follow their targets."""
 
 import struct
+import sys
 import zlib
 from collections import deque
 from pathlib import Path
@@ -10,6 +11,8 @@ import pytest
 from armlink import objects
 from armlink.armfile import parse_arm
 from armlink.link import Link
+
+sys.path.insert(0, str(Path(__file__).parent))
 
 SWITCH_ON_DISABLED, READY, SWITCHED_ON, ENABLED, QUICK_STOP, FAULT = 0x40, 0x21, 0x23, 0x27, 0x07, 0x08
 
