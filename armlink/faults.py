@@ -45,12 +45,11 @@ def find_fault(known: Known, now: float, modes: Sequence[int], max_age: float) -
         fault = node_fault(known)
         if fault:
             return fault
-    for joint, seen in enumerate(known.seen):
-        age = now - seen
-        if not age <= max_age:
-            return f"{known.names[joint]}: no reading for {age * 1e3:.0f} ms, limit {max_age * 1e3:.0f} ms"
-    for joint, mode in enumerate(modes):
-        status, display = known.statuses[joint], known.displays[joint]
+    oldest = min(known.seen)
+    if not now - oldest <= max_age:
+        name, age = known.names[known.seen.index(oldest)], now - oldest
+        return f"{name}: no reading for {age * 1e3:.0f} ms, limit {max_age * 1e3:.0f} ms"
+    for joint, (mode, status, display) in enumerate(zip(modes, known.statuses, known.displays, strict=True)):
         if mode != OFF and display != mode and not now - known.mode_since[joint] <= max_age:
             return f"{known.names[joint]}: {refused_mode(mode, display)}"
         if status & 0x6F == ENABLED_BITS:

@@ -20,6 +20,7 @@ its produced torque with the target torque, so that a change of mode starts from
 """
 
 import math
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from armlink.cia402 import Mode
@@ -36,7 +37,8 @@ SAMPLE_AGE, STATE = "sample age", "state"
 VELOCITY, WINDOW, ENTRY = "velocity", "window", "entry"
 
 
-class JointLimits(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class JointLimits:
     """Limits of one joint; no frame exceeds them."""
 
     max_torque: float
@@ -59,6 +61,15 @@ class JointLimits(NamedTuple):
     """A joint under torque control that reads a position further outside the window is refused [rad]."""
     max_age: float
     """Oldest command and oldest reading that count [s]."""
+    lowest_wire: int = field(init=False)
+    """Least 607Ah within the window, user units."""
+    highest_wire: int = field(init=False)
+    """Greatest 607Ah within the window, user units."""
+
+    def __post_init__(self) -> None:
+        """Work out what does not change from cycle to cycle."""
+        object.__setattr__(self, "lowest_wire", math.ceil(self.lower / self.position_unit))
+        object.__setattr__(self, "highest_wire", math.floor(self.upper / self.position_unit))
 
 
 class Seen(NamedTuple):
@@ -157,10 +168,7 @@ def _passed(limits: JointLimits, torque: float, position: float, mode: int, refu
     torque = _within(torque, -limits.max_torque, limits.max_torque)
     lowest, highest = LOWEST_WIRE, HIGHEST_WIRE
     if limits.lower <= position <= limits.upper:
-        lowest, highest = (
-            math.ceil(limits.lower / limits.position_unit),
-            math.floor(limits.upper / limits.position_unit),
-        )
+        lowest, highest = limits.lowest_wire, limits.highest_wire
     position_wire = max(lowest, min(highest, round(position / limits.position_unit)))
     return Passed(torque, position, int(torque / limits.torque_unit), position_wire, refused, mode)
 
@@ -170,4 +178,4 @@ def _towards(start: float, goal: float, step: float) -> float:
 
 
 def _within(value: float, lower: float, upper: float) -> float:
-    return max(lower, min(upper, value))
+    return value if lower <= value <= upper else max(lower, min(upper, value))

@@ -156,7 +156,7 @@ class Loop:
         self._awaited = self.n
         self._port.send_all(frames)
         self.stats.frames += len(frames)
-        self.bits += sum(FIXED_BITS + 8 * len(data) for _, data in frames)
+        self.bits += FIXED_BITS * len(frames) + 8 * sum([len(data) for _, data in frames])
         end = now + self._patience
         for _ in range(MOST_FRAMES):
             if self._awaited <= 0:

@@ -73,7 +73,9 @@ class Drives:
         self._reading_out[:] = np.rint(torque * 1e6)
         self._motor_out[:] = np.rint(motor * (1000 / self.rated))
         limited = np.abs(motor) >= self.loops.limit
-        self._status_out[:] = self._status | limited * np.uint16(INTERNAL_LIMIT) if limited.any() else self._status
+        self._status_out[:] = (
+            self._status | limited * np.uint16(INTERNAL_LIMIT) if np.count_nonzero(limited) else self._status
+        )
 
     # ---- commands
 

@@ -155,7 +155,7 @@ class Loops:
         self._integral += self._ki * error * duration
         np.minimum(np.maximum(self._integral, -self.limit, out=self._integral), self.limit, out=self._integral)
         level += self._k * self._target + self._d * self._rate + self._integral
-        if self._rate.any():
+        if np.count_nonzero(self._rate):
             move = self._rate * duration
             self._plant.step(level, level + self._k * move, duration)
             self._target += move

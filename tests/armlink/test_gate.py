@@ -1,6 +1,7 @@
 """The gate: whatever comes, no wire value exceeds a limit, and what is not known is refused."""
 
 import math
+from dataclasses import replace
 
 import pytest
 from hypothesis import given, settings
@@ -147,7 +148,7 @@ def test_the_window_ends_the_way_and_rounding_stays_inside(mode):
     assert low.position == -2.0
     assert low.position_wire == math.ceil(-2.0 / LIMITS.position_unit)
     # at the very ends too, whose nearest user unit lies outside
-    odd = LIMITS._replace(lower=1.4 * LIMITS.position_unit, upper=2.6 * LIMITS.position_unit)
+    odd = replace(LIMITS, lower=1.4 * LIMITS.position_unit, upper=2.6 * LIMITS.position_unit)
     assert start_from(odd, 0.0, odd.lower).position_wire == 2
     assert start_from(odd, 0.0, odd.upper).position_wire == 2
 
