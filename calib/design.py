@@ -16,8 +16,10 @@ SKETCH_STEPS = 5
 """Steps by which a candidate sweep is judged: enough for a sinusoid and an offset."""
 MINIMUM_LEVER = 0.3
 """Γ/g below which a combination is taken only where there is no better one."""
-EXCHANGES = 1
+EXCHANGES = 2
 """Rounds in which every chosen combination is compared once more with all others."""
+WAY = 0.6
+"""Log determinant that a second of travel between two sweeps must be worth."""
 PRIOR_GAIN, PRIOR_POSITION_GAIN, PRIOR_POINT = 0.15, 0.02, 0.2
 """What is known before any reading: standard deviations of torque gain, position gain, attachment point [m]."""
 
@@ -33,6 +35,11 @@ class Candidates:
     """(C, S, n) poses along each sweep [rad]."""
     lever: Array
     """Γ/g of the swept joint (C,)."""
+
+    @property
+    def count(self) -> int:
+        """How many there are, C."""
+        return len(self.stops)
 
     def kept(self, which: npt.NDArray[np.bool_]) -> "Candidates":
         """These combinations alone."""
@@ -59,28 +66,34 @@ def reachable(candidates: Candidates) -> Candidates:
 
 
 def choose(
-    arm: Arm, candidates: list[Candidates], count: list[int], moments: list[Array], sigma: Array, mass: float
+    arm: Arm,
+    candidates: list[Candidates],
+    count: list[int],
+    moments: list[Array],
+    sigma: Array,
+    mass: float,
+    speed: Array,
 ) -> list[list[int]]:
-    """For each joint's candidates, the indices of the `count` combinations that together are D-optimal.
+    """For each joint's candidates, the indices of the `count` combinations that together are best.
 
+    Best is D-optimal, less `WAY` for each second of travel from one sweep to the next at `speed` (n,) [rad/s].
     `moments` are the mass moments β (2n,) [kg·m] for which the design is made, as several guesses where they are
     unknown; sigma (n,) [N·m] of one reading; mass [kg] of the second pass. Greedy, then exchanged.
     """
     rows = [np.stack([_information(arm, each, beta, sigma, mass) for beta in moments]) for each in candidates]
-    prior = np.stack([_prior(arm, beta, sigma) for beta in moments])
+    total = np.stack([_prior(arm, beta, sigma) for beta in moments])
     chosen: list[list[int]] = [[] for _ in candidates]
-    total = prior.copy()
-    for place, wanted in enumerate(count):
-        for _ in range(min(wanted, len(candidates[place].stops))):
-            best = _best(total, rows[place], set(chosen[place]))
-            chosen[place].append(best)
-            total += rows[place][:, best]
-    for _ in range(EXCHANGES):
-        for place, picks in enumerate(chosen):
-            for slot, old in enumerate(picks):
-                total -= rows[place][:, old]
-                picks[slot] = _best(total, rows[place], set(picks) - {old})
-                total += rows[place][:, picks[slot]]
+    slots = [(place, slot) for place, each in enumerate(candidates) for slot in range(min(count[place], each.count))]
+    for turn in range(1 + EXCHANGES):
+        for place, slot in slots:
+            picks = chosen[place]
+            if turn:
+                total -= rows[place][:, picks[slot]]
+            score = np.linalg.slogdet(total[:, None] + rows[place])[1].mean(axis=0)
+            score -= WAY * _seconds(candidates, chosen, place, slot, speed)
+            score[[pick for other, pick in enumerate(picks) if other != slot]] = -np.inf
+            picks[slot : slot + 1] = [int(np.argmax(score))]
+            total += rows[place][:, picks[slot]]
     return chosen
 
 
@@ -92,11 +105,16 @@ def guessed_moments(arm: Arm, seed: int, draws: int = 3) -> list[Array]:
     return [(generator.normal(size=(arm.n, 2)) * beyond[:, None]).ravel() for _ in range(draws)]
 
 
-def _best(total: Array, rows: Array, taken: set[int]) -> int:
-    """The candidate that makes the mean log determinant largest."""
-    score = np.linalg.slogdet(total[:, None] + rows)[1].mean(axis=0)
-    score[list(taken)] = -np.inf
-    return int(np.argmax(score))
+def _seconds(candidates: list[Candidates], chosen: list[list[int]], place: int, slot: int, speed: Array) -> Array:
+    """Time (C,) [s] to each candidate for one slot from the sweep before it, and on to the one after it."""
+    here, time = candidates[place], np.zeros(candidates[place].count)
+    way = [(other, number) for other, picks in enumerate(chosen) for number in range(len(picks))]
+    before = [each for each in way if each < (place, slot)][-1:]
+    after = [each for each in way if each > (place, slot)][:1]
+    for other, number in before + after:
+        there = candidates[other].poses[chosen[other][number], 0]
+        time += (np.abs(here.poses[:, 0] - there) / speed).max(axis=1)
+    return time
 
 
 def _information(arm: Arm, candidates: Candidates, beta: Array, sigma: Array, mass: float) -> Array:

@@ -77,7 +77,7 @@ def plan_sweep(
     gain_std, finer = None, 1.0
     for more in range(MORE_POSES + 1):
         counts = [1 if each.lever.max() < DEAD_LEVER else poses + more for each in options]
-        picks = choose(described, options, counts, moments, sigma, mass)
+        picks = choose(described, options, counts, moments, sigma, mass, section.travel_speed * limits.speed)
         sweeps = [
             _sweep(described.names[each.joint], number, each, pick, section, limits, guess)
             for each, chosen in zip(options, picks, strict=True)
