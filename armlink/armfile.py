@@ -107,6 +107,8 @@ class LinkJoint(Section):
     """[rad/s]."""
     identity: DeviceIdentity = DeviceIdentity()
     """Another controller than this one at the joint's node is refused at the start."""
+    eds: str | None = None
+    """Electronic data sheet of its controller (CiA 306), a path from the arm file; by default the one we ship."""
     bus: str = ""
     """Name of its bus in link.buses; empty: link.bus."""
 

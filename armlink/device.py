@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from armlink import objects, pdo
 from armlink.armfile import DeviceIdentity, LinkJoint, LinkSection
 from armlink.cia402 import MODE_NAMES, NEEDED_MODES, Mode, state_of, supports
+from armlink.data_sheet import expected_identity
 from armlink.errors import BadInput, BusFault, Refused
 from armlink.gate import JointLimits
 from armlink.limits import milliseconds
@@ -87,10 +88,11 @@ def identity_mismatches(stated: DeviceIdentity, found: Mapping[str, int]) -> lis
 
 
 def check_identity(services: NodeServices, joint: LinkJoint) -> None:
-    """Raise Refused where another controller answers at the joint's node than the arm file states."""
-    stated = [key for key in IDENTITY_OBJECTS if getattr(joint.identity, key) is not None]
+    """Raise Refused where another controller answers at the joint's node than arm file and data sheet state."""
+    expected = expected_identity(joint, services.remote.object_dictionary)
+    stated = [key for key in IDENTITY_OBJECTS if getattr(expected, key) is not None]
     found = {key: int(services.read(IDENTITY_OBJECTS[key])) for key in stated}
-    mismatches = identity_mismatches(joint.identity, found)
+    mismatches = identity_mismatches(expected, found)
     if mismatches:
         raise refused_identity(joint.name, joint.node, mismatches)
 
@@ -99,7 +101,7 @@ def refused_identity(name: str, node: int, mismatches: list[str]) -> Refused:
     """The refusal of a joint's controller, with what differs and how to mend it."""
     return Refused(
         f"{name} (node {node}): another controller than the arm file states: {'; '.join(mismatches)}: "
-        "connect the right arm, or correct identity of this joint under link.joints"
+        "connect the right arm, or correct identity or eds of this joint under link.joints"
     )
 
 

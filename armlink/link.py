@@ -224,7 +224,7 @@ class Link:
         """SDO access to each joint's controller, in joint order."""
         network = PumpedNetwork(self._loop.send)
         self._loop.on_other = lambda can_id, data: network.notify(can_id, bytearray(data), 0.0)
-        return joint_services(network, self.names, self.nodes, self._pump)
+        return joint_services(network, self.arm, self._pump)
 
     def _pump(self, done: Callable[[], bool], timeout: float) -> bool:
         """Run the loop until `done` or the time is over; enabled joints get their last command in every cycle."""

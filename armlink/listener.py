@@ -133,7 +133,7 @@ class Listener:
     def _services(self) -> tuple[NodeServices, ...]:
         network = PumpedNetwork(self._loop.send)
         self._notify = network.notify
-        return joint_services(network, self.names, self.nodes, self._pump)
+        return joint_services(network, self.arm, self._pump)
 
     def _pump(self, done: Callable[[], bool], timeout: float) -> bool:
         """Go on listening until `done` or the time is over."""

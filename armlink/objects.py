@@ -2,7 +2,6 @@
 
 import struct
 from dataclasses import dataclass
-from importlib.resources import files
 
 
 @dataclass(frozen=True)
@@ -83,8 +82,3 @@ HEARTBEAT_ID = 0x700
 NMT_START, NMT_PRE_OPERATIONAL, NMT_RESET = 0x01, 0x80, 0x81
 OPERATIONAL = 0x05
 NMT_STATES = {0x00: "boot-up", 0x04: "stopped", 0x05: "operational", 0x7F: "pre-operational"}
-
-
-def eds_path() -> str:
-    """Path of the electronic data sheet that this package ships."""
-    return str(files("armlink").joinpath("eds/joint.eds"))

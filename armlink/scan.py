@@ -3,11 +3,11 @@
 from collections import Counter
 from collections.abc import Callable, Mapping
 
-from armlink import device
+from armlink import data_sheet, device
 from armlink.clock import Clock
 from armlink.port import Port
 from armlink.sample import Identity
-from armlink.services import NodeServices, PumpedNetwork, load_dictionary
+from armlink.services import NodeServices, PumpedNetwork
 
 SEARCH_SECONDS = 0.3
 """How long answers to the search are waited for after the last request."""
@@ -31,7 +31,7 @@ def scan_bus(port: Port, clock: Clock, joints: Mapping[int, str]) -> list[Identi
         return True
 
     found = _search(port, pump, network)
-    dictionary = load_dictionary()
+    dictionary = data_sheet.bundled()
     identities = []
     for node in sorted({*+found, *joints}):
         name = joints.get(node, "")

@@ -5,29 +5,22 @@ each in turn is quick-stopped, and left without commands; then all are left with
 device does, and how long it takes, is measured, not believed.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 from armlink import calibration, device, objects, pdo
-from armlink.armfile import DeviceIdentity
+from armlink.armfile import LinkJoint
 from armlink.cia402 import MODE_NAMES, Mode, supports
+from armlink.data_sheet import OPTIONAL, expected_identity, used_objects
 from armlink.errors import ArmlinkError
 from armlink.limits import gate_limits
 from armlink.link import Link
 from armlink.objects import Entry
 from armlink.powertest import PowerTest
-from armlink.services import NodeServices, load_dictionary
+from armlink.services import NodeServices
 
 Outcome = Literal["passed", "failed", "absent", "not run"]
-OPTIONAL = {
-    objects.TORQUE_OFFSET: "torque offset: nothing latched to clear",
-    objects.PROFILE_VELOCITY: "profile velocity: no profile position mode",
-    objects.TORQUE_SLOPE: "torque slope: no profile torque mode",
-    objects.STORE_MANUFACTURER: "store: a calibration is lost at power-off",
-    objects.HEARTBEAT_PRODUCER: "",
-}
-"""Objects that a controller may lack, and what it then does not do."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +56,7 @@ class SelfTest:
             self.progress(f"{services.joint}: identity, objects, settings")
             if services.joint in missing:
                 self._add(services.joint, "answers", "failed", f"no answer at node {services.node}")
-            elif self._identity(services, row.identity):
+            elif self._identity(services, row):
                 self._objects(services)
                 self._modes(services)
                 self._calibration(services)
@@ -96,24 +89,21 @@ class SelfTest:
             return False
         return True
 
-    def _identity(self, services: NodeServices, stated: DeviceIdentity) -> bool:
+    def _identity(self, services: NodeServices, row: LinkJoint) -> bool:
         def work() -> str:
-            row = next(row for row in self.link.section.joints if row.name == services.joint)
             device.check_identity(services, row)
+            stated = expected_identity(row, services.remote.object_dictionary)
             told = [f"{int(services.read(entry)):#x}" for entry in device.IDENTITY_OBJECTS.values()]
-            known = "as stated" if stated.model_fields_set else "not stated in the arm file"
+            known = "as stated" if stated.model_dump(exclude_none=True) else "not stated in the arm file"
             return f"{':'.join(told)}, {known}"
 
         return self._try(services.joint, "identity", work)
 
     def _objects(self, services: NodeServices) -> None:
         """Every object that the link uses is there, with the length that the data sheet has."""
-        dictionary, wrong, count = load_dictionary(), [], 0
+        wrong, count = [], 0
         for entry in used_objects():
-            sheet = dictionary.get_variable(entry.index, entry.sub)
-            if sheet is None or len(sheet) != entry.bits:
-                wrong.append(f"{entry}: not so in the data sheet")
-            elif services.has(entry):
+            if services.has(entry):
                 count += 1
                 try:
                     services.read(entry)
@@ -169,11 +159,6 @@ class SelfTest:
         device.configure_pdo(services, each, self.link.protection.deadline_ms)
         deadline = f", deadline {self.link.protection.deadline_ms} ms" if each is pdo.RPDO1 else ""
         return f"{len(each.entries)} objects, read back{deadline}"
-
-
-def used_objects() -> Iterable[Entry]:
-    """The objects of a controller that the link uses."""
-    return [value for value in vars(objects).values() if isinstance(value, Entry)]
 
 
 def _written(services: NodeServices, entry: Entry, value: int) -> str:

@@ -4,13 +4,14 @@ import logging
 import queue
 import struct
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import canopen
 from canopen.sdo.exceptions import SdoAbortedError, SdoError
 
-from armlink import objects
+from armlink import data_sheet, objects
+from armlink.armfile import ArmFile
 from armlink.errors import BusFault
 from armlink.objects import Entry
 
@@ -165,17 +166,10 @@ class NodeServices:
         return BusFault(f"{self.joint} (node {self.node}): {entry}: {what}")
 
 
-def load_dictionary() -> Any:
-    """The object dictionary of a joint controller from the shipped EDS."""
-    return canopen.import_od(objects.eds_path(), 1)
-
-
-def joint_services(
-    network: PumpedNetwork, names: Sequence[str], nodes: Sequence[int], pump: Pump
-) -> tuple[NodeServices, ...]:
-    """SDO access to every joint's controller, in joint order."""
-    dictionary = load_dictionary()
-    return tuple(NodeServices(network, name, node, dictionary, pump) for name, node in zip(names, nodes, strict=True))
+def joint_services(network: PumpedNetwork, arm: ArmFile, pump: Pump) -> tuple[NodeServices, ...]:
+    """SDO access to every joint's controller, in joint order; raises BadInput for a wrong data sheet."""
+    pairs = zip(arm.require_link().joints, data_sheet.of_joints(arm), strict=True)
+    return tuple(NodeServices(network, joint.name, joint.node, sheet, pump) for joint, sheet in pairs)
 
 
 def no_answer(error: SdoError) -> str:

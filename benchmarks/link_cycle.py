@@ -15,11 +15,11 @@ import time
 import canopen
 from echo_nodes import NODES, answer_in_kernel, make_arm, remove_gateway, start_nodes
 
+from armlink import data_sheet
 from armlink.bus import open_bus
 from armlink.clock import MonotonicClock
 from armlink.link import Link
 from armlink.sample import Command
-from armlink.services import load_dictionary
 
 FRAMES = 2 * len(NODES) + 1
 
@@ -56,7 +56,7 @@ class PeerHost:
     def __init__(self, channel: str) -> None:
         self.network = canopen.Network()
         self.network.connect(interface="socketcan", channel=channel)
-        dictionary = load_dictionary()
+        dictionary = data_sheet.bundled()
         self.came, self.missing = threading.Event(), 0
         self.commands, self.readings = [], []
         for number in NODES:

@@ -28,6 +28,8 @@ class BuiltModel:
     """Of the links, base to tip."""
     payload_body: int
     """Body fixed in the last link's bar frame that carries what is attached; almost massless when nothing is."""
+    spec: Any
+    """mujoco.MjSpec that it was compiled from."""
 
 
 def build_model(arm: ArmFile, state: Imperfections) -> BuiltModel:
@@ -56,7 +58,7 @@ def build_model(arm: ArmFile, state: Imperfections) -> BuiltModel:
     except ValueError as error:
         raise BadInput(f"{arm.path}: the simulated arm cannot be built: {error}") from None
     bodies = tuple(int(model.joint(name).bodyid[0]) for name in arm.joint_names)
-    return BuiltModel(model, bodies, int(model.body("payload").id))
+    return BuiltModel(model, bodies, int(model.body("payload").id), spec)
 
 
 def _from_denavit_hartenberg(arm: ArmFile, section: SimSection) -> Any:

@@ -8,6 +8,7 @@ from types import FrameType
 
 import can
 
+from armlink.bus import BusGroup
 from armlink.errors import BusFault
 from sim_bus.control import ControlPipe
 from sim_bus.fault_kinds import Fault
@@ -22,6 +23,7 @@ TICK = 0.002
 """Longest wait for a frame: timers and physics go on meanwhile [s]."""
 LOCKSTEP_PATIENCE = 1.0
 """In lock-step, so long without a SYNC and time goes on by itself, so that nodes notice a host that died [s]."""
+NMT_ID = 0x000
 SEND_PATIENCE = 0.1
 """How long a full transmit queue is waited for [s]; a frame that still does not go is lost, as on a dead bus."""
 INTERRUPTED, TERMINATED = 130, 0
@@ -33,7 +35,7 @@ class Server:
     def __init__(
         self,
         arm: SimulatedArm,
-        bus: can.BusABC,
+        bus: can.BusABC | BusGroup,
         drifts: Sequence[Drift] = (),
         lockstep: bool = False,
         now: Callable[[], float] = time.monotonic,
@@ -42,6 +44,14 @@ class Server:
     ) -> None:
         """`now` is the clock that the physics follows unless `lockstep`; `control` gives orders while it runs."""
         self._arm, self._bus, self._lockstep, self._now = arm, bus, lockstep, now
+        members: tuple[can.BusABC, ...] = getattr(bus, "members", (bus,))
+        self._others, self._leading = members[:-1], members[-1]
+        """Of several buses the last gives SYNC: a host fills them in their order."""
+        self._of_bus: dict[can.BusABC, set[int]] = {}
+        """Nodes on each of several buses."""
+        if isinstance(bus, BusGroup):
+            for node, place in bus.route.items():
+                self._of_bus.setdefault(members[place], set()).add(node)
         self._line: Line = arm
         self._control, self._injector = control, None if control is None and not faults else Injector(arm)
         if self._injector is not None:
@@ -73,10 +83,12 @@ class Server:
     def turn(self) -> None:
         """Wait for at most a tick, then deal with everything that is there."""
         try:
-            message = self._bus.recv(TICK)
+            message = self._leading.recv(TICK)
             while message is not None:
-                self._frame(message)
-                message = self._bus.recv(0)
+                self._take_from_others()
+                self._heard(message, self._leading)
+                message = self._leading.recv(0)
+            self._take_from_others()
         except can.CanError as error:
             if error.error_code != errno.ENETDOWN:  # else it may come up again, and until then nodes hear nothing
                 raise BusFault(f"bus {self._bus.channel_info}: {error}") from None
@@ -87,6 +99,20 @@ class Server:
             for wrong in self._control.poll(self._injector):
                 self.on_wrong(wrong)
         self._flush()
+
+    def _take_from_others(self) -> None:
+        for bus in self._others:
+            while (message := bus.recv(0)) is not None:
+                self._heard(message, bus)
+
+    def _heard(self, message: can.Message, bus: can.BusABC) -> None:
+        """What a host sends on every bus counts once: SYNC on the leading one, NMT commands on each node's own."""
+        if self._others and message.arbitration_id == NMT_ID and len(message.data) == 2:
+            command, addressed = message.data
+            for node in self._of_bus[bus] if addressed == 0 else self._of_bus[bus] & {addressed}:
+                self._line.on_frame(NMT_ID, bytes([command, node]))
+        elif bus is self._leading or message.arbitration_id != SYNC_ID:
+            self._frame(message)
 
     def _frame(self, message: can.Message) -> None:
         if message.is_error_frame or message.is_remote_frame or message.is_extended_id:

@@ -8,7 +8,7 @@ import numpy as np
 from canopen.objectdictionary import ODVariable
 from numpy.typing import NDArray
 
-from armlink.objects import eds_path
+from armlink.data_sheet import bundled_path
 
 DTYPES = {0x02: "<i1", 0x03: "<i2", 0x04: "<i4", 0x05: "<u1", 0x06: "<u2", 0x07: "<u4", 0x08: "<f4"}
 """numpy types of CiA 301 data types."""
@@ -18,7 +18,7 @@ Key = tuple[int, int]
 @cache
 def data_sheet() -> canopen.ObjectDictionary:
     """The joint's EDS, for node id 0: an entry whose `relative` is true adds the node's own."""
-    return canopen.import_od(eds_path(), node_id=0)
+    return canopen.import_od(bundled_path(), node_id=0)
 
 
 def variable(index: int, sub: int) -> ODVariable | None:

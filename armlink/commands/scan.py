@@ -21,10 +21,11 @@ def scan(
     from rich.console import Console
     from rich.table import Table
 
-    from armlink.armfile import load_arm
-    from armlink.bus import open_bus
+    from armlink.armfile import Bus, load_arm
+    from armlink.bus import open_bus, open_link_bus
     from armlink.clock import MonotonicClock
     from armlink.commands.output import write_json
+    from armlink.data_sheet import expected_identity, of_joints
     from armlink.device import identity_mismatches, refused_identity
     from armlink.errors import BadInput, BusFault
     from armlink.port import open_port
@@ -33,14 +34,14 @@ def scan(
     if arm is None and bus is None:
         raise BadInput("scan: give an arm file, or --bus INTERFACE:CHANNEL[@BITRATE]")
     if arm is None:
-        from armlink.armfile import Bus
-
-        joints, stated, section = {}, {}, Bus()
+        joints, stated = {}, {}
+        opened = open_bus(bus, Bus())
     else:
-        link = load_arm(arm).require_link()
-        joints, section = {joint.node: joint.name for joint in link.joints}, link.bus
-        stated = {joint.node: joint.identity for joint in link.joints}
-    opened = open_bus(bus, section)
+        described = load_arm(arm)
+        link, sheets = described.require_link(), of_joints(described)
+        joints = {joint.node: joint.name for joint in link.joints}
+        stated = {each.node: expected_identity(each, sheet) for each, sheet in zip(link.joints, sheets, strict=True)}
+        opened = open_link_bus(bus, link)
     try:
         clock = getattr(opened, "clock", None) or MonotonicClock()
         found = scan_bus(open_port(opened), clock, joints)

@@ -43,7 +43,7 @@ def sim(
     from rich.console import Console
 
     from armlink.armfile import load_arm
-    from armlink.bus import open_bus, resolve_bus
+    from armlink.bus import open_link_bus, resolve_bus
     from armlink.errors import BadInput
     from sim_bus.control import ControlPipe
     from sim_bus.fault_kinds import parse_fault
@@ -64,7 +64,7 @@ def sim(
     simulated.set_effects([*simulated.effects, *entries])
     if resolve_bus(bus or None, described.require_link().bus).interface == "armlink_sim":
         raise BadInput("sim: bus armlink_sim is a simulated arm itself; give --bus socketcan:vcan0, for example")
-    endpoint = open_bus(bus or None, described.require_link().bus)
+    endpoint = open_link_bus(bus or None, described.require_link())
     pipe = None
     try:
         pipe = None if control is None else ControlPipe(control)

@@ -4,13 +4,12 @@ import math
 
 import pytest
 
-from armlink import objects, pdo
+from armlink import data_sheet, objects, pdo
 from armlink.armfile import Bus
 from armlink.bus import open_bus, parse_bus
 from armlink.device import interpolation
 from armlink.emcy import name_of, parse
 from armlink.errors import BadInput, BusFault
-from armlink.services import load_dictionary
 from armlink.units import units_from
 
 
@@ -94,7 +93,7 @@ def test_mapping_entries():
 
 
 def test_every_object_that_the_link_uses_is_in_the_data_sheet_with_its_size():
-    dictionary = load_dictionary()
+    dictionary = data_sheet.bundled()
     entries = [value for value in vars(objects).values() if isinstance(value, objects.Entry)]
     assert len(entries) > 30
     for entry in entries:

@@ -7,7 +7,7 @@ import canopen
 import numpy as np
 import pytest
 
-from armlink.objects import eds_path
+from armlink.data_sheet import bundled_path
 from sim_bus.bus import LockStepBus
 
 
@@ -21,7 +21,7 @@ def network() -> canopen.Network:
 
 
 def test_remote_node_reads_and_writes_objects(network: canopen.Network) -> None:
-    node = network.add_node(3, eds_path())
+    node = network.add_node(3, bundled_path())
     node.sdo.RESPONSE_TIMEOUT = 5.0
     assert node.sdo["Manufacturer device name"].raw == "armlink joint"
     assert node.sdo["Motor rated torque"].raw == 60_000
@@ -32,7 +32,7 @@ def test_remote_node_reads_and_writes_objects(network: canopen.Network) -> None:
 
 
 def test_remote_node_reads_maps_and_receives_pdos(network: canopen.Network) -> None:
-    node = network.add_node(3, eds_path())
+    node = network.add_node(3, bundled_path())
     node.sdo.RESPONSE_TIMEOUT = 5.0
     node.tpdo.read()
     assert [variable.name for variable in node.tpdo[1]] == ["Position actual value", "Torque sensor.Reading"]
