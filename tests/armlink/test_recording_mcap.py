@@ -111,25 +111,27 @@ def test_a_stream_decodes_as_single_messages_do():
         assert stream(some[choice]) == decode_joint_state(some[choice])
 
 
-def test_a_recording_cut_anywhere_loads_up_to_the_cut_and_says_so(tmp_path):
-    recording = recording_of()
+@pytest.mark.parametrize(("rows", "cuts"), [(3, None), (300, 40)])
+def test_a_recording_cut_anywhere_loads_up_to_the_cut_and_says_so(tmp_path, rows, cuts):
+    """The short one at every byte, the long one, of many chunks, at some."""
+    recording = recording_of(rows=rows)
     save_recording(recording, tmp_path / "whole.mcap")
     whole = (tmp_path / "whole.mcap").read_bytes()
-    rng = np.random.default_rng(0)
+    drawn = np.random.default_rng(0).integers(0, len(whole) - 8, cuts) if cuts else np.arange(len(whole))
     last = 0
-    for cut in sorted(rng.integers(0, len(whole) - 8, 60).tolist()):
+    for cut in sorted(drawn.tolist()):
         (tmp_path / "cut.mcap").write_bytes(whole[:cut])
         try:
             loaded = load_recording(tmp_path / "cut.mcap")
         except BadInput:
             assert last == 0  # cut before the first row
             continue
-        rows = loaded.t.size
-        assert rows >= last
-        last = rows
-        np.testing.assert_array_equal(loaded.position, recording.position[:rows])
-        assert f"loaded {rows} rows" in loaded.warning or rows == recording.t.size
-    assert last == recording.t.size
+        found = loaded.t.size
+        assert found >= last
+        last = found
+        np.testing.assert_array_equal(loaded.position, recording.position[:found])
+        assert f"loaded {found} rows" in loaded.warning or found == rows
+    assert last == rows
 
 
 def test_a_recorder_that_is_killed_loses_at_most_the_last_second(tmp_path):
