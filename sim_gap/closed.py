@@ -2,7 +2,6 @@
 
 import copy
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,15 +9,17 @@ import numpy as np
 from armlink.errors import BadInput
 from sim_gap.effects.base import across
 from sim_gap.estimate import Estimate
-from sim_gap.model import SimModel
+from sim_gap.model import SimModel, read_spec
 from sim_gap.normal import Term
 from sim_gap.rigid import Array, inertial_of
+from sim_gap.tendons import SharedMotor, add_to
 
 HELD = {
     "friction.coulomb": "joint frictionloss",
     "friction.viscous": "joint damping",
     "actuator.rotor_inertia": "joint armature",
     "transmission.spring": "joint stiffness and springref",
+    "transmission.coupling": "fixed tendon",
     "link.mass_moment": "body inertial",
     "link.inertia": "body inertial",
     "link.payload": "body inertial",
@@ -41,10 +42,14 @@ class Closed:
 
 def with_effects(sim: SimModel, estimate: Estimate | None) -> Closed:
     """A copy of the compiled model with the estimate's effects in it."""
-    model = copy.copy(sim.mujoco_model)
     if estimate is None:
-        return Closed(model, (), ())
-    held = tuple(term for term in estimate.terms if term.effect in HELD and not term.bound)
+        return Closed(copy.copy(sim.mujoco_model), (), ())
+    model, coupled = _base(sim, shared_motors(sim, estimate))
+    held = tuple(
+        term
+        for term in estimate.terms
+        if term.effect in HELD and not term.bound and (coupled or term.effect != "transmission.coupling")
+    )
     for term in held:
         c, joint = estimate.of(term), sim.joints[-1 if term.effect == "link.payload" else term.place]
         if term.effect == "link.mass_moment":
@@ -58,9 +63,43 @@ def with_effects(sim: SimModel, estimate: Estimate | None) -> Closed:
         elif term.effect == "base.tilt":
             turns = [-np.cross(axis, sim.arm.gravity) for axis in across(sim.arm.gravity)]
             model.opt.gravity[:] += np.stack(turns, axis=-1) @ c
-        else:
+        elif term.effect != "transmission.coupling":
             _joint(model, joint, term.effect, c)
     return Closed(model, held, tuple(term for term in estimate.terms if term not in held))
+
+
+def shared_motors(sim: SimModel, estimate: Estimate | None) -> list[SharedMotor]:
+    """The motors that turn with two joints."""
+    terms = [] if estimate is None else [t for t in estimate.terms if t.effect == "transmission.coupling"]
+    names = sim.arm.names
+    return [
+        SharedMotor(names[t.place], names[int(t.shape[0]) - 1], t.shape[1], *estimate.of(t).tolist())
+        for t in terms
+        if estimate is not None
+    ]
+
+
+def _base(sim: SimModel, motors: list[SharedMotor]) -> tuple[Any, bool]:
+    """A copy of the nominal model with these motors in it, and whether it can hold them (it came from a file)."""
+    if not motors or sim.path is None:
+        return copy.copy(sim.mujoco_model), False
+    spec = spec_of(sim)
+    add_to(spec, motors)
+    return spec.compile(), True
+
+
+def spec_of(sim: SimModel) -> Any:
+    """The nominal model's file as a `mujoco.MjSpec`, its elements numbered and its joints named.
+
+    Raises BadInput where the model did not come from a file.
+    """
+    if sim.path is None:
+        raise BadInput("--out-model: the model did not come from a file: give MJCF, URDF or an arm file with --sim")
+    spec = read_spec(sim.path)
+    spec.compile()
+    for name, joint in zip(sim.arm.names, sim.joints, strict=True):
+        spec.joints[joint].name = spec.joints[joint].name or name
+    return spec
 
 
 def _point(c: Array) -> Array:
@@ -113,71 +152,3 @@ def split(inertial: Array) -> tuple[float, Array, Array]:
     centre = inertial[1:4] / mass
     about = inertial[4:][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
     return mass, centre, about - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-
-
-def write_model(sim: SimModel, estimate: Estimate | None, path: Path) -> list[str]:
-    """Write the model with the effects as MJCF; returns a line per effect that MJCF cannot hold, also put in a comment.
-
-    Raises BadInput where the nominal model did not come from an MJCF or URDF file, or the file cannot be written.
-    """
-    import mujoco
-
-    if sim.path is None or sim.path.suffix in (".yaml", ".yml"):
-        raise BadInput(f"--out-model: {sim.path or 'the model'} is not MJCF or URDF: give such a file with --sim")
-    closed = with_effects(sim, estimate)
-    spec = mujoco.MjSpec.from_file(str(sim.path))
-    spec.compile()  # numbers the elements
-    for body in list(spec.bodies)[1:]:
-        _set_inertial(body, closed.model)
-    for joint in spec.joints:
-        _set_joint(joint, closed.model)
-    gains = _gains(sim, estimate)
-    driven = {actuator.target for actuator in spec.actuators}
-    for actuator in spec.actuators:
-        actuator.gear = [gains.get(actuator.target, 1.0) * actuator.gear[0], *actuator.gear[1:]]
-    spec.option.gravity = closed.model.opt.gravity
-    spec.compile()
-    lines = (
-        []
-        if estimate is None
-        else [
-            _line(sim, estimate, term)
-            for term in closed.not_held
-            if term.effect != "actuator.gain" or sim.arm.names[term.place] not in driven
-        ]
-    )
-    text = "".join(f"  {line}\n" for line in lines)
-    comment = f"<!-- Effects that MJCF cannot hold:\n{text}-->\n" if lines else ""
-    try:
-        path.write_text(comment + spec.to_xml(), encoding="utf-8")
-    except OSError as error:
-        raise BadInput(f"{path}: cannot be written: {error.strerror}") from None
-    return lines
-
-
-def _gains(sim: SimModel, estimate: Estimate | None) -> dict[str, float]:
-    """Torque made per torque commanded, by joint name."""
-    terms = [] if estimate is None else [term for term in estimate.terms if term.effect == "actuator.gain"]
-    return {sim.arm.names[t.place]: estimate.parameters(t)["gain"].value for t in terms if estimate is not None}
-
-
-def _line(sim: SimModel, estimate: Estimate, term: Term) -> str:
-    values = estimate.parameters(term)
-    where = f"in recording {term.bound}" if term.bound else sim.arm.names[term.place]
-    return f"{term.effect} {where} " + ", ".join(f"{k} {v.value:.6g} {v.unit}" for k, v in values.items())
-
-
-def _set_inertial(body: Any, model: Any) -> None:
-    i = body.id
-    body.explicitinertial = True
-    body.mass, body.ipos, body.iquat = float(model.body_mass[i]), model.body_ipos[i], model.body_iquat[i]
-    body.inertia = model.body_inertia[i]
-    body.fullinertia = [np.nan] * 6
-
-
-def _set_joint(joint: Any, model: Any) -> None:
-    dof, adr = model.jnt_dofadr[joint.id], model.jnt_qposadr[joint.id]
-    joint.frictionloss, joint.armature = float(model.dof_frictionloss[dof]), float(model.dof_armature[dof])
-    joint.damping[0] = float(np.reshape(model.dof_damping, (model.nv, -1))[dof, 0])
-    joint.stiffness[0] = float(np.reshape(model.jnt_stiffness, (model.njnt, -1))[joint.id, 0])
-    joint.springref = float(model.qpos_spring[adr])

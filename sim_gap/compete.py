@@ -85,15 +85,14 @@ def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
 
 def _between(data: ResidualSet, term: Term) -> tuple[int, float, float] | None:
     """The free entry of a term's shape and its neighbours on the starting grid; None where there is none."""
-    effect = effects()[term.effect]
-    free = [i for i in range(len(term.shape)) if i not in effect.counted]
-    if effect.secant or len(free) != 1:
+    free = term.free
+    if free is None:
         return None
-    grid = sorted({shape[free[0]] for shape in effect.grid(data.signals, term.place)})
-    value = term.shape[free[0]]
+    grid = sorted({shape[free] for shape in effects()[term.effect].grid(data.signals, term.place)})
+    value = term.shape[free]
     lower, upper = [x for x in grid if x < value - 1e-9], [x for x in grid if x > value + 1e-9]
     beyond = sorted((0.5 * value, 1.5 * value))
-    return free[0], (lower[-1] if lower else beyond[0]), (upper[0] if upper else beyond[1])
+    return free, (lower[-1] if lower else beyond[0]), (upper[0] if upper else beyond[1])
 
 
 def secants(store: ColumnStore, active: list[Term]) -> list[Term]:

@@ -24,6 +24,8 @@ from sim_gap.verdict import is_quiet, share_left, verdict
 
 OWN_HELDOUT = 0.3
 """Share at the end of each training recording that is kept for judging where no other motion is given."""
+OWN_HELDOUT_S = 3.0
+"""It is at least so long [s], or half of a short recording."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +129,8 @@ def _names(recording: Recording) -> tuple[str, ...]:
 def _split(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Recording]]:
     first, last = [], []
     for recording in recordings:
-        cut = recording.t[0] + (1.0 - OWN_HELDOUT) * (recording.t[-1] - recording.t[0])
+        span = recording.t[-1] - recording.t[0]
+        cut = recording.t[-1] - max(OWN_HELDOUT * span, min(OWN_HELDOUT_S, 0.5 * span))
         first.append(slice_rows(recording, recording.t < cut))
         last.append(slice_rows(recording, recording.t >= cut))
     return first, last

@@ -55,7 +55,7 @@ class Estimate:
         """Per row: weight, columns with shape derivatives (k, P + S), residual (k,), block (k,)."""
         data, out = self.store.data, []
         weights = self.normal.weights(self.normal.mean_square(self.index, self.coefficients))
-        shaped = [(term, i) for term in self.terms for i in range(len(term.shape)) if self._smooth(term)]
+        shaped = [(term, term.free) for term in self._shaped]
         for weight, row in zip(weights, self.normal.rows, strict=True):
             valid = data.valid[row]
             x = np.zeros((len(valid), self.normal.size + len(shaped)))
@@ -64,15 +64,16 @@ class Estimate:
                     x[:, self.normal.at[term]] = columns[row]
             for k, (term, i) in enumerate(shaped):
                 if row in self.store.columns(term):
+                    assert i is not None
                     x[:, self.normal.size + k] = self._shape_slope(term, i, row)
             residual = data.values[row] - x[:, : self.normal.size] @ self.coefficients
             out.append((float(weight), x[valid], residual[valid], data.blocks[valid]))
         return out
 
-    @staticmethod
-    def _smooth(term: Term) -> bool:
-        effect = effects()[term.effect]
-        return len(term.shape) == 1 and not effect.secant and not effect.counted
+    @cached_property
+    def _shaped(self) -> list[Term]:
+        """Terms one of whose shape's entries was fitted."""
+        return [term for term in self.terms if term.free is not None]
 
     def _shape_slope(self, term: Term, i: int, row: Row) -> Array:
         step = SHAPE_STEP * abs(term.shape[i])
@@ -103,23 +104,22 @@ class Estimate:
         """Reported parameters with 95 % intervals."""
         effect = effects()[term.effect]
         beneath = {other.effect: other for other in self.terms if other.key in term.beneath}
-        shaped = [other for other in self.terms if other.shape and self._smooth(other)]
+        shaped, free = self._shaped, term.free
         chosen = [*self.normal.at[term], *(i for other in beneath.values() for i in self.normal.at[other])]
         if term in shaped:
             chosen.append(self.normal.size + shaped.index(term))
         own = len(self.normal.at[term])
 
         def evaluate(z: Array) -> Array:
-            shape = (float(z[-1]),) if term in shaped else term.shape
+            shape = term.shape if free is None else term.reshaped(free, float(z[-1])).shape
             under, at = {"nominal": self.normal.known_friction[term.place, None]}, own
             for name, other in beneath.items():
                 width = len(self.normal.at[other])
                 under[name], at = z[at : at + width], at + width
             return np.asarray(effect.values(z[:own], shape, under), float)
 
-        start = np.concatenate(
-            [self.of(term), *(self.of(other) for other in beneath.values()), term.shape if term in shaped else ()]
-        )
+        size = () if free is None else (term.shape[free],)
+        start = np.concatenate([self.of(term), *(self.of(other) for other in beneath.values()), size])
         centre, steps = evaluate(start), 1e-5 * np.maximum(np.abs(start), 1e-3)
         slopes = [
             (evaluate(start + d) - evaluate(start - d)) / (2 * s) for s, d in zip(steps, np.diag(steps), strict=True)

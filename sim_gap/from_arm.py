@@ -7,8 +7,8 @@ from armlink.armfile import load_arm
 from armlink.errors import BadInput
 
 
-def nominal_model(path: Path) -> Any:
-    """Compile the arm file at a path (or the bundled arm of that name) to a `mujoco.MjModel`, effects left out.
+def nominal_spec(path: Path) -> Any:
+    """The arm file at a path (or the bundled arm of that name) as a `mujoco.MjSpec`, effects left out.
 
     Raises BadInput where the file carries no masses.
     """
@@ -17,11 +17,12 @@ def nominal_model(path: Path) -> Any:
         from sim_bus.effects.state import Imperfections
         from sim_bus.mjcf import build_model
 
-        model = build_model(arm, Imperfections(arm.joint_names)).model
-        model.dof_frictionloss[:] = 0.0  # the plant sets its friction as it runs
-        return model
+        spec = build_model(arm, Imperfections(arm.joint_names)).spec
+        for joint in spec.joints:
+            joint.frictionloss = 0.0  # the plant sets its friction as it runs
+        return spec
     if arm.model_path is None:
         raise BadInput(f"{path}: carries no masses: give kinematics.model (URDF or MJCF), a sim section, or --sim MJCF")
-    from sim_gap.model import compiled
+    from sim_gap.model import read_spec
 
-    return compiled(arm.model_path)
+    return read_spec(arm.model_path)

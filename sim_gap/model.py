@@ -1,6 +1,6 @@
 """The simulation model: MJCF, URDF or an arm file, compiled by MuJoCo, its joints matched to a recording's."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -59,20 +59,28 @@ def load_model(source: Any, names: tuple[str, ...] = (), count: int | None = Non
 
 def compiled(path: Path) -> Any:
     """Compile an MJCF, URDF or arm file (by path or bundled name) to a `mujoco.MjModel`. Raises BadInput."""
+    try:
+        return read_spec(path).compile()
+    except ValueError as error:
+        raise BadInput(f"{path}: MuJoCo cannot compile it: {error}") from None
+
+
+def read_spec(path: Path) -> Any:
+    """Read an MJCF, URDF or arm file (by path or bundled name) as a `mujoco.MjSpec`. Raises BadInput."""
     import mujoco
 
     from armlink.armfile import bundled_arms
 
     if path.suffix in (".yaml", ".yml") or str(path) in bundled_arms():
-        from sim_gap.from_arm import nominal_model
+        from sim_gap.from_arm import nominal_spec
 
-        return nominal_model(path)
+        return nominal_spec(path)
     if not path.is_file():
         raise BadInput(f"no model file {path}: give an MJCF, URDF or arm file")
     try:
-        return mujoco.MjModel.from_xml_path(str(path))
+        return mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
-        raise BadInput(f"{path}: MuJoCo cannot compile it: {error}") from None
+        raise BadInput(f"{path}: MuJoCo cannot read it: {error}") from None
 
 
 def _check(model: Any, joints: list[int], arm: RigidArm, label: str) -> None:
@@ -82,7 +90,10 @@ def _check(model: Any, joints: list[int], arm: RigidArm, label: str) -> None:
     data, random = mujoco.MjData(model), np.random.default_rng(0)
     adr, dof = model.jnt_qposadr[list(joints)], model.jnt_dofadr[list(joints)]
     flags, model.opt.disableflags = model.opt.disableflags, model.opt.disableflags | _WITHOUT_CONTACT
-    loss, model.dof_frictionloss[:] = model.dof_frictionloss.copy(), 0.0
+    losses = [(loss, loss.copy()) for loss in (model.dof_frictionloss, model.tendon_frictionloss)]
+    for loss, _ in losses:
+        loss[:] = 0.0
+    arm = replace(arm, tendons=replace(arm.tendons, frictionloss=0.0 * arm.tendons.frictionloss))
     try:
         q, v, a = (random.uniform(-1, 1, (3, arm.n)) for _ in range(3))
         for row in range(3):
@@ -95,11 +106,13 @@ def _check(model: Any, joints: list[int], arm: RigidArm, label: str) -> None:
             if abs(ours[worst] - data.qfrc_inverse[dof][worst]) > 1e-6 * (1.0 + np.abs(ours).max()):
                 raise BadInput(
                     f"{label}: joint {arm.names[worst]}: the model's torque is {data.qfrc_inverse[dof][worst]:.6g} "
-                    f"N·m, its rigid chain gives {ours[worst]:.6g}: expected a plain hinge chain (no tendons, gravity "
-                    "compensation, fluid forces or joint couplings)"
+                    f"N·m, its rigid chain gives {ours[worst]:.6g}: expected a plain hinge chain (no springs between "
+                    "joints, gravity compensation, fluid forces or joint equalities)"
                 )
     finally:
-        model.opt.disableflags, model.dof_frictionloss[:] = flags, loss
+        model.opt.disableflags = flags
+        for loss, was in losses:
+            loss[:] = was
 
 
 _WITHOUT_CONTACT = 1 | (1 << 4) | (1 << 3)  # mjDSBL_CONSTRAINT, CONTACT, LIMIT

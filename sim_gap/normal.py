@@ -34,6 +34,13 @@ class Term:
         """The same term with one entry of its shape changed."""
         return Term(self.effect, self.place, (*self.shape[:entry], value, *self.shape[entry + 1 :]))
 
+    @property
+    def free(self) -> int | None:
+        """The one entry of its shape that is fitted beside its coefficients; None where there is none."""
+        effect = effects()[self.effect]
+        entries = [i for i in range(len(self.shape)) if i not in effect.counted]
+        return entries[0] if len(entries) == 1 and not effect.secant else None
+
     def covers(self, layout: Layout) -> tuple[tuple[str, int], ...]:
         """Keys of the terms that it contains."""
         return effects()[self.effect].covers(layout, self.place)

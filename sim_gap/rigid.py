@@ -12,7 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_gap.tendons import Tendons, tendons_of
+
 Array = NDArray[np.float64]
+CREEP = 0.01
+"""Speed [rad/s] below which the sign of a velocity means nothing and friction may take any value."""
 INERTIAL = ("mass", "mx", "my", "mz", "ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
@@ -41,6 +45,8 @@ class RigidArm:
     stiffness: Array
     rest: Array
     """The nominal joints' own motor-side terms, (n,) each: kg·m², N·m·s/rad, N·m, N·m/rad, rad."""
+    tendons: Tendons
+    """Motors that turn with several joints."""
 
     @property
     def n(self) -> int:
@@ -120,12 +126,13 @@ class RigidArm:
         return turns, moves
 
     def nominal_joint_torque(self, q: Array, v: Array, a: Array, direction: Array) -> Array:
-        """What the nominal model's joints add on the motor side: armature, damping, friction loss, spring (K, n).
+        """What the nominal joints add on the motor side: armature, damping, friction loss, spring, tendons (K, n).
 
         `direction` is the sign of the velocity, however it is smoothed around rest.
         """
         spring = self.stiffness * (q - self.rest)
-        return self.armature * a + self.damping * v + self.frictionloss * direction + spring
+        own = self.armature * a + self.damping * v + self.frictionloss * direction + spring
+        return np.asarray(own + self.tendons.torque(v, a, CREEP))
 
 
 def _link_columns(axis: Array, lever: Array, omega: Array, alpha: Array, push: Array) -> Array:
@@ -215,6 +222,7 @@ def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:
         frictionloss=model.dof_frictionloss[dof].copy(),
         stiffness=np.reshape(model.jnt_stiffness, (model.njnt, -1))[list(joints), 0].copy(),
         rest=model.qpos_spring[adr].copy(),
+        tendons=tendons_of(model, joints),
     )
 
 

@@ -9,9 +9,9 @@ from rich.table import Table
 
 from armlink.errors import BadInput
 from armlink.recording import load_recording
-from sim_gap.closed import write_model
 from sim_gap.diagnose import diagnose
 from sim_gap.diagnosis import Diagnosis
+from sim_gap.export import write_model
 from sim_gap.wording import sentence
 
 

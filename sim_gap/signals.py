@@ -14,7 +14,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from armlink.errors import BadInput
 from armlink.recording import Recording
-from sim_gap.rigid import Array, RigidArm
+from sim_gap.rigid import CREEP, Array, RigidArm
 
 BAND_HZ = 6.0
 """Pass band in which model and recording are compared."""
@@ -26,8 +26,6 @@ WORK_HZ = 125.0
 """Highest rate at which columns are computed; faster recordings are low-passed and decimated to it."""
 TRIM_S = 0.3
 """Cut at both ends after filtering."""
-CREEP = 0.01
-"""Speed [rad/s] below which the sign of a velocity means nothing and friction may take any value."""
 SHORTEST_S = 3.0
 SLOW_HZ = 60.0
 """Below this rate a recorded velocity is used; above, positions are differentiated, for drives report velocity late."""
@@ -162,7 +160,6 @@ def prepare(recording: Recording, arm: RigidArm, label: str = "recording") -> Si
     """Make a recording ready for comparison with `arm`. Raises BadInput where it cannot be used, saying why."""
     if recording.n != arm.n:
         raise BadInput(f"{label}: has {recording.n} joints, the model {arm.n}: give the model of the recorded arm")
-    require_length(recording, label)
     raw_step = float(np.median(np.diff(recording.t)))
     even = np.arange(recording.t[0], recording.t[-1] + 0.5 * raw_step, raw_step)
     stride = max(1, int(1.0 / raw_step / WORK_HZ + 0.1))

@@ -31,7 +31,7 @@ from sim_gap.demo.show import calibration_table, drift_line, gap_line, verify_ta
 from sim_gap.demo.summary import DemoResult, summary
 from sim_gap.diagnose import diagnose
 from sim_gap.diagnosis import Diagnosis
-from sim_gap.from_arm import nominal_model
+from sim_gap.model import compiled
 
 TRAIN_SECONDS, HELDOUT_SECONDS = 40.0, 25.0
 """Length of the gap's recordings [s]."""
@@ -152,7 +152,7 @@ def _record(
 
 def _diagnose(arm_path: Path, recordings: tuple[Recording, Recording]) -> Diagnosis:
     """In the other process: the recordings against the arm's nominal model."""
-    return diagnose(nominal_model(arm_path), recordings[:1], recordings[1:], labels=["train", "heldout"])
+    return diagnose(compiled(arm_path), recordings[:1], recordings[1:], labels=["train", "heldout"])
 
 
 def _fresh(out: Path) -> Path:

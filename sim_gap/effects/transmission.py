@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from sim_gap.effects.registry import Columns, Effect, Layout, Parameter, Shape
-from sim_gap.rigid import Array
-from sim_gap.signals import CREEP, Signals
+from sim_gap.rigid import CREEP, Array
+from sim_gap.signals import Signals
 
 
 class Ripple(Effect):
