@@ -16,6 +16,8 @@ from typing import Any
 from armlink.errors import BadInput
 
 SCHEMA = 1
+CACHE_KB = 256
+"""Pages of the file that SQLite keeps in memory: its own 2 MB would fill over days, as if memory leaked."""
 _TABLES = """
 CREATE TABLE IF NOT EXISTS events (
     id INTEGER PRIMARY KEY AUTOINCREMENT, time TEXT NOT NULL, t REAL NOT NULL, kind TEXT NOT NULL, joint TEXT,
@@ -70,7 +72,7 @@ class Journal:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._db = sqlite3.connect(path, isolation_level=None, timeout=10.0)
-            for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON"):
+            for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", f"cache_size=-{CACHE_KB}"):
                 self._db.execute(f"PRAGMA {pragma}")
             version = self._db.execute("PRAGMA user_version").fetchone()[0]
             if version not in (0, SCHEMA):
