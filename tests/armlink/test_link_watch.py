@@ -57,7 +57,7 @@ def test_another_controller_than_the_arm_file_states_is_refused(arm_of, bus, key
             Refused, match=rf"joint_1 \(node 1\): .*1018h:0{sub} .* is {found}, expected 0x1234"
         ) as caught:
             link.start()
-        assert "connect the right arm, or correct identity of this joint under link.joints" in str(caught.value)
+        assert "connect the right arm, or correct identity or eds of this joint under link.joints" in str(caught.value)
     assert not [data for can_id, data in bus.sent if can_id == 0x601 and data[0] & 0xE0 == 0x20]  # nothing was written
 
 

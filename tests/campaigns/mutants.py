@@ -48,7 +48,7 @@ EXPLAINED = {
 SLOW = "whoever_calls"
 """Tests by this name run only on mutants that the others did not notice."""
 SECONDS = 120
-"""A mutant that takes longer hangs [s], and is noticed by that."""
+"""A mutant that takes more processor time hangs [s], and is noticed by that."""
 SWAPS: dict[type, tuple[type, ...]] = {
     ast.Lt: (ast.LtE, ast.GtE),
     ast.LtE: (ast.Lt, ast.Gt),
@@ -180,7 +180,7 @@ def noticed(target: str, source: str, tests: list[str]) -> bool:
     """Whether the tests fail, or hang, on a mutant's source; each runs in a child of this process."""
     child = os.fork()
     if child == 0:
-        signal.alarm(SECONDS)
+        signal.setitimer(signal.ITIMER_PROF, SECONDS)
         silent = os.open(os.devnull, os.O_WRONLY)
         os.dup2(silent, 1)
         os.dup2(silent, 2)
