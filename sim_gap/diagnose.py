@@ -146,10 +146,16 @@ def _notes(data: ResidualSet) -> tuple[str, ...]:
 
 
 def _bound(estimate: Estimate | None, data: ResidualSet) -> tuple[str, ...]:
-    """A line for what is in one recording alone."""
+    """A line for what is in one recording alone, and for a payload that could be in part the links' own weight."""
     terms = () if estimate is None else estimate.terms
     labels = {s.number: s.label for s in data.signals}
-    return tuple(f"{term.effect} is in {labels[term.bound]} alone" for term in terms if term.bound)
+    lines = [f"{term.effect} is in {labels[term.bound]} alone" for term in terms if term.bound]
+    if any(term.effect == "link.payload" and not term.bound for term in terms):
+        lines.append(
+            "link.payload: what the links themselves weigh beyond the model counts to it; recordings of the arm "
+            "without the payload, given as well (--train), tell the two apart"
+        )
+    return tuple(lines)
 
 
 def _hits(data: ResidualSet) -> tuple[str, ...]:

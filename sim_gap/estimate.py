@@ -13,7 +13,12 @@ from sim_gap.residual import ResidualSet
 from sim_gap.rigid import Array
 from sim_gap.select import Search
 
+NOMINAL, WORSE, WORST = 0.01, 0.5, 0.2
+"""Error that the nominal mass moments of all links may have unfound, as a share; where some link's was found wrong, it
+is this share of the largest such error, up to the last."""
 SHAPE_STEP = 1e-2
+SHORT_M = 0.01
+"""A link's centre of mass counts as at least so far from its joint's axis where errors of its moment are judged [m]."""
 SYSTEMATIC = 0.3
 """Share of a row's residual, and of what is not worth explaining, that may pass for any effect however long one
 records."""
@@ -86,7 +91,8 @@ class Estimate:
     @cached_property
     def covariance(self) -> Array:
         """Of coefficients and smooth shapes, (P + S, P + S): sandwich over blocks of time, and what the rest of the arm
-        being a little wrong adds: an error of SYSTEMATIC times each row's residual that follows the column itself."""
+        being a little wrong adds: an error of SYSTEMATIC times each row's residual that follows the column itself, and
+        mass moments of links that are wrong unfound."""
         size = self._jacobian[0][1].shape[1]
         bread, scores = np.zeros((size, size)), np.zeros((int(self.store.data.blocks.max()) + 1, size))
         for weight, x, residual, block in self._jacobian:
@@ -98,7 +104,43 @@ class Estimate:
         blocks = max(len(scores), 2)
         seen = sum(len(residual) for _, _, residual, _ in self._jacobian) / max(len(self._jacobian), 1)
         systematic = SYSTEMATIC**2 * seen / CORRELATED * inverse
-        return np.asarray(inverse @ (scores.T @ scores) @ inverse * blocks / (blocks - 1) + systematic)
+        statistical = inverse @ (scores.T @ scores) @ inverse * blocks / (blocks - 1)
+        return np.asarray(statistical + systematic + self._unfound(inverse))
+
+    def _unfound(self, inverse: Array) -> Array:
+        """What mass moments z of links that are wrong, but were not found so, add to the covariance, (P + S, P + S).
+
+        They pull the coefficients by A⁻¹ XᵀW Z z, A⁻¹ being `inverse`; of z is known what is usual, and what the
+        residual says: its mean square about zero given both.
+        """
+        links, scale = self._other_links()
+        size = len(scale)
+        if not size:
+            return np.zeros_like(inverse)
+        pull, own, seen = np.zeros((len(inverse), size)), np.eye(size), np.zeros(size)
+        for (weight, x, residual, _), row in zip(self._jacobian, self.normal.rows, strict=True):
+            z, valid = np.zeros((len(residual), size)), self.store.data.valid[row]
+            for k, link in enumerate(links):
+                if row in (columns := self.store.columns(Term("link.mass_moment", link))):
+                    z[:, 3 * k : 3 * k + 3] = columns[row][valid]
+            z *= scale
+            pull += weight * x.T @ z
+            own += weight * z.T @ z
+            seen += weight * z.T @ residual
+        moved = inverse @ pull
+        spread = np.linalg.inv(own - pull.T @ moved)
+        mean = spread @ seen
+        return np.asarray(moved @ (spread + np.outer(mean, mean)) @ moved.T)
+
+    def _other_links(self) -> tuple[list[int], Array]:
+        """Links whose mass moment is no term, and how wrong each component of it usually is [kg·m], (3 L,)."""
+        arm = self.store.data.signals[0].arm
+        found = {term.place: self.of(term) for term in self.terms if term.effect == "link.mass_moment"}
+        usual = np.maximum(np.linalg.norm(arm.inertial[:, 1:4], axis=1), SHORT_M * arm.inertial[:, 0])
+        wrong = max((float(np.linalg.norm(found[link]) / usual[link]) for link in found), default=0.0)
+        share = min(max(NOMINAL, WORSE * wrong), WORST)
+        links = [link for link in range(arm.n) if link not in found]
+        return links, np.repeat(share * usual[links], 3)
 
     def parameters(self, term: Term) -> dict[str, Value]:
         """Reported parameters with 95 % intervals."""

@@ -1,9 +1,10 @@
-"""Figures of a diagnosis: gap before and after, residual against velocity, position, time with the fitted effects."""
+"""Figures of a diagnosis: gap before and after; residual over velocity, position, load, time, and what is explained."""
 
 from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
+from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
 from sim_gap.diagnosis import Diagnosis, Rollout
@@ -61,34 +62,45 @@ def rollout_bars(names: tuple[str, ...], rollout: Rollout) -> Any:
 
 
 def residual_panels(answer: Diagnosis, channel: str) -> Any:
-    """One row a joint; residual of `channel` against velocity, position and time; None where nothing can be drawn."""
+    """One row a joint; residual of `channel` against velocity, position, load and time; None where there is nothing."""
     data, estimate = answer.internals.heldout, answer.internals.estimate
     explained = estimate.predict(data) if estimate is not None else None
     joints = [j for j in range(data.layout.n) if data.valid[channel, j].sum() > 10]
     if not joints:
         return None
-    titles = [f"{answer.names[j]} against {what}" for j in joints for what in ("velocity", "position", "time")]
+    columns = [("velocity [rad/s]", "v"), ("position [rad]", "q"), ("model torque [N·m]", "model")]
+    titles = [name for j in joints for name in (answer.names[j], *[""] * len(columns))]
     figure = make_subplots(
-        rows=len(joints), cols=3, subplot_titles=titles, vertical_spacing=0.32 / len(joints), horizontal_spacing=0.06
+        rows=len(joints),
+        cols=len(columns) + 1,
+        subplot_titles=titles,
+        vertical_spacing=0.32 / len(joints),
+        horizontal_spacing=0.04,
+        shared_yaxes=True,
     )
-    axes = [np.concatenate([s.filtered(x) for s, x in zip(data.signals, xs, strict=True)]) for xs in _xs(data)]
+    sides = [stacked(data, name) for _, name in columns]
     for line, j in enumerate(joints, start=1):
-        chosen = _thinned(data.valid[channel, j])
-        for column, x in enumerate((axes[0][:, j], axes[1][:, j], data.time), start=1):
-            _panel(
-                figure,
-                line,
-                column,
-                x[chosen],
-                data.values[channel, j][chosen],
-                None if explained is None else explained[channel, j][chosen],
-            )
-    for column, label in enumerate(("velocity [rad/s]", "position [rad]", "time [s]"), start=1):
+        chosen = thinned(data.valid[channel, j])
+        left, fit = data.values[channel, j][chosen], None if explained is None else explained[channel, j][chosen]
+        for column, x in enumerate((*(side[:, j] for side in sides), data.time), start=1):
+            _panel(figure, line, column, x[chosen], left, fit)
+    for column, label in enumerate((*(label for label, _ in columns), "time [s]"), start=1):
         figure.update_xaxes(title_text=label, row=len(joints), col=column)
     figure.update_yaxes(title_text="N·m", col=1)
-    figure.update_annotations(font_size=12)
+    figure.update_annotations(font_size=13, x=0, xanchor="left")
     figure.update_layout(height=90 + 210 * len(joints), showlegend=False)
     return figure
+
+
+def stacked(data: ResidualSet, name: str) -> Array:
+    """A quantity of the signals (`v`, `q`, `a`, `model`) at the rate of the comparison, recordings in a row, (K, n)."""
+    return np.concatenate([s.filtered(getattr(s, name)) for s in data.signals])
+
+
+def thinned(valid: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Places of the samples that are drawn: some hundreds of the valid ones."""
+    rows = np.flatnonzero(valid)
+    return rows[:: max(1, len(rows) // POINTS)]
 
 
 def _panel(figure: Any, row: int, column: int, x: Array, residual: Array, explained: Array | None) -> None:
@@ -100,12 +112,3 @@ def _panel(figure: Any, row: int, column: int, x: Array, residual: Array, explai
                 row=row,
                 col=column,
             )
-
-
-def _thinned(valid: Any) -> Any:
-    rows = np.flatnonzero(valid)
-    return rows[:: max(1, len(rows) // POINTS)]
-
-
-def _xs(data: ResidualSet) -> tuple[list[Array], list[Array]]:
-    return [s.v for s in data.signals], [s.q for s in data.signals]

@@ -7,6 +7,7 @@ from typing import Any
 from calib.report.page import ReportTable, Section, paragraph, render
 from sim_gap.diagnosis import Cause, Diagnosis
 from sim_gap.figures import gap_bars, residual_panels, rollout_bars
+from sim_gap.findings import finding_figure
 from sim_gap.wording import PLAIN, sentence
 
 
@@ -14,7 +15,7 @@ def sections(answer: Diagnosis) -> list[Section]:
     """Sections for a page of its own or within another report."""
     out = [_verdict(answer), _gap(answer)]
     if answer.internals is not None:
-        out += _residuals(answer)
+        out += [*_findings(answer), *_residuals(answer)]
     return out
 
 
@@ -90,6 +91,19 @@ def _gap(answer: Diagnosis) -> Section:
     if answer.rollout is not None:
         figures.append(rollout_bars(answer.names, answer.rollout))
     return Section("How far it closes", paragraph(text), figures, [ReportTable(header, rows)])
+
+
+def _findings(answer: Diagnosis) -> list[Section]:
+    """A figure for every cause."""
+    figures = [finding_figure(answer, cause) for cause in answer.causes]
+    shown = [figure for figure in figures if figure is not None]
+    if not shown:
+        return []
+    text = (
+        "Each cause where it explains most, on the other motion: grey is the residual less all other causes, orange "
+        "what this cause makes of it. Where it is right, orange lies in the middle of grey."
+    )
+    return [Section("The causes one by one", paragraph(text), shown)]
 
 
 def _residuals(answer: Diagnosis) -> list[Section]:
