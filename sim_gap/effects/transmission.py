@@ -9,6 +9,10 @@ from sim_gap.rigid import CREEP, Array
 from sim_gap.signals import Signals
 
 
+ALWAYS, MOST, SLOWLY = 24, 64, 0.25
+"""Ripple is searched for up to so many cycles a radian: in any case, and at most where a joint turns slowly enough."""
+
+
 class Ripple(Effect):
     """Motor torque that varies with the position of the gear's teeth: amplitude·sin(cycles·q + phase)."""
 
@@ -19,7 +23,14 @@ class Ripple(Effect):
         angle = shape[0] * signals.q[:, place]
         return {(layout.motor_side, place): np.column_stack([np.sin(angle), np.cos(angle)])}
 
-    shapes = tuple((float(cycles),) for cycles in range(4, 25, 2))
+    def grid(self, signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
+        """Up to ALWAYS cycles a radian, and up to MOST as far as the joint turns slowly enough to show them in the band
+        during a share SLOWLY of its motion.
+        """
+        speed = np.concatenate([np.abs(s.v[s.moving[:, place] > 0, place]) for s in signals])
+        slow = float(np.quantile(speed, SLOWLY)) if len(speed) else np.inf
+        shown = 2.0 * np.pi * min(s.band for s in signals) / max(slow, CREEP)
+        return tuple((float(cycles),) for cycles in range(4, int(min(max(shown, ALWAYS), MOST)) + 1, 2))
 
     def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
         return np.array([np.hypot(*coefficients), shape[0], np.arctan2(coefficients[1], coefficients[0])])

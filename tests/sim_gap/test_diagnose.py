@@ -63,6 +63,14 @@ def test_two_effects_on_different_sides_are_both_found():
     assert {cause.effect for cause in answer.causes if cause.confidence > 0.8} == {"friction.coulomb", "torque.gain"}
 
 
+def test_ripple_of_many_teeth_is_found_where_the_joint_turns_slowly_enough():
+    """A harmonic drive of ratio 100: two waves a turn of the motor, 32 a radian of the joint."""
+    answer = told(Wrong(ripple=at(1, 0.6), cycles=100 / np.pi))
+    assert answer.causes[0].effect == "transmission.ripple"
+    assert value(answer, "joint_2", "cycles") == pytest.approx(100 / np.pi, rel=0.01)
+    assert value(answer, "joint_2", "amplitude") == pytest.approx(0.6, rel=0.1)
+
+
 @pytest.mark.parametrize("channels", [BOTH, MOTOR])
 def test_a_true_model_has_no_gap(channels):
     answer = told(Wrong(), channels)
