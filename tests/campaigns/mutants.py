@@ -42,6 +42,8 @@ EXPLAINED = {
     "(0 if acknowledged else NEW_SET_POINT)': 0 becomes 1": "bit 0 is set by enable already",
     "bool(supported >> (mode - 1) & 1))': 32 becomes 33": "6502h has 32 bits: there is none for mode 33",
     "0.0 becomes 1.0": "stands for a mode that needs no number; any finite one does",
+    "value if lower <= value <= upper else max(lower, min(upper, value))': condition always false": "the quick way out",
+    "value if lower <= value <= upper else max(lower, min(upper, value))': LtE becomes Lt": "max and min do the same",
     "'return \"\"': returns None": "asked only whether it is true; the field of Passed has its own default",
 }
 """Part of a mutant's description → why no test can tell it from the original."""
