@@ -18,7 +18,7 @@ from armlink.clock import Clock, MonotonicClock
 from armlink.loop import Loop
 from armlink.monitor import assumed_units
 from armlink.pdo import RPDO1
-from armlink.port import open_port
+from armlink.port import GroupPort, open_port
 from armlink.sample import Array, Calibration, Sample, Stats
 from armlink.services import NodeServices, PumpedNetwork, joint_services
 
@@ -38,7 +38,10 @@ class Listener:
         self.n, self.period = len(self.names), 1.0 / section.rate
         own_clock: Clock | None = getattr(bus, "clock", None)
         self.clock: Clock = clock or own_clock or MonotonicClock()
-        self._loop = Loop(open_port(bus), self.clock, self.nodes, 0, self.period, own_clock is not None)
+        port = open_port(bus)
+        if isinstance(port, GroupPort):
+            port.one_sync = True
+        self._loop = Loop(port, self.clock, self.nodes, 0, self.period, own_clock is not None)
         units = assumed_units(arm)
         self._loop.set_units(units)
         self._loop.on_other = self._take

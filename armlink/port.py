@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import can
 
 from armlink.errors import BusFault
+from armlink.objects import SYNC_ID
 
 Frame = tuple[int, bytes]
 
@@ -133,6 +134,8 @@ class GroupPort:
         self._ports = tuple(open_port(bus) for bus in group.members)
         self._of_node: dict[int, Port] = {node: self._ports[index] for node, index in group.route.items()}
         self._numbers = [port.fileno() for port in self._ports if hasattr(port, "fileno")]
+        self.one_sync = False
+        """For a listener: the SYNC of the first bus stands for all, where a controller sends one on each."""
 
     @property
     def errors(self) -> int:
@@ -171,8 +174,8 @@ class GroupPort:
         return None
 
     def _poll(self, timeout: float) -> Frame | None:
-        for port in self._ports:
+        for index, port in enumerate(self._ports):
             frame = port.receive(timeout)
-            if frame is not None:
+            if frame is not None and not (index and self.one_sync and frame[0] == SYNC_ID):
                 return frame
         return None

@@ -47,8 +47,9 @@ def daemon(
     from armlink.armfile import load_arm
     from armlink.bus import resolve_bus
     from armlink.errors import BadInput
+    from calib.daemon.host import ChildHost
     from calib.daemon.logs import log_as_json
-    from calib.daemon.run import Options, run_daemon, state_directory
+    from calib.daemon.options import Options, state_directory
 
     described = load_arm(arm)
     resolve_bus(bus, described.require_link().bus)
@@ -67,12 +68,14 @@ def daemon(
         tcp=address,
         token=token,
         policy=None if policy is None else policy.value,
-        state=directory,
         store=store,
         work=work,
     )
     log_as_json()
-    run_daemon(options, described, directory)
+    host = ChildHost(options.loop(described), fork=True)
+    from calib.daemon.run import run_daemon  # which takes long to load: the bus process opens the bus meanwhile
+
+    run_daemon(options, described, directory, host)
     return 0
 
 

@@ -91,15 +91,15 @@ class ServiceView:
         return tuple(EventRecord(**row) for row in self._service.journal.events(after, limit))
 
     def history(
-        self, joint: str, since: datetime | None = None, until: datetime | None = None, most: int = 2000
+        self, joint: str | None, since: datetime | None = None, until: datetime | None = None, most: int = 2000
     ) -> tuple[HistoryPoint, ...]:
         """Estimates over time, oldest first; raises NoSuch."""
         names = self._service.names
-        if joint not in names:
+        if joint is not None and joint not in names:
             raise NoSuch(f"no joint {joint!r}; there are {', '.join(names)}")
-        j = names.index(joint)
         points = self._service.journal.history(since, until, most)
-        return tuple(_point(joint, j, *point) for point in points if len(point[3]["gain"]) > j)
+        wanted = range(len(names)) if joint is None else (names.index(joint),)
+        return tuple(_point(names[j], j, *point) for j in wanted for point in points if len(point[3]["gain"]) > j)
 
     def proposals(self, limit: int = 200) -> tuple[Proposal, ...]:
         """Newest first."""

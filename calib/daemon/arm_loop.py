@@ -103,10 +103,9 @@ class ArmLoop:
 
     def _open(self) -> Message:
         options = self.options
-        from armlink.bus import open_bus
+        from armlink.bus import open_link_bus
 
-        section = options.arm.require_link()
-        bus = options.open_bus() if options.open_bus else open_bus(options.bus, section.bus)
+        bus = options.open_bus() if options.open_bus else open_link_bus(options.bus, options.arm.require_link())
         self._heard = math.inf
         if options.listen_only:
             self._source = Listener(options.arm, bus)
@@ -115,8 +114,8 @@ class ArmLoop:
         link = Link(options.arm, bus)
         self._source = link
         link.start()
+        held = [link.read_calibration(joint) for joint in range(link.n)]  # before there are cycles to wait for
         sample = link.enable()
-        held = [link.read_calibration(joint) for joint in range(link.n)]
         self._shift = link.clock.now() - sample.t
         self._targets = self._motion(link)
         self._real_start = None

@@ -201,15 +201,14 @@ class Journal:
     ) -> list[tuple[datetime, float, str | None, dict[str, Any]]]:
         """Estimates of a time span, oldest first, thinned evenly to at most `most`; the newest is always there."""
         span = (_iso(since) if since else "", _iso(until) if until else "9999")
-        ids = [
-            row[0] for row in self._db.execute("SELECT id FROM history WHERE time >= ? AND time <= ? ORDER BY id", span)
-        ]
-        step = -(-len(ids) // max(most, 1)) if ids else 1
-        found = []
-        for wanted in reversed(ids[::-1][::step]):
-            row = self._db.execute("SELECT time, t, record, estimate FROM history WHERE id = ?", (wanted,)).fetchone()
-            found.append((datetime.fromisoformat(row[0]), row[1], row[2], json.loads(row[3])))
-        return found
+        count = int(self._db.execute("SELECT COUNT(*) FROM history WHERE time >= ? AND time <= ?", span).fetchone()[0])
+        step = max(1, -(-count // max(most, 1)))
+        rows = self._db.execute(
+            "SELECT time, t, record, estimate FROM (SELECT *, ROW_NUMBER() OVER (ORDER BY id DESC) AS place "
+            "FROM history WHERE time >= ? AND time <= ?) WHERE (place - 1) % ? = 0 ORDER BY id",
+            (*span, step),
+        )
+        return [(datetime.fromisoformat(time), t, record, json.loads(found)) for time, t, record, found in rows]
 
     def thin_history(self, before: datetime, keep_every: int) -> None:
         """Of the estimates before a time keep one in `keep_every`."""

@@ -6,7 +6,6 @@ import logging
 import signal
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,10 +15,10 @@ from armlink.errors import ArmlinkError, BadInput
 from armlink.sample import Calibration
 from calib.daemon.answers import ServiceView
 from calib.daemon.host import ChildHost
-from calib.daemon.messages import Down, LoopOptions
+from calib.daemon.messages import Down
 from calib.daemon.notify import Notifier, watchdog_seconds
+from calib.daemon.options import Options
 from calib.daemon.service import Around, Service
-from calib.daemon.settings import DaemonSection, Policy, daemon_section
 from calib.store import RecordStore
 from calib.writing import Controllers
 
@@ -30,33 +29,6 @@ SILENT_SECONDS = 15.0
 BEGIN_SECONDS = 30.0
 """A new bus process may take so long to say its first word."""
 log = logging.getLogger("armlink.daemon")
-
-
-@dataclass(frozen=True)
-class Options:
-    """The command line."""
-
-    arm: str
-    bus: str | None = None
-    listen_only: bool = False
-    socket: Path | None = None
-    tcp: tuple[str, int] | None = None
-    token: str | None = None
-    policy: Policy | None = None
-    state: Path | None = None
-    store: str | None = None
-    work: bool = False
-
-    def settings(self, arm: ArmFile) -> DaemonSection:
-        """The arm file's section, with what the command line says instead."""
-        given: dict[str, Any] = {} if self.policy is None else {"policy": self.policy}
-        if self.work:
-            given["work"] = True
-        return daemon_section(arm).model_copy(update=given)
-
-    def loop(self, arm: ArmFile) -> LoopOptions:
-        """Options of the bus loop."""
-        return LoopOptions(arm, self.bus, self.listen_only, work=self.settings(arm).work, seed=int(time.time()))
 
 
 class Daemon:
@@ -138,15 +110,18 @@ class Daemon:
 
     async def _timer(self) -> None:
         """Snapshots, the service's second, the watchdog, and a look after the bus process."""
-        ticked = kept_alive = 0.0
+        ticked, kept_alive, said = 0.0, 0.0, ""
         due = time.monotonic()
         while True:
             now = time.monotonic()
             self.view.publish()
+            status = f"STATUS={self.service.state} {self.service.fault or self.service.detail}".strip()
+            if status != said:
+                said = status
+                self._notify(status)
             if now - ticked >= 1.0:
                 ticked = now
                 self.service.tick()
-                self._notify(f"STATUS={self.service.state} {self.service.fault or self.service.detail}".strip())
                 if now - self._heard > SILENT_SECONDS:
                     self._restart("the bus loop's process hangs")
             if self._watchdog is not None and now - kept_alive >= self._watchdog / 3:
@@ -207,20 +182,8 @@ class Daemon:
         future.add_done_callback(back)
 
 
-def state_directory(given: Path | None, arm: ArmFile) -> Path:
-    """Where the daemon keeps what it knows: --state, else systemd's STATE_DIRECTORY, else the user's own."""
-    import os
-
-    if given is not None:
-        return given
-    of_systemd = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
-    user = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "armlink"
-    return Path(of_systemd or user) / "daemon" / f"{arm.name}-{arm.serial}"
-
-
-def run_daemon(options: Options, arm: ArmFile, state: Path) -> None:
-    """Run until told to stop; the bus process starts first, so that the arm is held while the rest is loaded."""
-    host = ChildHost(options.loop(arm))
+def run_daemon(options: Options, arm: ArmFile, state: Path, host: ChildHost) -> None:
+    """Run until told to stop, with a bus process that is there already; it has ended when this returns."""
 
     async def main() -> None:
         try:

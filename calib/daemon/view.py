@@ -236,9 +236,12 @@ class DaemonView(Protocol):
         ...
 
     def history(
-        self, joint: str, since: datetime | None = None, until: datetime | None = None, most: int = 2000
+        self, joint: str | None, since: datetime | None = None, until: datetime | None = None, most: int = 2000
     ) -> tuple[HistoryPoint, ...]:
-        """Estimates over time, oldest first, thinned evenly to at most `most`; raises NoSuch."""
+        """Estimates over time, oldest first, thinned evenly to at most `most` a joint; raises NoSuch.
+
+        Without a joint those of every joint, joint after joint.
+        """
         ...
 
     def proposals(self, limit: int = 200) -> tuple[Proposal, ...]:

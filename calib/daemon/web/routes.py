@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Header, Path, Query, Request
 from fastapi.responses import FileResponse, Response
+from pydantic import TypeAdapter
 
 from calib.daemon.view import (
     DaemonView,
@@ -101,12 +102,11 @@ def _add_past(router: APIRouter, view: DaemonView) -> None:
         """Events after an id, oldest first."""
         return view.events(after=query.after, limit=query.limit)
 
-    @router.get("/api/history", responses=NO_SUCH, tags=["past"])
-    async def history(query: Annotated[HistoryQuery, Query()]) -> tuple[HistoryPoint, ...]:
+    @router.get("/api/history", response_model=tuple[HistoryPoint, ...], responses=NO_SUCH, tags=["past"])
+    async def history(query: Annotated[HistoryQuery, Query()]) -> Response:
         """Gain and offset over time, oldest first; without a joint, joint after joint."""
-        names = [query.joint] if query.joint else [joint.joint for joint in view.joints()]
-        found = (view.history(name, query.since, query.until, query.limit) for name in names)
-        return tuple(point for points in found for point in points)
+        points = view.history(query.joint or None, query.since, query.until, query.limit)
+        return Response(_HISTORY.dump_json(points), media_type="application/json")
 
     @router.get("/api/report", response_class=FileResponse, responses=NO_SUCH | _HTML, tags=["past"])
     async def report() -> FileResponse:
@@ -117,6 +117,7 @@ def _add_past(router: APIRouter, view: DaemonView) -> None:
         return FileResponse(path, media_type="text/html", headers={"content-security-policy": REPORT_CSP})
 
 
+_HISTORY = TypeAdapter(tuple[HistoryPoint, ...])
 _HTML: dict[int | str, dict[str, Any]] = {200: {"content": {"text/html": {}}, "description": "HTML"}}
 
 

@@ -160,8 +160,10 @@ class MadeUpView:
         return tuple(event for event in self.log if event.id > after)[:limit]
 
     def history(
-        self, joint: str, since: datetime | None = None, until: datetime | None = None, most: int = 2000
+        self, joint: str | None, since: datetime | None = None, until: datetime | None = None, most: int = 2000
     ) -> tuple[HistoryPoint, ...]:
+        if joint is None:
+            return tuple(point for name in NAMES for point in self.history(name, since, until, most))
         if joint not in NAMES:
             raise NoSuch(f"no joint {joint!r}; there are {', '.join(NAMES)}")
         points = [point for point in self.points if point.joint == joint]
