@@ -1,40 +1,43 @@
 """Campaign: the daemon killed (SIGKILL) at random moments; nothing kept is lost, nothing is left half done.
 
-python tests/campaigns/daemon_kills.py [--kills 100] [--bus-kills 10] [--seed 0]
+python tests/campaigns/daemon_kills.py [--kills 100] [--bus-kills 30] [--seed 0]
 Exit status 1 if a bound fails. Two parts. In the first the service runs as fast as it can on an arm whose sensors keep
 drifting, policy apply, so that kills fall into writes too; controllers are a table in a file. In the second the whole
-`armlink daemon` drives `armlink sim` over a bus (udp_multicast, no root), and the joints are looked at after each kill.
+`armlink daemon` drives `armlink sim` over a bus (udp_multicast, no root); service, bus process or both are killed, and
+the joints are looked at after each kill.
 """
 
 import argparse
 import contextlib
-import json
 import logging
 import multiprocessing
 import os
 import random
 import signal
+import socket
 import sqlite3
 import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import httpx
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
 
 from fast_daemon import QUIET, FastDaemon
 
+from armlink.armfile import ArmFile
 from calib.daemon.settings import DaemonSection
 from calib.records import CalibrationRecord
 
 LOST_ROWS = 8
 """Stops of the arm that the observer may have to see again: five seconds of work, and one moved on meanwhile."""
-HOLDING = {"quick stop active", "operation enabled"}
 STILL = 0.02
 """How far a joint may move after a kill, once it has stopped [rad]."""
 
@@ -136,7 +139,7 @@ def kill_service(given: argparse.Namespace) -> list[str]:
 
 
 def kill_daemon(given: argparse.Namespace) -> list[str]:
-    """The second part: the joints hold after each kill, whichever process it hits."""
+    """The second part: the joints hold after each kill, whichever process it hits, and the next life goes on."""
     from daemon_bench import good_records
 
     from armlink.armfile import load_arm
@@ -145,76 +148,144 @@ def kill_daemon(given: argparse.Namespace) -> list[str]:
     from sim_bus.truth import Truth
 
     folder, armlink = Path(tempfile.mkdtemp(prefix="armlink-kills-")), Path(sys.executable).with_name("armlink")
-    bus, choose, wrong, starts = given.bus, random.Random(given.seed), list[str](), list[float]()
+    choose, wrong, lives = random.Random(given.seed), list[str](), list[Life]()
     arm = load_arm("sarcos")
     store = RecordStore(str(folder / "records.db"))
     for record in good_records(arm, SimulatedArm(arm, Truth.of(arm), 0).true_sensors):
         store.put(record, arm, by="ann", reason="sweep")
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    with subprocess.Popen([armlink, "sim", "sarcos", "--bus", bus], **quiet) as simulated:
+    daemon = [armlink, "daemon", "sarcos", "--bus", given.bus, "--work", "--store", folder / "records.db"]
+    daemon = [str(part) for part in [*daemon, "--state", folder / "state"]]
+    with subprocess.Popen([armlink, "sim", "sarcos", "--bus", given.bus], **quiet) as simulated:
         time.sleep(5)
-        daemon = [armlink, "daemon", "sarcos", "--bus", bus, "--work", "--store", folder / "records.db"]
-        daemon += ["--state", folder / "state"]
         for number in range(given.bus_kills):
-            began = time.monotonic()
-            process = subprocess.Popen([str(part) for part in daemon], start_new_session=True, **quiet)
-            while state(folder) != "observing" and time.monotonic() - began < 60:
-                time.sleep(0.1)
-            starts.append(time.monotonic() - began)
-            time.sleep(choose.uniform(0.0, 3.0))
-            both = choose.random() < 0.5
-            if both:
-                os.killpg(process.pid, signal.SIGKILL)
-            else:
-                process.kill()  # its bus process sees that and stops the arm itself
-            process.wait()
-            time.sleep(1.0)
-            before = joints(armlink, bus)
-            after = joints(armlink, bus)
-            states = {joint["state"] for joint in after}
-            moved = max(abs(a["position"] - b["position"]) for a, b in zip(before, after, strict=True))
-            if not states <= HOLDING or not moved < STILL:
-                wrong.append(f"bus kill {number}: {states}, moved {moved:.3f} rad")
+            lives.append(one_life(daemon, folder, choose, ("service", "both", "bus")[number % 3], lives))
+            wrong += [f"bus kill {number}: {what}" for what in lives[-1].wrong + not_holding(arm, given.bus)]
+            print(f"bus kill {number}: {lives[-1]}", flush=True)
         simulated.terminate()
+    observing = [life.observing for life in lives]
     print(
-        f"daemon: {given.bus_kills} kills, observing after {np.median(starts):.1f} s (median), "
-        f"{max(starts):.1f} s at most, {len(wrong)} wrong",
+        f"daemon: {given.bus_kills} kills, observing after {np.median(observing):.1f} s (median), "
+        f"{max(observing):.1f} s at most, {len(wrong)} wrong",
         flush=True,
     )
     return wrong
 
 
-def state(folder: Path) -> str:
-    """State of the daemon by its API, empty where it does not answer."""
-    command = [
-        "curl",
-        "-s",
-        "--max-time",
-        "1",
-        "--unix-socket",
-        folder / "state" / "api.sock",
-        "http://localhost/api/status",
-    ]
-    done = subprocess.run([str(part) for part in command], capture_output=True, text=True, check=False)
+@dataclass
+class Life:
+    """One life of `armlink daemon`."""
+
+    hit: str
+    observing: float = np.nan
+    """Seconds from its start to its first observing."""
+    cpu: float = np.nan
+    """Processor seconds that it and its bus process had used by then."""
+    rows: int = 0
+    """Stops of the arm that it knew last."""
+    wrong: list[str] = field(default_factory=list)
+
+
+def one_life(daemon: list[str], folder: Path, choose: random.Random, hit: str, before: list[Life]) -> Life:
+    """Start, wait until it observes, kill what is to be hit; where that is the bus process, the service after it."""
+    life, quiet = Life(hit), {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    with Told(folder / "notify") as told:
+        environment = {**os.environ, "NOTIFY_SOCKET": str(told.path)}
+        process = subprocess.Popen(daemon, process_group=0, env=environment, **quiet)
+        life.observing = told.until("STATUS=observing")
+        life.cpu = cpu_of(process.pid) + sum(map(cpu_of, children(process.pid)))
+        known = before[-1].rows if before else 0
+        while (rows := status(folder).get("rows")) is None:
+            time.sleep(0.1)
+        if rows < known - LOST_ROWS:
+            life.wrong.append(f"the observer knows {rows} stops, before the kill {known}")
+        time.sleep(choose.uniform(0.0, 3.0))
+        if hit == "bus":
+            for child in children(process.pid):
+                os.kill(child, signal.SIGKILL)
+            if np.isnan(told.until("STATUS=observing")):
+                life.wrong.append("the bus process was not begun anew")
+        life.rows = max(rows, status(folder).get("rows", 0))
+        if hit == "service":
+            process.kill()  # its bus process sees that and stops the arm itself
+        else:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    if np.isnan(life.observing):
+        life.wrong.append("it never observed")
+    return life
+
+
+class Told:
+    """What a service tells systemd."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __enter__(self) -> "Told":
+        self.path.unlink(missing_ok=True)
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(str(self.path))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
+
+    def until(self, line: str, seconds: float = 60.0) -> float:
+        """Seconds until a line that begins like this, NaN where none came."""
+        began = time.monotonic()
+        while (left := began + seconds - time.monotonic()) > 0:
+            self._socket.settimeout(left)
+            with contextlib.suppress(TimeoutError):
+                if any(each.startswith(line) for each in self._socket.recv(4096).decode().splitlines()):
+                    return time.monotonic() - began
+        return float("nan")
+
+
+def children(process: int) -> list[int]:
+    """Ids of its child processes."""
+    return [int(child) for child in Path(f"/proc/{process}/task/{process}/children").read_text().split()]
+
+
+def cpu_of(process: int) -> float:
+    """Processor seconds that it has used."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def status(folder: Path) -> dict[str, Any]:
+    """The daemon's status by its API, empty where it does not answer."""
+    transport = httpx.HTTPTransport(uds=str(folder / "state" / "api.sock"))
     try:
-        return str(json.loads(done.stdout)["state"])
-    except (ValueError, KeyError):
-        return ""
+        with httpx.Client(transport=transport, base_url="http://localhost", timeout=5.0) as client:
+            return dict(client.get("/api/status").json())
+    except (httpx.HTTPError, ValueError):
+        return {}
 
 
-def joints(armlink: Path, bus: str) -> list[dict[str, Any]]:
-    """The joints as another host sees them."""
-    command = [armlink, "monitor", "sarcos", "--bus", bus, "--sync", "--cycles", "3", "--json", "-"]
-    done = subprocess.run([str(part) for part in command], capture_output=True, text=True, check=False)
-    return list(json.loads(done.stdout)["joints"])
+def not_holding(arm: ArmFile, bus: str) -> list[str]:
+    """What another host sees of the joints a second after a kill, where they do not all hold still in quick stop."""
+    from armlink.bus import open_link_bus
+    from armlink.monitor import Monitor
+
+    time.sleep(1.0)
+    opened = open_link_bus(bus, arm.require_link())
+    try:
+        monitor = Monitor(arm, opened, True, False)
+        before, after = (monitor.describe(monitor.watch(0.5))["joints"] for _ in range(2))
+    finally:
+        opened.shutdown()
+    states = {joint["state"] for joint in after}
+    moved = max(abs(a["position"] - b["position"]) for a, b in zip(before, after, strict=True))
+    return [] if states == {"quick stop active"} and moved < STILL else [f"{states}, moved {moved:.3f} rad"]
 
 
 def main() -> int:
     """Run, tell, judge."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=100)
-    parser.add_argument("--bus-kills", type=int, default=10)
-    parser.add_argument("--bus", default="udp_multicast:239.74.163.9")
+    parser.add_argument("--bus-kills", type=int, default=30)
+    parser.add_argument("--bus", default="udp_multicast:239.74.166.9")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--life", type=float, default=1.0, help="Mean seconds from a start to the kill.")
     given = parser.parse_args()
