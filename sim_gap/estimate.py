@@ -91,8 +91,8 @@ class Estimate:
     @cached_property
     def covariance(self) -> Array:
         """Of coefficients and smooth shapes, (P + S, P + S): sandwich over blocks of time, and what the rest of the arm
-        being a little wrong adds: an error of SYSTEMATIC times each row's residual that follows the column itself, and
-        mass moments of links that are wrong unfound."""
+        being a little wrong adds: an error of SYSTEMATIC times each row's residual that follows the column itself, mass
+        moments of links that are wrong unfound, and what every arm has of the effect."""
         size = self._jacobian[0][1].shape[1]
         bread, scores = np.zeros((size, size)), np.zeros((int(self.store.data.blocks.max()) + 1, size))
         for weight, x, residual, block in self._jacobian:
@@ -105,7 +105,10 @@ class Estimate:
         seen = sum(len(residual) for _, _, residual, _ in self._jacobian) / max(len(self._jacobian), 1)
         systematic = SYSTEMATIC**2 * seen / CORRELATED * inverse
         statistical = inverse @ (scores.T @ scores) @ inverse * blocks / (blocks - 1)
-        return np.asarray(statistical + systematic + self._unfound(inverse))
+        ordinary = np.zeros(size)
+        for term in self.terms:
+            ordinary[self.normal.at[term]] = effects()[term.effect].ordinary
+        return np.asarray(statistical + systematic + self._unfound(inverse) + np.diag(ordinary**2))
 
     def _unfound(self, inverse: Array) -> Array:
         """What mass moments z of links that are wrong, but were not found so, add to the covariance, (P + S, P + S).

@@ -14,6 +14,7 @@ class Gain(Effect):
 
     id = "actuator.gain"
     parameters = (Parameter("gain", "1"),)
+    ordinary = 0.002
 
     def places(self, layout: Layout) -> range:
         return range(layout.n if layout.motor else 0)

@@ -38,6 +38,7 @@ class Coulomb(_Friction):
     id = "friction.coulomb"
     parameters = (Parameter("torque", "N·m"),)
     rare = 0
+    ordinary = 0.03
 
     def plausible_on(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> bool:
         """Less than the nominal model has is possible; a hundredth of a newton-metre below nothing is noise."""
@@ -53,6 +54,7 @@ class Viscous(_Friction):
     id = "friction.viscous"
     parameters = (Parameter("damping", "N·m·s/rad"),)
     rare = 0
+    ordinary = 0.02
 
     def column(self, s: Signals, joint: int, shape: Shape) -> Array:
         return s.v[:, joint]

@@ -103,6 +103,8 @@ class Effect(ABC):
     """Shapes tried at first; the best is then refined between its neighbours."""
     rare: ClassVar[int] = 3
     """What it must earn besides, in parameters: 0 for what every arm has, more for what few have."""
+    ordinary: ClassVar[float] = 0.0
+    """What every arm has of it, as a standard deviation of each coefficient: an interval leaves room for it."""
     counted: ClassVar[frozenset[int]] = frozenset()
     """Which entries of the shape are numbers of something (a joint): they are not refined."""
     whole_arm: ClassVar[bool] = False

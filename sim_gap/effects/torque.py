@@ -15,6 +15,7 @@ class Offset(Effect):
     id = "torque.offset"
     parameters = (Parameter("offset", "N·m"),)
     rare = 0
+    ordinary = 0.02
 
     def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
         return layout.sensor_columns(place, np.ones((len(signals.t), 1)))
@@ -31,6 +32,7 @@ class Gain(_Sensor):
     id = "torque.gain"
     parameters = (Parameter("gain", "1"),)
     rare = 0
+    ordinary = 0.002
 
     def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
         return layout.sensor_columns(place, signals.model[:, place, None])

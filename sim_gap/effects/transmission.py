@@ -8,7 +8,6 @@ from sim_gap.effects.registry import Columns, Effect, Layout, Parameter, Shape
 from sim_gap.rigid import CREEP, Array
 from sim_gap.signals import Signals
 
-
 ALWAYS, MOST, SLOWLY = 24, 64, 0.25
 """Ripple is searched for up to so many cycles a radian: in any case, and at most where a joint turns slowly enough."""
 
