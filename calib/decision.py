@@ -7,6 +7,7 @@ import numpy as np
 from calib.causes import CauseTest, Verdict
 from calib.observer_config import ObserverConfig
 from calib.records import Array
+from calib.rest import Row
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,15 @@ class Finding:
         """Standard deviations of gain and offset [N·m]."""
         gain, offset = np.sqrt(np.diag(self.covariance))
         return float(gain), float(offset)
+
+
+@dataclass(frozen=True)
+class Agreeing:
+    """Rows that agree on a drift of these joints."""
+
+    rows: list[Row]
+    test: CauseTest
+    joints: frozenset[int]
 
 
 def agreed(first: CauseTest, second: CauseTest, joint: int, beside: int | None, limit: float) -> bool:

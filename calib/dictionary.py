@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.records import Array
+from calib.rest import Row
 from gcomp.arm import Arm
 from gcomp.gravity import gravity_regressor, gravity_stiffness
 from gcomp.moments import payload_columns
@@ -20,6 +21,12 @@ class Window:
     position: Array
     torque: Array
     direction: Array
+
+    @classmethod
+    def of(cls, rows: list[Row]) -> "Window":
+        """From K rows whose positions are true angles."""
+        columns = ([getattr(row, name) for row in rows] for name in ("position", "torque", "direction"))
+        return cls(*map(np.array, columns))
 
 
 @dataclass(frozen=True)

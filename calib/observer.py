@@ -4,7 +4,7 @@ Pure: samples in, events out; no bus, clock, file or thread. Readings are those 
 every estimate is relative to it: reading = gain·τ + offset with gain 1 and offset 0 while nothing has drifted.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from calib.belief import ModelBelief
 from calib.causes import CauseTest, Verdict
 from calib.cusum import Cusum
-from calib.decision import Finding, agreed, decide
+from calib.decision import Agreeing, Finding, agreed, decide
 from calib.dictionary import Window
 from calib.events import Estimate, Event, verdict_evidence
 from calib.observer_config import ObserverConfig
@@ -138,7 +138,7 @@ class Observer:
         verdict = self.cause_test(self.window).verdict()
         if verdict.cause == "none":
             if self.learnt < self.config.baseline_rows:
-                window = _window(self.window[-self.config.audit_rows :])
+                window = Window.of(self.window[-self.config.audit_rows :])
                 self.belief.learn(window.position, window.torque, self.sigma)
                 self.places.forget()
                 self.learnt += self.config.audit_rows
@@ -216,7 +216,7 @@ class Observer:
 
     def cause_test(self, rows: list[Row]) -> CauseTest:
         """The cause test of these rows, by what is believed now."""
-        return CauseTest(self.belief, _window(rows), self.sigma, self.config)
+        return CauseTest(self.belief, Window.of(rows), self.sigma, self.config)
 
     def _start_test(self) -> None:
         self._clear()
@@ -261,17 +261,3 @@ class Observer:
 
     def _event(self, t: float, kind: str, joint: int | None, **evidence: Any) -> Event:
         return Event(t, kind, None if joint is None else self.arm.names[joint], evidence)
-
-
-@dataclass(frozen=True)
-class Agreeing:
-    """Rows that agree on a drift of these joints."""
-
-    rows: list[Row]
-    test: CauseTest
-    joints: frozenset[int]
-
-
-def _window(rows: list[Row]) -> Window:
-    columns = ([getattr(row, name) for row in rows] for name in ("position", "torque", "direction"))
-    return Window(*map(np.array, columns))

@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.observer import Agreeing, Observer
+from calib.decision import Agreeing
+from calib.observer import Observer
 from calib.records import Array
 from calib.rest import Row
 

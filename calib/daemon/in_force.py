@@ -3,8 +3,9 @@
 from typing import TYPE_CHECKING
 
 from armlink.errors import ArmlinkError, Refused
+from calib.daemon.outside import Outside
 from calib.daemon.proposal import finding_of
-from calib.daemon.recalibrations import Outside, Recalibrations
+from calib.daemon.recalibrations import Recalibrations
 from calib.daemon.watcher import Watcher
 from calib.decision import Finding
 from calib.recalibration import write_record
@@ -79,7 +80,7 @@ class InForce:
         service = self._service
         if self._busy or service.calibration is None or service.gravity is None:
             return
-        service.keep()
+        service.keeping.keep()
         self._begin(service.calibration, service.gravity)
         if service.connected and not service.listen_only:
             self._ask()
@@ -131,7 +132,7 @@ class InForce:
         service.calibration = record
         service.watcher.follow(record)
         service.watcher.observer.install(finding)
-        service.keep(history=True)
+        service.keeping.keep(history=True)
 
     # ---- controllers
 

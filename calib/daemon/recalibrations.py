@@ -2,15 +2,15 @@
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, Protocol, TypeVar
+from typing import TypeVar
 
 from armlink.armfile import ArmFile
 from armlink.errors import ArmlinkError, Refused
 from calib.after_write import Checked
 from calib.daemon.journal import Journal, ProposalRow
 from calib.daemon.messages import Array
+from calib.daemon.outside import Outside
 from calib.daemon.proposal import finding_json, finding_of, proposal_answer
 from calib.daemon.settings import DaemonSection
 from calib.daemon.view import NoSuch, NotPossible, Proposal
@@ -24,28 +24,6 @@ T = TypeVar("T")
 DAY = 86400.0
 WAITING = 1000
 """Batches that wait for an alarm to be explained: a hundred seconds."""
-
-Say = Callable[[str, str | None, str, dict[str, Any]], int]
-"""(kind, joint, text, evidence) → id of the event."""
-
-
-class Jobs(Protocol):
-    """Runs work that waits for the bus: aside, and hands the outcome back on the service's own thread."""
-
-    def __call__(self, work: Callable[[], T], done: Callable[[T | Exception], None]) -> None:
-        """`done` gets what `work` returned, or the error that it raised."""
-        ...
-
-
-@dataclass(frozen=True)
-class Outside:
-    """What recalibrations need of the service."""
-
-    say: Say
-    now: Callable[[], datetime]
-    run: Jobs
-    installed: Callable[[CalibrationRecord, Finding], None]
-    """Called when a record is in force and its finding in the controller."""
 
 
 class Recalibrations:

@@ -13,8 +13,10 @@ from armlink import emcy
 from armlink.armfile import ArmFile
 from calib.daemon.in_force import InForce
 from calib.daemon.journal import Journal
+from calib.daemon.keeping import Keeping
 from calib.daemon.messages import Batch, Down, Message, Progress, Reply, Up
-from calib.daemon.recalibrations import Jobs, Recalibrations
+from calib.daemon.outside import Jobs
+from calib.daemon.recalibrations import Recalibrations
 from calib.daemon.recordings import Recordings
 from calib.daemon.settings import DaemonSection
 from calib.daemon.stream import Hub
@@ -27,10 +29,6 @@ from calib.records import CalibrationRecord, GravityRecord
 from calib.store import RecordStore
 from calib.writing import Controllers
 
-BELIEF_SECONDS = 5.0
-"""The observer's belief is kept at least so often while there is something new."""
-HISTORY_SECONDS = 60.0
-"""One point of history in this time, and one at each event."""
 CLOCK_JUMP = 2.0
 """A wall clock that moves by so much more or less than the monotonic one was set [s]."""
 FAULT_EVENTS_AN_HOUR = 20
@@ -88,8 +86,7 @@ class Service:
         self.calibration: CalibrationRecord | None = None
         self.gravity: GravityRecord | None = None
         self.accepted: dict[str, datetime] = {}
-        self._kept_rows = 0
-        self._kept_at = self._history_at = -float("inf")
+        self.keeping = Keeping(self)
         self._offset = around.wall().timestamp() - around.monotonic()
         self._fault_times: list[float] = []
         self.say("started", None, f"armlink {self.version} for {arm.name} {arm.serial}", {"policy": settings.policy})
@@ -210,7 +207,7 @@ class Service:
                 self.say(kind, event.joint, text, evidence)
                 if event.kind == "verdict" and self.recalibrations is not None:
                     self.recalibrations.explained(kind, event.joint)
-            self.keep(history=True)
+            self.keeping.keep(history=True)
         assert self.recalibrations is not None
         for event in events:
             if event.finding is not None:
@@ -254,29 +251,12 @@ class Service:
         self._watch_clock(now)
         self.in_force.tick(now)
         self.tours.tick(now)
-        if self.watcher is not None:
-            new = self.watcher.observer.rows != self._kept_rows
-            due = now - self._history_at >= HISTORY_SECONDS
-            if new and (now - self._kept_at >= BELIEF_SECONDS or due):
-                self.keep(history=due)
-
-    def keep(self, history: bool = False) -> None:
-        """Put the observer's belief on disk, and a point of history where asked for, both or neither."""
-        if self.watcher is None:
-            return
-        now, t = self.around.wall(), self.around.monotonic()
-        calibration, gravity = self.watcher.calibration.id, self.watcher.gravity.id
-        with self.journal.transaction():
-            self.journal.save_belief(now, calibration, gravity, self.watcher.save())
-            if history:
-                self.journal.add_history(now, t, calibration, self.watcher.point())
-                self._history_at = t
-        self._kept_at, self._kept_rows, self.trouble = t, self.watcher.observer.rows, ""
+        self.keeping.tick(now)
 
     def close(self, why: str) -> None:
         """Keep everything and end."""
         try:
-            self.keep()
+            self.keeping.keep()
             self.say("stopped", None, why, {})
         except sqlite3.Error as error:
             log.error("journal: %s", error)

@@ -159,7 +159,7 @@ def test_payload_is_an_event_with_mass_and_centre_and_nothing_is_written(tmp_pat
 
 def test_after_a_kill_it_knows_everything(tmp_path: Path) -> None:
     daemon = drifted(tmp_path, "propose")
-    daemon.service.keep()
+    daemon.service.keeping.keep()
     events, estimates, proposals = daemon.view.events(), daemon.view.estimates(), daemon.view.proposals()
     rows = daemon.view.status().rows
     daemon.kill()
@@ -195,7 +195,7 @@ def test_an_approval_cut_off_after_the_write_is_in_force(tmp_path: Path) -> None
     daemon = drifted(tmp_path, "propose")
     proposal = daemon.view.proposals()[0]
     daemon.service.journal.decide(proposal.id, daemon.wall(), "approved", "ann")
-    daemon.service.keep()
+    daemon.service.keeping.keep()
     daemon.service.recalibrations.recalibrator.apply(daemon.store.get(proposal.record), 2, "ann")
     rows = daemon.view.status().rows
     daemon.kill()
@@ -332,6 +332,19 @@ def test_history_is_thinned_evenly_and_ends_with_the_newest(tmp_path: Path) -> N
     assert daemon.view.history("joint_3", since=points[-2].time) == points[-2:]
     with pytest.raises(NoSuch, match="joint_9"):
         daemon.view.history("joint_9")
+    everything = daemon.view.history(None, most=3)
+    assert [point for point in everything if point.joint == "joint_3"] == list(few)
+
+
+def test_history_older_than_a_month_is_thinned_the_rest_stays_whole(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings())
+    journal, old = daemon.service.journal, daemon.wall() - timedelta(days=31)
+    for minute in range(100):
+        journal.add_history(old + timedelta(minutes=minute), 60.0 * minute, None, {"gain": []})
+    daemon.run(400)
+    times = [point[0] for point in journal.history(None, None, 1000)]
+    assert sum(time < daemon.wall() - timedelta(days=30) for time in times) == 10
+    assert len(daemon.view.history("joint_3")) >= 6
 
 
 def test_recordings_are_rotated_within_their_quota_and_load(tmp_path: Path) -> None:

@@ -65,7 +65,7 @@ def test_generated_requests_to_a_whole_daemon_find_no_5xx(tmp_path: Path, monkey
     def begin() -> ServiceView:
         bench = DaemonBench(tmp_path, small_arm())
         bench.run(3.0)
-        bench.service.keep(history=True)
+        bench.service.keeping.keep(history=True)
         bench.service.say("drift", "elbow", "gain", {"value": float("inf")})
         return bench.view
 
