@@ -1,12 +1,13 @@
 """Choice of stop combinations: the D-optimal design of the whole sensor and gravity fit (theory.md 2, 4, 7)."""
 
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 import numpy.typing as npt
 
 from gcomp.arm import Arm
+from gcomp.design import stop_combinations as limit_poses
+from gcomp.design import well_felt
 from gcomp.gravity import gravity_levers, gravity_regressor, gravity_stiffness
 from gcomp.moments import payload_columns
 
@@ -14,8 +15,6 @@ Array = npt.NDArray[np.float64]
 
 SKETCH_STEPS = 5
 """Steps by which a candidate sweep is judged: enough for a sinusoid and an offset."""
-MINIMUM_LEVER = 0.3
-"""Γ/g below which a combination is taken only where there is no better one."""
 EXCHANGES = 2
 """Rounds in which every chosen combination is compared once more with all others."""
 WAY = 0.6
@@ -46,12 +45,12 @@ class Candidates:
         return Candidates(self.joint, self.stops[which], self.poses[which], self.lever[which])
 
 
-def stop_combinations(arm: Arm, joint: int, low: Array, high: Array, swept: tuple[float, float]) -> Candidates:
-    """The 2^(n-1) combinations in which the other joints stand at `low` or `high` (n,), `joint` sweeping `swept`."""
-    others = [i for i in range(arm.n) if i != joint]
-    stops = np.zeros((2 ** len(others), arm.n), dtype=np.int8)
-    stops[:, others] = np.array(list(product((-1, 1), repeat=len(others))), dtype=np.int8).reshape(-1, len(others))
-    poses = np.repeat(np.where(stops > 0, high, low)[:, None, :], SKETCH_STEPS, axis=1)
+def stop_combinations(arm: Arm, joint: int, swept: tuple[float, float]) -> Candidates:
+    """The 2^(n-1) combinations in which the other joints stand at a limit, `joint` sweeping `swept`."""
+    rest = limit_poses(arm, joint)
+    stops = np.where(rest > (arm.lower + arm.upper) / 2, 1, -1).astype(np.int8)
+    stops[:, joint] = 0
+    poses = np.repeat(rest[:, None, :], SKETCH_STEPS, axis=1)
     poses[:, :, joint] = np.linspace(*swept, SKETCH_STEPS)
     lever = gravity_levers(arm, poses[:, 0])[:, joint] / max(float(np.linalg.norm(arm.gravity)), 1e-9)
     return Candidates(joint, stops, poses, lever)
@@ -59,10 +58,7 @@ def stop_combinations(arm: Arm, joint: int, low: Array, high: Array, swept: tupl
 
 def reachable(candidates: Candidates) -> Candidates:
     """Those in which the swept joint feels gravity well; where there are none, the better half."""
-    good = candidates.lever >= MINIMUM_LEVER
-    if not good.any():
-        good = candidates.lever >= np.median(candidates.lever)
-    return candidates.kept(good)
+    return candidates.kept(well_felt(candidates.lever))
 
 
 def choose(

@@ -10,8 +10,8 @@ from armlink.calibration import GAIN_RANGE
 from armlink.errors import Refused
 from calib.dataset import SweepData
 from calib.description import gcomp_arm
+from calib.findings import Finding
 from calib.fit_rows import FitRows, fit_rows
-from calib.goodness import Finding
 from calib.records import Array, CalibrationRecord, GravityRecord, Parameter
 from calib.store import RecordStore
 from gcomp.errors import GcompError

@@ -1,13 +1,12 @@
 """Moves the arm through the link: travel, creeping onto stops, pressing, resting until a reading is exact."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 
 from armlink.errors import Refused
 from armlink.link import Link
 from armlink.sample import Command, Sample
+from calib.averages import Rest, average, stack
 from calib.motion import trajectory
 from calib.plan_limits import Limits
 from calib.section import SweepSection
@@ -29,6 +28,8 @@ CONTACT_STILL = 0.15
 """Share of the approach speed below which a joint does not move."""
 CHECK_EVERY = 5
 """Cycles from one look at the settle rule to the next."""
+COAST, COAST_LOOK, COAST_STILL = 5.0, 0.1, 0.002
+"""Longest time that joints may take to stop [s]; how often one looks [s]; way in that time of one that stands [rad]."""
 PRESS_SECONDS = 0.3
 STOP_TOLERANCE = 0.06
 """How far from the arm file's place a stop may be found, beyond the position sensor's own error [rad]."""
@@ -52,20 +53,6 @@ class Slipped(Refused):
         """Joint's name and index."""
         super().__init__(f"{name}: slipped off its stop")
         self.joint = joint
-
-
-@dataclass(frozen=True, eq=False)
-class Rest:
-    """Averages over the samples of one static reading, (n,) each."""
-
-    t: float
-    count: int
-    settled: bool
-    position: Array
-    position_std: Array
-    torque: Array
-    torque_std: Array
-    motor_torque: Array
 
 
 class Mover:
@@ -109,6 +96,17 @@ class Mover:
         joints = (self.command.mode != POSITION) | lost
         self.command.mode[:] = POSITION
         self.command.position[joints] = self.position[joints]
+
+    def come_to_rest(self) -> None:
+        """Hold every joint where it stands until all have stopped: one with a weak drive coasts on at first."""
+        cycles = max(int(COAST_LOOK / self.link.period), 2)
+        for _ in range(round(COAST / COAST_LOOK)):
+            self.hold_all()
+            before = self.position.copy()
+            for _ in range(cycles):
+                self.cycle()
+            if np.abs(self.position - before).max() < COAST_STILL:
+                return
 
     def travel(self, goal: Array, acceleration: float) -> None:
         """Move the joints under position control to goal (n,) [rad], together; raises Stalled."""
@@ -171,7 +169,7 @@ class Mover:
         resolution = np.where(np.isfinite(self.resolution), self.resolution, 0.0)
 
         def settled(some: list[Sample]) -> bool:
-            return rule.settled(_stack(some, "position"), _stack(some, "torque"), counts, resolution)
+            return rule.settled(stack(some, "position"), stack(some, "torque"), counts, resolution)
 
         while True:
             samples.append(self.cycle())
@@ -179,15 +177,15 @@ class Mover:
             if count < rule.window or (count - rule.window) % CHECK_EVERY:
                 continue
             if count >= rule.timeout:
-                return _average(samples[-rule.max_samples :], settled=False)
+                return average(samples[-rule.max_samples :], settled=False)
             if begin is None:
                 if settled(samples[-rule.window :]):
                     begin = count - rule.window // 2  # what settled last still decays in the first half
             elif count - begin >= rule.window:
                 enough = count - begin >= rule.max_samples
-                if enough or rule.exact(_stack(samples[begin:], "torque"), counts):
+                if enough or rule.exact(stack(samples[begin:], "torque"), counts):
                     if settled(samples[begin:]):
-                        return _average(samples[begin:], settled=True)
+                        return average(samples[begin:], settled=True)
                     begin = None  # it only stood at a turning point
 
     def _creep(self, stops: npt.NDArray[np.int64], joints: Flags) -> None:
@@ -238,23 +236,3 @@ class Mover:
         steps = np.abs(np.diff(np.array(seen), axis=0))
         steps = np.where(steps > 1e-9, steps, np.inf)
         self.resolution = np.minimum(self.resolution, np.nanmin(np.where(np.isnan(steps), np.inf, steps), axis=0))
-
-
-def _stack(samples: list[Sample], channel: str) -> Array:
-    return np.array([getattr(sample, channel) for sample in samples])
-
-
-def _average(samples: list[Sample], settled: bool) -> Rest:
-    position, torque, motor = (_stack(samples, name) for name in ("position", "torque", "motor_torque"))
-    reported = np.isfinite(motor).sum(axis=0)
-    mean = np.nansum(motor, axis=0) / np.maximum(reported, 1)
-    return Rest(
-        t=samples[-1].t,
-        count=int(np.isfinite(torque).all(axis=1).sum()),
-        settled=settled,
-        position=np.nanmean(position, axis=0),
-        position_std=np.nanstd(position, axis=0),
-        torque=np.nanmean(torque, axis=0),
-        torque_std=np.nanstd(torque, axis=0, ddof=1),
-        motor_torque=np.where(reported > 0, mean, np.nan),
-    )

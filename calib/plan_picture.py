@@ -18,6 +18,8 @@ from gcomp.arm import Arm, bar_frames
 Array = npt.NDArray[np.float64]
 PRESS, READ = 1.0, 0.5
 """Seconds that creeping onto stops and pressing take, and that one reading takes to settle and average."""
+COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#e377c2", "#8c564b")
+"""One a joint."""
 GHOSTS = 4
 """Poses drawn of each sweep."""
 
@@ -66,12 +68,24 @@ def draw_plan(arm: ArmFile, plan: SweepPlan, path: Path) -> None:
         points = np.concatenate(
             [np.vstack([places, np.full((1, 3), np.nan)]) for places in joint_places(described, poses)]
         )
+        line = {"width": 5, "color": COLOURS[sweep.joint % len(COLOURS)]}
         figure.add_scatter3d(
-            x=points[:, 0], y=points[:, 1], z=points[:, 2], mode="lines+markers", name=sweep.name, marker={"size": 3}
+            x=points[:, 0],
+            y=points[:, 1],
+            z=points[:, 2],
+            mode="lines+markers",
+            name=sweep.name,
+            line=line,
+            marker={"size": 3, "color": line["color"]},
         )
     scouted = joint_places(described, np.array(plan.scout))[:, -1]
     figure.add_scatter3d(
-        x=scouted[:, 0], y=scouted[:, 1], z=scouted[:, 2], mode="markers", name="scout (tip)", marker={"size": 4}
+        x=scouted[:, 0],
+        y=scouted[:, 1],
+        z=scouted[:, 2],
+        mode="markers",
+        name="scout (tip)",
+        marker={"size": 4, "color": "black"},
     )
     down = described.gravity / max(float(np.linalg.norm(described.gravity)), 1e-9)
     length = 0.3 * max(float(np.abs(described.a).sum() + np.abs(described.d).sum()), 0.1)
@@ -80,7 +94,39 @@ def draw_plan(arm: ArmFile, plan: SweepPlan, path: Path) -> None:
         x=arrow[:, 0], y=arrow[:, 1], z=arrow[:, 2], mode="lines", name="gravity", line={"width": 8, "color": "grey"}
     )
     figure.update_layout(
-        title=f"{escape(arm.name)}: where the arm will be (base frame, m)", scene={"aspectmode": "data"}, height=800
+        title=f"{escape(arm.name)}: where the arm will be (base frame, m)",
+        scene={"aspectmode": "data", "camera": _camera(down)},
+        height=800,
+        margin={"l": 0, "r": 0, "b": 0},
+        updatemenus=[{"buttons": _choices(plan), "x": 0.0, "xanchor": "left", "y": 1.0}],
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.write_html(path, include_plotlyjs=True, full_html=True)
+
+
+def _camera(down: Array) -> dict[str, dict[str, float]]:
+    """A view in which gravity points down on the screen, from a little above."""
+    up = -down if np.any(down) else np.array([0.0, 0.0, 1.0])
+    side = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    eye = 1.4 * (side / np.linalg.norm(side) + 0.6 * np.cross(up, side) + 0.35 * up)
+    return {
+        "up": dict(zip("xyz", up.tolist(), strict=True)),
+        "eye": dict(zip("xyz", eye.tolist(), strict=True)),
+    }
+
+
+def _choices(plan: SweepPlan) -> list[dict[str, object]]:
+    """Buttons: everything, or one sweep alone with the direction of gravity."""
+    count = len(plan.sweeps)
+    everything = {"label": "all sweeps", "method": "update", "args": [{"visible": [True] * (count + 2)}]}
+    return [
+        everything,
+        *(
+            {
+                "label": sweep.name,
+                "method": "update",
+                "args": [{"visible": [*(k == place for k in range(count)), False, True]}],
+            }
+            for place, sweep in enumerate(plan.sweeps)
+        ),
+    ]

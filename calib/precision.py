@@ -28,11 +28,12 @@ def predicted_gain_std(
     sigma: Array,
     position_offset_std: float,
     position_sigma: Array | float = 0.0,
+    point: Prior | None = None,
 ) -> Array:
     """Standard deviations (n,) of the torque gains after passes without and with `mass` [kg]; inf if not observable.
 
     scout (P, n) [rad] are poses at which all sensors count; sigma (n,) [N·m] is that of one reading, position_sigma
-    (n,) [rad] that of its positions.
+    (n,) [rad] that of its positions; `point` is what is known of where the mass hangs.
     """
     arm = guess.arm
     positions, counted = [scout], [np.ones(scout.shape, dtype=bool)]
@@ -58,6 +59,8 @@ def predicted_gain_std(
         unknown.add("position_offset")
         priors["position_offset"] = Prior(0.0, position_offset_std)
     tip = np.array([arm.a[-1] + SIDE, SIDE, arm.d[-1]])
+    if point is not None:
+        priors["rho"], tip = point, np.asarray(point.mean, dtype=np.float64)
     start = Parameters.nominal(arm.n, beta=guess.beta, rho=tip)
     std: Array = predict_covariance(
         arm, both, start, unknown=unknown, priors=priors, position_sigma=position_sigma

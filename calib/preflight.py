@@ -1,6 +1,7 @@
-"""Before a sweep: are the sensors alive and quiet, and is every stop where the arm file has it?
+"""Before a sweep: are the sensors alive and quiet, the drives cool, and is every stop where the arm file has it?
 
-CiA 402 has no object for a drive's temperature; a drive that is too hot says so by an emergency, which ends any sweep.
+CiA 402 has no object for a drive's temperature, so it is read where the joint's data sheet has one at 2101h and the
+device too (INTEGER16, 0.1 °C). Every drive that gets too hot says so by an emergency, which ends any sweep.
 """
 
 from collections.abc import Callable
@@ -12,19 +13,23 @@ import numpy.typing as npt
 from armlink.armfile import ArmFile
 from armlink.errors import Refused
 from armlink.link import Link
+from armlink.objects import Entry
 from calib.mover import Mover, Stalled
 from calib.plan_limits import Limits
 from calib.section import sweep_section
 
 Array = npt.NDArray[np.float64]
 LISTEN = 0.5
-"""Seconds for which the sensors are listened to at rest."""
+"""Seconds for which the sensors are listened to at rest, after as long again in which switching on dies down."""
 LOUD = 0.05
 """Noise of a torque sensor, as a share of rated torque, from which it is not fit for a calibration."""
 NEAR_LIMIT = 1.9
 """Reading, in rated torques, at which a torque sensor is about to saturate."""
 APPROACH = 0.08
 """Distance from the arm file's stop from which a joint creeps [rad]."""
+TEMPERATURE = Entry(0x2101, 0, "h", "drive temperature")
+HOT = 70.0
+"""Temperature of a drive from which no sweep is begun: it would fall or rise while the sensors are read [°C]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,15 +45,19 @@ class Preflight:
     """Readings at the lower and the upper stop (n, 2) [rad]; NaN where none was looked for."""
     expected: Array
     """Stops by the arm file (n, 2) [rad]."""
+    temperature: Array
+    """Of the drives (n,) [°C]; NaN where a drive does not report it."""
 
 
 def listen(link: Link, arm: ArmFile) -> Preflight:
     """Listen to an enabled arm at rest.
 
-    Raises Refused naming the joint whose sensor is silent, loud or at the end of its range.
+    Raises Refused naming the joint whose sensor is silent, loud or at the end of its range, or whose drive is hot.
     """
+    temperature = read_temperatures(link)
     limits, mover = Limits.of(arm), Mover(link, sweep_section(arm), Limits.of(arm))
-    samples = [mover.cycle() for _ in range(max(int(LISTEN / link.period), 20))]
+    cycles = max(int(LISTEN / link.period), 20)
+    samples = [mover.cycle() for _ in range(2 * cycles)][cycles:]
     torque = np.array([sample.torque for sample in samples])
     position = np.array([sample.position for sample in samples])
     for joint, name in enumerate(link.names):
@@ -72,7 +81,23 @@ def listen(link: Link, arm: ArmFile) -> Preflight:
     nowhere = np.full((link.n, 2), np.nan)
     expected = np.column_stack([limits.lower, limits.upper])
     mean = np.nanmean(torque, axis=0)
-    return Preflight(link.names, np.array([_noise(each) for each in torque.T]), mean, nowhere, expected)
+    return Preflight(link.names, np.array([_noise(each) for each in torque.T]), mean, nowhere, expected, temperature)
+
+
+def read_temperatures(link: Link) -> Array:
+    """Temperatures of the drives (n,) [°C], NaN where one does not report it; raises Refused naming one that is hot."""
+    temperature = np.full(link.n, np.nan)
+    for joint, services in enumerate(link.services):
+        told = services.remote.object_dictionary.get_variable(TEMPERATURE.index, TEMPERATURE.sub)
+        if told is None or "temperature" not in told.name.lower() or not services.has(TEMPERATURE):
+            continue
+        temperature[joint] = services.read(TEMPERATURE) / 10
+        if temperature[joint] >= HOT:
+            raise Refused(
+                f"{link.names[joint]}: its drive is at {temperature[joint]:.0f} °C, a sweep begins below {HOT:.0f}:"
+                " let it cool down"
+            )
+    return temperature
 
 
 def find_stops(
@@ -105,7 +130,7 @@ def find_stops(
             if report is not None:
                 report(2 * count + end + 1, 2 * link.n)
     mover.travel(middle, 1.0)
-    return Preflight(found.names, found.noise, found.torque, stops, found.expected)
+    return Preflight(found.names, found.noise, found.torque, stops, found.expected, found.temperature)
 
 
 def _noise(values: Array) -> float:

@@ -10,13 +10,14 @@ import numpy.typing as npt
 from armlink.armfile import ArmFile
 from armlink.errors import Refused
 from armlink.link import Link
+from calib.averages import Rest
 from calib.dataset import DataWriter, Manifest, PlanLine, Reading, SweepData, load_data
 from calib.geometry import check_plan
-from calib.mover import Mover, Rest, Slipped, Stalled
+from calib.mover import Mover, Slipped, Stalled
 from calib.plan import plan_sweep
 from calib.plan_limits import Limits
 from calib.plan_model import Sweep, SweepPlan
-from calib.scout import SCOUT, as_reading, rough_model, run_scout
+from calib.scout import SCOUT, SLOWER, as_reading, rough_model, run_scout
 from calib.section import SweepSection, sweep_section
 
 Array = npt.NDArray[np.float64]
@@ -27,8 +28,6 @@ APPROACH = 0.03
 """Each step is approached over at least this way [rad]."""
 GAP = 0.02
 """Distance from a stop at which creeping begins [rad]."""
-SLOWER = 0.4
-"""Factor on the acceleration after a joint did not follow."""
 BARS = "▁▂▃▄▅▆▇█"
 RETRIES = 3
 """How often a joint that slipped or stalled is tried again before the sweep gives up."""
@@ -165,9 +164,10 @@ class _Pass:
     def _rest_others(self, sweep: Sweep, bias: Array, target: float, direction: int, *, detour: bool = False) -> None:
         """Bring the resting joints to their places, by way of a pose known to be good, and press or hold them there."""
         mover = self.mover
-        mover.hold_all()
         if detour:
+            mover.come_to_rest()
             mover.travel(self.refuge, self.acceleration)
+        mover.hold_all()
         goal = np.array(sweep.rest)
         stops = np.array(sweep.stops, dtype=np.int64) * ~np.array(sweep.servo)
         for joint in np.flatnonzero(stops):

@@ -6,10 +6,11 @@ import numpy as np
 import numpy.typing as npt
 
 from armlink.armfile import ArmFile
+from calib.averages import Rest
 from calib.dataset import Reading
 from calib.description import gcomp_arm
 from calib.guess import GravityGuess, guess_gravity
-from calib.mover import Mover, Rest, Stalled
+from calib.mover import Mover, Stalled
 from calib.plan_limits import Limits
 from calib.plan_model import SweepPlan
 from calib.section import sweep_section
@@ -18,6 +19,8 @@ Array = npt.NDArray[np.float64]
 SCOUT = "scout"
 SCOUT_ACCELERATION = 1.0
 """Nothing is known of the arm's weight yet [rad/s²]."""
+SLOWER, SLOWEST = 0.4, 0.15
+"""Factor on the acceleration after a joint did not follow, and where that ends [rad/s²]."""
 
 
 def run_scout(mover: Mover, plan: SweepPlan, done: Collection[int], save: Callable[[Reading], None]) -> None:
@@ -27,16 +30,21 @@ def run_scout(mover: Mover, plan: SweepPlan, done: Collection[int], save: Callab
     """
     n = mover.link.n
     everything = np.ones(n, dtype=bool)
-    last, unreached = mover.position.copy(), []
+    acceleration, last, unreached = SCOUT_ACCELERATION, mover.position.copy(), list[Stalled]()
     for index, pose in enumerate(plan.scout):
         if index in done:
             continue
-        try:
-            mover.travel(np.array(pose), SCOUT_ACCELERATION)
-        except Stalled as stall:
-            unreached.append(stall)
-            mover.hold_all()
-            mover.travel(last, SCOUT_ACCELERATION)
+        stalls = list[Stalled]()
+        for goal in (np.array(pose), np.array(pose), last):
+            try:
+                mover.travel(goal, acceleration)
+                break
+            except Stalled as stall:
+                stalls.append(stall)
+                mover.come_to_rest()
+                acceleration = max(SLOWER * acceleration, SLOWEST)
+        if len(stalls) > 1:
+            unreached.append(stalls[0])
             continue
         rest = mover.rest(everything)
         last = mover.position.copy()

@@ -2,10 +2,12 @@
 
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field, FiniteFloat, PositiveFloat, model_validator
 
 from armlink.armfile import ArmFile, Section
 from armlink.errors import BadInput
+from gcomp.parameters import Prior
 
 Share = Annotated[FiniteFloat, Field(gt=0, lt=1)]
 
@@ -53,6 +55,12 @@ class SweepSection(Section):
     """Samples averaged at most."""
     reference_mass: PositiveFloat | None = None
     """Mass attached for the second pass [kg]; by default chosen from the torque limits."""
+    reference_point: tuple[FiniteFloat, FiniteFloat, FiniteFloat] | None = None
+    """Where the mass's centre hangs, if measured: in the frame that turns with the last joint, origin on its axis, z
+    along it and x along `a` [m]; by default it is fitted. It gives the gains' common scale where all axes nearly meet.
+    """
+    reference_point_std: PositiveFloat = 0.001
+    """How well `reference_point` is known [m]."""
     position_offset_std: Annotated[FiniteFloat, Field(ge=0)] = 0.005
     """How well the zero of the position sensors is known beforehand [rad]; 0 takes it as exact."""
 
@@ -61,6 +69,13 @@ class SweepSection(Section):
         if self.bias_torque is not None and not self.bias_torque:
             raise ValueError("bias_torque is empty: give one torque per joint, or leave it out")
         return self
+
+    @property
+    def known_point(self) -> Prior | None:
+        """What is known beforehand of the place where the mass hangs, None where that is nothing."""
+        if self.reference_point is None:
+            return None
+        return Prior(np.array(self.reference_point), self.reference_point_std)
 
 
 def sweep_section(arm: ArmFile) -> SweepSection:

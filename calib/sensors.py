@@ -10,8 +10,10 @@ from scipy import stats
 from armlink.armfile import ArmFile
 from calib.dataset import SweepData
 from calib.description import gcomp_arm
+from calib.findings import Finding
+from calib.fit_reasons import reasons_of
 from calib.fit_rows import FitRows, fit_rows
-from calib.goodness import Finding, Goodness, examine
+from calib.goodness import Goodness, examine
 from calib.records import PARAMETERS, CalibrationRecord, JointCalibration, Parameter, matrix, provenance
 from calib.section import sweep_section
 from gcomp.global_fit import GlobalFit, identify_global
@@ -19,8 +21,13 @@ from gcomp.parameters import Prior
 from gcomp.sensor_model import predict
 
 Array = npt.NDArray[np.float64]
-WORDY = 6
-"""Parameters that a reason names one by one."""
+WIDE = 0.005
+"""Half width of a gain's 95 % interval, as a share of it, from which the user is told."""
+COMMON = (
+    "the mass tells the gains' common scale by the levers between the axes before the last, which are too short here;"
+    " measure where it hangs (sweep.reference_point), or use a heavier one"
+)
+"""Why all gains may be known badly together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +84,41 @@ class SensorFit:
         return tuple(name for name in self.names if name in broken)
 
     @property
+    def attachment(self) -> tuple[Array, Array] | None:
+        """Where the reference mass hung, and half of its 95 % interval, (3,) each [m]; NaN where not determined.
+
+        In the frame that turns with the last joint, origin on its axis. None without a reference mass.
+        """
+        if not any(self.rows.masses):
+            return None
+        point = self.fit.values.rho
+        return point, np.where(np.isnan(point), np.nan, self.quantile * self.fit.std.rho)
+
+    @property
+    def attachment_text(self) -> str:
+        """The attachment and mass moment of each reference mass in one sentence; empty without one."""
+        if self.attachment is None:
+            return ""
+        point, half = self.attachment
+        place = ", ".join(f"{at:.4f} ± {by:.4f}" for at, by in zip(point, half, strict=True))
+        moments = [f"{mass:g} kg: {_triple(mass * point)} kg·m" for mass in self.rows.masses if mass]
+        return (
+            f"the reference mass hung at ({place}) m of the last joint's frame; its mass moment, {'; '.join(moments)}"
+        )
+
+    @property
+    def imprecise(self) -> dict[str, str]:
+        """Joint → why its gain, though determined, is known worse than `WIDE`."""
+        half = self.quantile * self.std("gain") / np.abs(self.value("gain"))
+        common = bool(np.all(half[np.isfinite(half)] > WIDE))
+        why = COMMON if common else "give its sweeps more poses, or the arm a heavier reference mass"
+        return {
+            name: f"{name} gain: known to ± {width:.1%} only: {why}"
+            for name, width in zip(self.names, half, strict=True)
+            if width > WIDE
+        }
+
+    @property
     def residual_rms(self) -> Array:
         """RMS of each joint's torque residual over the readings that count (n,) [N·m]."""
         rms: Array = np.sqrt(np.nanmean(self.fit.residual**2, axis=0))
@@ -129,7 +171,7 @@ def fit_sensors(arm: ArmFile, data: Sequence[SweepData]) -> SensorFit:
         friction=_friction(fit, rows),
         goodness=good,
         quantile=float(stats.t.ppf(0.975, max(fit.dof, 1))),
-        reasons=_reasons(fit, rows),
+        reasons=reasons_of(fit, rows),
         gain_ratio=None if loaded else _gain_ratio(arm, rows),
         sources={each.path.name: each.digest for each in data},
     )
@@ -137,14 +179,16 @@ def fit_sensors(arm: ArmFile, data: Sequence[SweepData]) -> SensorFit:
 
 def _fit(arm: ArmFile, rows: FitRows, **extra: Prior) -> Goodness:
     """The global fit, then refined and examined."""
-    described, zero_std = gcomp_arm(arm), sweep_section(arm).position_offset_std
+    described, section = gcomp_arm(arm), sweep_section(arm)
     unknown = {"gain", "offset", "position_gain", "beta"}
     priors = dict(extra)
-    if zero_std > 0:
+    if section.position_offset_std > 0:
         unknown.add("position_offset")
-        priors["position_offset"] = Prior(0.0, zero_std)
+        priors["position_offset"] = Prior(0.0, section.position_offset_std)
     if any(rows.masses):
         unknown.add("rho")
+        if section.known_point is not None:
+            priors["rho"] = section.known_point
     fit = identify_global(described, rows.readings, unknown=unknown, priors=priors, position_sigma=rows.position_sigma)
     rated = np.array([joint.rated_torque for joint in arm.require_link().joints])
     return examine(described, rows, fit, priors, rated)
@@ -174,33 +218,6 @@ def _mean(values: Array) -> float:
     return float(kept.mean()) if len(kept) else float("nan")
 
 
-def _reasons(fit: GlobalFit, rows: FitRows) -> dict[tuple[str, Parameter], str]:
-    """Why each parameter without a value has none."""
-    reasons: dict[tuple[str, Parameter], str] = {}
-    lost = {name: found for name, found in zip(fit.names, fit.identifiable, strict=True) if not found}
-    for name in (*lost, *fit.hopeless):
-        family, _, joint = name.rstrip("]").partition("[")
-        for parameter in PARAMETERS:
-            if parameter == family:
-                reasons[joint, parameter] = _reason(name, fit, rows)
-    return reasons
-
-
-def _reason(name: str, fit: GlobalFit, rows: FitRows) -> str:
-    if name in fit.hopeless:
-        spread = float(np.sqrt(fit.covariance_of(name)[0, 0]))
-        return f"these sweeps would give it to ± {2 * spread:.2g} only: gravity hardly acts on it in these poses"
-    for sentence in fit.null_space:
-        if name in sentence:
-            if "common factor" in sentence and not any(rows.masses):
-                return "no readings with a reference mass: only ratios of gains are determined"
-            others = sentence.count(",")
-            if others > WORDY:
-                return f"it can change together with {others} other parameters without changing any reading"
-            return sentence
-    return "the readings do not determine it"
-
-
 def _gain_ratio(arm: ArmFile, rows: FitRows) -> Array:
     """Gains as multiples of the last joint's (n,), from data without a reference mass."""
     n = len(arm.joint_names)
@@ -209,6 +226,10 @@ def _gain_ratio(arm: ArmFile, rows: FitRows) -> Array:
     fit = _fit(arm, rows, gain=Prior(1.0, std)).refined.fit
     ratio: Array = fit.values.gain
     return np.where(fit.std.gain < 0.2, ratio, np.nan)
+
+
+def _triple(values: Array) -> str:
+    return f"({', '.join(f'{value:.4f}' for value in values)})"
 
 
 def _number(value: float) -> float | None:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gcomp.arm import Arm
-from gcomp.arrays import Array, as_array
+from gcomp.arrays import Array, Mask, as_array
 from gcomp.errors import BadArray
 from gcomp.global_fit import Prediction, predict_covariance
 from gcomp.gravity import gravity_levers
@@ -80,12 +80,15 @@ def candidate_sweeps(arm: Arm, joint: int, steps: int, margin: float = 0.0) -> l
     Well is Γ ≥ 0.3 g; where no combination has that, the better half is taken.
     """
     poses = stop_combinations(arm, joint)
-    lever = gravity_levers(arm, poses)[:, joint]
-    good = lever >= MINIMUM_LEVER * np.linalg.norm(arm.gravity)
-    if not good.any():
-        good = lever >= np.median(lever)
+    good = well_felt(gravity_levers(arm, poses)[:, joint] / max(float(np.linalg.norm(arm.gravity)), 1e-9))
     angles = np.linspace(arm.lower[joint] + margin, arm.upper[joint] - margin, steps)
     return [Sweep(joint, pose, angles) for pose in poses[good]]
+
+
+def well_felt(lever: Array) -> Mask:
+    """Which levers Γ/g (C,) are at least `MINIMUM_LEVER`; where none is, the better half."""
+    good: Mask = lever >= MINIMUM_LEVER
+    return good if good.any() else lever >= np.median(lever)
 
 
 def readings_of(arm: Arm, sweeps: Sequence[Sweep], sigma: ArrayLike, loads: Sequence[float] = (0.0,)) -> Readings:

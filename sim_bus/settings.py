@@ -14,6 +14,9 @@ from sim_bus.signals import Key
 APPLIED = (0x6007, 0x605A, 0x6065, 0x607D, 0x6085, 0x60C2)
 """Objects of the drive profile that come into force when written."""
 
+TEMPERATURE = 310
+"""Of every drive [0.1 °C]."""
+
 
 def power_on_values(arm: ArmFile, joint: LinkJoint, increments: int) -> dict[Key, int | str]:
     """Objects of one joint that differ from the EDS's defaults; `increments` are the encoder's a joint turn."""
@@ -21,6 +24,7 @@ def power_on_values(arm: ArmFile, joint: LinkJoint, increments: int) -> dict[Key
     deceleration = round(servo.quick_stop_deceleration / UNIT)
     return {
         (0x1018, 4): crc32(f"{arm.name} {arm.serial} {joint.name}".encode()),
+        (0x2101, 0): TEMPERATURE,
         (0x6072, 0): min(round(joint.max_torque * 1000 / joint.rated_torque), 0xFFFF),
         (0x6076, 0): round(joint.rated_torque * 1000),
         (0x6081, 0): round(joint.max_velocity / UNIT),

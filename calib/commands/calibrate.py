@@ -92,6 +92,8 @@ def _answer(fit: "SensorFit", record: "CalibrationRecord", applied: bool) -> dic
             {"joint": joint, "parameter": parameter, "reason": reason}
             for (joint, parameter), reason in fit.reasons.items()
         ],
+        "imprecise": list(fit.imprecise),
+        "attachment": _attachment(fit),
         "gain_ratio": None if fit.gain_ratio is None else fit.gain_ratio.tolist(),
         "residual_rms": fit.residual_rms.tolist(),
         "hysteresis": fit.hysteresis.tolist(),
@@ -110,6 +112,17 @@ def _answer(fit: "SensorFit", record: "CalibrationRecord", applied: bool) -> dic
     }
 
 
+def _attachment(fit: "SensorFit") -> dict[str, list[Any]] | None:
+    """Where the reference mass hung [m], null where not determined."""
+    if fit.attachment is None:
+        return None
+    point, half = fit.attachment
+    return {
+        "estimated": point.tolist(),
+        "ci95": [[at - by, at + by] for at, by in zip(point.tolist(), half.tolist(), strict=True)],
+    }
+
+
 def _show(fit: "SensorFit") -> None:
     from calib.commands.screen import print_intervals, print_lines
 
@@ -118,13 +131,13 @@ def _show(fit: "SensorFit") -> None:
     columns["locked friction [N·m]"] = (fit.friction, 0 * fit.friction)
     print_intervals("Sensors, ± half of the 95 % interval", fit.names, columns)
     lines = [f"{joint} {parameter}: {reason}" for (joint, parameter), reason in fit.reasons.items()]
+    lines += [*fit.imprecise.values(), *([fit.attachment_text] if fit.attachment is not None else [])]
     if fit.gain_ratio is not None:
         ratios = ", ".join(f"{name} {ratio:.4f}" for name, ratio in zip(fit.names, fit.gain_ratio, strict=True))
         lines.append(f"gains as multiples of the last joint's: {ratios}")
-    lines += [f"[yellow]{finding.text}[/yellow]" for finding in fit.findings]
+    print_lines(lines)
+    print_lines([finding.text for finding in fit.findings], "yellow")
     worst = max(fit.goodness.left_out, key=lambda each: each.ratio, default=None)
     if worst is not None:
-        lines.append(
-            f"each sweep told by all others: within {worst.ratio:.1f} times its expected error at worst ({worst.sweep})"
-        )
-    print_lines(lines)
+        told = f"{worst.ratio:.1f} times its expected error at worst ({worst.sweep})"
+        print_lines([f"each sweep told by all others: within {told}"])

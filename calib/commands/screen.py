@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
@@ -16,7 +17,7 @@ from calib.plan_model import SweepPlan
 if TYPE_CHECKING:
     from calib.preflight import Preflight
 
-_CONSOLE = Console(stderr=True)
+_CONSOLE = Console(stderr=True, markup=False)  # units stand in brackets
 
 
 class SweepScreen:
@@ -64,40 +65,49 @@ def confirm(question: str) -> None:
 
 def print_preflight(found: "Preflight") -> None:
     """What the pre-flight found, a row a joint."""
-    table = Table(
-        "joint", "torque noise [N·m]", "torque at rest [N·m]", "lower stop", "upper stop [rad]", title="Pre-flight"
-    )
+    headings = ("joint", "torque noise [N·m]", "torque at rest [N·m]", "drive [°C]", "lower stop", "upper stop [rad]")
+    table = Table(*headings, title="Pre-flight")
     for joint, name in enumerate(found.names):
         stops = [
             "not pushed" if np.isnan(at) else f"{at:.3f} (arm file {wanted:.3f})"
             for at, wanted in zip(found.stops[joint], found.expected[joint], strict=True)
         ]
-        table.add_row(name, f"{found.noise[joint]:.3g}", f"{found.torque[joint]:.3g}", *stops)
+        warm = "not reported" if np.isnan(found.temperature[joint]) else f"{found.temperature[joint]:.0f}"
+        table.add_row(name, f"{found.noise[joint]:.3g}", f"{found.torque[joint]:.3g}", warm, *stops)
     _CONSOLE.print(table)
 
 
 def print_plan(arm: ArmFile, plan: SweepPlan) -> None:
     """The sweeps of a plan as a table: where each joint rests, what presses it, range and lever of gravity."""
-    table = Table("sweep", "from … to [rad]", "Γ/g", *arm.joint_names, title=f"{arm.name}: {len(plan.sweeps)} sweeps")
+    title = f"{arm.name}: {len(plan.sweeps)} sweeps"
+    table = Table(
+        "sweep", "from … to", "Γ/g", *_short(arm.joint_names), title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0)
+    )
     for sweep in plan.sweeps:
         cells = []
         for joint in range(len(arm.joint_names)):
             if joint == sweep.joint:
-                cells.append("sweeps")
+                cells.append("↔")
             elif sweep.servo[joint]:
-                cells.append(f"servo {sweep.rest[joint]:.2f}")
+                cells.append(f"={sweep.rest[joint]:.2f}")
             else:
-                end = "upper" if sweep.stops[joint] > 0 else "lower"
-                cells.append(end if sweep.bias is None else f"{end} {sweep.bias[joint]:+.1f}")
+                end = "▲" if sweep.stops[joint] > 0 else "▼"
+                cells.append(end if sweep.bias is None else f"{end}{sweep.bias[joint]:+.1f}")
         table.add_row(sweep.name, f"{sweep.steps[0]:.2f} … {sweep.steps[-1]:.2f}", f"{sweep.lever:.2f}", *cells)
     _CONSOLE.print(table)
-    if plan.sweeps[0].bias is None:
-        _CONSOLE.print("Bias torques [N·m] are set by the scout, which weighs the arm first.", highlight=False)
-    _CONSOLE.print(f"{plan.readings} readings; reference mass {plan.reference_mass:g} kg", highlight=False)
-    if plan.gain_std:
-        _CONSOLE.print(f"torque gains will be known to ± {2 * plan.gain_std:.2%} (95 %)", highlight=False)
+    _CONSOLE.print(
+        "↔ sweeps; ▲ ▼ rests on its upper, lower stop, pressed with so many N·m; = held there by its servo [rad]",
+        highlight=False,
+    )
     for note in plan.notes:
-        _CONSOLE.print(f"[yellow]{note}[/yellow]", highlight=False)
+        _CONSOLE.print(note, style="yellow", highlight=False)
+
+
+def _short(names: tuple[str, ...]) -> list[str]:
+    """The numbers of names such as joint_1, joint_2; other names as they are."""
+    begin = names[0].rstrip("0123456789")
+    short = [name.removeprefix(begin) for name in names]
+    return short if all(short) else list(names)
 
 
 def print_intervals(title: str, names: tuple[str, ...], columns: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:
@@ -108,10 +118,10 @@ def print_intervals(title: str, names: tuple[str, ...], columns: dict[str, tuple
     _CONSOLE.print(table)
 
 
-def print_lines(lines: list[str]) -> None:
-    """Plain lines."""
+def print_lines(lines: list[str], style: str | None = None) -> None:
+    """Plain lines, or in a style of rich's such as `yellow`."""
     for line in lines:
-        _CONSOLE.print(line, highlight=False)
+        _CONSOLE.print(line, style=style, highlight=False)
 
 
 def _interval(value: float, half: float) -> str:

@@ -82,6 +82,9 @@ def _sensors(done: Calibrated) -> Section:
         rows.append([escape(name), *cells, f"{fit.residual_rms[j]:.4f}", f"{fit.hysteresis[j]:.4f}"])
     table = ReportTable(header, rows, "Estimates ± half of the 95 % interval; reading = gain · torque + offset.")
     reasons = [f"{joint}, {parameter.replace('_', ' ')}: {why}." for (joint, parameter), why in fit.reasons.items()]
+    reasons += [f"{why}." for why in fit.imprecise.values()]
+    if fit.attachment is not None:
+        reasons.append(f"{fit.attachment_text[0].upper()}{fit.attachment_text[1:]}.")
     return Section("Sensors", "".join(paragraph(each) for each in reasons), (), [table])
 
 

@@ -130,7 +130,12 @@ def judge(arm: ArmFile, truth: Truth, data: list[SweepData], fit: SensorFit | No
     """Errors of the fit against the truth, and its unobservable parameters against the rank test."""
     fit = fit_sensors(arm, data) if fit is None else fit
     rated = np.array([joint.rated_torque for joint in arm.require_link().joints])
-    gain = float(np.nanmax(np.abs(fit.value("gain") / truth.gain - 1), initial=0.0))
+    off = np.abs(fit.value("gain") / truth.gain - 1)
+    gain = float(np.nanmax(off, initial=0.0))
+    told = np.array([name in fit.imprecise for name in fit.names])  # known worse than asked, and said so
+    width = 1.5 * fit.quantile * fit.std("gain") / np.abs(truth.gain)
+    beyond = off > np.where(told, np.maximum(width, GAIN), GAIN)
+    loosest = float(np.max(width, where=told, initial=GRAVITY))
     offset = float(np.nanmax(np.abs(fit.value("offset") - truth.offset) / rated, initial=0.0))
     inside = [
         bool(low <= true <= high)
@@ -143,8 +148,8 @@ def judge(arm: ArmFile, truth: Truth, data: list[SweepData], fit: SensorFit | No
     named = {(joint, parameter) for joint, parameter in fit.reasons if parameter in ("gain", "offset", "position_gain")}
     hopeless = {tuple(reversed(name.rstrip("]").split("["))) for name in fit.fit.hopeless}
     missed, invented = lost - named, named - lost - hopeless
-    wrong = [f"gain {gain:.2%}"] * (gain > GAIN) + [f"offset {offset:.2%}"] * (offset > OFFSET)
-    wrong += [f"gravity {gravity:.2%}"] * (gravity > GRAVITY)
+    wrong = [f"gain {gain:.2%}"] * bool(beyond.any()) + [f"offset {offset:.2%}"] * (offset > OFFSET)
+    wrong += [f"gravity {gravity:.2%}"] * (gravity > loosest)
     wrong += [f"missed {sorted(missed)}"] * bool(missed) + [f"invented {sorted(invented)}"] * bool(invented)
     return Verdict(arm, truth, data, fit, gain, offset, gravity, inside, missed, invented, wrong)
 

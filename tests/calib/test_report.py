@@ -12,8 +12,8 @@ from calib.diff import differences
 from calib.field import fit_field
 from calib.field_record import check_field_heldout, field_record
 from calib.field_rows import rows_of_sweeps
+from calib.findings import Finding
 from calib.gates import check_gates, check_heldout, check_holds, heldout_scores
-from calib.goodness import Finding
 from calib.identify import identify_gravity
 from calib.records import CalibrationRecord, JointCalibration
 from calib.report.calibration import Calibrated, write_report

@@ -1,14 +1,26 @@
 """Commands sweep, calibrate, identify and verify, as a user runs them, on a simulated arm in lock-step."""
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from sweep_arms import random_arm
 
+from armlink.armfile import load_arm
 from armlink.cli import run
+from armlink.link import Link
 from calib.dataset import load_data
+from calib.plan_limits import Limits
+from calib.records import CalibrationRecord
+from calib.runner import run_sweep
+from calib.store import RecordStore
+from sim_bus.bus import LockStepBus
+from sim_bus.simulated_arm import SimulatedArm
+from sim_bus.truth import Truth
 
 
 @pytest.fixture(scope="module")
@@ -72,10 +84,79 @@ def test_from_sweeps_to_a_verified_model(
     assert verified["gravity_record"] == gravity["record"]
 
 
-def test_plan_prints_and_moves_nothing(arm_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["sweep", str(arm_path), "--plan", "--json", "-"]) == 0
+def test_plan_prints_and_moves_nothing(arm_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["sweep", str(arm_path), "--plan", "--picture", str(tmp_path / "plan.html"), "--json", "-"]) == 0
     plan = json.loads(capsys.readouterr().out)
     assert [sweep["joint"] for sweep in plan["sweeps"]] == [1, 1, 0, 0]
+
+
+def test_a_dry_run_makes_the_whole_sweep_on_the_simulated_arm(
+    arm_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No bus is opened: the arm file's own, socketcan:can0, is not there."""
+    out = tmp_path / "dry"
+    assert run(["sweep", str(arm_path), "--dry-run", "--no-check-stops", "--out", str(out), "--json", "-"]) == 0
+    answer, said = json.loads(capsys.readouterr().out), capsys.readouterr().err
+    data = load_data(out)
+    assert data.complete
+    assert answer["readings"] == len(data.readings)
+    assert answer["recommended_reference_mass"] > 0
+    assert said == ""
+
+
+def test_where_the_model_does_not_hold_nothing_is_written_unless_accepted(
+    arm_path: Path, swept: Path, loaded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A cable over the second joint pulls with 4 % of rated torque a rad."""
+    bent = []
+    for whole in (swept, loaded):
+        copy = tmp_path / whole.name
+        shutil.copytree(whole, copy)
+        bent.append(str(copy))
+        lines = [json.loads(line) for line in (copy / "readings.jsonl").read_text().splitlines()]
+        rated = load_data(copy).manifest.rated_torque[1]
+        for line in lines:
+            if line["kind"] == "reading":
+                line["torque"][1] += 0.04 * rated * line["position"][1]
+        (copy / "readings.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    store, bus = ["--store", str(tmp_path / "records.db")], ["--bus", f"armlink_sim:{arm_path}"]
+    assert run(["calibrate", *bent, *store, *bus, "--apply"]) == 1
+    error = capsys.readouterr().err
+    assert "nothing is written: j2: torque linear in position" in error
+    assert "--accept j2" in error
+    assert RecordStore(str(tmp_path / "records.db")).current(CalibrationRecord, load_arm(str(arm_path))) is None
+    assert run(["calibrate", *bent, *store, *bus, "--apply", "--accept", "j2", "--json", "-"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["applied"]
+    assert answer["doubtful"] == ["j2"]
+
+
+def test_recalibrate_writes_what_drifted_to_the_controllers(
+    arm_path: Path, swept: Path, loaded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sensors 4 % up and 3 % down since the sweeps; a new sweep without a mass is enough, and 2100h then holds it."""
+    store, passes = ["--store", str(tmp_path / "records.db")], [str(swept), str(loaded)]
+    assert run(["calibrate", *passes, *store]) == 0
+    assert run(["identify", *passes, *store]) == 0
+    arm = load_arm(str(arm_path))
+    gain, offset = np.array([1.04, 0.97]), 0.01 * Limits.of(arm).rated
+    truth = replace(Truth.of(arm), gain=gain, offset=offset)
+    simulated = SimulatedArm(arm, truth, 5)
+    with Link(arm, LockStepBus(arm=simulated)) as link:
+        link.start()
+        link.enable()
+        again = run_sweep(link, arm, tmp_path / "again")
+    monkeypatch.setattr(Link, "open", lambda *_: Link(arm, LockStepBus(arm=simulated)))
+    assert run(["recalibrate", str(arm_path), str(again.path), *store, "--apply"]) == 0
+    record = RecordStore(str(tmp_path / "records.db")).current(CalibrationRecord, arm)
+    assert record is not None
+    for node, joint, true in zip(simulated.nodes, record.joints, gain, strict=True):
+        held = node.record.active
+        assert (held.gain, held.offset) == (np.float32(joint.gain), np.float32(joint.offset))
+        assert held.gain == pytest.approx(true, rel=0.01)
+    assert [each.offset for each in record.joints] == pytest.approx(
+        offset.tolist(), abs=0.003 * Limits.of(arm).rated.max()
+    )
 
 
 def test_sweep_needs_a_directory(arm_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,6 +1,6 @@
 """Campaign: SIGKILL at random moments of record writes, activations and writes to controllers.
 
-python tests/campaigns/kill_records.py [--kills 200] [--seed 0] [--url postgresql://…]
+python tests/campaigns/kill_records.py [--kills 200] [--seed 0] [--postgresql | --url postgresql://…]
 Exit status 1 if a record is torn or lost, the store does not open, or controllers and current record disagree.
 
 A child process keeps records, makes them current and writes them to two controllers whose memory is a file, object by
@@ -19,8 +19,12 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
+from postgres import server
 
 from armlink.armfile import ArmFile, parse_arm
 from armlink.errors import BadInput
@@ -173,10 +177,13 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--url", help="database to write to; default: SQLite in a temporary folder")
+    parser.add_argument("--postgresql", action="store_true", help="write to a temporary PostgreSQL server instead")
     given = parser.parse_args()
-    with tempfile.TemporaryDirectory(prefix="armlink-kills-") as name:
+    with tempfile.TemporaryDirectory(prefix="armlink-kills-") as name, ExitStack() as stack:
         folder = Path(name)
         url = given.url or str(folder / "records.db")
+        if given.postgresql:
+            url = f"{stack.enter_context(server())}/postgres"
         records, cut, wrong = campaign(url, folder, given.kills, given.seed)
     for line in wrong:
         print(line)

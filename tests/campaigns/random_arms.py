@@ -66,6 +66,7 @@ def main() -> int:
             f" of rated, gravity {verdict.gravity:.3%}, {sum(verdict.inside)}/{len(verdict.inside)} intervals hold,"
             f" chi2/dof {verdict.fit.fit.chi2 / max(verdict.fit.fit.dof, 1):.2f}, noise x"
             f" {' '.join(f'{factor:.2f}' for factor in verdict.fit.noise_factor)}; unobservable: {lost};"
+            f" said to be imprecise: {' '.join(verdict.fit.imprecise) or 'none'};"
             f" {robot:.0f} s of robot time, {time.monotonic() - began:.0f} s; {'; '.join(verdict.wrong) or 'ok'}",
             flush=True,
         )
