@@ -9,6 +9,7 @@ from rich.table import Table
 
 from armlink.errors import BadInput
 from armlink.recording import load_recording
+from sim_gap.callback import module_path
 from sim_gap.diagnose import diagnose
 from sim_gap.diagnosis import Diagnosis
 from sim_gap.export import write_model
@@ -47,6 +48,8 @@ def run_diagnose(
         console.print(f"model with the effects in {out_model}")
         for line in missing:
             console.print(f"MJCF cannot hold {line}", style="yellow")
+        if missing:
+            console.print(f"{module_path(out_model)} applies these in a MuJoCo simulation")
     text = json_format.dumps(answer.to_json(), indent=1, ensure_ascii=False)
     if json == "-":
         sys.stdout.write(text + "\n")

@@ -38,12 +38,15 @@ def make_cases(
 ) -> None:
     """Draw, simulate and write cases: `out/case_XXXX/{sim.xml,train.csv,heldout.csv}`, `labels/case_XXXX.json`.
 
-    A case whose effects do not stand out on the held-out motion, or whose arm was not under control, is drawn again.
+    A case whose effects do not stand out on the held-out motion, or whose arm was not under control, is drawn again;
+    one that no arm shows is left out.
     """
     labels.mkdir(parents=True, exist_ok=True)
     todo = dict.fromkeys(wanted, 0)
     for last in (*[False] * (ROUNDS - 1), True):
-        drawings = [draw(recipe, train_s, heldout_s, first) for recipe, first in todo.items()]
+        drawings = [d for recipe, first in todo.items() if (d := draw(recipe, train_s, heldout_s, first)) is not None]
+        if not drawings:
+            return
         logs = iter(simulate([run for d in drawings for run in (d.heldout, *d.without)]))
         seen = [_judged(drawing, [next(logs) for _ in range(1 + len(drawing.without))], rate) for drawing in drawings]
         good = [(d, judged) for d, judged in zip(drawings, seen, strict=True) if last or judged.good]

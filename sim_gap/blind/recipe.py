@@ -13,7 +13,8 @@ from sim_gap.blind.plant import Run
 from sim_gap.blind.scene import Scene
 from sim_gap.blind.truth import ordinary
 
-ATTEMPTS = 150
+ATTEMPTS = 600
+"""After so many arms that cannot show a case's effects it is left out; play, the rarest, takes some hundred."""
 OTHER_PAIR = 20
 """After so many arms that cannot show two effects together, two others are drawn."""
 NONE_SHARE, TWO_SHARE = 0.12, 0.18
@@ -67,8 +68,11 @@ def _pair(random: np.random.Generator) -> tuple[str, ...]:
     return tuple(random.choice(EFFECTS, 2, replace=False).tolist())
 
 
-def draw(recipe: Recipe, train_s: float, heldout_s: float, first: int = 0) -> Drawing:
-    """Draw one case; arms that cannot show its effects are drawn again. `first` is the attempt to begin with."""
+def draw(recipe: Recipe, train_s: float, heldout_s: float, first: int = 0) -> Drawing | None:
+    """Draw one case; arms that cannot show its effects are drawn again, None where there is none in `ATTEMPTS`.
+
+    `first` is the attempt to begin with.
+    """
     for attempt in range(first, first + ATTEMPTS):
         random = np.random.default_rng([*recipe.seed, attempt])
         if recipe.kind == "two" and attempt >= OTHER_PAIR:
@@ -85,7 +89,7 @@ def draw(recipe: Recipe, train_s: float, heldout_s: float, first: int = 0) -> Dr
             command = trajectory((held,), heldout_s, limits, random)
             motions = {"train": training, "heldout": (held,)}
             return _assemble(recipe, scene, tuple(d for d in drawn if d), motions, command, random, attempt)
-    raise RuntimeError(f"{recipe.name}: no arm in {ATTEMPTS} shows {', '.join(recipe.effects)}")
+    return None
 
 
 def _assemble(

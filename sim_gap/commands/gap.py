@@ -33,7 +33,10 @@ def diagnose(
     ] = None,
     json: Annotated[str | None, typer.Option(help="Write the answer here; - is standard output.")] = None,
     report: Annotated[Path | None, typer.Option(help="Write a self-contained HTML report here.")] = None,
-    out_model: Annotated[Path | None, typer.Option(help="Write the model with the effects added here (MJCF).")] = None,
+    out_model: Annotated[
+        Path | None,
+        typer.Option(help="Write the model with the effects added here (MJCF), and beside it a module for the rest."),
+    ] = None,
 ) -> None:
     """Say where the gap lies, which effects cause it, and how far it shrinks on motion not fitted.
 
