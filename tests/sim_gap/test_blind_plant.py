@@ -248,6 +248,16 @@ def test_cases_are_the_same_for_the_same_seed(tmp_path: Path) -> None:
         assert (tmp_path / "a/case_0000" / name).read_bytes() == (tmp_path / "b/case_0000" / name).read_bytes()
 
 
+def test_a_case_that_no_arm_shows_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(DRAWS, "torque.offset", lambda scene, random: None)
+    monkeypatch.setattr("sim_gap.blind.recipe.ATTEMPTS", 3)
+    wanted = [Recipe("case_0000", ("torque.offset",), (6, 1)), Recipe("case_0001", (), (6, 2))]
+    make_cases(wanted, tmp_path / "c", tmp_path / "l", train_s=3.0, heldout_s=3.0)
+    assert [path.name for path in (tmp_path / "c").iterdir()] == ["case_0001"]
+    make_cases(wanted[:1], tmp_path / "c", tmp_path / "l", train_s=3.0, heldout_s=3.0)
+    assert [path.name for path in (tmp_path / "c").iterdir()] == ["case_0001"]
+
+
 def test_nominal_model_and_recordings_load(tmp_path: Path) -> None:
     make_cases([Recipe("case_0000", (), (6, 1))], tmp_path / "c", tmp_path / "l", train_s=4.0, heldout_s=3.0)
     recording = load_recording(tmp_path / "c/case_0000/train.csv")
