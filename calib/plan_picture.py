@@ -108,7 +108,7 @@ def _camera(down: Array) -> dict[str, dict[str, float]]:
     """A view in which gravity points down on the screen, from a little above."""
     up = -down if np.any(down) else np.array([0.0, 0.0, 1.0])
     side = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
-    eye = 1.4 * (side / np.linalg.norm(side) + 0.6 * np.cross(up, side) + 0.35 * up)
+    eye = 1.8 * (side / np.linalg.norm(side) + 0.6 * np.cross(up, side) + 0.35 * up)
     return {
         "up": dict(zip("xyz", up.tolist(), strict=True)),
         "eye": dict(zip("xyz", eye.tolist(), strict=True)),

@@ -113,6 +113,8 @@ def campaign(kills: int, seed: int, folder: Path) -> tuple[int, int, list[str], 
         found, differences = compare(reference, load_data(out))
         wrong += found
         scores.append(differences)
+        rms = float(np.sqrt(np.mean(np.concatenate(scores) ** 2)))
+        print(f"sweep {sweeps}: {made} kills so far, differences {rms:.2f} rms; {'; '.join(found) or 'ok'}", flush=True)
     return made, sweeps, wrong, np.concatenate(scores)
 
 
