@@ -57,7 +57,8 @@ def _gains(sim: SimModel, estimate: Estimate | None) -> dict[str, float]:
 def _line(sim: SimModel, estimate: Estimate, term: Term) -> str:
     values = estimate.parameters(term)
     where = f"in recording {term.bound}" if term.bound else sim.arm.names[term.place]
-    return f"{term.effect} {where} " + ", ".join(f"{k} {v.value:.6g} {v.unit}" for k, v in values.items())
+    told = (f"{name} {v.value:.6g}" + (f" {v.unit}" if v.unit != "1" else "") for name, v in values.items())
+    return f"{term.effect} {where} " + ", ".join(told)
 
 
 def _set_inertial(body: Any, model: Any) -> None:

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from armlink.errors import BadInput
 from armlink.recording import load_recording
@@ -62,11 +62,11 @@ def show(answer: Diagnosis, console: Console) -> None:
     """Print verdict, causes and gap as tables for people."""
     console.print(f"[bold]{answer.verdict}[/bold]: {sentence(answer)}")
     if answer.causes:
-        table = Table(
-            "effect", "joints", "RMS before", "after", "confidence", "confounded with", title="causes, held-out motion"
-        )
+        effect = Column("effect", no_wrap=True)
+        headers = "joints", "RMS before", "after", "confidence", "confounded with"
+        table = Table(effect, *headers, title="causes, held-out motion")
         for cause in answer.causes:
-            joints = ", ".join(cause.joints)
+            joints = f"all {len(answer.names)}" if cause.joints == answer.names else ", ".join(cause.joints)
             numbers = f"{cause.gap_before:.3g}", f"{cause.gap_after:.3g}", f"{cause.confidence:.2f}"
             table.add_row(cause.effect, joints, *numbers, ", ".join(cause.confounded_with))
         console.print(table)
