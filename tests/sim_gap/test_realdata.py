@@ -44,6 +44,23 @@ def test_the_payload_of_one_recording_is_found_beside_what_is_wrong_with_the_arm
     assert any("is in recording 3 alone" in note for note in answer.notes)
 
 
+def test_a_loaded_recording_alone_says_that_the_arm_itself_may_be_heavier(realdata):
+    """The empty arm already looks heavier at the flange than its URDF: one recording cannot tell that from the load."""
+    folder = realdata / "ur10e"
+    answer = diagnose(folder / "sim.xml", [load_recording(folder / "payload.csv.gz")])
+    assert answer.causes[0].effect == "link.payload"
+    mass = answer.causes[0].parameters["arm"]["mass"]
+    assert mass.low < 2.6 < mass.high
+    assert any("recordings of the arm without the payload" in note for note in answer.notes)
+
+
+def test_a_short_recording_keeps_enough_back_to_judge_on(realdata):
+    """Nine seconds: the last three are kept back, and rotor and coupling are found all the same."""
+    answer = diagnose(realdata / "tx40" / "sim.xml", [load_recording(realdata / "tx40" / "recording.csv.gz")])
+    assert joints(answer, "transmission.coupling") & {"joint_5", "joint_6"}
+    assert np.all(answer.heldout_after[4:] <= 1.3)
+
+
 def test_panda_is_wrong_in_its_masses(realdata):
     answer = split(realdata / "panda", 0.6)
     assert answer.causes[0].effect == "link.mass_moment"
