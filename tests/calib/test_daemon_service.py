@@ -1,35 +1,26 @@
-"""The daemon's service: what it knows, says and does, on an arm without a bus; the whole with its bus at the end."""
+"""The daemon's service: what it knows, says and does, on an arm without a bus."""
 
 import json
 import logging
 import os
 import socket
-from collections import deque
 from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
 import pytest
-from daemon_bench import DaemonBench
 from fast_daemon import QUIET, FastDaemon
 
 from armlink.armfile import load_arm
-from armlink.errors import BadInput, BusFault
-from armlink.link import Link
+from armlink.errors import BadInput
 from armlink.recording import load_recording
-from armlink.sample import Command
-from calib.daemon.arm_loop import ArmLoop
 from calib.daemon.journal import Journal
 from calib.daemon.logs import JsonFormatter
-from calib.daemon.messages import Batch, Down, LoopOptions, Up
+from calib.daemon.messages import Down, Up
 from calib.daemon.notify import Notifier, watchdog_seconds
 from calib.daemon.settings import DaemonSection
 from calib.daemon.view import NoSuch, NotPossible, State
-from calib.description import gcomp_arm
 from calib.records import CalibrationRecord
-from calib.work import work_targets
-from sim_bus.bus import LockStepBus
-from sim_bus.simulated_arm import SimulatedArm
 
 
 def settings(policy: str = "apply", **more: object) -> DaemonSection:
@@ -413,120 +404,3 @@ def test_a_slow_client_loses_the_oldest_and_holds_nobody_up(tmp_path: Path) -> N
     daemon.view.publish()
     assert len(client._items) < 100
     assert last.joints[0].joint == "joint_1"
-
-
-# ---- with frames, physics and the link
-
-
-def test_on_the_simulated_arm_with_its_bus(tmp_path: Path) -> None:
-    bench = DaemonBench(tmp_path, settings=settings("propose", observer={"window": 12}))
-    assert bench.view.status().state is State.OBSERVING
-    bench.run(8)
-    assert bench.view.status().rows >= 2
-    assert {joint.state for joint in bench.view.joints()} == {"operation enabled"}
-    bench.bus_there = False
-    bench.host.close()
-    bench.run(2)
-    status = bench.view.status()
-    assert (status.state, status.bus.connected) == (State.FAULT, False)
-    assert "No such device" in (status.bus.fault or "")
-    bench.bus_there = True
-    bench.run(4)
-    assert bench.view.status().state is State.OBSERVING
-    assert [event.kind for event in bench.view.events()][-1] == "recovered"
-    bench.host.close()
-
-
-def test_a_fault_of_a_joint_is_a_message_and_the_bus_is_opened_again(tmp_path: Path) -> None:
-    bench = DaemonBench(tmp_path, settings=settings("observe"), work=False)
-    bench.run(1)
-    bench.host.loop.source.stop()
-    reply = bench.host.loop.run()
-    assert isinstance(reply[0], Down)
-    bench.run(1)
-    assert bench.view.status().state is State.OBSERVING
-
-
-def test_errors_of_the_bus_loop_come_back_as_what_they_are(tmp_path: Path) -> None:
-    bench = DaemonBench(tmp_path, settings=settings("observe"), work=False)
-    with pytest.raises(BadInput, match="gain 9"):
-        bench.host.controllers.write_calibration(0, 9.0, 0.0, 1)
-    bench.host.close()
-    with pytest.raises(BusFault):
-        bench.host.controllers.read_calibration(0)
-
-
-class Recorded(LockStepBus):
-    """The simulated arm's bus, with every frame on it kept."""
-
-    def __init__(self, arm: SimulatedArm) -> None:
-        super().__init__(arm=arm)
-        self.frames: list[tuple[float, int, bytes]] = []
-
-    def put(self, can_id: int, data: bytes) -> None:
-        self.frames.append((self.arm.time, can_id, bytes(data)))
-        super().put(can_id, data)
-
-    def take(self, timeout: float = 0.0) -> tuple[int, bytes] | None:
-        frame = super().take(timeout)
-        if frame is not None:
-            self.frames.append((self.arm.time, frame[0], bytes(frame[1])))
-        return frame
-
-
-class Tap:
-    """Another place on that bus, later: hears every frame at its time; sending is a failure."""
-
-    channel_info = "tap"
-
-    def __init__(self, frames: list[tuple[float, int, bytes]]) -> None:
-        self.frames, self.clock, self.time = deque(frames), self, 0.0
-
-    def now(self) -> float:
-        return self.time
-
-    def put(self, can_id: int, data: bytes) -> None:
-        raise AssertionError("listening only, nothing is sent")
-
-    def take(self, timeout: float = 0.0) -> tuple[int, bytes] | None:
-        if self.frames and self.frames[0][0] <= self.time + timeout:
-            self.time, can_id, data = self.frames.popleft()
-            return can_id, data
-        self.time += timeout
-        return None
-
-    def shutdown(self) -> None:
-        pass
-
-
-def test_beside_another_controller_it_hears_all_and_sends_nothing(tmp_path: Path) -> None:
-    bench = DaemonBench(tmp_path, settings=settings("observe"), work=False)
-    bench.host.close()
-    arm, bus = bench.arm, Recorded(bench.simulated)
-    described = gcomp_arm(arm)
-    with Link(arm, bus) as link:
-        link.start()
-        link.enable()
-        random = np.random.default_rng(3)
-        targets = work_targets(link.position_sent, described.lower, described.upper, np.ones(7), 0.004, random)
-        for _ in range(2000):
-            truth = link.cycle(Command.hold(next(targets)))
-    loop = ArmLoop(LoopOptions(arm, listen_only=True, open_bus=lambda: Tap(bus.frames)))
-    service = bench.service
-    service.listen_only = True
-    messages = [message for _ in range(120) for message in loop.run()]
-    for message in messages:
-        service.take(message)
-    batches = [message for message in messages if isinstance(message, Batch)]
-    assert sum(len(batch.t) for batch in batches) >= 1990
-    assert isinstance(messages[0], Up)
-    assert messages[0].held is None
-    assert "no SYNC" in messages[-1].reason
-    position = np.vstack([batch.channels["position"] for batch in batches])
-    assert np.isfinite(position).all()
-    assert np.abs(position - truth.position).max(axis=1).min() < 1e-3
-    sent = np.vstack([batch.channels["position_command"] for batch in batches])
-    assert np.abs(sent[50:-50] - position[50:-50]).max() < 0.1
-    assert bench.view.status().rows >= 2
-    assert bench.view.status().state is State.FAULT
-    assert batches[-1].stats.load > 0.2

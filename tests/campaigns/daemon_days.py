@@ -117,8 +117,9 @@ def frames(given: argparse.Namespace) -> list[str]:
         sign = 1 if joint % 2 else -1
         there.simulated.drift(joint, 1 + 0.01 * sign * (kind == "gain"), 0.2 * sign * (kind == "offset"))
         at, name = there.now(), f"joint_{joint + 1}"
-        there.run(600, until=lambda there=there: bool(there.of_kind("recalibration")))
-        events = there.view.events(limit=1000)
+        last = there.service.journal.last_event
+        there.run(600, until=lambda there=there, last=last: "recalibration" in kinds(there, last))
+        events = there.view.events(after=last)
         first = min((e.t - at for e in events if e.kind in ("alarm", "drift") and e.joint == name), default=np.inf)
         written = [(event.t - at, event.joint) for event in events if event.kind == "recalibration"]
         held = there.host.controllers.read_calibration(joint)
@@ -135,6 +136,11 @@ def frames(given: argparse.Namespace) -> list[str]:
     medians = {kind: float(np.median(times)) for kind, times in found.items()}
     wrong += [f"frames: {kind} found after {time:.0f} s" for kind, time in medians.items() if time > FOUND_SECONDS]
     return wrong + picked_up(given)
+
+
+def kinds(there: DaemonBench, after: int) -> list[str]:
+    """Kinds of the events after an id."""
+    return [event.kind for event in there.view.events(after=after)]
 
 
 def picked_up(given: argparse.Namespace) -> list[str]:

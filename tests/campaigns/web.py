@@ -20,7 +20,7 @@ from typing import Any
 import httpx
 
 TESTS = Path(__file__).parent.parent
-sys.path[:0] = [str(TESTS / "calib"), str(TESTS / "calib" / "web")]
+sys.path[:0] = [str(TESTS / "calib" / "web"), str(TESTS / "calib")]  # "conftest" is that of the web tests
 
 LOAD_SECONDS = 1.0
 """A page must show its numbers by then."""

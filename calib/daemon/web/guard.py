@@ -21,7 +21,7 @@ HEAD_LIMIT = 16384
 BODY_SECONDS = 10.0
 """A body that has not come by then is given up."""
 REQUESTS = Rate(burst=60, per_second=20)
-"""Of one TCP address; a page needs four requests to load and one in two seconds then."""
+"""Of one TCP address; a page needs 17 requests to load and four in two seconds then."""
 WRONG_TOKENS = Rate(burst=5, per_second=0.2)
 """Of one TCP address."""
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
