@@ -62,7 +62,7 @@ def compiled(path: Path) -> Any:
     try:
         return read_spec(path).compile()
     except ValueError as error:
-        raise BadInput(f"{path}: MuJoCo cannot compile it: {error}") from None
+        raise BadInput(f"{path}: MuJoCo cannot compile it: {_line(error)}") from None
 
 
 def read_spec(path: Path) -> Any:
@@ -80,7 +80,12 @@ def read_spec(path: Path) -> Any:
     try:
         return mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
-        raise BadInput(f"{path}: MuJoCo cannot read it: {error}") from None
+        raise BadInput(f"{path}: MuJoCo cannot read it: {_line(error)}") from None
+
+
+def _line(error: ValueError) -> str:
+    """MuJoCo's message, which runs over several lines, in one."""
+    return " ".join(str(error).split())
 
 
 def _check(model: Any, joints: list[int], arm: RigidArm, label: str) -> None:

@@ -77,6 +77,23 @@ def test_the_command_says_it_in_one_line(tmp_path, capsys, rows, line):
     assert "Traceback" not in said
 
 
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("<mujoco><worldbody><body></worldbody></mujoco>", "MuJoCo cannot read it"),
+        (
+            "<mujoco><worldbody><body><joint type='free'/><geom size='1'/></body></worldbody></mujoco>",
+            "has 0 hinge joints",
+        ),
+    ],
+)
+def test_a_model_that_cannot_be_used_is_refused_in_one_line(tmp_path, text, line):
+    (tmp_path / "arm.xml").write_text(text)
+    with pytest.raises(BadInput, match=line) as refused:
+        diagnose(tmp_path / "arm.xml", [good()])
+    assert "\n" not in str(refused.value)
+
+
 def test_json_on_standard_output_is_nothing_but_json(tmp_path, capsys):
     import json
 
