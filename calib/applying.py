@@ -79,9 +79,9 @@ def apply_field(
 
 def _require(record: CalibrationRecord, arm: ArmFile, store: RecordStore, how: Apply) -> None:
     """Keep the record; raise Refused where there is nothing to write, BadInput on an unknown joint."""
-    unknown = sorted(set(how.replaced) - set(arm.joint_names))
-    if unknown:
-        raise BadInput(f"--replaced {unknown[0]}: no such joint; the arm has {', '.join(arm.joint_names)}")
+    for option, joints in (("--replaced", how.replaced), ("--accept", how.accepted)):
+        for unknown in sorted(set(joints) - set(arm.joint_names)):
+            raise BadInput(f"{option} {unknown}: no such joint; the arm has {', '.join(arm.joint_names)}")
     store.add(record.require(arm))
     if all(joint.offset is None for joint in record.joints):
         raise Refused("--apply: no joint has a gain or an offset, so nothing is written")

@@ -60,9 +60,10 @@ def check_holds(findings: Sequence[Finding], accepted: Sequence[str] = ()) -> No
     """Raise Refused where the fit says that the sensor model does not hold on a joint that was not `accepted` so."""
     broken = next((each for each in findings if each.breaks_model and each.joint not in accepted), None)
     if broken is not None:
+        why = broken.text.removeprefix(f"{broken.joint}: ").rstrip(".")
         raise Refused(
-            f"{broken.joint}: the sensor model does not hold: {broken.text.rstrip('.')}: mend that and sweep again;"
-            " nothing was written"
+            f"{broken.joint}: the sensor model does not hold: {why}; nothing was written: mend that and sweep again, or"
+            f" give --accept {broken.joint}"
         )
 
 

@@ -59,24 +59,14 @@ def calibrate(
 
         write_report(Calibrated(arm_file, data, fit, record, current), report)
     if apply:
-        _refuse_doubtful(fit, accept or [])
-        how = Apply(by=user, bus=bus, replaced=tuple(replaced or ()), check=check, flash=flash)
+        how = Apply(
+            by=user, bus=bus, replaced=tuple(replaced or ()), accepted=tuple(accept or ()), check=check, flash=flash
+        )
         written = apply_calibration(record, arm_file, records, data, fit, how)
         print_lines([f"record {record.id} written to {len(written)} controllers, read back and current"])
     else:
         records.put(record, arm_file, by="armlink calibrate", reason="sweeps")
     write_json(json_file, _answer(fit, record, apply))
-
-
-def _refuse_doubtful(fit: "SensorFit", accepted: list[str]) -> None:
-    """Raise Refused, naming the first joint at which the model does not hold and that nobody has accepted."""
-    from armlink.errors import Refused
-
-    for finding in fit.findings:
-        if finding.breaks_model and finding.joint not in accepted:
-            raise Refused(
-                f"nothing is written: {finding.text}; mend it and sweep again, or give --accept {finding.joint}"
-            )
 
 
 def _answer(fit: "SensorFit", record: "CalibrationRecord", applied: bool) -> dict[str, Any]:
