@@ -191,8 +191,9 @@ class Recalibrations:
 
     def _checked(self, checked: Checked) -> None:
         joint = self.names[checked.joint]
+        why = checked.why.removeprefix(f"{joint}: ")
         if checked.verdict == "kept":
-            self._outside.say("check", joint, f"{joint}: recalibration holds: {checked.why}", {"kept": True})
+            self._outside.say("check", joint, f"{joint}: recalibration holds: {why}", {"kept": True})
             return
 
         def done(outcome: Recalibration | Exception) -> None:
@@ -201,7 +202,7 @@ class Recalibrations:
                 _known(outcome)
                 self._outside.say("refused", joint, f"{joint}: roll-back failed: {outcome}", {})
             else:
-                text = f"{joint}: rolled back to record {outcome.record.id}: {checked.why}"
+                text = f"{joint}: rolled back to record {outcome.record.id}: {why}"
                 self._outside.say("roll-back", joint, text, {"record": outcome.record.id, "why": checked.why})
                 assert outcome.undo is not None
                 self._outside.installed(outcome.record, outcome.undo)

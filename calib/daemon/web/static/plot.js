@@ -33,7 +33,7 @@ function axis(range, width, top, bottom) {
   const x = across(range, width);
   return timeTicks(range, width - LEFT - RIGHT).flatMap(([at, text]) => [
     svg("line", { class: "grid", x1: x(at), x2: x(at), y1: top, y2: bottom }),
-    svg("text", { x: x(at), y: bottom + 14, "text-anchor": "middle" }, text),
+    svg("text", { x: x(at), y: bottom + 14, "text-anchor": x(at) > width - 20 ? "end" : "middle" }, text),
   ]);
 }
 
