@@ -2,6 +2,7 @@
 
 from html import escape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -115,18 +116,9 @@ def _camera(down: Array) -> dict[str, dict[str, float]]:
     }
 
 
-def _choices(plan: SweepPlan) -> list[dict[str, object]]:
+def _choices(plan: SweepPlan) -> list[dict[str, Any]]:
     """Buttons: everything, or one sweep alone with the direction of gravity."""
     count = len(plan.sweeps)
-    everything = {"label": "all sweeps", "method": "update", "args": [{"visible": [True] * (count + 2)}]}
-    return [
-        everything,
-        *(
-            {
-                "label": sweep.name,
-                "method": "update",
-                "args": [{"visible": [*(k == place for k in range(count)), False, True]}],
-            }
-            for place, sweep in enumerate(plan.sweeps)
-        ),
-    ]
+    shown = {"all sweeps": [True] * (count + 2)}
+    shown |= {one.name: [*(one is other for other in plan.sweeps), False, True] for one in plan.sweeps}
+    return [{"label": label, "method": "update", "args": [{"visible": seen}]} for label, seen in shown.items()]
