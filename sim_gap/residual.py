@@ -132,6 +132,8 @@ class ResidualSet:
         parts = [s.noise[channel][joint], MODEL_FLOOR * load]
         if channel == self.layout.motor and self.layout.sensor:
             parts.append(s.noise[self.layout.sensor][joint])
+        if channel == self.layout.command and self.layout.motor:
+            parts.append(s.noise[self.layout.motor][joint])
         return float(np.linalg.norm(parts)) + 1e-6
 
     @cached_property
