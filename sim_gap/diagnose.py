@@ -11,7 +11,7 @@ from sim_gap.compete import compete
 from sim_gap.confidence import HINT
 from sim_gap.confound import Rivals
 from sim_gap.diagnosis import Cause, Diagnosis
-from sim_gap.effects.registry import effects, layout_of
+from sim_gap.effects.registry import layout_of, library_without
 from sim_gap.estimate import Estimate
 from sim_gap.model import SimModel, load_model
 from sim_gap.normal import ColumnStore
@@ -82,7 +82,7 @@ def diagnose(
     minor: list[Cause] = []
     if fit.struck or not (is_quiet(judge) and is_quiet(fit)):
         store = ColumnStore(fit)
-        search = compete(store, [name for name in effects() if name not in withhold])
+        search = compete(store, library_without(withhold))
         estimate = Estimate(store, search.active)
         found, minor = causes(estimate, judge, Rivals(search), sim.arm.names)
     return _answer(Internals(sim, fit, judge, estimate), found, minor, told, stuck)

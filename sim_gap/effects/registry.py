@@ -168,3 +168,8 @@ def effects() -> dict[str, Effect]:
     """All effects by id."""
     found = [effect for family in FAMILIES for effect in import_module(f"sim_gap.effects.{family}").EFFECTS]
     return {effect.id: effect for effect in found}
+
+
+def library_without(withheld: Sequence[str]) -> list[str]:
+    """Ids of the effects that remain where some are taken out: what stands upon one of these goes with it."""
+    return [name for name, effect in effects().items() if not {name, *effect.needs} & {*withheld}]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from wrong_arms import Wrong, model, record
 
-from sim_gap.effects.registry import effects, layout_of
+from sim_gap.effects.registry import effects, layout_of, library_without
 from sim_gap.model import load_model
 from sim_gap.residual import ResidualSet
 from sim_gap.signals import prepare
@@ -81,3 +81,10 @@ def test_the_library_holds_the_contracts_effects():
     for effect in effects().values():
         assert effect.parameters
         assert all(need in effects() for need in effect.needs)
+
+
+def test_what_stands_upon_an_effect_that_is_taken_out_goes_with_it() -> None:
+    assert library_without([]) == list(effects())
+    left = library_without(["friction.coulomb"])
+    assert set(effects()) - set(left) == {"friction.coulomb", "friction.stribeck", "friction.asymmetric"}
+    assert set(effects()) - set(library_without(["friction.stribeck"])) == {"friction.stribeck"}
