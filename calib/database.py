@@ -1,6 +1,8 @@
 """The record store's database: its URL, how it is opened, and its schema brought up to date."""
 
 import os
+import sqlite3
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +14,8 @@ from armlink.errors import BadInput
 from calib.schema import MIGRATIONS
 
 HEAD = MIGRATIONS[-1]
+BUSY_SECONDS = 10
+"""How long another writer of an SQLite store is waited for [s]."""
 _VERSION = "alembic_version"
 _LOCK = 0x61726D6C
 """PostgreSQL's advisory lock that one process at a time holds while it writes, as SQLite's writers do."""
@@ -115,13 +119,28 @@ def _prepare_sqlite(engine: sa.Engine) -> None:
     @sa.event.listens_for(engine, "connect")
     def _on_connect(connection: Any, _: Any) -> None:
         connection.isolation_level = None  # pysqlite would begin by itself, and too late
-        for pragma in ("busy_timeout=10000", "journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON"):
+        connection.execute(f"PRAGMA busy_timeout={BUSY_SECONDS * 1000}")
+        _to_write_ahead_log(connection)
+        for pragma in ("synchronous=FULL", "foreign_keys=ON"):
             connection.execute(f"PRAGMA {pragma}")
 
     @sa.event.listens_for(engine, "begin")
     def _on_begin(connection: sa.Connection) -> None:
         writing = connection.get_execution_options().get("writing", False)
         connection.exec_driver_sql("BEGIN IMMEDIATE" if writing else "BEGIN")
+
+
+def _to_write_ahead_log(connection: sqlite3.Connection) -> None:
+    """Switch the journal mode; where two do so at once SQLite tells one of them "locked" without any waiting."""
+    end = time.monotonic() + BUSY_SECONDS
+    while True:
+        try:
+            connection.execute("PRAGMA journal_mode=WAL")
+            return
+        except sqlite3.OperationalError as error:
+            if "locked" not in str(error) or time.monotonic() > end:
+                raise
+            time.sleep(0.01)
 
 
 def first_line(error: BaseException) -> str:
