@@ -10,11 +10,13 @@ CROWD_PER_JOINT, CROWD = 5, 30
 CROWDED_CYCLES = 10
 """So many cycles running that have more are a babbling node."""
 DOUBLE_CYCLES = 3
-"""So many cycles running with two readings of one joint are a second node with its id: a late frame comes but once."""
+"""So many cycles running with two readings of one joint are a second node with its id."""
+FORGIVEN = 25
+"""So many readings that did not come in their cycle may come later, two at a time, as from a node that caught up."""
 
 
 class BusWatch:
-    """Counts what the cyclic loop meets besides process data. Costs nothing a frame of process data."""
+    """Counts what the cyclic loop meets: the readings themselves, and what is no process data."""
 
     def __init__(self, nodes: tuple[int, ...], host: int) -> None:
         """`nodes` are the joints' node ids, `host` is our own: nobody else sends its heartbeat."""
@@ -30,6 +32,10 @@ class BusWatch:
         self._double_cycles = [0] * len(nodes)
         self._crowded_cycles = 0
         self._last: int | None = None
+        self.syncs = 0
+        """SYNCs that we sent."""
+        self.readings = [0] * len(nodes)
+        """Readings of each joint that came."""
         self.restarted: set[int] = set()
         """Joints whose controller has sent its boot-up message."""
         self.clear()
@@ -37,6 +43,7 @@ class BusWatch:
     def clear(self) -> None:
         """Forget what was seen: the link starts anew."""
         self.restarted.clear()
+        self.syncs, self.readings = 0, [0] * len(self.readings)
         self.intruder = ""
         """A frame that only we should send, in words; empty where none came."""
         self.flooded = False
@@ -44,8 +51,10 @@ class BusWatch:
         self._crowded_cycles = 0
 
     def again(self, joint: int) -> None:
-        """A second reading of a joint came in this cycle."""
-        self._doubled.add(joint)
+        """A second reading of a joint came in this cycle: a late one, or one too many for the SYNCs there were."""
+        self.readings[joint] = max(self.readings[joint], self.syncs - FORGIVEN)
+        if self.readings[joint] > self.syncs:
+            self._doubled.add(joint)
 
     def other(self, can_id: int) -> None:
         """A frame came that is no process data of a joint."""

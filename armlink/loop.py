@@ -154,6 +154,7 @@ class Loop:
         if self._first is None:
             self._first = now
         self._awaited = self.n
+        self.watch.syncs += 1
         self._port.send_all(frames)
         self.stats.frames += len(frames)
         self.bits += FIXED_BITS * len(frames) + 8 * sum([len(data) for _, data in frames])
@@ -194,6 +195,7 @@ class Loop:
         if len(data) != size:
             self.stats.errors += 1
         elif kind == 0:
+            self.watch.readings[joint] += 1
             if self._position[joint] != self._position[joint]:  # NaN: the first in this cycle
                 self._awaited -= 1
             else:

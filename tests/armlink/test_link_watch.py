@@ -1,5 +1,6 @@
 """What the link notices besides readings: another controller, a refused mode, a restart, a second host, a babbler."""
 
+import contextlib
 import struct
 
 import numpy as np
@@ -251,6 +252,32 @@ def test_a_frame_that_comes_late_once_is_no_twin(enabled, bus):
         bus.out.append((0x182, struct.pack("<ii", 5, 5)))
         enabled.cycle(command(POSITION))
         enabled.cycle(command(POSITION))
+
+
+def test_a_node_that_catches_up_two_readings_a_cycle_is_no_twin(enabled, bus):
+    """As a controller, or a simulated arm, that was not given its time: every reading belongs to a SYNC of ours."""
+    sync, late = bus._sync, []
+
+    def slow(node):
+        before = len(bus.out)
+        sync(node)
+        if node.node == 2 and lagging:
+            late.extend(frame for frame in list(bus.out)[before:] if frame[0] == 0x182)
+            for frame in late:
+                with contextlib.suppress(ValueError):
+                    bus.out.remove(frame)
+        elif node.node == 2 and late:
+            bus.out.append(late.pop(0))
+
+    bus._sync = slow
+    for _ in range(3):
+        lagging = True
+        for _ in range(8):
+            enabled.cycle(command(POSITION))
+        lagging = False
+        for _ in range(10):
+            enabled.cycle(command(POSITION))
+        assert not late
 
 
 def test_a_node_that_babbles_is_found(enabled, bus):
