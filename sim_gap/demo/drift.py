@@ -25,7 +25,7 @@ QUIET_SECONDS = 30.0
 """Ordinary work before the drift begins [s]."""
 SECONDS = 300.0
 """Ordinary work at most [s]."""
-SETTLED_SECONDS = 40.0
+SETTLED_SECONDS = 15.0
 """Ordinary work watched after a recalibration [s]."""
 
 
