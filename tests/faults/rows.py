@@ -139,7 +139,7 @@ ROWS = (
         "duplicated id",
         "a second node has the same id",
         "node.duplicate:joint_2",
-        "two readings a cycle, three cycles running",
+        "two readings a cycle, three cycles running, more than there were SYNCs",
         4,
         QUICK_STOP,
         "joint_2: two readings in every cycle: a second node has its id: give every node its own",
