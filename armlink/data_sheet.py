@@ -84,6 +84,5 @@ def expected_identity(joint: LinkJoint, sheet: Any) -> DeviceIdentity:
     if joint.eds is None:
         return joint.identity
     told = sheet.device_information
-    held = {"vendor": told.vendor_number or None, "product": told.product_number or None}
-    stated = joint.identity.model_dump(exclude_none=True)
-    return DeviceIdentity.model_validate({**{key: value for key, value in held.items() if value}, **stated})
+    held = DeviceIdentity(vendor=told.vendor_number or None, product=told.product_number or None)
+    return held.model_copy(update=joint.identity.model_dump(exclude_none=True))

@@ -107,16 +107,9 @@ class LockStepBus(can.BusABC):  # type: ignore[misc]
 
     def take(self, timeout: float = 0.0) -> tuple[int, bytes] | None:
         """As recv, without a message object; error frames are counted. Raises BusFault where one says bus-off."""
-        outbox = self._outbox
         while True:
-            if not outbox:
-                if timeout <= 0:
-                    return None
-                self._wait(timeout)
-                if not outbox:
-                    return None
-            frame = outbox.popleft()
-            if not frame[0] & ERROR_FLAG:
+            frame = self._next(timeout)
+            if frame is None or not frame[0] & ERROR_FLAG:
                 return frame
             self.errors += 1
             if frame[0] & BUS_OFF:

@@ -10,6 +10,7 @@ import can
 
 from armlink.bus import BusGroup
 from armlink.errors import BusFault
+from armlink.objects import NMT_ID
 from sim_bus.control import ControlPipe
 from sim_bus.fault_kinds import Fault
 from sim_bus.injector import ERROR_FLAG, Injector
@@ -23,7 +24,6 @@ TICK = 0.002
 """Longest wait for a frame: timers and physics go on meanwhile [s]."""
 LOCKSTEP_PATIENCE = 1.0
 """In lock-step, so long without a SYNC and time goes on by itself, so that nodes notice a host that died [s]."""
-NMT_ID = 0x000
 SEND_PATIENCE = 0.1
 """How long a full transmit queue is waited for [s]; a frame that still does not go is lost, as on a dead bus."""
 INTERRUPTED, TERMINATED = 130, 0
