@@ -1,5 +1,8 @@
 """Listening to an arm that another controller commands: one sample a SYNC of that controller; nothing is sent.
 
+On SocketCAN it sleeps for several cycles and then takes all that came, each SYNC with the kernel's own time of it; on
+other buses it wakes for each frame, whose time is when it was read.
+
 The one exception is asked for by name: `write_calibration` and `read_calibration` use SDO on object 2100h.
 """
 
@@ -18,10 +21,12 @@ from armlink.clock import Clock, MonotonicClock
 from armlink.loop import Loop
 from armlink.monitor import assumed_units
 from armlink.pdo import RPDO1
-from armlink.port import GroupPort, open_port
 from armlink.sample import Array, Calibration, Sample, Stats
 from armlink.services import NodeServices, PumpedNetwork, joint_services
+from armlink.stamped_port import StampedGroup, StampedPort, open_listening_port
 
+SLEEP = 0.02
+"""Frames that bear their time may wait for so long [s]: five cycles at 250 Hz, far less than a receive queue holds."""
 COMMAND_LAYOUT = struct.Struct("<Hhi")
 """RPDO1: control word, target torque, target position."""
 
@@ -29,18 +34,17 @@ COMMAND_LAYOUT = struct.Struct("<Hhi")
 class Listener:
     """Context manager: `with Listener(arm, bus) as listener: sample = listener.next(0.1)`."""
 
-    def __init__(self, arm: ArmFile, bus: Any, clock: Clock | None = None) -> None:
-        """Take `bus` (python-can's, closed on leaving) and a clock: by default the bus's own or the machine's."""
+    def __init__(self, arm: ArmFile, bus: Any) -> None:
+        """Take `bus` (python-can's, closed on leaving); its own clock counts where it has one, else the machine's."""
         self.arm, self.bus = arm, bus
         self.section = section = arm.require_link()
         self.names = tuple(joint.name for joint in section.joints)
         self.nodes = tuple(joint.node for joint in section.joints)
         self.n, self.period = len(self.names), 1.0 / section.rate
         own_clock: Clock | None = getattr(bus, "clock", None)
-        self.clock: Clock = clock or own_clock or MonotonicClock()
-        port = open_port(bus)
-        if isinstance(port, GroupPort):
-            port.one_sync = True
+        self.clock: Clock = own_clock or MonotonicClock()
+        port = open_listening_port(bus)
+        self._port = port if isinstance(port, StampedPort | StampedGroup) else None
         self._loop = Loop(port, self.clock, self.nodes, 0, self.period, own_clock is not None)
         units = assumed_units(arm)
         self._loop.set_units(units)
@@ -49,6 +53,8 @@ class Listener:
         self._position_unit = np.array([unit.position for unit in units])
         self._joint_of = {RPDO1.cob_base + node: joint for joint, node in enumerate(self.nodes)}
         self._ready: deque[Sample] = deque()
+        self._arrived: float | None = None
+        """Time of the frame that is being taken in, where its port tells it."""
         self._sync: float | None = None
         self._since: float | None = None
         self._notify: Callable[[int, bytearray, float], None] | None = None
@@ -92,7 +98,7 @@ class Listener:
             remaining = end - self.clock.now()
             if remaining <= 0:
                 return None
-            self._loop.receive(remaining)
+            self._hear(remaining)
         return self._ready.popleft()
 
     def read_calibration(self, joint: int) -> Calibration:
@@ -105,9 +111,22 @@ class Listener:
         """Make gain and offset [N·m] active in joint 0 … n−1, by SDO: sends; raises BadInput, BusFault."""
         return calibration.write_record(self._services[joint], gain, offset, record_id, date, store)
 
+    def _hear(self, seconds: float, at_once: bool = False) -> None:
+        """Take in what comes, for at most so long; `at_once`: somebody waits for the very next frame."""
+        port = self._port
+        if port is None:
+            self._loop.receive(seconds)
+            return
+        if at_once:
+            port.wait(seconds)
+        else:
+            self.clock.sleep_until(self.clock.now() + min(seconds, SLEEP))
+        for self._arrived, can_id, data in port.take_all():
+            self._loop.take(can_id, data)
+
     def _take(self, can_id: int, data: bytes) -> None:
         if can_id == objects.SYNC_ID:
-            self._complete(self.clock.now())
+            self._complete(self.clock.now() if self._arrived is None else self._arrived)
             return
         joint = self._joint_of.get(can_id)
         if joint is not None:
@@ -145,5 +164,5 @@ class Listener:
             remaining = end - self.clock.now()
             if remaining <= 0:
                 return False
-            self._loop.receive(remaining)
+            self._hear(remaining, at_once=True)
         return True

@@ -116,7 +116,7 @@ class Loop:
         frame = self._port.receive(timeout)
         if frame is None:
             return False
-        self._take(*frame)
+        self.take(*frame)
         return True
 
     def drain(self) -> None:
@@ -184,7 +184,8 @@ class Loop:
             self.stats.rate_hz = self.stats.cycles / elapsed
             self.stats.load = self.bits / (bitrate * elapsed)
 
-    def _take(self, can_id: int, data: bytes) -> None:
+    def take(self, can_id: int, data: bytes) -> None:
+        """Take one frame in, for what it is."""
         self.stats.frames += 1
         self.bits += FIXED_BITS + 8 * len(data)
         entry = self._table.get(can_id)

@@ -51,12 +51,21 @@ def open_port(bus: Any) -> Port:
         return GroupPort(bus)
     if hasattr(bus, "take"):
         return LockStepPort(bus)
-    fd = str(getattr(bus, "protocol", "")).startswith("CanProtocol.CAN_FD")
-    if type(bus).__name__ == "SocketcanBus":
+    if is_socketcan(bus):
         from armlink.socket_port import SocketPort
 
-        return SocketPort(bus, fd)
-    return MessagePort(bus, fd)
+        return SocketPort(bus, is_fd(bus))
+    return MessagePort(bus, is_fd(bus))
+
+
+def is_socketcan(bus: Any) -> bool:
+    """Whether a python-can bus is Linux's own SocketCAN."""
+    return type(bus).__name__ == "SocketcanBus"
+
+
+def is_fd(bus: Any) -> bool:
+    """Whether a python-can bus takes CAN FD frames."""
+    return str(getattr(bus, "protocol", "")).startswith("CanProtocol.CAN_FD")
 
 
 class LockStepPort:
@@ -129,9 +138,9 @@ class MessagePort:
 class GroupPort:
     """Several buses as one: a frame goes to the bus of its node, one for no node or for all of them to every bus."""
 
-    def __init__(self, group: Any) -> None:
-        """Take `group.members` (python-can buses) and `group.route` (node id → index of its bus)."""
-        self._ports = tuple(open_port(bus) for bus in group.members)
+    def __init__(self, group: Any, ports: Sequence[Port] = ()) -> None:
+        """Take `group.members` (python-can buses, or their ports) and `group.route` (node id → index of its bus)."""
+        self._ports = tuple(ports) or tuple(open_port(bus) for bus in group.members)
         self._of_node: dict[int, Port] = {node: self._ports[index] for node, index in group.route.items()}
         self._numbers = [port.fileno() for port in self._ports if hasattr(port, "fileno")]
         self.one_sync = False

@@ -19,14 +19,16 @@ RECEIVE_BUFFER = 1 << 21
 """Bytes of the socket's receive queue, which the kernel counts with its own overhead: some thousand frames."""
 _CLASSIC, _FD = struct.Struct("=IBB2x8s"), struct.Struct("=IBB2x64s")
 _FD_FLAGS = 0x05  # CANFD_BRS | CANFD_FDF: a CAN FD frame with bit-rate switch
-_FLAGS = 0xE0000000  # extended, remote, error
+FLAGS = 0xE0000000
+"""Extended, remote, error."""
 _ERROR_FLAG, _BUS_OFF = 0x20000000, 0x40
 _RETRY = 0.002  # [s] between tries while the transmit queue is full
 _TRIES = 25
 _FULL = (errno.ENOBUFS, errno.EAGAIN)
 _DONTWAIT = int(socket.MSG_DONTWAIT)
 _SO_RCVBUFFORCE, _SO_RXQ_OVFL = 33, 40
-_CONTROL = 64
+CONTROL = 64
+"""Bytes for the control messages of one frame."""
 _CONTROL_HEADER = struct.Struct("@Nii")
 
 
@@ -50,10 +52,11 @@ class _Message(ctypes.Structure):
     _fields_ = (("header", _Header), ("length", ctypes.c_uint))
 
 
-class _Batch:
+class Batch:
     """Preallocated frames and the headers that point at them, as sendmmsg and recvmmsg take them."""
 
     def __init__(self, size: int) -> None:
+        """BATCH frames of `size` bytes; no control messages."""
         self.frames = bytearray(BATCH * size)
         base = ctypes.addressof((ctypes.c_char * len(self.frames)).from_buffer(self.frames))
         self._vectors = (_Vector * BATCH)(*(_Vector(base + i * size, size) for i in range(BATCH)))
@@ -75,9 +78,9 @@ class SocketPort:
         self._socket: socket.socket = bus.socket
         self._number: int = self._socket.fileno()
         self._layout, self._flags = (_FD, _FD_FLAGS) if fd else (_CLASSIC, 0)
-        self._out, self._in = _Batch(self._layout.size), _Batch(self._layout.size)
+        self._out, self._in = Batch(self._layout.size), Batch(self._layout.size)
         self._received = memoryview(self._in.frames)
-        self._control = ctypes.create_string_buffer(_CONTROL)
+        self._control = ctypes.create_string_buffer(CONTROL)
         self._first = self._in.messages[0].header
         self._first.control = ctypes.addressof(self._control)
         self._waiting: list[Frame] = []
@@ -138,28 +141,41 @@ class SocketPort:
 
     def _fill(self) -> bool:
         """Take in a batch; False where nothing was there."""
-        first = self._first
-        first.control_length = _CONTROL
-        count = self._recvmmsg(self._number, self._in.address, BATCH, _DONTWAIT, None)
+        self._first.control_length = CONTROL
+        count = self._take_batch()
+        if not count:
+            return False
+        self._dry = count < BATCH
+        frames, others = self._waiting, []
+        for can_id, length, _, data in self._layout.iter_unpack(self._received[: count * self._layout.size]):
+            if not can_id & FLAGS:
+                frames.append((can_id, data[:length]))
+            else:
+                others.append(can_id)
+        frames.reverse()
+        if others:
+            self._take_others(others)
+        return True
+
+    def _take_batch(self) -> int:
+        """How many frames are in the batch now, 0 where nothing was there."""
+        count: int = self._recvmmsg(self._number, self._in.address, BATCH, _DONTWAIT, None)
         if count <= 0:
             number = ctypes.get_errno()
             if number == errno.EAGAIN:
-                return False
+                return 0
             raise BusFault(f"bus {self._name}: cannot receive: {os.strerror(number)}")
-        self._dry = count < BATCH
-        if first.control_length:
-            self._read_drops(first.control_length)
-        frames, bus_off = self._waiting, 0
-        for can_id, length, _, data in self._layout.iter_unpack(self._received[: count * self._layout.size]):
-            if not can_id & _FLAGS:
-                frames.append((can_id, data[:length]))
-            elif can_id & _ERROR_FLAG:
-                self.errors += 1
-                bus_off |= can_id & _BUS_OFF
-        frames.reverse()
-        if bus_off:
+        length = self._first.control_length
+        if length:
+            self._read_drops(length)
+        return count
+
+    def _take_others(self, others: list[int]) -> None:
+        """Frames that are no data frames with an 11-bit identifier: those that tell of errors count."""
+        errors = [can_id for can_id in others if can_id & _ERROR_FLAG]
+        self.errors += len(errors)
+        if any(can_id & _BUS_OFF for can_id in errors):
             raise BusFault(f"bus {self._name}: bus-off: check wiring, termination and bit rate")
-        return True
 
     def _read_drops(self, length: int) -> None:
         """The kernel's count of lost frames, 32 bits; among control messages, each aligned to eight bytes."""
