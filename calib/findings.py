@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from calib.encoder_bits import stuck_bits
 from calib.fit_rows import FitRows
-from calib.misfit import Effect
+from calib.misfit import Effect, size_of
 from calib.refine import Refined
 
 Array = npt.NDArray[np.float64]
@@ -60,8 +60,9 @@ def effect_said(names: tuple[str, ...], effect: Effect, coefficient: Array, refi
         )
         return Finding(name, "spring", value / gain, "N·m/rad", text)
     if effect.kind == "direction":
-        text = f"{name}: readings differ by {2 * abs(value):.3g} N·m with the side of approach; taken out"
-        return Finding(name, "direction", abs(value), "N·m", text)
+        size = size_of(coefficient)
+        text = f"{name}: readings differ by {2 * size:.3g} N·m with the side of approach; taken out"
+        return Finding(name, "direction", size, "N·m", text)
     if effect.kind == "hysteresis":
         text = (
             f"{name}: the torque sensor lags by {abs(value):.3g} N·m behind changes of torque (hysteresis); taken out"

@@ -1,6 +1,6 @@
 """Does the sensor model hold? Where it does not, at which joint, and why: goodness of fit, outliers, left-out poses."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from calib.findings import Finding, effect_said, encoders_said, outliers_said, scattered
 from calib.fit_rows import FitRows
-from calib.misfit import Effect, strongest
+from calib.misfit import Effect, size_of, strongest
 from calib.refine import Extra, Refined, refine
 from gcomp.arm import Arm
 from gcomp.global_fit import GlobalFit
@@ -59,34 +59,51 @@ def examine(arm: Arm, rows: FitRows, fit: GlobalFit, priors: Mapping[str, Prior]
     """Refine a global fit, one effect after another that its residuals ask for, without outliers. rated (n,) [N·m]."""
     rows, findings = _without_plateaus(arm.names, rows)
     encoders = encoders_said(arm.names, rows)
-    effects, readings = list[Effect](), rows.readings
+    effects, sound = list[Effect](), rows.readings.sigma
+    outliers = np.zeros(sound.shape, dtype=bool)
 
     def fitted() -> Refined:
         extras = tuple(extra for effect in effects for extra in effect.extras)
-        return refine(arm, readings, fit, priors, rows.resolution, extras)
+        kept = replace(rows.readings, torque=np.where(outliers, np.nan, rows.readings.torque))
+        return refine(arm, kept, fit, priors, rows.resolution, extras)
 
     refined = fitted()
-    outliers = np.zeros(readings.torque.shape, dtype=bool)
     for _ in range(MOST_EFFECTS):
         strange = _outliers(arm, refined, rows, [extra for effect in effects for extra in effect.extras])
         if (strange != outliers).any():
             outliers = strange
-            readings = replace(rows.readings, torque=np.where(outliers, np.nan, rows.readings.torque))
             refined = fitted()
-        found = strongest(arm, rows, readings, refined, rated)
+        found = strongest(arm, rows, ~outliers, refined, rated)
         if found is None:
             break
         effects.append(found)
         refined = fitted()
-    place = 0
-    for effect in effects:
-        coefficient = refined.coefficients[place : place + len(effect.extras)]
-        place += len(effect.extras)
+        if found.doubt is not None:
+            rows = replace(rows, readings=replace(rows.readings, sigma=_doubted(sound, effects, refined)))
+            refined = fitted()
+    for effect, coefficient in _sized(effects, refined):
         findings.append(effect_said(arm.names, effect, coefficient, refined, rated))
     findings += outliers_said(arm.names, rows, outliers)
     findings += scattered(arm.names, refined, rated, {finding.joint for finding in findings})
     said = encoders or findings  # what a wrong position does elsewhere is no finding of its own
     return Goodness(refined, tuple(said), outliers, leave_out(refined, rows))
+
+
+def _sized(effects: list[Effect], refined: Refined) -> Iterator[tuple[Effect, Array]]:
+    """Each effect with its coefficients."""
+    place = 0
+    for effect in effects:
+        yield effect, refined.coefficients[place : place + len(effect.extras)]
+        place += len(effect.extras)
+
+
+def _doubted(sigma: Array, effects: list[Effect], refined: Refined) -> Array:
+    """Standard deviations (K, n) [N·m] with what the effects leave open of each reading."""
+    square = sigma**2
+    for effect, coefficient in _sized(effects, refined):
+        if effect.doubt is not None:
+            square[:, effect.joint] += (effect.doubt * size_of(coefficient)) ** 2
+    return np.sqrt(square)
 
 
 def _without_plateaus(names: tuple[str, ...], rows: FitRows) -> tuple[FitRows, list[Finding]]:

@@ -1,7 +1,7 @@
 """Effects that the sensor model does not have, as columns: which of them the residuals of a fit ask for."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,8 @@ FEWEST = 6
 """Readings of a joint from which effects on it are looked for."""
 TURN = 2.0
 """Range of a joint from which an error once a turn can be told from a gain [rad]."""
+OWN_DOUBT, HELD_DOUBT = 0.1, 0.75
+"""Standard deviation of a sensor's lag, as a share of its size: along the joint's own sweep, and where it holds."""
 PATH = 12
 """Points of the way from one reading to the next at which the torque is computed for hysteresis."""
 
@@ -39,18 +41,26 @@ class Effect:
     p_value: float
     knee: float = np.nan
     """Torque at which a sensor begins to saturate [N·m]."""
+    doubt: Array | None = None
+    """What the columns leave open of each reading of the joint (K,), as a share of the effect's size."""
 
 
-def strongest(arm: Arm, rows: FitRows, readings: Readings, refined: Refined, rated: Array) -> Effect | None:
+def size_of(coefficients: Array) -> float:
+    """Root mean square of an effect's coefficients (m,), in their unit."""
+    return float(np.sqrt(np.mean(coefficients**2)))
+
+
+def strongest(arm: Arm, rows: FitRows, kept: Flags, refined: Refined, rated: Array) -> Effect | None:
     """The effect that explains most beyond chance of what `refined` left over, None where there is no material one.
 
-    rated (n,) [N·m]. The readings may be fewer than the rows' own: outliers made NaN.
+    rated (n,) [N·m]; kept (K, n) are the readings that `refined` was made from, outliers left out.
     """
+    counted = rows.readings.counted & kept
     linear, best, most = refined.linear, None, 0.0
     count = len(linear.row)
     squares = np.bincount(linear.joint, linear.residual[:count] ** 2, minlength=arm.n)
     for effect in _candidates(arm, rows, refined):
-        columns = np.column_stack([extra.column[readings.counted] for extra in effect.extras]) / linear.sigma[:, None]
+        columns = np.column_stack([extra.column[counted] for extra in effect.extras]) / linear.sigma[:, None]
         if not np.abs(columns).max(initial=0.0) > 0:
             continue
         rest = linear.left_over(columns)
@@ -72,7 +82,7 @@ def strongest(arm: Arm, rows: FitRows, readings: Readings, refined: Refined, rat
         shape = (columns * linear.sigma[:, None] @ coefficient)[own]
         size = float(np.std(shape)) if len(shape) else 0.0
         if p_value < CHANCE and size > MATERIAL * rated[effect.joint] and gain > most:
-            best, most = Effect(effect.joint, effect.kind, effect.extras, p_value, effect.knee), gain
+            best, most = replace(effect, p_value=p_value), gain
     return best
 
 
@@ -90,8 +100,12 @@ def _candidates(arm: Arm, rows: FitRows, refined: Refined) -> Iterator[Effect]:
             continue
         angle, own = readings.position[:, joint], torque[:, joint]
         yield _one(arm.n, joint, "spring", here * angle)
-        yield _one(arm.n, joint, "direction", np.where(rows.swept == joint, rows.direction, 0) * here)
-        yield _one(arm.n, joint, "hysteresis", here * lag(arm, rows, refined, joint))
+        doubt = _lag_doubt(rows, joint)
+        sides = [here * side for side in _sides(rows, joint)]
+        if sides:
+            columns = tuple(_one(arm.n, joint, "direction", side).extras[0] for side in sides)
+            yield Effect(joint, "direction", columns, 1.0, doubt=doubt)
+        yield replace(_one(arm.n, joint, "hysteresis", here * lag(arm, rows, refined, joint)), doubt=doubt)
         largest = float(np.abs(own[here]).max())
         yield _one(arm.n, joint, "nonlinear", here * own * np.abs(own) / max(largest, 1e-9))
         for share in KNEES:
@@ -109,6 +123,31 @@ def _one(n: int, joint: int, kind: str, values: Array, knee: float = np.nan) -> 
     column = np.zeros((len(values), n))
     column[:, joint] = values
     return Effect(joint, kind, (Extra(joint, kind, column),), 1.0, knee)
+
+
+def _sides(rows: FitRows, joint: int) -> Iterator[Array]:
+    """Side of approach (K,) in each sweep of a joint that has both, 0 elsewhere.
+
+    How far a sensor lags depends on how far the torque swung on the way, braking included: each sweep has its own.
+    """
+    names = np.array(rows.sweep)
+    for name in dict.fromkeys(names[rows.swept == joint]):
+        side = np.where((names == name) & (rows.swept == joint), rows.direction, 0)
+        if {-1, 1} <= set(side.tolist()):
+            yield side.astype(np.float64)
+
+
+def _lag_doubt(rows: FitRows, joint: int) -> Array:
+    """How badly a lag is known (K,), as a share of its size.
+
+    Along the joint's own sweep it hardly varies. Where the joint only holds it may stand anywhere between both ends,
+    and stays there while another is swept, so that those readings together count as one.
+    """
+    names, own = np.array(rows.sweep), rows.swept == joint
+    alone = rows.swept < 0
+    together = np.array([np.count_nonzero(names == name) for name in names])
+    held: Array = HELD_DOUBT * np.sqrt(np.where(alone, 1.0, together))
+    return np.where(own, OWN_DOUBT, held)
 
 
 def lag(arm: Arm, rows: FitRows, refined: Refined, joint: int) -> Array:

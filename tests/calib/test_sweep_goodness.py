@@ -107,6 +107,33 @@ def test_hysteresis_is_measured_and_the_intervals_hold(sound) -> None:
     assert np.abs(z_scores(fit, truth, "offset")).max() < 4
 
 
+def drawn_lag(seed: int, width: float) -> Callable[[Reading, np.ndarray, np.ndarray], None]:
+    """A lag of the joint's sensor: nearly even along each of its sweeps, anywhere within the play where it holds."""
+    random, by_sweep = np.random.default_rng(seed), dict[str, float]()
+
+    def lag(reading: Reading, _: np.ndarray, torque: np.ndarray) -> None:
+        if reading.joint == JOINT:
+            size = by_sweep.setdefault(reading.sweep, random.uniform(0.6, 1.0))
+            torque[JOINT] -= reading.direction * size * width * random.uniform(0.9, 1.0)
+        elif reading.joint is None:
+            torque[JOINT] += random.uniform(-width, width)
+        else:
+            torque[JOINT] += by_sweep.setdefault(f"{reading.sweep} held", random.uniform(-width, width))
+
+    return lag
+
+
+def test_a_lag_of_another_size_in_each_sweep_stays_within_the_intervals(sound) -> None:
+    arm, truth, data = sound
+    scores = []
+    for seed in range(8):
+        fit = fit_sensors(arm, bent(data, drawn_lag(seed, 0.03 * rated(arm))))
+        assert fit.doubtful == ()
+        scores += [z_scores(fit, truth, "gain"), z_scores(fit, truth, "offset")]
+    assert np.mean(np.abs(scores) < 1.96) > 0.9
+    assert np.abs(scores).max() < 4
+
+
 def test_a_saturated_sensor_is_named(sound) -> None:
     arm, _, data = sound
     limit = 0.6 * max(
