@@ -6,7 +6,6 @@ other buses it wakes for each frame, whose time is when it was read.
 The one exception is asked for by name: `write_calibration` and `read_calibration` use SDO on object 2100h.
 """
 
-import struct
 from collections import deque
 from collections.abc import Callable
 from functools import cached_property
@@ -27,8 +26,10 @@ from armlink.stamped_port import StampedGroup, StampedPort, open_listening_port
 
 SLEEP = 0.02
 """Frames that bear their time may wait for so long [s]: five cycles at 250 Hz, far less than a receive queue holds."""
-COMMAND_LAYOUT = struct.Struct("<Hhi")
-"""RPDO1: control word, target torque, target position."""
+COMMAND_LAYOUT = np.dtype([("control", "<u2"), ("torque", "<i2"), ("position", "<i4")])
+"""RPDO1."""
+NO_COMMAND = bytes(COMMAND_LAYOUT.itemsize)
+"""Stands for the RPDO1 that has not come yet; this object, not its value."""
 
 
 class Listener:
@@ -43,25 +44,18 @@ class Listener:
         self.n, self.period = len(self.names), 1.0 / section.rate
         own_clock: Clock | None = getattr(bus, "clock", None)
         self.clock: Clock = own_clock or MonotonicClock()
-        port = open_listening_port(bus)
-        self._port = port if isinstance(port, StampedPort | StampedGroup) else None
-        self._loop = Loop(port, self.clock, self.nodes, 0, self.period, own_clock is not None)
+        self._port = open_listening_port(bus)
+        self._loop = Loop(self._port, self.clock, self.nodes, 0, self.period, own_clock is not None)
         units = assumed_units(arm)
         self._loop.set_units(units)
-        self._loop.on_other = self._take
+        self._loop.on_other = self._take_other
         self._torque_unit = np.array([unit.torque for unit in units])
         self._position_unit = np.array([unit.position for unit in units])
-        self._joint_of = {RPDO1.cob_base + node: joint for joint, node in enumerate(self.nodes)}
+        self._commands = {RPDO1.cob_base + node: NO_COMMAND for node in self.nodes}
         self._ready: deque[Sample] = deque()
-        self._arrived: float | None = None
-        """Time of the frame that is being taken in, where its port tells it."""
         self._sync: float | None = None
         self._since: float | None = None
         self._notify: Callable[[int, bytearray, float], None] | None = None
-        self.torque_sent: Array = np.full(self.n, np.nan)
-        """Target torque of the other controller's newest frames [N·m], (n,); NaN before the first."""
-        self.position_sent: Array = np.full(self.n, np.nan)
-        """Likewise target position [rad]."""
 
     def __enter__(self) -> Self:
         """The listener itself."""
@@ -87,6 +81,22 @@ class Listener:
     def node_states(self) -> dict[int, int]:
         """Joint → NMT state of its newest heartbeat, 0 for boot-up; the caller may clear it."""
         return self._loop.node_states
+
+    @property
+    def torque_sent(self) -> Array:
+        """Target torque of the other controller's newest frames [N·m], (n,); NaN before the first."""
+        return self._sent("torque", self._torque_unit)
+
+    @property
+    def position_sent(self) -> Array:
+        """Likewise target position [rad]."""
+        return self._sent("position", self._position_unit)
+
+    def _sent(self, field: str, unit: Array) -> Array:
+        newest = list(self._commands.values())
+        values: Array = np.frombuffer(b"".join(newest), COMMAND_LAYOUT)[field] * unit
+        values[[each is NO_COMMAND for each in newest]] = np.nan
+        return values
 
     def next(self, timeout: float) -> Sample | None:
         """The next complete sample, or None where no SYNC completes one within `timeout` [s]; raises BusFault.
@@ -114,27 +124,32 @@ class Listener:
     def _hear(self, seconds: float, at_once: bool = False) -> None:
         """Take in what comes, for at most so long; `at_once`: somebody waits for the very next frame."""
         port = self._port
-        if port is None:
-            self._loop.receive(seconds)
-            return
-        if at_once:
-            port.wait(seconds)
+        if isinstance(port, StampedPort | StampedGroup):
+            if at_once:
+                port.wait(seconds)
+            else:
+                self.clock.sleep_until(self.clock.now() + min(seconds, SLEEP))
+            for t, can_id, data in port.take_all():
+                self._take(t, can_id, data)
         else:
-            self.clock.sleep_until(self.clock.now() + min(seconds, SLEEP))
-        for self._arrived, can_id, data in port.take_all():
+            frame = port.receive(seconds)
+            if frame is not None:
+                self._take(self.clock.now(), *frame)
+
+    def _take(self, t: float, can_id: int, data: bytes) -> None:
+        """One frame that came at time t [s]."""
+        if can_id in self._commands:
+            self._loop.count(data)
+            if len(data) == COMMAND_LAYOUT.itemsize:
+                self._commands[can_id] = data
+        elif can_id == objects.SYNC_ID:
+            self._loop.count(data)
+            self._complete(t)
+        else:
             self._loop.take(can_id, data)
 
-    def _take(self, can_id: int, data: bytes) -> None:
-        if can_id == objects.SYNC_ID:
-            self._complete(self.clock.now() if self._arrived is None else self._arrived)
-            return
-        joint = self._joint_of.get(can_id)
-        if joint is not None:
-            if len(data) == COMMAND_LAYOUT.size:
-                _, torque, position = COMMAND_LAYOUT.unpack(data)
-                self.torque_sent[joint] = torque * self._torque_unit[joint]
-                self.position_sent[joint] = position * self._position_unit[joint]
-        elif self._notify is not None:
+    def _take_other(self, can_id: int, data: bytes) -> None:
+        if self._notify is not None:
             self._notify(can_id, bytearray(data), 0.0)
 
     def _complete(self, now: float) -> None:

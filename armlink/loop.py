@@ -208,6 +208,11 @@ class Loop:
         else:
             self.statuses[joint], self.displays[joint] = unpack(data)
 
+    def count(self, data: bytes) -> None:
+        """Count a frame that somebody else has taken in."""
+        self.stats.frames += 1
+        self.bits += FIXED_BITS + 8 * len(data)
+
     def _take_other(self, can_id: int, data: bytes) -> None:
         self.watch.other(can_id)
         joint = self._joint_of.get(can_id & 0x7F)

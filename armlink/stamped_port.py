@@ -34,7 +34,7 @@ class StampedPort(SocketPort):
             message.header.control, message.header.control_length = base + i * CONTROL, CONTROL
         self._headers = bytes(self._in.messages)  # as the kernel wants them: it writes lengths into them
         self._stamps = memoryview(self._control)
-        self._before = time.monotonic()
+        self._began = time.monotonic()
 
     def wait(self, timeout: float) -> None:
         """Return when a frame is there, or after `timeout` seconds."""
@@ -46,6 +46,8 @@ class StampedPort(SocketPort):
         The kernel's stamps are by the wall clock: they are brought to the monotonic one by the difference of the two
         at this moment, and kept between the last call and this one, so that a clock that is set spoils one batch.
         """
+        earliest = self._began
+        self._began, ahead = _clocks()
         frames: list[Stamped] = []
         others: list[int] = []
         for _ in range(MOST_BATCHES):
@@ -57,14 +59,15 @@ class StampedPort(SocketPort):
                 if can_id & FLAGS:
                     others.append(can_id)
                 else:
-                    frames.append((seconds + 1e-9 * nano, can_id, data[:length]))
+                    frames.append((seconds - ahead + 1e-9 * nano, can_id, data[:length]))
             if count < BATCH:
                 break
-        now, ahead = _clocks()
-        before, self._before = self._before, now
         if others:
             self._take_others(others)
-        return [(min(max(stamp - ahead, before), now), can_id, data) for stamp, can_id, data in frames]
+        latest = time.monotonic()
+        if frames and not earliest <= frames[0][0] <= frames[-1][0] <= latest:
+            frames = [(min(max(t, earliest), latest), can_id, data) for t, can_id, data in frames]
+        return frames
 
 
 class StampedGroup(GroupPort):

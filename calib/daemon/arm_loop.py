@@ -162,7 +162,7 @@ class ArmLoop:
         while (remaining := end - listener.clock.now()) > 0:
             sample = listener.next(remaining)
             if sample is not None:
-                rows.append((sample.t, sample, listener.torque_sent.copy(), listener.position_sent.copy()))
+                rows.append((sample.t, sample, listener.torque_sent, listener.position_sent))
         return rows
 
     def _silence(self, listener: Listener, heard: bool) -> list[Message]:
