@@ -22,8 +22,9 @@ from armlink.port import open_port
 from armlink.sample import Array, Calibration, Command, Identity, Sample, Stats
 from armlink.services import NodeServices, PumpedNetwork, joint_services
 
-LISTEN_PERIODS, LISTEN_SECONDS = 2, 0.02
-"""Before anything is sent to the nodes, another host is listened for: so many periods, and at least so long [s]."""
+LISTEN_PERIODS, LISTEN_SECONDS = 2, 0.1
+"""Before anything is sent to the nodes, another host is listened for: so many periods, and at least so long [s]: a host
+on a busy computer may well pause for some 0.05 s."""
 
 
 class Link:
