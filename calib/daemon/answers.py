@@ -4,22 +4,21 @@ from datetime import datetime
 from typing import Any
 
 from calib.daemon.messages import Batch
-from calib.daemon.proposal import proposal_answer
-from calib.daemon.service import Service
-from calib.daemon.stream import Client
-from calib.daemon.view import (
+from calib.daemon.models import (
     BusHealth,
     EventRecord,
     HistoryPoint,
     JointEstimate,
     JointNow,
     JointsItem,
-    NoSuch,
-    NotPossible,
     Proposal,
     RecordsInForce,
     Status,
 )
+from calib.daemon.proposal import proposal_answer
+from calib.daemon.service import Service
+from calib.daemon.stream import Client
+from calib.daemon.view import NoSuch, NotPossible
 from calib.daemon.watcher import joints_now, number
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from calib.daemon.journal import ProposalRow
-from calib.daemon.view import Proposal
+from calib.daemon.models import Proposal
 from calib.daemon.wording import clean
 from calib.decision import Finding
 

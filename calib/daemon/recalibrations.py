@@ -10,10 +10,11 @@ from armlink.errors import ArmlinkError, Refused
 from calib.after_write import Checked
 from calib.daemon.journal import Journal, ProposalRow
 from calib.daemon.messages import Array
+from calib.daemon.models import Proposal
 from calib.daemon.outside import Outside
 from calib.daemon.proposal import finding_json, finding_of, proposal_answer
 from calib.daemon.settings import DaemonSection
-from calib.daemon.view import NoSuch, NotPossible, Proposal
+from calib.daemon.view import NoSuch, NotPossible
 from calib.decision import Finding
 from calib.recalibration import APPLIED_BY, Recalibration, Recalibrator
 from calib.records import CalibrationRecord

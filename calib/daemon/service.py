@@ -15,13 +15,13 @@ from calib.daemon.in_force import InForce
 from calib.daemon.journal import Journal
 from calib.daemon.keeping import Keeping
 from calib.daemon.messages import Batch, Down, Message, Progress, Reply, Up
+from calib.daemon.models import EventItem, EventRecord, State
 from calib.daemon.outside import Jobs
 from calib.daemon.recalibrations import Recalibrations
 from calib.daemon.recordings import Recordings
 from calib.daemon.settings import DaemonSection
 from calib.daemon.stream import Hub
 from calib.daemon.tours import Tours
-from calib.daemon.view import EventItem, EventRecord, State
 from calib.daemon.watcher import Watcher
 from calib.daemon.wording import clean, one_alarm_a_joint, told
 from calib.events import Event

@@ -3,7 +3,7 @@
 import asyncio
 from collections import deque
 
-from calib.daemon.view import EventItem, JointsItem
+from calib.daemon.models import EventItem, JointsItem
 
 QUEUE_ITEMS = 50
 """Items that wait for one client at most: five seconds of joints."""

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from calib.daemon.messages import Progress
-from calib.daemon.view import State
+from calib.daemon.models import State
 
 if TYPE_CHECKING:
     from calib.daemon.service import Service

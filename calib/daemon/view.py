@@ -1,199 +1,21 @@
-"""What the web layer sees of the daemon: typed answers of contract 8 and the interface that gives them.
+"""What the web layer may ask of the daemon, and what it may be refused.
 
 Everything here is called on the service's one event loop (asyncio, the same thread): an answer never waits for the bus.
-A missing number is None. Times are ISO 8601 with zone (`time`) and monotonic seconds (`t`, which a reboot resets).
 """
 
 from datetime import datetime
-from enum import StrEnum
-from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Protocol
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
-
-
-class State(StrEnum):
-    """What the daemon is doing."""
-
-    STARTING = "starting"
-    OBSERVING = "observing"
-    SWEEPING = "sweeping"
-    RECALIBRATING = "recalibrating"
-    FAULT = "fault"
-
-
-ProposalState = Literal["pending", "approved", "applied", "rejected", "failed", "superseded"]
-
-
-class Answer(BaseModel):
-    """Base of every answer."""
-
-    model_config = ConfigDict(frozen=True)
-
-
-class BusHealth(Answer):
-    """The bus as the loop counts it, since it was last opened."""
-
-    connected: bool
-    """Whether frames of the joints are coming in."""
-    fault: str | None = None
-    """Why not, in one line."""
-    rate_hz: float = 0.0
-    """Cycles (SYNC) a second."""
-    load: float = 0.0
-    """Share of the bus taken."""
-    frames: int = 0
-    missed: int = 0
-    """Sensor frames that did not come in their cycle."""
-    late: int = 0
-    """Cycles of our own that began more than a tenth of a period late."""
-    errors: int = 0
-
-
-class RecordsInForce(Answer):
-    """Ids of the records in force, None where there is none."""
-
-    calibration: str | None = None
-    gravity: str | None = None
-
-
-class Status(Answer):
-    """GET /api/status."""
-
-    state: State
-    detail: str = ""
-    """Why it is in this state, in one line; empty where there is nothing to say."""
-    arm: str
-    serial: str
-    version: str
-    policy: Literal["observe", "propose", "apply"]
-    listen_only: bool
-    time: AwareDatetime
-    t: float
-    uptime_s: float
-    bus: BusHealth
-    records: RecordsInForce
-    held: bool = False
-    """Whether an alarm stands, so that estimates are held until its cause is known."""
-    rows: int = 0
-    """Rests of the arm that the observer has used since the daemon first ran with these records."""
-    pending_proposals: int = 0
-    last_event: int = 0
-    """Id of the newest event, 0 where there is none."""
-    report: Path | None = None
-    """The newest report (HTML) of a sweep, where there is one."""
-
-
-class JointNow(Answer):
-    """One joint of GET /api/joints, and of the stream."""
-
-    joint: str
-    position: float | None
-    """[rad]"""
-    torque: float | None
-    """Sensor as the controller calibrates it [N·m]."""
-    model_torque: float | None
-    """Gravity model at this position [N·m]."""
-    residual: float | None
-    """Torque less model torque [N·m]; means something at rest."""
-    state: str
-    """CiA 402 state in words; "unknown" before the first status word."""
-    sample_age_s: float | None
-    """Time since position and torque last came; None where they never did."""
-
-
-class JointEstimate(Answer):
-    """One joint of GET /api/estimates: against the installed record, where gain 1 and offset 0 mean no change."""
-
-    joint: str
-    gain: float
-    gain_std: float
-    offset: float
-    """[N·m]"""
-    offset_std: float
-    samples: int
-    """Rests of the arm that went into it."""
-    last_accepted: AwareDatetime | None
-    installed_gain: float | None
-    """Gain and offset [N·m] of the record in force."""
-    installed_offset: float | None
-
-
-class EventRecord(Answer):
-    """One line of the event log."""
-
-    id: int
-    time: AwareDatetime
-    t: float
-    kind: str
-    """drift, payload, contact, effect, alarm, clear, undecided, proposal, approved, rejected, recalibration, refused,
-    roll-back, sweep, fault, recovered, started, stopped, configuration, clock."""
-    joint: str | None
-    text: str
-    """For people, one line."""
-    evidence: dict[str, Any]
-
-
-class HistoryPoint(Answer):
-    """Estimate of one joint at one time, as JointEstimate has it."""
-
-    time: AwareDatetime
-    t: float
-    joint: str
-    gain: float
-    gain_std: float
-    offset: float
-    offset_std: float
-    record: str | None
-    """Calibration record in force then: against it gain and offset are measured."""
-
-
-class Proposal(Answer):
-    """One proposed recalibration."""
-
-    id: int
-    time: AwareDatetime
-    state: ProposalState
-    joint: str
-    cause: str
-    """gain, offset or drift (both)."""
-    gain: float
-    """Relative to what is installed."""
-    gain_std: float
-    offset: float
-    """[N·m]"""
-    offset_std: float
-    rows: int
-    confidence: float
-    record: str
-    """Id of the record that approval puts in force."""
-    base: str
-    """Id of the record that it replaces."""
-    decided_at: AwareDatetime | None = None
-    decided_by: str | None = None
-    note: str = ""
-    """Why it failed or was superseded."""
-
-
-class JointsItem(Answer):
-    """Stream item, ten times a second."""
-
-    type: Literal["joints"] = "joints"
-    time: AwareDatetime
-    t: float
-    state: State
-    bus: BusHealth
-    joints: tuple[JointNow, ...]
-
-
-class EventItem(Answer):
-    """Stream item, as it comes."""
-
-    type: Literal["event"] = "event"
-    event: EventRecord
-
-
-StreamItem = Annotated[JointsItem | EventItem, Field(discriminator="type")]
+from calib.daemon.models import (
+    EventItem,
+    EventRecord,
+    HistoryPoint,
+    JointEstimate,
+    JointNow,
+    JointsItem,
+    Proposal,
+    Status,
+)
 
 
 class NotPossible(Exception):

@@ -8,7 +8,7 @@ import numpy as np
 from armlink.armfile import ArmFile
 from armlink.cia402 import state_of
 from calib.daemon.messages import Array, Batch
-from calib.daemon.view import JointNow
+from calib.daemon.models import JointNow
 from calib.description import gcomp_arm
 from calib.events import Event
 from calib.observer import Observer

@@ -18,8 +18,8 @@ from armlink.sample import Command
 from calib.daemon.arm_loop import ArmLoop
 from calib.daemon.host import ChildHost
 from calib.daemon.messages import Batch, Down, LoopOptions, Up
+from calib.daemon.models import State
 from calib.daemon.settings import DaemonSection
-from calib.daemon.view import State
 from calib.description import gcomp_arm
 from calib.work import work_targets
 from sim_bus.bus import LockStepBus

@@ -17,9 +17,10 @@ from armlink.recording import load_recording
 from calib.daemon.journal import Journal
 from calib.daemon.logs import JsonFormatter
 from calib.daemon.messages import Down, Up
+from calib.daemon.models import State
 from calib.daemon.notify import Notifier, watchdog_seconds
 from calib.daemon.settings import DaemonSection
-from calib.daemon.view import NoSuch, NotPossible, State
+from calib.daemon.view import NoSuch, NotPossible
 from calib.records import CalibrationRecord
 
 

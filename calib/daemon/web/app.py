@@ -53,7 +53,7 @@ def open_app(view: DaemonView, streams: Streams, files: dict[str, PageFile]) -> 
 
 def _sender(file: PageFile) -> Callable[[Request], Awaitable[Response]]:
     async def send(request: Request) -> Response:
-        headers = {"etag": file.etag, "cache-control": "no-cache"}
+        headers = {"etag": file.etag, "cache-control": "no-cache", "content-security-policy": file.policy}
         if request.headers.get("if-none-match") == file.etag:
             return Response(status_code=304, headers=headers)
         return Response(file.content, media_type=file.media_type, headers=headers)

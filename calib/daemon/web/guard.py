@@ -21,14 +21,12 @@ HEAD_LIMIT = 16384
 BODY_SECONDS = 10.0
 """A body that has not come by then is given up."""
 REQUESTS = Rate(burst=60, per_second=20)
-"""Of one TCP address; a page needs 17 requests to load and four in two seconds then."""
+"""Of one TCP address; a page needs three requests to load and four in two seconds then."""
 WRONG_TOKENS = Rate(burst=5, per_second=0.2)
 """Of one TCP address."""
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
-CSP = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self';"
-    " base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-)
+CSP = "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+"""Of whatever does not say otherwise: nothing in it may run or be shown."""
 HEADERS = {
     "content-security-policy": CSP,
     "x-content-type-options": "nosniff",
@@ -50,7 +48,7 @@ class Access:
     hosts: frozenset[str] = frozenset()
     """Names, beside the connection's own address, that a Host header may have."""
     open_paths: frozenset[str] = frozenset()
-    """The page's own static files, which need no token."""
+    """The page, which needs no token."""
     now: Callable[[], float] = field(default=time.monotonic, repr=False)
 
 

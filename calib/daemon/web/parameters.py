@@ -72,6 +72,17 @@ class HistoryQuery(_Query):
         return self
 
 
+class OverviewQuery(_Query):
+    """GET /api/overview."""
+
+    seconds: Annotated[float, Field(ge=0, le=1e9)] = 3600.0
+    """History of so long; 0: all there is."""
+    limit: Annotated[int, Field(ge=2, le=2000)] = 120
+    """At most so many points of history a joint, thinned evenly."""
+    events: Annotated[int, Field(ge=1, le=500)] = 500
+    """At most so many."""
+
+
 class StreamQuery(_Query):
     """GET /api/stream."""
 

@@ -1,24 +1,25 @@
 """The API's routes (contract 8). All read, except the two that decide on a proposal; none can command motion."""
 
 from collections.abc import Callable
+from datetime import timedelta
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Header, Path, Query, Request
 from fastapi.responses import FileResponse, Response
 from pydantic import TypeAdapter
 
-from calib.daemon.view import (
-    DaemonView,
-    EventRecord,
-    HistoryPoint,
-    JointEstimate,
-    JointNow,
-    NoSuch,
-    NotPossible,
-    Proposal,
-    Status,
+from calib.daemon.models import EventRecord, HistoryPoint, JointEstimate, JointNow, Overview, Proposal, Status
+from calib.daemon.view import DaemonView, NoSuch, NotPossible
+from calib.daemon.web.parameters import (
+    LARGEST_ID,
+    ApiError,
+    Decision,
+    EventsQuery,
+    HistoryQuery,
+    Id,
+    OverviewQuery,
+    StreamQuery,
 )
-from calib.daemon.web.parameters import LARGEST_ID, ApiError, Decision, EventsQuery, HistoryQuery, Id, StreamQuery
 from calib.daemon.web.peer import Peer, peer_of
 from calib.daemon.web.stream import StreamResponse, Streams
 
@@ -94,6 +95,21 @@ def _add_now(router: APIRouter, view: DaemonView) -> None:
     async def estimates() -> tuple[JointEstimate, ...]:
         """Every joint's gain and offset against the installed record, base to tip."""
         return view.estimates()
+
+    @router.get("/api/overview", response_model=Overview, tags=["now"])
+    async def overview(query: Annotated[OverviewQuery, Query()]) -> Response:
+        """All that the page shows in one answer: as the other routes have it, of the past the newest."""
+        status = view.status()
+        since = status.time - timedelta(seconds=query.seconds) if query.seconds else None
+        answer = Overview(
+            status=status,
+            joints=view.joints(),
+            estimates=view.estimates(),
+            proposals=view.proposals(),
+            events=view.events(after=max(0, status.last_event - query.events)),
+            history=view.history(None, since, None, query.limit),
+        )
+        return Response(answer.model_dump_json(), media_type="application/json")
 
 
 def _add_past(router: APIRouter, view: DaemonView) -> None:

@@ -5,7 +5,7 @@ import math
 from collections import deque
 from datetime import UTC, datetime, timedelta
 
-from calib.daemon.view import (
+from calib.daemon.models import (
     BusHealth,
     EventItem,
     EventRecord,
@@ -13,13 +13,12 @@ from calib.daemon.view import (
     JointEstimate,
     JointNow,
     JointsItem,
-    NoSuch,
-    NotPossible,
     Proposal,
     RecordsInForce,
     State,
     Status,
 )
+from calib.daemon.view import NoSuch, NotPossible
 
 NOW = datetime(2026, 5, 1, 8, 0, tzinfo=UTC)
 NAMES = tuple(f"joint_{i}" for i in range(1, 8))

@@ -9,7 +9,7 @@ from conftest import Served
 from made_up_view import NAMES, NOW, MadeUpView
 from prometheus_client.parser import text_string_to_metric_families
 
-from calib.daemon.view import HistoryPoint
+from calib.daemon.models import HistoryPoint
 from calib.daemon.web.page import page_files
 from calib.daemon.web.stream import Streams
 

@@ -14,8 +14,8 @@ from made_up_view import NAMES, NOW, MadeUpView
 from playwright.sync_api import Browser, Page, expect
 from small_arm import small_arm
 
+from calib.daemon.models import HistoryPoint, State
 from calib.daemon.settings import DaemonSection
-from calib.daemon.view import HistoryPoint, State
 from calib.records import CalibrationRecord
 
 PATIENCE = 60_000

@@ -27,13 +27,18 @@ export function addEvent(event) {
   drawn = false;
 }
 
+export const overviewQuery = () => `seconds=${seconds}&limit=${POINTS}`;
+
+export function setHistory(points) {
+  history.clear();
+  take(points);
+}
+
 const since = () => (seconds ? new Date(now - 1000 * seconds).toISOString() : "");
 
 // All of the time range anew; the caller draws.
 export async function fetchHistory() {
-  const points = await get(`/api/history?limit=${POINTS}&from=${encodeURIComponent(since())}`);
-  history.clear();
-  take(points);
+  setHistory(await get(`/api/history?limit=${POINTS}&from=${encodeURIComponent(since())}`));
 }
 
 // The caller draws.

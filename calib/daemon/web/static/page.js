@@ -1,11 +1,11 @@
 // The page: what the daemon says, at a glance. Everything it knows comes from the API; it sends nothing but decisions.
 
 import { blob, forgetToken, get, stream, token } from "./api.js";
-import { addEvent, draw, drawIfChanged, fetchHistory, fetchNew, initRanges, setLive, setNow } from "./drift.js";
+import { addEvent, draw, drawIfChanged, fetchNew, initRanges, overviewQuery, setHistory, setLive, setNow } from "./drift.js";
 import { showEvent } from "./events.js";
 import { by, clock, duration, put, whole } from "./format.js";
 import { showEstimates, showJoints, verdict } from "./joints.js";
-import { fetchProposals } from "./proposals.js";
+import { fetchProposals, showProposals } from "./proposals.js";
 
 const SLOW = 2000; // ms between looks at what changes slowly
 let status = null;
@@ -129,24 +129,22 @@ async function forEver() {
 
 async function start() {
   by("forget").addEventListener("click", () => { forgetToken(); location.reload(); });
-  const now = Promise.all([get("/api/joints"), get("/api/estimates"), fetchProposals()]);
-  now.catch(() => {}); // the status would say so first
-  status = await get("/api/status");
+  const all = await get(`/api/overview?${overviewQuery()}`);
+  status = all.status;
   connected = true;
+  said = verdict(all.estimates);
   setNow(status.time);
-  const past = Promise.all([get(`/api/events?after=${Math.max(0, status.last_event - 500)}`), fetchHistory()]);
-  const [joints, estimates] = await now;
-  said = verdict(estimates);
   showStatus();
-  showJoints(joints);
-  showEstimates(estimates);
-  setLive(estimates, status);
-  const [events] = await past;
-  for (const event of events) { addEvent(event); showEvent(event); }
+  showJoints(all.joints);
+  showEstimates(all.estimates);
+  showProposals(all.proposals);
+  setLive(all.estimates, status);
+  setHistory(all.history);
+  for (const event of all.events) { addEvent(event); showEvent(event); }
   draw();
   initRanges();
   document.body.dataset.shown = Math.round(performance.now()); // ms until everything stood here
-  stream(on, events.at(-1)?.id ?? status.last_event);
+  stream(on, status.last_event);
   forEver();
 }
 

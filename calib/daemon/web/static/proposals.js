@@ -55,8 +55,9 @@ function decide(one, verb) {
   dialog.showModal();
 }
 
-export async function fetchProposals() {
-  const all = await get("/api/proposals");
+export const fetchProposals = async () => showProposals(await get("/api/proposals"));
+
+export function showProposals(all) {
   const open = all.filter((one) => one.state === "pending");
   by("proposals").hidden = open.length === 0;
   by("proposal-list").replaceChildren(...open.map(pending));
@@ -68,5 +69,4 @@ export async function fetchProposals() {
     line.dataset.proposal = one.id;
     return line;
   }));
-  return open.length;
 }
