@@ -56,6 +56,8 @@ class FastArm:
         self.q = (self.arm.lower + self.arm.upper) / 2
         self.t = 0.0
         self.motion = WorkMotion()
+        self.job: Iterator[np.ndarray] | None = None
+        """Poses (n,) of a job, one after the other; None: random ones over the whole range."""
 
     def observer(self, config: ObserverConfig | None = None) -> Observer:
         config = config or ObserverConfig()
@@ -82,6 +84,8 @@ class FastArm:
             nearest = np.maximum(middle - half, self.q - motion.reach)
             farthest = np.minimum(middle + half, self.q + motion.reach)
             goal = self.random.uniform(np.minimum(nearest, farthest), np.maximum(nearest, farthest))
+            if self.job is not None:
+                goal = next(self.job)
             way = trajectory(
                 self.q, goal, motion.speed_share * self.speed, np.full(self.n, motion.acceleration), PERIOD
             )

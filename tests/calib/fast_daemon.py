@@ -50,7 +50,7 @@ class FastDaemon:
         self.ids = [0] * self.fast.n
         self.sdo: list[str] = []
         self.on_write: Callable[[int], None] = lambda joint: None
-        self.touring = 0
+        self.touring, self.job_after = 0, self.fast.job
         if records:
             for record in self.good_records():
                 self.store.put(record, self.arm, by="ann", reason="sweep")
@@ -106,7 +106,7 @@ class FastDaemon:
         return self.read_calibration(joint)
 
     def sweep(self, poses: int, seed: int) -> Reply | None:
-        self.touring = poses
+        self.touring, self.job_after, self.fast.job = poses, self.fast.job, None
         return None
 
     # ---- time
@@ -118,6 +118,8 @@ class FastDaemon:
             self.service.take(self.batch(t + self.clock_shift, position, torque))
             if self.touring:
                 self.touring -= 1
+                if not self.touring:
+                    self.fast.job = self.job_after
                 self.service.take(Progress(60 - self.touring, 60))
             if self.fast.t - ticked >= 1.0:
                 ticked = self.fast.t

@@ -1,5 +1,6 @@
 """The daemon's service: what it knows, says and does, on an arm without a bus."""
 
+import itertools
 import json
 import logging
 import os
@@ -290,6 +291,41 @@ def test_sweeps_are_by_schedule_or_request_and_only_where_the_bus_is_driven(tmp_
     listening = FastDaemon(tmp_path / "listening", 1, settings(), listen_only=True)
     listening.service.tours.request("asked for")
     assert "only listens" in listening.of_kind("refused")[0].text
+
+
+def at_a_job_of_few_poses(tmp_path: Path, **more: object) -> FastDaemon:
+    """A daemon that knows its arm, which then goes to and fro among three poses while joint_3's sensor drifts."""
+    daemon = FastDaemon(tmp_path, 4, settings("apply", **more))
+    daemon.run(150)
+    fast = daemon.fast
+    half = 0.4 * (fast.arm.upper - fast.arm.lower)
+    poses = fast.q.clip(fast.arm.lower + half, fast.arm.upper - half) + half * np.array([[-0.5], [0.0], [0.5]])
+    fast.job = itertools.cycle(poses)
+    daemon.run(60)
+    fast.offset[2] += 0.8
+    return daemon
+
+
+def test_where_watching_cannot_decide_a_sweep_follows_and_decides(tmp_path: Path) -> None:
+    daemon = at_a_job_of_few_poses(tmp_path, sweep_when_undecided=True)
+    daemon.run(900, until=lambda: daemon.view.status().state is State.SWEEPING)
+    assert daemon.view.status().state is State.SWEEPING
+    assert daemon.of_kind("alarm")
+    assert "too few different poses" in daemon.of_kind("undecided")[-1].text
+    assert not daemon.of_kind("recalibration")
+    daemon.run(600, until=lambda: daemon.view.status().state is State.OBSERVING)
+    (written,) = daemon.of_kind("recalibration")
+    assert written.joint == "joint_3"
+    gain, offset = daemon.fast.error()
+    assert np.abs(gain).max() < 0.003
+    assert np.abs(offset).max() < 0.05
+
+
+def test_without_leave_no_sweep_follows_and_nothing_is_written(tmp_path: Path) -> None:
+    daemon = at_a_job_of_few_poses(tmp_path)
+    daemon.run(400)
+    assert daemon.of_kind("undecided")
+    assert not daemon.of_kind("sweep", "recalibration", "proposal")
 
 
 # ---- journal, recordings, settings, systemd

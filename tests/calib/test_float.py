@@ -8,7 +8,7 @@ from daemon_bench import good_records
 
 from armlink.armfile import ArmFile, load_arm
 from armlink.link import Link
-from armlink.sample import Sample
+from armlink.sample import Command, Sample
 from calib.description import gcomp_arm
 from calib.float_control import FloatConfig, FloatControl
 from calib.float_run import run_float
@@ -80,6 +80,60 @@ def test_a_hard_push_ends_softly_within_the_stops() -> None:
     described = gcomp_arm(arm)
     assert (positions > described.lower - 0.1).all()
     assert (positions < described.upper + 0.1).all()
+
+
+class Peer:
+    """Another arm that follows the master by position; what pushes at it is told to the master, joint by joint."""
+
+    def __init__(self, arm: ArmFile) -> None:
+        self.simulated = SimulatedArm(arm, Truth.draw(arm, SEED + 1), SEED + 1)
+        calibration, gravity = good_records(arm, self.simulated.true_sensors)
+        self.described, self.beta = gcomp_arm(arm), np.array(gravity.beta)
+        self.link = Link(arm, LockStepBus(arm=self.simulated))
+        self.link.start()
+        self.goal = self.link.enable().position.copy()
+        write_record(calibration, self.link)
+        self.felt = [np.zeros(self.link.n)]
+
+    def reflect(self, master: Sample) -> np.ndarray:
+        """Torque of whatever touches the peer (n,) [N·m]: the model's less the sensor's, low-passed (0.04 s)."""
+        self.goal += (master.position - self.goal).clip(-0.002, 0.002)
+        sample = self.link.cycle(Command.hold(self.goal))
+        now = gravity_torque(self.described, self.beta, self.goal[None])[0] - sample.torque
+        self.felt.append(self.felt[-1] + 0.1 * (now - self.felt[-1]))
+        return self.felt[-1]
+
+    def push(self, force: list[float]) -> None:
+        self.simulated.plant.data.xfrc_applied[-1, :3] = force
+
+
+@pytest.mark.parametrize("pushed", [True, False])
+def test_a_master_arm_is_a_float_plus_a_peer(pushed: bool) -> None:
+    """A push at the peer's tip moves the master, which nobody touches, the way that the push would; else it rests."""
+    arm = smooth(load_arm("sarcos"))
+    simulated = SimulatedArm(arm, Truth.draw(arm, SEED), SEED)
+    calibration, gravity = good_records(arm, simulated.true_sensors)
+    link, peer, positions = Link(arm, LockStepBus(arm=simulated)), Peer(arm), []
+
+    def watch(sample: Sample, torque: np.ndarray) -> None:
+        positions.append(sample.position.copy())
+        if pushed and len(positions) == 250:
+            peer.push([8.0, 6.0, 4.0])
+
+    with link, peer.link:
+        link.start()
+        link.enable()
+        write_record(calibration, link)
+        beta = np.array(gravity.beta)
+        run_float(link, arm, beta, calibration, seconds=1.6, reflect=peer.reflect, on_sample=watch)
+    before, after = positions[240], positions[-1]
+    if not pushed:
+        assert np.abs(after - before).max() < 0.03
+        return
+    assert np.abs(after - before).max() > 0.05
+    push = np.mean(peer.felt[255:275], axis=0) - np.mean(peer.felt[200:240], axis=0)
+    assert np.dot(push, after - before) > 0  # its work: the way that it pushes
+    assert np.abs(peer.goal - after).max() < 0.05  # and the peer has come along
 
 
 @pytest.fixture
