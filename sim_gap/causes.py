@@ -12,6 +12,7 @@ from sim_gap.diagnosis import Cause, Signs
 from sim_gap.effects.registry import Row
 from sim_gap.estimate import Estimate, Value
 from sim_gap.normal import ColumnStore, Normal, Term
+from sim_gap.outside import Outside
 from sim_gap.residual import CARE_NM, ResidualSet
 from sim_gap.rigid import Array
 
@@ -65,7 +66,7 @@ class _Scorer:
         """Held-out mean square per row after fitting these terms on the training set, (R,)."""
         return self.normal.mean_square(np.arange(self.normal.size), self.estimate.subset(terms))
 
-    def signs(self, terms: tuple[Term, ...], evidence: float) -> Signs:
+    def signs(self, terms: tuple[Term, ...], evidence: float, outside: float) -> Signs:
         """What speaks for and against a cause, on the row that rises most without its terms."""
         data, rows = self.heldout, self.normal.rows
         final = self.squares(list(self.estimate.terms))
@@ -77,7 +78,7 @@ class _Scorer:
         gaps = self.counts & (np.sqrt(raw) > np.array([data.margin[row] for row in rows]))
         elsewhere = float(np.mean(above[gaps] / raw[gaps])) if gaps.any() else 0.0
         excess = float(np.sqrt(final[r])) / data.care[rows[r]]
-        return Signs(evidence, float(above[r] / max(raw[r], 1e-12)), excess, elsewhere)
+        return Signs(evidence, float(above[r] / max(raw[r], 1e-12)), excess, elsewhere, outside)
 
     def rms(self, terms: list[Term]) -> Array:
         """Held-out RMS per joint after fitting these terms on the training set, (n,)."""
@@ -126,23 +127,32 @@ def causes(
     minor: list[Cause] = []
     scorer = _Scorer(estimate, heldout)
     fitted = _Scorer(estimate, estimate.store.data)
+    outside = Outside(estimate.store, estimate.terms)
     for step in ordered(estimate, scorer):
         main = materials(step, estimate, heldout, scorer)
         rest = tuple(term for term in step.terms if term not in main)
         for terms, out in ((main, found), (rest, minor)):
             if terms:
                 bound = any(term.bound for term in terms)
-                out.append(_cause(step, terms, fitted if bound else scorer, rivals, names))
+                out.append(_cause(step, terms, fitted if bound else scorer, (rivals, outside), names))
     return found, minor
 
 
-def _cause(step: Step, terms: tuple[Term, ...], scorer: "_Scorer", rivals: Rivals, names: tuple[str, ...]) -> Cause:
-    """One cause from the terms of a step that belong together."""
+def _cause(
+    step: Step,
+    terms: tuple[Term, ...],
+    scorer: "_Scorer",
+    against: tuple[Rivals, Outside],
+    names: tuple[str, ...],
+) -> Cause:
+    """One cause from the terms of a step that belong together, weighed against the library and what is outside it."""
+    rivals, outside = against
     places = sorted({term.place for term in terms})
     whole = rivals.whole_arm(step.effect)
     touched = np.arange(len(names)) if whole else np.array(places)
     weighed = rivals.weigh(step.effect, terms)
-    signs = scorer.signs(terms, weighed.evidence)
+    stand_in = outside.weigh(terms)
+    signs = scorer.signs(terms, weighed.evidence, stand_in.worse)
     parameters: dict[str, dict[str, Value]] = {}
     for term in sorted(terms, key=lambda t: t.place):
         parameters.setdefault("arm" if whole else names[term.place], {}).update(scorer.estimate.parameters(term))
@@ -157,6 +167,7 @@ def _cause(step: Step, terms: tuple[Term, ...], scorer: "_Scorer", rivals: Rival
         signs=signs,
         confounded_with=weighed.confounded_with,
         separate_by=weighed.separate_by,
+        law=stand_in.law,
     )
 
 

@@ -15,6 +15,7 @@ from sim_gap.effects.registry import layout_of, library_without
 from sim_gap.estimate import Estimate
 from sim_gap.model import SimModel, load_model
 from sim_gap.normal import ColumnStore
+from sim_gap.notes import notes
 from sim_gap.regime import by_joint, combined, places
 from sim_gap.residual import ResidualSet
 from sim_gap.rollout import roll_out
@@ -111,7 +112,7 @@ def _answer(made: Internals, found: list[Cause], minor: list[Cause], told: str, 
         margin=combined(judge, judge.margin),
         heldout_is=told,
         rollout=roll_out(made.model, judge, estimate),
-        notes=(*_stuck(stuck, fit), *_hits(fit), *_bound(estimate, fit), *_notes(fit)),
+        notes=notes(found, stuck, estimate, fit, judge, left),
         internals=made,
     )
 
@@ -134,46 +135,6 @@ def _split(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Recor
         first.append(slice_rows(recording, recording.t < cut))
         last.append(slice_rows(recording, recording.t >= cut))
     return first, last
-
-
-def _notes(data: ResidualSet) -> tuple[str, ...]:
-    still = [
-        f"{data.signals[0].arm.names[joint]} hardly moves: its {channel} tells nothing of friction here"
-        for channel, joint in data.rows
-        if channel == data.layout.motor and not any(s.moving[:, joint].mean() > 0.02 for s in data.signals)
-    ]
-    return tuple(still)
-
-
-def _bound(estimate: Estimate | None, data: ResidualSet) -> tuple[str, ...]:
-    """A line for what is in one recording alone, and for a payload that could be in part the links' own weight."""
-    terms = () if estimate is None else estimate.terms
-    labels = {s.number: s.label for s in data.signals}
-    lines = [f"{term.effect} is in {labels[term.bound]} alone" for term in terms if term.bound]
-    if any(term.effect == "link.payload" and not term.bound for term in terms):
-        lines.append(
-            "link.payload: what the links themselves weigh beyond the model counts to it; recordings of the arm "
-            "without the payload, given as well (--train), tell the two apart"
-        )
-    return tuple(lines)
-
-
-def _hits(data: ResidualSet) -> tuple[str, ...]:
-    return tuple(
-        f"{data.signals[0].arm.names[joint]}: the torque jumps where it changes sign, as a gear with play does; "
-        f"these moments ({near.mean():.0%} of the time) are left out of the comparison"
-        for joint, near in data.struck.items()
-    )
-
-
-def _stuck(stuck: Sequence[Stuck], data: ResidualSet) -> tuple[str, ...]:
-    names = data.signals[0].arm.names
-    told = (
-        f"{names[one.joint]}: {one.channel} repeats one number for {one.seconds:.3g} s while the arm moves: stuck "
-        "sensor or channel; this recording cannot tell what it should read, and those moments are left out"
-        for one in stuck
-    )
-    return tuple(dict.fromkeys(told))
 
 
 def _refuse_rest(data: ResidualSet) -> None:

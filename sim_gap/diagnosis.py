@@ -25,6 +25,8 @@ class Signs:
     """What is left there in the end [RMS], in units of what is not worth explaining."""
     elsewhere: float
     """Share of the whole squared gap that is left."""
+    outside: float = float("inf")
+    """How much worse the best general law does in its place, in units of `evidence`: the library may lack it."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,8 @@ class Cause:
     """What the confidence was made from."""
     confounded_with: tuple[str, ...] = ()
     separate_by: str | None = None
+    law: str = ""
+    """The general law that could best stand in for it."""
 
     @property
     def shrink(self) -> float:

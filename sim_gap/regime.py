@@ -1,5 +1,6 @@
 """Where the gap lies: joint, channel, and the regime of the motion that it goes with."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,16 +26,20 @@ class Place:
     share: float
 
 
-def places(data: ResidualSet) -> list[Place]:
-    """Every row with its regime, the largest excess over its noise first."""
+def places(data: ResidualSet, left: dict[Row, Array] | None = None, rows: Sequence[Row] | None = None) -> list[Place]:
+    """Every row (or those of `rows`) with its regime, the largest excess over its noise first.
+
+    `left` is what is left of the residuals, instead of these, (K,) per row.
+    """
+    values = data.values if left is None else left
     features = [_features(s) for s in data.signals]
     out = []
-    for row in data.rows:
+    for row in data.rows if rows is None else rows:
         channel, joint = row
         valid = data.valid[row]
         if valid.sum() < 10:
             continue
-        residual = data.values[row][valid]
+        residual = values[row][valid]
         regime, share = _regime(
             residual, {k: np.concatenate([f[k][:, joint] for f in features])[valid] for k in features[0]}
         )

@@ -39,8 +39,7 @@ class Search:
         for _ in range(3):
             self.weighted = Weighted(self.normal, mean_square)
             mean_square = self.normal.mean_square(*self.weighted.fit(self.active))
-        while wrong := self._implausible(self.active):
-            self.active = self.without(wrong, self.active)
+        self.active = self.possible(self.active)
         self.score = self.judge(self.active)
 
     def judge(self, terms: Sequence[Term]) -> float:
@@ -51,6 +50,12 @@ class Search:
         squares = self.weighted.cross_validated(terms)
         fit = 0.5 * np.log(squares + normal.floor**2)[normal.seen].sum()
         return float(fit + normal.price * sum(self.cost(term) for term in terms))
+
+    def possible(self, terms: list[Term]) -> list[Term]:
+        """The terms less those whose coefficients no such effect can have, one after the other."""
+        while wrong := self._implausible(terms):
+            terms = self.without(wrong, terms)
+        return terms
 
     def _implausible(self, terms: Sequence[Term]) -> Term | None:
         """The first of the terms whose coefficients no such effect can have."""

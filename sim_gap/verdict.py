@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sim_gap.confidence import FOUNDED
+from sim_gap.confidence import founded
 from sim_gap.diagnosis import Cause, Verdict
 from sim_gap.effects.registry import Row
 from sim_gap.residual import ResidualSet, root_mean_square
@@ -48,4 +48,4 @@ def verdict(found: Sequence[Cause], data: ResidualSet, left: dict[Row, Array]) -
         return "unexplained"
     if found[0].confounded_with:
         return "ambiguous"
-    return "explained" if max(cause.confidence for cause in found) >= FOUNDED else "unexplained"
+    return "explained" if any(founded(cause.signs) for cause in found) else "unexplained"

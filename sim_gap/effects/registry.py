@@ -24,6 +24,7 @@ FAMILIES = (
     "soft",
     "actuator",
     "drive",
+    "laws",
 )
 """Modules of this package, one a family."""
 Row = tuple[str, int]
@@ -108,6 +109,8 @@ class Effect(ABC):
     counted: ClassVar[frozenset[int]] = frozenset()
     """Which entries of the shape are numbers of something (a joint): they are not refined."""
     whole_arm: ClassVar[bool] = False
+    general: ClassVar[bool] = False
+    """Whether it is no effect of the library but a law that causes are compared with."""
     secant: ClassVar[bool] = False
     """Whether the shape is the size at which a curved effect's secant is taken: set to the fit, then exact."""
 
@@ -165,11 +168,13 @@ class Effect(ABC):
 
 @cache
 def effects() -> dict[str, Effect]:
-    """All effects by id."""
+    """All effects and general laws by id."""
     found = [effect for family in FAMILIES for effect in import_module(f"sim_gap.effects.{family}").EFFECTS]
     return {effect.id: effect for effect in found}
 
 
 def library_without(withheld: Sequence[str]) -> list[str]:
     """Ids of the effects that remain where some are taken out: what stands upon one of these goes with it."""
-    return [name for name, effect in effects().items() if not {name, *effect.needs} & {*withheld}]
+    return [
+        name for name, effect in effects().items() if not effect.general and not {name, *effect.needs} & {*withheld}
+    ]
