@@ -118,6 +118,19 @@ def test_a_body_that_cannot_be_used_decides_nothing(server: Served, view: MadeUp
     assert server.do(lambda: view.offered[0].state) == "pending"
 
 
+def test_the_overview_is_what_the_other_routes_say(server: Served, view: MadeUpView) -> None:
+    for number in range(5):
+        server.do(lambda number=number: view.happen("drift", "joint_2", f"number {number}", gain=1.01))
+    server.do(view.propose)
+    client = server.client()
+    all_of_it = client.get("/api/overview", params={"seconds": 0, "events": 3}).json()
+    for name in ("joints", "estimates", "proposals", "history"):
+        assert all_of_it[name] == client.get(f"/api/{name}").json()
+    assert all_of_it["status"].keys() == client.get("/api/status").json().keys()
+    last = all_of_it["status"]["last_event"]
+    assert [event["id"] for event in all_of_it["events"]] == [last - 2, last - 1, last]
+
+
 def test_a_failure_inside_shows_no_traceback(server: Served, view: MadeUpView, monkeypatch: Any) -> None:
     def broken() -> None:
         raise RuntimeError("a secret of the inside")
@@ -152,7 +165,7 @@ def route_paths(routes: Any) -> set[str]:
 
 def test_every_route_of_the_contract_is_described_and_typed(server: Served) -> None:
     described = server.client().get("/openapi.json").json()
-    wanted = ("status", "joints", "estimates", "events", "history", "proposals", "stream")
+    wanted = ("status", "overview", "joints", "estimates", "events", "history", "proposals", "stream")
     assert {f"/api/{name}" for name in wanted} | {"/metrics"} <= described["paths"].keys()
     for name in wanted[:-1]:
         schema = described["paths"][f"/api/{name}"]["get"]["responses"]["200"]["content"]["application/json"]["schema"]

@@ -140,6 +140,18 @@ def test_the_token_is_asked_for_once(browser: Browser, server: Served) -> None:
     expect(page.locator("#ask-token")).to_be_visible()
 
 
+def test_one_document_and_one_answer_show_everything(browser: Browser, server: Served, view: MadeUpView) -> None:
+    context = browser.new_context()
+    context.add_init_script(f"localStorage.setItem('armlink-token', '{TOKEN}')")
+    page, asked = context.new_page(), []
+    page.on("request", lambda request: asked.append(request.url.removeprefix(server.url).partition("?")[0]))
+    page.goto(server.url)
+    page.wait_for_selector("body[data-shown]")
+    expect(page.locator("#joints tbody tr")).to_have_count(len(NAMES))
+    before_the_stream = [path for path in asked if path.startswith("/")]
+    assert before_the_stream[:3] in (["/", "/api/overview"], ["/", "/api/overview", "/api/stream"])
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_it_fits_a_phone(browser: Browser, server: Served, view: MadeUpView, scheme: str) -> None:
     server.do(view.propose)
