@@ -52,6 +52,7 @@ def test_a_force_from_outside_is_blamed_on_nothing(force):
     answer = told(pushed(force))
     assert answer.verdict == "unexplained"
     assert not [cause for cause in answer.causes if cause.confidence > 0.5]
+    assert any(note.startswith("joint_2: ") and "are left (noise" in note for note in answer.notes)
 
 
 def test_a_hum_below_the_pass_band_is_blamed_on_nothing():
