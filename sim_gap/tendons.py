@@ -45,8 +45,8 @@ class Tendons:
 
 def add_to(spec: Any, motors: Sequence[SharedMotor]) -> None:
     """Put the motors into a `mujoco.MjSpec`."""
-    for motor in motors:
-        tendon = spec.add_tendon(name=f"motor_of_{motor.joint}_and_{motor.other}")
+    for number, motor in enumerate(motors, start=1):
+        tendon = spec.add_tendon(name=f"motor_{number}_of_{motor.joint}_and_{motor.other}")
         tendon.wrap_joint(motor.joint, 1.0)
         tendon.wrap_joint(motor.other, motor.lever)
         tendon.armature, tendon.frictionloss = motor.inertia, motor.coulomb
