@@ -105,6 +105,9 @@ def answer_case(diagnose: Diagnose, cases: Path, case: str, withheld: str) -> tu
     except ArmlinkError as error:
         nothing: dict[str, Any] = {"before": [], "after": []}
         answer = {"verdict": "unexplained", "causes": [], "gap": {"heldout": nothing}, "refused": str(error)}
+    except Exception as error:
+        error.add_note(f"while diagnosing {folder}" + (f" without {withheld}" if withheld else ""))
+        raise
     return answer_name(case, withheld), {**answer, "seconds": time.monotonic() - started}
 
 
@@ -117,5 +120,8 @@ def _answers(
         return
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         jobs = [pool.submit(answer_case, diagnose, cases, case, withheld) for case, withheld in todo]
-        for job in as_completed(jobs):
-            yield job.result()
+        try:
+            for job in as_completed(jobs):
+                yield job.result()
+        finally:  # what waits is not diagnosed in vain where one failed
+            pool.shutdown(cancel_futures=True)

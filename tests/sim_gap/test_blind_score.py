@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from armlink.errors import BadInput, Refused
-from sim_gap.blind.bench import run_bench
+from sim_gap.blind.bench import _answers, run_bench
 from sim_gap.blind.judge import judge
 from sim_gap.blind.score import answer_name, score
 from sim_gap.blind.seal import MANIFEST, open_labels, seal, verify, write_answer
@@ -186,6 +186,22 @@ def test_a_broken_seal_is_refused(tmp_path: Path) -> None:
     with pytest.raises(Refused, match=r"b\.json: was removed"):
         verify(tmp_path, digest)
     assert (tmp_path / MANIFEST).exists()
+
+
+def fail(sim: Path, train: Any, heldout: Any, exclude: Any) -> dict[str, Any]:
+    with (sim.parent.parent / "tried").open("a") as stream:
+        stream.write(sim.parent.name + "\n")
+    raise ZeroDivisionError
+
+
+def test_a_diagnosis_that_breaks_ends_the_bench_and_says_where(tmp_path: Path) -> None:
+    todo = [(f"case_{k:04d}", "") for k in range(1000)]
+    with pytest.raises(ZeroDivisionError) as raised:
+        list(_answers(fail, tmp_path, todo, 1))
+    assert "case_0000" in raised.value.__notes__[0]
+    with pytest.raises(ZeroDivisionError):
+        list(_answers(fail, tmp_path, todo, 2))
+    assert len((tmp_path / "tried").read_text().splitlines()) < 1 + len(todo)
 
 
 def test_bench_runs_from_cases_to_score(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 from wrong_arms import THREE, Wrong, motion, record
@@ -10,7 +11,7 @@ from sim_gap.closed import shared_motors
 from sim_gap.diagnose import diagnose
 from sim_gap.export import write_model
 from sim_gap.model import load_model
-from sim_gap.tendons import SharedMotor
+from sim_gap.tendons import SharedMotor, add_to, tendons_of
 
 CASES = {
     "payload": Wrong(payload=0.8),
@@ -59,6 +60,14 @@ def test_a_shared_motor_becomes_a_fixed_tendon(tmp_path):
         [0.8, 0.05, 0.8, 0.3], rel=0.05
     )
     assert diagnose(tmp_path / "closed.xml", recordings[1:], recordings[:1]).verdict == "no_gap"
+
+
+def test_two_motors_may_turn_with_the_same_pair_of_joints():
+    spec = mujoco.MjSpec.from_string(THREE)
+    pair = [SharedMotor("joint_3", "joint_2", lever, inertia=0.05, coulomb=0.8, viscous=0.3) for lever in (0.8, -0.6)]
+    add_to(spec, pair)
+    model = spec.compile()
+    assert tendons_of(model, range(3)).turns == pytest.approx(np.array([[0.0, 0.8, 1.0], [0.0, -0.6, 1.0]]))
 
 
 def test_an_arm_files_model_can_be_written_too(tmp_path):
