@@ -8,6 +8,7 @@ frames to journal. Prints JSON.
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -45,7 +46,7 @@ def main(channel: str = "vcan0", seconds: float = 40.0) -> int:
         for record in good_records(arm, Truth.of(arm)):
             store.put(record, arm, by="benchmark", reason="to be watched")
         pace = [sys.executable, str(HERE / "paced_cycle.py"), channel, str(BEFORE + seconds + AFTER)]
-        host = subprocess.Popen(pace, stdout=subprocess.DEVNULL)
+        host = subprocess.Popen(pace, stdout=subprocess.DEVNULL, process_group=0)
         options = ["--bus", f"socketcan:{channel}", "--listen-only", "--store", str(folder / "records.db")]
         command = [str(Path(sys.executable).with_name("armlink")), "daemon", "sarcos", *options, "--state", name]
         time.sleep(BEFORE / 3)
@@ -54,7 +55,7 @@ def main(channel: str = "vcan0", seconds: float = 40.0) -> int:
             print(json.dumps(_measured(daemon, folder, seconds), indent=1))
         finally:
             daemon.terminate()
-            host.terminate()
+            os.killpg(host.pid, signal.SIGTERM)  # its nodes are a process of their own
             daemon.wait()
             host.wait()
     return 0

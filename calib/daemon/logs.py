@@ -32,3 +32,4 @@ def log_as_json(level: int = logging.INFO) -> None:
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(level)
+    logging.getLogger("can").setLevel(max(level, logging.WARNING))  # it tells of every socket that it opens

@@ -1,7 +1,8 @@
 """Campaign: the real daemon with many clients on its stream, the page's load time, generated requests at length.
 
 python tests/campaigns/web.py [--arm sarcos] [--bus armlink_sim:sarcos] [--clients 50] [--seconds 30] [--examples 200]
-Exit status 1 if a bound fails. On a real SocketCAN bus: scripts/with-vcan, with --bus socketcan:vcan0 and armlink sim.
+Exit status 1 if a bound fails. On a real SocketCAN bus: scripts/with-vcan, with --bus socketcan:vcan0 --kernel-nodes, where
+the kernel answers for the nodes, since a user-mode kernel has one slow processor; --examples 0 --no-page there.
 """
 
 import argparse

@@ -11,7 +11,7 @@ from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
 
 from calib.daemon.view import DaemonView
-from calib.daemon.web.description import describe_wholly
+from calib.daemon.web.description import Described
 from calib.daemon.web.guard import Access, Guard
 from calib.daemon.web.metrics import metrics_text
 from calib.daemon.web.page import PageFile, page_files
@@ -35,7 +35,7 @@ def make_app(view: DaemonView, access: Access | None = None) -> tuple[App, Strea
 
 def open_app(view: DaemonView, streams: Streams, files: dict[str, PageFile]) -> FastAPI:
     """The application without the guard before it."""
-    app = FastAPI(
+    app = Described(
         title="armlink daemon",
         description=PURPOSE,
         version=version("armlink"),
@@ -47,7 +47,6 @@ def open_app(view: DaemonView, streams: Streams, files: dict[str, PageFile]) -> 
     for path, file in files.items():
         app.add_api_route(path, _sender(file), methods=["GET"], include_in_schema=False)
     _add_error_handlers(app)
-    describe_wholly(app)
     return app
 
 
