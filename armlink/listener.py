@@ -6,6 +6,7 @@ other buses it wakes for each frame, whose time is when it was read.
 The one exception is asked for by name: `write_calibration` and `read_calibration` use SDO on object 2100h.
 """
 
+import struct
 from collections import deque
 from collections.abc import Callable
 from functools import cached_property
@@ -24,11 +25,12 @@ from armlink.sample import Array, Calibration, Sample, Stats
 from armlink.services import NodeServices, PumpedNetwork, joint_services
 from armlink.stamped_port import StampedGroup, StampedPort, open_listening_port
 
-SLEEP = 0.02
-"""Frames that bear their time may wait for so long [s]: five cycles at 250 Hz, far less than a receive queue holds."""
-COMMAND_LAYOUT = np.dtype([("control", "<u2"), ("torque", "<i2"), ("position", "<i4")])
-"""RPDO1."""
-NO_COMMAND = bytes(COMMAND_LAYOUT.itemsize)
+SLEEP = 0.04
+"""Frames that bear their time may wait for so long [s]: ten cycles at 250 Hz, half of what a small receive queue holds
+of a full bus."""
+COMMAND = "Hhi"
+"""RPDO1: control word, target torque, target position."""
+NO_COMMAND = bytes(8)
 """Stands for the RPDO1 that has not come yet; this object, not its value."""
 
 
@@ -52,7 +54,10 @@ class Listener:
         self._torque_unit = np.array([unit.torque for unit in units])
         self._position_unit = np.array([unit.position for unit in units])
         self._commands = {RPDO1.cob_base + node: NO_COMMAND for node in self.nodes}
-        self._ready: deque[Sample] = deque()
+        self._layout = struct.Struct("<" + self.n * COMMAND)
+        self._ready: deque[tuple[Sample, tuple[bytes, ...]]] = deque()
+        self._sent = self._given = (NO_COMMAND,) * self.n
+        """RPDO1 of each joint: for the sample that `next` gave last, and for the one that is coming in."""
         self._sync: float | None = None
         self._since: float | None = None
         self._notify: Callable[[int, bytearray, float], None] | None = None
@@ -84,18 +89,19 @@ class Listener:
 
     @property
     def torque_sent(self) -> Array:
-        """Target torque of the other controller's newest frames [N·m], (n,); NaN before the first."""
-        return self._sent("torque", self._torque_unit)
+        """Target torque of the other controller for the last sample of `next` [N·m], (n,); NaN before its first."""
+        return self._decoded(1, self._torque_unit)
 
     @property
     def position_sent(self) -> Array:
         """Likewise target position [rad]."""
-        return self._sent("position", self._position_unit)
+        return self._decoded(2, self._position_unit)
 
-    def _sent(self, field: str, unit: Array) -> Array:
-        newest = list(self._commands.values())
-        values: Array = np.frombuffer(b"".join(newest), COMMAND_LAYOUT)[field] * unit
-        values[[each is NO_COMMAND for each in newest]] = np.nan
+    def _decoded(self, place: int, unit: Array) -> Array:
+        values: Array = np.array(self._layout.unpack(b"".join(self._sent))[place::3]) * unit
+        for joint, data in enumerate(self._sent):
+            if data is NO_COMMAND:
+                values[joint] = np.nan
         return values
 
     def next(self, timeout: float) -> Sample | None:
@@ -103,13 +109,15 @@ class Listener:
 
         A sample is complete when the SYNC after it comes; its time is that of its own SYNC, by `clock`.
         """
-        end = self.clock.now() + timeout
-        while not self._ready:
-            remaining = end - self.clock.now()
-            if remaining <= 0:
-                return None
-            self._hear(remaining)
-        return self._ready.popleft()
+        if not self._ready:
+            end = self.clock.now() + timeout
+            while not self._ready:
+                remaining = end - self.clock.now()
+                if remaining <= 0:
+                    return None
+                self._hear(remaining)
+        sample, self._sent = self._ready.popleft()
+        return sample
 
     def read_calibration(self, joint: int) -> Calibration:
         """The torque sensor record (2100h) of joint 0 … n−1, by SDO: sends; raises BusFault."""
@@ -140,7 +148,7 @@ class Listener:
         """One frame that came at time t [s]."""
         if can_id in self._commands:
             self._loop.count(data)
-            if len(data) == COMMAND_LAYOUT.itemsize:
+            if len(data) == len(NO_COMMAND):
                 self._commands[can_id] = data
         elif can_id == objects.SYNC_ID:
             self._loop.count(data)
@@ -163,8 +171,8 @@ class Listener:
             sample.t = self._sync
             self._loop.stats.missed += int(np.isnan(sample.position).sum())
             self._loop.drop_readings()
-            self._ready.append(sample)
-        self._sync = now
+            self._ready.append((sample, self._given))
+        self._sync, self._given = now, tuple(self._commands.values())
 
     @cached_property
     def _services(self) -> tuple[NodeServices, ...]:

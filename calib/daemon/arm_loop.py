@@ -161,8 +161,9 @@ class ArmLoop:
         end = listener.clock.now() + BATCH_SECONDS
         while (remaining := end - listener.clock.now()) > 0:
             sample = listener.next(remaining)
-            if sample is not None:
+            while sample is not None:
                 rows.append((sample.t, sample, listener.torque_sent, listener.position_sent))
+                sample = listener.next(0.0)
         return rows
 
     def _silence(self, listener: Listener, heard: bool) -> list[Message]:

@@ -31,11 +31,20 @@ def test_each_sync_of_the_other_controller_gives_one_sample(arm_of):
     assert listener.stats.missed == 1
 
 
-def test_the_other_controllers_commands_are_known(arm_of):
-    listener = Listener(arm_of(2), Tap(conversation(3)))
+def test_the_other_controllers_commands_are_known_for_each_sample(arm_of):
+    listener = Listener(arm_of(2), Tap(conversation(4)))
+    assert np.isnan(listener.torque_sent).all()
+    for cycle in range(3):
+        assert listener.next(1.0) is not None
+        np.testing.assert_allclose(listener.torque_sent, 0.4 * cycle)  # 10 ‰ of 40 N·m a cycle
+        np.testing.assert_allclose(listener.position_sent, 1000 * cycle * UNIT)
+
+
+def test_a_joint_without_a_command_has_none(arm_of):
+    listener = Listener(arm_of(2), Tap(frame for frame in conversation(3) if frame[1] != 0x202))
     heard(listener, 1.0)
-    np.testing.assert_allclose(listener.torque_sent, 0.4 * 2)  # 20 ‰ of 40 N·m
-    np.testing.assert_allclose(listener.position_sent, 2000 * UNIT)
+    np.testing.assert_array_equal(np.isnan(listener.torque_sent), [False, True])
+    np.testing.assert_array_equal(np.isnan(listener.position_sent), [False, True])
 
 
 def test_a_silent_bus_gives_nothing_and_takes_no_longer_than_asked(arm_of):
