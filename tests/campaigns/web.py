@@ -1,12 +1,13 @@
 """Campaign: the real daemon with many clients on its stream, the page's load time, generated requests at length.
 
 python tests/campaigns/web.py [--arm sarcos] [--bus armlink_sim:sarcos] [--clients 50] [--seconds 30] [--examples 200]
-Exit status 1 if a bound fails. On a real SocketCAN bus: scripts/with-vcan, with --bus socketcan:vcan0 --kernel-nodes, where
-the kernel answers for the nodes, since a user-mode kernel has one slow processor; --examples 0 --no-page there.
+Exit status 1 if a bound fails. On real SocketCAN: scripts/with-vcan, with --bus socketcan:vcan0 --kernel-nodes (the
+kernel answers for nodes that hold still, since a user-mode kernel has one slow processor), --no-page --examples 0.
 """
 
 import argparse
 import asyncio
+import contextlib
 import json
 import os
 import shutil
@@ -15,10 +16,12 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import httpx
+import yaml
 
 TESTS = Path(__file__).parent.parent
 sys.path[:0] = [str(TESTS / "calib" / "web"), str(TESTS / "calib")]  # "conftest" is that of the web tests
@@ -37,7 +40,7 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def start(arm: str, bus: str, folder: Path, port: int) -> "subprocess.Popen[bytes]":
+def start(arm: str, bus: str, folder: Path, port: int, work: bool = True) -> "subprocess.Popen[bytes]":
     """`armlink daemon` with records of a good sweep, on the Unix socket and on TCP; returns when it observes."""
     from daemon_bench import good_records
 
@@ -50,7 +53,8 @@ def start(arm: str, bus: str, folder: Path, port: int) -> "subprocess.Popen[byte
     for record in good_records(described, Truth.of(described)):
         store.put(record, described, by="campaign", reason="sweep")
     (folder / "token").write_text("campaign-token-0123456789")
-    options = ["--bus", bus, "--work", "--state", str(folder), "--store", str(folder / "records.db")]
+    options = ["--work"] if work else []
+    options += ["--bus", bus, "--state", str(folder), "--store", str(folder / "records.db")]
     options += ["--tcp", f"127.0.0.1:{port}", "--token-file", str(folder / "token")]
     command = [str(Path(sys.executable).with_name("armlink")), "daemon", arm, *options]
     daemon = subprocess.Popen(command, stderr=(folder / "log").open("wb"))
@@ -63,6 +67,35 @@ def start(arm: str, bus: str, folder: Path, port: int) -> "subprocess.Popen[byte
                 pass
             time.sleep(0.2)
     raise SystemExit(f"the daemon ended: {(folder / 'log').read_text()}")
+
+
+@contextlib.contextmanager
+def kernel_nodes(bus: str, folder: Path) -> Iterator[tuple[str, Callable[[], None]]]:
+    """Nodes on SocketCAN that cost next to nothing, which hold still: their arm's file, and what to call once it is
+    driven, from when on the kernel answers each SYNC for them."""
+    sys.path.insert(0, str(TESTS.parent / "benchmarks"))
+    from echo_nodes import answer_in_kernel, remove_gateway, start_nodes
+
+    from armlink.armfile import load_arm
+
+    channel = bus.partition(":")[2]
+    content = yaml.safe_load(load_arm("sarcos").path.read_text())
+    content["link"]["deadline"] = 10.0
+    for joint in content["link"]["joints"]:
+        joint |= {"rated_torque": 40.0, "max_torque": 30.0}
+    (folder / "sarcos.yaml").write_text(yaml.safe_dump(content))
+    nodes = start_nodes(channel)
+
+    def take_over() -> None:
+        if not answer_in_kernel(channel):
+            print("this kernel has no can-gw: a process answers for the nodes", file=sys.stderr)
+
+    try:
+        yield str(folder / "sarcos.yaml"), take_over
+    finally:
+        nodes.terminate()
+        with contextlib.suppress(OSError):
+            remove_gateway()
 
 
 def client(folder: Path) -> httpx.Client:
@@ -177,13 +210,20 @@ def main() -> int:
     parser.add_argument("--clients", type=int, default=50)
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--examples", type=int, default=200)
+    parser.add_argument("--kernel-nodes", action="store_true")
+    parser.add_argument("--no-page", action="store_true")
     given = parser.parse_args()
-    with tempfile.TemporaryDirectory() as name:
-        folder, port = Path(name), free_port()
-        daemon = start(given.arm, given.bus, folder, port)
+    with contextlib.ExitStack() as there:
+        folder, port = Path(there.enter_context(tempfile.TemporaryDirectory())), free_port()
+        arm, take_over = given.arm, None
+        if given.kernel_nodes:
+            arm, take_over = there.enter_context(kernel_nodes(given.bus, folder))
+        daemon = start(arm, given.bus, folder, port, work=not given.kernel_nodes)
+        if take_over is not None:
+            take_over()
         try:
             found = {
-                "page": page(port, (folder / "token").read_text()),
+                "page": {} if given.no_page else page(port, (folder / "token").read_text()),
                 "stream": stream(folder, daemon.pid, given.clients, given.seconds),
             }
         finally:
