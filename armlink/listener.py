@@ -137,24 +137,20 @@ class Listener:
                 port.wait(seconds)
             else:
                 self.clock.sleep_until(self.clock.now() + min(seconds, SLEEP))
-            for t, can_id, data in port.take_all():
-                self._take(t, can_id, data)
+            frames = port.take_all()
         else:
             frame = port.receive(seconds)
-            if frame is not None:
-                self._take(self.clock.now(), *frame)
-
-    def _take(self, t: float, can_id: int, data: bytes) -> None:
-        """One frame that came at time t [s]."""
-        if can_id in self._commands:
-            self._loop.count(data)
-            if len(data) == len(NO_COMMAND):
-                self._commands[can_id] = data
-        elif can_id == objects.SYNC_ID:
-            self._loop.count(data)
-            self._complete(t)
-        else:
-            self._loop.take(can_id, data)
+            frames = [] if frame is None else [(self.clock.now(), *frame)]
+        self._loop.count(len(frames), sum([len(data) for _, _, data in frames]))
+        commands, take = self._commands, self._loop.take
+        for t, can_id, data in frames:
+            if can_id in commands:
+                if len(data) == len(NO_COMMAND):
+                    commands[can_id] = data
+            elif can_id == objects.SYNC_ID:
+                self._complete(t)
+            else:
+                take(can_id, data)
 
     def _take_other(self, can_id: int, data: bytes) -> None:
         if self._notify is not None:
@@ -169,7 +165,7 @@ class Listener:
         else:
             sample = self._loop.sample(self._sync)
             sample.t = self._sync
-            self._loop.stats.missed += int(np.isnan(sample.position).sum())
+            self._loop.stats.missed += sum([value != value for value in sample.position.tolist()])  # NaN
             self._loop.drop_readings()
             self._ready.append((sample, self._given))
         self._sync, self._given = now, tuple(self._commands.values())

@@ -116,6 +116,8 @@ class Loop:
         frame = self._port.receive(timeout)
         if frame is None:
             return False
+        self.stats.frames += 1
+        self.bits += FIXED_BITS + 8 * len(frame[1])
         self.take(*frame)
         return True
 
@@ -185,9 +187,7 @@ class Loop:
             self.stats.load = self.bits / (bitrate * elapsed)
 
     def take(self, can_id: int, data: bytes) -> None:
-        """Take one frame in, for what it is."""
-        self.stats.frames += 1
-        self.bits += FIXED_BITS + 8 * len(data)
+        """Take one frame in, for what it is; who takes it counts it."""
         entry = self._table.get(can_id)
         if entry is None:
             self._take_other(can_id, data)
@@ -208,10 +208,10 @@ class Loop:
         else:
             self.statuses[joint], self.displays[joint] = unpack(data)
 
-    def count(self, data: bytes) -> None:
-        """Count a frame that somebody else has taken in."""
-        self.stats.frames += 1
-        self.bits += FIXED_BITS + 8 * len(data)
+    def count(self, frames: int, size: int) -> None:
+        """Count frames that a listener has taken in, with so many bytes of data in all."""
+        self.stats.frames += frames
+        self.bits += FIXED_BITS * frames + 8 * size
 
     def _take_other(self, can_id: int, data: bytes) -> None:
         self.watch.other(can_id)
