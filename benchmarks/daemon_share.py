@@ -1,9 +1,12 @@
 """The daemon listening on SocketCAN at 250 Hz beside another host: share of a core of its two processes.
 
     scripts/with-vcan .venv/bin/python benchmarks/daemon_share.py [CHANNEL [SECONDS]]
+    .venv/bin/python benchmarks/daemon_share.py outside [SECONDS]
 
 `paced_cycle.py` is the host, the kernel answers for the seven nodes (echo_nodes.py): what is measured is the daemon,
-frames to journal. Prints JSON.
+frames to journal. Prints JSON. The kernel of user-mode-linux counts processor time by its ticks of 10 ms, which a
+process that wakes by the clock meets too often or not at all: `outside` starts it and asks this machine's own kernel
+what all of it takes, with the host alone and with the daemon beside it.
 """
 
 import json
@@ -23,6 +26,8 @@ sys.path.insert(0, str(HERE.parent / "tests" / "calib"))
 
 BEFORE, AFTER = 60.0, 20.0
 """The host runs for so long before, while the daemon starts, and after it was measured [s]."""
+SETTLE = 5.0
+"""After it observes: page and API are loaded too [s]."""
 
 
 def processor_time(process: int) -> float:
@@ -31,13 +36,17 @@ def processor_time(process: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def main(channel: str = "vcan0", seconds: float = 40.0) -> int:
-    """Measure for so many seconds and print the figures."""
+def main(channel: str = "vcan0", seconds: float = 40.0, phase: Path | None = None) -> int:
+    """Measure for so many seconds and print the figures; `phase` is told what is going on, for `outside`."""
     from daemon_bench import good_records
 
     from armlink.armfile import load_arm
     from calib.store import RecordStore
     from sim_bus.truth import Truth
+
+    def tell(what: str) -> None:
+        if phase is not None:
+            phase.write_text(what)
 
     arm = load_arm("sarcos")
     with tempfile.TemporaryDirectory() as name:
@@ -45,14 +54,22 @@ def main(channel: str = "vcan0", seconds: float = 40.0) -> int:
         store = RecordStore(str(folder / "records.db"))
         for record in good_records(arm, Truth.of(arm)):
             store.put(record, arm, by="benchmark", reason="to be watched")
-        pace = [sys.executable, str(HERE / "paced_cycle.py"), channel, str(BEFORE + seconds + AFTER)]
+        pace = [sys.executable, str(HERE / "paced_cycle.py"), channel, str(BEFORE + 2 * seconds + AFTER)]
         host = subprocess.Popen(pace, stdout=subprocess.DEVNULL, process_group=0)
         options = ["--bus", f"socketcan:{channel}", "--listen-only", "--store", str(folder / "records.db")]
         command = [str(Path(sys.executable).with_name("armlink")), "daemon", "sarcos", *options, "--state", name]
         time.sleep(BEFORE / 3)
+        if phase is not None:
+            tell("alone")
+            time.sleep(seconds)
+            tell("")
         daemon = subprocess.Popen(command, stderr=(folder / "log").open("wb"))
         try:
-            print(json.dumps(_measured(daemon, folder, seconds), indent=1))
+            started = _observing(daemon, folder)
+            time.sleep(SETTLE)
+            tell("both")
+            print(json.dumps({"observing_after_s": started, **_measured(daemon, folder, seconds)}, indent=1))
+            tell("")
         finally:
             daemon.terminate()
             os.killpg(host.pid, signal.SIGTERM)  # its nodes are a process of their own
@@ -61,34 +78,74 @@ def main(channel: str = "vcan0", seconds: float = 40.0) -> int:
     return 0
 
 
-def _measured(daemon: "subprocess.Popen[bytes]", folder: Path, seconds: float) -> dict[str, Any]:
+def outside(seconds: float = 40.0) -> int:
+    """Run it in user-mode-linux and print the share of a core that all of that takes in either phase."""
+    with tempfile.TemporaryDirectory() as name:
+        phase, now, since = Path(name) / "phase", "", (0.0, 0.0)
+        phase.write_text(now)
+        inside = [sys.executable, __file__, "vcan0", str(seconds), str(phase)]
+        kernel = subprocess.Popen([str(HERE.parent / "scripts" / "with-vcan"), *inside], stdout=subprocess.DEVNULL)
+        shares: dict[str, float] = {}
+        while kernel.poll() is None:
+            told = phase.read_text()
+            if told != now:
+                at = time.monotonic(), sum(map(processor_time, _family(kernel.pid)))
+                if now:
+                    shares[now] = (at[1] - since[1]) / (at[0] - since[0])
+                now, since = told, at
+            time.sleep(0.05)
+    if len(shares) < 2:
+        raise SystemExit("the run inside ended early")
+    print(json.dumps({**shares, "daemon": shares["both"] - shares["alone"]}, indent=1))
+    return kernel.returncode
+
+
+def _family(process: int) -> set[int]:
+    """A process and all that come from it."""
+    parents = {}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parents[int(path.parent.name)] = int(path.read_text().rpartition(")")[2].split()[1])
+        except OSError:
+            continue
+    family = {process}
+    while more := {child for child, parent in parents.items() if parent in family} - family:
+        family |= more
+    return family
+
+
+def _observing(daemon: "subprocess.Popen[bytes]", folder: Path) -> float:
+    """Seconds until it observes."""
     began = time.monotonic()
-    with httpx.Client(
-        transport=httpx.HTTPTransport(uds=str(folder / "api.sock")), base_url="http://localhost"
-    ) as asking:
+    while time.monotonic() - began < BEFORE:
+        try:
+            if _status(folder)["state"] == "observing":
+                return time.monotonic() - began
+        except httpx.TransportError:
+            if daemon.poll() is not None:
+                break
+        time.sleep(0.2)
+    raise SystemExit((folder / "log").read_text())
 
-        def status() -> dict[str, Any]:
-            answer: dict[str, Any] = asking.get("/api/status", timeout=10.0).json()
-            return answer
 
-        while True:
-            try:
-                if status()["state"] == "observing":
-                    break
-            except httpx.TransportError:
-                if daemon.poll() is not None or time.monotonic() - began > BEFORE:
-                    raise SystemExit((folder / "log").read_text()) from None
-            time.sleep(0.2)
-        started = time.monotonic() - began
-        children = Path(f"/proc/{daemon.pid}/task/{daemon.pid}/children").read_text().split()
-        processes = {"main": daemon.pid, **{f"bus {k}": int(child) for k, child in enumerate(children)}}
-        first, before, since = status(), {k: processor_time(p) for k, p in processes.items()}, time.monotonic()
-        time.sleep(seconds)
-        elapsed, last = time.monotonic() - since, status()
-        shares = {k: (processor_time(p) - before[k]) / elapsed for k, p in processes.items()}
+def _status(folder: Path) -> dict[str, Any]:
+    transport = httpx.HTTPTransport(uds=str(folder / "api.sock"))
+    with httpx.Client(transport=transport, base_url="http://localhost", timeout=10.0) as asking:
+        return dict(asking.get("/api/status").json())
+
+
+def _measured(daemon: "subprocess.Popen[bytes]", folder: Path, seconds: float) -> dict[str, Any]:
+    children = Path(f"/proc/{daemon.pid}/task/{daemon.pid}/children").read_text().split()
+    processes = {"main": daemon.pid, **{f"bus {k}": int(child) for k, child in enumerate(children)}}
+    first, before, since = _status(folder), {k: processor_time(p) for k, p in processes.items()}, time.monotonic()
+    time.sleep(seconds)
+    elapsed, last = time.monotonic() - since, _status(folder)
+    shares = {k: (processor_time(p) - before[k]) / elapsed for k, p in processes.items()}
     counted = {key: last["bus"][key] - first["bus"][key] for key in ("frames", "missed", "errors")}
-    return {"observing_after_s": started, "core_share": shares, "state": last["state"], **counted, **last["bus"]}
+    return {"core_share": shares, "state": last["state"], **counted, **last["bus"]}
 
 
 if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:2], *(float(each) for each in sys.argv[2:])))
+    if sys.argv[1:2] == ["outside"]:
+        sys.exit(outside(*map(float, sys.argv[2:3])))
+    sys.exit(main(*sys.argv[1:2], *map(float, sys.argv[2:3]), *map(Path, sys.argv[3:4])))
