@@ -88,9 +88,9 @@ class _Scorer:
         return np.asarray(np.sqrt(out))
 
 
-MINOR, MINOR_INNER = 0.009, 0.004
+MINOR, MINOR_INNER, MINOR_COMMAND = 0.009, 0.004, 0.001
 """Share of a joint's torque (RMS) that a cause must lower some joint's RMS by, not to be minor; where the cause shows
-against the model, and where only in motor against sensor or command."""
+against the model, where only in motor against sensor, and where only in command against motor."""
 
 
 def materials(step: Step, estimate: Estimate, heldout: ResidualSet, scorer: "_Scorer") -> tuple[Term, ...]:
@@ -100,7 +100,8 @@ def materials(step: Step, estimate: Estimate, heldout: ResidualSet, scorer: "_Sc
     if any(term.bound or (term.effect == "transmission.backlash" and term.place in hit) for term in step.terms):
         return step.terms
     shows = {channel for term in step.terms for channel, _ in estimate.store.columns(term)}
-    share = MINOR if heldout.layout.against_model in shows else MINOR_INNER
+    layout = heldout.layout
+    share = MINOR if layout.against_model in shows else MINOR_COMMAND if shows == {layout.command} else MINOR_INNER
     least = np.maximum(share * heldout.usual_torque, CARE_NM)
     if np.all(step.before - step.after < least):
         return ()

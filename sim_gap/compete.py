@@ -7,7 +7,7 @@ import numpy as np
 from sim_gap.effects.registry import effects
 from sim_gap.normal import ColumnStore, Normal, Term, Weighted
 from sim_gap.residual import ResidualSet
-from sim_gap.select import TRIES, Search
+from sim_gap.select import TRIES, Search, shortlist
 
 
 def compete(store: ColumnStore, library: Sequence[str]) -> Search:
@@ -15,9 +15,10 @@ def compete(store: ColumnStore, library: Sequence[str]) -> Search:
     offered = candidates(store.data, library)
     first = Search(Normal(store, offered))
     first.run()
-    chosen = refine(store, [named(term) for term in without_doubtful(first).active])
+    chosen = refine(store, one_each([named(term) for term in without_doubtful(first).active]))
     keys = {term.key for term in chosen}
-    search = Search(Normal(store, [*chosen, *(term for term in offered if term.key not in keys)]), chosen)
+    rivals = in_place(store, chosen, [term for term in offered if term.key not in keys])
+    search = Search(Normal(store, [*chosen, *rivals]), chosen)
     while search.backward():
         pass
     return search
@@ -37,6 +38,11 @@ def candidates(data: ResidualSet, library: Sequence[str]) -> list[Term]:
 def named(term: Term) -> Term:
     """The term by which one is named that shows exactly alike."""
     return Term(term.effect, *effects()[term.effect].settled(term.place, term.shape))
+
+
+def one_each(terms: Sequence[Term]) -> list[Term]:
+    """The terms, of one effect at one place the first: two shapes of it stand for one between them, to be refined."""
+    return list({term.key: term for term in reversed(terms)}.values())[::-1]
 
 
 def without_doubtful(search: Search) -> Search:
@@ -109,6 +115,30 @@ def secants(store: ColumnStore, active: list[Term]) -> list[Term]:
         return Term(term.effect, term.place, shape)
 
     return [settled(term) for term in normal.terms]
+
+
+def in_place(store: ColumnStore, chosen: list[Term], offered: list[Term]) -> list[Term]:
+    """The terms offered, curved ones with their secants at the size that they take in the place of a chosen one."""
+    for _ in range(2):
+        curved = [term for term in offered if effects()[term.effect].secant]
+        if not curved or not chosen:
+            return offered
+        search = Search(Normal(store, [*chosen, *curved]), list(chosen))
+        best: dict[Term, tuple[float, Term]] = {}
+        for term in search.active:
+            rest = search.without(term, search.active)
+            for _, other in shortlist(search.weighted.screen(rest, curved))[:2]:
+                terms = search.with_beneath(other, rest)
+                score = search.judge(terms)
+                if score < best.get(other, (np.inf, other))[0]:
+                    index, values = search.weighted.fit(terms)
+                    own = values[np.isin(index, search.normal.at[other])]
+                    best[other] = (
+                        score,
+                        Term(other.effect, other.place, effects()[other.effect].resized(own, other.shape)),
+                    )
+        offered = [best[term][1] if term in best else term for term in offered]
+    return offered
 
 
 def golden(function: Callable[[float], float], low: float, high: float, steps: int = 10) -> float:

@@ -7,8 +7,9 @@ from sim_gap.effects.registry import effects
 from sim_gap.normal import Term
 from sim_gap.select import Search, shortlist
 
-AS_GOOD = 0.02
-"""A rival is as good where it scores no more than this below the chosen effect (half a log of the mean square)."""
+AS_GOOD = 0.036
+"""A rival is as good where it scores no more than this below the chosen effect (half a log of the mean square): the
+price of three coefficients, for what every arm has besides may speak by so much for either."""
 TRIED = 4
 MOTION = {
     frozenset(

@@ -27,8 +27,19 @@ def notes(
     left: dict[Row, Array],
 ) -> tuple[str, ...]:
     """All lines; `fit` was fitted, `judge` was not, and of the latter this is `left`."""
-    known = (*_stuck(stuck, fit), *_hits(fit), *_bound(estimate, fit), *_alike(found))
+    known = (*_drowned(fit), *_stuck(stuck, fit), *_hits(fit), *_bound(estimate, fit), *_alike(found))
     return (*known, *_left(judge, left), *_still(fit))
+
+
+def _drowned(data: ResidualSet) -> tuple[str, ...]:
+    """A line where channels were left aside for their noise."""
+    if data.layout.motor != "tau_cmd" or data.layout.sensor:
+        return ()
+    aside = [channel for channel in data.signals[0].channels if channel != "tau_cmd"]
+    told = (
+        f"{' and '.join(aside)} drown in noise: the command is compared with the model instead"
+    )
+    return (told,) if aside else ()
 
 
 def _stuck(stuck: Sequence[Stuck], data: ResidualSet) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ SMALL, SMALL_INNER, SMALL_NM = 0.01, 0.003, 0.01
 or command, and [N·m]."""
 CARE_NM = 0.05
 """Smallest gap that a user would care about [N·m]: every arm has a few hundredths of friction and offset."""
-CARE, CARE_INNER, CARE_COMMAND = 0.016, 0.007, 0.003
+CARE, CARE_INNER, CARE_COMMAND = 0.016, 0.007, 0.001
 """A gap that a user would care about, as a share of the joint's torque (RMS): against the model, motor against sensor,
 command against motor."""
 FAINT = 0.5
@@ -129,7 +129,9 @@ class ResidualSet:
     def _floor(self, s: Signals, row: Row) -> float:
         channel, joint = row
         load = float(np.sqrt(np.mean(s.model[:, joint] ** 2)))
-        parts = [s.noise[channel][joint], MODEL_FLOOR * load]
+        parts = [s.noise[channel][joint]]
+        if channel != self.layout.command:
+            parts.append(MODEL_FLOOR * load)
         if channel == self.layout.motor and self.layout.sensor:
             parts.append(s.noise[self.layout.sensor][joint])
         if channel == self.layout.command and self.layout.motor:

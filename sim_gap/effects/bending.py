@@ -98,7 +98,7 @@ class Saturation(_Bent):
 
     id = "torque.saturation"
     parameters = (Parameter("limit", "N·m"),)
-    shares = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995)
+    shares = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995, 0.999)
 
     def grid(self, signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
         """Levels that the torque exceeds during some of the time."""

@@ -88,7 +88,9 @@ class Saturation(_Drive):
 
     def grid(self, signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
         asked = np.concatenate([np.abs(s.reading["tau_cmd"][:, place]) for s in signals])
-        return tuple((float(level),) for level in np.quantile(asked, (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995)))
+        return tuple(
+            (float(level),) for level in np.quantile(asked, (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995, 0.999))
+        )
 
     def missing(self, command: Array, shape: float, rate: float) -> Array:
         return np.asarray(command - np.clip(command, -shape, shape))

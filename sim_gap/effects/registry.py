@@ -84,13 +84,27 @@ class Layout:
         return out | ({(self.motor, joint): -column} if self.motor else {})
 
 
+NOISY, QUIETER = 0.05, 0.2
+"""A sensor tells nothing where at every joint its noise exceeds this share of the torque; the command is then compared
+with the model where its own noise is less than this share of the sensor's."""
+
+
 def layout_of(signals: list[Signals]) -> Layout:
-    """The channels that all recordings have."""
+    """The channels that all recordings have; of these the command alone where all others drown in noise."""
     common = set.intersection(*(set(s.channels) for s in signals))
+    others = common - {"tau_cmd"}
+    if "tau_cmd" in common and others and all(_drowned(s, channel) for s in signals for channel in others):
+        return Layout(signals[0].n, None, "tau_cmd")
     sensor = "tau" if "tau" in common else None
     motor = next((channel for channel in ("tau_motor", "tau_cmd") if channel in common), None)
     command = "tau_cmd" if {"tau_motor", "tau_cmd"} <= common else None
     return Layout(signals[0].n, sensor, motor, command)
+
+
+def _drowned(s: Signals, channel: str) -> bool:
+    """Whether noise hides what a channel reads, and the command is much quieter."""
+    noise, torque = s.noise[channel], np.sqrt(np.mean(s.model**2, axis=0))
+    return bool(np.all(noise > NOISY * torque) and np.all(s.noise["tau_cmd"] < QUIETER * noise))
 
 
 class Effect(ABC):
