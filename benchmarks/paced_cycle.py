@@ -25,6 +25,7 @@ def main(channel: str = "vcan0", seconds: float = 60.0, rate: float = 250.0) -> 
     bus = {"interface": "socketcan", "channel": channel}
     arm = make_arm(len(NODES), link={"bus": bus, "rate": rate, "deadline": 10.0})
     link = Link(arm, open_bus(None, arm.require_link().bus))
+    kernel = False
     try:
         link.start()
         command = Command.hold(link.enable().position)
