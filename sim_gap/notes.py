@@ -36,9 +36,7 @@ def _drowned(data: ResidualSet) -> tuple[str, ...]:
     if data.layout.motor != "tau_cmd" or data.layout.sensor:
         return ()
     aside = [channel for channel in data.signals[0].channels if channel != "tau_cmd"]
-    told = (
-        f"{' and '.join(aside)} drown in noise: the command is compared with the model instead"
-    )
+    told = f"{' and '.join(aside)} drown in noise: the command is compared with the model instead"
     return (told,) if aside else ()
 
 
