@@ -1,12 +1,16 @@
 """The diagnosis on arms that are wrong in a known way: right effect, joint, parameter; and none where there is none."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from wrong_arms import Wrong, model, record
 
 from armlink.recording import Recording
+from sim_gap.compete import one_each
 from sim_gap.diagnose import diagnose
 from sim_gap.diagnosis import Diagnosis
+from sim_gap.normal import Term
 
 BOTH, MOTOR = ("tau", "tau_motor"), ("tau_motor",)
 
@@ -126,3 +130,29 @@ def test_the_json_has_the_contracts_keys():
     assert answer["rollout"]["after"][1] < 0.3 * answer["rollout"]["before"][1]
     assert answer["where"][0]["joint"] == "joint_2"
     assert answer["where"][0]["regime"] == "velocity"
+
+
+def test_an_offset_of_the_last_joints_angle_is_not_passed_off_as_its_mass_moment():
+    """Both make the same torque but for the motion's dynamics; at 0.12 rad the offset's tangent is not the offset."""
+    wrong = Wrong(position_offset=np.array([0.0, 0.0, 0.12]))
+    recordings = [record(model(), wrong, seed=seed, seconds=40, rate=50.0) for seed in (1, 2)]
+    first = diagnose(model(), recordings[:1], recordings[1:]).causes[0]
+    assert "position.offset" in {first.effect, *first.confounded_with}
+
+
+def test_where_the_sensors_drown_in_noise_the_command_is_compared_with_the_model():
+    def noisy(seed: int) -> Recording:
+        clean = record(model(), Wrong(coulomb=np.array([0.0, 0.8, 0.0])), seed=seed, seconds=40, rate=50.0)
+        noise = 40.0 * np.random.default_rng(seed).normal(size=(2, *clean.torque.shape))
+        shaken = {"torque": clean.torque + noise[0], "motor_torque": clean.motor_torque + noise[1]}
+        return replace(clean, torque_command=clean.motor_torque, **shaken)
+
+    answer = diagnose(model(), [noisy(1)], [noisy(2)])
+    assert "drown in noise" in answer.notes[0]
+    assert (answer.causes[0].effect, answer.causes[0].joints) == ("friction.coulomb", ("joint_2",))
+
+
+def test_two_shapes_of_one_effect_at_one_place_become_one():
+    two = [Term("transmission.coupling", 2, (2.0, lever)) for lever in (-1.0, -0.6)]
+    friction = Term("friction.coulomb", 0)
+    assert set(one_each([two[0], friction, two[1]])) == {two[0], friction}
