@@ -1,4 +1,4 @@
-"""In CI a skipped test is a failed one; elsewhere its reason stands in the summary."""
+"""In CI a skipped test is a failed one, real recordings apart; elsewhere its reason stands in the summary."""
 
 import os
 import subprocess
@@ -23,7 +23,7 @@ def run_pytest(folder: Path, text: str, ci: str) -> subprocess.CompletedProcess[
     (folder / "conftest.py").write_text(CONFTEST.read_text())
     (folder / "pytest.ini").write_text("[pytest]\naddopts = -ra\nmarkers = vcan\n")
     (folder / "test_it.py").write_text(text)
-    environment = {**os.environ, "CI": ci, "ARMLINK_NO_VCAN": "this kernel has no vcan"}
+    environment = {**os.environ, "CI": ci, "ARMLINK_REALDATA": "/nowhere", "ARMLINK_NO_VCAN": "this kernel has no vcan"}
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(folder)]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
@@ -41,6 +41,12 @@ def test_in_ci_a_skip_is_a_failure(tmp_path):
     assert done.returncode == 1
     assert "in CI nothing may be skipped" in done.stdout
     assert "1 xfailed" in done.stdout
+
+
+def test_real_recordings_may_be_missing_in_ci_too(tmp_path):
+    done = run_pytest(tmp_path, "def test_that_needs_them(realdata): pass\n", ci="true")
+    assert done.returncode == 0
+    assert "no real recordings: " in done.stdout
 
 
 @pytest.mark.parametrize(("ci", "status"), [("", 5), ("true", 2)])
