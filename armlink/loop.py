@@ -104,8 +104,7 @@ class Loop:
     def send(self, can_id: int, data: bytes) -> None:
         """Send one frame and count it."""
         self._port.send(can_id, data)
-        self.stats.frames += 1
-        self.bits += FIXED_BITS + 8 * len(data)
+        self.count(1, len(data))
 
     def send_mode(self, joint: int, mode: int) -> None:
         """RPDO2: the mode of one joint."""
@@ -158,8 +157,7 @@ class Loop:
         self._awaited = self.n
         self.watch.syncs += 1
         self._port.send_all(frames)
-        self.stats.frames += len(frames)
-        self.bits += FIXED_BITS * len(frames) + 8 * sum([len(data) for _, data in frames])
+        self.count(len(frames), sum([len(data) for _, data in frames]))
         end = now + self._patience
         for _ in range(MOST_FRAMES):
             if self._awaited <= 0:
@@ -209,7 +207,7 @@ class Loop:
             self.statuses[joint], self.displays[joint] = unpack(data)
 
     def count(self, frames: int, size: int) -> None:
-        """Count frames that a listener has taken in, with so many bytes of data in all."""
+        """Count frames that went over the bus, with so many bytes of data in all."""
         self.stats.frames += frames
         self.bits += FIXED_BITS * frames + 8 * size
 
