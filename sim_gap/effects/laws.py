@@ -26,6 +26,13 @@ class _Law(Effect):
     """The law in words."""
 
 
+class _MotorLaw(_Law):
+    """Of the motor side, which only a recording with motor torque or command can tell from the link's."""
+
+    def places(self, layout: Layout) -> range:
+        return range(layout.n if layout.motor else 0)
+
+
 class OfPosition(_Law):
     """A smooth function of a joint's own position, against the model."""
 
@@ -37,15 +44,12 @@ class OfPosition(_Law):
         return {(layout.against_model, place): _of_position(signals, place)}
 
 
-class OfPositionAtMotor(_Law):
+class OfPositionAtMotor(_MotorLaw):
     """A smooth function of a joint's own position on the motor side."""
 
     id = "law.motor_position"
     family = "transmission"
     told = "anything in the drive train that varies smoothly with the joint's position"
-
-    def places(self, layout: Layout) -> range:
-        return range(layout.n if layout.motor else 0)
 
     def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
         return {(layout.motor_side, place): _of_position(signals, place)}
@@ -62,15 +66,12 @@ class OfLoad(_Law):
         return layout.sensor_columns(place, _of_load(signals.model[:, place]))
 
 
-class OfLoadAtMotor(_Law):
+class OfLoadAtMotor(_MotorLaw):
     """A motor side that loses or gains a smooth function of its torque."""
 
     id = "law.motor_load"
     family = "actuator"
     told = "any drive that is wrong by a constant and in proportion to its torque"
-
-    def places(self, layout: Layout) -> range:
-        return range(layout.n if layout.motor else 0)
 
     def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
         return {(layout.motor_side, place): _of_load(signals.motor_model[:, place])}
@@ -88,15 +89,12 @@ class OfVelocityAtMotor(_Law):
         return {(layout.motor_side, place): np.column_stack([v, v * np.abs(v)])}
 
 
-class OfAccelerationAtMotor(_Law):
+class OfAccelerationAtMotor(_MotorLaw):
     """A motor side that carries something heavy."""
 
     id = "law.motor_acceleration"
     family = "actuator"
     told = "anything in the drive train that goes with the joint's acceleration"
-
-    def places(self, layout: Layout) -> range:
-        return range(layout.n if layout.motor else 0)
 
     def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
         return {(layout.motor_side, place): signals.a[:, place, None]}
