@@ -143,11 +143,9 @@ def _lag_doubt(rows: FitRows, joint: int) -> Array:
     Along the joint's own sweep it hardly varies. Where the joint only holds it may stand anywhere between both ends,
     and stays there while another is swept, so that those readings together count as one.
     """
-    names, own = np.array(rows.sweep), rows.swept == joint
-    alone = rows.swept < 0
-    together = np.array([np.count_nonzero(names == name) for name in names])
-    held: Array = HELD_DOUBT * np.sqrt(np.where(alone, 1.0, together))
-    return np.where(own, OWN_DOUBT, held)
+    _, sweep, together = np.unique(rows.sweep, return_inverse=True, return_counts=True)
+    held: Array = HELD_DOUBT * np.sqrt(np.where(rows.swept < 0, 1, together[sweep]))
+    return np.where(rows.swept == joint, OWN_DOUBT, held)
 
 
 def lag(arm: Arm, rows: FitRows, refined: Refined, joint: int) -> Array:
