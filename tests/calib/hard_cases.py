@@ -12,6 +12,7 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+from drawn_arms import drawn_arm
 from rank_test import undetermined
 from sweep_arms import random_arm, with_section
 
@@ -65,10 +66,20 @@ def hard_arm(case: str, seed: int, n: int = 3, **section: Any) -> tuple[ArmFile,
     """A random arm with the case's trouble, and its simulation."""
     arm = random_arm(seed, n, vertical=case == "vertical")
     arm = with_section(arm, **section) if section else arm
+    return troubled(case, arm, Truth.draw(arm, seed), seed)
+
+
+def drawn_hard_arm(case: str, seed: int) -> tuple[ArmFile, SimulatedArm]:
+    """Likewise one of the arms of 3 to 7 joints that the sweeps' bounds are asked on."""
+    return troubled(case, *drawn_arm(seed, upright=case == "vertical" or None), seed)
+
+
+def troubled(case: str, arm: ArmFile, truth: Truth, seed: int) -> tuple[ArmFile, SimulatedArm]:
+    """The arm with the case's trouble, and its simulation."""
     if case == "range":
         arm = _short(arm)
     rated = float(Limits.of(arm).rated[JOINT])
-    simulated = SimulatedArm(arm, Truth.draw(arm, seed), seed)
+    simulated = SimulatedArm(arm, truth, seed)
     if case == "spring":
         simulated.set_effects([*simulated.effects, _effect("transmission.spring", stiffness=SPRING * rated)])
     if case == "hysteresis":
