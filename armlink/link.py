@@ -50,6 +50,8 @@ class Link:
         self.commander = Commander(self._loop, self.clock, self.names, self.period, section.deadline, self._lock_step)
         self._cycling = self._enabled = False
         self._since = 0.0
+        self.position_step = np.full(self.n, np.inf)
+        """Smallest change that each position reading can show (n,) [rad]; inf before start()."""
         self._last: Command | None = None
 
     @classmethod
@@ -155,6 +157,7 @@ class Link:
             limits.append(limit)
             units.append(unit)
         self._loop.set_units(tuple(units))
+        self.position_step = np.array([max(unit.position, unit.encoder_step) for unit in units])
         self.commander.begin(limits, passed, supported)
 
     def send_nmt(self, command: int, node: int = 0) -> None:

@@ -1,5 +1,6 @@
 """Bits of a position reading that never change, found whatever zero the counts are taken from."""
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -15,6 +16,12 @@ SPAN = 1.5
 AWAY, OFTEN = 6.0, 0.15
 """Counts by which a reading may lie off where the joint was sent; share of readings that must lie a bit's step off."""
 
+DENSE, TURNS, MOTION = 0.45, 3, 24
+"""Of a motion that tells all: the most that targets leave empty, as a share of the bit's weight; times round the
+circle; distinct readings."""
+JUMP_SLACK = 0.2
+"""Share of a bit's weight that a jump may differ from it."""
+
 
 def stuck_bits(position: Array, resolution: Array, target: Array) -> Iterator[tuple[int, int, float]]:
     """(joint, bit, its step [rad]) of each stuck bit in readings (K, n) of given resolution (n,).
@@ -27,9 +34,15 @@ def stuck_bits(position: Array, resolution: Array, target: Array) -> Iterator[tu
         asked = target[:, joint] / resolution[joint]
         bit = _by_target(counts, asked)
         if bit is None:
-            bit = _by_gap(counts, asked)
+            bit = missing_bit(counts, asked)
         if bit is not None:
             yield int(joint), bit, float(2.0**bit * resolution[joint])
+
+
+def bit_of(counts: float) -> int | None:
+    """The bit whose weight a jump of so many counts is; None: of no bit. The joint may have turned a little meanwhile."""
+    bit = max(round(math.log2(max(counts, 1.0))), 1)
+    return bit if abs(counts / 2.0**bit - 1) < JUMP_SLACK else None
 
 
 def _by_target(counts: Array, asked: Array) -> int | None:
@@ -44,10 +57,11 @@ def _by_target(counts: Array, asked: Array) -> int | None:
     return bit if np.mean(np.abs(strange - 2.0**bit) <= AWAY) > 0.8 else None
 
 
-def _by_gap(counts: Array, asked: Array) -> int | None:
-    """The bit that keeps the readings, taken round a circle of twice its weight, within one half of it.
+def missing_bit(counts: Array, asked: Array) -> int | None:
+    """The bit that keeps the readings, taken round a circle of twice its weight, within one half of it; None: no such.
 
-    A half that even the targets leave empty tells nothing.
+    Readings (K,) and the places that were asked for (any length), both in increments from whatever zero. A half that
+    even the places asked for leave empty tells nothing.
     """
     distinct, wanted = np.unique(counts), np.unique(np.rint(asked[np.isfinite(asked)]))
     if len(distinct) < FEWEST or len(wanted) < FEWEST:
@@ -57,7 +71,10 @@ def _by_gap(counts: Array, asked: Array) -> int | None:
         weight = 2.0**bit
         gap, points = _largest_gap(distinct, 2 * weight)
         expected, _ = _largest_gap(wanted, 2 * weight)
-        if gap >= weight + 0.5 and expected < 0.8 * weight and points * 0.5 ** (points - 1) < CHANCE:
+        by_chance = points * 0.5 ** (points - 1)
+        if expected < DENSE * weight and np.ptp(distinct) > TURNS * 2 * weight and len(distinct) >= MOTION:
+            by_chance = 0.0  # a motion through everything
+        if gap >= weight + 0.5 and expected < 0.8 * weight and by_chance < CHANCE:
             return bit
         bit += 1
     return None

@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hard_cases import stick
 from sweep_arms import random_arm
 
 from armlink.armfile import ArmFile
 from armlink.errors import Refused
 from armlink.link import Link
+from calib.mover import EncoderFault
 from calib.plan_limits import Limits
 from calib.preflight import HOT, find_stops, listen
 from sim_bus.bus import LockStepBus
@@ -104,3 +106,12 @@ def test_stops_are_found_where_the_arm_file_has_them_and_named_where_not() -> No
         assert counted[-1] == (4, 4)
         with pytest.raises(Refused, match=r"j2: blocked at .* its stop should be at"):
             find_stops(link, wider, listened)
+
+
+def test_a_stuck_encoder_bit_is_named_before_any_stop_is_pressed() -> None:
+    simulated = SimulatedArm(ARM, Truth.draw(ARM, 1), 1)
+    stick(simulated, 6)
+    with enabled(simulated) as link:
+        found = listen(link, ARM)
+        with pytest.raises(EncoderFault, match=r"^j2: its position reading .*bit 6 of its encoder, which is stuck"):
+            find_stops(link, ARM, found)

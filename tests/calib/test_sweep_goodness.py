@@ -11,7 +11,7 @@ from sweep_arms import random_arm, synthetic_pass
 from armlink.armfile import ArmFile, load_arm
 from calib.dataset import Reading, SweepData
 from calib.description import gcomp_arm
-from calib.encoder_bits import stuck_bits
+from calib.encoder_bits import missing_bit, stuck_bits
 from calib.identify import identify_gravity
 from calib.plan import plan_sweep
 from calib.scout import rough_model
@@ -185,6 +185,22 @@ def test_a_sound_encoder_has_no_stuck_bit() -> None:
     for _ in range(50):
         position = random.uniform(-1, 1, (40, 1))
         assert not list(stuck_bits(np.round(position, 4), np.array([1e-4]), position))
+
+
+@pytest.mark.parametrize("bit", [None, *range(2, 12)])
+def test_a_motion_tells_a_stuck_bit_and_a_sound_encoder_none(bit: int | None) -> None:
+    random = np.random.default_rng(1 if bit is None else bit)
+    for _ in range(200 if bit is None else 10):
+        goal = random.uniform(1, 3) * (1 if bit is None or bit > 8 else 0.3) * 2**14
+        path = np.cumsum(np.hanning(random.integers(100, 1500)))
+        path *= goal / path[-1]
+        late = np.interp(np.arange(len(path)) - random.uniform(0, 10), np.arange(len(path)), path)
+        stuck_by_friction = random.uniform(0, 8)  # the joint goes on only where it lags by so much
+        held = np.floor(late / stuck_by_friction) * stuck_by_friction
+        counts = np.rint(held + random.uniform(0, 2**14)).astype(int)
+        seen = counts if bit is None else counts & ~(1 << bit)
+        found = missing_bit(seen.astype(float), path)
+        assert found == bit or (bit == 2 and found is None)  # four counts: a fast motion does not tell
 
 
 def test_a_range_of_sixty_degrees_leaves_the_intervals_true() -> None:
