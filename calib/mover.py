@@ -242,9 +242,7 @@ class Mover:
         `path` (K, m) [rad] is where the m `joints` were sent.
         """
         told = self.link.position_step
-        step = np.where(
-            np.isfinite(self.resolution), self.resolution, told
-        )  # lowest bits that no reading has: no fault
+        step = np.where(np.isfinite(self.resolution), self.resolution, told)  # lowest bits that are never used
         for place, joint in enumerate(joints):
             counts = np.rint(seen[:, joint] / step[joint])
             bit = missing_bit(counts[np.isfinite(counts)], path[:, place] / step[joint])
