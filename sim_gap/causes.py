@@ -3,18 +3,20 @@
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from sim_gap.confidence import confidence
 from sim_gap.confound import Rivals
 from sim_gap.diagnosis import Cause, Signs
-from sim_gap.effects.registry import Row
+from sim_gap.effects.registry import Layout, Row
 from sim_gap.estimate import Estimate, Value
 from sim_gap.normal import ColumnStore, Normal, Term
 from sim_gap.outside import Outside
 from sim_gap.residual import CARE_NM, ResidualSet
 from sim_gap.rigid import Array
+from sim_gap.steady import STEADY, steadiness
 
 
 @dataclass(frozen=True)
@@ -23,6 +25,8 @@ class Step:
 
     effect: str
     terms: tuple[Term, ...]
+    below: tuple[Term, ...]
+    """Those before it."""
     before: Array
     after: Array
 
@@ -42,7 +46,7 @@ def ordered(estimate: Estimate, scorer: "_Scorer") -> list[Step]:
     while groups:
         outcomes = {effect: scorer.rms([*chosen, *terms]) for effect, terms in groups.items()}
         effect = max(outcomes, key=lambda name: float(np.max(before - outcomes[name])))
-        steps.append(Step(effect, tuple(groups.pop(effect)), before, outcomes[effect]))
+        steps.append(Step(effect, tuple(groups.pop(effect)), tuple(chosen), before, outcomes[effect]))
         chosen += steps[-1].terms
         before = outcomes[effect]
     return steps
@@ -53,6 +57,10 @@ def _belongs(term: Term, terms: Sequence[Term], tip: int) -> str:
     loaded = any(other.effect == "link.payload" for other in terms)
     inertia_of_payload = loaded and term.effect == "link.inertia" and term.place == tip
     return "link.payload" if inertia_of_payload else term.effect
+
+
+FLOOR_KNOWN = 1.05
+"""What is left counts as more than noise from this times the noise floor on: it is no better known."""
 
 
 class _Scorer:
@@ -74,15 +82,30 @@ class _Scorer:
         raw = np.maximum(self.squares([]), final)
         r = int(np.argmax(np.where(self.counts, np.sqrt(without) - np.sqrt(final), -np.inf)))
         floor = np.array([data.floor[row] for row in rows])
-        above = np.maximum(final - floor**2, 0.0)
+        above = np.maximum(final - (FLOOR_KNOWN * floor) ** 2, 0.0)
         gaps = self.counts & (np.sqrt(raw) > np.array([data.margin[row] for row in rows]))
         elsewhere = float(np.mean(above[gaps] / raw[gaps])) if gaps.any() else 0.0
         excess = float(np.sqrt(final[r])) / data.care[rows[r]]
         return Signs(evidence, float(above[r] / max(raw[r], 1e-12)), excess, elsewhere, outside)
 
+    @cached_property
+    def noise(self) -> Array:
+        """Mean square of the noise in each row: its floor's, but no more than what all terms leave, (R,)."""
+        floor = np.array([self.heldout.floor[row] for row in self.normal.rows])
+        return np.asarray(np.minimum(floor**2, self.squares(list(self.estimate.terms))))
+
     def rms(self, terms: list[Term]) -> Array:
         """Held-out RMS per joint after fitting these terms on the training set, (n,)."""
-        squares = self.squares(terms)
+        return self._by_joint(self.squares(terms))
+
+    def falls(self, terms: Sequence[Term], more: Sequence[Term]) -> Array:
+        """What `more` on top of `terms` lowers each joint's RMS by, noise apart: in a row or in all together, (n,)."""
+        before, after = (np.maximum(self.squares([*chosen]) - self.noise, 0.0) for chosen in (terms, [*terms, *more]))
+        out = self._by_joint(before) - self._by_joint(after)
+        np.maximum.at(out, self.joint[self.counts], (np.sqrt(before) - np.sqrt(after))[self.counts])
+        return np.asarray(out)
+
+    def _by_joint(self, squares: Array) -> Array:
         out = np.zeros(self.heldout.layout.n)
         np.add.at(out, self.joint[self.counts], squares[self.counts])
         return np.asarray(np.sqrt(out))
@@ -93,26 +116,31 @@ MINOR, MINOR_INNER, MINOR_COMMAND = 0.009, 0.004, 0.001
 against the model, where only in motor against sensor, and where only in command against motor."""
 
 
-def materials(step: Step, estimate: Estimate, heldout: ResidualSet, scorer: "_Scorer") -> tuple[Term, ...]:
+QUIET_NM = 0.08
+"""Least fall on a joint where all rows are within their margins, so that noise, and the little friction that every arm
+has, could be all there is [N·m]."""
+
+
+def materials(
+    step: Step, estimate: Estimate, heldout: ResidualSet, scorer: "_Scorer", care: float = CARE_NM
+) -> tuple[Term, ...]:
     """Those of a step's terms whose place matters: the rest can go together without a joint's RMS rising by what a
-    user would care about, all else that was found being there."""
+    user would care about (`care` [N·m] at least), all else that was found being there."""
     hit = heldout.struck | estimate.store.data.struck
     if any(term.bound or (term.effect == "transmission.backlash" and term.place in hit) for term in step.terms):
         return step.terms
-    shows = {channel for term in step.terms for channel, _ in estimate.store.columns(term)}
-    layout = heldout.layout
-    share = MINOR if layout.against_model in shows else MINOR_COMMAND if shows == {layout.command} else MINOR_INNER
-    least = np.maximum(share * heldout.usual_torque, CARE_NM)
-    if np.all(step.before - step.after < least):
+    shows = {row for term in step.terms for row in estimate.store.columns(term)}
+    least = np.maximum(_minor(shows, heldout.layout) * heldout.usual_torque, care)
+    if np.all(scorer.falls(step.below, step.terms) < least):
         return ()
     places = {term.place for term in step.terms}
     if len(places) == 1:
         return step.terms
-    whole, small = scorer.rms(list(estimate.terms)), set[int]()
+    small = set[int]()
 
     def rise(gone: set[int]) -> Array:
-        left = [term for term in estimate.terms if term not in step.terms or term.place not in gone]
-        return scorer.rms(left) - whole
+        lost = [term for term in step.terms if term.place in gone]
+        return scorer.falls([term for term in estimate.terms if term not in lost], lost)
 
     for place in sorted(places, key=lambda place: float(np.max(rise({place}) / least))):
         if np.all(rise({*small, place}) < least):
@@ -120,17 +148,31 @@ def materials(step: Step, estimate: Estimate, heldout: ResidualSet, scorer: "_Sc
     return tuple(term for term in step.terms if term.place not in small) or step.terms
 
 
+def _minor(shows: set[Row], layout: Layout) -> Array:
+    """Share of each joint's torque that a cause which shows in these rows must matter by, (n,)."""
+    if any(channel == layout.against_model for channel, _ in shows):
+        return np.full(layout.n, MINOR)
+    inner = {channel for channel, _ in shows} == {layout.command}
+    beyond = [layout.beyond(joint) > 0 for joint in range(layout.n)]
+    return np.where(beyond, MINOR_INNER, MINOR_COMMAND) if inner else np.full(layout.n, MINOR_INNER)
+
+
 def causes(
-    estimate: Estimate, heldout: ResidualSet, rivals: Rivals, names: tuple[str, ...]
+    estimate: Estimate, heldout: ResidualSet, rivals: Rivals, names: tuple[str, ...], quiet: bool = False
 ) -> tuple[list[Cause], list[Cause]]:
-    """The causes, most important first, and the minor ones: whole effects, and joints at which an effect is small."""
+    """The causes, most important first, and the minor ones: whole effects, and joints at which an effect is small.
+
+    Where all is `quiet`, noise could be all there is: what does not show throughout the held-out motion is minor, too.
+    """
     found: list[Cause] = []
     minor: list[Cause] = []
     scorer = _Scorer(estimate, heldout)
     fitted = _Scorer(estimate, estimate.store.data)
     outside = Outside(estimate.store, estimate.terms)
     for step in ordered(estimate, scorer):
-        main = materials(step, estimate, heldout, scorer)
+        main = materials(step, estimate, heldout, scorer, QUIET_NM if quiet else CARE_NM)
+        if quiet and main and steadiness(estimate, heldout, main) < STEADY:
+            main = ()
         rest = tuple(term for term in step.terms if term not in main)
         for terms, out in ((main, found), (rest, minor)):
             if terms:

@@ -78,14 +78,13 @@ def diagnose(
     layout = layout_of(ready)
     fit, judge = (ResidualSet(tuple(part), layout) for part in (ready[: len(train)], ready[len(train) :]))
     _refuse_rest(fit)
-    estimate = None
-    found: list[Cause] = []
-    minor: list[Cause] = []
-    if fit.struck or not (is_quiet(judge) and is_quiet(fit)):
-        store = ColumnStore(fit)
-        search = compete(store, library_without(withhold))
-        estimate = Estimate(store, search.active)
-        found, minor = causes(estimate, judge, Rivals(search), sim.arm.names)
+    store = ColumnStore(fit)
+    search = compete(store, library_without(withhold))
+    estimate = Estimate(store, search.active)
+    quiet = not fit.struck and is_quiet(judge) and is_quiet(fit)
+    found, minor = causes(estimate, judge, Rivals(search), sim.arm.names, quiet=quiet)
+    if quiet and not found:
+        return _answer(Internals(sim, fit, judge, None), [], [], told, stuck)
     return _answer(Internals(sim, fit, judge, estimate), found, minor, told, stuck)
 
 

@@ -98,6 +98,8 @@ class Normal:
             mean_square[block.index] += np.diagonal(block.whole) / max(self.count.sum(), 1.0)
         self.prior = 1.0 / spread**2 + 1e-9 * mean_square
         self.prior[mean_square == 0.0] += 1.0
+        usual = [np.full(w, effects()[term.effect].usual) for term, w in zip(self.terms, widths, strict=True)]
+        self.pull = self.prior * np.concatenate([*usual, np.zeros(0)])
 
     @property
     def price(self) -> float:
@@ -134,10 +136,10 @@ class Normal:
 
     def solve(self, index: NDArray[np.intp], gram: Array, side: Array) -> Array:
         """Coefficients at `index` from the weighted sums (p, p) and (p,) of these, with the prior."""
-        matrix = gram + np.diag(self.prior[index])
+        matrix, right = gram + np.diag(self.prior[index]), side + self.pull[index]
         scale = 1.0 / np.sqrt(np.diag(matrix))
         return np.asarray(
-            scale * np.linalg.solve(matrix * scale * scale[:, None] + 1e-10 * np.eye(len(index)), scale * side)
+            scale * np.linalg.solve(matrix * scale * scale[:, None] + 1e-10 * np.eye(len(index)), scale * right)
         )
 
     def mean_square(self, index: NDArray[np.intp], coefficients: Array) -> Array:

@@ -32,12 +32,14 @@ def notes(
 
 
 def _drowned(data: ResidualSet) -> tuple[str, ...]:
-    """A line where channels were left aside for their noise."""
-    if data.layout.motor != "tau_cmd" or data.layout.sensor:
-        return ()
-    aside = [channel for channel in data.signals[0].channels if channel != "tau_cmd"]
-    told = f"{' and '.join(aside)} drown in noise: the command is compared with the model instead"
-    return (told,) if aside else ()
+    """A line for each joint whose command is compared beyond channels that are noisy."""
+    layout, names = data.layout, data.signals[0].arm.names
+    return tuple(
+        f"{names[j]}: {' and '.join(layout.chain[: layout.beyond(j)])} drown in noise: the command is compared with "
+        f"{layout.reference((str(layout.command), j)) or 'the model'} instead"
+        for j in range(layout.n)
+        if layout.beyond(j)
+    )
 
 
 def _stuck(stuck: Sequence[Stuck], data: ResidualSet) -> tuple[str, ...]:

@@ -58,8 +58,12 @@ class ResidualSet:
     @cached_property
     def values(self) -> dict[Row, Array]:
         """Reading minus what it is compared with [N·m], (K,) per row."""
-        stacked = [self._differences(s) for s in self.signals]
-        return {row: np.concatenate([one[row] for one in stacked]) for row in self.rows}
+        return {row: np.concatenate([one[row] for one in self._stacked]) for row in self.rows}
+
+    @cached_property
+    def _stacked(self) -> list[dict[Row, Array]]:
+        """`values` of each recording."""
+        return [self._differences(s) for s in self.signals]
 
     def _differences(self, s: Signals) -> dict[Row, Array]:
         layout = self.layout
@@ -75,7 +79,7 @@ class ResidualSet:
                 against = s.reading[layout.motor]
             difference = s.filtered(s.reading[channel] - against)
             out |= {(channel, j): difference[:, j] for j in range(layout.n)}
-        return out
+        return layout.compared(out)
 
     @cached_property
     def struck(self) -> dict[int, NDArray[np.bool_]]:
@@ -101,10 +105,11 @@ class ResidualSet:
             moving = sliding(s)
             for channel, joint in self.rows:
                 there = s.filtered(s.known[channel][:, joint]) > 0.9
-                if channel == self.layout.motor and self.layout.sensor:
-                    there &= s.filtered(s.known[self.layout.sensor][:, joint]) > 0.9
-                if channel == self.layout.motor_side:
-                    there &= moving[:, joint] if self.layout.motor else True
+                reference = self.layout.reference((channel, joint))
+                if reference:
+                    there &= s.filtered(s.known[reference][:, joint]) > 0.9
+                if channel == self.layout.motor or (channel == self.layout.command and self.layout.beyond(joint)):
+                    there &= moving[:, joint]
                 out[channel, joint].append(there)
         calm = ~np.any([np.zeros(sum(self.lengths), bool), *self.struck.values()], axis=0)
         return {row: np.concatenate(parts) & calm for row, parts in out.items()}
@@ -112,7 +117,8 @@ class ResidualSet:
     @cached_property
     def floor(self) -> dict[Row, float]:
         """Noise floor of each row [N·m]: sensor noise, noise of the differentiated position, and model's own error."""
-        return {row: float(np.mean([self._floor(s, row) for s in self.signals])) for row in self.rows}
+        both = list(zip(self.signals, self._stacked, strict=True))
+        return {row: float(np.mean([self._floor(s, row, rest[row]) for s, rest in both])) for row in self.rows}
 
     @cached_property
     def care(self) -> dict[Row, float]:
@@ -126,17 +132,13 @@ class ResidualSet:
         """RMS model torque of each joint, in the recording where it is largest [N·m], (n,)."""
         return np.asarray(np.max([np.sqrt(np.mean(s.model**2, axis=0)) for s in self.signals], axis=0))
 
-    def _floor(self, s: Signals, row: Row) -> float:
+    def _floor(self, s: Signals, row: Row, rest: Array) -> float:
         channel, joint = row
-        load = float(np.sqrt(np.mean(s.model[:, joint] ** 2)))
-        parts = [s.noise[channel][joint]]
-        if channel != self.layout.command:
-            parts.append(MODEL_FLOOR * load)
-        if channel == self.layout.motor and self.layout.sensor:
-            parts.append(s.noise[self.layout.sensor][joint])
-        if channel == self.layout.command and self.layout.motor:
-            parts.append(s.noise[self.layout.motor][joint])
-        return float(np.linalg.norm(parts)) + 1e-6
+        reference = self.layout.reference(row)
+        told = float(np.linalg.norm([s.noise[name][joint] for name in (channel, reference) if name]))
+        inner = channel == self.layout.command and not self.layout.beyond(joint)
+        model = 0.0 if inner else MODEL_FLOOR * float(np.sqrt(np.mean(s.model[:, joint] ** 2)))
+        return float(np.hypot(min(told, float(s.upper_half(rest))), model)) + 1e-6
 
     @cached_property
     def folds(self) -> NDArray[np.intp]:
@@ -160,7 +162,8 @@ class ResidualSet:
 
     def columns(self, effect: Effect, place: int, shape: Shape) -> Columns:
         """The effect's columns, filtered as the readings are, (K, p) per row that it touches."""
-        parts = [_filtered(s, effect.columns(s, self.layout, place, shape)) for s in self.signals]
+        layout = self.layout
+        parts = [_filtered(s, layout.compared(effect.columns(s, layout, place, shape))) for s in self.signals]
         return {row: np.concatenate([part[row] for part in parts]) for row in parts[0]}
 
     @cached_property
@@ -169,14 +172,19 @@ class ResidualSet:
 
         The share is smaller where the motor is compared with the sensor, for no error of the links shows there.
         """
-        shares = {self.layout.against_model: CARE, self.layout.command: CARE_COMMAND}
-        care = {row: shares.get(row[0], CARE_INNER) for row in self.rows}
         torque = self.usual_torque
-        return {row: 2.0 * self.floor[row] + max(care[row] * torque[row[1]], CARE_NM) for row in self.rows}
+        return {row: 2.0 * self.floor[row] + max(self._care(row) * torque[row[1]], CARE_NM) for row in self.rows}
+
+    def _care(self, row: Row) -> float:
+        """Share of the joint's torque that a gap in this row must have for a user to care."""
+        reference = self.layout.reference(row)
+        if reference is None:
+            return CARE
+        return CARE_COMMAND if (row[0], reference) == (self.layout.command, self.layout.motor) else CARE_INNER
 
     @cached_property
     def faint(self) -> dict[Row, float]:
-        """Below this a row's RMS holds nothing worth a search [N·m]."""
+        """Below this a row's RMS may be noise and what nobody cares about: what is in it must show steadily [N·m]."""
         noise = {row: 2.0 * floor for row, floor in self.floor.items()}
         return {row: noise[row] + max(FAINT * (self.margin[row] - noise[row]), CARE_NM) for row in self.rows}
 

@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicSpline, make_interp_spline
-from scipy.signal import butter, sosfiltfilt
+from scipy.signal import butter, sosfiltfilt, sosfreqz
 
 from armlink.errors import BadInput
 from armlink.recording import Recording
@@ -139,6 +139,17 @@ class Signals:
     @cached_property
     def _sections(self) -> Array:
         return np.asarray(butter(4, self.band, fs=self.rate, output="sos"))
+
+    def upper_half(self, x: Array) -> Array:
+        """RMS that white noise has within the pass band which has the same above half of it as `filtered` values x
+        (k, …), (…)."""
+        rate = self.rate / self.step
+        sections = butter(4, 0.5 * self.band, btype="high", fs=rate, output="sos")
+        frequency = np.linspace(0.0, 0.5 * rate, 512)
+        passed = np.abs(sosfreqz(self._sections, frequency, fs=self.rate)[1]) ** 4
+        upper = passed * np.abs(sosfreqz(sections, frequency, fs=rate)[1]) ** 4
+        share = upper.sum() / passed.sum()
+        return np.asarray(np.sqrt(np.mean(sosfiltfilt(sections, x, axis=0) ** 2, axis=0) / share))
 
     def sampled(self, x: Array) -> Array:
         """The rows of `x` at which `filtered` gives its values, unfiltered."""

@@ -21,7 +21,7 @@ def row_rms(data: ResidualSet, left: dict[Row, Array] | None = None) -> dict[Row
 
 
 def is_quiet(data: ResidualSet) -> bool:
-    """Whether no row exceeds what is worth a search."""
+    """Whether no row exceeds what noise, and what nobody cares about, could be."""
     return all(rms <= data.faint[row] for row, rms in row_rms(data).items())
 
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from sim_gap.effects.drive import CLIPPED
 from sim_gap.effects.registry import Columns, Effect, Layout, Parameter, Shape
 from sim_gap.rigid import Array
 from sim_gap.signals import Signals
@@ -99,10 +100,14 @@ class Saturation(_Bent):
     id = "torque.saturation"
     parameters = (Parameter("limit", "N·m"),)
     shares = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995, 0.999)
+    usual = 1.0
 
     def grid(self, signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
         """Levels that the torque exceeds during some of the time."""
         return tuple((largest(signals, place, share),) for share in self.shares)
+
+    def spread(self, signals: Signals, place: int) -> Array:
+        return np.full(1, CLIPPED)
 
     def missing(self, torque: Array, level: float, rate: float) -> Array:
         return np.clip(torque, -level, level) - torque

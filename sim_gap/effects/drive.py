@@ -14,6 +14,8 @@ from sim_gap.signals import Signals
 
 SHORTEST, LONGEST = 1e-3, 0.2
 """Times that count as a lag or delay [s]."""
+CLIPPED = 0.2
+"""What is clipped is, within this, all that is above the level."""
 
 
 def commanding(layout: Layout) -> str | None:
@@ -85,12 +87,16 @@ class Saturation(_Drive):
 
     id = "actuator.saturation"
     parameters = (Parameter("limit", "N·m"),)
+    usual = 1.0
 
     def grid(self, signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
         asked = np.concatenate([np.abs(s.reading["tau_cmd"][:, place]) for s in signals])
         return tuple(
             (float(level),) for level in np.quantile(asked, (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995, 0.999))
         )
+
+    def spread(self, signals: Signals, place: int) -> Array:
+        return np.full(1, CLIPPED)
 
     def missing(self, command: Array, shape: float, rate: float) -> Array:
         return np.asarray(command - np.clip(command, -shape, shape))

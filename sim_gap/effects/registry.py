@@ -48,13 +48,17 @@ class Layout:
     """Which channels a data set has, and what each is compared with.
 
     The sensor row of a joint is `tau` − model. Where there is a sensor, the motor row is `tau_motor` − `tau`, so that
-    what is wrong with the links does not show there; where there is none, it is `tau_motor` − model.
+    what is wrong with the links does not show there; where there is none, it is `tau_motor` − model. The command row is
+    `tau_cmd` − `tau_motor`, or at a joint where that estimate is noisy, `tau_cmd` − `tau` or − model (`passed_over`).
     """
 
     n: int
     sensor: str | None
     motor: str | None
     command: str | None = None
+    passed_over: tuple[int, ...] = ()
+    """How many channels the command of each joint is compared beyond: 0 with the motor's, 1 with the next, then the
+    model; empty is 0 everywhere."""
 
     @property
     def rows(self) -> tuple[Row, ...]:
@@ -76,6 +80,31 @@ class Layout:
         assert channel is not None
         return channel
 
+    @property
+    def chain(self) -> tuple[str, ...]:
+        """Channels from the command down to the model, without these two."""
+        return tuple(channel for channel in (self.motor, self.sensor) if channel)
+
+    def beyond(self, joint: int) -> int:
+        """How many channels of the chain the joint's command is compared beyond."""
+        return self.passed_over[joint] if self.passed_over else 0
+
+    def reference(self, row: Row) -> str | None:
+        """The channel that a row is compared with; None is the model."""
+        chain: tuple[str | None, ...] = (*((self.command,) if self.command else ()), *self.chain, None)
+        ahead = self.beyond(row[1]) if row[0] == self.command else 0
+        return chain[chain.index(row[0]) + 1 + ahead]
+
+    def compared(self, rows: Columns) -> Columns:
+        """Columns (or residuals) as each channel is compared with the next, as they are with the rows' references."""
+        out = dict(rows)
+        for joint in range(self.n if self.command else 0):
+            parts = [(channel, joint) for channel in (self.command, *self.chain[: self.beyond(joint)]) if channel]
+            there = [rows[part] for part in parts if part in rows]
+            if there:
+                out[str(self.command), joint] = np.sum(there, axis=0)
+        return out
+
     def sensor_columns(self, joint: int, column: Array) -> Columns:
         """A term of the sensor's reading: with its sign in the sensor row, against it in motor − sensor."""
         if self.sensor is None:
@@ -84,27 +113,38 @@ class Layout:
         return out | ({(self.motor, joint): -column} if self.motor else {})
 
 
-NOISY, QUIETER = 0.05, 0.2
-"""A sensor tells nothing where at every joint its noise exceeds this share of the torque; the command is then compared
-with the model where its own noise is less than this share of the sensor's."""
+DOUBTED, DOUBTED_INNER = 0.01, 0.003
+"""Share of a joint's torque by which the model, and the friction between motor and sensor, may be wrong unfound."""
+QUIETER = 0.5
+"""A command is compared beyond the motor's estimate where that lets less than this share of the doubt in."""
 
 
 def layout_of(signals: list[Signals]) -> Layout:
-    """The channels that all recordings have; of these the command alone where all others drown in noise."""
+    """The channels that all recordings have, and what each joint's command is best compared with."""
     common = set.intersection(*(set(s.channels) for s in signals))
-    others = common - {"tau_cmd"}
-    if "tau_cmd" in common and others and all(_drowned(s, channel) for s in signals for channel in others):
-        return Layout(signals[0].n, None, "tau_cmd")
     sensor = "tau" if "tau" in common else None
     motor = next((channel for channel in ("tau_motor", "tau_cmd") if channel in common), None)
     command = "tau_cmd" if {"tau_motor", "tau_cmd"} <= common else None
-    return Layout(signals[0].n, sensor, motor, command)
+    n = signals[0].n
+    if command is None:
+        return Layout(n, sensor, motor)
+    torque = np.sqrt(np.mean([np.mean(s.model**2, axis=0) for s in signals], axis=0))
+    doubts = [_noise(signals, "tau_motor"), DOUBTED * torque]
+    if sensor:
+        doubts.insert(1, np.hypot(_noise(signals, sensor), DOUBTED_INNER * torque))
+    doubt = np.array(doubts)
+    best = np.argmin(doubt, axis=0)
+    clear = doubt[best, np.arange(n)] < QUIETER * doubt[0]
+    return Layout(n, sensor, motor, command, tuple(np.where(clear, best, 0).tolist()))
 
 
-def _drowned(s: Signals, channel: str) -> bool:
-    """Whether noise hides what a channel reads, and the command is much quieter."""
-    noise, torque = s.noise[channel], np.sqrt(np.mean(s.model**2, axis=0))
-    return bool(np.all(noise > NOISY * torque) and np.all(s.noise["tau_cmd"] < QUIETER * noise))
+def _noise(signals: list[Signals], channel: str) -> Array:
+    """Noise of a channel that the command does not have as well, (n,): no more than what their difference shows."""
+    told = [
+        np.minimum(s.noise[channel], s.upper_half(s.filtered(s.reading["tau_cmd"] - s.reading[channel])))
+        for s in signals
+    ]
+    return np.asarray(np.mean(told, axis=0))
 
 
 class Effect(ABC):
@@ -120,6 +160,8 @@ class Effect(ABC):
     """What it must earn besides, in parameters: 0 for what every arm has, more for what few have."""
     ordinary: ClassVar[float] = 0.0
     """What every arm has of it, as a standard deviation of each coefficient: an interval leaves room for it."""
+    usual: ClassVar[float] = 0.0
+    """About which its coefficients are spread: 1 where the shape says all and they need not be seen to be known."""
     counted: ClassVar[frozenset[int]] = frozenset()
     """Which entries of the shape are numbers of something (a joint): they are not refined."""
     whole_arm: ClassVar[bool] = False
@@ -161,7 +203,7 @@ class Effect(ABC):
         """Its columns at the work rate."""
 
     def spread(self, signals: Signals, place: int) -> Array:
-        """Largest plausible size of each coefficient (a prior standard deviation), (p,); infinite where open."""
+        """Prior standard deviation of each coefficient from `usual`, its largest plausible size, (p,); or infinite."""
         return np.full(1, np.inf)
 
     def plausible(self, coefficients: Array, shape: Shape) -> bool:

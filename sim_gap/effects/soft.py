@@ -14,15 +14,22 @@ from sim_gap.signals import Signals
 
 SMOOTH_HZ = 10.0
 """Pass band of the carried torque before its acceleration is taken."""
+NOISY = 0.05
+"""Share of the joint's torque (RMS) that a sensor's noise may be for its reading to count."""
 SETTLED = 0.02
 """Share of the largest torque within which the play is crossed."""
 
 
 def carried(signals: Signals, layout: Layout, joint: int) -> Array:
-    """Torque through the transmission, smooth, (K,): the sensor's, else the model's."""
-    torque = signals.reading[layout.sensor] if layout.sensor else signals.model
+    """Torque through the transmission, smooth, (K,): the sensor's; the model's without one, or where it is noisy.
+
+    The noise of a reading would explain itself.
+    """
+    model, sensor = signals.model[:, joint], layout.sensor
+    clear = sensor and signals.noise[sensor][joint] < NOISY * np.sqrt(np.mean(model**2))
+    torque = signals.reading[sensor][:, joint] if sensor and clear else model
     cut = min(SMOOTH_HZ, 0.4 * signals.rate)
-    return np.asarray(sosfiltfilt(butter(4, cut, fs=signals.rate, output="sos"), torque[:, joint]))
+    return np.asarray(sosfiltfilt(butter(4, cut, fs=signals.rate, output="sos"), torque))
 
 
 class Elasticity(Effect):
