@@ -7,7 +7,7 @@ from armlink.errors import Refused
 from armlink.link import Link
 from armlink.sample import Command, Sample
 from calib.averages import Rest, average, stack
-from calib.encoder_bits import bit_of, missing_bit
+from calib.encoder_check import EncoderCheck
 from calib.motion import trajectory
 from calib.plan_limits import Limits
 from calib.section import SweepSection
@@ -17,8 +17,6 @@ Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
 POSITION, TORQUE = 8, 10
-JUMP, JUMP_STEPS = 3.0, 4.0
-"""A position reading that goes so many times as far as the speed limit allows, and so many increments, is no motion."""
 STALL = 0.2
 """Following error at which a joint counts as blocked [rad]."""
 LOST = 0.05
@@ -58,15 +56,6 @@ class Slipped(Refused):
         self.joint = joint
 
 
-class EncoderFault(Refused):
-    """A joint's position readings are none of a sound encoder."""
-
-    def __init__(self, name: str, seen: str, bit: int | None) -> None:
-        """Joint's name, what its readings did, and the bit that would do it."""
-        cause = "its encoder or cable" if bit is None else f"bit {bit} of its encoder, which is stuck or lost"
-        super().__init__(f"{name}: {seen}: mend {cause}; nothing found with it would hold")
-
-
 class Mover:
     """Holds the arm's command and changes it in small, safe ways. The link must be enabled."""
 
@@ -78,7 +67,7 @@ class Mover:
         self.command = Command.hold(link.position_sent)
         first = link.cycle(self.command)
         self.position: Array = first.position.copy()
-        self._read_at = np.full(link.n, first.t)
+        self._encoders = EncoderCheck(link.names, link.position_step, limits.speed, first)
         self.pressed: Flags = np.zeros(link.n, dtype=bool)
         self.side = np.zeros(link.n)
         self.resolution = np.full(link.n, np.inf)
@@ -94,7 +83,7 @@ class Mover:
     def cycle(self) -> Sample:
         """One cycle of the present command; raises Slipped when a pressed joint has left its stop, EncoderFault."""
         sample = self.link.cycle(self.command)
-        self._check_jump(sample)
+        self._encoders.see(sample)
         np.copyto(self.position, sample.position, where=np.isfinite(sample.position))
         if self.pressed.any():
             off = self.side * (self._contact - self.position) > SLIP
@@ -139,7 +128,7 @@ class Mover:
                 joint = int(np.argmax(np.where(movable, lag, 0.0)))
                 raise Stalled(self.link.names[joint], float(self.position[joint]), float(goal[joint]))
         self._learn_resolution(seen)
-        self._check_bits(np.array(seen), path[:, movable], np.flatnonzero(movable))
+        self._encoders.judge(np.reshape(seen, path.shape), path, movable, self.resolution)
 
     def press(self, stops: npt.NDArray[np.int64], bias: Array) -> None:
         """Creep the joints with stops ±1 onto them, then press with bias (n,) [N·m]; raises Refused, Slipped."""
@@ -223,32 +212,6 @@ class Mover:
             open_joints &= ~(still & (lead > CONTACT_LEAD))
             for joint in np.flatnonzero(open_joints):
                 self._check_creep(int(joint), int(stops[joint]))
-
-    def _check_jump(self, sample: Sample) -> None:
-        """Raise EncoderFault where a position reading changed by more than its joint can have turned meanwhile."""
-        step = sample.position - self.position
-        most = JUMP * self.limits.speed * (sample.t - self._read_at) + JUMP_STEPS * self.link.position_step
-        jumped = np.abs(step) > most  # never of a reading that did not come: NaN
-        if jumped.any():
-            joint = int(np.argmax(jumped))
-            seen = f"its position reading jumped by {step[joint]:+.3g} rad between two cycles, which no motion does"
-            bit = bit_of(float(abs(step[joint]) / self.link.position_step[joint]))
-            raise EncoderFault(self.link.names[joint], seen, bit)
-        self._read_at[np.isfinite(step)] = sample.t
-
-    def _check_bits(self, seen: Array, path: Array, joints: npt.NDArray[np.intp]) -> None:
-        """Raise EncoderFault where what the joints read on their way (K, n) leaves out what one bit would have shown.
-
-        `path` (K, m) [rad] is where the m `joints` were sent.
-        """
-        told = self.link.position_step
-        step = np.where(np.isfinite(self.resolution), self.resolution, told)  # lowest bits that are never used
-        for place, joint in enumerate(joints):
-            counts = np.rint(seen[:, joint] / step[joint])
-            bit = missing_bit(counts[np.isfinite(counts)], path[:, place] / step[joint])
-            if bit is not None:
-                what = f"its position reading skips every other {2.0**bit * step[joint]:.3g} rad"
-                raise EncoderFault(self.link.names[joint], what, bit + round(float(np.log2(step[joint] / told[joint]))))
 
     def _check_creep(self, joint: int, side: int) -> None:
         """Raise Refused where a joint has gone beyond the place at which its stop should have been."""

@@ -13,7 +13,7 @@ from sweep_arms import random_arm
 from armlink.armfile import ArmFile
 from armlink.errors import Refused
 from armlink.link import Link
-from calib.mover import EncoderFault
+from calib.encoder_check import EncoderFault
 from calib.plan_limits import Limits
 from calib.preflight import HOT, find_stops, listen
 from sim_bus.bus import LockStepBus

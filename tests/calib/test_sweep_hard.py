@@ -7,7 +7,7 @@ import pytest
 from hard_cases import Outcome, hard_arm, judge, stick, sweep_case
 
 from calib.dataset import load_data
-from calib.mover import EncoderFault
+from calib.encoder_check import EncoderFault
 
 SEED = {"range": 1, "slip": 7, "vertical": 3}
 

@@ -17,7 +17,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
 from hard_cases import BUNDLED, CASES, JOINT, asked_hard_arm, judge, sweep_case
 
-from calib.mover import EncoderFault
+from calib.encoder_check import EncoderFault
 
 
 def main() -> int:
