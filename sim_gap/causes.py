@@ -98,12 +98,17 @@ class _Scorer:
         """Held-out RMS per joint after fitting these terms on the training set, (n,)."""
         return self._by_joint(self.squares(terms))
 
-    def falls(self, terms: Sequence[Term], more: Sequence[Term]) -> Array:
-        """What `more` on top of `terms` lowers each joint's RMS by, noise apart: in a row or in all together, (n,)."""
-        before, after = (np.maximum(self.squares([*chosen]) - self.noise, 0.0) for chosen in (terms, [*terms, *more]))
-        out = self._by_joint(before) - self._by_joint(after)
-        np.maximum.at(out, self.joint[self.counts], (np.sqrt(before) - np.sqrt(after))[self.counts])
-        return np.asarray(out)
+    def falls(self, terms: Sequence[Term], more: Sequence[Term], quiet: bool) -> Array:
+        """What `more` on top of `terms` lowers each joint's RMS by, (n,); where all is quiet, or at a joint some of
+        whose channels drown in noise, noise apart and in the row where it is most."""
+        layout = self.heldout.layout
+        before, after = (self.squares([*chosen]) for chosen in (terms, [*terms, *more]))
+        whole = self._by_joint(before) - self._by_joint(after)
+        before, after = (np.sqrt(np.maximum(squares - self.noise, 0.0)) for squares in (before, after))
+        out = np.zeros(layout.n)
+        np.maximum.at(out, self.joint[self.counts], (before - after)[self.counts])
+        noisy = np.array([quiet or layout.beyond(joint) > 0 for joint in range(layout.n)])
+        return np.where(noisy, out, whole)
 
     def _by_joint(self, squares: Array) -> Array:
         out = np.zeros(self.heldout.layout.n)
@@ -121,17 +126,15 @@ QUIET_NM = 0.08
 has, could be all there is [N·m]."""
 
 
-def materials(
-    step: Step, estimate: Estimate, heldout: ResidualSet, scorer: "_Scorer", care: float = CARE_NM
-) -> tuple[Term, ...]:
+def materials(step: Step, estimate: Estimate, heldout: ResidualSet, scorer: "_Scorer", quiet: bool) -> tuple[Term, ...]:
     """Those of a step's terms whose place matters: the rest can go together without a joint's RMS rising by what a
-    user would care about (`care` [N·m] at least), all else that was found being there."""
+    user would care about, all else that was found being there."""
     hit = heldout.struck | estimate.store.data.struck
     if any(term.bound or (term.effect == "transmission.backlash" and term.place in hit) for term in step.terms):
         return step.terms
     shows = {row for term in step.terms for row in estimate.store.columns(term)}
-    least = np.maximum(_minor(shows, heldout.layout) * heldout.usual_torque, care)
-    if np.all(scorer.falls(step.below, step.terms) < least):
+    least = np.maximum(_minor(shows, heldout.layout) * heldout.usual_torque, QUIET_NM if quiet else CARE_NM)
+    if np.all(scorer.falls(step.below, step.terms, quiet) < least):
         return ()
     places = {term.place for term in step.terms}
     if len(places) == 1:
@@ -140,7 +143,7 @@ def materials(
 
     def rise(gone: set[int]) -> Array:
         lost = [term for term in step.terms if term.place in gone]
-        return scorer.falls([term for term in estimate.terms if term not in lost], lost)
+        return scorer.falls([term for term in estimate.terms if term not in lost], lost, quiet)
 
     for place in sorted(places, key=lambda place: float(np.max(rise({place}) / least))):
         if np.all(rise({*small, place}) < least):
@@ -170,7 +173,7 @@ def causes(
     fitted = _Scorer(estimate, estimate.store.data)
     outside = Outside(estimate.store, estimate.terms)
     for step in ordered(estimate, scorer):
-        main = materials(step, estimate, heldout, scorer, QUIET_NM if quiet else CARE_NM)
+        main = materials(step, estimate, heldout, scorer, quiet)
         if quiet and main and steadiness(estimate, heldout, main) < STEADY:
             main = ()
         rest = tuple(term for term in step.terms if term not in main)
