@@ -113,13 +113,16 @@ def _blamed(causes: Sequence[Json], label: Json, withheld: str) -> tuple[str, ..
 
 
 def _joints(causes: Sequence[Json], truths: Sequence[Json]) -> tuple[int, int, int]:
-    """Joints right, wrong and missed, over the true effects that sit on joints and were named."""
+    """Joints right, wrong and missed, over the true effects that sit on joints: of the cause that names the effect,
+    or names it as what it is confounded with; where none does, all are missed."""
     right = wrong = missed = 0
     for truth in truths:
-        told = next((c for c in causes if c["effect"] == truth["effect"]), None)
-        if not truth["joints"] or told is None:
+        effect = truth["effect"]
+        rivals = [c for c in causes if effect in (c["confounded_with"] or ())]
+        told = next(iter([*(c for c in causes if c["effect"] == effect), *rivals]), None)
+        if not truth["joints"]:
             continue
-        claimed, true = set(_main_joints(told)), set(truth["joints"])
+        claimed, true = set(_main_joints(told) if told else ()), set(truth["joints"])
         right, wrong, missed = right + len(claimed & true), wrong + len(claimed - true), missed + len(true - claimed)
     return right, wrong, missed
 

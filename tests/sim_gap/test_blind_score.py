@@ -113,6 +113,13 @@ def test_gain_errs_by_its_distance_from_one() -> None:
     assert [e.relative for e in told.errors] == pytest.approx([0.1])
 
 
+def test_joints_of_an_effect_that_is_not_found_are_missed_and_of_one_named_as_rival_are_not() -> None:
+    nothing = judge(answer(), label(truth("friction.coulomb")))
+    assert (nothing.joints_right, nothing.joints_wrong, nothing.joints_missed) == (0, 0, 1)
+    rival = judge(answer(cause("actuator.lag", rivals=("actuator.delay",))), label(truth("actuator.delay")))
+    assert (rival.joints_right, rival.joints_wrong, rival.joints_missed) == (1, 0, 0)
+
+
 def test_inertia_errs_about_the_joints_axis() -> None:
     true = truth("link.inertia", xx=0.5, xy=0.0, xz=0.0, yy=0.5, yz=0.0, zz=1.0)
     told = judge(answer(cause("link.inertia", joint_2={"xx": 9.0, "zz": 0.9, "yz": 3.0})), label(true))
@@ -146,7 +153,8 @@ def test_score_counts_shares() -> None:
     assert told["first_or_confounded"] == 1.0
     assert told["no_effect"] == {"cases": 1, "false_alarms": 0.0}
     assert told["two"] == {"cases": 1, "both_found": 0.0}
-    assert told["joints"]["f1"] == 1.0
+    assert (told["joints"]["precision"], told["joints"]["recall"]) == (1.0, 0.75)  # of c the offset's joint is missed
+    assert told["joints"]["f1"] == pytest.approx(6 / 7)
     assert result["effect_withheld"]["false_blame"] == 1.0
     assert result["confusion"] == {
         "actuator.lag": {"actuator.delay": 1},
