@@ -110,20 +110,20 @@ def drawn_truth(arm: ArmFile, seed: int) -> Truth:
     )
 
 
-def sweep_both(simulated: SimulatedArm, out: Path) -> list[SweepData]:
-    """The pass without and the pass with the mass that the plan recommends."""
+def sweep(simulated: SimulatedArm, out: Path, *, loaded: bool = True) -> list[SweepData]:
+    """The pass without and, if asked for, the pass with the mass that the plan recommends."""
     arm = simulated.arm
-    link = Link(arm, LockStepBus(arm=simulated))
-    with link:
+    with Link(arm, LockStepBus(arm=simulated)) as link:
         link.start()
         link.enable()
-        bare = run_sweep(link, arm, out / "bare")
-        assert bare.plan is not None
-        mass = bare.plan.reference_mass
-        simulated.attach_mass(mass)
-        loaded = run_sweep(link, arm, out / "loaded", reference_mass=mass)
-    simulated.detach_mass()
-    return [bare, loaded]
+        data = [run_sweep(link, arm, out / "bare")]
+        if loaded:
+            assert data[0].plan is not None
+            mass = data[0].plan.reference_mass
+            simulated.attach_mass(mass)
+            data.append(run_sweep(link, arm, out / "loaded", reference_mass=mass))
+            simulated.detach_mass()
+    return data
 
 
 def judge(arm: ArmFile, truth: Truth, data: list[SweepData], fit: SensorFit | None = None) -> Verdict:

@@ -12,18 +12,16 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-from drawn_arms import drawn_arm, drawn_truth
+from drawn_arms import drawn_arm, drawn_truth, sweep
 from rank_test import undetermined
 from sweep_arms import random_arm, with_section
 
 from armlink.armfile import ArmFile, load_arm
-from armlink.link import Link
 from calib import runner
 from calib.dataset import SweepData
 from calib.plan_limits import Limits
 from calib.plan_model import SweepPlan
 from calib.sensors import SensorFit, fit_sensors
-from sim_bus.bus import LockStepBus
 from sim_bus.section import EffectEntry
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
@@ -100,15 +98,8 @@ def troubled(case: str, arm: ArmFile, truth: Truth, seed: int) -> tuple[ArmFile,
 
 def sweep_case(case: str, arm: ArmFile, simulated: SimulatedArm, out: Path, *, loaded: bool = True) -> Case:
     """The pass without and, if asked for, the pass with the recommended mass."""
-    with Link(arm, LockStepBus(arm=simulated)) as link, _weakened(simulated, case == "slip") as slips:
-        link.start()
-        link.enable()
-        data = [runner.run_sweep(link, arm, out / "bare")]
-        if loaded:
-            assert data[0].plan is not None
-            mass = data[0].plan.reference_mass
-            simulated.attach_mass(mass)
-            data.append(runner.run_sweep(link, arm, out / "loaded", reference_mass=mass))
+    with _weakened(simulated, case == "slip") as slips:
+        data = sweep(simulated, out, loaded=loaded)
     return Case(case, arm, simulated, data, slips())
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
-from drawn_arms import Verdict, drawn_arm, drawn_truth, judge, sweep_both
+from drawn_arms import Verdict, drawn_arm, drawn_truth, judge, sweep
 
 from armlink.armfile import load_arm
 from sim_bus.simulated_arm import SimulatedArm
@@ -33,7 +33,7 @@ def run(which: str, keep: Path | None) -> Verdict:
         arm, truth = drawn_arm(int(which))
     simulated = SimulatedArm(arm, truth, 1)
     with tempfile.TemporaryDirectory() as scratch:
-        data = sweep_both(simulated, (keep / which) if keep else Path(scratch))
+        data = sweep(simulated, (keep / which) if keep else Path(scratch))
         return judge(arm, simulated.true_sensors, data)
 
 
