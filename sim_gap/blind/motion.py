@@ -10,6 +10,8 @@ RATE = 500.0
 """Rate of the commanded trajectories [Hz]."""
 KINDS = ("sines", "points", "sweeps")
 CHIRP_S = 12.0
+SLOWEST, LONGEST_REST_S = 0.4, 0.9
+"""Of moves from point to point: least share of the limits, and longest rest between them [s]."""
 
 
 @dataclass(frozen=True)
@@ -70,16 +72,16 @@ def _points(t: Array, limits: Limits, random: np.random.Generator) -> Array:
         if random.random() < 0.25:  # one joint alone
             alone = random.integers(n)
             there = np.where(np.arange(n) == alone, there, here)
-        seconds = _seconds(there - here, limits, random)
-        if t[-1] - now / RATE < seconds + 4.0:  # back to the start
-            there, seconds = np.zeros(n), _seconds(here, limits, random)
+        seconds = _seconds(there - here, limits, random.uniform(SLOWEST, 1.0))
+        if t[-1] - now / RATE < seconds + LONGEST_REST_S + _seconds(there, limits, SLOWEST):  # no time to come back
+            there, seconds = np.zeros(n), _seconds(here, limits, random.uniform(SLOWEST, 1.0))
         rows = round(seconds * RATE)
         s = np.minimum(np.arange(rows) / max(rows - 1, 1), 1.0)[:, None]
         rise = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
         block = here + (there - here) * rise
         keep = min(rows, len(t) - now)
         out[now : now + keep] = block[:keep]
-        rest = now + rows + round(random.uniform(0.2, 0.9) * RATE)
+        rest = now + rows + round(random.uniform(0.2, LONGEST_REST_S) * RATE)
         out[now + keep : rest] = there
         here, now = there, rest
         if not here.any():
@@ -88,11 +90,11 @@ def _points(t: Array, limits: Limits, random: np.random.Generator) -> Array:
     return out
 
 
-def _seconds(way: Array, limits: Limits, random: np.random.Generator) -> float:
-    """Time of a quintic move at some share of the limits; its peaks are 1.875 d/T and 5.7735 d/T²."""
+def _seconds(way: Array, limits: Limits, share: float) -> float:
+    """Time of a quintic move at a share of the limits; its peaks are 1.875 d/T and 5.7735 d/T²."""
     distance = np.abs(way)
     fast = np.maximum(1.875 * distance / limits.velocity, np.sqrt(5.7735 * distance / limits.acceleration))
-    return max(0.5, float(fast.max()) / random.uniform(0.4, 1.0))
+    return max(0.5, float(fast.max()) / share)
 
 
 def _sweeps(t: Array, limits: Limits, random: np.random.Generator) -> Array:
