@@ -10,6 +10,8 @@ from sim_gap.select import Search, shortlist
 AS_GOOD = 0.036
 """A rival is as good where it scores no more than this below the chosen effect (half a log of the mean square): the
 price of three coefficients, for what every arm has besides may speak by so much for either."""
+BARE = 0.012
+"""A cause that brings no more than the price of a coefficient has a rival in whatever brings anything in its place."""
 TRIED = 4
 MOTION = {
     frozenset(
@@ -76,10 +78,13 @@ class Rivals:
                 and term.key not in other.beneath
                 and not (term.effect == other.effect == "transmission.coupling")
             ]
-            for _, other in shortlist(search.weighted.screen(rest, others))[:TRIED]:
+            likely = [other for _, other in shortlist(search.weighted.screen(rest, others))[:TRIED]]
+            known = [o for o in others if o.place == term.place and frozenset({term.effect, o.effect}) in MOTION]
+            for other in dict.fromkeys([*likely, *known]):
                 worse = search.judge(search.with_beneath(other, rest)) - search.score
                 weakest = min(weakest, worse)
-                if worse < AS_GOOD and worse < 0.5 * lost and other.effect != effect:
+                enough = max(0.5 * lost, min(lost, BARE))
+                if worse < AS_GOOD and worse < enough and other.effect != effect:
                     own.append(other.effect)
             if weakest >= evidence or not rivals:
                 evidence, rivals = max(evidence, weakest), own

@@ -8,7 +8,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from sim_gap.blind.plant import Log, simulate
 from sim_gap.blind.recipe import Drawing, Recipe, draw, label, recipes
 from sim_gap.blind.sensors import record
 
+Values = TypeVar("Values")
 BATCH = 12
 """Cases simulated side by side in one process."""
 TRAIN_S, HELDOUT_S, RATE = 120.0, 40.0, 250.0
@@ -78,7 +79,7 @@ def _judged(drawing: Drawing, logs: list[Log], rate: float) -> Judged:
         record(run.truth, log, rate, drawing.columns["velocity"], run.command, _random(drawing, 1))
         for run, log in zip(runs, logs, strict=True)
     ]
-    gaps = [gap(drawing.nominal, recording) for recording in recordings]
+    gaps = [_chosen(gap(drawing.nominal, recording), drawing.columns) for recording in recordings]
     falls = [largest_fall(gaps[0], less) for less in gaps[1 : 1 + len(drawing.drawn)]]
     steady = all(_steady(run.command, log) for run, log in zip(runs, logs, strict=True))
     found = {"with": gaps[0], "without": gaps[-1], "falls": falls}
@@ -106,7 +107,8 @@ def _random(drawing: Drawing, number: int) -> np.random.Generator:
     return np.random.default_rng([*drawing.recipe.seed, drawing.attempt, 1000 + number])
 
 
-def _chosen(columns: dict[str, Array], wanted: dict[str, bool]) -> dict[str, Array]:
+def _chosen(columns: dict[str, Values], wanted: dict[str, bool]) -> dict[str, Values]:
+    """Those that the recording has."""
     dropped = {name for name, key in (("q_cmd", "position_command"), ("tau_cmd", "torque_command")) if not wanted[key]}
     return {name: values for name, values in columns.items() if name not in dropped}
 

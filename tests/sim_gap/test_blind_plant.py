@@ -155,6 +155,14 @@ def test_trajectories_keep_their_limits_and_rest_at_both_ends(kind: str) -> None
     assert (np.ptp(q, axis=0) > 0.3).all()
 
 
+def test_point_to_point_motion_always_comes_back() -> None:
+    """Else the command would jump where the next kind of motion begins, and every drive be rated for that jump."""
+    bounds = limits(4)
+    for seed in range(60):
+        q = trajectory(("points", "sweeps"), 30.0, bounds, np.random.default_rng(seed))
+        assert (np.abs(derivatives(q)[1]).max(0) < 1.6 * bounds.acceleration).all()
+
+
 def _bristles(coulomb: float) -> Bristles:
     random = np.random.default_rng(0)
     arm = draw_arm(random, 3)
