@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armlink.recording import Recording
 from sim_gap.rigid import Array
@@ -30,7 +31,8 @@ def without_stuck(s: Signals, recording: Recording) -> tuple[Signals, tuple[Stuc
         values = getattr(recording, CHANNELS[channel])
         for joint in range(s.n):
             there = np.isfinite(values[:, joint])
-            still = _still(s, joint, recording.t[there] - recording.t[0], values[there, joint])
+            held = s.moving[:, joint] == 0.0 if channel != "tau" else np.zeros(len(s.t), bool)
+            still = _still(s, joint, held, recording.t[there] - recording.t[0], values[there, joint])
             if still:
                 marked = known[channel].copy()
                 for start, end in still:
@@ -40,10 +42,11 @@ def without_stuck(s: Signals, recording: Recording) -> tuple[Signals, tuple[Stuc
     return replace(s, known=known), tuple(found)
 
 
-def _still(s: Signals, joint: int, t: Array, x: Array) -> list[tuple[float, float]]:
+def _still(s: Signals, joint: int, held: NDArray[np.bool_], t: Array, x: Array) -> list[tuple[float, float]]:
     """Stretches of time in which the reading repeats itself and should not.
 
-    At zero and at the largest reading it may: a dead band and a clipped sensor do that.
+    At zero and at the largest reading it may: a dead band and a clipped sensor do that. So may the motor of a joint
+    that is `held` at rest, (K,): friction takes up what changes.
     """
     changes = np.flatnonzero(np.diff(x) != 0.0)
     starts, ends = np.r_[0, changes + 1], np.r_[changes, len(x) - 1]
@@ -54,7 +57,7 @@ def _still(s: Signals, joint: int, t: Array, x: Array) -> list[tuple[float, floa
         if t[b] - t[a] < LONGEST_S:
             continue
         natural = len(changes) > 0 and (x[a] == 0.0 or abs(x[a]) >= np.abs(x).max())
-        meanwhile = model[(s.t >= t[a]) & (s.t <= t[b])]
-        if not natural and np.ptp(meanwhile) > least:
+        meanwhile = (s.t >= t[a]) & (s.t <= t[b]) & ~held
+        if not natural and meanwhile.any() and np.ptp(model[meanwhile]) > least:
             out.append((float(t[a]), float(t[b])))
     return out

@@ -15,6 +15,7 @@ from sim_gap.hits import hits
 from sim_gap.model import load_model
 from sim_gap.residual import ResidualSet
 from sim_gap.signals import prepare
+from sim_gap.stuck import without_stuck
 
 Odd = Callable[[Recording], Recording]
 
@@ -85,6 +86,19 @@ def test_a_stuck_sensor_is_named_and_blames_no_effect(odd):
     assert answer.verdict == "unexplained"
     assert not answer.causes
     assert "joint_2: tau repeats one number" in answer.notes[0]
+
+
+@pytest.mark.parametrize(("held", "channels"), [(True, ["tau"]), (False, ["tau", "tau_motor"])])
+def test_the_motor_of_a_joint_that_is_held_may_repeat_one_number_its_sensor_may_not(held, channels):
+    """While other joints move, what a held joint carries changes; friction takes it up, and the motor need not."""
+    moving = record(model(), Wrong(), seed=1, seconds=40, rate=50.0)
+    position, torque, motor = (x.copy() for x in (moving.position, moving.torque, moving.motor_torque))
+    if held:
+        position[:, 1] = 0.3
+    torque[:, 1] = motor[:, 1] = 1.234
+    recording = replace(moving, position=position, torque=torque, motor_torque=motor)
+    _, found = without_stuck(prepare(recording, load_model(model(), (), 3).arm), recording)
+    assert [(one.channel, one.joint) for one in found] == [(channel, 1) for channel in channels]
 
 
 def test_beside_a_stuck_sensor_other_joints_are_still_read():
