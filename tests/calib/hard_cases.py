@@ -160,7 +160,7 @@ def _weakened(simulated: SimulatedArm, wanted: bool) -> Iterator[Callable[[], in
             if sweep.stops[joint] and not sweep.servo[joint]
         }
         (place, joint), pull = max(pulls.items(), key=lambda item: item[1])
-        assert pull > 0.15, "no resting joint is pulled off its stop"
+        assert pull > 0.12, "no resting joint is pulled off its stop"
         sweep = plan.sweeps[place]
         bias = list(sweep.bias or ())
         bias[joint] = WEAK * sweep.stops[joint] * _against(simulated, plan, place, joint)
