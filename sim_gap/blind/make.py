@@ -79,8 +79,9 @@ def _judged(drawing: Drawing, logs: list[Log], rate: float) -> Judged:
         record(run.truth, log, rate, drawing.columns["velocity"], run.command, _random(drawing, 1))
         for run, log in zip(runs, logs, strict=True)
     ]
-    gaps = [_chosen(gap(drawing.nominal, recording), drawing.columns) for recording in recordings]
-    falls = [largest_fall(gaps[0], less) for less in gaps[1 : 1 + len(drawing.drawn)]]
+    gaps = [gap(drawing.nominal, recording) for recording in recordings]
+    recorded = [_chosen(each, drawing.columns) for each in gaps]  # what nobody records does not make a case clear
+    falls = [largest_fall(recorded[0], less) for less in recorded[1 : 1 + len(drawing.drawn)]]
     steady = all(_steady(run.command, log) for run, log in zip(runs, logs, strict=True))
     found = {"with": gaps[0], "without": gaps[-1], "falls": falls}
     return Judged(recordings[0], found, steady and all(visible(fall) for fall in falls))

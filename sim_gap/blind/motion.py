@@ -10,8 +10,8 @@ RATE = 500.0
 """Rate of the commanded trajectories [Hz]."""
 KINDS = ("sines", "points", "sweeps")
 CHIRP_S = 12.0
-SLOWEST, LONGEST_REST_S = 0.4, 0.9
-"""Of moves from point to point: least share of the limits, and longest rest between them [s]."""
+SLOWEST, LONGEST_REST_S, NEAREST = 0.4, 0.9, 0.01
+"""Of moves from point to point: least share of the limits, longest rest between them [s], and nearest point [rad]."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,11 @@ def _points(t: Array, limits: Limits, random: np.random.Generator) -> Array:
         if random.random() < 0.25:  # one joint alone
             alone = random.integers(n)
             there = np.where(np.arange(n) == alone, there, here)
-        seconds = _seconds(there - here, limits, random.uniform(SLOWEST, 1.0))
-        if t[-1] - now / RATE < seconds + LONGEST_REST_S + _seconds(there, limits, SLOWEST):  # no time to come back
+        share, left = random.uniform(SLOWEST, 1.0), t[-1] - now / RATE - LONGEST_REST_S
+        while now == 0 and left < 2 * _seconds(there, limits, SLOWEST) and np.abs(there).max() > NEAREST:
+            there *= 0.8  # a short motion goes less far
+        seconds = _seconds(there - here, limits, share)
+        if left < seconds + _seconds(there, limits, SLOWEST):  # no time to come back
             there, seconds = np.zeros(n), _seconds(here, limits, random.uniform(SLOWEST, 1.0))
         rows = round(seconds * RATE)
         s = np.minimum(np.arange(rows) / max(rows - 1, 1), 1.0)[:, None]
