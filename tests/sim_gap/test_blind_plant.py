@@ -163,6 +163,14 @@ def test_point_to_point_motion_always_comes_back() -> None:
         assert (np.abs(derivatives(q)[1]).max(0) < 1.6 * bounds.acceleration).all()
 
 
+def test_a_short_motion_from_point_to_point_moves_and_comes_back() -> None:
+    bounds = limits(4)
+    for seed in range(30):
+        q = trajectory(("points",), 5.0, bounds, np.random.default_rng(seed))
+        assert np.ptp(q, axis=0).max() > 0.0
+        np.testing.assert_allclose(q[-1], q[0], atol=1e-9)
+
+
 def _bristles(coulomb: float) -> Bristles:
     random = np.random.default_rng(0)
     arm = draw_arm(random, 3)
