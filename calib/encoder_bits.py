@@ -15,7 +15,6 @@ SPAN = 1.5
 """How many times a bit's own step the joint must have moved for it to be judged."""
 AWAY, OFTEN = 6.0, 0.15
 """Counts by which a reading may lie off where the joint was sent; share of readings that must lie a bit's step off."""
-
 DENSE, TURNS, MOTION = 0.45, 3, 24
 """Of a motion that tells all: the most that targets leave empty, as a share of the bit's weight; times round the
 circle; distinct readings."""

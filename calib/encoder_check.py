@@ -26,21 +26,22 @@ class EncoderFault(Refused):
 class EncoderCheck:
     """Sees every sample, and at the end of each motion what was read on the way."""
 
-    def __init__(self, names: tuple[str, ...], step: Array, speed: Array, first: Sample) -> None:
+    def __init__(self, names: tuple[str, ...], step: Array, speed: Array, now: float) -> None:
         """Of n joints whose readings change by at least `step` [rad], and that turn at most at `speed` [rad/s]."""
-        self._names, self._step, self._speed = names, step, speed
-        self._position, self._read_at = first.position.copy(), np.full(len(names), first.t)
+        self._names, self._step = names, step
+        self._fastest, self._slack = JUMP * speed, JUMP_STEPS * step
+        self._read_at = np.full(len(names), now)
 
-    def see(self, sample: Sample) -> None:
-        """Raise EncoderFault where a position reading changed by more than its joint can have turned meanwhile."""
-        moved = sample.position - self._position
-        jumped = np.abs(moved) > JUMP * self._speed * (sample.t - self._read_at) + JUMP_STEPS * self._step
+    def see(self, sample: Sample, before: Array) -> None:
+        """Raise EncoderFault where a position reading differs from the last one `before` it (n,) [rad] by more than its
+        joint can have turned meanwhile."""
+        moved = sample.position - before
+        jumped = np.abs(moved) > self._fastest * (sample.t - self._read_at) + self._slack
         if jumped.any():  # never of a reading that did not come: NaN
             joint = int(np.argmax(jumped))
             what = f"its position reading jumped by {moved[joint]:+.3g} rad between two cycles, which no motion does"
             raise EncoderFault(self._names[joint], what, bit_of(float(abs(moved[joint]) / self._step[joint])))
-        came = np.isfinite(sample.position)
-        self._position[came], self._read_at[came] = sample.position[came], sample.t
+        self._read_at[np.isfinite(sample.position)] = sample.t
 
     def judge(self, seen: Array, path: Array, movable: Flags, resolution: Array) -> None:
         """Raise EncoderFault where what a joint read on its way leaves out what one bit would have shown.

@@ -67,7 +67,7 @@ class Mover:
         self.command = Command.hold(link.position_sent)
         first = link.cycle(self.command)
         self.position: Array = first.position.copy()
-        self._encoders = EncoderCheck(link.names, link.position_step, limits.speed, first)
+        self._encoders = EncoderCheck(link.names, link.position_step, limits.speed, first.t)
         self.pressed: Flags = np.zeros(link.n, dtype=bool)
         self.side = np.zeros(link.n)
         self.resolution = np.full(link.n, np.inf)
@@ -83,7 +83,7 @@ class Mover:
     def cycle(self) -> Sample:
         """One cycle of the present command; raises Slipped when a pressed joint has left its stop, EncoderFault."""
         sample = self.link.cycle(self.command)
-        self._encoders.see(sample)
+        self._encoders.see(sample, self.position)
         np.copyto(self.position, sample.position, where=np.isfinite(sample.position))
         if self.pressed.any():
             off = self.side * (self._contact - self.position) > SLIP

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from rank_test import undetermined
 
-from armlink.armfile import ArmFile, parse_arm
+from armlink.armfile import ArmFile, load_arm, parse_arm
 from armlink.link import Link
 from calib.dataset import SweepData
 from calib.description import gcomp_arm
@@ -23,6 +23,7 @@ from sim_bus.truth import Truth, flange
 Array = np.ndarray
 GAIN, OFFSET, GRAVITY = 0.005, 0.003, 0.005
 """Largest errors: of a gain, of an offset as a share of rated torque, gravity RMS as a share of the largest torque."""
+BUNDLED = ("sarcos", "parallel6")
 FRICTION, OFFSET_RANGE = 0.05, 0.2
 """Coulomb friction and largest offset (10 % of the sensor's range of ± 2 rated torques), as shares of rated torque."""
 
@@ -108,6 +109,16 @@ def drawn_truth(arm: ArmFile, seed: int) -> Truth:
         position_offset=np.zeros(n),
         attachment=flange(arm) + np.array([*random.uniform(-0.15, 0.15, 2), 0.0]),
     )
+
+
+def asked_arm(which: str, *, upright: bool | None = None) -> tuple[ArmFile, Truth]:
+    """An arm that the sweeps' bounds are asked on, upright if told: bundled, or drawn by the number of its seed."""
+    if which not in BUNDLED:
+        return drawn_arm(int(which), upright=upright)
+    arm = load_arm(which)
+    if upright:
+        arm = arm.model_copy(update={"kinematics": arm.kinematics.model_copy(update={"gravity": (0, 0, -9.80665)})})
+    return arm, drawn_truth(arm, 1)
 
 
 def sweep(simulated: SimulatedArm, out: Path, *, loaded: bool = True) -> list[SweepData]:

@@ -12,11 +12,11 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-from drawn_arms import drawn_arm, drawn_truth, sweep
+from drawn_arms import BUNDLED, asked_arm, sweep
 from rank_test import undetermined
 from sweep_arms import random_arm, with_section
 
-from armlink.armfile import ArmFile, load_arm
+from armlink.armfile import ArmFile
 from calib import runner
 from calib.dataset import SweepData
 from calib.plan_limits import Limits
@@ -33,7 +33,6 @@ RANGE, SPRING, HYSTERESIS = np.pi / 3, 0.04, 0.03
 """Range [rad], stiffness [rated torques/rad], half width of the play [rated torques]."""
 BITS = range(1, 11)
 """Stuck bits of the encoder, one after the other with the seed."""
-BUNDLED = ("sarcos", "parallel6")
 WEAK = 0.8
 """Share of the gravity torque at which the slipping joint is pressed."""
 SENSOR = ("gain", "offset", "position_gain")
@@ -71,14 +70,9 @@ def hard_arm(case: str, seed: int, n: int = 3, **section: Any) -> tuple[ArmFile,
 
 
 def asked_hard_arm(case: str, which: str) -> tuple[ArmFile, SimulatedArm]:
-    """Likewise one of the arms that the sweeps' bounds are asked on: bundled, or drawn by the number of its seed."""
-    upright = case == "vertical"
-    if which not in BUNDLED:
-        return troubled(case, *drawn_arm(int(which), upright=upright or None), int(which))
-    arm = load_arm(which)
-    if upright:
-        arm = arm.model_copy(update={"kinematics": arm.kinematics.model_copy(update={"gravity": (0, 0, -9.80665)})})
-    return troubled(case, arm, drawn_truth(arm, 1), 1)
+    """Likewise one of the arms that the sweeps' bounds are asked on."""
+    arm, truth = asked_arm(which, upright=case == "vertical" or None)
+    return troubled(case, arm, truth, 1 if which in BUNDLED else int(which))
 
 
 def troubled(case: str, arm: ArmFile, truth: Truth, seed: int) -> tuple[ArmFile, SimulatedArm]:

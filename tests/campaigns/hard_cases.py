@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
-from hard_cases import BUNDLED, CASES, JOINT, asked_hard_arm, judge, sweep_case
+from drawn_arms import BUNDLED
+from hard_cases import CASES, JOINT, asked_hard_arm, judge, sweep_case
 
 from calib.encoder_check import EncoderFault
 

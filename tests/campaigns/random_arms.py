@@ -16,21 +16,14 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
-from drawn_arms import Verdict, drawn_arm, drawn_truth, judge, sweep
+from drawn_arms import BUNDLED, Verdict, asked_arm, judge, sweep
 
-from armlink.armfile import load_arm
 from sim_bus.simulated_arm import SimulatedArm
-
-BUNDLED = ("sarcos", "parallel6")
 
 
 def run(which: str, keep: Path | None) -> Verdict:
     """Both passes of one arm, named or by the number of its seed."""
-    if which in BUNDLED:
-        arm = load_arm(which)
-        truth = drawn_truth(arm, 1)
-    else:
-        arm, truth = drawn_arm(int(which))
+    arm, truth = asked_arm(which)
     simulated = SimulatedArm(arm, truth, 1)
     with tempfile.TemporaryDirectory() as scratch:
         data = sweep(simulated, (keep / which) if keep else Path(scratch))
