@@ -117,12 +117,12 @@ def _joints(causes: Sequence[Json], truths: Sequence[Json]) -> tuple[int, int, i
     or names it as what it is confounded with; where none does, all are missed."""
     right = wrong = missed = 0
     for truth in truths:
-        effect = truth["effect"]
-        rivals = [c for c in causes if effect in (c["confounded_with"] or ())]
-        told = next(iter([*(c for c in causes if c["effect"] == effect), *rivals]), None)
         if not truth["joints"]:
             continue
-        claimed, true = set(_main_joints(told) if told else ()), set(truth["joints"])
+        effect, true = truth["effect"], set(truth["joints"])
+        telling = [c for c in causes if c["effect"] == effect]
+        telling += [c for c in causes if effect in (c["confounded_with"] or ())]
+        claimed = set(_main_joints(telling[0])) if telling else set[str]()
         right, wrong, missed = right + len(claimed & true), wrong + len(claimed - true), missed + len(true - claimed)
     return right, wrong, missed
 
