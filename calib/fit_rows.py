@@ -14,7 +14,8 @@ Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
 UNSETTLED = 3.0
-"""Factor on the standard deviation of a reading that was taken before it had settled."""
+"""Factor on the standard deviation of a reading that was taken before it had settled; what its samples scatter beyond
+their noise, by a swing or a creep, counts whole beside it, for no average takes that out."""
 FLOOR = 2e-5
 """Smallest standard deviation of a reading, as a share of rated torque: sensors have a last bit too."""
 
@@ -76,8 +77,10 @@ def fit_rows(data: Sequence[SweepData]) -> FitRows:
     noise = np.sqrt(np.nanmedian(np.where(counts, std, np.nan) ** 2, axis=0))
     noise = np.maximum(np.nan_to_num(noise), 0.0)
     rated = np.array(first.rated_torque)
-    settled = np.array([reading.settled for _, reading in rows])
-    sigma = np.hypot(noise / np.sqrt(count)[:, None], FLOOR * rated) * np.where(settled, 1.0, UNSETTLED)[:, None]
+    unsettled = ~np.array([reading.settled for _, reading in rows])
+    sigma = np.hypot(noise / np.sqrt(count)[:, None], FLOOR * rated)
+    swing = np.sqrt(np.maximum(std[unsettled] ** 2 - noise**2, 0.0))
+    sigma[unsettled] = np.hypot(UNSETTLED * sigma[unsettled], swing)
     load = np.array([each.manifest.reference_mass for each, _ in rows])
     resolution = np.max([each.resolution for each in data], axis=0)
     return FitRows(

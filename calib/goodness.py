@@ -27,8 +27,11 @@ MOST_OUTLIERS = 0.15
 """Share of a joint's readings that may be left out as outliers; where there are more, the model is at fault."""
 PLATEAU, PLATEAU_POSES = 4.0, 4
 """Standard deviations within which readings count as equal; different poses at one extreme from which it is a limit."""
-SWING = 800.0
-"""Standard deviations that a joint's torque must range over: else a sinusoid's own peak is as flat as a limit."""
+SWING, MOST = 800.0, (90.0, 10.0)
+"""Standard deviations that a joint's torque must range over: else a sinusoid's own peak is as flat as a limit. Between
+these percentiles, for a knock makes no range."""
+BLURRED = 3.0
+"""A reading so many times less exact than most, as of an arm that swung, is near to every limit: it shows none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,11 +114,14 @@ def _without_plateaus(names: tuple[str, ...], rows: FitRows) -> tuple[FitRows, l
     torque, flat, found = rows.readings.torque, np.zeros(rows.readings.torque.shape, dtype=bool), []
     for joint, name in enumerate(names):
         counted = np.flatnonzero(rows.readings.counted[:, joint])
+        sigma = rows.readings.sigma[counted, joint]
+        sharp = sigma <= BLURRED * np.median(sigma)
+        counted, sigma = counted[sharp], sigma[sharp]
         for side in (1.0, -1.0):
             value = side * torque[counted, joint]
-            if len(value) < FEWEST or np.ptp(value) < SWING * np.median(rows.readings.sigma[counted, joint]):
+            if len(value) < FEWEST or np.subtract(*np.percentile(value, MOST)) < SWING * np.median(sigma):
                 continue
-            near = counted[value > value.max() - PLATEAU * rows.readings.sigma[counted, joint]]
+            near = counted[value > value.max() - PLATEAU * sigma]
             poses = np.round(rows.readings.position[near], 1)
             distinct = np.unique(np.column_stack([poses, rows.readings.load[near]]), axis=0)
             if len(distinct) >= max(PLATEAU_POSES, 0.1 * len(counted)):

@@ -164,6 +164,50 @@ def test_what_was_touched_is_left_out_and_named(sound) -> None:
     assert np.abs(z_scores(fit, truth, "gain")).max() < 4
 
 
+@pytest.fixture(scope="module")
+def upright() -> tuple[ArmFile, Truth, list[SweepData]]:
+    """An arm whose first joint carries no gravity: all its readings are alike."""
+    arm = random_arm(52, 3, vertical=True)
+    truth = Truth.draw(arm, 52)
+    return arm, truth, swept(arm, truth, 52)
+
+
+def test_a_knock_does_not_make_a_joint_without_gravity_saturate(upright) -> None:
+    arm, _, data = upright
+
+    def knock(reading: Reading, _: np.ndarray, torque: np.ndarray) -> None:
+        if reading.joint is None and reading.index == 0:
+            torque[0] += 0.3 * rated(arm)
+
+    fit = fit_sensors(arm, bent(data, knock))
+    assert {finding.kind for finding in fit.findings} == {"outliers"}
+    assert fit.doubtful == ()
+
+
+def test_an_arm_that_swung_while_it_was_read_counts_by_its_swing(upright) -> None:
+    arm, truth, data = upright
+    random, swing = np.random.default_rng(4), 0.1 * rated(arm)
+    swung = []
+    for each in bent(data, lambda *_: None):
+        readings = [
+            reading.model_copy(
+                update={
+                    "settled": False,
+                    "torque": tuple(np.add(reading.torque, swing * random.standard_normal(len(reading.torque)))),
+                    "torque_std": tuple(np.hypot(reading.torque_std, swing)),
+                }
+            )
+            if reading.joint is None and reading.index < 2
+            else reading
+            for reading in each.readings
+        ]
+        swung.append(replace(each, readings=tuple(readings)))
+    fit = fit_sensors(arm, swung)
+    assert fit.findings == ()
+    for parameter in ("gain", "offset", "position_gain"):
+        assert np.nanmax(np.abs(z_scores(fit, truth, parameter))) < 4
+
+
 @pytest.mark.parametrize(("bit", "level"), [(6, 0), (9, 1), (11, 0)])
 def test_a_stuck_encoder_bit_is_named(sound, bit: int, level: int) -> None:
     arm, _, data = sound
