@@ -100,7 +100,9 @@ class SensorFit:
         if self.attachment is None:
             return ""
         point, half = self.attachment
-        place = ", ".join(f"{at:.4f} ± {by:.4f}" for at, by in zip(point, half, strict=True))
+        if np.isnan(point).all():
+            return "where the reference mass hung is not observable"
+        place = ", ".join(_said(at, f" ± {by:.4f}") for at, by in zip(point, half, strict=True))
         moments = [f"{mass:g} kg: {_triple(mass * point)} kg·m" for mass in self.rows.masses if mass]
         return (
             f"the reference mass hung at ({place}) m of the last joint's frame; its mass moment, {'; '.join(moments)}"
@@ -229,7 +231,11 @@ def _gain_ratio(arm: ArmFile, rows: FitRows) -> Array:
 
 
 def _triple(values: Array) -> str:
-    return f"({', '.join(f'{value:.4f}' for value in values)})"
+    return f"({', '.join(map(_said, values))})"
+
+
+def _said(value: float, interval: str = "") -> str:
+    return "not observable" if np.isnan(value) else f"{value:.4f}{interval}"
 
 
 def _number(value: float) -> float | None:

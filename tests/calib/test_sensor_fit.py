@@ -82,6 +82,16 @@ def test_a_vertical_joint_is_named_and_gets_no_gain() -> None:
     assert np.abs(fit.value("gain")[1:] / truth.gain[1:] - 1).max() < 0.01
 
 
+def test_one_joint_that_gravity_acts_on_does_not_tell_its_gain_nor_where_the_mass_hung() -> None:
+    arm = random_arm(4, 2, vertical=True)
+    _, data = passes(arm, 4)
+    fit = fit_sensors(arm, data)
+    assert {key for key in fit.reasons if key[1] == "gain"} == {("j1", "gain"), ("j2", "gain")}
+    assert fit.attachment is not None
+    assert np.isnan(fit.attachment[0]).all()
+    assert fit.attachment_text == "where the reference mass hung is not observable"
+
+
 def test_where_all_axes_nearly_meet_it_says_so_and_a_measured_point_helps() -> None:
     """The mass has no lever but the one that is fitted with it: gains are right, but not to half a percent."""
     arm = random_arm(61, 3)
