@@ -31,7 +31,13 @@ CHECK_EVERY = 5
 """Cycles from one look at the settle rule to the next."""
 COAST, COAST_LOOK, COAST_STILL = 5.0, 0.1, 0.002
 """Longest time that joints may take to stop [s]; how often one looks [s]; way in that time of one that stands [rad]."""
+BOUNCE = 0.05
+"""How far it may while all are being pressed: one that lands throws the others [rad]."""
 PRESS_SECONDS = 0.3
+"""Time over which the torque of a joint at its stop rises to its bias."""
+BOUNCE_SECONDS, BOUNCE_LOOK, BOUNCE_STILL = 2.0, 0.15, 0.003
+"""Longest time that joints may take to stand on their stops [s]; how long one looks [s]; way in that time of one that
+stands [rad]."""
 STOP_TOLERANCE = 0.06
 """How far from the arm file's place a stop may be found, beyond the position sensor's own error [rad]."""
 
@@ -71,6 +77,7 @@ class Mover:
         self.pressed: Flags = np.zeros(link.n, dtype=bool)
         self.side = np.zeros(link.n)
         self.resolution = np.full(link.n, np.inf)
+        self._slack = SLIP
         self._contact = self.position.copy()
         self._produced = np.zeros(link.n)
         self.contacts: dict[tuple[int, int], float] = {}
@@ -86,7 +93,7 @@ class Mover:
         self._encoders.see(sample, self.position)
         np.copyto(self.position, sample.position, where=np.isfinite(sample.position))
         if self.pressed.any():
-            off = self.side * (self._contact - self.position) > SLIP
+            off = self.side * (self._contact - self.position) > self._slack
             if off.any():
                 joint = int(np.argmax(off & self.pressed))
                 raise Slipped(self.link.names[joint], joint)
@@ -136,15 +143,16 @@ class Mover:
         self._creep(stops, joints)
         self._contact = self.position.copy()
         self.side = np.where(joints, stops, 0).astype(float)
-        self.pressed = joints.copy()
+        self.pressed, self._slack = joints.copy(), BOUNCE
         self.command.mode[joints] = TORQUE
         cycles = max(int(PRESS_SECONDS / self.link.period), 1)
         start = np.where(joints, self._produced, 0.0)
         for share in np.linspace(1 / cycles, 1.0, cycles):
             self.command.torque[joints] = (start + share * (bias - start))[joints]
             self.cycle()
-        for _ in range(cycles // 2):
-            self.cycle()
+        self._stand(joints)
+        self._slack = SLIP
+        self.cycle()
         for joint in np.flatnonzero(joints):
             self._check_stop(int(joint), int(stops[joint]))
         self._contact = self.position.copy()
@@ -192,6 +200,18 @@ class Mover:
                     if settled(samples[begin:]):
                         return average(samples[begin:], settled=True)
                     begin = None  # it only stood at a turning point
+
+    def _stand(self, joints: Flags) -> None:
+        """Wait until pressed joints stand; raises Slipped where one leaves its stop."""
+        still = np.maximum(BOUNCE_STILL, 1.5 * np.where(np.isfinite(self.resolution), self.resolution, 0.0))
+        look = max(int(BOUNCE_LOOK / self.link.period), 2)
+        for _ in range(round(BOUNCE_SECONDS / BOUNCE_LOOK)):
+            low, high = self.position.copy(), self.position.copy()
+            for _ in range(look):
+                self.cycle()
+                low, high = np.minimum(low, self.position), np.maximum(high, self.position)
+            if np.all((high - low < still) | ~joints):
+                return
 
     def _creep(self, stops: npt.NDArray[np.int64], joints: Flags) -> None:
         """Move each joint towards its stop until it does not follow any more."""

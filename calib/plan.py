@@ -187,12 +187,11 @@ def _sweep(
         needed = required_bias(guess, section, limits, one.stops, one.poses)[0]
         least, largest, _ = hold_torque(guess, section, limits, one.poses)
         spare = limits.max_torque - np.maximum(np.abs(least), np.abs(largest))[0]
-        own = float(spare[joint] / max(2 * guess.inertia()[joint], 1e-9))
         pressed = resting & ~servo
         size, acceleration = bias_and_acceleration(
-            needed, reaction_bound(guess, joint), pressed, section, limits, joint, own
+            needed, spare, reaction_bound(guess, joint), pressed, section, limits, joint
         )
-        bias = tuple((stops * np.where(resting & ~servo, size, 0.0)).tolist())
+        bias = tuple((stops * np.where(pressed, size, 0.0)).tolist())
     rest = np.where(stops > 0, limits.upper, limits.lower) - SERVO_GAP * stops * servo
     rest[joint] = steps[0]
     return Sweep(

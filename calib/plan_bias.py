@@ -54,12 +54,17 @@ def reaction_bound(guess: GravityGuess, joint: int) -> Array:
 
 
 def bias_and_acceleration(
-    needed: Array, reaction: Array, pressed: Flags, section: SweepSection, limits: Limits, joint: int, own: float
+    needed: Array, spare: Array, reaction: Array, pressed: Flags, section: SweepSection, limits: Limits, joint: int
 ) -> tuple[Array, float]:
-    """(Bias size (n,) [N·m], acceleration [rad/s²]): as fast as the resting joints' torque and its own allow."""
+    """(Bias size (n,) [N·m], acceleration [rad/s²]): as fast as every joint's torque allows.
+
+    `spare` (n,) [N·m] is what the drives have beside gravity: a joint held by its servo bears the swept one's reaction
+    with it, and the swept joint moves by half of it.
+    """
     given = limits.max_torque if section.bias_torque is None else np.array(section.bias_torque)
-    room = np.where(pressed, (given - needed) / np.maximum(reaction, 1e-9), np.inf)
-    room[joint] = own
+    left = np.where(pressed, given - needed, spare)
+    left[joint] = spare[joint] / 2
+    room = left / np.maximum(reaction, 1e-9)
     acceleration = float(np.clip(room.min(), SLOWEST, section.acceleration))
     if section.bias_torque is not None:
         return given, acceleration

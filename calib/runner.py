@@ -148,7 +148,7 @@ class _Pass:
             except Slipped as slip:
                 retries += 1
                 standing = False
-                bias = self._more_bias(sweep, bias, slip.joint, retries)
+                sweep, bias = self._firmer(sweep, bias, slip.joint, retries)
                 continue
             except Stalled:
                 retries += 1
@@ -190,14 +190,20 @@ class _Pass:
         counts[joint] = True
         return mover.rest(counts)
 
-    def _more_bias(self, sweep: Sweep, bias: Array, joint: int, retries: int) -> Array:
-        """A fifth more torque for a joint that slipped; raises Refused where that was tried often enough."""
+    def _firmer(self, sweep: Sweep, bias: Array, joint: int, retries: int) -> tuple[Sweep, Array]:
+        """For a joint that slipped: a fifth more torque or, where it has all that it may, slower motion of the others.
+
+        Raises Refused where that was tried often enough.
+        """
         name, limit = self.mover.link.names[joint], self.mover.limits.max_torque[joint]
         more = bias.copy()
         more[joint] = np.clip(1.2 * bias[joint], -limit, limit)
-        if retries > RETRIES or more[joint] == bias[joint]:
+        if retries > RETRIES:
             raise Refused(
                 f"{name}: slips off its stop in sweep {sweep.name} at {bias[joint]:.1f} N·m of {limit:.1f} allowed:"
                 " lessen sweep.acceleration, or hold by servo (sweep.hold: servo)"
             )
-        return more
+        if more[joint] == bias[joint]:
+            self.acceleration *= SLOWER
+            sweep = sweep.model_copy(update={"acceleration": SLOWER * sweep.acceleration})
+        return sweep, more

@@ -143,7 +143,7 @@ def stick(simulated: SimulatedArm, bit: int) -> None:
 @contextmanager
 def _weakened(simulated: SimulatedArm, wanted: bool) -> Iterator[Callable[[], int]]:
     """The plan presses one resting joint too weakly for gravity; gives how often a joint was pressed again."""
-    plans, more, slips = runner._final_plan, runner._Pass._more_bias, []
+    plans, more, slips = runner._final_plan, runner._Pass._firmer, []
 
     def weak(*given: Any) -> SweepPlan:
         plan = plans(*given)
@@ -167,7 +167,7 @@ def _weakened(simulated: SimulatedArm, wanted: bool) -> Iterator[Callable[[], in
         return more(*given)
 
     with (
-        patch.object(runner._Pass, "_more_bias", counted),
+        patch.object(runner._Pass, "_firmer", counted),
         patch.object(runner, "_final_plan", weak if wanted else plans),
     ):
         yield lambda: len(slips)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from drawn_arms import drawn_arm
 from sweep_arms import random_arm, synthetic_pass, with_section
 
 from armlink.armfile import ArmFile, load_arm
@@ -95,6 +96,20 @@ def test_servo_hold_presses_nothing() -> None:
     arm = with_section(random_arm(6, 3), hold="servo")
     for sweep in plan_sweep(arm).sweeps:
         assert sum(sweep.servo) == 2
+
+
+def test_held_joints_can_bear_the_reaction_of_the_one_that_moves() -> None:
+    """Checked with MuJoCo's inertia, which the plan has not seen; this upright arm's first drive has little torque."""
+    arm, truth = drawn_arm(9, upright=True, hold="servo")
+    limits, simulated, slowed = Limits.of(arm), SimulatedArm(arm, truth), 0
+    for sweep in scouted_plan(arm, truth).sweeps:
+        poses = np.tile(sweep.rest, (len(sweep.steps), 1))
+        poses[:, sweep.joint] = sweep.steps
+        reaction = np.array([np.abs(simulated.plant.inertia(pose)[sweep.joint]) for pose in poses])
+        spare = limits.max_torque - np.abs(simulated.gravity_torque(poses))
+        assert np.all(sweep.acceleration * reaction < spare) or sweep.acceleration == pytest.approx(0.3)
+        slowed += sweep.acceleration < 3.0
+    assert slowed > 0
 
 
 def test_a_range_too_short_to_sweep_names_the_joint() -> None:

@@ -11,6 +11,7 @@ from sweep_arms import random_arm, with_section
 from armlink.armfile import ArmFile
 from armlink.errors import Refused
 from armlink.link import Link
+from calib import runner
 from calib.dataset import SweepData, load_data
 from calib.identify import identify_gravity
 from calib.mover import Mover, Slipped
@@ -138,6 +139,25 @@ def test_a_joint_that_cannot_be_held_on_its_stop_is_noticed(chain: Chain) -> Non
     assert stops[slip.value.joint] != 0
     mover.hold_all()
     mover.cycle()
+
+
+def test_a_joint_that_slips_is_pressed_harder_and_at_its_limit_the_others_move_slower(chain: Chain) -> None:
+    limits = Limits.of(chain.arm)
+    mover = Mover(chain.link, sweep_section(chain.arm), limits)
+    run = runner._Pass(mover, None, [], lambda *_: None, lambda: 0.0)
+    assert chain.data[0].plan is not None
+    sweep = chain.data[0].plan.sweeps[0]
+    joint = int(np.flatnonzero(sweep.stops)[0])
+    side, limit = sweep.stops[joint], float(limits.max_torque[joint])
+    bias = side * 0.5 * limits.max_torque
+    same, more = run._firmer(sweep, bias, joint, 1)
+    assert same == sweep
+    assert more[joint] == pytest.approx(side * 0.6 * limit)
+    slower, most = run._firmer(sweep, side * limits.max_torque, joint, 1)
+    assert most[joint] == side * limit
+    assert slower.acceleration == pytest.approx(0.4 * sweep.acceleration)
+    with pytest.raises(Refused, match="slips off its stop"):
+        run._firmer(sweep, bias, joint, 4)
 
 
 def test_a_stop_that_is_not_where_the_arm_file_has_it_is_named(chain: Chain) -> None:
