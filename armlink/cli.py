@@ -53,8 +53,8 @@ def _call(point: EntryPoint, arguments: list[str]) -> int:
     except Exception as error:
         if hasattr(error, "format_message"):  # a usage error: unknown option, missing argument, bad value
             return _fail(f"{point.name}: {error.format_message()} (see armlink {point.name} --help)", USAGE_STATUS)
-        if isinstance(error, OSError) and error.filename is not None:
-            return _fail(f"{error.filename}: {error.strerror}", USAGE_STATUS)
+        if isinstance(error, OSError) and error.strerror is not None:  # a write to a full disk names no file
+            return _fail(f"{error.filename or point.name}: {error.strerror}", USAGE_STATUS)
         status = getattr(error, "exit_status", None)  # every package's own error tree carries one
         if status is None:
             raise

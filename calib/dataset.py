@@ -1,5 +1,6 @@
 """The sweep data set: a directory with a manifest and one line per static reading, each on disk before the next."""
 
+import errno
 import hashlib
 import json
 import os
@@ -20,6 +21,7 @@ from calib.plan_model import SweepPlan
 
 Array = npt.NDArray[np.float64]
 MANIFEST, LINES = "manifest.json", "readings.jsonl"
+PART = MANIFEST + ".part"
 
 
 class _Model(BaseModel):
@@ -128,6 +130,11 @@ class SweepData:
         """Whether every reading of the plan is there."""
         return self.plan is not None and len(self.readings) >= self.plan.readings
 
+    @property
+    def unsettled(self) -> tuple[Reading, ...]:
+        """Readings that were taken before the arm stood still."""
+        return tuple(reading for reading in self.readings if not reading.settled)
+
     def require(self, arm: ArmFile) -> Self:
         """This data set, if it is of this arm; else raises Refused with one line that names what differs."""
         differing = {
@@ -174,24 +181,29 @@ class DataWriter:
 
     def __init__(self, path: Path, manifest: Manifest, resume: bool = False) -> None:
         """Make the directory, or with `resume` go on with the one there; raises BadInput where that cannot be."""
-        lines = path / LINES
         if resume:
             _require_same(_read_manifest(path), manifest, path)
-        elif path.exists() and any(path.iterdir()):
+        elif path.exists() and any(each.name != PART for each in path.iterdir()):
             raise BadInput(f"{path}: not empty: choose another directory, or continue the sweep there with --resume")
         else:
             path.mkdir(parents=True, exist_ok=True)
-            part = path / (MANIFEST + ".part")
-            part.write_text(manifest.model_dump_json(by_alias=True, indent=1), encoding="utf-8")
-            part.replace(path / MANIFEST)
-        self._file = lines.open("ab+")
+            _write_manifest(manifest, path)
+        self._file = (path / LINES).open("ab+", buffering=0)
         self._drop_torn_line()
+        _keep_names(path)
 
     def append(self, line: Reading | PlanLine) -> None:
-        """Write one line and wait until it is on disk."""
-        self._file.write(line.model_dump_json().encode() + b"\n")
-        self._file.flush()
-        os.fsync(self._file.fileno())
+        """Write one line and wait until it is on disk; raises BadInput where the disk is full or fails."""
+        content = line.model_dump_json().encode() + b"\n"
+        try:
+            if self._file.write(content) < len(content):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise BadInput(
+                f"{self._file.name}: {error.strerror}: the last reading is not kept, those before it are;"
+                " mend the disk, then go on with --resume"
+            ) from None
 
     def __enter__(self) -> Self:
         """The writer itself."""
@@ -205,6 +217,23 @@ class DataWriter:
         self._file.seek(0)
         content = self._file.read()
         self._file.truncate(content.rfind(b"\n") + 1)
+
+
+def _write_manifest(manifest: Manifest, path: Path) -> None:
+    """Whole or not at all, and on disk before it has its name."""
+    with (path / PART).open("w", encoding="utf-8") as part:
+        part.write(manifest.model_dump_json(by_alias=True, indent=1))
+        part.flush()
+        os.fsync(part.fileno())
+    (path / PART).replace(path / MANIFEST)
+
+
+def _keep_names(path: Path) -> None:
+    """Wait until a directory's new names and its own are on disk: a power cut must not take them."""
+    for folder in (path, path.parent):
+        opened = os.open(folder, os.O_RDONLY)
+        os.fsync(opened)
+        os.close(opened)
 
 
 def _read_manifest(path: Path) -> Manifest:

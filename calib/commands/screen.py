@@ -15,6 +15,7 @@ from armlink.armfile import ArmFile
 from calib.plan_model import SweepPlan
 
 if TYPE_CHECKING:
+    from calib.dataset import SweepData
     from calib.preflight import Preflight
 
 _CONSOLE = Console(stderr=True, markup=False)  # units stand in brackets
@@ -101,6 +102,17 @@ def print_plan(arm: ArmFile, plan: SweepPlan) -> None:
     )
     for note in plan.notes:
         _CONSOLE.print(note, style="yellow", highlight=False)
+
+
+def unsettled_said(data: "SweepData") -> list[str]:
+    """In one line, which readings were taken of an arm that did not stand still; nothing where there are none."""
+    if not data.unsettled:
+        return []
+    places = list(dict.fromkeys(reading.sweep for reading in data.unsettled))
+    return [
+        f"{len(data.unsettled)} of {len(data.readings)} readings had not settled when their time was up, in"
+        f" {', '.join(places)}: they count less. Does a joint swing under its position loop?"
+    ]
 
 
 def _short(names: tuple[str, ...]) -> list[str]:

@@ -47,7 +47,7 @@ def sweep(
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
     from armlink.link import Link
-    from calib.commands.screen import SweepScreen, confirm, print_lines, print_plan, print_preflight
+    from calib.commands.screen import SweepScreen, confirm, print_lines, print_plan, print_preflight, unsettled_said
     from calib.description import model_arm
     from calib.geometry import check_plan
     from calib.guess import guess_of_model
@@ -89,6 +89,7 @@ def sweep(
     print_preflight(found)
     assert data.plan is not None
     print_plan(arm_file, data.plan)
+    print_lines(unsettled_said(data), "yellow")
     if not reference_mass:
         screen.say(
             f"{out} is complete. Now attach {data.plan.reference_mass:g} kg and sweep again with"
@@ -99,7 +100,7 @@ def sweep(
         "arm": arm_file.name,
         "serial": arm_file.serial,
         "readings": len(data.readings),
-        "unsettled": sum(not reading.settled for reading in data.readings),
+        "unsettled": len(data.unsettled),
         "seconds": data.readings[-1].t,
         "reference_mass": reference_mass,
         "recommended_reference_mass": data.plan.reference_mass,

@@ -1,6 +1,8 @@
 """Parts of the sweep that need no arm: trajectories, the settle rule, the data set on disk."""
 
 import json
+import resource
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ from hypothesis import strategies as st
 from sweep_arms import random_arm, synthetic_pass
 
 from armlink.errors import BadInput, Refused
+from calib.commands.screen import unsettled_said
 from calib.dataset import DataWriter, Manifest, PlanLine, Reading, load_data
 from calib.motion import trajectory
 from calib.plan import plan_sweep
@@ -100,6 +103,45 @@ def test_a_torn_last_line_is_left_out_and_overwritten_on_resume(tmp_path: Path, 
     with DataWriter(folder, Manifest.of(arm, 0.0), resume=True) as writer:
         writer.append(readings[2])
     assert load_data(folder).readings == readings
+
+
+def test_a_full_disk_is_said_in_one_line_and_loses_one_reading(tmp_path: Path) -> None:
+    """A file may not grow beyond what it is: as on a full disk, the write fails and what was there stands."""
+    arm = random_arm(1, 3)
+    readings = synthetic_pass(arm, Truth.of(arm), plan_sweep(arm), 0.0, np.random.default_rng(0)).readings[:3]
+    folder = tmp_path / "set"
+    with DataWriter(folder, Manifest.of(arm, 0.0)) as writer:
+        writer.append(readings[0])
+        unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
+        size = (folder / "readings.jsonl").stat().st_size
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size + 40, unlimited[1]))
+        try:
+            with pytest.raises(BadInput, match=r"readings\.jsonl: .*the last reading is not kept.*--resume"):
+                writer.append(readings[1])
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
+    assert load_data(folder).readings == readings[:1]
+    with DataWriter(folder, Manifest.of(arm, 0.0), resume=True) as writer:
+        writer.append(readings[1])
+    assert load_data(folder).readings == readings[:2]
+
+
+def test_a_data_set_whose_beginning_was_cut_off_can_be_begun_again(tmp_path: Path) -> None:
+    arm = random_arm(1, 3)
+    (tmp_path / "manifest.json.part").write_text('{"schema": "armlink.sw')
+    with DataWriter(tmp_path, Manifest.of(arm, 0.0)):
+        pass
+    assert load_data(tmp_path).readings == ()
+
+
+def test_unsettled_readings_are_told_with_their_sweeps() -> None:
+    arm = random_arm(1, 3)
+    data = synthetic_pass(arm, Truth.of(arm), plan_sweep(arm), 0.0, np.random.default_rng(0))
+    assert unsettled_said(data) == []
+    swung = data.readings[0].model_copy(update={"settled": False})
+    (line,) = unsettled_said(replace(data, readings=(swung, *data.readings[1:])))
+    assert line.startswith(f"1 of {len(data.readings)} readings had not settled")
+    assert "in scout: they count less" in line
 
 
 def test_a_missing_number_stays_missing(tmp_path: Path) -> None:

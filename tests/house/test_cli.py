@@ -46,6 +46,7 @@ def raising(error):
         (typer.Abort(), 130, "interrupted"),
         (FileNotFoundError(2, "No such file or directory", "gone.csv"), 2, "gone.csv: No such file or directory"),
         (PermissionError(13, "Permission denied", "/out"), 2, "/out: Permission denied"),
+        (OSError(28, "No space left on device"), 2, "work: No space left on device"),
     ],
 )
 def test_an_error_is_one_line_and_its_exit_status(command, capsys, error, status, line):
