@@ -79,7 +79,7 @@ def fit_rows(data: Sequence[SweepData]) -> FitRows:
     rated = np.array(first.rated_torque)
     unsettled = ~np.array([reading.settled for _, reading in rows])
     sigma = np.hypot(noise / np.sqrt(count)[:, None], FLOOR * rated)
-    swing = np.sqrt(np.maximum(std[unsettled] ** 2 - noise**2, 0.0))
+    swing = np.sqrt(np.maximum(np.nan_to_num(std[unsettled]) ** 2 - noise**2, 0.0))  # NaN: a sensor that was silent
     sigma[unsettled] = np.hypot(UNSETTLED * sigma[unsettled], swing)
     load = np.array([each.manifest.reference_mass for each, _ in rows])
     resolution = np.max([each.resolution for each in data], axis=0)

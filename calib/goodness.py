@@ -27,7 +27,7 @@ MOST_OUTLIERS = 0.15
 """Share of a joint's readings that may be left out as outliers; where there are more, the model is at fault."""
 PLATEAU, PLATEAU_POSES = 4.0, 4
 """Standard deviations within which readings count as equal; different poses at one extreme from which it is a limit."""
-SWING, MOST = 800.0, (90.0, 10.0)
+SWING, BULK = 800.0, (10.0, 90.0)
 """Standard deviations that a joint's torque must range over: else a sinusoid's own peak is as flat as a limit. Between
 these percentiles, for a knock makes no range."""
 BLURRED = 3.0
@@ -113,24 +113,28 @@ def _without_plateaus(names: tuple[str, ...], rows: FitRows) -> tuple[FitRows, l
     """The rows without readings at a torque beyond which a sensor never went though the arm moved: it saturates."""
     torque, flat, found = rows.readings.torque, np.zeros(rows.readings.torque.shape, dtype=bool), []
     for joint, name in enumerate(names):
-        counted = np.flatnonzero(rows.readings.counted[:, joint])
-        sigma = rows.readings.sigma[counted, joint]
-        sharp = sigma <= BLURRED * np.median(sigma)
-        counted, sigma = counted[sharp], sigma[sharp]
+        counted = _sharp(rows, joint)
+        value, sigma = torque[counted, joint], rows.readings.sigma[counted, joint]
+        if len(counted) < FEWEST or np.ptp(np.percentile(value, BULK)) < SWING * np.median(sigma):
+            continue
         for side in (1.0, -1.0):
-            value = side * torque[counted, joint]
-            if len(value) < FEWEST or np.subtract(*np.percentile(value, MOST)) < SWING * np.median(sigma):
-                continue
-            near = counted[value > value.max() - PLATEAU * sigma]
+            near = counted[side * value > np.max(side * value) - PLATEAU * sigma]
             poses = np.round(rows.readings.position[near], 1)
             distinct = np.unique(np.column_stack([poses, rows.readings.load[near]]), axis=0)
             if len(distinct) >= max(PLATEAU_POSES, 0.1 * len(counted)):
                 flat[near, joint] = True
-                limit = float(side * value.max())
+                limit = float(side * np.max(side * value))
                 text = f"{name}: {len(near)} readings at different poses stand at {limit:.4g} N·m: the sensor saturates"
                 found.append(Finding(name, "saturation", limit, "N·m", text))
     readings = replace(rows.readings, torque=np.where(flat, np.nan, torque))
     return (replace(rows, readings=readings) if found else rows), found
+
+
+def _sharp(rows: FitRows, joint: int) -> npt.NDArray[np.intp]:
+    """The rows in which a joint's reading counts and is exact enough to show a limit."""
+    counted = np.flatnonzero(rows.readings.counted[:, joint])
+    sigma = rows.readings.sigma[counted, joint]
+    return counted[sigma <= BLURRED * np.median(sigma)] if len(counted) else counted
 
 
 def leave_out(refined: Refined, rows: FitRows) -> tuple[LeftOut, ...]:

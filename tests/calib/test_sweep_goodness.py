@@ -12,6 +12,8 @@ from armlink.armfile import ArmFile, load_arm
 from calib.dataset import Reading, SweepData
 from calib.description import gcomp_arm
 from calib.encoder_bits import missing_bit, stuck_bits
+from calib.fit_rows import fit_rows
+from calib.goodness import _without_plateaus
 from calib.identify import identify_gravity
 from calib.plan import plan_sweep
 from calib.scout import rough_model
@@ -206,6 +208,25 @@ def test_an_arm_that_swung_while_it_was_read_counts_by_its_swing(upright) -> Non
     assert fit.findings == ()
     for parameter in ("gain", "offset", "position_gain"):
         assert np.nanmax(np.abs(z_scores(fit, truth, parameter))) < 4
+
+
+def test_a_sensor_that_was_silent_while_the_arm_had_not_settled_tells_nothing_and_breaks_nothing(sound) -> None:
+    arm, truth, data = sound
+    (first, *others), silent = data[0].readings, (float("nan"), *data[0].readings[0].torque[1:])
+    update = {"settled": False, "torque": silent, "torque_std": (float("nan"), *first.torque_std[1:])}
+    fit = fit_sensors(arm, [replace(data[0], readings=(first.model_copy(update=update), *others)), *data[1:]])
+    assert fit.findings == ()
+    assert np.abs(z_scores(fit, truth, "gain")).max() < 4
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_joint_without_readings_shows_no_limit(sound) -> None:
+    arm, _, data = sound
+    rows = fit_rows(data)
+    torque = rows.readings.torque.copy()
+    torque[:, JOINT] = np.nan
+    silent = replace(rows, readings=replace(rows.readings, torque=torque))
+    assert _without_plateaus(arm.joint_names, silent) == (silent, [])
 
 
 @pytest.mark.parametrize(("bit", "level"), [(6, 0), (9, 1), (11, 0)])
