@@ -83,6 +83,11 @@ class Mover:
         self.contacts: dict[tuple[int, int], float] = {}
         """(joint, side) → reading at which that stop was found [rad]."""
 
+    @property
+    def known_resolution(self) -> Array:
+        """Smallest step that each position sensor has shown (n,) [rad]; 0 where it has shown none."""
+        return np.where(np.isfinite(self.resolution), self.resolution, 0.0)
+
     def average_to(self, share: float) -> None:
         """From now on average readings to this standard error, a share of rated torque."""
         self.rule = SettleRule.of(self.section, share * self.limits.rated, self.link.period)
@@ -177,9 +182,8 @@ class Mover:
 
     def rest(self, counts: Flags) -> Rest:
         """Wait until all has settled and the torque averages that `counts` (n,) are exact enough; raises Slipped."""
-        rule, samples = self.rule, list[Sample]()
+        rule, samples, resolution = self.rule, list[Sample](), self.known_resolution
         begin: int | None = None
-        resolution = np.where(np.isfinite(self.resolution), self.resolution, 0.0)
 
         def settled(some: list[Sample]) -> bool:
             return rule.settled(stack(some, "position"), stack(some, "torque"), counts, resolution)
@@ -202,8 +206,8 @@ class Mover:
                     begin = None  # it only stood at a turning point
 
     def _stand(self, joints: Flags) -> None:
-        """Wait until pressed joints stand; raises Slipped where one leaves its stop."""
-        still = np.maximum(BOUNCE_STILL, 1.5 * np.where(np.isfinite(self.resolution), self.resolution, 0.0))
+        """Wait until pressed joints stand, `BOUNCE_SECONDS` at most; raises Slipped where one leaves its stop."""
+        still = np.maximum(BOUNCE_STILL, 1.5 * self.known_resolution)
         look = max(int(BOUNCE_LOOK / self.link.period), 2)
         for _ in range(round(BOUNCE_SECONDS / BOUNCE_LOOK)):
             low, high = self.position.copy(), self.position.copy()

@@ -61,10 +61,9 @@ def run_sweep(
             check_plan(arm, first)
             run.total = first.readings
             run.scout(first)
-            resolution = np.where(np.isfinite(mover.resolution), mover.resolution, 0.0)
-            plan = _final_plan(arm, first, run.readings, reference_mass, seed, resolution)
+            plan = _final_plan(arm, first, run.readings, reference_mass, seed, mover.known_resolution)
             check_plan(arm, plan)
-            writer.append(PlanLine(plan=plan, resolution=tuple(resolution.tolist())))
+            writer.append(PlanLine(plan=plan, resolution=tuple(mover.known_resolution.tolist())))
         else:
             plan = data.plan
             mover.resolution = np.where(data.resolution > 0, data.resolution, np.inf)
