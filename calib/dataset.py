@@ -18,10 +18,10 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, V
 from armlink.armfile import ArmFile, describe, load_arm
 from armlink.errors import BadInput, Refused
 from calib.plan_model import SweepPlan
+from calib.whole_file import part_of, write_whole
 
 Array = npt.NDArray[np.float64]
 MANIFEST, LINES = "manifest.json", "readings.jsonl"
-PART = MANIFEST + ".part"
 
 
 class _Model(BaseModel):
@@ -183,11 +183,11 @@ class DataWriter:
         """Make the directory, or with `resume` go on with the one there; raises BadInput where that cannot be."""
         if resume:
             _require_same(_read_manifest(path), manifest, path)
-        elif path.exists() and any(each.name != PART for each in path.iterdir()):
+        elif path.exists() and any(each != part_of(path / MANIFEST) for each in path.iterdir()):
             raise BadInput(f"{path}: not empty: choose another directory, or continue the sweep there with --resume")
         else:
             path.mkdir(parents=True, exist_ok=True)
-            _write_manifest(manifest, path)
+            write_whole(path / MANIFEST, manifest.model_dump_json(by_alias=True, indent=1))
         self._file = (path / LINES).open("ab+", buffering=0)
         self._drop_torn_line()
         _keep_names(path)
@@ -217,15 +217,6 @@ class DataWriter:
         self._file.seek(0)
         content = self._file.read()
         self._file.truncate(content.rfind(b"\n") + 1)
-
-
-def _write_manifest(manifest: Manifest, path: Path) -> None:
-    """Whole or not at all, and on disk before it has its name."""
-    with (path / PART).open("w", encoding="utf-8") as part:
-        part.write(manifest.model_dump_json(by_alias=True, indent=1))
-        part.flush()
-        os.fsync(part.fileno())
-    (path / PART).replace(path / MANIFEST)
 
 
 def _keep_names(path: Path) -> None:

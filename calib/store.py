@@ -15,6 +15,7 @@ from armlink.errors import BadInput, Refused
 from calib.database import default_url, first_line, open_database, transaction
 from calib.records import CalibrationRecord, GravityRecord, Record, parse_record
 from calib.schema import ACTIVATIONS, RECORDS, WRITES
+from calib.whole_file import write_whole
 
 R = TypeVar("R", CalibrationRecord, GravityRecord)
 AnyRecord = CalibrationRecord | GravityRecord
@@ -187,9 +188,7 @@ def load_yaml(path: Path) -> AnyRecord:
 
 def export_yaml(record: Record, path: Path) -> None:
     """Write a record to a YAML file, whole or not at all."""
-    part = path.with_name(path.name + ".part")
-    part.write_text(record.to_yaml(), encoding="utf-8")
-    part.replace(path)
+    write_whole(path, record.to_yaml())
 
 
 def _now() -> str:
