@@ -7,7 +7,7 @@ import sys
 from importlib.metadata import EntryPoint, entry_points, version
 from pathlib import Path
 
-from armlink.signals import terminate_as_interrupt
+from armlink.termination import terminate_as_interrupt
 
 PURPOSE = (
     "Calibrates a robot arm's joint torque sensors over CAN, learns its gravity model, explains the sim-to-real gap."

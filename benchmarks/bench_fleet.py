@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 from side_by_side import Case
 
-from armlink.recording import Recording, save_recording
-from sim_gap.cluster import cluster
-from sim_gap.fleet import diagnose_fleet, find_cases
+from armlink.recording.recording import Recording, save_recording
+from sim_gap.fleet.cluster import cluster
+from sim_gap.fleet.fleet import diagnose_fleet, find_cases
 
 RECORDINGS = 200
 SECONDS, RATE = 15.0, 50.0

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from side_by_side import Case, Figure, seconds
 
-from armlink.recording import Recording
-from sim_gap.diagnose import diagnose
+from armlink.recording.recording import Recording
+from sim_gap.attribution.diagnose import diagnose
 from sim_gap.effects.registry import layout_of
-from sim_gap.model import load_model, read_spec
-from sim_gap.regime import by_joint
-from sim_gap.residual import ResidualSet
-from sim_gap.signals import prepare
+from sim_gap.model.load import load_model, read_spec
+from sim_gap.residuals.preprocess import prepare
+from sim_gap.residuals.residual_set import ResidualSet
+from sim_gap.residuals.where import by_joint
 
 Array = NDArray[np.float64]
 ARM = "sarcos"

@@ -4,13 +4,13 @@ import numpy as np
 import pinocchio as pin
 from side_by_side import Case, seconds
 
-from armlink.armfile import load_arm
-from calib.description import gcomp_arm
-from gcomp.arm import Arm
-from gcomp.gravity import gravity_regressor, gravity_torque
-from gcomp.kernel import GravityModel
-from gcomp.moments import base_parameters
-from sim_bus.section import sim_section
+from armlink.arm_file import load_arm
+from calib.arm.kinematics import gcomp_arm
+from gcomp.arm.arm import Arm
+from gcomp.arm.mass_moments import base_parameters
+from gcomp.gravity.batch import GravityModel
+from gcomp.gravity.torque import gravity_regressor, gravity_torque
+from sim_bus.sim_section import sim_section
 
 POSES = 10_000
 

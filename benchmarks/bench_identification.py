@@ -8,12 +8,12 @@ import pinocchio as pin
 from bench_gravity import pinocchio_model
 from side_by_side import Case, seconds
 
-from armlink.armfile import load_arm
-from calib.description import gcomp_arm
-from gcomp.gravity import gravity_torque
-from gcomp.moments import base_parameters
-from gcomp.streaming import MomentAccumulator, MomentFit
-from sim_bus.section import sim_section
+from armlink.arm_file import load_arm
+from calib.arm.kinematics import gcomp_arm
+from gcomp.arm.mass_moments import base_parameters
+from gcomp.gravity.torque import gravity_torque
+from gcomp.identify.accumulator import MomentAccumulator, MomentFit
+from sim_bus.sim_section import sim_section
 
 SAMPLES, SIGMA = 10_000, 0.05
 

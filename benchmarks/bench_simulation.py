@@ -6,10 +6,10 @@ import time
 import numpy as np
 from side_by_side import Case
 
-from armlink.armfile import load_arm
-from armlink.link import Link
-from armlink.sample import Command
-from sim_bus.bus import LockStepBus
+from armlink.arm_file import load_arm
+from armlink.link.link import Link
+from armlink.link.types import Command
+from sim_bus.bus.lock_step import LockStepBus
 
 CYCLES = 500
 

@@ -40,8 +40,8 @@ def main(channel: str = "vcan0", seconds: float = 40.0, phase: Path | None = Non
     """Measure for so many seconds and print the figures; `phase` is told what is going on, for `outside`."""
     from daemon_bench import good_records
 
-    from armlink.armfile import load_arm
-    from calib.store import RecordStore
+    from armlink.arm_file import load_arm
+    from calib.records.store import RecordStore
     from sim_bus.truth import Truth
 
     def tell(what: str) -> None:

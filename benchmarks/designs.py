@@ -4,16 +4,16 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from armlink.armfile import load_arm
-from calib.description import gcomp_arm
-from gcomp.arm import Arm
-from gcomp.design import Sweep, choose_sweeps, readings_of, stop_combinations
-from gcomp.global_fit import Prediction, predict_covariance
-from gcomp.gravity import torque_covariance
-from gcomp.moments import base_parameters
-from gcomp.parameters import Parameters
-from gcomp.readings import Readings
-from sim_bus.section import sim_section
+from armlink.arm_file import load_arm
+from calib.arm.kinematics import gcomp_arm
+from gcomp.arm.arm import Arm
+from gcomp.arm.mass_moments import base_parameters
+from gcomp.design.sweep_design import Sweep, choose_sweeps, readings_of, stop_combinations
+from gcomp.gravity.torque import torque_covariance
+from gcomp.identify.global_fit import Prediction, predict_covariance
+from gcomp.identify.parameters import Parameters
+from gcomp.identify.readings import Readings
+from sim_bus.sim_section import sim_section
 
 SIGMA = np.array([0.15, 0.15, 0.08, 0.06, 0.03, 0.03, 0.02])
 STEPS, RANDOM_DESIGNS, LOADS = 25, 100, (0.0, 2.0)

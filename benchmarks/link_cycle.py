@@ -15,11 +15,11 @@ import time
 import canopen
 from echo_nodes import NODES, answer_in_kernel, make_arm, remove_gateway, start_nodes
 
-from armlink import data_sheet
-from armlink.bus import open_bus
+from armlink.bus.open import open_bus
+from armlink.canopen import eds_file as data_sheet
 from armlink.clock import MonotonicClock
-from armlink.link import Link
-from armlink.sample import Command
+from armlink.link.link import Link
+from armlink.link.types import Command
 
 FRAMES = 2 * len(NODES) + 1
 

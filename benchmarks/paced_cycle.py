@@ -12,11 +12,11 @@ import time
 import numpy as np
 from echo_nodes import NODES, answer_in_kernel, make_arm, remove_gateway, start_nodes
 
-from armlink.bus import open_bus
-from armlink.bus_load import frame_bits, longest_frame_bits
-from armlink.link import Link
-from armlink.pdo import RPDO1
-from armlink.sample import Command
+from armlink.bus.frame_bits import frame_bits, longest_frame_bits
+from armlink.bus.open import open_bus
+from armlink.canopen.pdo import RPDO1
+from armlink.link.link import Link
+from armlink.link.types import Command
 
 
 def main(channel: str = "vcan0", seconds: float = 60.0, rate: float = 250.0) -> None:

@@ -8,20 +8,20 @@ from contextlib import contextmanager
 import numpy as np
 from numpy.typing import NDArray
 
-from armlink.armfile import ArmFile
+from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
-from sim_bus.cia402 import State
-from sim_bus.drives import Drives
 from sim_bus.effects.state import Entry, imperfections
-from sim_bus.nmt import RESET_NODE, NetworkManagement
-from sim_bus.node import Node
-from sim_bus.pdo import Frame, PdoGroup, PdoTable
-from sim_bus.plant import Plant
-from sim_bus.section import sim_section
-from sim_bus.sensors import Sensors
-from sim_bus.settings import APPLIED, bring_into_force, power_on_values
-from sim_bus.signals import Key, Signals
-from sim_bus.supervision import Supervision
+from sim_bus.node.cia402 import State
+from sim_bus.node.controller_settings import APPLIED, bring_into_force, power_on_values
+from sim_bus.node.drives import Drives
+from sim_bus.node.nmt import RESET_NODE, NetworkManagement
+from sim_bus.node.node import Node
+from sim_bus.node.object_arrays import Key, Signals
+from sim_bus.node.pdo import Frame, PdoGroup, PdoTable
+from sim_bus.node.supervision import Supervision
+from sim_bus.physics.plant import Plant
+from sim_bus.physics.sensors import Sensors
+from sim_bus.sim_section import sim_section
 from sim_bus.truth import Truth
 
 Array = NDArray[np.float64]

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from armlink.armfile import ArmFile
-from sim_bus.section import sim_section
+from armlink.arm_file import ArmFile
+from sim_bus.sim_section import sim_section
 
 Array = NDArray[np.float64]
 GAIN_RANGE = (0.9, 1.1)

@@ -8,7 +8,7 @@ import typer
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from armlink.selftest import Result
+    from armlink.selftest.without_power import Result
 
 SCHEMA = "armlink.check/1"
 WARNING = (
@@ -37,11 +37,11 @@ def check(
     """
     from rich.console import Console
 
-    from armlink.armfile import load_arm
+    from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
     from armlink.errors import BadInput, BusFault, Refused
-    from armlink.link import Link
-    from armlink.selftest import SelfTest
+    from armlink.link.link import Link
+    from armlink.selftest.without_power import SelfTest
 
     console = Console(stderr=True)
     described = load_arm(arm)

@@ -35,11 +35,11 @@ def monitor(
     from rich.console import Console
     from rich.live import Live
 
-    from armlink.armfile import load_arm
-    from armlink.bus import open_link_bus
+    from armlink.arm_file import load_arm
+    from armlink.bus.open import open_link_bus
     from armlink.commands.output import write_json
     from armlink.errors import BusFault
-    from armlink.monitor import Monitor
+    from armlink.monitor.monitor import Monitor
 
     arm_file = load_arm(arm)
     opened = open_link_bus(bus, arm_file.require_link())

@@ -33,13 +33,13 @@ def record(
 
     from rich.console import Console
 
-    from armlink.armfile import load_arm
-    from armlink.bus import open_link_bus
+    from armlink.arm_file import load_arm
+    from armlink.bus.frame_log import FrameLog, TappedBus
+    from armlink.bus.open import open_link_bus
     from armlink.commands.output import write_json
     from armlink.errors import BadInput, BusFault
-    from armlink.frames import FrameLog, TappedBus
-    from armlink.recorder import Recorder
-    from armlink.recording_mcap import RecordingWriter
+    from armlink.recording.mcap import RecordingWriter
+    from armlink.recording.recorder import Recorder
 
     arm_file = load_arm(arm)
     if out is None and frames is None:

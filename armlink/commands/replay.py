@@ -31,12 +31,12 @@ def replay(
     """
     from rich.console import Console
 
-    from armlink.armfile import load_arm
+    from armlink.arm_file import load_arm
+    from armlink.bus.frame_log import is_log
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
-    from armlink.frames import is_log
-    from armlink.recording import load_recording, save_recording
-    from armlink.replay import play_onto, recording_of_log, show
+    from armlink.recording.recording import load_recording, save_recording
+    from armlink.recording.replay import play_onto, recording_of_log, show
 
     arm_file = load_arm(arm)
     console = Console(stderr=True)

@@ -21,15 +21,15 @@ def scan(
     from rich.console import Console
     from rich.table import Table
 
-    from armlink.armfile import Bus, load_arm
-    from armlink.bus import open_bus, open_link_bus
+    from armlink.arm_file import Bus, load_arm
+    from armlink.bus.open import open_bus, open_link_bus
+    from armlink.bus.port import open_port
+    from armlink.canopen.eds_file import expected_identity, of_joints
     from armlink.clock import MonotonicClock
     from armlink.commands.output import write_json
-    from armlink.data_sheet import expected_identity, of_joints
-    from armlink.device import identity_mismatches, refused_identity
     from armlink.errors import BadInput, BusFault
-    from armlink.port import open_port
-    from armlink.scan import describe_type, scan_bus
+    from armlink.link.controller_setup import identity_mismatches, refused_identity
+    from armlink.monitor.scan import describe_type, scan_bus
 
     if arm is None and bus is None:
         raise BadInput("scan: give an arm file, or --bus INTERFACE:CHANNEL[@BITRATE]")

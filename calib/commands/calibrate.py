@@ -9,8 +9,8 @@ import typer
 from calib.commands.options import Bus, Check, Flash, JsonFile, Replaced, Store
 
 if TYPE_CHECKING:
-    from calib.records import CalibrationRecord, Parameter
-    from calib.sensors import SensorFit
+    from calib.fit.sensor_fit import SensorFit
+    from calib.records.records import CalibrationRecord, Parameter
 
 
 def calibrate(
@@ -35,12 +35,12 @@ def calibrate(
     """
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
-    from calib.applying import Apply, apply_calibration
     from calib.commands.screen import print_lines
-    from calib.dataset import load_data
-    from calib.records import CalibrationRecord
-    from calib.sensors import fit_sensors
-    from calib.store import RecordStore
+    from calib.fit.sensor_fit import fit_sensors
+    from calib.install.apply import Apply, apply_calibration
+    from calib.records.records import CalibrationRecord
+    from calib.records.store import RecordStore
+    from calib.sweep.dataset import load_data
 
     if not directories:
         raise BadInput("calibrate: give the directories that armlink sweep wrote")
@@ -70,7 +70,7 @@ def calibrate(
 
 
 def _answer(fit: "SensorFit", record: "CalibrationRecord", applied: bool) -> dict[str, Any]:
-    from calib.records import PARAMETERS
+    from calib.records.records import PARAMETERS
 
     return {
         "schema": "armlink.calibration/1",

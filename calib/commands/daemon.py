@@ -44,11 +44,11 @@ def daemon(
 
     Example: armlink daemon sarcos --bus socketcan:can0 --listen-only --policy propose
     """
-    from armlink.armfile import load_arm
-    from armlink.bus import resolve_bus
+    from armlink.arm_file import load_arm
+    from armlink.bus.open import resolve_bus
     from armlink.errors import BadInput
-    from calib.daemon.host import ChildHost
     from calib.daemon.logs import log_as_json
+    from calib.daemon.loop.loop_process import ChildHost
     from calib.daemon.options import Options, state_directory
 
     described = load_arm(arm)
@@ -73,7 +73,7 @@ def daemon(
     )
     log_as_json()
     host = ChildHost(options.loop(described), fork=True)
-    from calib.daemon.run import run_daemon  # which takes long to load: the bus process opens the bus meanwhile
+    from calib.daemon.main_loop import run_daemon  # which takes long to load: the bus process opens the bus meanwhile
 
     run_daemon(options, described, directory, host)
     return 0

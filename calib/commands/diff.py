@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from calib.diff import Change
-    from calib.records import CalibrationRecord, GravityRecord
-    from calib.store import RecordStore
+    from calib.records.compare import Change
+    from calib.records.records import CalibrationRecord, GravityRecord
+    from calib.records.store import RecordStore
 
 STRIKING = 3.0
 """Standard deviations from which on a change stands out in the table."""
@@ -27,8 +27,8 @@ def diff(
     Example: armlink diff 1f0c9a2b 77e01d3c --json -
     """
     from armlink.commands.output import write_json
-    from calib.diff import differences
-    from calib.store import RecordStore
+    from calib.records.compare import differences
+    from calib.records.store import RecordStore
 
     records = RecordStore(store)
     old, new = (_record(records, each) for each in (before, after))
@@ -44,7 +44,7 @@ def diff(
 
 def _record(records: "RecordStore", given: str) -> "CalibrationRecord | GravityRecord":
     """A record by its id, or out of a YAML file, of whatever arm."""
-    from calib.store import load_yaml
+    from calib.records.store import load_yaml
 
     return load_yaml(Path(given)) if given.endswith((".yaml", ".yml")) else records.get(given)
 

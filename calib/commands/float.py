@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from armlink.armfile import ArmFile
-    from calib.records import Array, CalibrationRecord
+    from armlink.arm_file import ArmFile
+    from calib.records.records import Array, CalibrationRecord
 
 
 def hold_afloat(
@@ -30,10 +30,10 @@ def hold_afloat(
     """
     from rich.console import Console
 
-    from armlink.armfile import load_arm
+    from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
-    from armlink.link import Link
-    from calib.float_run import run_float
+    from armlink.link.link import Link
+    from calib.floating.run import run_float
 
     arm_file = load_arm(arm)
     beta, calibration, source = _model(arm_file, record, store)
@@ -63,9 +63,9 @@ def _model(arm_file: "ArmFile", record: str | None, store: str | None) -> "tuple
     import numpy as np
 
     from armlink.errors import BadInput, Refused
-    from calib.description import model_arm
-    from calib.records import CalibrationRecord, GravityRecord
-    from calib.store import RecordStore
+    from calib.arm.kinematics import model_arm
+    from calib.records.records import CalibrationRecord, GravityRecord
+    from calib.records.store import RecordStore
 
     records = RecordStore(store)
     calibration = records.current(CalibrationRecord, arm_file)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from calib.store import Activation, ControllerWrite
+    from calib.records.store import Activation, ControllerWrite
 
 
 def history(
@@ -28,10 +28,10 @@ def history(
 
     Example: armlink history sarcos --json -
     """
-    from armlink.armfile import load_arm
+    from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
-    from calib.store import RecordStore
+    from calib.records.store import RecordStore
 
     arm_file, records = load_arm(arm), RecordStore(store)
     if activate and import_file is None:

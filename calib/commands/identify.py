@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from calib.identify import GravityFit
+    from calib.fit.gravity_fit import GravityFit
 
 
 def identify(
@@ -26,11 +26,11 @@ def identify(
     """
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
-    from calib.dataset import load_data
-    from calib.identify import identify_gravity
-    from calib.records import CalibrationRecord
-    from calib.sensors import SensorFit, fit_sensors
-    from calib.store import RecordStore
+    from calib.fit.gravity_fit import identify_gravity
+    from calib.fit.sensor_fit import SensorFit, fit_sensors
+    from calib.records.records import CalibrationRecord
+    from calib.records.store import RecordStore
+    from calib.sweep.dataset import load_data
 
     if not directories:
         raise BadInput("identify: give the directories that armlink sweep wrote")

@@ -9,10 +9,10 @@ import typer
 from calib.commands.options import Bus, Check, Flash, JsonFile, Replaced, Store
 
 if TYPE_CHECKING:
-    from armlink.armfile import ArmFile
-    from calib.field import FieldFit
-    from calib.field_rows import FieldRows
-    from calib.records import CalibrationRecord
+    from armlink.arm_file import ArmFile
+    from calib.field.field_fit import FieldFit
+    from calib.field.rows import FieldRows
+    from calib.records.records import CalibrationRecord
 
 
 def recalibrate(
@@ -38,13 +38,13 @@ def recalibrate(
 
     Example: armlink recalibrate sarcos slow.mcap --json -
     """
-    from armlink.armfile import load_arm
+    from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
     from armlink.errors import Refused
-    from calib.field import fit_field
-    from calib.field_record import field_record
-    from calib.records import CalibrationRecord, GravityRecord
-    from calib.store import RecordStore
+    from calib.field.field_fit import fit_field
+    from calib.field.field_record import field_record
+    from calib.records.records import CalibrationRecord, GravityRecord
+    from calib.records.store import RecordStore
 
     arm_file, records = load_arm(arm), RecordStore(store)
     gravity, before = records.current(GravityRecord, arm_file), records.current(CalibrationRecord, arm_file)
@@ -57,7 +57,7 @@ def recalibrate(
     if apply:
         import numpy as np
 
-        from calib.applying import Apply, apply_field
+        from calib.install.apply import Apply, apply_field
 
         user = getpass.getuser()
         record = record.model_copy(update={"confirmed_by": user})
@@ -78,9 +78,9 @@ def _rows(
     import numpy as np
 
     from armlink.errors import BadInput
-    from armlink.recording import load_recording
-    from calib.dataset import load_data
-    from calib.field_rows import join, rows_of_recording, rows_of_sweeps
+    from armlink.recording.recording import load_recording
+    from calib.field.rows import join, rows_of_recording, rows_of_sweeps
+    from calib.sweep.dataset import load_data
 
     n = len(arm_file.joint_names)
     gain, offset = (np.ones(n), np.zeros(n)) if held is None else (held.values("gain", 1.0), held.values("offset", 0.0))

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from armlink.armfile import ArmFile
-    from calib.records import CalibrationRecord
-    from calib.store import RecordStore
+    from armlink.arm_file import ArmFile
+    from calib.records.records import CalibrationRecord
+    from calib.records.store import RecordStore
 
 
 def rollback(
@@ -27,10 +27,10 @@ def rollback(
 
     Example: armlink rollback sarcos --to 1f0c9a2b --reason "sensor exchanged" --apply
     """
-    from armlink.armfile import load_arm
+    from armlink.arm_file import load_arm
     from armlink.errors import BadInput
-    from calib.records import CalibrationRecord
-    from calib.store import RecordStore
+    from calib.records.records import CalibrationRecord
+    from calib.records.store import RecordStore
 
     arm_file, records, user = load_arm(arm), RecordStore(store), getpass.getuser()
     if apply:
@@ -52,8 +52,8 @@ def _apply(
     arm_file: "ArmFile", record: "CalibrationRecord", records: "RecordStore", bus: str | None, user: str, reason: str
 ) -> None:
     """Write the record to every controller, read back, and make it current; the joints need not be enabled."""
-    from armlink.link import Link
-    from calib.writing import install
+    from armlink.link.link import Link
+    from calib.install.journaled_write import install
 
     with Link.open(arm_file, bus) as link:
         link.start()

@@ -11,12 +11,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
-from armlink.armfile import ArmFile
-from calib.plan_model import SweepPlan
+from armlink.arm_file import ArmFile
+from calib.plan.types import SweepPlan
 
 if TYPE_CHECKING:
-    from calib.dataset import SweepData
-    from calib.preflight import Preflight
+    from calib.sweep.dataset import SweepData
+    from calib.sweep.preflight import Preflight
 
 _CONSOLE = Console(stderr=True, markup=False)  # units stand in brackets
 

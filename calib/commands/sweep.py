@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from armlink.armfile import ArmFile
-    from armlink.link import Link
+    from armlink.arm_file import ArmFile
+    from armlink.link.link import Link
 
 
 def sweep(
@@ -43,19 +43,19 @@ def sweep(
 
     Example: armlink sweep sarcos --bus socketcan:vcan0 --out unloaded
     """
-    from armlink.armfile import load_arm
+    from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
-    from armlink.link import Link
+    from armlink.link.link import Link
+    from calib.arm.kinematics import model_arm
+    from calib.arm.sweep_section import with_hold
     from calib.commands.screen import SweepScreen, confirm, print_lines, print_plan, print_preflight, unsettled_said
-    from calib.description import model_arm
-    from calib.geometry import check_plan
-    from calib.guess import guess_of_model
-    from calib.plan import plan_sweep
-    from calib.plan_picture import draw_plan, seconds
-    from calib.preflight import find_stops, listen
-    from calib.runner import run_sweep
-    from calib.section import with_hold
+    from calib.plan.collisions import check_plan
+    from calib.plan.drawing import draw_plan, seconds
+    from calib.plan.rough_gravity import guess_of_model
+    from calib.plan.sweep_plan import plan_sweep
+    from calib.sweep.preflight import find_stops, listen
+    from calib.sweep.run import run_sweep
 
     arm_file = with_hold(load_arm(arm), hold)
     if plan:
@@ -111,7 +111,7 @@ def sweep(
 
 def _dry_link(arm_file: "ArmFile", reference_mass: float) -> "Link":
     """A link to the simulated arm that the arm file describes, with the mass attached where there is one."""
-    from armlink.link import Link
+    from armlink.link.link import Link
 
     link = Link.open(arm_file, f"armlink_sim:{arm_file.path}")
     if reference_mass:

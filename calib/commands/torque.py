@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from gcomp.arm import Arm
+    from gcomp.arm.arm import Arm
 
     Array = npt.NDArray[np.float64]
 
@@ -38,8 +38,8 @@ def torque(
     from rich.table import Table
 
     from armlink.commands.output import write_json
-    from calib.poses import load_poses
-    from gcomp.gravity import gravity_torque
+    from calib.commands.poses_csv import load_poses
+    from gcomp.gravity.torque import gravity_torque
 
     described, beta, source = _model(arm, tip, record, store)
     poses = load_poses(q, described.n)
@@ -56,12 +56,12 @@ def _model(arm: str, tip: str | None, record: str | None, store: str | None) -> 
     """The arm, its mass moments (2n,) [kg·m], and where these come from; raises BadInput or Refused."""
     import numpy as np
 
-    from armlink.armfile import load_arm
+    from armlink.arm_file import load_arm
     from armlink.errors import BadInput, Refused
-    from calib.description import gcomp_arm, model_arm
-    from calib.records import GravityRecord
-    from calib.store import RecordStore
-    from gcomp.model import load_model
+    from calib.arm.kinematics import gcomp_arm, model_arm
+    from calib.records.records import GravityRecord
+    from calib.records.store import RecordStore
+    from gcomp.arm.load import load_model
 
     if Path(arm).suffix.lower() in MODEL_SUFFIXES:
         if record is not None:

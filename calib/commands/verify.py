@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from calib.records import CalibrationRecord, GravityRecord
-    from calib.verify import Verification
+    from calib.records.records import CalibrationRecord, GravityRecord
+    from calib.sweep.verify import Verification
 
 
 def verify(
@@ -28,12 +28,12 @@ def verify(
 
     Example: armlink verify sarcos --bus socketcan:vcan0 --poses 40 --json -
     """
-    from armlink.armfile import load_arm
+    from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
-    from armlink.link import Link
+    from armlink.link.link import Link
     from calib.commands.screen import SweepScreen
-    from calib.store import RecordStore
-    from calib.verify import run_verify
+    from calib.records.store import RecordStore
+    from calib.sweep.verify import run_verify
 
     arm_file = load_arm(arm)
     with Link.open(arm_file, bus) as link:
@@ -54,7 +54,7 @@ def verify(
 def _records(store: Any, arm_file: Any, ids: list[str]) -> "tuple[GravityRecord, CalibrationRecord | None]":
     """The records named, else the current ones; raises Refused where there is no gravity record."""
     from armlink.errors import Refused
-    from calib.records import CalibrationRecord, GravityRecord
+    from calib.records.records import CalibrationRecord, GravityRecord
 
     named = [store.get(record).require(arm_file) for record in ids]
     gravity = next((each for each in named if isinstance(each, GravityRecord)), None)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from armlink.armfile import ArmFile
-from calib.daemon.messages import LoopOptions
+from armlink.arm_file import ArmFile
+from calib.daemon.loop.loop_messages import LoopOptions
 from calib.daemon.settings import DaemonSection, Policy, daemon_section
 
 

@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from calib.daemon.journal import ProposalRow
-from calib.daemon.models import Proposal
-from calib.daemon.wording import clean
-from calib.decision import Finding
+from calib.daemon.state.journal import ProposalRow
+from calib.daemon.view.api_models import Proposal
+from calib.daemon.view.event_text import clean
+from calib.observer.decision import Finding
 
 
 def proposal_answer(row: ProposalRow) -> Proposal:

@@ -9,25 +9,25 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol
 
-from armlink import emcy
-from armlink.armfile import ArmFile
-from calib.daemon.in_force import InForce
-from calib.daemon.journal import Journal
-from calib.daemon.keeping import Keeping
-from calib.daemon.messages import Batch, Down, Message, Progress, Reply, Up
-from calib.daemon.models import EventItem, EventRecord, State
-from calib.daemon.outside import Jobs
-from calib.daemon.recalibrations import Recalibrations
-from calib.daemon.recordings import Recordings
+from armlink.arm_file import ArmFile
+from armlink.canopen import emcy
+from calib.daemon.loop.loop_messages import Batch, Down, Message, Progress, Reply, Up
+from calib.daemon.observer_feed import Watcher
+from calib.daemon.pose_tours import Tours
+from calib.daemon.recalibration_workflow import Recalibrations
+from calib.daemon.service_hooks import Jobs
 from calib.daemon.settings import DaemonSection
-from calib.daemon.stream import Hub
-from calib.daemon.tours import Tours
-from calib.daemon.watcher import Watcher
-from calib.daemon.wording import clean, one_alarm_a_joint, told
-from calib.events import Event
-from calib.records import CalibrationRecord, GravityRecord
-from calib.store import RecordStore
-from calib.writing import Controllers
+from calib.daemon.state.active_records import InForce
+from calib.daemon.state.journal import Journal
+from calib.daemon.state.persistence import Keeping
+from calib.daemon.state.recordings import Recordings
+from calib.daemon.view.api_models import EventItem, EventRecord, State
+from calib.daemon.view.event_text import clean, one_alarm_a_joint, told
+from calib.daemon.view.fan_out import Hub
+from calib.install.journaled_write import Controllers
+from calib.observer.events import Event
+from calib.records.records import CalibrationRecord, GravityRecord
+from calib.records.store import RecordStore
 
 CLOCK_JUMP = 2.0
 """A wall clock that moves by so much more or less than the monotonic one was set [s]."""

@@ -5,8 +5,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, FiniteFloat, PositiveFloat, field_validator
 
-from armlink.armfile import ArmFile, Section
-from calib.observer_config import ObserverConfig
+from armlink.arm_file import ArmFile, Section
+from calib.observer.config import ObserverConfig
 
 Policy = Literal["observe", "propose", "apply"]
 
@@ -40,7 +40,7 @@ class DaemonSection(Section):
     """Whether the daemon, where it drives the bus, moves the arm among random poses: a stand-in for ordinary work."""
     recording: RecordingSettings = RecordingSettings()
     observer: dict[str, FiniteFloat] = Field(default_factory=dict)
-    """Thresholds of the observer (calib/observer_config.py) that differ from their defaults."""
+    """Thresholds of the observer (calib/observer/config.py) that differ from their defaults."""
 
     @field_validator("observer")
     @classmethod

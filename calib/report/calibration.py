@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from armlink.armfile import ArmFile
-from calib.dataset import SweepData
-from calib.description import gcomp_arm
-from calib.diff import differences
-from calib.gates import heldout_scores
-from calib.records import Array, CalibrationRecord, Parameter
+from armlink.arm_file import ArmFile
+from calib.arm.kinematics import gcomp_arm
+from calib.fit.sensor_fit import SensorFit
+from calib.install.plausibility import heldout_scores
+from calib.records.compare import differences
+from calib.records.records import Array, CalibrationRecord, Parameter
 from calib.report.figures import before_after_figure, joint_figure, left_out_figure, sweep_rows, sweeps_of
 from calib.report.page import ReportTable, Section, paragraph, render
-from calib.sensors import SensorFit
-from gcomp.gravity import gravity_torque
+from calib.sweep.dataset import SweepData
+from gcomp.gravity.torque import gravity_torque
 
 PARAMETERS: tuple[tuple[Parameter, str, str], ...] = (
     ("gain", "gain", "1"),

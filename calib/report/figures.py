@@ -7,11 +7,11 @@ import numpy.typing as npt
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from calib.sensors import SensorFit
-from calib.verify import Verification
-from gcomp.arm import Arm
-from gcomp.readings import Readings
-from gcomp.sensor_model import predict
+from calib.fit.sensor_fit import SensorFit
+from calib.sweep.verify import Verification
+from gcomp.arm.arm import Arm
+from gcomp.identify.readings import Readings
+from gcomp.identify.sensor_model import predict
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]

@@ -3,11 +3,11 @@
 from html import escape
 from pathlib import Path
 
-from armlink.armfile import ArmFile
-from calib.records import CalibrationRecord, GravityRecord
+from armlink.arm_file import ArmFile
+from calib.records.records import CalibrationRecord, GravityRecord
 from calib.report.figures import verify_figure
 from calib.report.page import ReportTable, Section, paragraph, render
-from calib.verify import Verification
+from calib.sweep.verify import Verification
 
 
 def write_report(

@@ -42,13 +42,13 @@ def sim(
     import mujoco
     from rich.console import Console
 
-    from armlink.armfile import load_arm
-    from armlink.bus import open_link_bus, resolve_bus
+    from armlink.arm_file import load_arm
+    from armlink.bus.open import open_link_bus, resolve_bus
     from armlink.errors import BadInput
-    from sim_bus.control import ControlPipe
-    from sim_bus.fault_kinds import parse_fault
-    from sim_bus.options import parse_drift, parse_effect
-    from sim_bus.server import Server
+    from sim_bus.bus.control_pipe import ControlPipe
+    from sim_bus.bus.effect_options import parse_drift, parse_effect
+    from sim_bus.bus.fault_kinds import parse_fault
+    from sim_bus.bus.server import Server
     from sim_bus.simulated_arm import SimulatedArm
     from sim_bus.truth import Truth
 

@@ -2,7 +2,7 @@
 
 Ripple is motor torque lost to the gear's teeth, `amplitude·sin(cycles·θ + phase)`; the spring, a cable bundle over the
 joint, pulls on the link with `−stiffness·(θ − rest)` and so shows in both channels. Elasticity, backlash (its full
-width) and coupling are those of `sim_bus.transmission`; the position sensor sits at the motor.
+width) and coupling are those of `sim_bus.physics.transmission`; the position sensor sits at the motor.
 """
 
 from collections.abc import Mapping

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from armlink.errors import ArmlinkError, BadInput, Refused
-from sim_gap.blind.make import HELDOUT_S, TRAIN_S
-from sim_gap.blind.score import answer_name, score
-from sim_gap.blind.seal import open_labels, seal, write_answer
+from sim_gap.blind.cases.make import HELDOUT_S, TRAIN_S
+from sim_gap.blind.cases.seal import open_labels, seal, write_answer
+from sim_gap.blind.judging.score import answer_name, score
 
 Diagnose = Callable[[Path, Sequence[Path], Sequence[Path], Sequence[str]], dict[str, Any]]
 """Model, training and held-out recordings, effects withheld → the answer of contract 5."""
@@ -55,7 +55,7 @@ def run_bench(
 
 def make_apart(out: Path, seed: int, cases: int, workers: int, lengths: tuple[float, float]) -> Iterator[int]:
     """Make the cases in a separate process; yields now and then how many there are. Raises Refused where it fails."""
-    command = [sys.executable, "-m", "sim_gap.blind.make", "--seed", str(seed), "--cases", str(cases)]
+    command = [sys.executable, "-m", "sim_gap.blind.cases.make", "--seed", str(seed), "--cases", str(cases)]
     command += ["--out", str(out / "cases"), "--labels", str(out / "labels"), "--workers", str(workers)]
     command += ["--train-s", str(lengths[0]), "--heldout-s", str(lengths[1])]
     (out / "cases").mkdir(parents=True)
@@ -85,8 +85,8 @@ def tasks(out: Path) -> list[tuple[str, str]]:
 
 def diagnose_files(sim: Path, train: Sequence[Path], heldout: Sequence[Path], exclude: Sequence[str]) -> dict[str, Any]:
     """The diagnosis of this package on files, `exclude` taken out of its library."""
-    from armlink.recording import load_recording
-    from sim_gap.diagnose import diagnose
+    from armlink.recording.recording import load_recording
+    from sim_gap.attribution.diagnose import diagnose
 
     answer = diagnose(
         sim, [load_recording(path) for path in train], [load_recording(path) for path in heldout], withhold=exclude

@@ -44,6 +44,6 @@ def diagnose(
     """
     from rich.console import Console
 
-    from sim_gap.run import run_diagnose
+    from sim_gap.commands.diagnose import run_diagnose
 
     run_diagnose(sim, train, heldout or [], json, report, out_model, Console(stderr=True))

@@ -26,7 +26,7 @@ def bench(
 
     from armlink.errors import BadInput
     from sim_gap.blind.bench import diagnose_files, run_bench
-    from sim_gap.blind.tables import show
+    from sim_gap.blind.judging.tables import show
 
     if json not in (None, "-") and not Path(str(json)).resolve().parent.is_dir():
         raise BadInput(f"--json {json}: its folder does not exist: make it first")

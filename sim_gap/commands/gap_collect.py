@@ -22,12 +22,12 @@ def collect(
     from rich.console import Console
     from rich.progress import Progress
 
-    from armlink.armfile import load_arm
+    from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
-    from armlink.link import Link
-    from sim_gap.collect import collect as run
-    from sim_gap.motion_file import load_motion
+    from armlink.link.link import Link
+    from sim_gap.experiment.collect import collect as run
+    from sim_gap.experiment.motion_file import load_motion
 
     if out.suffix != ".mcap" or not out.resolve().parent.is_dir():
         raise BadInput(f"--out {out}: expected a .mcap file in a folder that is there")

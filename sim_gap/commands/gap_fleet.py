@@ -29,9 +29,9 @@ def diagnose_fleet(
     from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 
     from armlink.commands.output import write_json
-    from sim_gap.cluster import cluster
-    from sim_gap.fleet import Answers, diagnose_fleet, find_cases
-    from sim_gap.fleet import table as table_of
+    from sim_gap.fleet.cluster import cluster
+    from sim_gap.fleet.fleet import Answers, diagnose_fleet, find_cases
+    from sim_gap.fleet.fleet import table as table_of
 
     cases = find_cases(folder, sim)
     answers = Answers(out or folder / "answers.jsonl")

@@ -25,10 +25,10 @@ def plan(
     """
     from rich.console import Console
 
-    from armlink.armfile import load_arm
+    from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
-    from sim_gap.motion import joints_in_doubt, plan_motion
-    from sim_gap.motion_file import save_motion
+    from sim_gap.experiment.excitation import joints_in_doubt, plan_motion
+    from sim_gap.experiment.motion_file import save_motion
 
     joints, sentences = joints_in_doubt(answer) if answer else ([], [])
     motion = plan_motion(load_arm(arm), [*joints, *(joint or [])], poses, seed)

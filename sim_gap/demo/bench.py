@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from armlink.armfile import ArmFile
-from armlink.link import Link
-from calib.records import CalibrationRecord
-from gcomp.arm import Arm
-from gcomp.gravity import gravity_torque
-from sim_bus.bus import LockStepBus
+from armlink.arm_file import ArmFile
+from armlink.link.link import Link
+from calib.records.records import CalibrationRecord
+from gcomp.arm.arm import Arm
+from gcomp.gravity.torque import gravity_torque
+from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from armlink.sample import Sample
-from calib.observer import Observer
-from calib.recalibration import Recalibrator
-from calib.records import CalibrationRecord, GravityRecord
-from calib.store import RecordStore
-from calib.verify import Verification
-from calib.watch import WatchHistory, watch
-from calib.work import work_targets
+from armlink.link.types import Sample
+from calib.motion.random_work import work_targets
+from calib.observer.observer import Observer
+from calib.observer.recalibrator import Recalibrator
+from calib.observer.watch_loop import WatchHistory, watch
+from calib.records.records import CalibrationRecord, GravityRecord
+from calib.records.store import RecordStore
+from calib.sweep.verify import Verification
 from sim_gap.demo.bench import Bench
 from sim_gap.demo.narrator import Report
 

@@ -7,9 +7,9 @@ import numpy.typing as npt
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
+from calib.fit.sensor_fit import SensorFit
 from calib.report.figures import COLOURS, GREY, PANEL, add_sweeps
-from calib.sensors import SensorFit
-from gcomp.arm import Arm
+from gcomp.arm.arm import Arm
 from sim_gap.demo.drift import Drift
 
 Array = npt.NDArray[np.float64]

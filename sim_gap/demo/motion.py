@@ -3,10 +3,10 @@
 import numpy as np
 import numpy.typing as npt
 
-from armlink.recording import Recording
-from armlink.sample import Command
-from calib.motion import trajectory
-from calib.records import CalibrationRecord
+from armlink.link.types import Command
+from armlink.recording.recording import Recording
+from calib.motion.trajectory import trajectory
+from calib.records.records import CalibrationRecord
 from sim_gap.demo.bench import Bench
 from sim_gap.demo.narrator import Report
 

@@ -10,7 +10,7 @@ from calib.report.page import ReportTable, Section, paragraph, render
 from sim_gap.demo.figures import drift_figure, error_bars, sweep_figure
 from sim_gap.demo.show import drift_line, gap_line
 from sim_gap.demo.summary import SHOWN, DemoResult
-from sim_gap.report import sections as gap_sections
+from sim_gap.report.page import sections as gap_sections
 
 
 def write_report(result: DemoResult, path: Path) -> None:

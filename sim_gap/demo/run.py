@@ -10,18 +10,20 @@ from pathlib import Path
 
 from rich.console import Console
 
-from armlink.armfile import ArmFile, load_arm
+from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import BadInput
-from armlink.recording import Recording, save_recording
-from calib.dataset import SweepData
-from calib.description import gcomp_arm
-from calib.identify import identify_gravity
-from calib.recalibration import write_record
-from calib.records import CalibrationRecord
-from calib.runner import run_sweep
-from calib.sensors import fit_sensors
-from calib.store import RecordStore
-from calib.verify import run_verify
+from armlink.recording.recording import Recording, save_recording
+from calib.arm.kinematics import gcomp_arm
+from calib.fit.gravity_fit import identify_gravity
+from calib.fit.sensor_fit import fit_sensors
+from calib.observer.recalibrator import write_record
+from calib.records.records import CalibrationRecord
+from calib.records.store import RecordStore
+from calib.sweep.dataset import SweepData
+from calib.sweep.run import run_sweep
+from calib.sweep.verify import run_verify
+from sim_gap.attribution.diagnose import diagnose
+from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.demo.bench import Bench, check_gravity
 from sim_gap.demo.drift import run_drift
 from sim_gap.demo.motion import multisine, record_motion, travel
@@ -29,9 +31,7 @@ from sim_gap.demo.narrator import Narrator, Report
 from sim_gap.demo.report import write_report
 from sim_gap.demo.show import calibration_table, drift_line, gap_line, verify_table
 from sim_gap.demo.summary import DemoResult, summary
-from sim_gap.diagnose import diagnose
-from sim_gap.diagnosis import Diagnosis
-from sim_gap.model import compiled
+from sim_gap.model.load import compiled
 
 TRAIN_SECONDS, HELDOUT_SECONDS = 40.0, 25.0
 """Length of the gap's recordings [s]."""

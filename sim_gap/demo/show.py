@@ -3,13 +3,13 @@
 import numpy as np
 from rich.table import Table
 
-from calib.sensors import SensorFit
-from calib.verify import Verification
+from calib.fit.sensor_fit import SensorFit
+from calib.sweep.verify import Verification
+from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.demo.bench import Bench, GravityCheck
 from sim_gap.demo.drift import Drift
 from sim_gap.demo.summary import SHOWN
-from sim_gap.diagnosis import Diagnosis
-from sim_gap.wording import sentence
+from sim_gap.report.effect_text import sentence
 
 
 def calibration_table(bench: Bench, fit: SensorFit) -> Table:

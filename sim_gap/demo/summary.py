@@ -6,17 +6,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from armlink.sample import Stats
-from calib.dataset import SweepData
-from calib.identify import GravityFit
-from calib.records import Parameter
-from calib.sensors import SensorFit
-from calib.verify import Verification
-from gcomp.arm import Arm
+from armlink.link.types import Stats
+from calib.fit.gravity_fit import GravityFit
+from calib.fit.sensor_fit import SensorFit
+from calib.records.records import Parameter
+from calib.sweep.dataset import SweepData
+from calib.sweep.verify import Verification
+from gcomp.arm.arm import Arm
 from sim_bus.truth import Truth
+from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.demo.bench import GravityCheck
 from sim_gap.demo.drift import Drift
-from sim_gap.diagnosis import Diagnosis
 
 SCHEMA = "armlink.demo/1"
 SHOWN: tuple[tuple[Parameter, int], ...] = (("gain", 4), ("offset", 3), ("position_gain", 5))

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.signal import lfilter
 
 from sim_gap.effects.registry import Columns, Effect, Layout, Parameter, Shape
-from sim_gap.rigid import Array
-from sim_gap.signals import Signals
+from sim_gap.model.rigid_body import Array
+from sim_gap.residuals.preprocess import Signals
 
 SHORTEST, LONGEST = 1e-3, 0.2
 """Times that count as a lag or delay [s]."""

@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from sim_gap.effects.registry import Columns, Effect, Layout, Parameter, Shape
-from sim_gap.rigid import Array
-from sim_gap.signals import Signals
+from sim_gap.model.rigid_body import Array
+from sim_gap.residuals.preprocess import Signals
 
 WITHIN = 0.5
 """A Stribeck velocity is below this share of the fastest usual speed."""

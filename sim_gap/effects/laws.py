@@ -12,8 +12,8 @@ import numpy as np
 
 from sim_gap.effects.drive import commanding
 from sim_gap.effects.registry import Columns, Effect, Layout, Parameter, Shape
-from sim_gap.rigid import Array
-from sim_gap.signals import Signals
+from sim_gap.model.rigid_body import Array
+from sim_gap.residuals.preprocess import Signals
 
 
 class _Law(Effect):

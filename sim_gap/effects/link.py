@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from sim_gap.effects.registry import Columns, Effect, Layout, Parameter, Shape
-from sim_gap.rigid import Array
-from sim_gap.signals import Signals
+from sim_gap.model.rigid_body import Array
+from sim_gap.residuals.preprocess import Signals
 
 LEVER = 0.15
 """Plausible shift of a link's centre of mass [m], and radius of gyration of what is added [m]."""

@@ -9,8 +9,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from sim_gap.rigid import Array
-from sim_gap.signals import Signals
+from sim_gap.model.rigid_body import Array
+from sim_gap.residuals.preprocess import Signals
 
 FAMILIES = (
     "friction",
@@ -18,10 +18,10 @@ FAMILIES = (
     "base",
     "position",
     "torque",
-    "bending",
+    "sensor_nonlinearity",
     "timing",
     "transmission",
-    "soft",
+    "elasticity_backlash",
     "actuator",
     "drive",
     "laws",

@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from sim_gap.effects.registry import Columns, Effect, Layout, Parameter, Shape
-from sim_gap.rigid import CREEP, Array
-from sim_gap.signals import Signals
+from sim_gap.model.rigid_body import CREEP, Array
+from sim_gap.residuals.preprocess import Signals
 
 ALWAYS, MOST, SLOWLY = 24, 64, 0.25
 """Ripple is searched for up to so many cycles a radian: in any case, and at most where a joint turns slowly enough."""

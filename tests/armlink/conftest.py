@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from armlink import objects
-from armlink.armfile import parse_arm
-from armlink.link import Link
+from armlink.arm_file import parse_arm
+from armlink.canopen import object_dictionary as objects
+from armlink.link.link import Link
 
 sys.path.insert(0, str(Path(__file__).parent))
 

@@ -7,17 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from armlink.armfile import ArmFile, load_arm
-from calib.daemon.answers import ServiceView
-from calib.daemon.host import InlineHost
-from calib.daemon.messages import LoopOptions
+from armlink.arm_file import ArmFile, load_arm
+from calib.arm.kinematics import gcomp_arm
+from calib.daemon.loop.loop_messages import LoopOptions
+from calib.daemon.loop.loop_process import InlineHost
 from calib.daemon.service import Around, Service
 from calib.daemon.settings import DaemonSection
-from calib.description import gcomp_arm
-from calib.records import CalibrationRecord, GravityRecord, JointCalibration, matrix, provenance
-from calib.store import RecordStore
-from gcomp.moments import base_parameters
-from sim_bus.bus import LockStepBus
+from calib.daemon.view.service_view import ServiceView
+from calib.records.records import CalibrationRecord, GravityRecord, JointCalibration, matrix, provenance
+from calib.records.store import RecordStore
+from gcomp.arm.mass_moments import base_parameters
+from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
@@ -103,7 +103,7 @@ class DaemonBench:
 
     def install(self) -> None:
         """Write the current record to the controllers, as `armlink calibrate --apply` does."""
-        from calib.recalibration import write_record
+        from calib.observer.recalibrator import write_record
 
         record = self.store.current(CalibrationRecord, self.arm)
         assert record is not None

@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 from rank_test import undetermined
 
-from armlink.armfile import ArmFile, load_arm, parse_arm
-from armlink.link import Link
-from calib.dataset import SweepData
-from calib.description import gcomp_arm
-from calib.identify import identify_gravity
-from calib.records import PARAMETERS
-from calib.runner import run_sweep
-from calib.sensors import SensorFit, fit_sensors
-from gcomp.gravity import gravity_torque
-from sim_bus.bus import LockStepBus
+from armlink.arm_file import ArmFile, load_arm, parse_arm
+from armlink.link.link import Link
+from calib.arm.kinematics import gcomp_arm
+from calib.fit.gravity_fit import identify_gravity
+from calib.fit.sensor_fit import SensorFit, fit_sensors
+from calib.records.records import PARAMETERS
+from calib.sweep.dataset import SweepData
+from calib.sweep.run import run_sweep
+from gcomp.gravity.torque import gravity_torque
+from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth, flange
 

@@ -7,14 +7,14 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from armlink.armfile import ArmFile, load_arm
-from calib.description import gcomp_arm
-from calib.motion import trajectory
-from calib.observer import Observer
-from calib.observer_config import ObserverConfig
-from calib.work import WorkMotion
-from gcomp.gravity import gravity_regressor, gravity_torque
-from gcomp.moments import base_parameters, payload_columns
+from armlink.arm_file import ArmFile, load_arm
+from calib.arm.kinematics import gcomp_arm
+from calib.motion.random_work import WorkMotion
+from calib.motion.trajectory import trajectory
+from calib.observer.config import ObserverConfig
+from calib.observer.observer import Observer
+from gcomp.arm.mass_moments import base_parameters, payload_columns
+from gcomp.gravity.torque import gravity_regressor, gravity_torque
 
 PERIOD = 0.02
 DECIMATED = 5

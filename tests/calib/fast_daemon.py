@@ -9,15 +9,15 @@ import numpy as np
 from daemon_bench import run_now
 from fast_arm import PERIOD, FastArm
 
-from armlink.armfile import ArmFile, load_arm
+from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import BusFault
-from armlink.sample import Calibration, Stats
-from calib.daemon.answers import ServiceView
-from calib.daemon.messages import Batch, Progress, Reply, Up
+from armlink.link.types import Calibration, Stats
+from calib.daemon.loop.loop_messages import Batch, Progress, Reply, Up
 from calib.daemon.service import Around, Service
 from calib.daemon.settings import DaemonSection
-from calib.records import CalibrationRecord, GravityRecord, JointCalibration, matrix, provenance
-from calib.store import RecordStore
+from calib.daemon.view.service_view import ServiceView
+from calib.records.records import CalibrationRecord, GravityRecord, JointCalibration, matrix, provenance
+from calib.records.store import RecordStore
 
 START = datetime(2026, 1, 1, tzinfo=UTC)
 QUIET = {"enabled": False}

@@ -16,13 +16,13 @@ from drawn_arms import BUNDLED, asked_arm, sweep
 from rank_test import undetermined
 from sweep_arms import random_arm, with_section
 
-from armlink.armfile import ArmFile
-from calib import runner
-from calib.dataset import SweepData
-from calib.plan_limits import Limits
-from calib.plan_model import SweepPlan
-from calib.sensors import SensorFit, fit_sensors
-from sim_bus.section import EffectEntry
+from armlink.arm_file import ArmFile
+from calib.arm.drive_limits import Limits
+from calib.fit.sensor_fit import SensorFit, fit_sensors
+from calib.plan.types import SweepPlan
+from calib.sweep import run as runner
+from calib.sweep.dataset import SweepData
+from sim_bus.sim_section import EffectEntry
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from fast_arm import FastArm
 
-from armlink.armfile import load_arm
-from armlink.recording import Recording, load_recording, save_recording
-from calib.observer import Observer
+from armlink.arm_file import load_arm
+from armlink.recording.recording import Recording, load_recording, save_recording
+from calib.observer.observer import Observer
 
 FOLDER = Path(__file__).parent / "replays"
 DIGITS = 5

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from armlink.armfile import ArmFile, parse_arm
-from calib.dataset import Manifest, Reading, SweepData
-from calib.plan_model import SweepPlan
+from armlink.arm_file import ArmFile, parse_arm
+from calib.plan.types import SweepPlan
+from calib.sweep.dataset import Manifest, Reading, SweepData
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
@@ -65,7 +65,7 @@ def random_arm(seed: int, n: int, *, headroom: float = 1.8, vertical: bool = Fal
 
 def with_section(arm: ArmFile, **section: Any) -> ArmFile:
     """The same arm with these keys in its sweep section."""
-    from calib.section import SweepSection
+    from calib.arm.sweep_section import SweepSection
 
     return arm.model_copy(update={"sweep": SweepSection(**section)})
 

@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
 from daemon_bench import DaemonBench
 from fast_daemon import QUIET, FastDaemon
 
-from armlink.armfile import load_arm
+from armlink.arm_file import load_arm
 from calib.daemon.settings import DaemonSection
 
 FOUND_SECONDS, GAIN_LEFT, OFFSET_LEFT, FOLLOWED, TOLD, GROWTH = 60.0, 0.003, 0.05, 0.002, 0.98, 0.01

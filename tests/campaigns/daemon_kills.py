@@ -32,9 +32,9 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
 
 from fast_daemon import QUIET, FastDaemon
 
-from armlink.armfile import ArmFile
+from armlink.arm_file import ArmFile
 from calib.daemon.settings import DaemonSection
-from calib.records import CalibrationRecord
+from calib.records.records import CalibrationRecord
 
 LOST_ROWS = 8
 """Stops of the arm that the observer may have to see again: five seconds of work, and one moved on meanwhile."""
@@ -144,8 +144,8 @@ def kill_daemon(given: argparse.Namespace) -> list[str]:
     """The second part: the joints hold after each kill, whichever process it hits, and the next life goes on."""
     from daemon_bench import good_records
 
-    from armlink.armfile import load_arm
-    from calib.store import RecordStore
+    from armlink.arm_file import load_arm
+    from calib.records.store import RecordStore
     from sim_bus.simulated_arm import SimulatedArm
     from sim_bus.truth import Truth
 
@@ -286,8 +286,8 @@ def status(folder: Path) -> dict[str, Any]:
 
 def not_holding(arm: ArmFile, bus: str) -> list[str]:
     """What another host sees of the joints a second after a kill, where they do not all hold still in quick stop."""
-    from armlink.bus import open_link_bus
-    from armlink.monitor import Monitor
+    from armlink.bus.open import open_link_bus
+    from armlink.monitor.monitor import Monitor
 
     time.sleep(1.0)
     opened = open_link_bus(bus, arm.require_link())

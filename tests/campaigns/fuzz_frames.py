@@ -14,13 +14,14 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent.parent))
-from armlink.errors import ArmlinkError
-from armlink.link import Link
-from armlink.loop import Loop
-from armlink.port import open_port
-from armlink.sample import Command
-from tests.armlink.conftest import make_arm
 from tests.armlink.test_gate_bytes import ENABLE, MAX_TORQUE, TORQUE_UNIT, N, Observed, check
+
+from armlink.bus.port import open_port
+from armlink.errors import ArmlinkError
+from armlink.link.cyclic_exchange import Loop
+from armlink.link.link import Link
+from armlink.link.types import Command
+from tests.armlink.conftest import make_arm
 
 BATCH = 25
 """Frames a cycle."""

@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
 from drawn_arms import BUNDLED
 from hard_cases import CASES, JOINT, asked_hard_arm, judge, sweep_case
 
-from calib.encoder_check import EncoderFault
+from calib.motion.encoder_check import EncoderFault
 
 
 def main() -> int:

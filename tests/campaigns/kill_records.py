@@ -26,12 +26,12 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
 from postgres import server
 
-from armlink.armfile import ArmFile, parse_arm
+from armlink.arm_file import ArmFile, parse_arm
 from armlink.errors import BadInput
-from armlink.sample import Calibration
-from calib.records import CalibrationRecord, JointCalibration, provenance
-from calib.store import RecordStore
-from calib.writing import install, mend, same_real32
+from armlink.link.types import Calibration
+from calib.install.journaled_write import install, mend, same_real32
+from calib.records.records import CalibrationRecord, JointCalibration, provenance
+from calib.records.store import RecordStore
 
 NAMES = ("shoulder", "elbow")
 LONGEST = 0.4

@@ -20,11 +20,11 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
 from sweep_arms import random_arm, with_section
 
-from armlink.armfile import ArmFile
-from armlink.link import Link
-from calib.dataset import SweepData, load_data
-from calib.runner import run_sweep
-from sim_bus.bus import LockStepBus
+from armlink.arm_file import ArmFile
+from armlink.link.link import Link
+from calib.sweep.dataset import SweepData, load_data
+from calib.sweep.run import run_sweep
+from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 

@@ -31,9 +31,9 @@ sys.dont_write_bytecode = True
 
 ROOT = Path(__file__).parent.parent.parent
 TARGETS = {
-    "armlink/gate.py": ["tests/armlink/test_gate.py"],
-    "armlink/limits.py": ["tests/armlink/test_limits.py"],
-    "armlink/cia402.py": ["tests/armlink/test_cia402.py"],
+    "armlink/link/gate.py": ["tests/armlink/link/test_gate.py"],
+    "armlink/link/gate_limits.py": ["tests/armlink/link/test_gate_limits.py"],
+    "armlink/canopen/cia402.py": ["tests/armlink/canopen/test_cia402.py"],
 }
 EXPLAINED = {
     "int becomes round": "a mode is a whole number, and round() of one is that number",

@@ -44,8 +44,8 @@ def start(arm: str, bus: str, folder: Path, port: int, work: bool = True) -> "su
     """`armlink daemon` with records of a good sweep, on the Unix socket and on TCP; returns when it observes."""
     from daemon_bench import good_records
 
-    from armlink.armfile import load_arm
-    from calib.store import RecordStore
+    from armlink.arm_file import load_arm
+    from calib.records.store import RecordStore
     from sim_bus.truth import Truth
 
     described = load_arm(arm)
@@ -76,7 +76,7 @@ def kernel_nodes(bus: str, folder: Path) -> Iterator[tuple[str, Callable[[], Non
     sys.path.insert(0, str(TESTS.parent / "benchmarks"))
     from echo_nodes import answer_in_kernel, remove_gateway, start_nodes
 
-    from armlink.armfile import load_arm
+    from armlink.arm_file import load_arm
 
     channel = bus.partition(":")[2]
     content = yaml.safe_load(load_arm("sarcos").path.read_text())

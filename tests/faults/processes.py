@@ -13,8 +13,8 @@ from typing import Any
 import can
 from rows import ARM
 
-from armlink.armfile import parse_arm
-from armlink.cia402 import State, state_of
+from armlink.arm_file import parse_arm
+from armlink.canopen.cia402 import State, state_of
 
 ROOT = Path(__file__).parent.parent.parent
 ARMLINK = [sys.executable, "-c", "from armlink.cli import main; main()"]
@@ -23,10 +23,10 @@ STATUS_READ = bytes.fromhex("4b416000")
 """How the answer to an SDO upload of 6041h begins."""
 HOST = """
 import sys
-from armlink.armfile import load_arm
+from armlink.arm_file import load_arm
 from armlink.errors import ArmlinkError
-from armlink.link import Link
-from armlink.sample import Command
+from armlink.link.link import Link
+from armlink.link.types import Command
 try:
     with Link.open(load_arm(sys.argv[1]), sys.argv[2]) as link:
         for attempt in range(5):  # a busy machine may be late with an answer; that is not what is tried here

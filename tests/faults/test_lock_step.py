@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from rows import ARM, QUICK_STOP, ROWS, Row, table
 
-from armlink.armfile import parse_arm
+from armlink.arm_file import parse_arm
 from armlink.errors import ArmlinkError, BadInput, BusFault
-from armlink.link import Link
-from armlink.sample import Command
-from sim_bus.bus import LockStepBus
-from sim_bus.cia402 import State
-from sim_bus.fault_kinds import KINDS, parse_fault
+from armlink.link.link import Link
+from armlink.link.types import Command
+from sim_bus.bus.fault_kinds import KINDS, parse_fault
+from sim_bus.bus.lock_step import LockStepBus
+from sim_bus.node.cia402 import State
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 

@@ -15,11 +15,11 @@ from processes import SAFE, Ear, simulated, start_host, write_arm
 from rows import QUICK_STOP, ROWS, Row
 from test_lock_step import pattern
 
-from armlink.armfile import load_arm
-from armlink.cia402 import State
+from armlink.arm_file import load_arm
+from armlink.canopen.cia402 import State
 from armlink.errors import ArmlinkError, BusFault
-from armlink.link import Link
-from armlink.sample import Command
+from armlink.link.link import Link
+from armlink.link.types import Command
 
 pytestmark = pytest.mark.vcan
 

@@ -11,9 +11,9 @@ sys.path.insert(0, str(Path(__file__).parent))  # importlib mode leaves this fol
 
 from gravity_rig import SARCOS_MOMENTS, Built, make_random_arm, make_sarcos
 
-from gcomp.arm import Arm
+from gcomp.arm.arm import Arm
+from gcomp.arm.mass_moments import bar_moments
 from gcomp.arrays import Array
-from gcomp.moments import bar_moments
 
 
 @pytest.fixture

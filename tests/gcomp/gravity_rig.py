@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from gcomp.arm import Arm
+from gcomp.arm.arm import Arm
+from gcomp.arm.mass_moments import base_parameters
 from gcomp.arrays import Array
-from gcomp.moments import base_parameters
-from gcomp.parameters import Parameters
-from gcomp.readings import Readings
-from gcomp.sensor_model import predict
+from gcomp.identify.parameters import Parameters
+from gcomp.identify.readings import Readings
+from gcomp.identify.sensor_model import predict
 
 DOWN, TILTED = (0.0, 0.0, -9.81), (9.81, 0.0, 0.0)
 SARCOS_BETA = np.array(

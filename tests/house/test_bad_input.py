@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from armlink import cli
-from armlink.armfile import bundled_arms
+from armlink.arm_file import bundled_arms
 
 SARCOS = bundled_arms()["sarcos"]
 NOT_THERE = "socketcan:nosuch0"

@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 from armlink import cli
-from armlink.armfile import parse_arm
+from armlink.arm_file import parse_arm
 
 ROOT = Path(__file__).parent.parent.parent
 PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from armlink.armfile import ArmFile, load_arm, parse_arm
-from sim_bus.bus import LockStepBus
+from armlink.arm_file import ArmFile, load_arm, parse_arm
+from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import mujoco
 import numpy as np
 
-from armlink.recording import Recording
+from armlink.recording.recording import Recording
 
 THREE = """
 <mujoco><option gravity="0 0 -9.81"/><worldbody>

@@ -1,1 +1,1 @@
-"""The daemon's API and page: reads through `calib.daemon.view.DaemonView`, commands nothing."""
+"""The daemon's API and page: reads through `calib.daemon.view.view.DaemonView`, commands nothing."""

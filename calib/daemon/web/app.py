@@ -10,7 +10,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
 
-from calib.daemon.view import DaemonView
+from calib.daemon.view.view import DaemonView
 from calib.daemon.web.description import Described
 from calib.daemon.web.guard import Access, Guard
 from calib.daemon.web.metrics import metrics_text

@@ -5,7 +5,7 @@ from typing import Any
 from fastapi import FastAPI
 from pydantic import TypeAdapter
 
-from calib.daemon.models import StreamItem
+from calib.daemon.view.api_models import StreamItem
 
 TOKEN = {"type": "http", "scheme": "bearer", "description": "TCP only; the Unix socket's mode says who may come there"}
 

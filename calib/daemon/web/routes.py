@@ -8,8 +8,8 @@ from fastapi import APIRouter, Body, Header, Path, Query, Request
 from fastapi.responses import FileResponse, Response
 from pydantic import TypeAdapter
 
-from calib.daemon.models import EventRecord, HistoryPoint, JointEstimate, JointNow, Overview, Proposal, Status
-from calib.daemon.view import DaemonView, NoSuch, NotPossible
+from calib.daemon.view.api_models import EventRecord, HistoryPoint, JointEstimate, JointNow, Overview, Proposal, Status
+from calib.daemon.view.view import DaemonView, NoSuch, NotPossible
 from calib.daemon.web.parameters import (
     LARGEST_ID,
     ApiError,

@@ -12,7 +12,7 @@ from pathlib import Path
 import uvicorn
 
 from armlink.errors import BadInput
-from calib.daemon.view import DaemonView
+from calib.daemon.view.view import DaemonView
 from calib.daemon.web.app import make_app
 from calib.daemon.web.guard import Access, names_of_host
 from calib.daemon.web.peer import BoundedProtocol

@@ -6,8 +6,8 @@ from contextlib import suppress
 
 from fastapi.responses import StreamingResponse
 
-from calib.daemon.models import EventItem, JointsItem
-from calib.daemon.view import DaemonView
+from calib.daemon.view.api_models import EventItem, JointsItem
+from calib.daemon.view.view import DaemonView
 from calib.daemon.web.peer import Message, Receive, Scope, Send, peer_of
 
 SEND_SECONDS = 5.0

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from sim_gap.blind.cases.scene import Scene, rms
+from sim_gap.blind.cases.truth import Truth
 from sim_gap.blind.effects.drawn import Draw, Drawn, motor_level, pick, sign
-from sim_gap.blind.scene import Scene, rms
-from sim_gap.blind.truth import Truth
 
 LATE_S = (0.008, 0.016)
 """Delays and lags: two to four sample intervals."""

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_gap.blind.arms import Arm, Array
-from sim_gap.blind.scene import Scene, rms
-from sim_gap.blind.truth import Truth
+from sim_gap.blind.cases.arms import Arm, Array
+from sim_gap.blind.cases.scene import Scene, rms
+from sim_gap.blind.cases.truth import Truth
 
 SENSOR_LEAST = 0.12
 MOTOR_LEAST = 0.3

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim_gap.blind.arms import Arm
+from sim_gap.blind.cases.arms import Arm
+from sim_gap.blind.cases.scene import Scene, rms
+from sim_gap.blind.cases.truth import Truth
 from sim_gap.blind.effects.drawn import Draw, Drawn, motor_level, pick, sign
-from sim_gap.blind.scene import Scene, rms
-from sim_gap.blind.truth import Truth
 
 MOVING = 0.02
 """Below this speed [rad/s] friction shows nothing that can be read."""

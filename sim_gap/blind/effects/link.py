@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_gap.blind.arms import Arm, Array
+from sim_gap.blind.cases.arms import Arm, Array
+from sim_gap.blind.cases.scene import Scene, rms
+from sim_gap.blind.cases.truth import Truth
 from sim_gap.blind.effects.drawn import Draw, Drawn, sensor_level
-from sim_gap.blind.scene import Scene, rms
-from sim_gap.blind.truth import Truth
 
 XYZ = ("x", "y", "z")
 INERTIA = (("xx", 0, 0), ("xy", 0, 1), ("xz", 0, 2), ("yy", 1, 1), ("yz", 1, 2), ("zz", 2, 2))

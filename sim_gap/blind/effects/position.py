@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from sim_gap.blind.arms import Array
+from sim_gap.blind.cases.arms import Array
+from sim_gap.blind.cases.scene import Scene, rms
+from sim_gap.blind.cases.truth import Truth
 from sim_gap.blind.effects.drawn import Draw, Drawn, pick, sensor_level, sign
-from sim_gap.blind.scene import Scene, rms
-from sim_gap.blind.truth import Truth
 
 PERIOD_S = 0.004
 """The recordings' sample interval: shorter delays are not in them."""

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from sim_gap.blind.cases.scene import Scene, rms
+from sim_gap.blind.cases.truth import Truth
 from sim_gap.blind.effects.drawn import OFTEN, Draw, Drawn, pick, reversals, sensor_level, sign
-from sim_gap.blind.scene import Scene, rms
-from sim_gap.blind.truth import Truth
 
 
 def offset(scene: Scene, random: np.random.Generator) -> Drawn | None:

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim_gap.blind.arms import Arm, Array
+from sim_gap.blind.cases.arms import Arm, Array
+from sim_gap.blind.cases.scene import Scene, rms
+from sim_gap.blind.cases.truth import SharedMotor, Truth
 from sim_gap.blind.effects.drawn import OFTEN, Draw, Drawn, motor_level, pick, reversals, sensor_level, sign
-from sim_gap.blind.scene import Scene, rms
-from sim_gap.blind.truth import SharedMotor, Truth
 
 STEP_S = 5e-4
 """The plant's step: springs must be slower than it."""

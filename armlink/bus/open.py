@@ -1,0 +1,116 @@
+"""Buses by name: `INTERFACE:CHANNEL[@BITRATE]`, any interface that python-can knows."""
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from armlink.arm_file import Bus, LinkSection
+from armlink.errors import BadInput, BusFault
+
+if TYPE_CHECKING:
+    import can
+
+SLICE = 0.001
+"""Longest wait for one of several buses at a time [s]."""
+FORM = "INTERFACE:CHANNEL[@BITRATE], for example socketcan:can0 or socketcan:can0@1000000"
+
+
+def parse_bus(spec: str, default_bitrate: int = 1_000_000) -> Bus:
+    """Take a bus specification apart; raises BadInput with the form that was expected."""
+    interface, colon, rest = spec.partition(":")
+    channel, at, bitrate = rest.partition("@")
+    if not (interface and colon and channel):
+        raise BadInput(f"bus {spec!r}: expected {FORM}")
+    if at and not (bitrate.isdigit() and int(bitrate) > 0):
+        raise BadInput(f"bus {spec!r}: bit rate {bitrate!r}, expected a number of bits a second: {FORM}")
+    return Bus(interface=interface, channel=channel, bitrate=int(bitrate) if at else default_bitrate)
+
+
+def resolve_bus(spec: str | None, section: Bus) -> Bus:
+    """The bus that the command line names, with the arm file's options where its interface is the same, or that."""
+    if spec is None:
+        return section
+    bus = parse_bus(spec, section.bitrate)
+    same = {"fd": section.fd, "options": section.options} if bus.interface == section.interface else {}
+    return bus.model_copy(update=same)
+
+
+def open_bus(spec: str | None, section: Bus) -> "can.BusABC":
+    """Open the bus that `spec` names, or else the arm file's section.
+
+    Raises BadInput for a malformed specification or an interface that python-can does not know, and BusFault where
+    the bus does not exist or cannot be opened.
+    """
+    import can
+    from can.exceptions import CanInterfaceNotImplementedError
+
+    bus = resolve_bus(spec, section)
+    name = f"{bus.interface}:{bus.channel}"
+    options: dict[str, Any] = {} if bus.interface == "socketcan" else {"bitrate": bus.bitrate}
+    if bus.fd:
+        options |= {"protocol": can.CanProtocol.CAN_FD} if bus.interface == "virtual" else {"fd": True}
+    try:
+        return can.Bus(interface=bus.interface, channel=bus.channel, **options, **bus.options)
+    except CanInterfaceNotImplementedError as error:
+        raise BadInput(f"bus {name}: {error}: python-can has no such interface here") from None
+    except TypeError as error:
+        raise BadInput(f"bus {name}: an option of link.bus.options that the interface does not take: {error}") from None
+    except (can.CanError, OSError, ValueError, ImportError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise BusFault(f"bus {name}: cannot open it: {reason}") from None
+
+
+def open_link_bus(spec: str | None, section: LinkSection) -> Any:
+    """Open the bus of an arm's link, or all of its buses as one (BusGroup); `spec` puts every joint on one bus.
+
+    Raises as open_bus.
+    """
+    names = list(dict.fromkeys(joint.bus for joint in section.joints))
+    if spec is not None or names == [""]:
+        return open_bus(spec, section.bus)
+    members: list[Any] = []
+    try:
+        for name in names:
+            member = open_bus(None, section.buses[name] if name else section.bus)
+            members.append(member)
+    except Exception:
+        for member in members:
+            member.shutdown()
+        raise
+    if len(members) == 1:
+        return members[0]
+    return BusGroup(members, {joint.node: names.index(joint.bus) for joint in section.joints})
+
+
+class BusGroup:
+    """Several python-can buses as one: a message goes to the bus of its node, or to every bus where it is for all."""
+
+    def __init__(self, members: Sequence[Any], route: Mapping[int, int]) -> None:
+        """`route` is node id → index of its bus among `members`."""
+        self.members, self.route = tuple(members), dict(route)
+        self.channel_info = " and ".join(str(member.channel_info) for member in self.members)
+
+    def send(self, msg: "can.Message", timeout: float | None = None) -> None:
+        """Send one message, as python-can's buses do."""
+        index = self.route.get(msg.arbitration_id & 0x7F)
+        for member in self.members if index is None else (self.members[index],):
+            member.send(msg, timeout)
+
+    def recv(self, timeout: float | None = None) -> "can.Message | None":
+        """The next message of any bus, or None after `timeout` seconds (None: wait for ever)."""
+        end = math.inf if timeout is None else time.monotonic() + timeout
+        wait = 0.0
+        while True:
+            for member in self.members:
+                message = member.recv(wait)
+                if message is not None:
+                    return message
+            if time.monotonic() >= end:
+                return None
+            wait = min(SLICE, max(0.0, end - time.monotonic()))
+
+    def shutdown(self) -> None:
+        """Close every bus."""
+        for member in self.members:
+            member.shutdown()

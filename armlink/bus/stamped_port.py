@@ -1,0 +1,114 @@
+"""SocketCAN for who only listens: now and then all that came, each frame with the time at which the kernel had it."""
+
+import ctypes
+import select
+import socket
+import struct
+import time
+from typing import Any
+
+from armlink.bus.port import GroupPort, Port, is_fd, is_socketcan, open_port
+from armlink.bus.socket_port import BATCH, CONTROL, FLAGS, SocketPort
+from armlink.canopen.object_dictionary import SYNC_ID
+
+Stamped = tuple[float, int, bytes]
+"""When a frame came, by the machine's monotonic clock [s], its identifier and its data."""
+
+MOST_BATCHES = 256
+"""So many batches are taken at once: frames without end do not keep a listener for ever."""
+_SO_TIMESTAMPNS = 35
+_STAMP = struct.Struct("=16xqq32x")  # the first control message of a frame, by the wall clock [s], [ns]; CONTROL bytes
+_CLOCK_TRIES, _CLOCK_SECONDS = 5, 1e-4  # two clocks are read so close together, or so often tried
+
+
+class StampedPort(SocketPort):
+    """A SocketPort whose frames are taken in batches, with their times: by `wait` and `take_all`, not by `receive`."""
+
+    def __init__(self, bus: Any, fd: bool = False) -> None:
+        """The raw socket of a python-can SocketCAN bus; every frame has room for its control messages."""
+        super().__init__(bus, fd)
+        self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        self._control = ctypes.create_string_buffer(BATCH * CONTROL)
+        base = ctypes.addressof(self._control)
+        for i, message in enumerate(self._in.messages):
+            message.header.control, message.header.control_length = base + i * CONTROL, CONTROL
+        self._headers = bytes(self._in.messages)  # as the kernel wants them: it writes lengths into them
+        self._stamps = memoryview(self._control)
+        self._began = time.monotonic()
+
+    def wait(self, timeout: float) -> None:
+        """Return when a frame is there, or after `timeout` seconds."""
+        select.select([self._number], [], [], timeout)
+
+    def take_all(self) -> list[Stamped]:
+        """All frames that are there, in their order; raises BusFault.
+
+        The kernel's stamps are by the wall clock: they are brought to the monotonic one by the difference of the two
+        at this moment, and kept between the last call and this one, so that a clock that is set spoils one batch.
+        """
+        earliest = self._began
+        self._began, ahead = _clocks()
+        frames: list[Stamped] = []
+        others: list[int] = []
+        for _ in range(MOST_BATCHES):
+            ctypes.memmove(self._in.address, self._headers, len(self._headers))
+            count = self._take_batch()
+            stamps = _STAMP.iter_unpack(self._stamps[: count * CONTROL])
+            layouts = self._layout.iter_unpack(self._received[: count * self._layout.size])
+            for (can_id, length, _, data), (seconds, nano) in zip(layouts, stamps, strict=True):
+                if can_id & FLAGS:
+                    others.append(can_id)
+                else:
+                    frames.append((seconds - ahead + 1e-9 * nano, can_id, data[:length]))
+            if count < BATCH:
+                break
+        if others:
+            self._take_others(others)
+        latest = time.monotonic()
+        if frames and not earliest <= frames[0][0] <= frames[-1][0] <= latest:
+            frames = [(min(max(t, earliest), latest), can_id, data) for t, can_id, data in frames]
+        return frames
+
+
+class StampedGroup(GroupPort):
+    """Several buses as one, their frames in the order of their times; the SYNC of the first bus stands for all."""
+
+    def __init__(self, group: Any) -> None:
+        """Take `group.members` (SocketCAN buses) and `group.route` (node id → index of its bus)."""
+        self._members = tuple(StampedPort(bus, is_fd(bus)) for bus in group.members)
+        super().__init__(group, self._members)
+        self._early: list[Stamped] = []
+
+    def wait(self, timeout: float) -> None:
+        """Return when a frame is there, or after `timeout` seconds."""
+        select.select(self._numbers, [], [], timeout)
+
+    def take_all(self) -> list[Stamped]:
+        """All frames that came before this call, as StampedPort.take_all; later ones wait for those of every bus."""
+        end = time.monotonic()
+        frames, self._early = self._early, []
+        for index, member in enumerate(self._members):
+            for frame in member.take_all():
+                if not (index and frame[1] == SYNC_ID):
+                    (frames if frame[0] <= end else self._early).append(frame)
+        return sorted(frames, key=lambda frame: frame[0])
+
+
+def open_listening_port(bus: Any) -> Port:
+    """A StampedPort or StampedGroup where every bus is SocketCAN, else as open_port; a group counts SYNC once."""
+    members = getattr(bus, "members", (bus,))
+    if all(map(is_socketcan, members)):
+        return StampedGroup(bus) if hasattr(bus, "members") else StampedPort(bus, is_fd(bus))
+    port = open_port(bus)
+    if isinstance(port, GroupPort):
+        port.one_sync = True
+    return port
+
+
+def _clocks() -> tuple[float, float]:
+    """The monotonic clock [s], and how far the wall clock is ahead of it [s]."""
+    for _ in range(_CLOCK_TRIES):
+        before, wall, now = time.monotonic(), time.time(), time.monotonic()
+        if now - before < _CLOCK_SECONDS:
+            break
+    return now, wall - 0.5 * (before + now)

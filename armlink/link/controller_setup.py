@@ -1,0 +1,212 @@
+"""What the link reads from and sets on one joint's controller before the cycle starts."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from armlink.arm_file import DeviceIdentity, LinkJoint, LinkSection
+from armlink.canopen import object_dictionary as objects
+from armlink.canopen import pdo
+from armlink.canopen.cia402 import MODE_NAMES, NEEDED_MODES, Mode, state_of, supports
+from armlink.canopen.eds_file import expected_identity
+from armlink.canopen.object_dictionary import Entry
+from armlink.canopen.pdo import Pdo
+from armlink.canopen.sdo import NodeServices
+from armlink.canopen.units import Units, units_from
+from armlink.errors import BadInput, BusFault, Refused
+from armlink.link.gate import JointLimits
+from armlink.link.gate_limits import milliseconds
+from armlink.link.types import Identity
+
+QUICK_STOP_AND_HOLD = 6
+"""605Ah: quick stop ramp, then stay in quick stop, power on: the joint holds."""
+ABORT_IS_QUICK_STOP = 3
+"""6007h: what a lost host leads to."""
+RATED_TORQUE_TOLERANCE = 1e-3
+_INTERPOLATION_VALUE = Entry(0x60C2, 1, "B", "interpolation time period value")
+_INTERPOLATION_INDEX = Entry(0x60C2, 2, "b", "interpolation time index")
+
+
+@dataclass(frozen=True)
+class Protection:
+    """What the controller itself watches over."""
+
+    host: int
+    """Node id of the host, whose heartbeat the joints watch."""
+    deadline_ms: int
+    """A joint that hears no RPDO1 for so long goes to quick stop."""
+    heartbeat_ms: int
+    """A joint that hears no heartbeat of the host for so long goes to quick stop."""
+    producer_ms: int
+    """Period of the joint's own heartbeat."""
+
+
+def protection_of(section: LinkSection) -> Protection:
+    """Host node (the highest that no joint has) and times from the arm file's deadline."""
+    nodes = {joint.node for joint in section.joints}
+    host = next(node for node in range(127, 0, -1) if node not in nodes)
+    return Protection(
+        host,
+        deadline_ms=milliseconds(section.deadline),
+        heartbeat_ms=milliseconds(2 * section.deadline),
+        producer_ms=milliseconds(section.deadline / 2),
+    )
+
+
+def identify(services: NodeServices) -> Identity:
+    """Identity (1000h, 1008h, 1018h) and CiA 402 state of a node that is there."""
+    read = services.read
+    return Identity(
+        joint=services.joint,
+        node=services.node,
+        present=True,
+        name=services.read_text(objects.DEVICE_NAME_INDEX),
+        device_type=int(read(objects.DEVICE_TYPE)),
+        vendor=int(read(objects.VENDOR)),
+        product=int(read(objects.PRODUCT)),
+        revision=int(read(objects.REVISION)),
+        serial=int(read(objects.SERIAL)),
+        state=state_of(int(read(objects.STATUS_WORD))),
+    )
+
+
+IDENTITY_OBJECTS = {
+    "vendor": objects.VENDOR,
+    "product": objects.PRODUCT,
+    "revision": objects.REVISION,
+    "serial": objects.SERIAL,
+}
+
+
+def identity_mismatches(stated: DeviceIdentity, found: Mapping[str, int]) -> list[str]:
+    """What of an identity (1018h: vendor, product, revision, serial) is not as the arm file states it, in words."""
+    mismatches = []
+    for key, entry in IDENTITY_OBJECTS.items():
+        expected = getattr(stated, key)
+        if expected is not None and found[key] != expected:
+            mismatches.append(f"{entry} is {found[key]:#x}, expected {expected:#x}")
+    return mismatches
+
+
+def check_identity(services: NodeServices, joint: LinkJoint) -> None:
+    """Raise Refused where another controller answers at the joint's node than arm file and data sheet state."""
+    expected = expected_identity(joint, services.remote.object_dictionary)
+    stated = [key for key in IDENTITY_OBJECTS if getattr(expected, key) is not None]
+    found = {key: int(services.read(IDENTITY_OBJECTS[key])) for key in stated}
+    mismatches = identity_mismatches(expected, found)
+    if mismatches:
+        raise refused_identity(joint.name, joint.node, mismatches)
+
+
+def refused_identity(name: str, node: int, mismatches: list[str]) -> Refused:
+    """The refusal of a joint's controller, with what differs and how to mend it."""
+    return Refused(
+        f"{name} (node {node}): another controller than the arm file states: {'; '.join(mismatches)}: "
+        "connect the right arm, or correct identity or eds of this joint under link.joints"
+    )
+
+
+def read_units(services: NodeServices, joint: LinkJoint) -> Units:
+    """Scales of a joint from its controller; raises BadInput where its rated torque is not the arm file's."""
+    read = services.read
+    rated_mnm = int(read(objects.RATED_TORQUE))
+    if abs(rated_mnm * 1e-3 - joint.rated_torque) > RATED_TORQUE_TOLERANCE * joint.rated_torque:
+        raise BadInput(
+            f"{joint.name} (node {joint.node}): rated torque 6076h is {rated_mnm * 1e-3} N·m, the arm file says "
+            f"{joint.rated_torque}: correct link.joints or connect the right arm"
+        )
+    encoder = int(read(objects.ENCODER_INCREMENTS)), int(read(objects.ENCODER_REVOLUTIONS))
+    gear = int(read(objects.GEAR_MOTOR)), int(read(objects.GEAR_SHAFT))
+    feed = int(read(objects.FEED)), int(read(objects.FEED_SHAFT))
+    try:
+        return units_from(rated_mnm, encoder, gear, feed)
+    except ValueError as error:
+        raise BusFault(f"{joint.name} (node {joint.node}): no units: {error}") from None
+
+
+def check_modes(services: NodeServices) -> int:
+    """Supported modes (6502h); raises BusFault where cyclic synchronous position or torque mode is not among them."""
+    supported = int(services.read(objects.SUPPORTED_MODES))
+    for mode in NEEDED_MODES:
+        if not supports(supported, mode):
+            raise BusFault(
+                f"{services.joint} (node {services.node}): mode {int(mode)} ({MODE_NAMES[mode]}) "
+                f"is not supported: 6502h is {supported:#x}"
+            )
+    return supported
+
+
+def configure_pdo(services: NodeServices, each: Pdo, deadline_ms: int) -> None:
+    """Map one PDO of the link and read the mapping back; raises BusFault naming the joint.
+
+    RPDO1 gets the deadline [ms]: a joint that hears none for so long stops by itself.
+    """
+
+    def write(entry: Entry, value: int) -> None:
+        services.write(entry, value)
+
+    def read(entry: Entry) -> int:
+        return int(services.read(entry))
+
+    try:
+        pdo.configure(each, services.node, write, read, deadline_ms if each is pdo.RPDO1 else 0)
+    except pdo.MappingRefused as error:
+        raise BusFault(f"{services.joint} (node {services.node}): {error}") from None
+
+
+def configure(
+    services: NodeServices,
+    joint: LinkJoint,
+    unit: Units,
+    limits: JointLimits,
+    period: float,
+    protection: Protection,
+    supported: int,
+) -> None:
+    """PDOs, and the limits that hold even without this host: torque, position window, quick stop, who is watched.
+
+    All is read back. The torque offset 60B2h, which adds to every target torque and stays latched, is cleared where the
+    device has one. `supported` is 6502h. Raises BusFault naming joint and object.
+    """
+    for each in pdo.LINK_PDOS:
+        configure_pdo(services, each, protection.deadline_ms)
+    if services.has(objects.TORQUE_OFFSET):
+        services.write_checked(objects.TORQUE_OFFSET, 0)
+    for entry, value in settings(joint, unit, limits, period, protection, supported):
+        services.write_checked(entry, value)
+
+
+def settings(
+    joint: LinkJoint, unit: Units, limits: JointLimits, period: float, protection: Protection, supported: int
+) -> list[tuple[Entry, int]]:
+    """What one controller is set to besides its PDOs, in this order.
+
+    Profile modes, where the device has them (6502h, `supported`), get the arm file's velocity and torque rate.
+    """
+    value, exponent = interpolation(period)
+    held = [
+        (objects.MAX_TORQUE, math.floor(joint.max_torque / unit.torque + 1e-9)),
+        (objects.POSITION_LOWER, math.ceil(limits.lower / unit.position)),
+        (objects.POSITION_UPPER, math.floor(limits.upper / unit.position)),
+        (objects.QUICK_STOP_OPTION, QUICK_STOP_AND_HOLD),
+        (objects.ABORT_OPTION, ABORT_IS_QUICK_STOP),
+        (_INTERPOLATION_VALUE, value),
+        (_INTERPOLATION_INDEX, exponent),
+        (objects.HEARTBEAT_PRODUCER, protection.producer_ms),
+        (objects.HEARTBEAT_CONSUMER, protection.host << 16 | protection.heartbeat_ms),
+    ]
+    if supports(supported, Mode.PROFILE_POSITION):
+        held.append((objects.PROFILE_VELOCITY, max(1, math.floor(joint.max_velocity / unit.position))))
+    if supports(supported, Mode.PROFILE_TORQUE):
+        held.append((objects.TORQUE_SLOPE, max(1, math.floor(joint.max_torque_rate / unit.torque))))
+    return held
+
+
+def interpolation(period: float) -> tuple[int, int]:
+    """Interpolation time 60C2h of a cycle of `period` seconds: value and power of ten, as exact as a byte allows."""
+    for exponent in (-3, -4, -5):
+        value = round(period / 10.0**exponent)
+        if 1 <= value <= 255 and math.isclose(value * 10.0**exponent, period, rel_tol=1e-9):
+            return value, exponent
+    exponent = math.ceil(math.log10(period / 255))
+    return round(period / 10.0**exponent), exponent

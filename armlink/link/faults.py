@@ -1,0 +1,151 @@
+"""Faults that a cycle shows, in words: which joint, what, and what to do. Pure."""
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+from armlink.bus.bus_watchdog import BusWatch
+from armlink.canopen import emcy
+from armlink.canopen import object_dictionary as objects
+from armlink.canopen.cia402 import MODE_NAMES, Mode, State, state_of
+from armlink.link import gate
+from armlink.link.gate import OFF, JointLimits, Passed, Seen
+from armlink.link.types import Command
+
+ENABLED_BITS = 0x27
+_FAULTS = (State.FAULT, State.FAULT_REACTION)
+_MODES = ", ".join(f"{int(mode)} ({name})" for mode, name in MODE_NAMES.items())
+
+
+@dataclass
+class Known:
+    """What is known of the bus and of n joints: the lists are the loop's own, so that it stays what is known now."""
+
+    names: Sequence[str]
+    statuses: Sequence[int]
+    """Newest status words (6041h)."""
+    displays: Sequence[int]
+    """Newest mode displays (6061h)."""
+    seen: Sequence[float]
+    """When position and torque came, by the clock [s]."""
+    mode_since: Sequence[float]
+    """When each joint's mode was commanded, by the clock [s]."""
+    emergencies: Collection[tuple[int, int, int]]
+    """(joint, code, error register)."""
+    node_states: Mapping[int, int]
+    """NMT states by joint, of the newest heartbeat."""
+    restarted: Collection[int]
+    """Joints whose controller has sent its boot-up message."""
+
+
+def find_fault(known: Known, now: float, modes: Sequence[int], max_age: float) -> str | None:
+    """The first fault at time `now` where every joint with a mode was to be enabled in it, or None.
+
+    A mode must be displayed, and a reading come, within `max_age` [s].
+    """
+    if known.emergencies or known.restarted or known.node_states:
+        fault = node_fault(known)
+        if fault:
+            return fault
+    oldest = min(known.seen)
+    if not now - oldest <= max_age:
+        name, age = known.names[known.seen.index(oldest)], now - oldest
+        return f"{name}: no reading for {age * 1e3:.0f} ms, limit {max_age * 1e3:.0f} ms"
+    for joint, (mode, status, display) in enumerate(zip(modes, known.statuses, known.displays, strict=True)):
+        if mode != OFF and display != mode and not now - known.mode_since[joint] <= max_age:
+            return f"{known.names[joint]}: {refused_mode(mode, display)}"
+        if status & 0x6F == ENABLED_BITS:
+            continue
+        state = state_of(status)
+        if mode != OFF or state in _FAULTS:
+            return f"{known.names[joint]}: {state.value} (status word {status:#06x}), expected operation enabled"
+    return None
+
+
+def node_fault(known: Known) -> str | None:
+    """The first fault of a node, whatever its drive is doing: emergency, restart, NMT state; or None."""
+    for joint, code, register in known.emergencies:
+        return f"{known.names[joint]}: emergency {code:04X}h, {emcy.name_of(code)} (error register {register:02X}h)"
+    for joint in sorted(known.restarted):
+        return (
+            f"{known.names[joint]}: its controller has restarted (boot-up message): calibration and mode are lost; "
+            "find out why, then start again"
+        )
+    for joint, state in known.node_states.items():
+        if state != objects.OPERATIONAL:
+            found = objects.NMT_STATES.get(state, str(state))
+            return f"{known.names[joint]}: NMT state is {found}, expected operational"
+    return None
+
+
+def refused_mode(mode: int, display: int) -> str:
+    """That a controller does not enter a mode that it was told to."""
+    return (
+        f"refuses mode {mode} ({MODE_NAMES[Mode(mode)]}): its mode display 6061h is {display}; "
+        "look at its error code 603Fh and at what 6502h says it supports"
+    )
+
+
+def refusal(
+    names: Sequence[str],
+    command: Command,
+    age: float,
+    passed: Sequence[Passed],
+    seen: Sequence[Seen],
+    limits: Sequence[JointLimits],
+) -> str | None:
+    """Why the gate refused a command, in one line; None where a fault of the bus or a joint was the reason."""
+    for joint, name in enumerate(names):
+        why, limit, now = passed[joint].refused, limits[joint], seen[joint]
+        if why == gate.COMMAND_AGE:
+            return f"the command is {age * 1e3:.0f} ms old, expected 0 to {limit.max_age * 1e3:.0f} ms"
+        if why == gate.BAD_MODE:
+            return f"{name}: mode {command.mode[joint]}, expected {_MODES}"
+        if why == gate.BAD_NUMBER and command.mode[joint] in gate.TORQUE_MODES:
+            return f"{name}: target torque is {command.torque[joint]}, expected a finite number"
+        if why == gate.BAD_NUMBER:
+            return f"{name}: target position is {command.position[joint]}, expected a finite number"
+        if why == gate.VELOCITY and math.isnan(now.velocity):
+            return f"{name}: no velocity (606Ch, TPDO2) has come of late, and torque control needs to know it"
+        if why == gate.VELOCITY:
+            return (
+                f"{name}: turns at {now.velocity:.3g} rad/s under torque control, limit {limit.overspeed:.3g} "
+                "(max_velocity and its margin): less torque, or a higher max_velocity"
+            )
+        if why == gate.WINDOW:
+            lower, upper = limit.lower - limit.outside, limit.upper + limit.outside
+            return (
+                f"{name}: reads {now.position:.4g} rad under torque control, expected {lower:.4g} to {upper:.4g}: "
+                "its stop or its position sensor is not where the arm file has it"
+            )
+        if why == gate.ENTRY:
+            return f"{name}: the torque now produced (6077h) is not known, and torque control would start from zero"
+    return None
+
+
+def stuck(known: Known, states: Sequence[State], target: State, modes: Sequence[int], seconds: float) -> str:
+    """Why the joints did not all reach `target` in their `modes` within `seconds`: the first that did not."""
+    for joint, code, _ in known.emergencies:
+        if states[joint] is not target:
+            return f"{known.names[joint]}: {states[joint].value} after emergency {code:04X}h, {emcy.name_of(code)}"
+    for name, state in zip(known.names, states, strict=True):
+        if state is not target:
+            return f"{name}: stays in {state.value}, expected {target.value} within {seconds} s"
+    for name, mode, display in zip(known.names, modes, known.displays, strict=True):
+        if mode not in (Mode.OFF, display):
+            return f"{name}: {refused_mode(mode, display)}"
+    return f"no complete set of readings within {seconds} s of cycles: frames are lost"
+
+
+def bus_fault(names: Sequence[str], watch: BusWatch, dropped: int) -> str | None:
+    """What the bus itself shows: a second host, a duplicated node id, a babbling node, lost frames; or None."""
+    if watch.intruder:
+        return f"another host is on this bus: it sends {watch.intruder}: stop it, only one program may command an arm"
+    doubled = watch.doubled
+    if doubled is not None:
+        return f"{names[doubled]}: two readings in every cycle: a second node has its id: give every node its own"
+    if watch.babbling:
+        return f"more frames than these joints send, the last other one {watch.last}: a node babbles: disconnect it"
+    if dropped:
+        return f"{dropped} frames lost: this host reads too slowly: give it more time or less to do"
+    return None

@@ -1,0 +1,188 @@
+"""Listening to an arm that another controller commands: one sample a SYNC of that controller; nothing is sent.
+
+On SocketCAN it sleeps for several cycles and then takes all that came, each SYNC with the kernel's own time of it; on
+other buses it wakes for each frame, whose time is when it was read.
+
+The one exception is asked for by name: `write_calibration` and `read_calibration` use SDO on object 2100h.
+"""
+
+import struct
+from collections import deque
+from collections.abc import Callable
+from functools import cached_property
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from armlink.arm_file import ArmFile
+from armlink.bus.stamped_port import StampedGroup, StampedPort, open_listening_port
+from armlink.canopen import object_dictionary as objects
+from armlink.canopen.pdo import RPDO1
+from armlink.canopen.sdo import NodeServices, PumpedNetwork, joint_services
+from armlink.clock import Clock, MonotonicClock
+from armlink.link import torque_sensor_record as calibration
+from armlink.link.cyclic_exchange import Loop
+from armlink.link.types import Array, Calibration, Sample, Stats
+from armlink.monitor.monitor import assumed_units
+
+SLEEP = 0.04
+"""Frames that bear their time may wait for so long [s]: ten cycles at 250 Hz, half of what a small receive queue holds
+of a full bus."""
+COMMAND = "Hhi"
+"""RPDO1: control word, target torque, target position."""
+NO_COMMAND = bytes(8)
+"""Stands for the RPDO1 that has not come yet; this object, not its value."""
+
+
+class Listener:
+    """Context manager: `with Listener(arm, bus) as listener: sample = listener.next(0.1)`."""
+
+    def __init__(self, arm: ArmFile, bus: Any) -> None:
+        """Take `bus` (python-can's, closed on leaving); its own clock counts where it has one, else the machine's."""
+        self.arm, self.bus = arm, bus
+        self.section = section = arm.require_link()
+        self.names = tuple(joint.name for joint in section.joints)
+        self.nodes = tuple(joint.node for joint in section.joints)
+        self.n, self.period = len(self.names), 1.0 / section.rate
+        own_clock: Clock | None = getattr(bus, "clock", None)
+        self.clock: Clock = own_clock or MonotonicClock()
+        self._port = open_listening_port(bus)
+        self._loop = Loop(self._port, self.clock, self.nodes, 0, self.period, own_clock is not None)
+        units = assumed_units(arm)
+        self._loop.set_units(units)
+        self._loop.on_other = self._take_other
+        self._torque_unit = np.array([unit.torque for unit in units])
+        self._position_unit = np.array([unit.position for unit in units])
+        self._commands = {RPDO1.cob_base + node: NO_COMMAND for node in self.nodes}
+        self._layout = struct.Struct("<" + self.n * COMMAND)
+        self._ready: deque[tuple[Sample, tuple[bytes, ...]]] = deque()
+        self._sent = self._given = (NO_COMMAND,) * self.n
+        """RPDO1 of each joint: for the sample that `next` gave last, and for the one that is coming in."""
+        self._sync: float | None = None
+        self._since: float | None = None
+        self._notify: Callable[[int, bytearray, float], None] | None = None
+
+    def __enter__(self) -> Self:
+        """The listener itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        """Close the bus."""
+        self.bus.shutdown()
+
+    @property
+    def stats(self) -> Stats:
+        """Counters since the first SYNC heard, rate and load brought up to date; `late` stays 0."""
+        if self._since is not None:
+            self._loop.measure(self.clock.now() - self._since, self.section.bus.bitrate)
+        return self._loop.stats
+
+    @property
+    def emergencies(self) -> deque[tuple[int, int, int]]:
+        """(Joint, code, error register) of every emergency heard; the caller may clear it."""
+        return self._loop.emergencies
+
+    @property
+    def node_states(self) -> dict[int, int]:
+        """Joint → NMT state of its newest heartbeat, 0 for boot-up; the caller may clear it."""
+        return self._loop.node_states
+
+    @property
+    def torque_sent(self) -> Array:
+        """Target torque of the other controller for the last sample of `next` [N·m], (n,); NaN before its first."""
+        return self._decoded(1, self._torque_unit)
+
+    @property
+    def position_sent(self) -> Array:
+        """Likewise target position [rad]."""
+        return self._decoded(2, self._position_unit)
+
+    def _decoded(self, place: int, unit: Array) -> Array:
+        values: Array = np.array(self._layout.unpack(b"".join(self._sent))[place::3]) * unit
+        for joint, data in enumerate(self._sent):
+            if data is NO_COMMAND:
+                values[joint] = np.nan
+        return values
+
+    def next(self, timeout: float) -> Sample | None:
+        """The next complete sample, or None where no SYNC completes one within `timeout` [s]; raises BusFault.
+
+        A sample is complete when the SYNC after it comes; its time is that of its own SYNC, by `clock`.
+        """
+        if not self._ready:
+            end = self.clock.now() + timeout
+            while not self._ready:
+                remaining = end - self.clock.now()
+                if remaining <= 0:
+                    return None
+                self._hear(remaining)
+        sample, self._sent = self._ready.popleft()
+        return sample
+
+    def read_calibration(self, joint: int) -> Calibration:
+        """The torque sensor record (2100h) of joint 0 … n−1, by SDO: sends; raises BusFault."""
+        return calibration.read_record(self._services[joint])
+
+    def write_calibration(
+        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
+    ) -> Calibration:
+        """Make gain and offset [N·m] active in joint 0 … n−1, by SDO: sends; raises BadInput, BusFault."""
+        return calibration.write_record(self._services[joint], gain, offset, record_id, date, store)
+
+    def _hear(self, seconds: float, at_once: bool = False) -> None:
+        """Take in what comes, for at most so long; `at_once`: somebody waits for the very next frame."""
+        port = self._port
+        if isinstance(port, StampedPort | StampedGroup):
+            if at_once:
+                port.wait(seconds)
+            else:
+                self.clock.sleep_until(self.clock.now() + min(seconds, SLEEP))
+            frames = port.take_all()
+        else:
+            frame = port.receive(seconds)
+            frames = [] if frame is None else [(self.clock.now(), *frame)]
+        self._loop.count(len(frames), sum([len(data) for _, _, data in frames]))
+        commands, take = self._commands, self._loop.take
+        for t, can_id, data in frames:
+            if can_id in commands:
+                if len(data) == len(NO_COMMAND):
+                    commands[can_id] = data
+            elif can_id == objects.SYNC_ID:
+                self._complete(t)
+            else:
+                take(can_id, data)
+
+    def _take_other(self, can_id: int, data: bytes) -> None:
+        if self._notify is not None:
+            self._notify(can_id, bytearray(data), 0.0)
+
+    def _complete(self, now: float) -> None:
+        """A SYNC: what came since the one before is its sample."""
+        if self._sync is None or self._since is None:
+            self._loop.reset_counters()
+            self._loop.drop_readings()
+            self._since = now
+        else:
+            sample = self._loop.sample(self._sync)
+            sample.t = self._sync
+            self._loop.stats.missed += sum([value != value for value in sample.position.tolist()])  # NaN
+            self._loop.drop_readings()
+            self._ready.append((sample, self._given))
+        self._sync, self._given = now, tuple(self._commands.values())
+
+    @cached_property
+    def _services(self) -> tuple[NodeServices, ...]:
+        network = PumpedNetwork(self._loop.send)
+        self._notify = network.notify
+        return joint_services(network, self.arm, self._pump)
+
+    def _pump(self, done: Callable[[], bool], timeout: float) -> bool:
+        """Go on listening until `done` or the time is over."""
+        end = self.clock.now() + timeout
+        while not done():
+            remaining = end - self.clock.now()
+            if remaining <= 0:
+                return False
+            self._hear(remaining, at_once=True)
+        return True

@@ -1,0 +1,59 @@
+"""The torque sensor record 2100h of a controller: staged, read back bit for bit, made active by its CRC.
+
+Written in this order: staged gain, staged offset, record id, record date, CRC-32, each read back; then `activate` = 1.
+The controller computes the CRC-32 over what it holds and aborts the write where it differs; then the staged values
+become the active ones. Nothing is stored to flash unless asked for (1010h:04), since flash wears.
+"""
+
+import struct
+import zlib
+
+from armlink.canopen import object_dictionary as objects
+from armlink.canopen.sdo import NodeServices
+from armlink.errors import BadInput
+from armlink.link.types import Calibration
+
+_CONTENT = struct.Struct("<ffII")
+GAIN_RANGE = (0.5, 2.0)
+
+
+def calibration_crc(gain: float, offset: float, record_id: int, date: int) -> int:
+    """CRC-32 (IEEE 802.3) of gain REAL32, offset REAL32, record id U32, date U32, little endian, 16 bytes."""
+    return zlib.crc32(_CONTENT.pack(gain, offset, record_id, date))
+
+
+def read_record(services: NodeServices) -> Calibration:
+    """The record that is active; raises BusFault."""
+    read = services.read
+    return Calibration(
+        gain=float(read(objects.GAIN)),
+        offset=float(read(objects.OFFSET)),
+        record_id=int(read(objects.RECORD_ID)),
+        date=int(read(objects.RECORD_DATE)),
+        crc=int(read(objects.RECORD_CRC)),
+    )
+
+
+def write_record(
+    services: NodeServices, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
+) -> Calibration:
+    """Make a gain and an offset [N·m] the controller's active ones, and return what it then holds.
+
+    Raises BadInput for values that no sensor has, BusFault where the controller holds something else than was written.
+    """
+    if not GAIN_RANGE[0] <= gain <= GAIN_RANGE[1]:
+        raise BadInput(f"{services.joint}: gain {gain} for the controller: expected {GAIN_RANGE[0]} to {GAIN_RANGE[1]}")
+    if not abs(offset) < 1e4:
+        raise BadInput(f"{services.joint}: offset {offset} N·m for the controller: expected a finite number")
+    crc = calibration_crc(gain, offset, record_id, date)
+    services.write_checked(objects.STAGED_GAIN, gain)
+    services.write_checked(objects.STAGED_OFFSET, offset)
+    services.write_checked(objects.RECORD_ID, record_id)
+    services.write_checked(objects.RECORD_DATE, date)
+    services.write_checked(objects.RECORD_CRC, crc)
+    services.write(objects.ACTIVATE, 1)
+    services.expect(objects.GAIN, gain)
+    services.expect(objects.OFFSET, offset)
+    if store:
+        services.write(objects.STORE_MANUFACTURER, objects.STORE_SIGNATURE)
+    return read_record(services)

@@ -1,0 +1,101 @@
+"""What goes into and comes out of a cycle of the link, in SI units."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armlink.canopen.cia402 import Mode, State
+
+Array = NDArray[np.float64]
+
+
+@dataclass(eq=False)
+class Command:
+    """One cycle's command for n joints; each joint uses the field that its mode needs, the other may be NaN."""
+
+    mode: NDArray[np.int8]
+    """0 off, 8 cyclic synchronous position, 10 cyclic synchronous torque; (n,)."""
+    torque: Array
+    """Target torque [N·m], (n,)."""
+    position: Array
+    """Target position by the joint's own sensor [rad], (n,)."""
+    t: float | None = None
+    """When it was decided, by the link's clock [s]; None: now. The gate refuses a command that is too old."""
+
+    @classmethod
+    def hold(cls, position: Array) -> "Command":
+        """Every joint under position control at `position` [rad]."""
+        n = position.size
+        return cls(np.full(n, Mode.POSITION, np.int8), np.zeros(n), position.copy())
+
+
+@dataclass(eq=False)
+class Sample:
+    """What n joints read in one cycle; a value that did not come in this cycle is NaN, never the last one."""
+
+    t: float
+    """Time of the SYNC that asked for it, since the link's first [s]."""
+    position: Array
+    """Position sensor [rad], (n,); each cycle (TPDO1)."""
+    velocity: Array
+    """[rad/s], (n,); each fourth cycle (TPDO2), NaN in the others."""
+    torque: Array
+    """Link-side torque sensor as the controller calibrates it [N·m], (n,); each cycle (TPDO1)."""
+    motor_torque: Array
+    """Torque actual value 6077h [N·m], (n,); each fourth cycle (TPDO2), NaN in the others."""
+    status: NDArray[np.int64]
+    """Newest status word 6041h, (n,); sent when it changes, so the last one stands."""
+    age: Array
+    """Time since position and torque last came [s], (n,); 0 where they came in this cycle, inf before the first."""
+
+
+@dataclass(frozen=True)
+class Identity:
+    """One node as `scan` finds it."""
+
+    joint: str
+    """Joint name of the arm file; empty for a node that the arm file does not know."""
+    node: int
+    present: bool
+    name: str = ""
+    device_type: int = 0
+    vendor: int = 0
+    product: int = 0
+    revision: int = 0
+    serial: int = 0
+    state: State = State.UNKNOWN
+    answers: int = 1
+    """How many answered one request at this node id; more than one is a duplicated id."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Torque sensor calibration that a controller holds (2100h): it sends (reading − offset) / gain."""
+
+    gain: float
+    offset: float
+    """[N·m]."""
+    record_id: int
+    date: int
+    """Seconds since 1970, 0 where none was written."""
+    crc: int
+
+
+@dataclass
+class Stats:
+    """Counters of the link since its first cycle."""
+
+    frames: int = 0
+    """Frames sent and received."""
+    cycles: int = 0
+    missed: int = 0
+    """Sensor frames (TPDO1) that did not come in their cycle."""
+    late: int = 0
+    """Cycles that began more than a tenth of a period late."""
+    errors: int = 0
+    """Error frames and frames of a wrong length."""
+    rate_hz: float = 0.0
+    """Cycles a second, measured."""
+    load: float = 0.0
+    """Share of the bus that the frames take at its bit rate, without stuff bits, which are a tenth more."""

@@ -1,0 +1,132 @@
+"""Watching an arm's bus: what its joints send, decoded, without commanding them."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import can
+
+from armlink.arm_file import ArmFile
+from armlink.bus.frame_log import TappedBus, is_ours
+from armlink.bus.port import open_port
+from armlink.canopen import emcy
+from armlink.canopen import object_dictionary as objects
+from armlink.canopen.cia402 import state_of
+from armlink.canopen.units import Units, units_from
+from armlink.clock import Clock, MonotonicClock
+from armlink.link.cyclic_exchange import NO_STATUS, Loop
+from armlink.link.types import Sample
+from armlink.monitor.cycle_stats import CycleStats
+
+USER_UNITS = 1 << 20
+"""User units of a joint turn; a monitor does not ask the controllers, since another host may be doing so."""
+
+
+@dataclass(eq=False)
+class View:
+    """What was heard in one interval, newest values by joint; NaN where none came."""
+
+    sample: Sample
+    rate_hz: float
+    """SYNCs a second."""
+    load: float
+    """Share of the bus that the frames heard and sent took."""
+
+
+class Monitor:
+    """Listens to an arm's joints. With `sync` it is the bus's host: starts the nodes (NMT) and sends SYNC itself."""
+
+    def __init__(self, arm: ArmFile, bus: Any, sync: bool = False, stats: bool = False) -> None:
+        """`stats`: measure the cycle too, from every frame's time stamp, which costs more than listening alone."""
+        self.section = section = arm.require_link()
+        self.names = tuple(joint.name for joint in section.joints)
+        self.nodes = tuple(joint.node for joint in section.joints)
+        own_clock: Clock | None = getattr(bus, "clock", None)
+        self.clock: Clock = own_clock or MonotonicClock()
+        self._sync, self._period = sync, 1.0 / section.rate
+        self.cycle_stats: CycleStats | None = None
+        """Figures of the cycle so far, None where they were not asked for."""
+        if stats:
+            self.cycle_stats = CycleStats(self.nodes, self._period, section.bus.bitrate)
+            bus = TappedBus(bus, self._count_cycle, sends=sync)
+        self._loop = Loop(open_port(bus), self.clock, self.nodes, 0, self._period, own_clock is not None)
+        self._loop.set_units(assumed_units(arm))
+        self._loop.on_other = self._count
+        self._syncs = 0
+        if sync:
+            self._loop.send(objects.NMT_ID, bytes([objects.NMT_START, 0]))
+
+    @property
+    def frames(self) -> int:
+        """Frames heard and sent so far."""
+        return self._loop.stats.frames
+
+    @property
+    def errors(self) -> int:
+        """Frames of a wrong length so far."""
+        return self._loop.stats.errors
+
+    def watch(self, seconds: float) -> View:
+        """Listen for `seconds`; raises BusFault where the bus fails."""
+        start, syncs, bits = self.clock.now(), self._syncs, self._loop.bits
+        sample = self._send_syncs(seconds) if self._sync else self._loop.listen(seconds)
+        elapsed = self.clock.now() - start
+        rate = (self._syncs - syncs) / elapsed
+        return View(sample, rate, (self._loop.bits - bits) / (self.section.bus.bitrate * elapsed))
+
+    def describe(self, view: View) -> dict[str, Any]:
+        """A view as JSON: joints with readings [rad, rad/s, N·m], states and age [s]; bus with rate and load; cycle."""
+        cycle = {} if self.cycle_stats is None else {"cycle": self.cycle_stats.as_json()}
+        return {
+            **cycle,
+            "joints": [self._joint(view.sample, joint) for joint in range(len(self.names))],
+            "emergencies": [
+                {"joint": self.names[joint], "code": f"{code:04X}h", "meaning": emcy.name_of(code)}
+                for joint, code, _ in self._loop.emergencies
+            ],
+            "bus": {"rate_hz": view.rate_hz, "load": view.load, "frames": self.frames, "errors": self.errors}
+            | {"dropped": self._loop.dropped},
+        }
+
+    def _joint(self, sample: Sample, joint: int) -> dict[str, Any]:
+        sends = math.isfinite(sample.position[joint])  # which only an operational node does
+        nmt = objects.OPERATIONAL if sends else self._loop.node_states.get(joint)
+        status = int(sample.status[joint])
+        return {
+            "joint": self.names[joint],
+            "node": self.nodes[joint],
+            "position": float(sample.position[joint]),
+            "velocity": float(sample.velocity[joint]),
+            "torque": float(sample.torque[joint]),
+            "motor_torque": float(sample.motor_torque[joint]),
+            "state": None if status == NO_STATUS else state_of(status).value,
+            "nmt": None if nmt is None else objects.NMT_STATES.get(nmt, str(nmt)),
+            "age": float(sample.age[joint]),
+        }
+
+    def _send_syncs(self, seconds: float) -> Sample:
+        self._loop.drain()
+        count = max(1, round(seconds / self._period))
+        start = self.clock.now()
+        for cycle in range(count):
+            self._loop.send(objects.SYNC_ID, b"")
+            self._syncs += 1
+            end = start + (cycle + 1) * self._period
+            while (remaining := end - self.clock.now()) > 0:
+                self._loop.receive(remaining)
+            while self._loop.receive(0.0):
+                pass
+        return self._loop.sample(self.clock.now())
+
+    def _count_cycle(self, message: can.Message, stamp: int) -> None:
+        if self.cycle_stats and is_ours(message):
+            self.cycle_stats.take(stamp / 1e6, message.arbitration_id, bytes(message.data))
+
+    def _count(self, can_id: int, data: bytes) -> None:
+        self._syncs += can_id == objects.SYNC_ID
+
+
+def assumed_units(arm: ArmFile) -> tuple[Units, ...]:
+    """Scales by the arm file's rated torques and 2^20 user units a turn."""
+    joints = arm.require_link().joints
+    return tuple(units_from(round(joint.rated_torque * 1e3), (1, 1), (1, 1), (USER_UNITS, 1)) for joint in joints)

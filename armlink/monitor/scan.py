@@ -1,0 +1,69 @@
+"""Which nodes are on a bus, who they are and in which state; nothing is written to them."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+
+from armlink.bus.port import Port
+from armlink.canopen import eds_file as data_sheet
+from armlink.canopen.sdo import NodeServices, PumpedNetwork
+from armlink.clock import Clock
+from armlink.link import controller_setup as device
+from armlink.link.types import Identity
+
+SEARCH_SECONDS = 0.3
+"""How long answers to the search are waited for after the last request."""
+_READ_DEVICE_TYPE = b"\x40\x00\x10\x00\x00\x00\x00\x00"
+
+
+def scan_bus(port: Port, clock: Clock, joints: Mapping[int, str]) -> list[Identity]:
+    """Every node that answers a read of its device type, and those of `joints` (node id → joint name) that do not.
+
+    Sorted by node id. Raises BusFault where a node that answered stops answering.
+    """
+    network = PumpedNetwork(port.send)
+
+    def pump(done: Callable[[], bool], timeout: float) -> bool:
+        end = clock.now() + timeout
+        while not done():
+            frame = port.receive(max(0.0, end - clock.now()))
+            if frame is None or clock.now() > end + SEARCH_SECONDS:  # a node that babbles must not hold the search
+                return False
+            network.notify(frame[0], bytearray(frame[1]), 0.0)
+        return True
+
+    found = _search(port, pump, network)
+    dictionary = data_sheet.bundled()
+    identities = []
+    for node in sorted({*+found, *joints}):
+        name = joints.get(node, "")
+        if found[node] > 1:  # whatever one of them is asked, the other answers too
+            identities.append(Identity(name, node, present=True, answers=found[node]))
+        elif found[node]:
+            identities.append(device.identify(NodeServices(network, name, node, dictionary, pump)))
+        else:
+            identities.append(Identity(name, node, present=False))
+    return identities
+
+
+def _search(port: Port, pump: Callable[[Callable[[], bool], float], bool], network: PumpedNetwork) -> Counter[int]:
+    """Node id → number of answers to one request."""
+    found: Counter[int] = Counter()
+
+    def answered(can_id: int, data: bytearray, timestamp: float) -> None:
+        found[can_id - 0x580] += bytes(data[1:4]) == _READ_DEVICE_TYPE[1:4]
+
+    for node in range(1, 128):
+        network.subscribe(0x580 + node, answered)
+        port.send(0x600 + node, _READ_DEVICE_TYPE)
+        pump(lambda: False, 0.0)
+    pump(lambda: False, SEARCH_SECONDS)
+    for node in range(1, 128):
+        network.unsubscribe(0x580 + node, answered)
+    return found
+
+
+def describe_type(device_type: int) -> str:
+    """Device profile of 1000h in words, such as `CiA 402 servo drive`."""
+    profile = device_type & 0xFFFF
+    kind = {0x0001: "frequency converter", 0x0002: "servo drive", 0x0004: "stepper"}.get(device_type >> 16 & 0xFF, "")
+    return f"CiA {profile} {kind}".strip() if profile else "no profile"

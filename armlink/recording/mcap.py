@@ -1,0 +1,188 @@
+"""Recordings as MCAP in the form of a ROS 2 bag: JointState messages on the topics of contract 2.
+
+`/joint_states` carries position, velocity and effort = torque sensor, `/motor_states` effort = motor torque,
+`/joint_commands` position and effort = commanded position and torque. JointState has no temperature: joint
+temperatures go as effort on `/joint_temperatures` [°C].
+"""
+
+import struct
+from collections import defaultdict
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.records import Channel, Footer, Message, Schema
+from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
+from mcap.writer import Writer
+from zstandard import ZstdError
+
+from armlink.errors import BadInput
+from armlink.recording.recording import Array, Recording
+from armlink.recording.ros_joint_state import SCHEMA, SCHEMA_NAME, JointState, JointStateDecoder, joint_state_encoder
+
+TOPICS: dict[str, tuple[str | None, str | None, str | None]] = {
+    "/joint_states": ("position", "velocity", "torque"),
+    "/motor_states": (None, None, "motor_torque"),
+    "/joint_commands": ("position_command", None, "torque_command"),
+    "/joint_temperatures": (None, None, "temperature"),
+}
+"""Topic → channels that its position, velocity and effort are."""
+FLUSH_SECONDS = 0.5
+"""A killed recorder loses at most this and what the operating system had not written."""
+_NANO = 1_000_000_000
+
+
+class RecordingWriter:
+    """Writes rows as they come; a context manager that ends the file properly."""
+
+    def __init__(self, path: Path, names: tuple[str, ...]) -> None:
+        """Create the file for joints of these names."""
+        self._stream = path.open("wb")
+        self._names, self._n = names, len(names)
+        self._writer = Writer(self._stream)
+        self._writer.start(profile=Profile.ROS2, library="armlink")
+        self._schema = self._writer.register_schema(SCHEMA_NAME, SchemaEncoding.ROS2, SCHEMA.encode())
+        self._channels: dict[str, int] = {}
+        self._encoders: dict[tuple[bool, bool, bool], Any] = {}
+        self._flushed = 0
+
+    def __enter__(self) -> Self:
+        """The writer itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        """End the file: index and footer."""
+        self._writer.finish()
+        self._stream.close()
+
+    def append(self, t: float, channels: Mapping[str, Array]) -> None:
+        """Add one row at time `t` [s]: channel names of Recording → (n,) values; absent channels are not written."""
+        stamp = round(t * _NANO)
+        for topic, of_topic in TOPICS.items():
+            lists = tuple(name is not None and name in channels for name in of_topic)
+            if not any(lists):
+                continue
+            encode = self._encoders.get(lists)  # type: ignore[arg-type]
+            if encode is None:
+                encode = self._encoders[lists] = joint_state_encoder(self._names, lists)  # type: ignore[arg-type,index]
+            numbers = [x for name in of_topic if name is not None and name in channels for x in channels[name].tolist()]
+            self._writer.add_message(self._channel(topic), stamp, encode(stamp, numbers), stamp)
+        if stamp - self._flushed > FLUSH_SECONDS * _NANO:
+            self._writer.flush()
+            self._flushed = stamp
+
+    def _channel(self, topic: str) -> int:
+        if topic not in self._channels:
+            self._channels[topic] = self._writer.register_channel(topic, MessageEncoding.CDR, self._schema)
+        return self._channels[topic]
+
+
+def save_mcap(recording: Recording, path: Path) -> None:
+    """Write a whole recording; times are kept to the nanosecond."""
+    channels = recording.channels()
+    with RecordingWriter(path, recording.names) as writer:
+        for row, t in enumerate(recording.t.tolist()):
+            writer.append(t, {name: values[row] for name, values in channels.items()})
+
+
+def load_mcap(path: Path) -> Recording:
+    """Load a recording or a ROS 2 bag in MCAP; one that was cut loads up to the cut and says so in `warning`.
+
+    Time is that of `/joint_states` from its first message; other topics' messages go to the row nearest in time, if
+    nearer than half the median period, and are NaN elsewhere. Joints are those of the first `/joint_states` message.
+    """
+    messages, cut = _read(path)
+    states = messages.pop("/joint_states", [])
+    if not states:
+        raise BadInput(f"{path}: no {SCHEMA_NAME} on /joint_states{f'; {cut}' if cut else ''}")
+    stamps = np.array([state.stamp for state in states], dtype=np.int64)
+    names = states[0].names
+    channels = _channels_of("/joint_states", states, names, str(path))
+    half = np.median(np.diff(stamps)) / 2 if stamps.size > 1 else 0.0
+    for topic, others in messages.items():
+        times = np.array([state.stamp for state in others], dtype=np.int64)
+        for name, values in _channels_of(topic, others, names, str(path)).items():
+            channels[name] = _align(values, times, stamps, half)
+    if "position" not in channels:
+        raise BadInput(f"{path}: /joint_states carry no position")
+    return Recording(t=(stamps - stamps[0]) / _NANO, names=names, warning=cut, **channels)
+
+
+def _read(path: Path) -> tuple[dict[str, list[JointState]], str]:
+    """Messages by topic in the order of the file, and what to say where the file ends before its end."""
+    found: dict[str, list[JointState]] = defaultdict(list)
+    topics: dict[int, str] = {}
+    schemas: dict[int, Schema] = {}
+    decode = JointStateDecoder()
+    complete, why = False, "the file ends early"
+    with path.open("rb") as stream:
+        try:
+            for record in StreamReader(stream, validate_crcs=True).records:
+                if isinstance(record, Message) and record.channel_id in topics:
+                    found[topics[record.channel_id]].append(decode(record.data))
+                elif isinstance(record, Schema):
+                    schemas[record.id] = record
+                elif isinstance(record, Channel) and record.topic in TOPICS:
+                    _check_schema(record, schemas, path)
+                    topics[record.id] = record.topic
+                complete = complete or isinstance(record, Footer)
+        except CRCValidationError as error:
+            why = str(error)
+        except (McapError, ValueError, MemoryError, OSError, struct.error, ZstdError):
+            pass
+        position = stream.tell()
+    if complete:
+        return found, ""
+    rows = len(found.get("/joint_states", []))
+    return found, f"cut recording, {why}: loaded {rows} rows, up to about byte {position}"
+
+
+def _check_schema(channel: Channel, schemas: dict[int, Schema], path: Path) -> None:
+    schema = schemas.get(channel.schema_id)
+    kind = schema.name if schema else "nothing"
+    if kind != SCHEMA_NAME or channel.message_encoding != MessageEncoding.CDR:
+        encoding = channel.message_encoding
+        raise BadInput(f"{path}: {channel.topic} carries {kind} as {encoding}, expected {SCHEMA_NAME} as cdr")
+
+
+def _channels_of(topic: str, states: list[JointState], names: tuple[str, ...], source: str) -> dict[str, Array]:
+    """The topic's channels, (K, n) in the order of `names`; joints that a message leaves out are NaN."""
+    channels: dict[str, Array] = {}
+    for field, name in zip(("position", "velocity", "effort"), TOPICS[topic], strict=True):
+        if name is None or not any(getattr(state, field) for state in states):
+            continue
+        rows = np.full((len(states), len(names)), np.nan)
+        orders: dict[tuple[str, ...], tuple[list[int], list[int]]] = {}
+        for row, state in enumerate(states):
+            values = getattr(state, field)
+            if not values:
+                continue
+            if len(values) != len(state.names):
+                found = f"{len(values)} values of {field} for {len(state.names)} names"
+                raise BadInput(f"{source}: {topic} message {row + 1}: {found}")
+            if state.names not in orders:
+                orders[state.names] = _order(state.names, names)
+            into, of = orders[state.names]
+            rows[row, into] = np.array(values)[of]
+        channels[name] = rows
+    return channels
+
+
+def _order(message: tuple[str, ...], names: tuple[str, ...]) -> tuple[list[int], list[int]]:
+    both = [name for name in names if name in message]
+    return [names.index(name) for name in both], [message.index(name) for name in both]
+
+
+def _align(values: Array, times: Any, stamps: Any, half: float) -> Array:
+    """Values at the rows' stamps: of the nearest message within `half` nanoseconds, NaN where there is none."""
+    order = np.argsort(times, kind="stable")
+    times, values = times[order], values[order]
+    after = np.clip(np.searchsorted(times, stamps), 0, times.size - 1)
+    before = np.clip(after - 1, 0, None)
+    nearest = np.where(np.abs(times[before] - stamps) <= np.abs(times[after] - stamps), before, after)
+    aligned: Array = np.where((np.abs(times[nearest] - stamps) <= half)[:, None], values[nearest], np.nan)
+    return aligned

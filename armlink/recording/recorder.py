@@ -1,0 +1,87 @@
+"""Recording an arm's bus while its host runs it: one row a SYNC, commands included; nothing is sent."""
+
+import math
+import struct
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from armlink.arm_file import ArmFile
+from armlink.bus.port import open_port
+from armlink.canopen import object_dictionary as objects
+from armlink.canopen.pdo import RPDO1
+from armlink.clock import Clock, MonotonicClock
+from armlink.link.cyclic_exchange import Loop
+from armlink.link.types import Array
+from armlink.monitor.monitor import assumed_units
+
+WAIT_SECONDS = 0.1
+Row = tuple[float, dict[str, Array]]
+
+
+class Recorder:
+    """Iterates over rows: time from the first SYNC [s], and channels of Recording, NaN where nothing came."""
+
+    def __init__(self, arm: ArmFile, bus: Any) -> None:
+        section = arm.require_link()
+        self.names = tuple(joint.name for joint in section.joints)
+        nodes = tuple(joint.node for joint in section.joints)
+        own_clock: Clock | None = getattr(bus, "clock", None)
+        self.clock: Clock = own_clock or MonotonicClock()
+        self._stamp: Callable[[], float] = getattr(bus, "stamp", self.clock.now)
+        self._bus = bus
+        self._loop = Loop(open_port(bus), self.clock, nodes, 0, 1.0 / section.rate, own_clock is not None)
+        units = assumed_units(arm)
+        self._loop.set_units(units)
+        self._loop.on_other = self._take
+        self._torque_unit = np.array([unit.torque for unit in units])
+        self._position_unit = np.array([unit.position for unit in units])
+        self._joint_of = {RPDO1.cob_base + node: joint for joint, node in enumerate(nodes)}
+        self._n = len(nodes)
+        self._start: float | None = None
+        self._sync: float | None = None
+        self._rows: list[Row] = []
+        self._torque: Array = np.full(self._n, math.nan)
+        self._position: Array = np.full(self._n, math.nan)
+        self._forget()
+
+    def rows(self, seconds: float) -> Iterator[Row]:
+        """Rows that are complete within `seconds`, or in a whole log (LogBus); raises BusFault where the bus fails."""
+        end = self.clock.now() + seconds
+        while (remaining := end - self.clock.now()) > 0 and not getattr(self._bus, "ended", False):
+            self._loop.receive(min(remaining, WAIT_SECONDS))
+            yield from self._rows
+            self._rows.clear()
+
+    def _take(self, can_id: int, data: bytes) -> None:
+        joint = self._joint_of.get(can_id)
+        if can_id == objects.SYNC_ID:
+            self._complete(self._stamp())
+        elif joint is not None and len(data) == RPDO1.layout.size:
+            _, self._next_torque[joint], self._next_position[joint] = struct.unpack("<Hhi", data)
+
+    def _complete(self, now: float) -> None:
+        """A SYNC: what came since the one before is its row; commands that came before it take effect now."""
+        sample = self._loop.sample(now)
+        self._loop.drop_readings()
+        if self._sync is not None and self._start is not None:
+            channels = {
+                "position": sample.position,
+                "velocity": sample.velocity,
+                "torque": sample.torque,
+                "motor_torque": sample.motor_torque,
+                "torque_command": self._torque,
+                "position_command": self._position,
+            }
+            self._rows.append((self._sync - self._start, channels))
+        else:
+            self._start = now
+        self._sync = now
+        self._torque = np.asarray(self._next_torque) * self._torque_unit
+        self._position = np.asarray(self._next_position) * self._position_unit
+        self._forget()
+
+    def _forget(self) -> None:
+        self._next_torque: list[float] = [math.nan] * self._n
+        self._next_position: list[float] = [math.nan] * self._n

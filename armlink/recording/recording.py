@@ -1,0 +1,193 @@
+"""Recordings: what the arm's channels read over time, loaded and saved by suffix (contract 2)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armlink.errors import BadInput
+
+Array = NDArray[np.float64]
+
+COLUMNS = {
+    "position": "q",
+    "velocity": "dq",
+    "torque": "tau",
+    "motor_torque": "tau_motor",
+    "torque_command": "tau_cmd",
+    "position_command": "q_cmd",
+    "temperature": "temp",
+}
+"""Channel name -> column prefix; joint i of 1..n has the column `PREFIX_i`."""
+TORQUE_CHANNELS = ("torque", "motor_torque", "torque_command")
+SUFFIXES = (".csv", ".csv.gz", ".parquet", ".mcap")
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Channels of n joints at K times; a missing value is NaN, a missing channel is None."""
+
+    t: Array
+    """Time, strictly increasing [s], shape (K,)."""
+    position: Array
+    """Position sensor readings [rad], shape (K, n)."""
+    velocity: Array | None = None
+    """[rad/s], shape (K, n)."""
+    torque: Array | None = None
+    """Joint torque sensor, link side of the transmission [N·m], shape (K, n)."""
+    motor_torque: Array | None = None
+    """The drive's own estimate (6077h) [N·m], shape (K, n)."""
+    torque_command: Array | None = None
+    """Target torque (6071h) [N·m], shape (K, n)."""
+    position_command: Array | None = None
+    """[rad], shape (K, n)."""
+    temperature: Array | None = None
+    """[°C], shape (K, n)."""
+    names: tuple[str, ...] = ()
+    """Joint names base to tip; `joint_1` … where the file does not say."""
+    warning: str = ""
+    """What the loader left out or could not read; empty when all was read."""
+
+    def __post_init__(self) -> None:
+        if not self.names:
+            object.__setattr__(self, "names", default_names(self.n))
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return int(self.position.shape[1])
+
+    def channels(self) -> dict[str, Array]:
+        """The channels that are there, by name, each (K, n)."""
+        found = {name: getattr(self, name) for name in COLUMNS}
+        return {name: values for name, values in found.items() if values is not None}
+
+    def check(self, source: str) -> "Recording":
+        """Return this recording if it is sound, else raise BadInput with one line that begins with `source`."""
+        if self.t.ndim != 1 or self.t.size < 2:
+            raise BadInput(f"{source}: {self.t.size} rows: a recording needs at least two")
+        _check_time(self.t, source)
+        for name, values in self.channels().items():
+            if values.shape != (self.t.size, len(self.names)):
+                expected = (self.t.size, len(self.names))
+                raise BadInput(f"{source}: channel {name} has shape {values.shape}, expected {expected}")
+            _check_finite_or_nan(values, COLUMNS[name], source)
+        if not any(getattr(self, name) is not None for name in TORQUE_CHANNELS):
+            wanted = ", ".join(f"{COLUMNS[name]}_1" for name in TORQUE_CHANNELS)
+            raise BadInput(f"{source}: no torque channel: at least one of {wanted} … must be there")
+        return self
+
+
+def default_names(n: int) -> tuple[str, ...]:
+    """`joint_1` … `joint_n`, for files that name no joints."""
+    return tuple(f"joint_{i}" for i in range(1, n + 1))
+
+
+def columns_of(recording: Recording) -> dict[str, Array]:
+    """The recording as columns of contract 2, `t` first, each (K,)."""
+    columns = {"t": recording.t}
+    for name, values in recording.channels().items():
+        columns |= {f"{COLUMNS[name]}_{i + 1}": values[:, i] for i in range(recording.n)}
+    return columns
+
+
+def channels_of(columns: Mapping[str, Array], source: str) -> dict[str, Array | None]:
+    """Group columns of contract 2 into channels (K, n); raises BadInput naming the first missing column."""
+    n = joint_count(list(columns), source)
+    grouped: dict[str, Array | None] = {}
+    for name, prefix in COLUMNS.items():
+        wanted = [f"{prefix}_{i}" for i in range(1, n + 1)]
+        grouped[name] = np.column_stack([columns[column] for column in wanted]) if wanted[0] in columns else None
+    return grouped
+
+
+def joint_count(columns: list[str], source: str) -> int:
+    """Number of joints that these column names describe; raises BadInput naming a column that is missing."""
+    indices = [index for column in columns if (index := _joint_index(column)) is not None]
+    n = max(indices, default=1)
+    present = set(columns)
+    for name, prefix in COLUMNS.items():
+        wanted = [f"{prefix}_{i}" for i in range(1, n + 1)]
+        missing = [column for column in wanted if column not in present]
+        if missing and (name == "position" or len(missing) < n):
+            others = f" ({', '.join(wanted[:1] + wanted[-1:])} expected)" if n > 1 else ""
+            raise BadInput(f"{source}: missing column {missing[0]}: channel {name} needs one a joint{others}")
+    if "t" not in present:
+        raise BadInput(f"{source}: missing column t: time [s], strictly increasing")
+    return n
+
+
+def is_channel(column: str) -> bool:
+    """Whether a column is one of contract 2."""
+    return column == "t" or _joint_index(column) is not None
+
+
+def load_recording(path: str | Path) -> Recording:
+    """Load `.csv`, `.csv.gz`, `.parquet` or `.mcap`; raises BadInput with one line that names row or column."""
+    path = Path(path)
+    suffix = _suffix(path)
+    if not path.is_file():
+        raise BadInput(f"no recording {path}: give a {', '.join(SUFFIXES)} file")
+    if suffix == ".mcap":
+        from armlink.recording.mcap import load_mcap
+
+        return load_mcap(path).check(str(path))
+    from armlink.recording.tables import load_csv, load_parquet
+
+    return (load_parquet if suffix == ".parquet" else load_csv)(path).check(str(path))
+
+
+def save_recording(recording: Recording, path: str | Path) -> None:
+    """Save by suffix (see load_recording); raises BadInput where the recording is not sound."""
+    path = Path(path)
+    suffix = _suffix(path)
+    recording.check(str(path))
+    if suffix == ".mcap":
+        from armlink.recording.mcap import save_mcap
+
+        save_mcap(recording, path)
+        return
+    from armlink.recording.tables import save_csv, save_parquet
+
+    (save_parquet if suffix == ".parquet" else save_csv)(recording, path)
+
+
+def slice_rows(recording: Recording, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Recording:
+    """The recording at some of its rows (times unchanged)."""
+    values = {field.name: getattr(recording, field.name) for field in fields(recording)}
+    for name, value in values.items():
+        if isinstance(value, np.ndarray):
+            values[name] = value[rows]
+    return Recording(**values)
+
+
+def _suffix(path: Path) -> str:
+    for suffix in sorted(SUFFIXES, key=len, reverse=True):
+        if path.name.lower().endswith(suffix):
+            return suffix
+    raise BadInput(f"{path}: not a recording by its suffix, expected {', '.join(SUFFIXES)}")
+
+
+def _joint_index(column: str) -> int | None:
+    prefix, _, index = column.rpartition("_")
+    known = prefix in COLUMNS.values() and index.isdigit() and not index.startswith("0")
+    return int(index) if known else None
+
+
+def _check_time(t: Array, source: str) -> None:
+    bad = np.flatnonzero(~np.isfinite(t))
+    if bad.size:
+        raise BadInput(f"{source}: row {bad[0] + 1}: t is {t[bad[0]]}, expected a time [s]")
+    back = np.flatnonzero(np.diff(t) <= 0)
+    if back.size:
+        row = back[0] + 1
+        raise BadInput(f"{source}: row {row + 1}: t {t[row]:.9g} does not follow {t[row - 1]:.9g}: time must increase")
+
+
+def _check_finite_or_nan(values: Array, prefix: str, source: str) -> None:
+    bad = np.argwhere(np.isinf(values))
+    if bad.size:
+        row, joint = bad[0]
+        raise BadInput(f"{source}: row {row + 1}: {prefix}_{joint + 1} is infinite, expected a number or NaN")

@@ -1,0 +1,143 @@
+"""Raw logs and recordings played again: decoded, shown, or sent as what joints send, on a virtual bus."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from armlink.arm_file import ArmFile
+from armlink.bus.frame_log import LogBus, LogReader, is_log
+from armlink.bus.open import open_bus, parse_bus
+from armlink.canopen import object_dictionary as objects
+from armlink.canopen.pdo import TPDO1, TPDO2, TPDO3
+from armlink.canopen.units import TORQUE_PER_MICRO
+from armlink.clock import Clock, MonotonicClock
+from armlink.errors import BadInput
+from armlink.monitor.monitor import assumed_units
+from armlink.recording.recorder import Recorder
+from armlink.recording.recording import Array, Recording
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+VIRTUAL_INTERFACES = ("virtual", "udp_multicast")
+_JOINTS_SEND = (0x080, 0x180, 0x280, 0x380, 0x480, 0x580, 0x700)
+_ENABLED = 0x27
+_REFRESH = 0.2  # [s]
+_I16, _I32 = (-(1 << 15), (1 << 15) - 1), (-(1 << 31), (1 << 31) - 1)
+Stamped = tuple[float, int, bytes]
+
+
+def recording_of_log(arm: ArmFile, path: Path) -> Recording:
+    """Decode a raw log with the recorder's own decoding; `warning` says where it was cut. Raises BadInput."""
+    bus = LogBus(path)
+    recorder = Recorder(arm, bus)
+    times: list[float] = []
+    channels: dict[str, list[Array]] = {}
+    for t, row in recorder.rows(math.inf):
+        times.append(t)
+        for name, values in row.items():
+            channels.setdefault(name, []).append(values)
+    warning = bus.reader.warning
+    if len(times) < 2:
+        cut = f"; {warning}" if warning else ""
+        raise BadInput(f"{path}: {len(times)} whole cycles in {bus.reader.count} frames: no SYNCs of {arm.name}?{cut}")
+    stacked = {name: np.array(rows) for name, rows in channels.items()}
+    return Recording(t=np.array(times), names=recorder.names, warning=warning, **stacked).check(str(path))
+
+
+def play_onto(arm: ArmFile, source: Path, recording: Recording, spec: str, speed: float) -> int:
+    """Send what the joints sent and SYNC onto a virtual bus, at `speed` times its pace; how many frames.
+
+    Raises BadInput for a bus that is not virtual, BusFault where it cannot be opened or takes no frames.
+    """
+    from armlink.bus.port import open_port
+
+    described = parse_bus(spec)
+    virtual = described.interface == "socketcan" and described.channel.startswith("vcan")
+    if not virtual and described.interface not in VIRTUAL_INTERFACES:
+        raise BadInput(
+            f"bus {spec}: replay goes onto a virtual bus only: virtual:…, udp_multicast:… or socketcan:vcan…"
+        )
+    bus = open_bus(spec, arm.require_link().bus)
+    try:
+        frames = frames_of_log(source) if is_log(source) else frames_of_recording(arm, recording)
+        return _play(frames, open_port(bus), MonotonicClock(), speed)
+    finally:
+        bus.shutdown()
+
+
+def frames_of_log(path: Path) -> Iterator[Stamped]:
+    """Time [s], identifier and data of the log's frames that joints or SYNC sent; no command, SDO request or NMT."""
+    for stamp, can_id, data in LogReader(path).frames():
+        if can_id & 0x780 in _JOINTS_SEND:
+            yield stamp / 1e6, can_id, data
+
+
+def frames_of_recording(arm: ArmFile, recording: Recording) -> Iterator[Stamped]:
+    """Time [s], identifier and data of the frames with which an arm's joints would have sent a recording.
+
+    SYNC and TPDO1 each row, TPDO2 where there is what it carries; the joints are enabled, in no mode. A missing reading
+    is a frame that is not sent. Raises BadInput for another number of joints.
+    """
+    joints, units = arm.require_link().joints, assumed_units(arm)
+    if recording.n != len(joints):
+        raise BadInput(f"recording of {recording.n} joints, but {arm.name} has {len(joints)}")
+    nothing = np.full_like(recording.position, math.nan)
+    torque = nothing if recording.torque is None else recording.torque
+    motor = nothing if recording.motor_torque is None else recording.motor_torque
+    velocity = nothing if recording.velocity is None else recording.velocity
+    for row, t in enumerate((recording.t - recording.t[0]).tolist()):
+        yield t, objects.SYNC_ID, b""
+        for j, (joint, unit) in enumerate(zip(joints, units, strict=True)):
+            position, reading = recording.position[row, j], torque[row, j]
+            if math.isfinite(position) and math.isfinite(reading):
+                counts = _whole(position / unit.position, _I32), _whole(reading / TORQUE_PER_MICRO, _I32)
+                yield t, TPDO1.cob_base + joint.node, TPDO1.layout.pack(*counts)
+            if row == 0:
+                yield t, TPDO3.cob_base + joint.node, TPDO3.layout.pack(_ENABLED, 0)
+            if math.isfinite(motor[row, j]) and math.isfinite(velocity[row, j]):
+                values = _whole(motor[row, j] / unit.torque, _I16), _whole(velocity[row, j] / unit.position, _I32)
+                yield t, TPDO2.cob_base + joint.node, TPDO2.layout.pack(_ENABLED, *values)
+
+
+def show(recording: Recording, console: "Console", speed: float, clock: Clock | None = None) -> None:
+    """Show a recording as a table that follows its time, `speed` times as fast; 0: its end at once."""
+    from rich.live import Live
+
+    clock = clock or MonotonicClock()
+    start, times = clock.now(), recording.t - recording.t[0]
+    step = max(1, int(np.searchsorted(times, _REFRESH * speed)))
+    with Live(console=console, auto_refresh=False, transient=True) as live:
+        for row in range(0, times.size, step) if speed > 0 and console.is_terminal else ():
+            clock.sleep_until(start + float(times[row]) / speed)
+            live.update(_table(recording, row), refresh=True)
+    console.print(_table(recording, times.size - 1))
+
+
+def _play(frames: Iterator[Stamped], port: Any, clock: Clock, speed: float) -> int:
+    start, count = clock.now(), 0
+    for t, can_id, data in frames:
+        if speed > 0:
+            clock.sleep_until(start + t / speed)
+        port.send(can_id, data)
+        count += 1
+    return count
+
+
+def _table(recording: Recording, row: int) -> Any:
+    from rich.box import SIMPLE
+    from rich.table import Table
+
+    channels = recording.channels()
+    table = Table("joint", *(name.replace("_", "\n") for name in channels), box=SIMPLE)
+    table.title = f"t = {recording.t[row]:.2f} s of {recording.t[-1]:.2f} s"
+    for joint, name in enumerate(recording.names):
+        table.add_row(name, *(f"{values[row, joint]:+.4f}" for values in channels.values()))
+    return table
+
+
+def _whole(value: float, limits: tuple[int, int]) -> int:
+    return max(limits[0], min(limits[1], round(value)))

@@ -1,0 +1,169 @@
+"""The self-test of an arm's controllers: what they are, what they hold, and what they do when their host falls silent.
+
+Without power it reads, configures and reads back. With power every joint is enabled and holds where it stands; then
+each in turn is quick-stopped, and left without commands; then all are left without the host's heartbeat. What each
+device does, and how long it takes, is measured, not believed.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from armlink.arm_file import LinkJoint
+from armlink.canopen import object_dictionary as objects
+from armlink.canopen import pdo
+from armlink.canopen.cia402 import MODE_NAMES, Mode, supports
+from armlink.canopen.eds_file import OPTIONAL, expected_identity, used_objects
+from armlink.canopen.object_dictionary import Entry
+from armlink.canopen.sdo import NodeServices
+from armlink.errors import ArmlinkError
+from armlink.link import controller_setup as device
+from armlink.link import torque_sensor_record as calibration
+from armlink.link.gate_limits import gate_limits
+from armlink.link.link import Link
+from armlink.selftest.with_power import PowerTest
+
+Outcome = Literal["passed", "failed", "absent", "not run"]
+
+
+@dataclass(frozen=True)
+class Result:
+    """One check of one joint."""
+
+    joint: str
+    check: str
+    """`GROUP` or `GROUP: PART`."""
+    outcome: Outcome
+    found: str
+    seconds: float | None = None
+    """How long the device took, where that was measured [s]."""
+
+
+class SelfTest:
+    """Runs the checks on an arm's controllers; the link must not be started. Results gather in `results`."""
+
+    def __init__(self, link: Link, progress: Callable[[str], None] = lambda text: None) -> None:
+        """`progress` is told what is being done."""
+        self.link, self.progress = link, progress
+        self.results: list[Result] = []
+
+    def run(self, power: bool) -> list[Result]:
+        """All checks; those with power only where `power`, and where all before them passed.
+
+        Raises BusFault where another host is on the bus.
+        """
+        link = self.link
+        missing = [each.joint for each in link.services if not each.present()]
+        link.require_alone()
+        for services, row in zip(link.services, link.section.joints, strict=True):
+            self.progress(f"{services.joint}: identity, objects, settings")
+            if services.joint in missing:
+                self._add(services.joint, "answers", "failed", f"no answer at node {services.node}")
+            elif self._identity(services, row):
+                self._objects(services)
+                self._modes(services)
+                self._calibration(services)
+        if all(each.outcome != "failed" for each in self.results):
+            link.send_nmt(objects.NMT_PRE_OPERATIONAL)
+            for joint, services in enumerate(link.services):
+                self._settings(services, joint)
+        self._with_power(power)
+        return self.results
+
+    def _with_power(self, power: bool) -> None:
+        failed = [each for each in self.results if each.outcome == "failed"]
+        if failed or not power:
+            reason = f"not run: {failed[0].joint} failed: {failed[0].check}" if failed else "not run: not asked for"
+            for check in PowerTest.CHECKS:
+                for name in self.link.names:
+                    self._add(name, check, "not run", reason)
+            return
+        PowerTest(self.link, self._add, self.progress).run()
+
+    def _add(self, joint: str, check: str, outcome: Outcome, found: str, seconds: float | None = None) -> None:
+        self.results.append(Result(joint, check, outcome, found, seconds))
+
+    def _try(self, joint: str, check: str, work: Callable[[], str]) -> bool:
+        """Add what `work` found, or what it raised; whether it passed."""
+        try:
+            self._add(joint, check, "passed", work())
+        except ArmlinkError as error:
+            self._add(joint, check, "failed", str(error))
+            return False
+        return True
+
+    def _identity(self, services: NodeServices, row: LinkJoint) -> bool:
+        def work() -> str:
+            device.check_identity(services, row)
+            stated = expected_identity(row, services.remote.object_dictionary)
+            told = [f"{int(services.read(entry)):#x}" for entry in device.IDENTITY_OBJECTS.values()]
+            known = "as stated" if stated.model_dump(exclude_none=True) else "not stated in the arm file"
+            return f"{':'.join(told)}, {known}"
+
+        return self._try(services.joint, "identity", work)
+
+    def _objects(self, services: NodeServices) -> None:
+        """Every object that the link uses is there, with the length that the data sheet has."""
+        wrong, count = [], 0
+        for entry in used_objects():
+            if services.has(entry):
+                count += 1
+                try:
+                    services.read(entry)
+                except ArmlinkError as error:
+                    wrong.append(str(error))
+            elif entry in OPTIONAL:
+                self._add(services.joint, f"data sheet: {entry}", "absent", OPTIONAL[entry] or "the device lacks it")
+            else:
+                wrong.append(f"{entry}: the device lacks it")
+        found = "; ".join(wrong) or f"{count} objects as the data sheet has them"
+        self._add(services.joint, "data sheet", "failed" if wrong else "passed", found)
+
+    def _modes(self, services: NodeServices) -> None:
+        def work() -> str:
+            supported = device.check_modes(services)
+            for mode in (Mode.PROFILE_POSITION, Mode.PROFILE_TORQUE):
+                if not supports(supported, mode):
+                    self._add(services.joint, f"modes: {int(mode)}", "absent", f"no {MODE_NAMES[mode]} mode")
+            return ", ".join(str(int(mode)) for mode in MODE_NAMES if mode and supports(supported, mode))
+
+        self._try(services.joint, "modes", work)
+
+    def _calibration(self, services: NodeServices) -> None:
+        def work() -> str:
+            held = calibration.read_record(services)
+            crc = calibration.calibration_crc(held.gain, held.offset, held.record_id, held.date)
+            new = (held.gain, held.offset, held.record_id, held.crc) == (1.0, 0.0, 0, 0)
+            if held.crc != crc and not new:
+                raise services.fault(objects.RECORD_CRC, f"is {held.crc:#x}, but what it holds gives {crc:#x}")
+            return f"gain {held.gain:.6g}, offset {held.offset:.4g} N·m, record {held.record_id}"
+
+        self._try(services.joint, "calibration", work)
+
+    def _settings(self, services: NodeServices, joint: int) -> None:
+        """Configure as start() does, but go on where something is refused."""
+        link, row = self.link, self.link.section.joints[joint]
+        for each in pdo.LINK_PDOS:
+            self._try(services.joint, f"PDO mapping: {each.name}", lambda each=each: self._mapping(services, each))  # type: ignore[misc]
+        try:
+            unit = device.read_units(services, row)
+            limits = gate_limits(row, link.windows[joint], unit, link.period, link.section.deadline)
+            settings = device.settings(row, unit, limits, link.period, link.protection, device.check_modes(services))
+        except ArmlinkError as error:
+            self._add(services.joint, "units", "failed", str(error))
+            return
+        self._add(services.joint, "units", "passed", f"rated torque {unit.torque * 1e3:.6g} N·m")
+        if services.has(objects.TORQUE_OFFSET):
+            settings = [(objects.TORQUE_OFFSET, 0), *settings]
+        for entry, value in settings:
+            self._try(services.joint, f"settings: {entry}", lambda e=entry, v=value: _written(services, e, v))  # type: ignore[misc]
+
+    def _mapping(self, services: NodeServices, each: pdo.Pdo) -> str:
+        device.configure_pdo(services, each, self.link.protection.deadline_ms)
+        deadline = f", deadline {self.link.protection.deadline_ms} ms" if each is pdo.RPDO1 else ""
+        return f"{len(each.entries)} objects, read back{deadline}"
+
+
+def _written(services: NodeServices, entry: Entry, value: int) -> str:
+    services.write_checked(entry, value)
+    return f"{value}, read back"

@@ -1,0 +1,54 @@
+"""The arm file's kinematics as gcomp's arm, whether given as Denavit-Hartenberg rows or as a model file."""
+
+import numpy as np
+
+from armlink.arm_file import ArmFile
+from armlink.errors import BadInput
+from gcomp.arm.arm import Arm
+from gcomp.arm.load import ModelArm, load_model
+from gcomp.errors import GcompError
+
+
+def gcomp_arm(arm_file: ArmFile) -> Arm:
+    """The arm that gcomp computes with, joints in the arm file's order.
+
+    Raises BadInput where a model file cannot be used or its joints are not the ones that the link section drives.
+    """
+    kinematics = arm_file.kinematics
+    if arm_file.model_path is not None:
+        return model_arm(arm_file).arm
+    rows = kinematics.joints
+    try:
+        return Arm(
+            names=tuple(row.name for row in rows),
+            alpha=np.array([row.alpha for row in rows]),
+            a=np.array([row.a for row in rows]),
+            d=np.array([row.d for row in rows]),
+            theta_offset=np.array([row.theta_offset for row in rows]),
+            gravity=np.array(kinematics.gravity),
+            lower=np.array([row.lower for row in rows]),
+            upper=np.array([row.upper for row in rows]),
+        )
+    except GcompError as error:
+        raise BadInput(f"{arm_file.path}: kinematics: {error}") from None
+
+
+def model_arm(arm_file: ArmFile) -> ModelArm:
+    """The arm of the arm file's model file, with the model's own mass moments; raises BadInput as gcomp_arm does.
+
+    The arm file's gravity is in the model's world frame; where the arm file gives none, the model's own holds.
+    """
+    path, kinematics = arm_file.model_path, arm_file.kinematics
+    if path is None:
+        raise BadInput(f"{arm_file.path}: key kinematics.model is missing: this needs a URDF or MJCF file")
+    gravity = kinematics.gravity if "gravity" in kinematics.model_fields_set else None
+    try:
+        model = load_model(path, tip=kinematics.tip, gravity=gravity)
+    except GcompError as error:
+        raise BadInput(f"{arm_file.path}: key kinematics.model: {error}") from None
+    if arm_file.link is not None and arm_file.joint_names != model.arm.names:
+        raise BadInput(
+            f"{arm_file.path}: link.joints are {list(arm_file.joint_names)}, but the model's chain has "
+            f"{list(model.arm.names)}: same names, same order"
+        )
+    return model

@@ -1,0 +1,216 @@
+"""The bus loop: drives the bus or listens to it, cycle by cycle; knows no web, no database and no observer."""
+
+import math
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from armlink.errors import ArmlinkError, BusFault, Refused
+from armlink.link.link import Link
+from armlink.link.listener import Listener
+from armlink.link.types import Calibration, Command, Sample
+from calib.arm.kinematics import gcomp_arm
+from calib.daemon.loop.loop_messages import Array, Batch, Down, LoopOptions, Message, Progress, Reply, Request, Up
+from calib.motion.random_work import WorkMotion, work_pieces
+
+BATCH_SECONDS = 0.1
+"""Samples go to the service so often: the snapshot rate of contract 8."""
+RETRY_SECONDS = 1.0
+"""A bus that is not there is tried again after this time."""
+TOUR = WorkMotion(reach=10.0)
+"""A tour's moves may go from one end of a joint's range to the other."""
+SILENCE_SECONDS = 0.5
+"""A bus without SYNC, or joints without readings, for so long is reported."""
+
+
+class ArmLoop:
+    """`run()` makes cycles for a tenth of a second and returns what there is to say; `handle` does what is asked.
+
+    A fault of bus or joint is a message, never an exception: the bus is opened again until it works.
+    """
+
+    def __init__(self, options: LoopOptions) -> None:
+        self.options = options
+        self._tour: list[int] | None = None
+        self._told = -1
+        self._source: Link | Listener | None = None
+        self._targets: Iterator[Array] | None = None
+        self._shift = 0.0
+        self._said: str | None = None
+        self._heard = math.inf
+        self._real_start: tuple[float, float] | None = None
+
+    @property
+    def source(self) -> Link | Listener | None:
+        """The open link or listener, None while there is none."""
+        return self._source
+
+    def run(self) -> list[Message]:
+        """Cycles for BATCH_SECONDS, or one try to open the bus."""
+        try:
+            if self._source is None:
+                return [self._open()]
+            return self._cycle()
+        except ArmlinkError as error:
+            self.close()
+            return self._down(str(error))
+
+    def wait(self) -> float:
+        """How long to wait before the next run() [s]: 0 while the bus is there."""
+        return 0.0 if self._source is not None else RETRY_SECONDS
+
+    def close(self) -> None:
+        """Let go of the bus; joints that were enabled are in quick stop, holding."""
+        source, self._source, self._targets, self._tour = self._source, None, None, None
+        if source is not None:
+            try:
+                source.__exit__(None, None, None)
+            except (ArmlinkError, OSError):
+                return  # it is gone already: the joints' own deadlines stop them
+
+    def handle(self, request: Request) -> Reply:
+        """Do what is asked; every failure is in the reply."""
+        source = self._source
+        if source is None:
+            return Reply(request.id, error=self._said or "the bus is not open", status=BusFault.exit_status)
+        try:
+            return Reply(request.id, self._do(source, request))
+        except BusFault as error:
+            self.close()
+            return Reply(request.id, error=str(error), status=error.exit_status)
+        except ArmlinkError as error:
+            return Reply(request.id, error=str(error), status=error.exit_status)
+
+    def _do(self, source: Link | Listener, request: Request) -> Any:
+        arguments = request.arguments
+        if request.what == "read":
+            return source.read_calibration(arguments["joint"])
+        if request.what == "write":
+            return source.write_calibration(**arguments)
+        if request.what == "sweep":
+            return self._sweep(source, arguments["poses"], arguments["seed"])
+        raise BusFault(f"the loop knows no request {request.what!r}")
+
+    def _sweep(self, source: Link | Listener, poses: int, seed: int) -> int:
+        """From now on the arm tours so many poses all over its range, then holds; `run` tells how far it is."""
+        if not isinstance(source, Link):
+            raise Refused("a sweep moves the arm, and this daemon only listens: let its controller move it more")
+        self._tour = [0, poses]
+        self._targets = self._touring(source, poses, seed)
+        return poses
+
+    def _open(self) -> Message:
+        options = self.options
+        from armlink.bus.open import open_link_bus
+
+        bus = options.open_bus() if options.open_bus else open_link_bus(options.bus, options.arm.require_link())
+        self._heard = math.inf
+        if options.listen_only:
+            self._source = Listener(options.arm, bus)
+            self._heard = self._source.clock.now()
+            return self._up(None)
+        link = Link(options.arm, bus)
+        self._source = link
+        link.start()
+        held = [link.read_calibration(joint) for joint in range(link.n)]  # before there are cycles to wait for
+        sample = link.enable()
+        self._shift = link.clock.now() - sample.t
+        self._targets = self._motion(link)
+        self._real_start = None
+        return self._up(held)
+
+    def _up(self, held: list[Calibration] | None) -> Up:
+        self._said = None
+        return Up(None if held is None else tuple((each.gain, each.offset, each.record_id) for each in held))
+
+    def _down(self, reason: str) -> list[Message]:
+        self._said = reason
+        return [Down(reason)]
+
+    def _cycle(self) -> list[Message]:
+        source = self._source
+        rows = self._listen(source) if isinstance(source, Listener) else self._drive(source)  # type: ignore[arg-type]
+        assert source is not None
+        if isinstance(source, Listener):
+            heard = tuple(source.emergencies)
+            source.emergencies.clear()
+            messages: list[Message] = [Batch.of(rows, source.stats, heard)] if rows else []
+            return messages + self._silence(source, bool(rows))
+        messages = [Batch.of(rows, source.stats)]
+        if self._tour is not None and self._tour[0] != self._told:
+            self._told = self._tour[0]
+            messages.append(Progress(*self._tour))
+            if self._told >= self._tour[1]:
+                self._tour, self._told = None, -1
+        return messages
+
+    def _drive(self, link: Link) -> list[tuple[float, Sample, Array, Array]]:
+        rows = []
+        if self._targets is None:
+            self._targets = self._motion(link)
+        for _ in range(max(1, round(BATCH_SECONDS / link.period))):
+            sample = link.cycle(Command.hold(next(self._targets)))
+            rows.append((sample.t + self._shift, sample, link.torque_sent, link.position_sent))
+            self._keep_pace(link)
+        return rows
+
+    def _listen(self, listener: Listener) -> list[tuple[float, Sample, Array, Array]]:
+        rows = []
+        end = listener.clock.now() + BATCH_SECONDS
+        while (remaining := end - listener.clock.now()) > 0:
+            sample = listener.next(remaining)
+            while sample is not None:
+                rows.append((sample.t, sample, listener.torque_sent, listener.position_sent))
+                sample = listener.next(0.0)
+        return rows
+
+    def _silence(self, listener: Listener, heard: bool) -> list[Message]:
+        """Say once that nobody sends SYNC, and when somebody does again."""
+        now = listener.clock.now()
+        if heard:
+            self._heard = now
+            if self._said is not None:
+                return [self._up(None)]
+            return []
+        if now - self._heard <= SILENCE_SECONDS or self._said is not None:
+            return []
+        return self._down(f"no SYNC on {listener.bus.channel_info}: is the arm's controller running?")
+
+    def _motion(self, link: Link) -> Iterator[Array]:
+        """Targets, one a cycle: where the arm stands, or ordinary work where that was asked for."""
+        if self.options.work:
+            for pose in self._poses(link, self.options.seed, WorkMotion()):
+                yield from pose
+        here = link.position_sent
+        while True:
+            yield here
+
+    def _touring(self, link: Link, poses: int, seed: int) -> Iterator[Array]:
+        """Targets of a tour over the whole range, then back to what it did before."""
+        for done, pose in enumerate(self._poses(link, seed, TOUR), start=1):
+            yield from pose
+            if self._tour is not None:
+                self._tour[0] = done
+            if done >= poses:
+                break
+        yield from self._motion(link)
+
+    def _poses(self, link: Link, seed: int, motion: WorkMotion) -> Iterator[Array]:
+        """Pieces (K, n) of motion without end, each to another pose and a rest there."""
+        arm = gcomp_arm(self.options.arm)
+        speed = np.array([joint.max_velocity for joint in self.options.arm.require_link().joints])
+        random = np.random.default_rng([seed, 8])
+        return work_pieces(link.position_sent, arm.lower, arm.upper, speed, link.period, random, motion)
+
+    def _keep_pace(self, link: Link) -> None:
+        """An in-process arm's time is as fast as the machine: wait for the machine's clock."""
+        if not self.options.pace or getattr(link.bus, "clock", None) is None:
+            return
+        now, real = link.clock.now(), time.monotonic()
+        if self._real_start is None or real - self._real_start[1] - (now - self._real_start[0]) > 1.0:
+            self._real_start = (now, real)  # the machine is slower than the arm: do not make up for it
+        ahead = (now - self._real_start[0]) - (real - self._real_start[1])
+        if ahead > 0:
+            time.sleep(ahead)

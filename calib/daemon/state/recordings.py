@@ -1,0 +1,86 @@
+"""Recordings that the daemon keeps by itself: MCAP files of some minutes, the oldest dropped when the quota is full."""
+
+import logging
+from datetime import UTC, datetime
+from pathlib import Path
+
+from calib.daemon.loop.loop_messages import Batch
+from calib.daemon.settings import RecordingSettings
+
+log = logging.getLogger("armlink.daemon")
+GAP = 1.0
+"""A pause in the samples longer than this begins another file [s]."""
+
+
+class Recordings:
+    """Writes every so many-th sample; a disk that is full or fails is logged and never stops the daemon.
+
+    Files are numbered, since clocks are set back.
+    """
+
+    def __init__(self, directory: Path, names: tuple[str, ...], settings: RecordingSettings) -> None:
+        """Files go to `directory`, which is made when the first one is."""
+        from armlink.recording.mcap import RecordingWriter
+
+        self._make = RecordingWriter
+        self._directory, self._names, self.settings = directory, names, settings
+        self._writer: RecordingWriter | None = None
+        self._begun = self._last = self._due = -float("inf")
+        self._failed_at = -float("inf")
+
+    def append(self, batch: Batch) -> None:
+        """Write what is due of a batch."""
+        settings = self.settings
+        if not settings.enabled or batch.t[-1] - self._failed_at < 60.0:
+            return
+        try:
+            if batch.t[0] - self._last > GAP or batch.t[0] < self._last or self._old(float(batch.t[0])):
+                self._rotate(float(batch.t[0]))
+            self._write(batch)
+        except OSError as error:
+            log.error("recordings: %s", error)
+            self._failed_at = float(batch.t[-1])
+            self.close()
+        self._last = float(batch.t[-1])
+
+    def close(self) -> None:
+        """End the file that is open."""
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            try:
+                writer.__exit__(None, None, None)
+            except OSError as error:
+                log.error("recordings: %s", error)
+
+    def _old(self, t: float) -> bool:
+        return self._writer is not None and t - self._begun > self.settings.minutes * 60.0
+
+    def _write(self, batch: Batch) -> None:
+        assert self._writer is not None
+        for k, t in enumerate(batch.t.tolist()):
+            if t < self._due:
+                continue
+            self._due = max(self._due + 1 / self.settings.rate, t + 0.5 / self.settings.rate)
+            self._writer.append(t - self._begun, {name: values[k] for name, values in batch.channels.items()})
+
+    def _rotate(self, t: float) -> None:
+        self.close()
+        self._directory.mkdir(parents=True, exist_ok=True)
+        self._keep_quota()
+        last = max((path.name for path in self._directory.glob("*.mcap")), default="0")
+        number = int(last.partition("-")[0]) + 1 if last.partition("-")[0].isdigit() else 1
+        stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+        self._writer = self._make(self._directory / f"{number:08d}-{stamp}.mcap", self._names)
+        self._begun = self._due = t
+
+    def _keep_quota(self) -> None:
+        """Drop the oldest files until the rest, one more of the largest size included, fits the quota."""
+        files = sorted(self._directory.glob("*.mcap"), key=lambda path: path.name)
+        sizes = [path.stat().st_size for path in files]
+        room = self.settings.quota_mb * 1e6 - max(sizes, default=0)
+        total = sum(sizes)
+        for path, size in zip(files, sizes, strict=True):
+            if total <= room:
+                break
+            path.unlink(missing_ok=True)
+            total -= size

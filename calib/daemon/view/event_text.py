@@ -1,0 +1,99 @@
+"""What the observer says, as the event log has it: kind, one line for people, evidence as JSON."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+from calib.observer.effect_dictionary import DRIFT
+from calib.observer.events import Event
+
+Told = tuple[str, str, dict[str, Any]]
+"""(kind, text, evidence)"""
+
+_EFFECTS = {
+    "friction": "friction shows in the sensor",
+    "spring": "a spring (cable, hose) pulls at the joint",
+    "slip": "the position reading has slipped",
+    "tilt": "the base has tilted",
+    "scale": "all torques changed by one factor: gravity, supply voltage, or a common scale",
+    "temperature": "several sensors' zeros moved together: temperature or supply voltage",
+}
+
+
+def told(event: Event) -> Told:
+    """An observer's event in the terms of contract 8."""
+    evidence = clean(event.evidence)
+    joint = event.joint or "the arm"
+    if event.kind == "alarm":
+        return "alarm", f"{joint}: sensor and model disagree ({evidence.get('channel', '?')})", evidence
+    if event.kind == "outliers":
+        return "alarm", f"{joint}: {evidence.get('rows', 'several')} readings in a row are far from the model", evidence
+    if event.kind == "undecided":
+        return "undecided", f"{joint}: nothing is changed: {'; '.join(evidence.get('reasons', []))}", evidence
+    if event.kind == "proposal":
+        return "drift", f"{joint}: sensor drift confirmed: {_change(evidence)}", evidence
+    return _verdict(joint, evidence)
+
+
+def one_alarm_a_joint(events: list[Event]) -> list[Event]:
+    """The same events, several alarms of one joint at one time as one: all its channels."""
+    channels: dict[str | None, list[str]] = {}
+    for event in events:
+        if event.kind == "alarm":
+            channels.setdefault(event.joint, []).append(event.evidence["channel"])
+    merged = []
+    for event in events:
+        if event.kind != "alarm":
+            merged.append(event)
+        elif event.joint in channels:
+            merged.append(replace(event, evidence={"channel": ", ".join(channels.pop(event.joint))}))
+    return merged
+
+
+def clean(value: Any) -> Any:
+    """A value that JSON can carry: numbers that are not finite become None."""
+    if isinstance(value, dict):
+        return {str(key): clean(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [clean(item) for item in value]
+    if isinstance(value, bool | str) or value is None:
+        return value
+    if isinstance(value, int):
+        return value
+    value = float(value)
+    return value if math.isfinite(value) else None
+
+
+def _verdict(joint: str, evidence: dict[str, Any]) -> Told:
+    cause, sure = evidence["cause"], f"confidence {evidence['confidence']:.1%}"
+    if cause in DRIFT:
+        beside = f", and {evidence['beside']}" if "beside" in evidence else ""
+        return "drift", f"{joint}{beside}: the torque sensor drifts ({cause}); {sure}; not written yet", evidence
+    if cause == "none":
+        return "clear", "sensors and model agree again: what it was is over (a collision, a contact, a load)", evidence
+    if cause in ("payload", "tool"):
+        return "payload", f"{_load(cause, evidence)}; {sure}", evidence
+    if cause == "ambiguous":
+        return "undecided", f"cannot be told apart yet: {', '.join(evidence['rivals'])}; {sure}", evidence
+    if cause == "unknown":
+        return (
+            "contact",
+            "contact, or several things at once: no single cause explains it; estimates are held",
+            evidence,
+        )
+    return "effect", f"{joint}: {_EFFECTS.get(cause, cause)}; {sure}; estimates are held", evidence
+
+
+def _load(cause: str, evidence: dict[str, Any]) -> str:
+    mass, place = evidence["mass"], ", ".join(f"{x:.3f}" for x in evidence["com"])
+    if mass < 0:
+        return f"{-mass:.3f} kg taken off at ({place}) m of the last link"
+    held = "estimates are held" if cause == "payload" else "it stays: a tool, in the model from now on"
+    return f"payload of {mass:.3f} kg at ({place}) m of the last link; {held}"
+
+
+def _change(evidence: dict[str, Any]) -> str:
+    return (
+        f"gain {evidence['gain']:.5f} ± {evidence['gain_std']:.5f}, "
+        f"offset {evidence['offset']:+.3f} ± {evidence['offset_std']:.3f} N·m"
+    )

@@ -1,0 +1,54 @@
+"""The stream: every client has a short queue of its own; a slow one loses the oldest items and holds nobody up."""
+
+import asyncio
+from collections import deque
+
+from calib.daemon.view.api_models import EventItem, JointsItem
+
+QUEUE_ITEMS = 50
+"""Items that wait for one client at most: five seconds of joints."""
+
+Item = JointsItem | EventItem
+
+
+class Client:
+    """One client's items; used on the event loop's thread alone."""
+
+    def __init__(self, hub: "Hub") -> None:
+        self._hub = hub
+        self._items: deque[Item] = deque(maxlen=QUEUE_ITEMS)
+        self._more = asyncio.Event()
+
+    def put(self, item: Item) -> None:
+        """Take one more item; where the queue is full the oldest one is lost."""
+        self._items.append(item)
+        self._more.set()
+
+    async def get(self) -> Item:
+        """The next item."""
+        while not self._items:
+            self._more.clear()
+            await self._more.wait()
+        return self._items.popleft()
+
+    def close(self) -> None:
+        """No more items."""
+        self._hub.clients.discard(self)
+
+
+class Hub:
+    """All clients of the stream."""
+
+    def __init__(self) -> None:
+        self.clients: set[Client] = set()
+
+    def subscribe(self) -> Client:
+        """A new client."""
+        client = Client(self)
+        self.clients.add(client)
+        return client
+
+    def publish(self, item: Item) -> None:
+        """Give an item to every client."""
+        for client in self.clients:
+            client.put(item)

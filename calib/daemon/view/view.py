@@ -1,0 +1,86 @@
+"""What the web layer may ask of the daemon, and what it may be refused.
+
+Everything here is called on the service's one event loop (asyncio, the same thread): an answer never waits for the bus.
+"""
+
+from datetime import datetime
+from typing import Protocol
+
+from calib.daemon.view.api_models import (
+    EventItem,
+    EventRecord,
+    HistoryPoint,
+    JointEstimate,
+    JointNow,
+    JointsItem,
+    Proposal,
+    Status,
+)
+
+
+class NotPossible(Exception):
+    """An approval or rejection that cannot be done now; the message says why (HTTP 409)."""
+
+
+class NoSuch(Exception):
+    """No proposal or joint of that id or name; the message lists what there is (HTTP 404)."""
+
+
+class Subscription(Protocol):
+    """One client's stream: bounded; a client that is too slow loses the oldest items, never holds the daemon up."""
+
+    async def get(self) -> JointsItem | EventItem:
+        """The next item."""
+        ...
+
+    def close(self) -> None:
+        """No more items."""
+        ...
+
+
+class DaemonView(Protocol):
+    """What the web layer may ask. Nothing here commands torque or motion."""
+
+    def status(self) -> Status:
+        """State, bus and records."""
+        ...
+
+    def joints(self) -> tuple[JointNow, ...]:
+        """Every joint as of the newest snapshot, base to tip."""
+        ...
+
+    def estimates(self) -> tuple[JointEstimate, ...]:
+        """Every joint's gain and offset, base to tip; empty while there is no gravity record."""
+        ...
+
+    def events(self, after: int = 0, limit: int = 500) -> tuple[EventRecord, ...]:
+        """Events with a larger id, oldest first, at most `limit` of them: the next ones are `after` the last."""
+        ...
+
+    def history(
+        self, joint: str | None, since: datetime | None = None, until: datetime | None = None, most: int = 2000
+    ) -> tuple[HistoryPoint, ...]:
+        """Estimates over time, oldest first, thinned evenly to at most `most` a joint; raises NoSuch.
+
+        Without a joint those of every joint, joint after joint.
+        """
+        ...
+
+    def proposals(self, limit: int = 200) -> tuple[Proposal, ...]:
+        """Newest first."""
+        ...
+
+    def approve(self, proposal: int, by: str) -> Proposal:
+        """Put a pending proposal in force; it is `approved` at once, `applied` or `failed` a moment later (an event).
+
+        Raises NoSuch, NotPossible.
+        """
+        ...
+
+    def reject(self, proposal: int, by: str) -> Proposal:
+        """Drop a pending proposal. Raises NoSuch, NotPossible."""
+        ...
+
+    def subscribe(self) -> Subscription:
+        """A new client of the stream; it begins with the present joints."""
+        ...

@@ -1,0 +1,196 @@
+"""Calibration in the field, without a mass: gains and offsets from slow motion and the identified gravity parameters.
+
+v_i = K_i τ_i(q; β) + O_i + s_i f_i, with s_i the side of approach and f_i hysteresis or friction that the sensor sees;
+β ~ N(β̂, Cov β̂) from the gravity record and position offsets within what is known of them, all joints in one problem
+(theory.md sections 4 (iii) and 7). The intervals hold the gravity record's own error, which does not average out.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from armlink.arm_file import ArmFile
+from armlink.errors import BadInput, Refused
+from calib.field.linear_model import UNKNOWN_MOMENT, Belief, Solution, belief_of, field_columns, solve
+from calib.field.rows import FieldRows
+from calib.records.records import Array, CalibrationRecord, GravityRecord, Parameter
+from gcomp.arm.mass_moments import payload_columns
+from gcomp.gravity.torque import gravity_regressor
+
+Flags = npt.NDArray[np.bool_]
+
+GAIN_STD = 0.02
+"""A gain known no better than this, as a ratio, is not told from the offset."""
+OFFSET_STD = 0.005
+"""Likewise an offset, as a share of rated torque."""
+DRIFT = 0.05
+"""Standard deviation of the drift that a gain may have had which these rows do not show, as a ratio."""
+ROUNDS = 4
+"""Gauss-Newton steps, each with the noise brought to the scatter that is there."""
+PAYLOAD_EVIDENCE = 10.0
+"""BIC by which a payload may be worse than new gains and offsets and still cannot be excluded."""
+
+
+@dataclass(frozen=True, eq=False)
+class FieldFit:
+    """Gains and offsets (n,) as the sensors have them now; NaN where these rows do not separate them, and why."""
+
+    names: tuple[str, ...]
+    gain: Array
+    offset: Array
+    """[N·m]"""
+    covariance: Array
+    """Of (gain, offset) of each joint (n, 2, 2); NaN where there is no value."""
+    hysteresis: Array
+    """Half the difference between both directions (n,) [N·m]; NaN where only one was seen."""
+    reasons: dict[tuple[str, Parameter], str]
+    common_scale_std: float
+    """Standard deviation of a factor common to all gains, which comes from the gravity record alone."""
+    residual: Array
+    """Readings less fit (K, n) [N·m], NaN where none counts."""
+    torque: Array
+    """Model torque (K, n) [N·m]."""
+    rows: Array
+    """Rows that count (n,)."""
+
+    def std(self, parameter: Parameter) -> Array:
+        """Standard deviations of "gain" or "offset" (n,), NaN where there is no value."""
+        place = 0 if parameter == "gain" else 1
+        std: Array = np.sqrt(self.covariance[:, place, place])
+        return std
+
+    def ci95(self, parameter: Parameter) -> Array:
+        """95 % intervals (n, 2)."""
+        value, half = getattr(self, parameter), 1.96 * self.std(parameter)
+        return np.stack([value - half, value + half], axis=1)
+
+
+def fit_field(arm: ArmFile, rows: FieldRows, gravity: GravityRecord, calibration: CalibrationRecord | None) -> FieldFit:
+    """Gains and offsets from slow rows; `calibration` gives the position sensors and what was in force.
+
+    Raises Refused where a payload explains the rows as well, or the records are of another arm; BadInput.
+    """
+    belief = belief_of(arm, gravity, calibration)
+    n, q = belief.arm.n, rows.position * belief.position_gain + belief.position_offset
+    if not np.isfinite(rows.torque).any():
+        raise BadInput("no torque reading counts")
+    gain, sigma = belief.installed[0], rows.sigma
+    noise, prior = sigma, belief.prior(np.ones(n))
+    for _ in range(ROUNDS):
+        columns = field_columns(belief, rows, q, gain)
+        solved = solve(columns, rows.torque, noise, prior)
+        residual: Array = rows.torque - columns @ solved.value
+        factor = _scatter(residual / sigma) * _correlation(residual, rows.series)
+        gain, noise = solved.value[:n], sigma * np.maximum(factor, 1.0)
+    unseen = np.sqrt(np.diag(solved.covariance)[:n]) > GAIN_STD * np.abs(gain)
+    if unseen.any():
+        columns = field_columns(belief, rows, q, np.where(unseen, belief.installed[0], gain))
+        solved = solve(columns, rows.torque, noise, belief.prior(np.where(unseen, DRIFT, 1.0)))
+    if calibration is not None:
+        _refuse_payload(belief, rows, q, noise, solved.chi2)
+    return _report(belief, rows, columns, solved, unseen)
+
+
+def _scatter(score: Array) -> Array:
+    """RMS of residuals over their standard deviation (n,)."""
+    counted = np.isfinite(score)
+    total = np.where(counted, score**2, 0.0).sum(axis=0)
+    scatter: Array = np.sqrt(total / np.maximum(counted.sum(axis=0) - 3, 1))
+    return scatter
+
+
+def _correlation(residual: Array, series: npt.NDArray[np.int64]) -> Array:
+    """Factor (n,) on the standard deviation of a row for neighbouring residuals that are alike: √(1 + 2 Σ ρ_k)."""
+    factor = np.ones(residual.shape[1])
+    for joint in range(residual.shape[1]):
+        parts = [residual[series == each, joint] for each in np.unique(series)]
+        parts = [part[np.isfinite(part)] for part in parts]
+        power = sum(float(part @ part) for part in parts)
+        total = 1.0
+        for lag in range(1, max((len(part) for part in parts), default=0) // 4):
+            rho = sum(float(part[lag:] @ part[:-lag]) for part in parts if len(part) > lag) / max(power, 1e-300)
+            if rho < 0.05:
+                break
+            total += 2 * rho
+        factor[joint] = np.sqrt(total)
+    return factor
+
+
+def _refuse_payload(belief: Belief, rows: FieldRows, q: Array, noise: Array, chi2: float) -> None:
+    """Raise Refused where the installed pairs do not fit, and a payload with them does as well as new pairs do."""
+    n = belief.arm.n
+    base = field_columns(belief, rows, q, belief.installed[0])
+    held = belief.prior_installed()
+    fixed, by_point = payload_columns(belief.arm)
+    load = gravity_regressor(belief.arm, q) @ np.column_stack([fixed, by_point]) * belief.installed[0][:, None]
+    with_load = solve(
+        np.concatenate([base, load], axis=2),
+        rows.torque,
+        noise,
+        (np.concatenate([held[0], np.zeros(4)]), np.concatenate([held[1], np.full(4, UNKNOWN_MOMENT)])),
+    )
+    log_rows = np.log(np.isfinite(rows.torque).sum())
+    as_load, mass = with_load.chi2 + 4 * log_rows, float(with_load.value[-4])
+    as_installed = solve(base, rows.torque, noise, held).chi2
+    if as_installed > as_load + PAYLOAD_EVIDENCE and mass > 0 and as_load < chi2 + 2 * n * log_rows + PAYLOAD_EVIDENCE:
+        raise Refused(
+            f"a payload of {mass:.2f} kg explains these readings as well as other gains do: take it off and record"
+            " again (or, if there is none, sweep with a reference mass)"
+        )
+
+
+def _report(belief: Belief, rows: FieldRows, columns: Array, solved: Solution, unseen: Flags) -> FieldFit:
+    n, names = belief.arm.n, belief.arm.names
+    counted = np.isfinite(rows.torque)
+    model = columns[:, np.arange(n), np.arange(n)]
+    gain, offset, hysteresis = (solved.value[k * n : (k + 1) * n].copy() for k in range(3))
+    pairs = np.array([solved.covariance[np.ix_([j, n + j], [j, n + j])] for j in range(n)])
+    reasons: dict[tuple[str, Parameter], str] = {}
+    for j, name in enumerate(names):
+        here = model[counted[:, j], j]
+        sides = set(np.sign(rows.direction[counted[:, j], j])) - {0.0}
+        if len(here) == 0:
+            reasons[name, "gain"] = reasons[name, "offset"] = "its sensor counts in none of these rows"
+        elif unseen[j]:
+            reasons[name, "gain"] = _no_gain(here)
+        if len(here) and len(sides) < 2:
+            hysteresis[j] = np.nan
+            reasons[name, "offset"] = (
+                "it was approached from one side only, so that friction or hysteresis looks the same: move it both ways"
+            )
+        elif len(here) and np.sqrt(pairs[j, 1, 1]) > OFFSET_STD * belief.rated[j]:
+            reasons[name, "offset"] = (
+                f"it cannot be told from the gain: ± {2 * np.sqrt(pairs[j, 1, 1]):.2g} N·m only, since torque stays"
+                f" between {here.min():.2f} and {here.max():.2f} N·m"
+            )
+    for place, (parameter, value) in enumerate((("gain", gain), ("offset", offset))):
+        for j, name in enumerate(names):
+            if (name, parameter) in reasons:
+                value[j] = pairs[j, place, :] = pairs[j, :, place] = np.nan
+    known = np.flatnonzero(np.isfinite(gain))
+    of_gains = solved.covariance[np.ix_(known, known)] / np.outer(gain[known], gain[known])
+    common = float(np.sqrt(of_gains.mean())) if len(known) else np.nan
+    residual = rows.torque - columns @ solved.value
+    return FieldFit(
+        names,
+        gain,
+        offset,
+        pairs,
+        hysteresis,
+        reasons,
+        common,
+        residual,
+        np.where(counted, model, np.nan),
+        counted.sum(axis=0),
+    )
+
+
+def _no_gain(torque: Array) -> str:
+    spread = float(np.std(torque))
+    if np.abs(torque).max() < 1e-3:
+        return "gravity does not act on it: its axis is vertical in all of these poses"
+    return (
+        f"it cannot be told from the offset: gravity torque varies by {spread:.2g} N·m only (standard deviation) in"
+        " these poses: move it, or the joints beyond it, further"
+    )

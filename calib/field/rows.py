@@ -1,0 +1,143 @@
+"""Rows for a calibration in the field: slow instants of a recording, or the readings of sweeps."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from armlink.errors import BadInput
+from armlink.recording.recording import Recording
+from calib.fit.rows import fit_rows
+from calib.sweep.dataset import SweepData
+
+Array = npt.NDArray[np.float64]
+
+WINDOW = 0.25
+"""Samples are averaged over so long: one row [s]."""
+FEWEST_SAMPLES = 3
+SLOW = 0.1
+"""A window counts where no joint moves faster: centrifugal torque is then at most 0.1 N·m at 10 kg·m² [rad/s]."""
+STEADY = 0.05
+"""And where no joint's speed changes faster [rad/s²]."""
+MOVED = 0.004
+"""Way of a joint from which on its direction counts as changed [rad]."""
+FEWEST_ROWS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class FieldRows:
+    """K static or slow rows of n joints, in time order; NaN torque where a sensor does not count."""
+
+    position: Array
+    """Position readings (K, n) [rad]."""
+    torque: Array
+    """Torque as the sensors themselves read it, no controller's calibration in it (K, n) [N·m]."""
+    sigma: Array
+    """Standard deviation of a torque row (K, n) [N·m]."""
+    direction: Array
+    """Sign of each joint's last motion (K, n); 0 where it has not moved yet."""
+    series: npt.NDArray[np.int64]
+    """Which recording or data set a row is of (K,)."""
+
+
+def rows_of_recording(recording: Recording, gain: Array, offset: Array, number: int, source: str) -> FieldRows:
+    """Windows of a recording in which all joints move slowly and steadily.
+
+    `gain` and `offset` (n,) are the pairs that the controllers held: what they sent is turned back to the sensors' own
+    readings. Raises BadInput where there is no joint torque, or nothing slow enough.
+    """
+    if recording.torque is None:
+        raise BadInput(f"{source}: no joint torque (columns tau_1 …): calibration needs the torque sensors' readings")
+    keep = np.isfinite(recording.position).all(axis=1) & np.isfinite(recording.torque).all(axis=1)
+    t, position = recording.t[keep], recording.position[keep]
+    torque = recording.torque[keep] * gain + offset
+    windows = _windows(t)
+    if not windows:
+        raise BadInput(f"{source}: no {WINDOW} s with {FEWEST_SAMPLES} samples of every joint in it")
+    slopes = np.array([_slope(t[each], position[each]) for each in windows])
+    middles = np.array([t[each].mean() for each in windows])
+    change = np.abs(np.diff(slopes, axis=0)) / np.diff(middles)[:, None]
+    padded = np.concatenate([change[:1], change, change[-1:]]) if len(change) else np.zeros((2, recording.n))
+    steady = np.maximum(padded[:-1], padded[1:]).max(axis=1) <= STEADY
+    slow = (np.abs(slopes).max(axis=1) <= SLOW) & steady
+    if slow.sum() < FEWEST_ROWS:
+        raise BadInput(
+            f"{source}: {int(slow.sum())} instants of {WINDOW} s are slow enough, at least {FEWEST_ROWS} are needed:"
+            f" record rests, or motion below {SLOW} rad/s without jerks"
+        )
+    means = np.array([position[each].mean(axis=0) for each in windows])
+    chosen = [each for each, fine in zip(windows, slow, strict=True) if fine]
+    sigma = np.array([_scatter(t[each], torque[each]) / np.sqrt(len(t[each])) for each in chosen])
+    typical = np.sqrt(np.median(sigma**2, axis=0))
+    return FieldRows(
+        means[slow],
+        np.array([torque[each].mean(axis=0) for each in chosen]),
+        np.broadcast_to(np.maximum(typical, 1e-6), (len(chosen), recording.n)).copy(),
+        _directions(means)[slow],
+        np.full(len(chosen), number),
+    )
+
+
+def rows_of_sweeps(data: SweepData, number: int) -> FieldRows:
+    """The unloaded readings of a sweep data set; raises BadInput where a reference mass was attached."""
+    if data.manifest.reference_mass > 0:
+        raise BadInput(
+            f"{data.path}: swept with a reference mass of {data.manifest.reference_mass:g} kg: this takes the arm as"
+            " its gravity record knows it, without a mass (armlink calibrate takes both)"
+        )
+    rows = fit_rows([data])
+    direction = np.zeros(rows.readings.position.shape)
+    swept = np.flatnonzero(rows.swept >= 0)
+    direction[swept, rows.swept[swept]] = rows.direction[swept]
+    readings = rows.readings
+    return FieldRows(
+        np.array(readings.position),
+        np.array(readings.torque),
+        np.array(readings.sigma),
+        direction,
+        np.full(len(readings.load), number),
+    )
+
+
+def join(parts: Sequence[FieldRows]) -> FieldRows:
+    """All rows together."""
+    names = ("position", "torque", "sigma", "direction", "series")
+    return FieldRows(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+def _windows(t: Array) -> list[slice]:
+    """Windows of WINDOW seconds with enough samples and no gap in them."""
+    windows, begin = [], 0
+    while begin < len(t):
+        end = int(np.searchsorted(t, t[begin] + WINDOW))
+        if end - begin >= FEWEST_SAMPLES and t[end - 1] - t[begin] >= WINDOW / 2:
+            windows.append(slice(begin, end))
+        begin = max(end, begin + 1)
+    return windows
+
+
+def _slope(t: Array, values: Array) -> Array:
+    """Mean rate of change (n,) by least squares."""
+    time = t - t.mean()
+    slope: Array = time @ (values - values.mean(axis=0)) / (time @ time)
+    return slope
+
+
+def _scatter(t: Array, values: Array) -> Array:
+    """Standard deviation (n,) about a straight line."""
+    line = np.outer(t - t.mean(), _slope(t, values)) + values.mean(axis=0)
+    scatter: Array = np.sqrt(((values - line) ** 2).sum(axis=0) / max(len(t) - 2, 1))
+    return scatter
+
+
+def _directions(positions: Array) -> Array:
+    """Sign of each joint's last motion of at least MOVED, row by row (K, n)."""
+    direction, now = np.zeros_like(positions), np.zeros(positions.shape[1])
+    anchor = positions[0].copy()
+    for row, here in enumerate(positions):
+        moved = np.abs(here - anchor) > MOVED
+        now = np.where(moved, np.sign(here - anchor), now)
+        anchor = np.where(moved, here, anchor)
+        direction[row] = now
+    return direction

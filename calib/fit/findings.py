@@ -1,0 +1,127 @@
+"""What the readings of a sweep show that the sensor model does not have, in words."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from calib.fit.refinement import Refined
+from calib.fit.rows import FitRows
+from calib.fit.unmodelled_effects import Effect, size_of
+from calib.motion.encoder_bits import stuck_bits
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+Kind = Literal[
+    "spring",
+    "direction",
+    "hysteresis",
+    "nonlinear",
+    "saturation",
+    "drift",
+    "eccentricity",
+    "encoder",
+    "outliers",
+    "scatter",
+]
+SCATTER, MATERIAL_SCATTER = 3.0, 0.002
+"""Scatter that is no longer noise: this many times what the samples explain, and this share of rated torque."""
+HOLDING: tuple[Kind, ...] = ("direction", "hysteresis", "outliers")
+"""What the fit takes out completely: the model holds without it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """Something that the sensor model does not have and the readings show."""
+
+    joint: str
+    kind: Kind
+    size: float
+    """In `unit`; NaN where there is no one number."""
+    unit: str
+    text: str
+    """One sentence for a person."""
+
+    @property
+    def breaks_model(self) -> bool:
+        """Whether the joint's values must not be relied on as they are."""
+        return self.kind not in HOLDING
+
+
+def effect_said(names: tuple[str, ...], effect: Effect, coefficient: Array, refined: Refined, rated: Array) -> Finding:
+    """One effect in words."""
+    name, gain = names[effect.joint], float(refined.fit.complete.gain[effect.joint]) or 1.0
+    value = float(coefficient[0])
+    if effect.kind == "spring":
+        text = (
+            f"{name}: torque linear in position that gravity does not explain, {value / gain:+.3g} N·m/rad: a cable or"
+            " spring over the joint? It is taken out; its pull at 0 rad is part of the offset"
+        )
+        return Finding(name, "spring", value / gain, "N·m/rad", text)
+    if effect.kind == "direction":
+        size = size_of(coefficient)
+        text = f"{name}: readings differ by {2 * size:.3g} N·m with the side of approach; taken out"
+        return Finding(name, "direction", size, "N·m", text)
+    if effect.kind == "hysteresis":
+        text = (
+            f"{name}: the torque sensor lags by {abs(value):.3g} N·m behind changes of torque (hysteresis); taken out"
+        )
+        return Finding(name, "hysteresis", abs(value), "N·m", text)
+    if effect.kind == "saturation":
+        text = f"{name}: the torque sensor flattens beyond {effect.knee:.3g} N·m: does it saturate?"
+        return Finding(name, "saturation", effect.knee, "N·m", text)
+    if effect.kind == "drift":
+        text = f"{name}: the torque reading drifts by {value * 3600:+.3g} N·m an hour: warm up, then sweep again"
+        return Finding(name, "drift", value * 3600, "N·m/h", text)
+    if effect.kind == "eccentricity":
+        size = float(np.hypot(*coefficient))
+        text = f"{name}: the position reading is wrong by {size:.3g} rad once a turn: an eccentric encoder disc?"
+        return Finding(name, "eccentricity", size, "rad", text)
+    text = f"{name}: the torque sensor's gain changes with the load (by {2 * value / gain:+.2%} at the largest)"
+    return Finding(name, "nonlinear", value / gain, "1", text)
+
+
+def encoders_said(names: tuple[str, ...], rows: FitRows) -> list[Finding]:
+    """Position sensors with a bit that never changes."""
+    found = []
+    for joint, bit, step in stuck_bits(rows.readings.position, rows.resolution, rows.target):
+        text = (
+            f"{names[joint]}: bit {bit} of the position reading ({step:.3g} rad) never changes: the encoder or its"
+            " transmission is faulty; nothing found with this joint's positions holds"
+        )
+        found.append(Finding(names[joint], "encoder", step, "rad", text))
+    return found
+
+
+def outliers_said(names: tuple[str, ...], rows: FitRows, outliers: Flags) -> list[Finding]:
+    """Outliers by joint and sweep, with what a run of them looks like."""
+    found = []
+    for joint in np.flatnonzero(outliers.any(axis=0)):
+        at = np.flatnonzero(outliers[:, joint])
+        where = ", ".join(f"{rows.sweep[row]} at {rows.readings.position[row, joint]:.3f} rad" for row in at[:4])
+        more = f" and {len(at) - 4} more" if len(at) > 4 else ""
+        run = len(at) >= 2 and len({rows.sweep[row] for row in at}) == 1
+        cause = "it touched something there, or a resting joint slipped" if run else "a knock or a bad contact"
+        text = f"{names[joint]}: {len(at)} readings left out, {where}{more}: {cause}?"
+        found.append(Finding(names[joint], "outliers", float(len(at)), "readings", text))
+    return found
+
+
+def scattered(names: tuple[str, ...], refined: Refined, rated: Array, named: set[str]) -> list[Finding]:
+    """Joints whose readings scatter far more than their samples' noise, with nothing found that explains it."""
+    linear, found = refined.linear, []
+    count = len(linear.row)
+    rest = linear.residual[:count] * linear.sigma
+    for joint, name in enumerate(names):
+        here = linear.joint == joint
+        if name in named or not here.any():
+            continue
+        rms = float(np.sqrt(np.mean(rest[here] ** 2)))
+        if refined.factor[joint] > SCATTER and rms > MATERIAL_SCATTER * rated[joint]:
+            text = (
+                f"{name}: readings scatter by {rms:.3g} N·m, {refined.factor[joint]:.0f} times what their noise"
+                " explains, and no known effect accounts for it: the model does not hold here"
+            )
+            found.append(Finding(name, "scatter", rms, "N·m", text))
+    return found

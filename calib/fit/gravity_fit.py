@@ -1,0 +1,141 @@
+"""Gravity identification from sweeps: recursive from the tip to the base, then global, in calibrated torque."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from armlink.arm_file import ArmFile
+from armlink.errors import Refused
+from calib.arm.kinematics import gcomp_arm
+from calib.fit.rows import FitRows, fit_rows
+from calib.fit.sensor_fit import SensorFit
+from calib.records.records import CalibrationRecord, GravityRecord, matrix, provenance
+from calib.sweep.dataset import SweepData
+from gcomp.errors import GcompError
+from gcomp.identify.global_fit import GlobalFit, identify_global
+from gcomp.identify.parameters import Parameters
+from gcomp.identify.readings import Readings
+from gcomp.identify.recursive import RecursiveFit, identify_recursive
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class GravityFit:
+    """Mass moments of the arm without load, with their covariance."""
+
+    names: tuple[str, ...]
+    beta: Array
+    """From the global fit (2n,) [kg·m]; 0 where gravity cannot determine it."""
+    covariance: Array
+    """(2n, 2n), the sensors' own uncertainty included; 0 where not determined."""
+    identifiable: Flags
+    """(2n,)"""
+    recursive: RecursiveFit | None
+    """The recursion from tip to base on the calibrated unloaded sweeps; None where there was no full unloaded pass."""
+    residual_rms: Array
+    """RMS of calibrated torque minus model over the unloaded readings that count (n,) [N·m]."""
+    sources: dict[str, str]
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations of β (2n,) [kg·m]."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    def record(self, arm: ArmFile, calibration: CalibrationRecord | None = None) -> GravityRecord:
+        """The gravity record of this fit, made with the sensors of a calibration record."""
+        return GravityRecord(
+            **provenance(arm, self.sources),
+            names=self.names,
+            beta=tuple(self.beta.tolist()),
+            covariance=matrix(self.covariance),
+            identifiable=tuple(bool(found) for found in self.identifiable),
+            gravity=tuple(gcomp_arm(arm).gravity.tolist()),
+            calibration=None if calibration is None else calibration.id,
+        )
+
+
+def identify_gravity(arm: ArmFile, data: Sequence[SweepData], sensors: SensorFit | CalibrationRecord) -> GravityFit:
+    """Mass moments from sweeps and either the sensor fit of the same sweeps or an earlier calibration record.
+
+    With a sensor fit the global result is its own: sensors and moments were estimated together. With a record its
+    gains hold, and offsets are estimated anew. Raises Refused where no torque scale is known, BadInput on bad data.
+    """
+    rows = fit_rows([each.require(arm) for each in data])
+    if isinstance(sensors, SensorFit):
+        fit, calibration = sensors.fit, sensors.fit.complete
+        _require_scale(sensors.names, np.isnan(sensors.value("gain")))
+    else:
+        calibration = _parameters(sensors.require(arm))
+        fit = _global(arm, rows, calibration)
+    found = ~np.isnan(fit.values.beta)
+    covariance = np.where(np.isnan(fit.beta_covariance), 0.0, fit.beta_covariance)
+    residual = np.where(rows.readings.load[:, None] == 0, fit.residual, np.nan) / calibration.gain
+    return GravityFit(
+        names=arm.joint_names,
+        beta=np.where(found, fit.values.beta, 0.0),
+        covariance=covariance,
+        identifiable=found,
+        recursive=_recursion(arm, rows, calibration),
+        residual_rms=_rms(residual),
+        sources={each.path.name: each.digest for each in data},
+    )
+
+
+def calibrated(rows: FitRows, calibration: Parameters, which: Flags) -> Readings:
+    """Rows as true angles [rad] and torques [N·m] by the calibration, own sensors of swept joints alone."""
+    readings = rows.readings
+    own = rows.own
+    torque = np.where(own, (readings.torque - calibration.offset) / calibration.gain, np.nan)
+    position = readings.position * calibration.position_gain + calibration.position_offset
+    sigma = readings.sigma / np.abs(calibration.gain)
+    return Readings(position, torque, sigma, readings.load).rows(which & own.any(axis=1))
+
+
+def _recursion(arm: ArmFile, rows: FitRows, calibration: Parameters) -> RecursiveFit | None:
+    readings = calibrated(rows, calibration, rows.readings.load == 0)
+    if len(readings.load) == 0 or not readings.counted.any(axis=0).all():
+        return None
+    try:
+        return identify_recursive(gcomp_arm(arm), readings)
+    except GcompError:
+        return None
+
+
+def _global(arm: ArmFile, rows: FitRows, calibration: Parameters) -> GlobalFit:
+    """Mass moments, offsets and, where there is a load, its point, with gains and position sensors known."""
+    unknown = {"beta", "offset"} | ({"rho"} if any(rows.masses) else set())
+    return identify_global(
+        gcomp_arm(arm), rows.readings, unknown=unknown, start=calibration, position_sigma=rows.position_sigma
+    )
+
+
+def _parameters(record: CalibrationRecord) -> Parameters:
+    names = tuple(joint.name for joint in record.joints)
+    _require_scale(names, np.isnan(record.values("gain")))
+    return Parameters.nominal(
+        len(names),
+        gain=record.values("gain", 1.0),
+        offset=record.values("offset", 0.0),
+        position_gain=record.values("position_gain", 1.0),
+        position_offset=record.values("position_offset", 0.0),
+    )
+
+
+def _require_scale(names: tuple[str, ...], lost: Flags) -> None:
+    """Raise Refused where no joint's gain is known: then mass moments are known up to a factor only."""
+    if lost.all():
+        raise Refused(
+            f"no torque gain of {', '.join(names)} is known, so mass moments are known up to a common factor only:"
+            " a sweep with --reference-mass gives the scale where the links have a lever; or give a calibration record"
+        )
+
+
+def _rms(values: Array) -> Array:
+    counted = np.isfinite(values)
+    total = np.where(counted, values**2, 0.0).sum(axis=0)
+    rms: Array = np.sqrt(total / np.maximum(counted.sum(axis=0), 1))
+    return rms

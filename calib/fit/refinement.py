@@ -1,0 +1,217 @@
+"""The end of the sensor fit: what a global fit of the model alone cannot hold, as extra linear columns.
+
+A position that was rounded once is wrong by the same amount in every reading taken there, so the rounding of each
+distinct position is an unknown of its own, with its prior. Whatever else bends the readings (hysteresis, a spring)
+enters the same way, without a prior. Gauss-Newton from the global fit; each joint's noise is brought to the scatter
+that is there.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from gcomp.arm.arm import Arm
+from gcomp.identify.global_fit import GlobalFit
+from gcomp.identify.identifiability import analyse, describe_null_space
+from gcomp.identify.natural_units import natural_units
+from gcomp.identify.parameters import Parameters, Prior, parameter_names, prior_vectors
+from gcomp.identify.readings import Readings
+from gcomp.identify.sensor_model import predict_and_jacobian
+
+Array = npt.NDArray[np.float64]
+ROUNDS = 4
+"""Gauss-Newton steps, with the noise brought up to date after each."""
+NEGLIGIBLE = 0.1
+"""Rounding that changes no reading by more than this share of its noise is left out."""
+FEWEST = 8.0
+"""Free readings of a joint from which its scatter is judged."""
+
+
+@dataclass(frozen=True, eq=False)
+class Extra:
+    """One extra column: what a joint's torque reading would gain per unit of an effect."""
+
+    joint: int
+    """Index of the joint whose sensor shows it."""
+    kind: str
+    column: Array
+    """By reading (K, n)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """The fit linearised where it ended; P counted readings, p parameters, rounding and extra columns behind them."""
+
+    row: npt.NDArray[np.int64]
+    """Row of each counted reading (P,)."""
+    joint: npt.NDArray[np.int64]
+    """Its joint (P,)."""
+    sigma: Array
+    """Its standard deviation, position rounding not counted (P,) [N·m]."""
+    basis: Array
+    """Orthonormal columns (P + priors, r) that span what the parameters can do, in standard deviations."""
+    residual: Array
+    """Residuals of readings, then of priors, in standard deviations (P + priors,)."""
+
+    @property
+    def leverage(self) -> Array:
+        """How much of each reading the fit takes for itself (P,), 0 to 1."""
+        part: Array = np.einsum("pr,pr->p", self.basis, self.basis)[: len(self.row)]
+        return part
+
+    def left_over(self, columns: Array) -> Array:
+        """Columns (P, m), in standard deviations, without what the parameters can do (P + priors, m)."""
+        padded = np.vstack([columns, np.zeros((len(self.residual) - len(columns), columns.shape[1]))])
+        rest: Array = padded - self.basis @ (self.basis.T @ padded)
+        return rest
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """The global fit with rounding and extras taken into account."""
+
+    fit: GlobalFit
+    factor: Array
+    """Scatter of each joint's readings over what its samples' noise explains (n,); at least 1."""
+    raw_factor: Array
+    """The same where it may be below 1; NaN for a joint with too few readings."""
+    linear: Linear
+    coefficients: Array
+    """Of the extras, in their units (m,)."""
+    coefficient_std: Array
+    freedom: Array
+    """Free readings of each joint (n,)."""
+
+
+def refine(
+    arm: Arm,
+    readings: Readings,
+    fit: GlobalFit,
+    priors: Mapping[str, Prior],
+    resolution: Array,
+    extras: tuple[Extra, ...] = (),
+) -> Refined:
+    """From a global fit; `resolution` (n,) [rad] is the smallest step of the position readings, 0 where not known."""
+    problem = _Problem(arm, readings, fit, priors, resolution, extras)
+    vector, factor = fit.complete.vector.copy(), np.ones(arm.n)
+    for _ in range(ROUNDS):
+        step = problem.step(vector, factor)
+        vector[problem.free] += step.solution[: step.parameters]
+        raw, freedom = _scatter(step.linear, arm.n)
+        used, factor = factor, np.maximum(factor * np.where(np.isnan(raw), 1.0, raw), 1.0)
+    found = analyse(step.triangle, step.scale)
+    inner, behind = slice(0, step.parameters), slice(step.parameters, None)
+    residual = np.full(readings.torque.shape, np.nan)
+    residual[readings.counted] = step.linear.residual[: len(step.linear.row)] * step.linear.sigma
+    determined, covariance = found.determined[inner], found.covariance[inner, inner]
+    deviation = np.zeros(len(vector))
+    deviation[problem.free] = np.where(determined, np.sqrt(np.abs(np.diag(covariance))), np.inf)
+    scaled = step.linear.residual[: len(step.linear.row)]
+    refined = replace(
+        fit,
+        values=Parameters.from_vector(np.where(np.isinf(deviation), np.nan, vector), arm.n),
+        std=Parameters.from_vector(deviation, arm.n),
+        complete=Parameters.from_vector(vector, arm.n),
+        covariance=covariance,
+        identifiable=determined,
+        null_space=describe_null_space(found.null_basis[inner], fit.names),
+        residual=residual,
+        chi2=float(scaled @ scaled),
+        dof=round(float(freedom.sum())),
+    )
+    spread = np.sqrt(np.abs(np.diag(found.covariance)[behind]))
+    return Refined(refined, factor, raw * used, step.linear, step.solution[behind], spread, freedom)
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """One Gauss-Newton step."""
+
+    solution: Array
+    """Change of the free parameters, then the extras' coefficients."""
+    parameters: int
+    triangle: Array
+    scale: Array
+    linear: Linear
+
+
+class _Problem:
+    """What is fitted, in matrices that do not change from step to step."""
+
+    def __init__(
+        self,
+        arm: Arm,
+        readings: Readings,
+        fit: GlobalFit,
+        priors: Mapping[str, Prior],
+        resolution: Array,
+        extras: tuple[Extra, ...],
+    ) -> None:
+        self.arm, self.readings = arm, readings
+        self.free = np.array([name in fit.names for name in parameter_names(arm)])
+        self.mean, self.std = (values[self.free] for values in prior_vectors(arm.n, priors))
+        self.row, self.joint = np.nonzero(readings.counted)
+        count = len(self.row)
+        self.columns = np.column_stack([np.zeros((count, 0)), *(extra.column[readings.counted] for extra in extras)])
+        torque = float(np.abs(readings.torque[readings.counted]).max())
+        sizes = torque / np.maximum(np.abs(self.columns).max(axis=0, initial=0.0), 1e-9)
+        self.scale = np.concatenate([natural_units(arm, readings, fit.complete)[self.free], sizes])
+        self.resolution = resolution
+
+    def step(self, vector: Array, factor: Array) -> _Step:
+        """Solve the problem linearised at a parameter vector (6n + 3,), noise times factor (n,)."""
+        readings, free = self.readings, int(self.free.sum())
+        modelled, jacobian, slope = predict_and_jacobian(self.arm, Parameters.from_vector(vector, self.arm.n), readings)
+        sigma = readings.sigma[readings.counted] * factor[self.joint]
+        rounding = _rounding_columns(readings, self.resolution, slope / sigma[:, None])
+        informed = np.flatnonzero(np.isfinite(self.std))
+        count, known = len(sigma), len(informed)
+        rows = count + known + rounding.shape[1]
+        design, target = np.zeros((rows, free + self.columns.shape[1])), np.zeros(rows)
+        design[:count] = np.hstack([jacobian[:, self.free], self.columns]) / sigma[:, None]
+        target[:count] = (readings.torque[readings.counted] - modelled) / sigma
+        design[np.arange(count, count + known), informed] = 1 / self.std[informed]
+        target[count : count + known] = ((self.mean - vector[self.free]) / self.std)[informed]
+        nuisance = np.zeros((rows, rounding.shape[1]))
+        nuisance[:count] = rounding
+        nuisance[count + known :] = np.eye(rounding.shape[1])
+        taken = np.linalg.qr(nuisance)[0]
+        rest = design - taken @ (taken.T @ design)
+        left, values, right = np.linalg.svd(rest * self.scale, full_matrices=False)
+        keep = values > max(1.0, 1e-7 * values[0])
+        basis = np.hstack([taken, left[:, keep]])
+        solution = self.scale * (right[keep].T @ ((left[:, keep].T @ target) / values[keep]))
+        linear = Linear(self.row, self.joint, sigma, basis, target - basis @ (basis.T @ target))
+        triangle: Array = np.asarray(np.linalg.qr(rest, mode="r"), dtype=np.float64)
+        return _Step(solution, free, triangle, self.scale, linear)
+
+
+def _scatter(linear: Linear, n: int) -> tuple[Array, Array]:
+    """(Each joint's scatter over what was expected of it, NaN where too few readings are free; free readings) (n,)."""
+    count = len(linear.row)
+    free: Array = np.bincount(linear.joint, 1 - linear.leverage, minlength=n).astype(np.float64)
+    total = np.bincount(linear.joint, linear.residual[:count] ** 2, minlength=n)
+    ratio: Array = np.where(free >= FEWEST, np.sqrt(total / np.maximum(free, 1e-9)), np.nan)
+    return ratio, free
+
+
+def _rounding_columns(readings: Readings, resolution: Array, slope: Array) -> Array:
+    """What one standard deviation of each distinct position's rounding does to the readings (P, m), in their own.
+
+    slope (P, n) is that of each reading by each position, in standard deviations per rad. Joints whose rounding does
+    not matter are left out.
+    """
+    row = np.nonzero(readings.counted)[0]
+    columns = [np.zeros((len(row), 0))]
+    for joint in np.flatnonzero(resolution > 0):
+        size = slope[:, joint] * resolution[joint] / np.sqrt(12.0)
+        if np.abs(size).max() < NEGLIGIBLE:
+            continue
+        counts = np.rint(readings.position[row, joint] / resolution[joint])
+        _, place = np.unique(counts, return_inverse=True)
+        column = np.zeros((len(row), int(place.max()) + 1))
+        column[np.arange(len(row)), place] = size
+        columns.append(column)
+    return np.hstack(columns)

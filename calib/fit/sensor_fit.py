@@ -1,0 +1,242 @@
+"""The sensor fit: torque gains and offsets, position gains, mass moments and load point from sweeps, in one problem."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+
+from armlink.arm_file import ArmFile
+from calib.arm.kinematics import gcomp_arm
+from calib.arm.sweep_section import sweep_section
+from calib.fit.examination import Goodness, examine
+from calib.fit.findings import Finding
+from calib.fit.missing_values import reasons_of
+from calib.fit.rows import FitRows, fit_rows
+from calib.records.records import PARAMETERS, CalibrationRecord, JointCalibration, Parameter, matrix, provenance
+from calib.sweep.dataset import SweepData
+from gcomp.identify.global_fit import GlobalFit, identify_global
+from gcomp.identify.parameters import Prior
+from gcomp.identify.sensor_model import predict
+
+Array = npt.NDArray[np.float64]
+WIDE = 0.005
+"""Half width of a gain's 95 % interval, as a share of it, from which the user is told."""
+COMMON = (
+    "the mass tells the gains' common scale by the levers between the axes before the last, which are too short here;"
+    " measure where it hangs (sweep.reference_point), or use a heavier one"
+)
+"""Why all gains may be known badly together."""
+
+
+@dataclass(frozen=True, eq=False)
+class SensorFit:
+    """What the sweeps say about every sensor; NaN where they say nothing, and then `reasons` says why."""
+
+    names: tuple[str, ...]
+    fit: GlobalFit
+    rows: FitRows
+    noise_factor: Array
+    """Scatter of the readings over what their samples' noise explains (n,); at least 1."""
+    hysteresis: Array
+    """Half the mean difference between readings approached upwards and downwards (n,) [N·m]."""
+    friction: Array
+    """Friction still locked at rest: half the mean difference of the drives' own torque between the directions, less
+    that of the sensors (n,) [N·m]; NaN where the drives report none."""
+    goodness: Goodness
+    """Whether the model holds, and what speaks against it."""
+    quantile: float
+    """Student quantile of a 95 % interval."""
+    reasons: dict[tuple[str, Parameter], str]
+    """(joint, parameter) → why there is no value."""
+    gain_ratio: Array | None
+    """Without a reference mass: gains as multiples of the last joint's (n,); NaN where not known."""
+    sources: dict[str, str]
+
+    def value(self, parameter: Parameter) -> Array:
+        """Estimates of one parameter (n,), NaN where not identifiable."""
+        found: Array = getattr(self.fit.values, parameter).copy()
+        for joint, name in enumerate(self.names):
+            if (name, parameter) in self.reasons:
+                found[joint] = np.nan
+        return found
+
+    def std(self, parameter: Parameter) -> Array:
+        """Standard deviations (n,), NaN where not identifiable."""
+        spread: Array = getattr(self.fit.std, parameter)
+        return np.where(np.isnan(self.value(parameter)), np.nan, spread)
+
+    def ci95(self, parameter: Parameter) -> Array:
+        """95 % intervals (n, 2), NaN where not identifiable."""
+        half = self.quantile * self.std(parameter)
+        return np.stack([self.value(parameter) - half, self.value(parameter) + half], axis=1)
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What the readings show that the model does not have, in words."""
+        return self.goodness.findings
+
+    @property
+    def doubtful(self) -> tuple[str, ...]:
+        """Joints at which the model does not hold, so that their values must not be relied on."""
+        broken = {finding.joint for finding in self.findings if finding.breaks_model}
+        return tuple(name for name in self.names if name in broken)
+
+    @property
+    def attachment(self) -> tuple[Array, Array] | None:
+        """Where the reference mass hung, and half of its 95 % interval, (3,) each [m]; NaN where not determined.
+
+        In the frame that turns with the last joint, origin on its axis. None without a reference mass.
+        """
+        if not any(self.rows.masses):
+            return None
+        point = self.fit.values.rho
+        return point, np.where(np.isnan(point), np.nan, self.quantile * self.fit.std.rho)
+
+    @property
+    def attachment_text(self) -> str:
+        """The attachment and mass moment of each reference mass in one sentence; empty without one."""
+        if self.attachment is None:
+            return ""
+        point, half = self.attachment
+        if np.isnan(point).all():
+            return "where the reference mass hung is not observable"
+        place = ", ".join(_said(at, f" ± {by:.4f}") for at, by in zip(point, half, strict=True))
+        moments = [f"{mass:g} kg: {_triple(mass * point)} kg·m" for mass in self.rows.masses if mass]
+        return (
+            f"the reference mass hung at ({place}) m of the last joint's frame; its mass moment, {'; '.join(moments)}"
+        )
+
+    @property
+    def imprecise(self) -> dict[str, str]:
+        """Joint → why its gain, though determined, is known worse than `WIDE`."""
+        half = self.quantile * self.std("gain") / np.abs(self.value("gain"))
+        common = bool(np.all(half[np.isfinite(half)] > WIDE))
+        why = COMMON if common else "give its sweeps more poses, or the arm a heavier reference mass"
+        return {
+            name: f"{name} gain: known to ± {width:.1%} only: {why}"
+            for name, width in zip(self.names, half, strict=True)
+            if width > WIDE
+        }
+
+    @property
+    def residual_rms(self) -> Array:
+        """RMS of each joint's torque residual over the readings that count (n,) [N·m]."""
+        rms: Array = np.sqrt(np.nanmean(self.fit.residual**2, axis=0))
+        return rms
+
+    def record(self, arm: ArmFile) -> CalibrationRecord:
+        """The calibration record of this fit."""
+        residual = self.residual_rms
+        joints = tuple(
+            JointCalibration(
+                name=name,
+                **{parameter: _number(self.value(parameter)[joint]) for parameter in PARAMETERS},
+                not_identifiable={p: self.reasons[name, p] for p in PARAMETERS if (name, p) in self.reasons},
+                residual_std=_number(residual[joint]),
+            )
+            for joint, name in enumerate(self.names)
+        )
+        wanted = [
+            (f"{name}.{parameter}", f"{parameter}[{name}]")
+            for name in self.names
+            for parameter in PARAMETERS
+            if (name, parameter) not in self.reasons and f"{parameter}[{name}]" in self.fit.names
+        ]
+        covariance = self.fit.covariance_of(*(inner for _, inner in wanted)) if wanted else np.zeros((0, 0))
+        return CalibrationRecord(
+            **provenance(arm, self.sources),
+            joints=joints,
+            covariance_of=tuple(outer for outer, _ in wanted),
+            covariance=matrix(covariance) if wanted else (),
+        )
+
+
+def fit_sensors(arm: ArmFile, data: Sequence[SweepData]) -> SensorFit:
+    """Fit every sensor of the arm to its sweep data sets (unloaded, with a reference mass, or several of each).
+
+    Unknown are torque gains k and offsets o, position gains c, position offsets within the arm file's trust
+    (`sweep.position_offset_std`), mass moments β and the load point ρ; theory.md section 7. Raises BadInput on data
+    that cannot be fitted, Refused on data of another arm.
+    """
+    rows = fit_rows([each.require(arm) for each in data])
+    good = _fit(arm, rows)
+    fit = good.refined.fit
+    loaded = any(rows.masses)
+    return SensorFit(
+        names=arm.joint_names,
+        fit=fit,
+        rows=rows,
+        noise_factor=good.refined.factor,
+        hysteresis=_half_difference(rows.readings.torque - _modelled(arm, fit, rows), rows),
+        friction=_friction(fit, rows),
+        goodness=good,
+        quantile=float(stats.t.ppf(0.975, max(fit.dof, 1))),
+        reasons=reasons_of(fit, rows),
+        gain_ratio=None if loaded else _gain_ratio(arm, rows),
+        sources={each.path.name: each.digest for each in data},
+    )
+
+
+def _fit(arm: ArmFile, rows: FitRows, **extra: Prior) -> Goodness:
+    """The global fit, then refined and examined."""
+    described, section = gcomp_arm(arm), sweep_section(arm)
+    unknown = {"gain", "offset", "position_gain", "beta"}
+    priors = dict(extra)
+    if section.position_offset_std > 0:
+        unknown.add("position_offset")
+        priors["position_offset"] = Prior(0.0, section.position_offset_std)
+    if any(rows.masses):
+        unknown.add("rho")
+        if section.known_point is not None:
+            priors["rho"] = section.known_point
+    fit = identify_global(described, rows.readings, unknown=unknown, priors=priors, position_sigma=rows.position_sigma)
+    rated = np.array([joint.rated_torque for joint in arm.require_link().joints])
+    return examine(described, rows, fit, priors, rated)
+
+
+def _modelled(arm: ArmFile, fit: GlobalFit, rows: FitRows) -> Array:
+    """Torque readings (K, n) by the fitted sensors and moments alone [N·m]."""
+    return predict(gcomp_arm(arm), fit.complete, rows.readings)
+
+
+def _friction(fit: GlobalFit, rows: FitRows) -> Array:
+    """Half difference (n,) between the directions of motor torque less sensor torque [N·m]."""
+    gain = np.where(np.abs(fit.complete.gain) > 1e-6, fit.complete.gain, 1.0)
+    sensed = (rows.readings.torque - fit.complete.offset) / gain
+    return _half_difference(rows.motor_torque - sensed, rows)
+
+
+def _half_difference(values: Array, rows: FitRows) -> Array:
+    """Half the mean difference (n,) between upward and downward approach of each swept joint's own values (K, n)."""
+    own = np.where(rows.own, values, np.nan)
+    up, down = own[rows.direction > 0], own[rows.direction < 0]
+    return np.array([_mean(up[:, j]) - _mean(down[:, j]) for j in range(own.shape[1])]) / 2
+
+
+def _mean(values: Array) -> float:
+    kept = values[~np.isnan(values)]
+    return float(kept.mean()) if len(kept) else float("nan")
+
+
+def _gain_ratio(arm: ArmFile, rows: FitRows) -> Array:
+    """Gains as multiples of the last joint's (n,), from data without a reference mass."""
+    n = len(arm.joint_names)
+    std = np.full(n, np.inf)
+    std[-1] = 1e-4
+    fit = _fit(arm, rows, gain=Prior(1.0, std)).refined.fit
+    ratio: Array = fit.values.gain
+    return np.where(fit.std.gain < 0.2, ratio, np.nan)
+
+
+def _triple(values: Array) -> str:
+    return f"({', '.join(map(_said, values))})"
+
+
+def _said(value: float, interval: str = "") -> str:
+    return "not observable" if np.isnan(value) else f"{value:.4f}{interval}"
+
+
+def _number(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)

@@ -1,0 +1,170 @@
+"""Effects that the sensor model does not have, as columns: which of them the residuals of a fit ask for."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+
+from calib.fit.refinement import Extra, Refined
+from calib.fit.rows import FitRows
+from gcomp.arm.arm import Arm
+from gcomp.identify.readings import Readings
+from gcomp.identify.sensor_model import predict, predict_and_jacobian
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+CHANCE = 1e-7
+"""Probability of an F ratio at which an effect is held for real: some fifty are tried on each fit."""
+MATERIAL = 0.0005
+"""Root mean square of an effect, as a share of rated torque, below which nobody need know of it."""
+KNEES = (0.6, 0.7, 0.8, 0.9, 0.95)
+"""Shares of the largest torque at which a sensor is tried for beginning to saturate."""
+FEWEST = 6
+"""Readings of a joint from which effects on it are looked for."""
+TURN = 2.0
+"""Range of a joint from which an error once a turn can be told from a gain [rad]."""
+OWN_DOUBT, HELD_DOUBT = 0.1, 0.75
+"""Standard deviation of a sensor's lag, as a share of its size: along the joint's own sweep, and where it holds."""
+PATH = 12
+"""Points of the way from one reading to the next at which the torque is computed for hysteresis."""
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """An effect found: its columns, in the kind's own units, and what it explains."""
+
+    joint: int
+    kind: str
+    extras: tuple[Extra, ...]
+    p_value: float
+    knee: float = np.nan
+    """Torque at which a sensor begins to saturate [N·m]."""
+    doubt: Array | None = None
+    """What the columns leave open of each reading of the joint (K,), as a share of the effect's size."""
+
+
+def size_of(coefficients: Array) -> float:
+    """Root mean square of an effect's coefficients (m,), in their unit."""
+    return float(np.sqrt(np.mean(coefficients**2)))
+
+
+def strongest(arm: Arm, rows: FitRows, kept: Flags, refined: Refined, rated: Array) -> Effect | None:
+    """The effect that explains most beyond chance of what `refined` left over, None where there is no material one.
+
+    rated (n,) [N·m]; kept (K, n) are the readings that `refined` was made from, outliers left out.
+    """
+    counted = rows.readings.counted & kept
+    linear, best, most = refined.linear, None, 0.0
+    count = len(linear.row)
+    squares = np.bincount(linear.joint, linear.residual[:count] ** 2, minlength=arm.n)
+    for effect in _candidates(arm, rows, refined):
+        columns = np.column_stack([extra.column[counted] for extra in effect.extras]) / linear.sigma[:, None]
+        if not np.abs(columns).max(initial=0.0) > 0:
+            continue
+        rest = linear.left_over(columns)
+        norm = np.linalg.norm(rest, axis=0)
+        if np.any(norm < 1e-3 * np.linalg.norm(columns, axis=0)):
+            continue  # the parameters can do nearly the same
+        basis, triangle = np.linalg.qr(rest / norm)
+        along = basis.T @ linear.residual
+        gain, m = float(along @ along), len(effect.extras)
+        touched = np.unique(linear.joint[np.abs(columns).max(axis=1) > 1e-3 * np.abs(columns).max()])
+        free = float(refined.freedom[touched].sum()) - m
+        if free < 4:
+            continue
+        left = max(float(squares[touched].sum()) - gain, 1e-6 * float(squares[touched].sum()) + 1e-9)
+        ratio = (gain / m) / (left / free)
+        p_value = float(stats.f.sf(ratio, m, free))
+        coefficient = np.linalg.lstsq(triangle, along, rcond=None)[0] / norm
+        own = linear.joint == effect.joint
+        shape = (columns * linear.sigma[:, None] @ coefficient)[own]
+        size = float(np.std(shape)) if len(shape) else 0.0
+        if p_value < CHANCE and size > MATERIAL * rated[effect.joint] and gain > most:
+            best, most = replace(effect, p_value=p_value), gain
+    return best
+
+
+def _candidates(arm: Arm, rows: FitRows, refined: Refined) -> Iterator[Effect]:
+    """Every effect that is tried, a joint at a time."""
+    complete, readings = refined.fit.complete, rows.readings
+    counted = readings.counted
+    _, _, flat = predict_and_jacobian(arm, complete, readings)
+    slope = np.zeros((*counted.shape, arm.n))
+    slope[counted] = flat
+    torque = predict(arm, complete, readings) - complete.offset
+    for joint in range(arm.n):
+        here = counted[:, joint]
+        if here.sum() < FEWEST:
+            continue
+        angle, own = readings.position[:, joint], torque[:, joint]
+        yield _one(arm.n, joint, "spring", here * angle)
+        doubt = _lag_doubt(rows, joint)
+        sides = [here * side for side in _sides(rows, joint)]
+        if sides:
+            columns = tuple(_one(arm.n, joint, "direction", side).extras[0] for side in sides)
+            yield Effect(joint, "direction", columns, 1.0, doubt=doubt)
+        yield replace(_one(arm.n, joint, "hysteresis", here * lag(arm, rows, refined, joint)), doubt=doubt)
+        largest = float(np.abs(own[here]).max())
+        yield _one(arm.n, joint, "nonlinear", here * own * np.abs(own) / max(largest, 1e-9))
+        for share in KNEES:
+            bent = np.where(here, np.sign(own) * np.maximum(np.abs(own) - share * largest, 0.0), 0.0)
+            if np.count_nonzero(bent) >= FEWEST // 2:
+                yield _one(arm.n, joint, "saturation", bent, share * largest / max(abs(complete.gain[joint]), 1e-9))
+        yield _one(arm.n, joint, "drift", here * (rows.time - rows.time.mean()))
+        if float(np.ptp(angle[here])) > TURN:
+            turn = (slope[..., joint] * np.sin(angle)[:, None], slope[..., joint] * np.cos(angle)[:, None])
+            yield Effect(joint, "eccentricity", tuple(Extra(joint, "eccentricity", each) for each in turn), 1.0)
+
+
+def _one(n: int, joint: int, kind: str, values: Array, knee: float = np.nan) -> Effect:
+    """An effect that shows in one joint's sensor alone, `values` (K,)."""
+    column = np.zeros((len(values), n))
+    column[:, joint] = values
+    return Effect(joint, kind, (Extra(joint, kind, column),), 1.0, knee)
+
+
+def _sides(rows: FitRows, joint: int) -> Iterator[Array]:
+    """Side of approach (K,) in each sweep of a joint that has both, 0 elsewhere.
+
+    How far a sensor lags depends on how far the torque swung on the way, braking included: each sweep has its own.
+    """
+    names = np.array(rows.sweep)
+    for name in dict.fromkeys(names[rows.swept == joint]):
+        side = np.where((names == name) & (rows.swept == joint), rows.direction, 0)
+        if {-1, 1} <= set(side.tolist()):
+            yield side.astype(np.float64)
+
+
+def _lag_doubt(rows: FitRows, joint: int) -> Array:
+    """How badly a lag is known (K,), as a share of its size.
+
+    Along the joint's own sweep it hardly varies. Where the joint only holds it may stand anywhere between both ends,
+    and stays there while another is swept, so that those readings together count as one.
+    """
+    _, sweep, together = np.unique(rows.sweep, return_inverse=True, return_counts=True)
+    held: Array = HELD_DOUBT * np.sqrt(np.where(rows.swept < 0, 1, together[sweep]))
+    return np.where(rows.swept == joint, OWN_DOUBT, held)
+
+
+def lag(arm: Arm, rows: FitRows, refined: Refined, joint: int) -> Array:
+    """Where in its play (K,), -1 to 1, a joint's torque sensor stands at each reading, the way to it being straight.
+
+    The play is as wide as the residuals say (half their robust range), so that small changes of torque leave it where
+    it was. Rows where the joint was neither swept nor held stand at 0.
+    """
+    position, load = rows.readings.position, rows.readings.load
+    shares = np.linspace(0, 1, PATH + 1)[1:]
+    way = position[:-1, None] + shares[:, None] * (position[1:] - position[:-1])[:, None]
+    way = np.concatenate([np.repeat(position[:1, None], PATH, axis=1), way])
+    flat = Readings.of(way.reshape(-1, arm.n), np.zeros((len(position) * PATH, arm.n)), 1.0, np.repeat(load, PATH))
+    torque = predict(arm, refined.fit.complete, flat)[:, joint].reshape(-1, PATH)
+    residual = refined.fit.residual[:, joint]
+    width = max(float(np.nanmedian(np.abs(residual))) * 1.5, 1e-9)
+    held, place = float(torque[0, 0]), np.zeros(len(position))
+    for row, values in enumerate(torque):
+        for value in values:
+            held = min(max(held, value - width), value + width)
+        place[row] = (held - torque[row, -1]) / width
+    return place

@@ -1,0 +1,59 @@
+"""Are a joint's position readings those of a sound encoder? Judged while it moves, before anything relies on them."""
+
+import numpy as np
+import numpy.typing as npt
+
+from armlink.errors import Refused
+from armlink.link.types import Sample
+from calib.motion.encoder_bits import bit_of, missing_bit
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+JUMP, JUMP_STEPS = 3.0, 4.0
+"""A position reading that goes so many times as far as the speed limit allows, and so many increments, is no motion."""
+
+
+class EncoderFault(Refused):
+    """A joint's position readings are none of a sound encoder."""
+
+    def __init__(self, name: str, seen: str, bit: int | None) -> None:
+        """Joint's name, what its readings did, and the bit that would do it."""
+        cause = "its encoder or cable" if bit is None else f"bit {bit} of its encoder, which is stuck or lost"
+        super().__init__(f"{name}: {seen}: mend {cause}; nothing found with it would hold")
+
+
+class EncoderCheck:
+    """Sees every sample, and at the end of each motion what was read on the way."""
+
+    def __init__(self, names: tuple[str, ...], step: Array, speed: Array, now: float) -> None:
+        """Of n joints whose readings change by at least `step` [rad], and that turn at most at `speed` [rad/s]."""
+        self._names, self._step = names, step
+        self._fastest, self._slack = JUMP * speed, JUMP_STEPS * step
+        self._read_at = np.full(len(names), now)
+
+    def see(self, sample: Sample, before: Array) -> None:
+        """Raise EncoderFault where a position reading differs from the last one `before` it (n,) [rad] by more than its
+        joint can have turned meanwhile."""
+        moved = sample.position - before
+        jumped = np.abs(moved) > self._fastest * (sample.t - self._read_at) + self._slack
+        if jumped.any():  # never of a reading that did not come: NaN
+            joint = int(np.argmax(jumped))
+            what = f"its position reading jumped by {moved[joint]:+.3g} rad between two cycles, which no motion does"
+            raise EncoderFault(self._names[joint], what, bit_of(float(abs(moved[joint]) / self._step[joint])))
+        self._read_at[np.isfinite(sample.position)] = sample.t
+
+    def judge(self, seen: Array, path: Array, movable: Flags, resolution: Array) -> None:
+        """Raise EncoderFault where what a joint read on its way leaves out what one bit would have shown.
+
+        seen (K, n) is what was read and path (K, n) where the `movable` joints were sent [rad]; `resolution` (n,) is
+        the smallest change that was ever read, inf where none was: bits below it are never used.
+        """
+        step = np.where(np.isfinite(resolution), resolution, self._step)
+        for joint in np.flatnonzero(movable):
+            counts = np.rint(seen[:, joint] / step[joint])
+            bit = missing_bit(counts[np.isfinite(counts)], path[:, joint] / step[joint])
+            if bit is not None:
+                what = f"its position reading skips every other {2.0**bit * step[joint]:.3g} rad"
+                unused = round(float(np.log2(step[joint] / self._step[joint])))
+                raise EncoderFault(self._names[joint], what, bit + unused)

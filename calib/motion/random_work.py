@@ -1,0 +1,66 @@
+"""Ordinary work for a simulated arm: endless random waypoints inside the joint range, short moves, short rests."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.motion.trajectory import trajectory
+from calib.records.records import Array
+
+
+@dataclass(frozen=True)
+class WorkMotion:
+    """How the arm moves."""
+
+    reach: float = 0.8
+    """Longest move of a joint from one waypoint to the next [rad]."""
+    margin: float = 0.1
+    """Distance kept from the stops [rad]."""
+    speed_share: float = 0.8
+    """Of each joint's largest velocity."""
+    acceleration: float = 3.0
+    """[rad/s²]"""
+    rest: float = 0.5
+    """Rest at each waypoint [s]: settling and average of the rest detection, and a little more."""
+
+
+def work_targets(
+    start: Array,
+    lower: Array,
+    upper: Array,
+    max_velocity: Array,
+    period: float,
+    random: np.random.Generator,
+    motion: WorkMotion | None = None,
+) -> Iterator[Array]:
+    """Position targets (n,) [rad], one a cycle of `period` [s], without end; as work_pieces has them."""
+    for piece in work_pieces(start, lower, upper, max_velocity, period, random, motion or WorkMotion()):
+        yield from piece
+
+
+def work_pieces(
+    start: Array,
+    lower: Array,
+    upper: Array,
+    max_velocity: Array,
+    period: float,
+    random: np.random.Generator,
+    motion: WorkMotion,
+) -> Iterator[Array]:
+    """Pieces (K, n) of position targets [rad] without end: the way to another pose and the rest there.
+
+    `start` is where the arm is; lower and upper (n,) [rad] are its stops, max_velocity (n,) [rad/s].
+    """
+    middle, half = (lower + upper) / 2, np.maximum((upper - lower) / 2 - motion.margin, 0.0)
+    here = np.array(start, dtype=float)
+    while True:
+        nearest, farthest = (
+            np.maximum(middle - half, here - motion.reach),
+            np.minimum(middle + half, here + motion.reach),
+        )
+        goal = random.uniform(np.minimum(nearest, farthest), np.maximum(nearest, farthest))
+        speed, acceleration = motion.speed_share * max_velocity, np.full_like(here, motion.acceleration)
+        way = trajectory(here, goal, speed, acceleration, period)
+        yield np.vstack([way, np.repeat(goal[None], round(motion.rest / period), axis=0)])
+        here = goal

@@ -1,0 +1,69 @@
+"""When is a joint at rest, and when is its average exact enough: judged from the samples, not from a fixed sleep."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from calib.arm.sweep_section import SweepSection
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+DRIFT = 2.5
+"""Standard errors by which the means of the window's halves may differ."""
+QUIET = 1.0
+"""Torque scatter that is this many times the standard error asked for has settled whatever its shape."""
+
+
+@dataclass(frozen=True, eq=False)
+class SettleRule:
+    """The rule of one arm; all arrays (n,)."""
+
+    window: int
+    """Cycles over which it judges."""
+    timeout: int
+    """Cycles after which a reading is taken as it is."""
+    max_samples: int
+    span: float
+    """Half of what a joint at rest may cover during the window [rad]."""
+    scatter: float
+    standard_error: Array
+    """Asked for [N·m]."""
+
+    @classmethod
+    def of(cls, section: SweepSection, standard_error: Array, period: float) -> "SettleRule":
+        """From the sweep section; standard error (n,) [N·m] of each reading, cycle `period` [s]."""
+        window = max(round(section.settle_window / period), 8)
+        return cls(
+            window=window,
+            timeout=round(section.settle_timeout / period),
+            max_samples=max(section.max_samples, window),
+            span=section.settle_velocity * window * period / 2,
+            scatter=section.settle_scatter,
+            standard_error=standard_error,
+        )
+
+    def settled(self, position: Array, torque: Array, counts: Flags, resolution: Array) -> bool:
+        """Whether nothing moves any more: position and torque (W, n) of the last window.
+
+        A joint moves if its position covers more than twice `span` and more than one step of its sensor (an overshoot
+        that is turning back covers as much as one that is under way). A torque that `counts` (n,) has settled if it
+        scatters no more than its own sample-to-sample noise explains (von Neumann's ratio) and does not drift between
+        the window's halves, or scatters too little to matter.
+        """
+        covered = np.nanmax(position, axis=0) - np.nanmin(position, axis=0)
+        if np.any(covered > np.maximum(2 * self.span, 1.5 * resolution)):
+            return False
+        half = len(torque) // 2
+        drift = np.nanmean(torque[half:], axis=0) - np.nanmean(torque[:half], axis=0)
+        spread = np.nanvar(torque, axis=0)
+        step = np.nanmean(np.diff(torque, axis=0) ** 2, axis=0) / 2
+        allowed = np.maximum(self.scatter**2 * step, (QUIET * self.standard_error) ** 2)
+        steady = drift**2 <= DRIFT**2 * np.maximum(step, self.standard_error**2) * 4 / len(torque)
+        return bool(np.all((spread <= allowed) & steady | ~counts))
+
+    def exact(self, torque: Array, counts: Flags) -> bool:
+        """Whether the mean of the torque samples (K, n) is as exact as asked for, in every joint that `counts`."""
+        error = np.nanstd(torque, axis=0, ddof=1) / np.sqrt(len(torque))
+        return bool(np.all((error <= self.standard_error) | ~counts))

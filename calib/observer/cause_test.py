@@ -1,0 +1,190 @@
+"""The cause test: which one effect explains a window's torque residual, if any does (theory.md section 6)."""
+
+from dataclasses import dataclass, field
+from itertools import combinations, pairwise, product
+
+import numpy as np
+
+from calib.observer.config import ObserverConfig
+from calib.observer.effect_dictionary import DRIFT, Entry, Window, class_of, dictionary, kin
+from calib.observer.gravity_belief import ModelBelief
+from calib.records.records import Array
+from gcomp.gravity.torque import gravity_levers
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the window says. `values` and `covariance` are the parameters of the winning entry."""
+
+    cause: str
+    """none, unknown, ambiguous, temperature (several zeros at once) or the winning entry's cause."""
+    joint: int | None
+    """Index of the joint, None where it concerns the arm."""
+    confidence: float
+    """Share of the winner among all classes, exp(−BIC/2) weighted; for unknown and ambiguous that of the best entry."""
+    values: Array
+    covariance: Array
+    evidence: dict[str, float] = field(default_factory=dict)
+    """BIC of the best entry of each class above the best one; `misfit` of the winner in standard deviations."""
+    rivals: tuple[str, ...] = ()
+    """Classes that fit as well, where ambiguous."""
+    beside: int | None = None
+    """Another joint whose sensor drifts at the same time."""
+
+    @property
+    def is_drift(self) -> bool:
+        """Whether it is a drift of torque sensors, the only verdict that may lead to a new record."""
+        return self.cause in DRIFT
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        """The joints concerned, the one with more evidence first."""
+        return tuple(joint for joint in (self.joint, self.beside) if joint is not None)
+
+    def other(self, joint: int) -> int | None:
+        """The joint that drifts beside this one, if any."""
+        return next((other for other in self.joints if other != joint), None)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    entry: Entry
+    bic: float
+    chi2: float
+    values: Array
+    covariance: Array
+
+
+class CauseTest:
+    """The dictionary fitted to one window, the model's error marginalised: covariance σ²I + Y Cov(β) Yᵀ + H Σ_q Hᵀ."""
+
+    def __init__(self, belief: ModelBelief, window: Window, sigma: Array, config: ObserverConfig) -> None:
+        """sigma (n,) [N·m]: standard deviation of one row."""
+        self.belief, self.window, self._config = belief, window, config
+        residual, nuisance = belief.residual(window.position, window.torque, config.position_std)
+        noise = np.tile(sigma, len(window.position))
+        covariance = nuisance @ nuisance.T
+        covariance[np.diag_indices_from(covariance)] += noise**2
+        self.entries = list(dictionary(belief.arm, belief.beta, window))
+        stacked = np.column_stack([residual.ravel(), *(entry.columns for entry in self.entries)])
+        white: Array = np.linalg.solve(np.linalg.cholesky(covariance), stacked)  # scipy would take longer to load
+        self._white: Array = white[:, 0]
+        ends = np.cumsum([1, *(entry.columns.shape[1] for entry in self.entries)])
+        self._columns: list[Array] = [white[:, start:end] for start, end in pairwise(ends)]
+        self.chi2_none = float(self._white @ self._white)
+
+    def verdict(self) -> Verdict:
+        """Which class wins, and whether it is decided."""
+        fits = sorted(map(self._fit, range(len(self.entries))), key=lambda fit: fit.bic)
+        best, config = fits[0], self._config
+        classes = {"none": self.chi2_none}
+        for fit in reversed(fits):
+            classes[class_of(fit.entry)] = fit.bic
+        top = min(classes.values())
+        weights = {name: np.exp(-(bic - top) / 2) for name, bic in classes.items()}
+        total = sum(weights.values())
+        evidence = {
+            name: round(float(bic - top), 1) for name, bic in sorted(classes.items(), key=lambda item: item[1])[:6]
+        }
+
+        def answer(cause: str, fit: _Fit | None, of: str, rivals: tuple[str, ...] = ()) -> Verdict:
+            known = (fit.values, fit.covariance) if fit else (np.empty(0), np.empty((0, 0)))
+            joint = fit.entry.joint if fit else None
+            return Verdict(cause, joint, float(weights[of] / total), *known, evidence, rivals)
+
+        if self.chi2_none - best.bic < config.evidence:
+            misfit = self._misfit(self.chi2_none, 0)
+            evidence["misfit"] = misfit
+            return answer("unknown" if misfit > config.misfit else "none", None, "none")
+        winner, name = best.entry, class_of(best.entry)
+        evidence["misfit"] = self._misfit(best.chi2, winner.columns.shape[1])
+        if evidence["misfit"] > config.misfit or (winner.cause == "payload" and not self._weighs(best)):
+            return self._two_drifts() or self._all_zeros() or answer("unknown", None, name)
+        near = [fit.entry for fit in fits[1:] if fit.bic - best.bic < config.evidence]
+        rivals = tuple(dict.fromkeys(class_of(entry) for entry in near if not kin(entry, winner)))
+        if rivals:
+            return answer("ambiguous", best, name, rivals)
+        return answer(winner.cause, best, name)
+
+    def _fit(self, *indices: int) -> _Fit:
+        """Generalised least squares of entries together; columns that these poses do not tell apart never win."""
+        columns = np.hstack([self._columns[index] for index in indices])
+        entries = [self.entries[index] for index in indices]
+        count = columns.shape[1]
+        nothing = _Fit(entries[0], np.inf, np.inf, np.full(count, np.nan), np.full((count, count), np.nan))
+        size = np.linalg.norm(columns, axis=0)
+        if (size < 1e-9).any():
+            return nothing
+        u, s, vt = np.linalg.svd(columns / size, full_matrices=False)
+        if s[-1] < 1e-6 * s[0]:
+            return nothing
+        back = (vt.T / s) / size[:, None]
+        explained = u.T @ self._white
+        chi2 = self.chi2_none - float(explained @ explained)
+        price = sum(entry.columns.shape[1] if entry.price is None else entry.price for entry in entries)
+        return _Fit(entries[0], chi2 + price * np.log(len(self._white)), chi2, back @ explained, back @ back.T)
+
+    def _two_drifts(self) -> Verdict | None:
+        """Two joints that drift at once, where that alone explains the window; else None.
+
+        Competes with one joint's drift beside an effect on the whole arm: a payload picked up meanwhile, say.
+        """
+        whole = [index for index, entry in enumerate(self.entries) if entry.joint is None]
+        drifts = [index for index, entry in enumerate(self.entries) if entry.cause == "drift"]
+        drifts.sort(key=lambda index: self._fit(index).chi2)
+        pairs = [*combinations(drifts, 2), *product(drifts, whole)]
+        fits = {pair: self._fit(*pair) for pair in pairs}
+        best = min(fits, key=lambda pair: fits[pair].bic)
+        fit = fits[best]
+        if not np.isfinite(fit.bic) or self._misfit(fit.chi2, 4) > self._config.misfit or best[1] in whole:
+            return None
+        above = np.array([other.bic - fit.bic for pair, other in fits.items() if pair != best])
+        if above.min() < self._config.evidence:
+            return None
+        confidence = float(1 / (1 + np.exp(-above / 2).sum()))
+        evidence = {"next": round(float(above.min()), 1), "misfit": self._misfit(fit.chi2, 4)}
+        first, second = (self.entries[index].joint for index in best)
+        return Verdict("drift", first, confidence, fit.values, fit.covariance, evidence, beside=second)
+
+    def _weighs(self, payload: _Fit) -> bool:
+        """Whether a payload's mass can be: positive, or what the model believes to be carried taken off."""
+        return bool(payload.values[0] > min(0.0, -1.2 * self.belief.mass))
+
+    def _all_zeros(self) -> Verdict | None:
+        """The zeros of several sensors moved together, where that alone explains the window: as temperature does it."""
+        zeros = [self._index("offset", joint) for joint in range(self.belief.arm.n)]
+        fit = self._fit(*zeros)
+        misfit = self._misfit(fit.chi2, len(zeros))
+        if not np.isfinite(fit.bic) or misfit > self._config.misfit:
+            return None
+        return Verdict("temperature", None, 1.0, fit.values, fit.covariance, {"misfit": misfit})
+
+    def drift(self, joint: int, cause: str, beside: int | None = None) -> tuple[Array, Array]:
+        """Gain and offset change of a joint (2,), as `cause` (gain, offset or drift) has it, and covariance (2, 2).
+
+        Where the joint `beside` drifts too, both are fitted together.
+        """
+        also = [] if beside is None else [self._index("drift", beside)]
+        fit = self._fit(self._index(cause, joint), *also)
+        at = [index for index, name in enumerate(("gain", "offset")) if cause in (name, "drift")]
+        values, covariance = np.zeros(2), np.zeros((2, 2))
+        values[at] = fit.values[: len(at)]
+        covariance[np.ix_(at, at)] = fit.covariance[: len(at), : len(at)]
+        return values, covariance
+
+    def loss(self, joint: int, simple: str, full: str, beside: int | None = None) -> float:
+        """How much worse (BIC) the drift `simple` of a joint explains the window than `full` (gain, offset, drift)."""
+        also = [] if beside is None else [self._index("drift", beside)]
+        return self._fit(self._index(simple, joint), *also).bic - self._fit(self._index(full, joint), *also).bic
+
+    def lever_share(self, joint: int) -> float:
+        """Largest Γ_j/g that the window reached."""
+        levers = gravity_levers(self.belief.arm, self.window.position)[:, joint]
+        return float(levers.max() / np.linalg.norm(self.belief.arm.gravity))
+
+    def _index(self, cause: str, joint: int) -> int:
+        return [(entry.cause, entry.joint) for entry in self.entries].index((cause, joint))
+
+    def _misfit(self, chi2: float, parameters: int) -> float:
+        dof = len(self._white) - parameters
+        return round(float((chi2 - dof) / np.sqrt(2 * dof)), 2)

@@ -1,0 +1,101 @@
+"""From a drift verdict to what may be written: the rules at the end of theory.md section 6."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.observer.cause_test import CauseTest, Verdict
+from calib.observer.config import ObserverConfig
+from calib.observer.rest_detector import Row
+from calib.records.records import Array
+
+
+@dataclass(frozen=True)
+class Finding:
+    """How one joint's sensor changed against what is installed, and why that may not be written, if so."""
+
+    joint: int
+    cause: str
+    """gain, offset or drift (both)."""
+    gain: float
+    """Relative gain: 1 where it has not changed."""
+    offset: float
+    """[N·m], of the reading as installed."""
+    covariance: Array
+    """(2, 2) of gain and offset; 0 where not estimated."""
+    rows: int
+    confidence: float
+    refused: tuple[str, ...] = ()
+
+    @property
+    def std(self) -> tuple[float, float]:
+        """Standard deviations of gain and offset [N·m]."""
+        gain, offset = np.sqrt(np.diag(self.covariance))
+        return float(gain), float(offset)
+
+
+@dataclass(frozen=True)
+class Agreeing:
+    """Rows that agree on a drift of these joints."""
+
+    rows: list[Row]
+    test: CauseTest
+    joints: frozenset[int]
+
+
+def agreed(first: CauseTest, second: CauseTest, joint: int, beside: int | None, limit: float) -> bool:
+    """Whether two disjoint windows find the same gain and offset change of a joint: χ²₂ of the difference.
+
+    Where gravity does not load the joint, the offset alone is compared. `beside`: a joint that drifts at the same time.
+    """
+    (a, cov_a), (b, cov_b) = (window.drift(joint, "drift", beside) for window in (first, second))
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        (a, cov_a), (b, cov_b) = (window.drift(joint, "offset", beside) for window in (first, second))
+        return bool((a - b)[1] ** 2 < limit * (cov_a + cov_b)[1, 1])
+    return float((a - b) @ np.linalg.solve(cov_a + cov_b, a - b)) < limit
+
+
+def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig) -> Finding:
+    """The finding for one joint of a drift verdict on all rows that agree, with every rule that forbids to write it."""
+    cause, refused = verdict.cause, []
+    beside = verdict.other(joint)
+    change, covariance = test.drift(joint, cause, beside)
+    weak_lever = test.lever_share(joint) < config.lever_share
+    if cause != "offset" and (weak_lever or covariance[0, 0] > config.gain_std**2):
+        told = f"gain known to {np.sqrt(covariance[0, 0]):.2%} only, {config.gain_std:.2%} is asked: sweep this joint"
+        if test.loss(joint, "offset", cause, beside) < config.evidence:
+            cause = "offset"  # as well explained without the gain, which stays frozen
+            change, covariance = test.drift(joint, cause, beside)
+        else:
+            refused.append("gravity's lever too short for a gain" if weak_lever else told)
+    if covariance[1, 1] > config.offset_std**2:
+        refused.append(f"offset known to {np.sqrt(covariance[1, 1]):.3f} N·m only, {config.offset_std} is asked")
+    if _distance(change, covariance) < config.significance:
+        refused.append(f"change is less than {config.significance:g} standard deviations")
+    if len(set(np.sign(test.window.direction[:, joint])) - {0.0}) < 2:
+        refused.append("joint approached from one side only: friction looks like an offset")
+    alike = _alike(test, joint, config.significance)
+    if alike >= config.common_joints:
+        refused.append(f"{alike} joints changed by the same factor: gravity, payload or supply voltage")
+    rows = len(test.window.position)
+    return Finding(
+        joint, cause, 1.0 + float(change[0]), float(change[1]), covariance, rows, verdict.confidence, tuple(refused)
+    )
+
+
+def _distance(change: Array, covariance: Array) -> float:
+    """Length of the change in standard deviations, over the parameters that were estimated."""
+    estimated = np.diag(covariance) > 0
+    part = change[estimated]
+    return float(np.sqrt(part @ np.linalg.solve(covariance[np.ix_(estimated, estimated)], part)))
+
+
+def _alike(test: CauseTest, joint: int, significance: float) -> int:
+    """How many joints, each taken alone, changed their gain by a factor that cannot be told from this joint's."""
+    fits = [test.drift(j, "gain") for j in range(test.belief.arm.n)]
+    changes = np.array([change[0] for change, _ in fits])
+    stds = np.array([np.sqrt(covariance[0, 0]) for _, covariance in fits])
+    alike = (np.abs(changes) >= significance * stds) & (
+        np.abs(changes - changes[joint]) <= 3 * np.hypot(stds, stds[joint])
+    )
+    return int(alike.sum())

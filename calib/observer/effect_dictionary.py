@@ -1,0 +1,87 @@
+"""The dictionary of effects that the cause test fits: what each adds to the torque readings (theory.md section 6)."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.observer.rest_detector import Row
+from calib.records.records import Array
+from gcomp.arm.arm import Arm
+from gcomp.arm.mass_moments import payload_columns
+from gcomp.gravity.torque import gravity_regressor, gravity_stiffness
+
+DRIFT = ("gain", "offset", "drift")
+
+
+@dataclass(frozen=True)
+class Window:
+    """K rows: true-angle positions (K, n) [rad], torque readings as installed (K, n) [N·m], directions (K, n)."""
+
+    position: Array
+    torque: Array
+    direction: Array
+
+    @classmethod
+    def of(cls, rows: list[Row]) -> "Window":
+        """From K rows whose positions are true angles."""
+        columns = ([getattr(row, name) for row in rows] for name in ("position", "torque", "direction"))
+        return cls(*map(np.array, columns))
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One effect of the dictionary."""
+
+    cause: str
+    """gain, offset, drift (both), friction, spring, slip, payload, tilt or scale."""
+    joint: int | None
+    """Index of the joint, None where it concerns the arm."""
+    columns: Array
+    """What a unit of each parameter adds to the torque readings, (K·n, p)."""
+    contains: tuple[str, ...] = ()
+    """Causes of the same joint that are special cases of this one."""
+    price: int | None = None
+    """Parameters that it is charged for in the BIC; by default those that it has."""
+
+
+def dictionary(arm: Arm, beta: Array, window: Window) -> Iterator[Entry]:
+    """Every entry of the dictionary for the poses of a window; beta (2n,) [kg·m] is the model believed."""
+    q, n = window.position, arm.n
+    regressor = gravity_regressor(arm, q)
+    torque = regressor @ beta
+    middle = np.where(np.isfinite(arm.lower + arm.upper), (arm.lower + arm.upper) / 2, 0.0)
+    one = np.ones(len(q))
+
+    def row_of(joint: int, *columns: Array) -> Array:
+        full = np.zeros((len(q), n, len(columns)))
+        full[:, joint] = np.stack(columns, axis=1)
+        return full.reshape(len(q) * n, len(columns))
+
+    for j in range(n):
+        yield Entry("gain", j, row_of(j, torque[:, j]))
+        yield Entry("offset", j, row_of(j, one))
+        yield Entry("drift", j, row_of(j, torque[:, j], one), contains=("gain", "offset"))
+        yield Entry("friction", j, row_of(j, window.direction[:, j]))
+        yield Entry("spring", j, row_of(j, q[:, j] - middle[j], one), contains=("offset",))
+    stiffness = gravity_stiffness(arm, beta, q)
+    for j in range(n):
+        yield Entry("slip", j, stiffness[:, :, j].reshape(-1, 1))
+    at_origin, by_point = payload_columns(arm)
+    yield Entry("payload", None, (regressor @ np.column_stack([at_origin, by_point])).reshape(-1, 4))
+    across = np.linalg.svd(arm.gravity[None])[2][1:] * np.linalg.norm(arm.gravity)
+    tilted = [gravity_regressor(replace(arm, gravity=direction), q) @ beta for direction in across]
+    yield Entry("tilt", None, np.stack(tilted, axis=-1).reshape(-1, 2))
+    # a payload explains nine tenths of a common scale and is far more frequent: same price, so that it wins
+    yield Entry("scale", None, torque.reshape(-1, 1), price=4)
+
+
+def class_of(entry: Entry) -> str:
+    """What an entry counts as when verdicts compete: gain, offset and both of one joint are one class."""
+    cause = "drift" if entry.cause in DRIFT else entry.cause
+    return cause if entry.joint is None else f"{cause}_{entry.joint + 1}"
+
+
+def kin(entry: Entry, winner: Entry) -> bool:
+    """Whether an entry is no rival: same class, or the winner is a special case of it."""
+    return class_of(entry) == class_of(winner) or (entry.joint == winner.joint and winner.cause in entry.contains)

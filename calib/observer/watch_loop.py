@@ -1,0 +1,108 @@
+"""Watches an arm at work: samples to the observer, findings to recalibration, estimates kept for a report."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from armlink.errors import Refused
+from armlink.link.types import Command, Sample
+from calib.observer.events import Event
+from calib.observer.observer import Observer
+from calib.observer.recalibrator import Recalibration, Recalibrator
+from calib.records.records import Array
+
+
+class Cycling(Protocol):
+    """What watching needs of the link (`armlink.link.link.Link`)."""
+
+    def cycle(self, command: Command) -> Sample:
+        """One cycle; raises BusFault."""
+        ...
+
+
+@dataclass
+class WatchHistory:
+    """What happened, for reports: estimates once a row, and all events. Times by the samples' clock [s]."""
+
+    t: list[float] = field(default_factory=list)
+    gain: list[Array] = field(default_factory=list)
+    """Gain (n,) against the calibration installed at that time."""
+    gain_std: list[Array] = field(default_factory=list)
+    offset: list[Array] = field(default_factory=list)
+    """Likewise (n,) [N·m]."""
+    offset_std: list[Array] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
+    recalibrations: list[tuple[float, Recalibration]] = field(default_factory=list)
+
+    def first(self, kind: str, joint: str, after: float = 0.0) -> float | None:
+        """Time of the first event of a kind on a joint from `after` on, None where there was none."""
+        times = (event.t for event in self.events if event.kind == kind and event.joint == joint and event.t >= after)
+        return next(times, None)
+
+
+def watch(
+    link: Cycling,
+    observer: Observer,
+    targets: Iterable[Array],
+    seconds: float,
+    recalibrator: Recalibrator | None = None,
+    on_sample: Callable[[Sample, WatchHistory], bool] | None = None,
+) -> WatchHistory:
+    """Run the arm along position targets (n,) [rad], one a cycle, for so many seconds of its clock, and observe.
+
+    A finding goes to the recalibrator; where that writes it, the observer takes it as installed. `on_sample` sees each
+    sample and ends the watch by returning True. Raises BusFault.
+    """
+    history, end = WatchHistory(), None
+    for target in targets:
+        sample = link.cycle(Command.hold(target))
+        end = sample.t + seconds if end is None else end
+        rows = observer.rows
+        events = observer.handle(sample.t, sample.position, sample.torque)
+        for event in events:
+            history.events.append(event)
+            if event.finding is not None and recalibrator is not None:
+                _recalibrate(event, observer, recalibrator, history)
+        if recalibrator is not None:
+            _check(sample, observer, recalibrator, history)
+        if observer.rows > rows:
+            _keep(sample.t, observer, history)
+        if sample.t >= end or (on_sample is not None and on_sample(sample, history)):
+            break
+    return history
+
+
+def _recalibrate(event: Event, observer: Observer, recalibrator: Recalibrator, history: WatchHistory) -> None:
+    assert event.finding is not None
+    try:
+        outcome = recalibrator.handle(event.finding)
+    except Refused as error:
+        history.events.append(Event(event.t, "refused", event.joint, {"reason": str(error)}))
+        return
+    if outcome is None:
+        return
+    history.recalibrations.append((event.t, outcome))
+    evidence = {"record": outcome.record.id, "gain": outcome.gain, "offset": outcome.offset, "applied": outcome.applied}
+    history.events.append(Event(event.t, "recalibration", event.joint, evidence))
+    if outcome.applied:
+        observer.install(event.finding)
+
+
+def _check(sample: Sample, observer: Observer, recalibrator: Recalibrator, history: WatchHistory) -> None:
+    """After a recalibration: what made the readings worse is taken back."""
+    checked = recalibrator.sample(sample.t, sample.position, sample.torque)
+    if checked is None or checked.verdict == "kept":
+        return
+    outcome = recalibrator.undo(checked)
+    history.events.append(
+        Event(sample.t, "roll-back", outcome.joint, {"record": outcome.record.id, "why": checked.why})
+    )
+    if outcome.undo is not None:
+        observer.install(outcome.undo)
+
+
+def _keep(t: float, observer: Observer, history: WatchHistory) -> None:
+    estimate = observer.estimate()
+    history.t.append(t)
+    for name in ("gain", "gain_std", "offset", "offset_std"):
+        getattr(history, name).append(getattr(estimate, name))

@@ -1,0 +1,80 @@
+"""How hard resting joints are pressed on their stops, and how fast the others may then move."""
+
+import numpy as np
+import numpy.typing as npt
+
+from calib.arm.drive_limits import Limits
+from calib.arm.sweep_section import SweepSection
+from calib.plan.rough_gravity import GravityGuess
+from calib.plan.stop_selection import Candidates
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+SLOWEST = 0.3
+"""Acceleration that every planned sweep must allow [rad/s²]."""
+FASTEST = 2.0
+"""Acceleration between sweeps where the drives allow it [rad/s²]."""
+
+
+def hold_torque(guess: GravityGuess, section: SweepSection, limits: Limits, poses: Array) -> tuple[Array, Array, Array]:
+    """(Least, largest, allowance) holding torque (C, n) [N·m] along candidate sweeps with poses (C, S, n).
+
+    The allowance covers the rough model's error, the torque scale and friction, but not the margin.
+    """
+    torque = guess.torque(poses)
+    doubt = (guess.uncertainty(poses) + section.gain_tolerance * np.abs(torque)).max(axis=1)
+    return torque.min(axis=1), torque.max(axis=1), doubt + section.friction * limits.rated
+
+
+def required_bias(
+    guess: GravityGuess, section: SweepSection, limits: Limits, stops: npt.NDArray[np.int8], poses: Array
+) -> Array:
+    """Size of the torque (C, n) [N·m] that keeps each resting joint pressed along candidate sweeps; 0 if swept."""
+    least, largest, allowance = hold_torque(guess, section, limits, poses)
+    against = np.where(stops > 0, largest, -least)
+    floor = section.bias_margin * limits.max_torque + section.friction * limits.rated
+    needed = np.maximum(against + allowance + section.bias_margin * limits.max_torque, floor)
+    return np.where(stops == 0, 0.0, needed)
+
+
+def pressable(guess: GravityGuess, section: SweepSection, limits: Limits, candidates: Candidates) -> Flags:
+    """Which resting joints (C, n) can be pressed on their stop within max_torque; True for the swept joint."""
+    needed = required_bias(guess, section, limits, candidates.stops, candidates.poses)
+    needed = needed + SLOWEST * reaction_bound(guess, candidates.joint)
+    given = limits.max_torque if section.bias_torque is None else np.array(section.bias_torque)
+    flags: Flags = (needed <= np.minimum(given, limits.max_torque)) | (candidates.stops == 0)
+    return flags
+
+
+def reaction_bound(guess: GravityGuess, joint: int) -> Array:
+    """Bound of the torque (n,) [N·m] that 1 rad/s² of the swept joint makes at every joint: √(M_ii M_jj)."""
+    inertia = guess.inertia()
+    bound: Array = np.sqrt(inertia * inertia[joint])
+    return bound
+
+
+def bias_and_acceleration(
+    needed: Array, spare: Array, reaction: Array, pressed: Flags, section: SweepSection, limits: Limits, joint: int
+) -> tuple[Array, float]:
+    """(Bias size (n,) [N·m], acceleration [rad/s²]): as fast as every joint's torque allows.
+
+    `spare` (n,) [N·m] is what the drives have beside gravity: a joint held by its servo bears the swept one's reaction
+    with it, and the swept joint moves by half of it.
+    """
+    given = limits.max_torque if section.bias_torque is None else np.array(section.bias_torque)
+    left = np.where(pressed, given - needed, spare)
+    left[joint] = spare[joint] / 2
+    room = left / np.maximum(reaction, 1e-9)
+    acceleration = float(np.clip(room.min(), SLOWEST, section.acceleration))
+    if section.bias_torque is not None:
+        return given, acceleration
+    return np.minimum(needed + acceleration * reaction, limits.max_torque), acceleration
+
+
+def travel_acceleration(limits: Limits, options: list[Candidates], guess: GravityGuess | None) -> float:
+    """Acceleration [rad/s²] that the drives can give beside gravity at the poses between which they travel."""
+    if guess is None:
+        return 1.0
+    poses = np.concatenate([each.poses.reshape(-1, guess.arm.n) for each in options])
+    spare = limits.max_torque - np.abs(guess.torque(poses)).max(axis=0)
+    return float(np.clip(np.min(spare / np.maximum(2 * guess.inertia(), 1e-9)), SLOWEST, FASTEST))

@@ -1,0 +1,129 @@
+"""Does the arm touch itself or its surroundings on the way? By MuJoCo's contacts on the arm file's model, if any."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from armlink.arm_file import ArmFile
+from armlink.errors import Refused
+from calib.plan.types import Sweep, SweepPlan
+
+Array = npt.NDArray[np.float64]
+POINTS = 15
+"""Poses looked at on each way from one place to the next."""
+DEPTH = 0.0005
+"""Overlap from which bodies count as touching [m]."""
+Pair = tuple[str, str]
+
+
+class Collided(Refused):
+    """The plan leads through a contact."""
+
+
+@dataclass(frozen=True, eq=False)
+class Contact:
+    """Two bodies that overlap."""
+
+    bodies: Pair
+    depth: float
+    """[m]"""
+
+
+class Geometry:
+    """The bodies of the arm file's model. Overlaps that the model has at every pose are its own, and no collisions."""
+
+    def __init__(self, arm: ArmFile) -> None:
+        """Compile the model; raises BadInput where it cannot be used."""
+        import mujoco
+
+        from calib.arm.kinematics import gcomp_arm
+        from gcomp.arm.load import compile_model
+
+        assert arm.model_path is not None
+        self._mujoco = mujoco
+        described = gcomp_arm(arm)  # checks the chain and says in the arm file's words what is wrong
+        self.model = compile_model(arm.model_path)
+        self.data = mujoco.MjData(self.model)
+        self._places = [int(self.model.joint(name).qposadr[0]) for name in described.names]
+        generator = np.random.default_rng(0)
+        poses = generator.uniform(described.lower, described.upper, (12, described.n))
+        always = [{contact.bodies for contact in self._contacts(pose)} for pose in poses]
+        self._own: set[Pair] = set.intersection(*always)
+
+    def contacts(self, pose: Array) -> list[Contact]:
+        """Collisions at a pose (n,) [rad], deepest first."""
+        return [contact for contact in self._contacts(pose) if contact.bodies not in self._own]
+
+    def free(self, poses: Array) -> npt.NDArray[np.bool_]:
+        """Which of the poses (K, n) [rad] have no collision (K,)."""
+        return np.array([not self.contacts(pose) for pose in poses], dtype=bool)
+
+    def _contacts(self, pose: Array) -> list[Contact]:
+        data, model = self.data, self.model
+        data.qpos[self._places] = pose
+        self._mujoco.mj_kinematics(model, data)
+        self._mujoco.mj_comPos(model, data)
+        self._mujoco.mj_collision(model, data)
+        found: dict[Pair, float] = {}
+        for contact in data.contact[: data.ncon]:
+            if contact.dist < -DEPTH:
+                first, second = sorted(int(model.geom_bodyid[geom]) for geom in contact.geom)
+                pair = (self._name(first), self._name(second))
+                found[pair] = max(found.get(pair, 0.0), -float(contact.dist))
+        return sorted((Contact(pair, depth) for pair, depth in found.items()), key=lambda each: -each.depth)
+
+    def _name(self, body: int) -> str:
+        return "the surroundings" if body == 0 else str(self.model.body(body).name or f"body {body}")
+
+
+def check_plan(arm: ArmFile, plan: SweepPlan) -> str:
+    """Look at the whole way of a plan; raises Collided naming bodies, sweep and pose. Returns what was checked."""
+    if arm.model_path is None:
+        return "collisions not checked: the arm file has no kinematics.model with geometry"
+    geometry = Geometry(arm)
+    if geometry.model.ngeom == 0:
+        return "collisions not checked: the model has no geometry"
+    count = 0
+    for where, pose in way(plan):
+        count += 1
+        touching = geometry.contacts(pose)
+        if touching:
+            first, second = touching[0].bodies
+            raise Collided(
+                f"{arm.name}: {first} would touch {second} {where}, {touching[0].depth * 1000:.1f} mm deep, at"
+                f" {' '.join(f'{angle:.3f}' for angle in pose)} rad: narrow lower and upper of these joints in the arm"
+                " file, or clear the workspace"
+            )
+    return f"no collision at {count} poses along the way"
+
+
+def way(plan: SweepPlan) -> Iterator[tuple[str, Array]]:
+    """(Where, pose (n,) [rad]) along everything that the plan does, straight from one place to the next."""
+    here = None
+    for number, scouted in enumerate(plan.scout, start=1):
+        goal = np.array(scouted)
+        yield from _between(here, goal, f"on the way to scout pose {number}")
+        here = goal
+    for sweep in plan.sweeps:
+        begin, end = ends(sweep)
+        yield from _between(here, begin, f"on the way to sweep {sweep.name}")
+        yield from _between(begin, end, f"in sweep {sweep.name}")
+        here = begin
+
+
+def ends(sweep: Sweep) -> tuple[Array, Array]:
+    """First and last pose (n,) [rad] of a sweep."""
+    begin = np.array(sweep.rest)
+    end = begin.copy()
+    begin[sweep.joint], end[sweep.joint] = sweep.steps[0], sweep.steps[-1]
+    return begin, end
+
+
+def _between(start: Array | None, goal: Array, where: str) -> Iterator[tuple[str, Array]]:
+    if start is None:
+        yield where, goal
+        return
+    for share in np.linspace(0, 1, POINTS + 1)[1:]:
+        yield where, start + share * (goal - start)

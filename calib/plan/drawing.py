@@ -1,0 +1,124 @@
+"""Where the arm will be, as a picture and as a time: one page that opens without a network."""
+
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from armlink.arm_file import ArmFile
+from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import gcomp_arm
+from calib.arm.sweep_section import sweep_section
+from calib.motion.trajectory import trajectory
+from calib.plan.collisions import ends
+from calib.plan.types import SweepPlan
+from gcomp.arm.arm import Arm, bar_frames
+
+Array = npt.NDArray[np.float64]
+PRESS, READ = 1.0, 0.5
+"""Seconds that creeping onto stops and pressing take, and that one reading takes to settle and average."""
+COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#e377c2", "#8c564b")
+"""One a joint."""
+GHOSTS = 4
+"""Poses drawn of each sweep."""
+
+
+def joint_places(arm: Arm, q: Array) -> Array:
+    """Origins of all frames, base to tip (K, n + 1, 3) [m], at poses q (K, n) [rad]."""
+    rotation = bar_frames(arm, q).rotation
+    levers = np.column_stack([arm.a, np.zeros(arm.n), np.zeros(arm.n)])
+    along = np.einsum("knij,nj->kni", rotation, levers) + rotation[..., 2] * arm.d[:, None]
+    places = np.zeros((len(q), arm.n + 1, 3))
+    places[:, 1:] = np.cumsum(along, axis=1)
+    return places
+
+
+def seconds(arm: ArmFile, plan: SweepPlan) -> float:
+    """Time that one pass of a plan will take, roughly [s]."""
+    section, limits = sweep_section(arm), Limits.of(arm)
+    period, speed = 0.02, section.travel_speed * limits.speed
+
+    def travel(start: Array, goal: Array, acceleration: float) -> float:
+        return period * len(trajectory(start, goal, speed, np.full(len(goal), acceleration), period))
+
+    total, here = 0.0, np.array(plan.scout[0])
+    for scouted in plan.scout:
+        goal = np.array(scouted)
+        total += travel(here, goal, 1.0) + READ
+        here = goal
+    for sweep in plan.sweeps:
+        begin, _ = ends(sweep)
+        total += travel(here, begin, plan.travel_acceleration) + PRESS
+        one = np.zeros(len(here))
+        one[sweep.joint] = abs(sweep.steps[-1] - sweep.steps[0]) / (len(sweep.steps) - 1)
+        total += 2 * len(sweep.steps) * (travel(np.zeros(len(here)), one, sweep.acceleration) + READ)
+        here = begin
+    return total
+
+
+def draw_plan(arm: ArmFile, plan: SweepPlan, path: Path) -> None:
+    """Write the picture: each sweep's poses as a stick figure that can be turned, shown and hidden. Raises OSError."""
+    import plotly.graph_objects as graph
+
+    described, figure = gcomp_arm(arm), graph.Figure()
+    for sweep in plan.sweeps:
+        begin, end = ends(sweep)
+        poses = begin + np.linspace(0, 1, GHOSTS)[:, None] * (end - begin)
+        points = np.concatenate(
+            [np.vstack([places, np.full((1, 3), np.nan)]) for places in joint_places(described, poses)]
+        )
+        line = {"width": 5, "color": COLOURS[sweep.joint % len(COLOURS)]}
+        figure.add_scatter3d(
+            x=points[:, 0],
+            y=points[:, 1],
+            z=points[:, 2],
+            mode="lines+markers",
+            name=sweep.name,
+            line=line,
+            marker={"size": 3, "color": line["color"]},
+        )
+    scouted = joint_places(described, np.array(plan.scout))[:, -1]
+    figure.add_scatter3d(
+        x=scouted[:, 0],
+        y=scouted[:, 1],
+        z=scouted[:, 2],
+        mode="markers",
+        name="scout (tip)",
+        marker={"size": 4, "color": "black"},
+    )
+    down = described.gravity / max(float(np.linalg.norm(described.gravity)), 1e-9)
+    length = 0.3 * max(float(np.abs(described.a).sum() + np.abs(described.d).sum()), 0.1)
+    arrow = np.vstack([np.zeros(3), length * down])
+    figure.add_scatter3d(
+        x=arrow[:, 0], y=arrow[:, 1], z=arrow[:, 2], mode="lines", name="gravity", line={"width": 8, "color": "grey"}
+    )
+    figure.update_layout(
+        title=f"{escape(arm.name)}: where the arm will be (base frame, m)",
+        scene={"aspectmode": "data", "camera": _camera(down)},
+        height=800,
+        margin={"l": 0, "r": 0, "b": 0},
+        updatemenus=[{"buttons": _choices(plan), "x": 0.0, "xanchor": "left", "y": 1.0}],
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.write_html(path, include_plotlyjs=True, full_html=True)
+
+
+def _camera(down: Array) -> dict[str, dict[str, float]]:
+    """A view in which gravity points down on the screen, from a little above."""
+    up = -down if np.any(down) else np.array([0.0, 0.0, 1.0])
+    side = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    eye = 1.8 * (side / np.linalg.norm(side) + 0.6 * np.cross(up, side) + 0.35 * up)
+    return {
+        "up": dict(zip("xyz", up.tolist(), strict=True)),
+        "eye": dict(zip("xyz", eye.tolist(), strict=True)),
+    }
+
+
+def _choices(plan: SweepPlan) -> list[dict[str, Any]]:
+    """Buttons: everything, or one sweep alone with the direction of gravity."""
+    count = len(plan.sweeps)
+    shown = {"all sweeps": [True] * (count + 2)}
+    shown |= {one.name: [*(one is other for other in plan.sweeps), False, True] for one in plan.sweeps}
+    return [{"label": label, "method": "update", "args": [{"visible": seen}]} for label, seen in shown.items()]

@@ -1,0 +1,79 @@
+"""Where the arm goes: range of each sweep, poses of the scout, and the order of poses for short ways."""
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from armlink.errors import BadInput
+from calib.arm.drive_limits import Limits
+from calib.arm.sweep_section import SweepSection
+from gcomp.arm.arm import Arm
+from gcomp.gravity.torque import gravity_regressor
+
+Array = npt.NDArray[np.float64]
+SCOUT_CANDIDATES = 300
+"""Random poses among which the scout's are chosen."""
+
+
+def sweep_range(section: SweepSection, limits: Limits, joint: int) -> tuple[float, float]:
+    """First and last step [rad] of a joint: the margin grows with the angle, for the position gain is unknown."""
+    low, high = float(limits.lower[joint]), float(limits.upper[joint])
+    margin = section.range_margin
+    return low + margin + 0.02 * abs(low), high - margin - 0.02 * abs(high)
+
+
+def scout_poses(
+    described: Arm,
+    section: SweepSection,
+    limits: Limits,
+    seed: int,
+    free: Callable[[Array], npt.NDArray[np.bool_]] | None = None,
+) -> tuple[tuple[float, ...], ...]:
+    """n + 3 poses (n,) that determine mass moments and sensor offsets well, ordered for short ways between them.
+
+    `free` tells which of poses (K, n) are without collision. Raises BadInput where too few are.
+    """
+    n = described.n
+    ends = np.array([sweep_range(section, limits, joint) for joint in range(n)])
+    generator = np.random.default_rng(seed)
+    poses = ends[:, 0] + generator.random((SCOUT_CANDIDATES, n)) * (ends[:, 1] - ends[:, 0])
+    if free is not None:
+        poses = poses[free(poses)]
+        if len(poses) < 2 * (n + 3):
+            raise BadInput("almost every pose within the joint range collides: narrow lower and upper in the arm file")
+    regressor = gravity_regressor(described, poses)
+    offsets = np.broadcast_to(np.eye(n), (len(poses), n, n))
+    rows = np.concatenate([regressor, 10 * offsets], axis=2) / limits.rated[:, None]
+    information = np.einsum("kip,kiq->kpq", rows, rows)
+    total = np.eye(3 * n) * 1e-6
+    chosen: list[int] = []
+    for _ in range(n + 3):
+        score = np.linalg.slogdet(total + information)[1]
+        score[chosen] = -np.inf
+        chosen.append(int(np.argmax(score)))
+        total = total + information[chosen[-1]]
+    return tuple(tuple(pose.tolist()) for pose in short_way(poses[chosen], ends.mean(axis=1)))
+
+
+def short_way(poses: Array, begin: Array) -> Array:
+    """The same poses, each followed by the nearest that is left."""
+    left, way = list(range(len(poses))), []
+    here = begin
+    while left:
+        nearest = min(left, key=lambda k: float(np.abs(poses[k] - here).max()))
+        left.remove(nearest)
+        way.append(nearest)
+        here = poses[nearest]
+    return poses[way]
+
+
+def require_range(section: SweepSection, limits: Limits, described: Arm) -> None:
+    """Raise BadInput, naming the joint, where a range leaves nothing to sweep."""
+    for joint, name in enumerate(described.names):
+        first, last = sweep_range(section, limits, joint)
+        if not np.isfinite([first, last]).all() or last - first < 0.2:
+            raise BadInput(
+                f"joint {name}: its range {limits.lower[joint]} to {limits.upper[joint]} rad leaves nothing to sweep"
+                f" within range_margin {section.range_margin} rad: check lower and upper, or lessen the margin"
+            )

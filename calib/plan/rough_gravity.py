@@ -1,0 +1,99 @@
+"""The rough gravity model that the scout's static readings give: enough to choose bias torques that surely hold."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from gcomp.arm.arm import Arm
+from gcomp.gravity.torque import gravity_regressor
+
+Array = npt.NDArray[np.float64]
+
+GAIN_STD = 0.3
+"""What is assumed of an uncalibrated torque gain: 1 ± 0.3."""
+MODEL_ERROR = 0.1
+"""Share by which mass moments of a model file are assumed to be wrong."""
+SIGMAS = 3.0
+"""Standard deviations of the rough model that bounds take in."""
+
+
+@dataclass(frozen=True, eq=False)
+class GravityGuess:
+    """Mass moments in the scale of the drives' own torque, which is the scale of the commands."""
+
+    arm: Arm
+    beta: Array
+    """(2n,) [kg·m]"""
+    covariance: Array
+    """(2n, 2n)"""
+
+    def torque(self, q: Array) -> Array:
+        """Holding torque (…, n) [N·m] at poses q (…, n) [rad]."""
+        torque: Array = gravity_regressor(self.arm, q) @ self.beta
+        return torque
+
+    def uncertainty(self, q: Array) -> Array:
+        """Bound of the model's error (…, n) [N·m] at poses q (…, n) [rad]."""
+        regressor = gravity_regressor(self.arm, q)
+        variance = np.einsum("...ip,pq,...iq->...i", regressor, self.covariance, regressor, optimize=True)
+        bound: Array = SIGMAS * np.sqrt(np.maximum(variance, 0.0))
+        return bound
+
+    def inertia(self) -> Array:
+        """Rough upper size (n,) [kg·m²] of each joint's inertia: composite mass moment times reach."""
+        moment = np.linalg.norm(self.beta.reshape(-1, 2), axis=1)[::-1].cumsum()[::-1]
+        size: Array = moment * reach(self.arm)
+        return size
+
+
+def guess_of_model(arm: Arm, beta: Array) -> GravityGuess:
+    """What a model file's own inertials (2n,) [kg·m] are worth for planning: each mass moment to a tenth."""
+    size = np.maximum(np.abs(beta), np.abs(beta).max(initial=0.0) / 20)
+    return GravityGuess(arm, beta, np.diag((MODEL_ERROR * size) ** 2))
+
+
+def reach(arm: Arm, hand: float = 0.15) -> Array:
+    """Longest distance (n,) [m] from each joint to the tip's far side."""
+    return np.hypot(arm.a, arm.d)[::-1].cumsum()[::-1] + hand
+
+
+def guess_gravity(
+    arm: Arm, position: Array, torque: Array, motor_torque: Array, rated: Array, friction: float
+) -> GravityGuess:
+    """Rough mass moments from servo-held poses: positions, sensor readings, drive torques, all (P, n).
+
+    Linear least squares on κ v − ω = Y β and τ_motor = Y β, with κ = 1/gain near 1; `friction`, a share of rated
+    torque (n,) [N·m], is how far the drive's torque may lie off. Where the fit is worse, the covariance says so.
+    """
+    poses, n = position.shape
+    regressor = gravity_regressor(arm, position)
+    sensor_rows = np.zeros((poses, n, 4 * n))
+    motor_rows = np.zeros((poses, n, 4 * n))
+    joints = np.arange(n)
+    sensor_rows[:, joints, joints] = torque
+    sensor_rows[:, joints, n + joints] = -1.0
+    sensor_rows[:, :, 2 * n :] = -regressor
+    motor_rows[:, :, 2 * n :] = regressor
+    sensor_sigma, motor_sigma = 0.005 * rated, friction * rated
+    spread = np.concatenate([np.full(n, GAIN_STD), 0.3 * rated, np.full(2 * n, _largest_moment(arm, rated))])
+    expected = np.concatenate([np.ones(n), np.zeros(3 * n)])
+    counted = np.isfinite(motor_torque)
+    design = np.concatenate(
+        [
+            (sensor_rows / sensor_sigma[:, None]).reshape(-1, 4 * n),
+            (motor_rows / motor_sigma[:, None])[counted],
+            np.diag(1 / spread),
+        ]
+    )
+    target = np.concatenate([np.zeros(poses * n), (motor_torque / motor_sigma)[counted], expected / spread])
+    solution = np.linalg.lstsq(design, target, rcond=None)[0]
+    covariance = np.linalg.inv(design.T @ design)
+    residual = design @ solution - target
+    excess = max(float(residual @ residual) / max(len(target) - 4 * n, 1), 1.0)
+    return GravityGuess(arm, solution[2 * n :], covariance[2 * n :, 2 * n :] * excess)
+
+
+def _largest_moment(arm: Arm, rated: Array) -> float:
+    """A mass moment [kg·m] that no arm of these drives exceeds."""
+    return 2 * float(rated.max()) / max(float(np.linalg.norm(arm.gravity)), 1.0)

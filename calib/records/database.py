@@ -1,0 +1,148 @@
+"""The record store's database: its URL, how it is opened, and its schema brought up to date."""
+
+import os
+import sqlite3
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+
+from armlink.errors import BadInput
+from calib.records.schema import MIGRATIONS
+
+HEAD = MIGRATIONS[-1]
+BUSY_SECONDS = 10
+"""How long another writer of an SQLite store is waited for [s]."""
+_VERSION = "alembic_version"
+_LOCK = 0x61726D6C
+"""PostgreSQL's advisory lock that one process at a time holds while it writes, as SQLite's writers do."""
+
+
+def default_url() -> str:
+    """URL of the store in the user's state directory (XDG_STATE_HOME, else ~/.local/state)."""
+    state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
+    return f"sqlite:///{state / 'armlink' / 'records.db'}"
+
+
+def open_database(url: str) -> sa.Engine:
+    """Open, and make where missing, the database at an SQLAlchemy URL or a file path, with today's schema.
+
+    An older schema is migrated; raises BadInput for a newer one, or where the database cannot be opened.
+    """
+    full = _full_url(url)
+    try:
+        engine = sa.create_engine(full)
+        if engine.dialect.name == "sqlite":
+            _prepare_sqlite(engine)
+        _migrate(engine)
+    except (sa.exc.SQLAlchemyError, ImportError, OSError, ValueError) as error:
+        raise BadInput(f"record store {_shown(full)}: cannot be opened: {first_line(error)}") from None
+    return engine
+
+
+@contextmanager
+def transaction(engine: sa.Engine) -> Iterator[sa.Connection]:
+    """One writing transaction: all of it is on disk when it returns, or nothing is. Raises BadInput where it fails."""
+    try:
+        with engine.execution_options(writing=True).begin() as connection:
+            _lock(connection)
+            yield connection
+    except (sa.exc.OperationalError, sa.exc.InternalError) as error:
+        reason = first_line(error.orig if error.orig is not None else error)
+        shown = engine.url.render_as_string(hide_password=True)
+        raise BadInput(f"record store {shown}: nothing was written: {reason}: mend that and run it again") from None
+
+
+def _migrate(engine: sa.Engine) -> None:
+    """Bring the schema to HEAD; a store from before migrations has the tables of 0001 and no version."""
+    with engine.connect() as connection:
+        if _version(connection) == HEAD:
+            return
+    with engine.execution_options(writing=True).begin() as connection:
+        _lock(connection)
+        found = _version(connection)
+        if found == HEAD:  # another process was first
+            return
+        if found is not None and found not in MIGRATIONS:
+            raise BadInput(
+                f"record store {engine.url.render_as_string(hide_password=True)}: its schema {found} is newer than this"
+                f" armlink knows ({HEAD}): install a newer armlink; nothing was changed"
+            )
+        _upgrade(connection, stamp=found is None and sa.inspect(connection).has_table("records"))
+
+
+def _upgrade(connection: sa.Connection, stamp: bool) -> None:
+    from alembic import command
+    from alembic.config import Config
+
+    config = Config()
+    config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
+    config.attributes["connection"] = connection
+    if stamp:
+        command.stamp(config, "0001")
+    command.upgrade(config, HEAD)
+
+
+def _lock(connection: sa.Connection) -> None:
+    if connection.dialect.name == "postgresql":
+        connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_LOCK)))
+
+
+def _version(connection: sa.Connection) -> str | None:
+    if not sa.inspect(connection).has_table(_VERSION):
+        return None
+    return connection.execute(sa.text(f"SELECT version_num FROM {_VERSION}")).scalar()
+
+
+def _full_url(url: str) -> str:
+    if "://" not in url:
+        return f"sqlite:///{Path(url).expanduser().resolve()}"
+    scheme, _, rest = url.partition("://")
+    return f"postgresql+psycopg://{rest}" if scheme in ("postgres", "postgresql") else url
+
+
+def _shown(url: str) -> str:
+    try:
+        return sa.make_url(url).render_as_string(hide_password=True)
+    except sa.exc.ArgumentError:
+        return url
+
+
+def _prepare_sqlite(engine: sa.Engine) -> None:
+    """Write-ahead log, full synchronisation, transactions that take the write lock at their start."""
+    if engine.url.database not in (None, "", ":memory:"):
+        Path(str(engine.url.database)).parent.mkdir(parents=True, exist_ok=True)
+
+    @sa.event.listens_for(engine, "connect")
+    def _on_connect(connection: Any, _: Any) -> None:
+        connection.isolation_level = None  # pysqlite would begin by itself, and too late
+        connection.execute(f"PRAGMA busy_timeout={BUSY_SECONDS * 1000}")
+        _to_write_ahead_log(connection)
+        for pragma in ("synchronous=FULL", "foreign_keys=ON"):
+            connection.execute(f"PRAGMA {pragma}")
+
+    @sa.event.listens_for(engine, "begin")
+    def _on_begin(connection: sa.Connection) -> None:
+        writing = connection.get_execution_options().get("writing", False)
+        connection.exec_driver_sql("BEGIN IMMEDIATE" if writing else "BEGIN")
+
+
+def _to_write_ahead_log(connection: sqlite3.Connection) -> None:
+    """Switch the journal mode; where two do so at once SQLite tells one of them "locked" without any waiting."""
+    end = time.monotonic() + BUSY_SECONDS
+    while True:
+        try:
+            connection.execute("PRAGMA journal_mode=WAL")
+            return
+        except sqlite3.OperationalError as error:
+            if "locked" not in str(error) or time.monotonic() > end:
+                raise
+            time.sleep(0.01)
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of what an error says."""
+    return str(error).strip().partition("\n")[0]

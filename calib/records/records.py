@@ -1,0 +1,202 @@
+"""Calibration and gravity records: what was found about one arm, by what and from what."""
+
+import hashlib
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from importlib.metadata import version
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+
+from armlink.arm_file import ArmFile, describe
+from armlink.errors import BadInput, Refused
+
+Array = npt.NDArray[np.float64]
+Matrix = tuple[tuple[FiniteFloat, ...], ...]
+Parameter = Literal["gain", "offset", "position_gain", "position_offset"]
+PARAMETERS: tuple[Parameter, ...] = ("gain", "offset", "position_gain", "position_offset")
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Record(_Frozen):
+    """What every record carries: whose it is, when, by what and from what it was made. Records never change."""
+
+    kind: str
+    schema_version: int = 1
+    arm: str
+    serial: str
+    description_hash: str
+    """SHA-256 of the arm's kinematics; of another description the numbers mean nothing."""
+    created: AwareDatetime
+    software: str
+    sources: dict[str, str] = {}
+    """Name and SHA-256 of every data set and recording that went in."""
+    confirmed_by: str | None = None
+    """Who let it pass: a user's name, or the policy that applied it by itself; None where nobody has."""
+    parent: str | None = None
+    """Id of the record that this one replaces."""
+    note: str = ""
+
+    SCHEMA: ClassVar[int] = 1
+
+    @property
+    def id(self) -> str:
+        """Eight hex digits of the content's SHA-256; as a number it fits record id of object 2100h (UNSIGNED32)."""
+        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:8]
+
+    @property
+    def number(self) -> int:
+        """`id` as the unsigned 32-bit number that a controller keeps beside its gain and offset."""
+        return int(self.id, 16)
+
+    def require(self, arm: ArmFile) -> Self:
+        """This record, if it is of this arm; else raises Refused with one line that names what differs."""
+        differing = {
+            "arm": (self.arm, arm.name),
+            "serial": (self.serial, arm.serial),
+            "description": (self.description_hash[:12], arm.description_hash[:12]),
+            "schema version": (self.schema_version, self.SCHEMA),
+        }
+        for what, (ours, wanted) in differing.items():
+            if ours != wanted:
+                raise Refused(f"record {self.id}: {what} is {ours}, but {wanted} is wanted: made for something else")
+        return self
+
+    def to_yaml(self) -> str:
+        """The record as YAML, with its id as check sum."""
+        return yaml.safe_dump({"id": self.id, **self.model_dump(mode="json")}, sort_keys=False, allow_unicode=True)
+
+
+class JointCalibration(_Frozen):
+    """Sensor parameters of one joint: v = gain·τ + offset, θ = position_gain·φ + position_offset.
+
+    A parameter is None where the data could not determine it; `not_identifiable` then says why.
+    """
+
+    name: str
+    gain: FiniteFloat | None
+    offset: FiniteFloat | None
+    """[N·m]"""
+    position_gain: FiniteFloat | None
+    position_offset: FiniteFloat | None
+    """[rad]"""
+    not_identifiable: dict[Parameter, str] = {}
+    residual_std: FiniteFloat | None = None
+    """Standard deviation of the fit's torque residual at one stop [N·m]."""
+
+    @model_validator(mode="after")
+    def _none_has_a_reason(self) -> Self:
+        missing = {parameter for parameter in PARAMETERS if getattr(self, parameter) is None}
+        if missing != set(self.not_identifiable):
+            raise ValueError(
+                f"joint {self.name}: {sorted(missing)} have no value, {sorted(self.not_identifiable)} have a reason:"
+                " give a reason for each missing value and for no other"
+            )
+        if self.gain == 0.0 or self.position_gain == 0.0:
+            raise ValueError(f"joint {self.name}: a gain of 0 is not a sensor")
+        return self
+
+
+class CalibrationRecord(Record):
+    """Sensor gains and offsets of all joints, base to tip."""
+
+    kind: Literal["calibration"] = "calibration"
+    joints: Annotated[tuple[JointCalibration, ...], Field(min_length=1)]
+    covariance_of: tuple[str, ...] = ()
+    """What rows and columns of `covariance` stand for: "joint_1.gain", …, those that were estimated."""
+    covariance: Matrix = ()
+
+    @model_validator(mode="after")
+    def _covariance_fits(self) -> Self:
+        _square(self.covariance, len(self.covariance_of), "covariance_of")
+        known = {f"{joint.name}.{parameter}" for joint in self.joints for parameter in PARAMETERS}
+        for name in self.covariance_of:
+            if name not in known:
+                raise ValueError(f"covariance_of: {name!r} is none of this record's parameters")
+        return self
+
+    def values(self, parameter: Parameter, missing: float = np.nan) -> Array:
+        """One parameter of all joints (n,), `missing` where it is not identifiable."""
+        found = [getattr(joint, parameter) for joint in self.joints]
+        return np.array([missing if value is None else value for value in found])
+
+    def std(self, parameter: Parameter) -> Array:
+        """Standard deviations of one parameter of all joints (n,), NaN where it was not estimated."""
+        place = {name: index for index, name in enumerate(self.covariance_of)}
+        names = [f"{joint.name}.{parameter}" for joint in self.joints]
+        return np.array([self.covariance[place[n]][place[n]] ** 0.5 if n in place else np.nan for n in names])
+
+
+class GravityRecord(Record):
+    """Gravity parameters β = (n_1x, n_1y, …, n_nx, n_ny) [kg·m] (theory.md section 2) and how well they are known."""
+
+    kind: Literal["gravity"] = "gravity"
+    names: Annotated[tuple[str, ...], Field(min_length=1)]
+    """Joint names, base to tip."""
+    beta: tuple[FiniteFloat, ...]
+    """(2n,); 0 where gravity cannot determine it."""
+    covariance: Matrix
+    """(2n, 2n) [kg²·m²]; 0 where not determined."""
+    identifiable: tuple[bool, ...]
+    """(2n,)"""
+    gravity: Annotated[tuple[FiniteFloat, ...], Field(min_length=3, max_length=3)]
+    """Acceleration of gravity used, base frame [m/s²]: β scales with it."""
+    calibration: str | None = None
+    """Id of the calibration record whose sensors measured it."""
+
+    @model_validator(mode="after")
+    def _sizes_fit(self) -> Self:
+        size = 2 * len(self.names)
+        for key in ("beta", "identifiable"):
+            if len(getattr(self, key)) != size:
+                raise ValueError(f"{key}: {len(getattr(self, key))} values, expected {size} (two a joint)")
+        _square(self.covariance, size, "twice the joints")
+        return self
+
+
+def provenance(arm: ArmFile, sources: dict[str, str] | None = None, created: datetime | None = None) -> dict[str, Any]:
+    """The identity part of a new record of this arm, as keyword arguments for its class."""
+    return {
+        "arm": arm.name,
+        "serial": arm.serial,
+        "description_hash": arm.description_hash,
+        "created": (created or datetime.now(UTC)).replace(microsecond=0),
+        "software": f"armlink {version('armlink')}",
+        "sources": sources or {},
+    }
+
+
+def matrix(values: npt.ArrayLike) -> Matrix:
+    """A (P, P) array as a record keeps it, made exactly symmetric."""
+    array = np.asarray(values, dtype=float)
+    return tuple(tuple(row) for row in ((array + array.T) / 2).tolist())
+
+
+def parse_record(content: Any, origin: str) -> CalibrationRecord | GravityRecord:
+    """A record from a mapping, of whichever kind it says; a key `id` must match. Raises BadInput with one line."""
+    kinds: dict[Any, type[CalibrationRecord] | type[GravityRecord]] = {
+        "calibration": CalibrationRecord,
+        "gravity": GravityRecord,
+    }
+    kind = content.get("kind") if isinstance(content, dict) else None
+    if kind not in kinds:
+        raise BadInput(f"{origin}: key kind: expected calibration or gravity (value {kind!r})")
+    body = {key: value for key, value in content.items() if key != "id"}
+    try:
+        record = kinds[kind].model_validate(body)
+    except ValidationError as error:
+        raise BadInput(f"{origin}: {describe(error)}") from None
+    if content.get("id", record.id) != record.id:
+        raise BadInput(f"{origin}: content was changed: it says id {content['id']}, but its content makes {record.id}")
+    return record
+
+
+def _square(rows: Sequence[Sequence[float]], size: int, of: str) -> None:
+    if len(rows) != size or any(len(row) != size for row in rows):
+        raise ValueError(f"covariance: expected {size} × {size} ({of}), got {len(rows)} rows")

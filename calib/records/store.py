@@ -1,0 +1,200 @@
+"""The record store: append-only, on SQLite by default or PostgreSQL by URL; what is current is the last activation."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, TypeVar
+
+import sqlalchemy as sa
+import yaml
+
+from armlink.arm_file import ArmFile
+from armlink.errors import BadInput, Refused
+from calib.records.atomic_file import write_whole
+from calib.records.database import default_url, first_line, open_database, transaction
+from calib.records.records import CalibrationRecord, GravityRecord, Record, parse_record
+from calib.records.schema import ACTIVATIONS, RECORDS, WRITES
+
+R = TypeVar("R", CalibrationRecord, GravityRecord)
+AnyRecord = CalibrationRecord | GravityRecord
+
+
+@dataclass(frozen=True)
+class Activation:
+    """One line of the activation log: from `at` (ISO 8601) on, `record` was the current one of its kind."""
+
+    number: int
+    record: str
+    kind: str
+    at: str
+    by: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class ControllerWrite:
+    """One line of the journal of writes to controllers: `begun`, later `finished` or `undone`."""
+
+    number: int
+    record: str
+    at: str
+    by: str
+    stage: str
+    body: dict[str, Any]
+    """begun: `before`, what each controller held; undone: `reason`."""
+
+
+class RecordStore:
+    """Records, and the log of which was current when. Nothing is changed or deleted; going back is an append too."""
+
+    def __init__(self, url: str | None = None) -> None:
+        """Open, and make where missing, the store at an SQLAlchemy URL or a file path; raises BadInput if it cannot."""
+        self._engine = open_database(url or default_url())
+        self.url = self._engine.url.render_as_string(hide_password=True)
+
+    def close(self) -> None:
+        """Let go of the database."""
+        self._engine.dispose()
+
+    def add(self, record: AnyRecord) -> str:
+        """Append a record and return its id; adding the same record again changes nothing. Raises Refused."""
+        row = {name: getattr(record, name) for name in ("id", "kind", "arm", "serial")}
+        row |= {"created": record.created.isoformat(), "body": record.model_dump_json()}
+        with transaction(self._engine) as connection:
+            known = connection.execute(sa.select(RECORDS.c.body).where(RECORDS.c.id == record.id)).scalar()
+            if known is None:
+                connection.execute(RECORDS.insert().values(row))
+            elif known != row["body"]:
+                raise Refused(f"record {record.id}: another record has this id already; make it again")
+        return record.id
+
+    def get(self, record_id: str) -> AnyRecord:
+        """The record of that id; raises Refused where there is none."""
+        with self._engine.connect() as connection:
+            body = connection.execute(sa.select(RECORDS.c.body).where(RECORDS.c.id == record_id)).scalar()
+        if body is None:
+            raise Refused(f"no record {record_id} in {self.url}; armlink history ARM lists those that there are")
+        return parse_record(json.loads(body), f"record {record_id}")
+
+    def activate(
+        self, record_id: str, arm: ArmFile, by: str, reason: str, finishes: ControllerWrite | None = None
+    ) -> Activation:
+        """Make a kept record the current one of its kind; raises Refused if it is of another arm.
+
+        `finishes` is the journal's write to the controllers that ends well with it, in the same transaction.
+        """
+        record = self.get(record_id).require(arm)
+        row = {"record": record.id, "kind": record.kind, "arm": arm.name, "serial": arm.serial, "by": by}
+        row |= {"reason": reason, "at": _now()}
+        with transaction(self._engine) as connection:
+            number = connection.execute(ACTIVATIONS.insert().values(row).returning(ACTIVATIONS.c.number)).scalar_one()
+            if finishes is not None:
+                connection.execute(WRITES.insert().values(_write_row(finishes, arm, record.id, "finished", {})))
+        return Activation(number, record.id, record.kind, row["at"], by, reason)
+
+    def put(self, record: AnyRecord, arm: ArmFile, by: str, reason: str) -> str:
+        """Append a record and make it current; returns its id."""
+        self.add(record.require(arm))
+        return self.activate(record.id, arm, by, reason).record
+
+    def former(self, arm: ArmFile, record_id: str) -> AnyRecord:
+        """A record that was current before and is not now; raises Refused if it never was, or is of another arm."""
+        record = self.get(record_id).require(arm)
+        log = [line.record for line in self.activations(arm) if line.kind == record.kind]
+        if record_id not in log:
+            raise Refused(f"record {record_id} was never current on {arm.name} {arm.serial}: nothing to go back to")
+        if log[-1] == record_id:
+            raise Refused(f"record {record_id} is current on {arm.name} {arm.serial} already")
+        return record
+
+    def rollback(self, arm: ArmFile, to: str, by: str, reason: str = "rollback") -> Activation:
+        """Go back to a record that was current before; raises Refused if it never was, or is now."""
+        return self.activate(self.former(arm, to).id, arm, by, reason)
+
+    def current(self, kind: type[R], arm: ArmFile) -> R | None:
+        """The current record of a kind, None where there is none yet.
+
+        Raises Refused where it is of another description of this arm: a changed arm needs a new calibration.
+        """
+        wanted = kind.model_fields["kind"].default
+        log = [line for line in self.activations(arm) if line.kind == wanted]
+        if not log:
+            return None
+        record = self.get(log[-1].record).require(arm)
+        assert isinstance(record, kind)
+        return record
+
+    def activations(self, arm: ArmFile) -> list[Activation]:
+        """The activation log of this arm (name and serial), oldest first."""
+        log = ACTIVATIONS.c
+        wanted = sa.select(log.number, log.record, log.kind, log.at, log.by, log.reason)
+        wanted = wanted.where(log.arm == arm.name, log.serial == arm.serial).order_by(log.number)
+        with self._engine.connect() as connection:
+            return [Activation(*row) for row in connection.execute(wanted)]
+
+    def history(self, arm: ArmFile) -> list[AnyRecord]:
+        """All records of this arm (name and serial), oldest first, of whatever description."""
+        rows = RECORDS.c
+        wanted = sa.select(rows.id, rows.body).where(rows.arm == arm.name, rows.serial == arm.serial)
+        with self._engine.connect() as connection:
+            found = connection.execute(wanted.order_by(rows.created, rows.id)).all()
+        return [parse_record(json.loads(body), f"record {record_id}") for record_id, body in found]
+
+    def begin_write(self, record_id: str, arm: ArmFile, by: str, before: Sequence[dict[str, Any]]) -> ControllerWrite:
+        """Note, before any controller is touched, what each holds: what a write that is killed is undone by."""
+        line = ControllerWrite(0, record_id, _now(), by, "begun", {"before": list(before)})
+        with transaction(self._engine) as connection:
+            row = _write_row(line, arm, record_id, line.stage, line.body)
+            number = connection.execute(WRITES.insert().values(row).returning(WRITES.c.number)).scalar_one()
+        return replace(line, number=number)
+
+    def undo_write(self, line: ControllerWrite, arm: ArmFile, reason: str) -> None:
+        """Note that the controllers hold again what they held before that write."""
+        with transaction(self._engine) as connection:
+            row = _write_row(line, arm, line.record, "undone", {"reason": reason})
+            connection.execute(WRITES.insert().values(row))
+
+    def unfinished_write(self, arm: ArmFile) -> ControllerWrite | None:
+        """The write to this arm's controllers that was begun and never ended, as after a power loss; else None."""
+        log = self.writes(arm)
+        return log[-1] if log and log[-1].stage == "begun" else None
+
+    def writes(self, arm: ArmFile) -> list[ControllerWrite]:
+        """The journal of writes to this arm's controllers, oldest first."""
+        log = WRITES.c
+        wanted = sa.select(log.number, log.record, log.at, log.by, log.stage, log.body)
+        wanted = wanted.where(log.arm == arm.name, log.serial == arm.serial).order_by(log.number)
+        with self._engine.connect() as connection:
+            return [ControllerWrite(*row[:5], json.loads(row[5])) for row in connection.execute(wanted)]
+
+    def import_yaml(self, path: Path, arm: ArmFile) -> str:
+        """Append the record of a YAML file (as `Record.to_yaml` wrote it), not making it current; returns its id.
+
+        Raises BadInput where the file is no record or was changed, Refused where it is of another arm.
+        """
+        return self.add(load_yaml(path).require(arm))
+
+
+def load_yaml(path: Path) -> AnyRecord:
+    """The record of a YAML file (as `Record.to_yaml` wrote it); raises BadInput where it is none or was changed."""
+    try:
+        content: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise BadInput(f"{path}: cannot be read as YAML: {first_line(error)}") from None
+    return parse_record(content, str(path))
+
+
+def export_yaml(record: Record, path: Path) -> None:
+    """Write a record to a YAML file, whole or not at all."""
+    write_whole(path, record.to_yaml())
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def _write_row(line: ControllerWrite, arm: ArmFile, record: str, stage: str, body: dict[str, Any]) -> dict[str, Any]:
+    row = {"record": record, "arm": arm.name, "serial": arm.serial, "at": _now(), "by": line.by, "stage": stage}
+    return row | {"body": json.dumps(body)}

@@ -1,0 +1,263 @@
+"""The sweep data set: a directory with a manifest and one line per static reading, each on disk before the next."""
+
+import errno
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from armlink.arm_file import ArmFile, describe, load_arm
+from armlink.errors import BadInput, Refused
+from calib.plan.types import SweepPlan
+from calib.records.atomic_file import part_of, write_whole
+
+Array = npt.NDArray[np.float64]
+MANIFEST, LINES = "manifest.json", "readings.jsonl"
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True, ser_json_inf_nan="constants")
+
+
+class Manifest(_Model):
+    """Whose data this is, and with what load it was taken."""
+
+    schema_: Literal["armlink.sweep/1"] = Field(default="armlink.sweep/1", alias="schema")
+    arm: str
+    serial: str
+    description_hash: str
+    arm_file: str
+    """Path of the arm file that it was made with."""
+    names: tuple[str, ...]
+    reference_mass: float
+    """Reference mass attached during this pass [kg]; 0 for none."""
+    rated_torque: tuple[float, ...]
+    """[N·m]"""
+    installed_gain: tuple[float, ...]
+    """Torque gains that the controllers applied while it was taken: readings are (v − offset) / gain."""
+    installed_offset: tuple[float, ...]
+    """[N·m]"""
+    created: AwareDatetime
+    software: str
+
+    @classmethod
+    def of(cls, arm: ArmFile, reference_mass: float, installed: Sequence[tuple[float, float]] | None = None) -> Self:
+        """The manifest of a new data set of this arm; `installed` are the controllers' (gain, offset), default 1, 0."""
+        pairs = installed or [(1.0, 0.0)] * len(arm.joint_names)
+        return cls(
+            arm=arm.name,
+            serial=arm.serial,
+            description_hash=arm.description_hash,
+            arm_file=str(arm.path),
+            names=arm.joint_names,
+            reference_mass=reference_mass,
+            rated_torque=tuple(joint.rated_torque for joint in arm.require_link().joints),
+            installed_gain=tuple(gain for gain, _ in pairs),
+            installed_offset=tuple(offset for _, offset in pairs),
+            created=datetime.now(UTC).replace(microsecond=0),
+            software=f"armlink {version('armlink')}",
+        )
+
+
+class Reading(_Model):
+    """One static reading: averages over samples taken at rest, (n,) per joint."""
+
+    kind: Literal["reading"] = "reading"
+    sweep: str
+    """Name of the sweep, or "scout"."""
+    index: int
+    """Number of the reading within its sweep."""
+    joint: int | None
+    """Index of the swept joint; None where all joints were held."""
+    direction: Literal[-1, 0, 1]
+    """Side from which the swept joint came: 1 upwards, -1 downwards; 0 where none was swept."""
+    t: float
+    """Link time at its end [s]."""
+    count: int
+    """Samples averaged."""
+    settled: bool
+    """False where the settle rule's time was up."""
+    servo: tuple[bool, ...]
+    """Which joints were servo-held at rest: only their torque sensors read gravity."""
+    position: tuple[float, ...]
+    """Mean position reading [rad]."""
+    position_std: tuple[float, ...]
+    torque: tuple[float, ...]
+    """Mean torque reading of the sensor [N·m]."""
+    torque_std: tuple[float, ...]
+    """Standard deviation of one sample [N·m]."""
+    motor_torque: tuple[float, ...]
+    """Mean of the drive's own estimate [N·m]."""
+
+
+class PlanLine(_Model):
+    """The plan as it is run: written once the scout has found the bias torques."""
+
+    kind: Literal["plan"] = "plan"
+    plan: SweepPlan
+    resolution: tuple[float, ...]
+    """Smallest step seen in each joint's position reading [rad]."""
+
+
+_LINE: TypeAdapter[Reading | PlanLine] = TypeAdapter(Annotated[Reading | PlanLine, Field(discriminator="kind")])
+
+
+@dataclass(frozen=True, eq=False)
+class SweepData:
+    """A data set as read back from its directory."""
+
+    path: Path
+    manifest: Manifest
+    readings: tuple[Reading, ...]
+    plan: SweepPlan | None
+    """The plan as run; None where the scout had not been finished."""
+    resolution: Array
+    """Smallest step seen in each joint's position reading (n,) [rad]; 0 where it is not known."""
+    digest: str = field(repr=False)
+    """SHA-256 (hex) of the lines read."""
+
+    @property
+    def complete(self) -> bool:
+        """Whether every reading of the plan is there."""
+        return self.plan is not None and len(self.readings) >= self.plan.readings
+
+    @property
+    def unsettled(self) -> tuple[Reading, ...]:
+        """Readings that were taken before the arm stood still."""
+        return tuple(reading for reading in self.readings if not reading.settled)
+
+    def require(self, arm: ArmFile) -> Self:
+        """This data set, if it is of this arm; else raises Refused with one line that names what differs."""
+        differing = {
+            "arm": (self.manifest.arm, arm.name),
+            "serial": (self.manifest.serial, arm.serial),
+            "description": (self.manifest.description_hash[:12], arm.description_hash[:12]),
+        }
+        for what, (ours, wanted) in differing.items():
+            if ours != wanted:
+                raise Refused(f"{self.path}: {what} is {ours}, but {wanted} is wanted: swept on something else")
+        return self
+
+    def load_arm(self, override: str | None = None) -> ArmFile:
+        """The arm file that it was made with, or the one given instead; raises BadInput, Refused on another arm."""
+        path = Path(self.manifest.arm_file)
+        found = override or (str(path) if path.is_file() else self.manifest.arm)
+        arm = load_arm(found)
+        self.require(arm)
+        return arm
+
+    def array(self, name: str) -> Array:
+        """One field of all readings, (K,) or (K, n), as numbers."""
+        return np.array([getattr(reading, name) for reading in self.readings], dtype=float)
+
+
+def load_data(path: Path) -> SweepData:
+    """Read a data set; a torn last line is left out. Raises BadInput naming the file and line."""
+    manifest = _read_manifest(path)
+    content = (path / LINES).read_bytes() if (path / LINES).is_file() else b""
+    whole = content[: content.rfind(b"\n") + 1]
+    readings: list[Reading] = []
+    plan, resolution = None, np.zeros(len(manifest.names))
+    for line in _parse(whole.splitlines(), path / LINES):
+        if isinstance(line, PlanLine):
+            plan, resolution = line.plan, np.array(line.resolution)
+        else:
+            _check_width(line, len(manifest.names), path)
+            readings.append(line)
+    return SweepData(path, manifest, tuple(readings), plan, resolution, hashlib.sha256(whole).hexdigest())
+
+
+class DataWriter:
+    """Appends to a data set; each line is on disk when `append` returns. A context manager."""
+
+    def __init__(self, path: Path, manifest: Manifest, resume: bool = False) -> None:
+        """Make the directory, or with `resume` go on with the one there; raises BadInput where that cannot be."""
+        if resume:
+            _require_same(_read_manifest(path), manifest, path)
+        elif path.exists() and any(each != part_of(path / MANIFEST) for each in path.iterdir()):
+            raise BadInput(f"{path}: not empty: choose another directory, or continue the sweep there with --resume")
+        else:
+            path.mkdir(parents=True, exist_ok=True)
+            write_whole(path / MANIFEST, manifest.model_dump_json(by_alias=True, indent=1))
+        self._file = (path / LINES).open("ab+", buffering=0)
+        self._drop_torn_line()
+        _keep_names(path)
+
+    def append(self, line: Reading | PlanLine) -> None:
+        """Write one line and wait until it is on disk; raises BadInput where the disk is full or fails."""
+        content = line.model_dump_json().encode() + b"\n"
+        try:
+            if self._file.write(content) < len(content):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise BadInput(
+                f"{self._file.name}: {error.strerror}: the last reading is not kept, those before it are;"
+                " mend the disk, then go on with --resume"
+            ) from None
+
+    def __enter__(self) -> Self:
+        """The writer itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _drop_torn_line(self) -> None:
+        self._file.seek(0)
+        content = self._file.read()
+        self._file.truncate(content.rfind(b"\n") + 1)
+
+
+def _keep_names(path: Path) -> None:
+    """Wait until a directory's new names and its own are on disk: a power cut must not take them."""
+    for folder in (path, path.parent):
+        opened = os.open(folder, os.O_RDONLY)
+        os.fsync(opened)
+        os.close(opened)
+
+
+def _read_manifest(path: Path) -> Manifest:
+    file = path / MANIFEST
+    if not file.is_file():
+        raise BadInput(f"{path}: no sweep data set there: {MANIFEST} is missing")
+    try:
+        return Manifest.model_validate(json.loads(file.read_text(encoding="utf-8")))
+    except ValidationError as error:
+        raise BadInput(f"{file}: {describe(error)}") from None
+    except (ValueError, OSError) as error:
+        raise BadInput(f"{file}: not readable as JSON: {error}") from None
+
+
+def _parse(lines: Sequence[bytes], file: Path) -> Iterator[Reading | PlanLine]:
+    for number, line in enumerate(lines, start=1):
+        try:
+            yield _LINE.validate_json(line)
+        except ValidationError as error:
+            raise BadInput(f"{file}: line {number}: {describe(error)}") from None
+
+
+def _check_width(reading: Reading, n: int, path: Path) -> None:
+    for key in ("servo", "position", "position_std", "torque", "torque_std", "motor_torque"):
+        if len(getattr(reading, key)) != n:
+            raise BadInput(f"{path}: sweep {reading.sweep}, reading {reading.index}: {key} is not one per joint ({n})")
+
+
+def _require_same(found: Manifest, wanted: Manifest, path: Path) -> None:
+    differing: dict[str, tuple[Any, Any]] = {
+        key: (getattr(found, key), getattr(wanted, key))
+        for key in ("arm", "serial", "description_hash", "reference_mass", "installed_gain", "installed_offset")
+        if getattr(found, key) != getattr(wanted, key)
+    }
+    for key, (ours, theirs) in differing.items():
+        raise Refused(f"{path}: {key} is {ours} there, but {theirs} is asked for: resume with the same arm and mass")

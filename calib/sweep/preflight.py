@@ -1,0 +1,139 @@
+"""Before a sweep: are the sensors alive and quiet, the drives cool, and is every stop where the arm file has it?
+
+CiA 402 has no object for a drive's temperature, so it is read where the joint's data sheet has one at 2101h and the
+device too (INTEGER16, 0.1 °C). Every drive that gets too hot says so by an emergency, which ends any sweep.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from armlink.arm_file import ArmFile
+from armlink.canopen.object_dictionary import Entry
+from armlink.errors import Refused
+from armlink.link.link import Link
+from calib.arm.drive_limits import Limits
+from calib.arm.sweep_section import sweep_section
+from calib.motion.mover import Mover, Stalled
+
+Array = npt.NDArray[np.float64]
+LISTEN = 0.5
+"""Seconds for which the sensors are listened to at rest, after as long again in which switching on dies down."""
+LOUD = 0.05
+"""Noise of a torque sensor, as a share of rated torque, from which it is not fit for a calibration."""
+NEAR_LIMIT = 1.9
+"""Reading, in rated torques, at which a torque sensor is about to saturate."""
+APPROACH = 0.08
+"""Distance from the arm file's stop from which a joint creeps [rad]."""
+TEMPERATURE = Entry(0x2101, 0, "h", "drive temperature")
+HOT = 70.0
+"""Temperature of a drive from which no sweep is begun: it would fall or rise while the sensors are read [°C]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Preflight:
+    """What was found; arrays (n,)."""
+
+    names: tuple[str, ...]
+    noise: Array
+    """Standard deviation of one torque sample [N·m]."""
+    torque: Array
+    """Mean torque reading at rest [N·m]."""
+    stops: Array
+    """Readings at the lower and the upper stop (n, 2) [rad]; NaN where none was looked for."""
+    expected: Array
+    """Stops by the arm file (n, 2) [rad]."""
+    temperature: Array
+    """Of the drives (n,) [°C]; NaN where a drive does not report it."""
+
+
+def listen(link: Link, arm: ArmFile) -> Preflight:
+    """Listen to an enabled arm at rest.
+
+    Raises Refused naming the joint whose sensor is silent, loud or at the end of its range, or whose drive is hot.
+    """
+    temperature = read_temperatures(link)
+    limits, mover = Limits.of(arm), Mover(link, sweep_section(arm), Limits.of(arm))
+    cycles = max(int(LISTEN / link.period), 20)
+    samples = [mover.cycle() for _ in range(2 * cycles)][cycles:]
+    torque = np.array([sample.torque for sample in samples])
+    position = np.array([sample.position for sample in samples])
+    for joint, name in enumerate(link.names):
+        for what, values in (("torque", torque[:, joint]), ("position", position[:, joint])):
+            missing = int(np.isnan(values).sum())
+            if missing > 0.1 * len(values):
+                raise Refused(
+                    f"{name}: {missing} of {len(values)} {what} readings are missing: check its TPDO and cable"
+                )
+        if np.nanmax(np.abs(torque[:, joint])) > NEAR_LIMIT * limits.rated[joint]:
+            raise Refused(
+                f"{name}: its torque sensor reads {torque[-1, joint]:.3g} N·m at rest, near the end of its range:"
+                " unload the joint, or check the sensor"
+            )
+        noise = _noise(torque[:, joint])
+        if noise > LOUD * limits.rated[joint]:
+            raise Refused(
+                f"{name}: its torque sensor's noise is {noise:.3g} N·m, expected below {LOUD:.0%} of rated torque"
+                f" ({LOUD * limits.rated[joint]:.3g}): check shielding and mounting, or that the arm stands still"
+            )
+    nowhere = np.full((link.n, 2), np.nan)
+    expected = np.column_stack([limits.lower, limits.upper])
+    mean = np.nanmean(torque, axis=0)
+    return Preflight(link.names, np.array([_noise(each) for each in torque.T]), mean, nowhere, expected, temperature)
+
+
+def read_temperatures(link: Link) -> Array:
+    """Temperatures of the drives (n,) [°C], NaN where one does not report it; raises Refused naming one that is hot."""
+    temperature = np.full(link.n, np.nan)
+    for joint, services in enumerate(link.services):
+        told = services.remote.object_dictionary.get_variable(TEMPERATURE.index, TEMPERATURE.sub)
+        if told is None or "temperature" not in told.name.lower() or not services.has(TEMPERATURE):
+            continue
+        temperature[joint] = services.read(TEMPERATURE) / 10
+        if temperature[joint] >= HOT:
+            raise Refused(
+                f"{link.names[joint]}: its drive is at {temperature[joint]:.0f} °C, a sweep begins below {HOT:.0f}:"
+                " let it cool down"
+            )
+    return temperature
+
+
+def find_stops(
+    link: Link, arm: ArmFile, found: Preflight, report: Callable[[int, int], None] | None = None
+) -> Preflight:
+    """Push each joint slowly onto both its stops, no harder than its position loop does 15 mrad off, others mid-range.
+
+    Raises Refused naming the joint and the place where a stop is not where the arm file has it. A stop that a joint
+    does not get to is left out.
+    """
+    limits, section = Limits.of(arm), sweep_section(arm)
+    mover = Mover(link, section, limits)
+    mover.hold_all()
+    middle = (limits.lower + limits.upper) / 2
+    stops = np.full((link.n, 2), np.nan)
+    for count, joint in enumerate(reversed(range(link.n))):
+        for end, side in enumerate((-1, 1)):
+            goal = middle.copy()
+            goal[joint] = mover.before_stop(joint, side, APPROACH)
+            try:
+                mover.travel(goal, 1.0)
+                push = np.zeros(link.n, dtype=np.int64)
+                push[joint] = side
+                stops[joint, end] = mover.touch(push)[joint]
+                mover.hold_all()
+                mover.travel(goal, 1.0)
+            except Stalled:  # too heavy to hold there: the sweeps, which know the weight, look again
+                mover.hold_all()
+                mover.travel(middle, 1.0)
+            if report is not None:
+                report(2 * count + end + 1, 2 * link.n)
+    mover.travel(middle, 1.0)
+    return Preflight(found.names, found.noise, found.torque, stops, found.expected, found.temperature)
+
+
+def _noise(values: Array) -> float:
+    """Standard deviation of one sample from the steps between samples, so that a slow change does not count."""
+    steps = np.diff(values)
+    return float(np.sqrt(np.nanmean(steps**2) / 2)) if np.isfinite(steps).any() else float("nan")

@@ -1,0 +1,208 @@
+"""Runs one pass of sweeps through the link and writes each reading to disk before the next is begun."""
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from armlink.arm_file import ArmFile
+from armlink.errors import Refused
+from armlink.link.link import Link
+from calib.arm.drive_limits import Limits
+from calib.arm.sweep_section import SweepSection, sweep_section
+from calib.motion.mover import Mover, Slipped, Stalled
+from calib.motion.static_reading import Rest
+from calib.plan.collisions import check_plan
+from calib.plan.sweep_plan import plan_sweep
+from calib.plan.types import Sweep, SweepPlan
+from calib.sweep.dataset import DataWriter, Manifest, PlanLine, Reading, SweepData, load_data
+from calib.sweep.scout import SCOUT, SLOWER, as_reading, rough_model, run_scout
+
+Array = npt.NDArray[np.float64]
+Progress = Callable[[int, int, float, str], None]
+"""Called after each reading with (readings done, readings in all, seconds left, what is being done)."""
+
+APPROACH = 0.03
+"""Each step is approached over at least this way [rad]."""
+GAP = 0.02
+"""Distance from a stop at which creeping begins [rad]."""
+BARS = "▁▂▃▄▅▆▇█"
+RETRIES = 3
+"""How often a joint that slipped or stalled is tried again before the sweep gives up."""
+
+
+def run_sweep(
+    link: Link,
+    arm: ArmFile,
+    out: Path,
+    *,
+    reference_mass: float = 0.0,
+    resume: bool = False,
+    progress: Progress | None = None,
+    clock: Callable[[], float] = time.monotonic,
+    seed: int = 0,
+) -> SweepData:
+    """One pass over all joints with `reference_mass` [kg] attached (0 for none), into the directory `out`.
+
+    The link must have been enabled; the joints hold at the end. First the scout, then the plan with its bias torques,
+    then the sweeps, tip to base. With `resume` it goes on after the last reading
+    on disk. Raises BadInput, Refused where the arm cannot be swept, BusFault; every reading made is on disk.
+    """
+    installed = [link.read_calibration(joint) for joint in range(link.n)]
+    manifest = Manifest.of(arm, reference_mass, [(each.gain, each.offset) for each in installed])
+    with DataWriter(out, manifest, resume) as writer:
+        data = load_data(out)
+        mover = Mover(link, sweep_section(arm), Limits.of(arm))
+        run = _Pass(mover, writer, list(data.readings), progress or (lambda *_: None), clock)
+        if data.plan is None:
+            first = plan_sweep(arm, seed=seed, reference_mass=reference_mass)
+            check_plan(arm, first)
+            run.total = first.readings
+            run.scout(first)
+            plan = _final_plan(arm, first, run.readings, reference_mass, seed, mover.known_resolution)
+            check_plan(arm, plan)
+            writer.append(PlanLine(plan=plan, resolution=tuple(mover.known_resolution.tolist())))
+        else:
+            plan = data.plan
+            mover.resolution = np.where(data.resolution > 0, data.resolution, np.inf)
+        run.total = plan.readings
+        run.acceleration, run.refuge = plan.travel_acceleration, np.array(plan.scout[0])
+        mover.average_to(plan.standard_error)
+        for sweep in plan.sweeps:
+            run.sweep(sweep)
+        mover.hold_all()
+        mover.cycle()
+    return load_data(out)
+
+
+def _final_plan(
+    arm: ArmFile, first: SweepPlan, readings: list[Reading], mass: float, seed: int, resolution: Array
+) -> SweepPlan:
+    """The plan with bias torques, and the scout poses that were reached."""
+    plan = plan_sweep(arm, rough_model(arm, readings), seed=seed, reference_mass=mass, resolution=resolution)
+    reached = tuple(first.scout[reading.index] for reading in readings if reading.sweep == SCOUT)
+    return plan.model_copy(update={"scout": reached})
+
+
+def sparkline(values: Sequence[float]) -> str:
+    """A curve of one character a value."""
+    low, high = min(values), max(values)
+    steps = (len(BARS) - 1) / max(high - low, 1e-12)
+    return "".join(BARS[round((value - low) * steps)] for value in values)
+
+
+class _Pass:
+    """One pass under way."""
+
+    def __init__(
+        self,
+        mover: Mover,
+        writer: DataWriter,
+        readings: list[Reading],
+        progress: Progress,
+        clock: Callable[[], float],
+    ) -> None:
+        self.mover, self.writer, self.readings = mover, writer, readings
+        self.section: SweepSection = mover.section
+        self.total, self.acceleration = 0, 1.0
+        self.refuge = mover.position.copy()
+        self._progress, self._clock = progress, clock
+        self._began, self._at_start = clock(), len(readings)
+
+    def save(self, reading: Reading) -> None:
+        """Put a reading on disk and report."""
+        self.writer.append(reading)
+        self.readings.append(reading)
+        made = len(self.readings) - self._at_start
+        left = (self._clock() - self._began) / made * max(self.total - len(self.readings), 0)
+        self._progress(len(self.readings), self.total, left, self._text(reading))
+
+    def _text(self, reading: Reading) -> str:
+        """What is being done, with a plot of the swept joint's torque in the sweep so far."""
+        if reading.joint is None:
+            return f"{reading.sweep} {reading.index + 1}"
+        curve = [each.torque[reading.joint] for each in self.readings if each.sweep == reading.sweep]
+        return f"{reading.sweep} {reading.index + 1} {sparkline(curve)}"
+
+    def scout(self, plan: SweepPlan) -> None:
+        """Take the scout poses that are still to be taken."""
+        done = {reading.index for reading in self.readings if reading.sweep == SCOUT}
+        run_scout(self.mover, plan, done, self.save)
+
+    def sweep(self, sweep: Sweep) -> None:
+        """Take the readings of one sweep that are still to be taken; a joint that slips is pressed again."""
+        done = {reading.index for reading in self.readings if reading.sweep == sweep.name}
+        open_readings = [index for index in range(sweep.readings) if index not in done]
+        bias = np.array(sweep.bias)
+        retries, standing = 0, False
+        while open_readings:
+            index = open_readings[0]
+            try:
+                if not standing:
+                    self._rest_others(sweep, bias, *sweep.target(index), detour=retries > 0)
+                    standing = True
+                rest = self._step(sweep, *sweep.target(index))
+            except Slipped as slip:
+                retries += 1
+                standing = False
+                sweep, bias = self._firmer(sweep, bias, slip.joint, retries)
+                continue
+            except Stalled:
+                retries += 1
+                standing = False
+                self.acceleration *= SLOWER
+                if retries > RETRIES:
+                    raise
+                continue
+            counts = np.array(sweep.servo)
+            self.save(as_reading(rest, sweep.name, index, sweep.joint, sweep.target(index)[1], counts))
+            open_readings.pop(0)
+
+    def _rest_others(self, sweep: Sweep, bias: Array, target: float, direction: int, *, detour: bool = False) -> None:
+        """Bring the resting joints to their places, by way of a pose known to be good, and press or hold them there."""
+        mover = self.mover
+        if detour:
+            mover.come_to_rest()
+            mover.travel(self.refuge, self.acceleration)
+        mover.hold_all()
+        goal = np.array(sweep.rest)
+        stops = np.array(sweep.stops, dtype=np.int64) * ~np.array(sweep.servo)
+        for joint in np.flatnonzero(stops):
+            goal[joint] = mover.before_stop(int(joint), int(stops[joint]), GAP)
+        goal[sweep.joint] = target - direction * APPROACH
+        mover.travel(goal, self.acceleration)
+        if stops.any():
+            mover.press(stops, bias)
+
+    def _step(self, sweep: Sweep, target: float, direction: int) -> Rest:
+        """Bring the swept joint to a step from its side and read."""
+        mover, joint = self.mover, sweep.joint
+        goal = mover.command.position.copy()
+        if direction * (target - goal[joint]) < APPROACH / 2:
+            goal[joint] = target - direction * APPROACH
+            mover.travel(goal, sweep.acceleration)
+        goal[joint] = target
+        mover.travel(goal, sweep.acceleration)
+        counts = np.array(sweep.servo)
+        counts[joint] = True
+        return mover.rest(counts)
+
+    def _firmer(self, sweep: Sweep, bias: Array, joint: int, retries: int) -> tuple[Sweep, Array]:
+        """For a joint that slipped: a fifth more torque or, where it has all that it may, slower motion of the others.
+
+        Raises Refused where that was tried often enough.
+        """
+        name, limit = self.mover.link.names[joint], self.mover.limits.max_torque[joint]
+        more = bias.copy()
+        more[joint] = np.clip(1.2 * bias[joint], -limit, limit)
+        if retries > RETRIES:
+            raise Refused(
+                f"{name}: slips off its stop in sweep {sweep.name} at {bias[joint]:.1f} N·m of {limit:.1f} allowed:"
+                " lessen sweep.acceleration, or hold by servo (sweep.hold: servo)"
+            )
+        if more[joint] == bias[joint]:
+            self.acceleration *= SLOWER
+            sweep = sweep.model_copy(update={"acceleration": SLOWER * sweep.acceleration})
+        return sweep, more

@@ -1,0 +1,146 @@
+"""Verification: drives to poses that no fit has seen and compares model torque with sensor torque (Figure 6)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from armlink.arm_file import ArmFile
+from armlink.errors import Refused
+from armlink.link.link import Link
+from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import gcomp_arm
+from calib.arm.sweep_section import SweepSection, sweep_section
+from calib.motion.mover import Mover, Stalled
+from calib.plan.poses import short_way, sweep_range
+from calib.records.records import CalibrationRecord, GravityRecord
+from gcomp.gravity.torque import gravity_torque, torque_covariance
+
+Array = npt.NDArray[np.float64]
+ACCELERATION = 2.0
+TOLERANCE = 0.01
+"""RMS that passes, as a share of the joint's largest model torque, beside the noise floor."""
+NOISE_FLOOR = 0.003
+"""RMS that passes anyway, as a share of rated torque."""
+
+
+@dataclass(frozen=True, eq=False)
+class Verification:
+    """Model torque against sensor torque at P poses."""
+
+    names: tuple[str, ...]
+    position: Array
+    """True angles by the calibration (P, n) [rad]."""
+    sensor: Array
+    """Calibrated sensor torque (P, n) [N·m]."""
+    model: Array
+    """Model torque (P, n) [N·m]."""
+    model_std: Array
+    """Standard deviation of the model torque by the record's covariance (P, n) [N·m]."""
+    skipped: int
+    """Poses that the drives did not reach."""
+    tolerance: Array
+    """RMS that passes (n,) [N·m]."""
+
+    @property
+    def rms(self) -> Array:
+        """RMS of sensor minus model (n,) [N·m]."""
+        rms: Array = np.sqrt(np.mean((self.sensor - self.model) ** 2, axis=0))
+        return rms
+
+    @property
+    def max_error(self) -> Array:
+        """Largest absolute difference (n,) [N·m]."""
+        largest: Array = np.abs(self.sensor - self.model).max(axis=0)
+        return largest
+
+    @property
+    def passed(self) -> bool:
+        """Whether every joint's RMS is within its tolerance."""
+        return bool(np.all(self.rms <= self.tolerance))
+
+
+def run_verify(
+    link: Link,
+    arm: ArmFile,
+    gravity: GravityRecord,
+    calibration: CalibrationRecord | None = None,
+    *,
+    poses: int = 24,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> Verification:
+    """Drive, servo-held, to random poses within the joint range and read every torque sensor there.
+
+    The link must have been enabled. Without a calibration record the controllers' own calibration stands. Raises
+    Refused on records of another arm, or where no pose can be reached; BusFault.
+    """
+    n, section, limits = link.n, sweep_section(arm), Limits.of(arm)
+    described = gcomp_arm(arm)
+    sensors = _Sensors.of(link, None if calibration is None else calibration.require(arm))
+    beta = np.array(gravity.require(arm).beta)
+    mover = Mover(link, section, limits)
+    mover.hold_all()
+    everything, angles, torques, skipped = np.ones(n, dtype=bool), [], [], 0
+    for number, pose in enumerate(verify_poses(limits, section, poses, seed, mover.position), start=1):
+        begin = mover.position.copy()
+        try:
+            mover.travel(pose, ACCELERATION)
+        except Stalled:
+            skipped += 1
+            mover.hold_all()
+            mover.travel(begin, ACCELERATION)
+            continue
+        rest = mover.rest(everything)
+        angles.append(sensors.angle(rest.position))
+        torques.append(sensors.torque(rest.torque))
+        if progress is not None:
+            progress(number, poses)
+    if not angles:
+        raise Refused("no pose was reached: the drives stalled at every one; is the arm free to move?")
+    q = np.array(angles)
+    model = gravity_torque(described, beta, q)
+    variance = np.diagonal(torque_covariance(described, np.array(gravity.covariance), q), axis1=-2, axis2=-1)
+    tolerance = np.maximum(TOLERANCE * np.abs(model).max(axis=0), NOISE_FLOOR * limits.rated)
+    return Verification(link.names, q, np.array(torques), model, np.sqrt(np.maximum(variance, 0.0)), skipped, tolerance)
+
+
+def verify_poses(limits: Limits, section: SweepSection, count: int, seed: int, begin: Array) -> Array:
+    """Random poses (count, n) [rad] within the joint range, ordered for short ways from `begin` (n,)."""
+    ends = np.array([sweep_range(section, limits, joint) for joint in range(len(limits.lower))])
+    generator = np.random.default_rng([seed, 6])
+    return short_way(ends[:, 0] + generator.random((count, len(ends))) * (ends[:, 1] - ends[:, 0]), begin)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sensors:
+    """From what the controllers send to angles and torques."""
+
+    installed_gain: Array
+    installed_offset: Array
+    gain: Array
+    offset: Array
+    position_gain: Array
+    position_offset: Array
+
+    @classmethod
+    def of(cls, link: Link, record: CalibrationRecord | None) -> "_Sensors":
+        installed = [link.read_calibration(joint) for joint in range(link.n)]
+        gain, offset = np.array([each.gain for each in installed]), np.array([each.offset for each in installed])
+        if record is None:
+            return cls(gain, offset, gain, offset, np.ones(link.n), np.zeros(link.n))
+        return cls(
+            gain,
+            offset,
+            np.where(np.isnan(record.values("gain")), gain, record.values("gain")),
+            np.where(np.isnan(record.values("offset")), offset, record.values("offset")),
+            record.values("position_gain", 1.0),
+            record.values("position_offset", 0.0),
+        )
+
+    def angle(self, reading: Array) -> Array:
+        return reading * self.position_gain + self.position_offset
+
+    def torque(self, reading: Array) -> Array:
+        return (reading * self.installed_gain + self.installed_offset - self.offset) / self.gain

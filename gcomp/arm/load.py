@@ -1,0 +1,180 @@
+"""Arms from URDF and MJCF files, read through MuJoCo and converted to Denavit-Hartenberg form."""
+
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gcomp.arm.arm import Arm
+from gcomp.arm.dh_rows import ArmGeometry, axes_to_arm
+from gcomp.arrays import Array, as_array
+from gcomp.errors import BadModel
+
+if TYPE_CHECKING:
+    import mujoco
+
+URDF_COMPILER = {"fusestatic": "false", "discardvisual": "true", "balanceinertia": "true"}
+URDF_COMPILER |= {"boundmass": "1e-14", "boundinertia": "1e-14"}
+"""MuJoCo refuses massless moving bodies, which URDF files are full of: they get a mass that gravity does not notice."""
+
+
+@dataclass(frozen=True, eq=False)
+class ModelArm:
+    """An arm read from a model file, with the gravity of its own inertials."""
+
+    arm: Arm
+    beta: Array
+    """Mass moments (2n,) of the model's inertials [kg·m]."""
+    mass: Array
+    """Link masses (n,), bodies welded to a link included [kg]."""
+    first_moment: Array
+    """Link first moments (n, 3) in bar frames, from the joint's anchor [kg·m]."""
+    bodies: tuple[tuple[str, ...], ...]
+    """Names of the bodies that each link consists of, the one with the joint first."""
+
+
+def load_model(path: Path, *, tip: str | None = None, gravity: ArrayLike | None = None) -> ModelArm:
+    """The serial arm of revolute joints in a URDF or MJCF file.
+
+    The chain ends in body `tip`; by default in the last body that moves. Joints off the chain are refused unless `tip`
+    is given: then they stay where the file puts them. `gravity` (3,) [m/s²] in the model's world frame replaces the
+    model's own. Raises BadModel, naming the joint, where the chain is not a serial arm of revolute joints.
+    """
+    return place_chain(path, tip=tip, gravity=gravity).arm
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedChain:
+    """The chain in MuJoCo's reference configuration: what it takes to write inertials back into the file."""
+
+    model: "mujoco.MjModel"
+    data: "mujoco.MjData"
+    arm: ModelArm
+    geometry: ArmGeometry
+    anchors: Array
+    """A point on each joint's axis (n, 3), world frame [m]."""
+    bodies: tuple[tuple[int, ...], ...]
+    """Ids of the bodies that each link consists of."""
+
+
+def place_chain(path: Path, *, tip: str | None = None, gravity: ArrayLike | None = None) -> PlacedChain:
+    """As load_model, with the bodies behind the links; raises BadModel likewise."""
+    model = compile_model(path)
+    return _place(model, _chain(model, path, tip), gravity)
+
+
+def compile_model(path: Path) -> "mujoco.MjModel":
+    """The file compiled by MuJoCo: a URDF without its meshes, which gravity does not need. Raises BadModel."""
+    import mujoco
+
+    try:
+        root = ET.fromstring(path.read_bytes())
+    except (ET.ParseError, OSError) as error:
+        raise BadModel(f"{path}: not a URDF or MJCF file: {error}") from None
+    try:
+        if root.tag == "robot":
+            return mujoco.MjModel.from_xml_string(_plain_urdf(root, path))
+        return mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise BadModel(f"{path}: MuJoCo refuses it: {error}") from None
+
+
+def _plain_urdf(root: ET.Element, path: Path) -> str:
+    """The URDF with only links, joints and inertials, for MuJoCo's compiler."""
+    for joint in root.iter("joint"):
+        if joint.find("mimic") is not None:
+            raise BadModel(f"{path}: joint {joint.get('name')} mimics another: a serial arm has one drive per joint")
+    for link in root.iter("link"):
+        for shape in [*link.findall("visual"), *link.findall("collision")]:
+            link.remove(shape)
+    for own in root.findall("mujoco"):
+        root.remove(own)
+    ET.SubElement(ET.SubElement(root, "mujoco"), "compiler", URDF_COMPILER)
+    return ET.tostring(root, encoding="unicode")
+
+
+def _chain(model: "mujoco.MjModel", path: Path, tip: str | None) -> list[int]:
+    """Ids of the chain's joints, base to tip; every one a hinge."""
+    import mujoco
+
+    joints = list(range(model.njnt))
+    if not joints:
+        raise BadModel(f"{path}: no joint: an arm has at least one revolute joint")
+    last = model.jnt_bodyid[joints[-1]]
+    if tip is not None:
+        last = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, tip)
+        if last < 0:
+            names = ", ".join(model.body(body).name for body in range(1, model.nbody))
+            raise BadModel(f"{path}: no body {tip!r} for tip; there are {names}")
+    ancestors = {int(last)}
+    while last:
+        last = model.body_parentid[last]
+        ancestors.add(int(last))
+    chain = [joint for joint in joints if model.jnt_bodyid[joint] in ancestors]
+    aside = [joint for joint in joints if joint not in chain]
+    for joint in chain if aside and tip is not None else joints:
+        if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
+            kind = mujoco.mjtJoint(model.jnt_type[joint]).name.removeprefix("mjJNT_").lower()
+            kind = "prismatic" if kind == "slide" else kind
+            raise BadModel(f"{path}: joint {model.joint(joint).name} is {kind}: only revolute joints can be identified")
+    if aside and tip is None:
+        name = model.joint(aside[0]).name
+        raise BadModel(f"{path}: joint {name} branches off the chain: say with tip which body the chain ends in")
+    if not chain:
+        raise BadModel(f"{path}: no joint between the base and tip {tip!r}")
+    _refuse_couplings(model, chain, path)
+    return chain
+
+
+def _refuse_couplings(model: "mujoco.MjModel", chain: list[int], path: Path) -> None:
+    import mujoco
+
+    for equality in range(model.neq):
+        coupled = int(model.eq_obj1id[equality])
+        if model.eq_type[equality] == mujoco.mjtEq.mjEQ_JOINT and coupled in chain:
+            raise BadModel(f"{path}: joint {model.joint(coupled).name} mimics another: one drive per joint is needed")
+
+
+def _place(model: "mujoco.MjModel", chain: list[int], gravity: ArrayLike | None) -> PlacedChain:
+    """Axes, points and inertials in the model's reference configuration, then Denavit-Hartenberg form."""
+    import mujoco
+
+    data: Any = mujoco.MjData(model)
+    mujoco.mj_resetData(model, data)
+    mujoco.mj_kinematics(model, data)
+    limited = np.array([bool(model.jnt_limited[joint]) for joint in chain])
+    limits = np.where(limited[:, None], model.jnt_range[chain], [-np.inf, np.inf])
+    reference = np.array([model.qpos0[model.jnt_qposadr[joint]] for joint in chain])
+    link_of = _links(model, chain)
+    mass, first_moment = np.zeros(len(chain)), np.zeros((len(chain), 3))
+    bodies: list[list[int]] = [[] for _ in chain]
+    for body, link in link_of.items():
+        mass[link] += model.body_mass[body]
+        first_moment[link] += model.body_mass[body] * (data.xipos[body] - data.xanchor[chain[link]])
+        bodies[link].append(body)
+    geometry = axes_to_arm(
+        names=tuple(model.joint(joint).name or f"joint_{i + 1}" for i, joint in enumerate(chain)),
+        axes=data.xaxis[chain],
+        points=data.xanchor[chain],
+        reference=reference,
+        gravity=np.array(model.opt.gravity) if gravity is None else as_array("gravity", gravity, (3,)),
+        limits=limits,
+    )
+    moments = np.einsum("ndk,nd->nk", geometry.bar, first_moment)
+    names = tuple(tuple(model.body(body).name for body in of_link) for of_link in bodies)
+    arm = ModelArm(geometry.arm, geometry.base_parameters(mass, moments), mass, moments, names)
+    return PlacedChain(model, data, arm, geometry, data.xanchor[chain], tuple(map(tuple, bodies)))
+
+
+def _links(model: "mujoco.MjModel", chain: list[int]) -> dict[int, int]:
+    """Which link of the chain each body belongs to; bodies of the base are left out."""
+    link_of: dict[int, int] = {}
+    last_joint = {int(model.jnt_bodyid[joint]): link for link, joint in enumerate(chain)}
+    for body in range(1, model.nbody):  # parents come before children
+        link = last_joint.get(body, link_of.get(int(model.body_parentid[body])))
+        if link is not None:
+            link_of[body] = link
+    return link_of

@@ -1,0 +1,60 @@
+"""Mass moments of an arm: from its links' inertials, and what a payload adds (theory note, equations (R) and (P))."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gcomp.arm.arm import Arm
+from gcomp.arrays import Array, as_array
+
+
+def base_parameters(arm: Arm, mass: ArrayLike, first_moment: ArrayLike) -> Array:
+    """Mass moments β = (n_1x, n_1y, …, n_nx, n_ny) (2n,) [kg·m] that gravity torque depends on; equation (R).
+
+    mass (n,) [kg]; first_moment (n, 3) [kg·m], mass times centre of mass in each link's bar frame (origin on the
+    joint axis at o_{i-1}, turning with the joint, z along the axis).
+    """
+    masses = as_array("mass", mass, (arm.n,))
+    moments = as_array("first_moment", first_moment, (arm.n, 3))
+    beta = np.empty((arm.n, 2))
+    distal_mass = along_axis = 0.0
+    for i in reversed(range(arm.n)):
+        beta[i, 0] = moments[i, 0] + distal_mass * arm.a[i]
+        beta[i, 1] = moments[i, 1] - np.sin(arm.alpha[i]) * along_axis
+        along_axis = moments[i, 2] + np.cos(arm.alpha[i]) * along_axis + distal_mass * arm.d[i]
+        distal_mass += masses[i]
+    return beta.ravel()
+
+
+def bar_moments(arm: Arm, first_moment: ArrayLike) -> Array:
+    """First moments (n, 3) given in Denavit-Hartenberg frames' axes, from o_{i-1}, in bar frames' axes: Rx(α_i)."""
+    moments = as_array("first_moment", first_moment, (arm.n, 3))
+    ca, sa = np.cos(arm.alpha), np.sin(arm.alpha)
+    x, y, z = moments.T
+    return np.stack([x, ca * y - sa * z, sa * y + ca * z], axis=1)
+
+
+def payload_columns(arm: Arm) -> tuple[Array, Array]:
+    """(E_0 (2n,), E_ρ (2n, 3)): mass μ at point ρ of bar frame n adds Δβ = μ (E_0 + E_ρ ρ); equation (P)."""
+    none = np.zeros((arm.n, 3))
+    mass = np.zeros(arm.n)
+    mass[-1] = 1.0
+    at_origin = base_parameters(arm, mass, none)
+    by_point = np.empty((2 * arm.n, 3))
+    for axis in range(3):
+        moment = none.copy()
+        moment[-1, axis] = 1.0
+        by_point[:, axis] = base_parameters(arm, np.zeros(arm.n), moment)
+    return at_origin, by_point
+
+
+def base_parameter_names(arm: Arm, tolerance: float = 1e-6) -> tuple[str, ...]:
+    """Names of the mass moments that gravity can show in some pose: 2(n − p) of them (theory note, section 2).
+
+    p leading joints have their axis along gravity in every pose, to within `tolerance` [rad]; they carry no torque.
+    """
+    vertical = 0
+    strength = float(np.linalg.norm(arm.gravity))
+    if np.hypot(arm.gravity[0], arm.gravity[1]) <= tolerance * strength:
+        bends = np.abs(np.sin(arm.alpha)) > tolerance
+        vertical = int(np.argmax(bends)) + 1 if bends[:-1].any() else arm.n
+    return tuple(f"mass_moment_{axis}[{name}]" for name in arm.names[vertical:] for axis in "xy")

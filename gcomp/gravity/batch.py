@@ -1,0 +1,118 @@
+"""Gravity torque computed fast: one pose in plain floats, many poses in blocks of arrays that stay in the cache.
+
+Two passes along the arm: composite mass moments inwards, gravity outwards into each bar frame, and at each joint
+τ_i = ḡ_ix N_iy − ḡ_iy N_ix, equation (E4) of the theory note. The components across a joint's axis are one complex
+number, so that turning about the axis by θ is a product with e^{iθ}.
+"""
+
+import threading
+from collections.abc import Callable
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gcomp.arm.arm import Arm
+from gcomp.arrays import Array, as_array, as_batch, as_poses
+from gcomp.gravity.half_angle import half_angles
+from gcomp.gravity.single_pose import compile_single_pose, without_rounding
+
+BLOCK = 5000
+"""Poses worked on at a time: about two megabytes of work space for seven joints. Not a power of two: rows that begin
+at the same place of a memory page push each other out of the cache."""
+
+ComplexArray = NDArray[np.complex128]
+
+
+class GravityModel:
+    """The gravity torque of one arm with one set of mass moments, prepared for many calls."""
+
+    def __init__(self, arm: Arm, beta: ArrayLike) -> None:
+        """Prepare for mass moments β (2n,) [kg·m]; raises BadArray on a wrong shape."""
+        self.arm = arm
+        self.beta = as_array("beta", beta, (2 * arm.n,), finite=False)
+        self._moments = self.beta[::2] + 1j * self.beta[1::2]
+        self._twists = [without_rounding(alpha) for alpha in arm.alpha]
+
+    @cached_property
+    def one(self) -> Callable[[Array], Array]:
+        """Holding torque (n,) [N·m] at one pose q (n,) [rad], in a few microseconds: its argument is not checked."""
+        return compile_single_pose(self.arm, self.beta)
+
+    def many(self, q: ArrayLike) -> Array:
+        """Holding torque (…, n) [N·m] at poses q (…, n) [rad]; raises BadArray where the last axis is not n."""
+        poses, leading = as_poses("q", q, self.arm.n)
+        torque = np.empty(poses.shape)
+        for begin in range(0, len(poses), BLOCK):
+            block = slice(begin, begin + BLOCK)
+            space = _space_for(self.arm.n, len(poses[block]))
+            _turn(self.arm, poses[block], space.tangent, space.double, space.turn)
+            self._moments_inwards(space)
+            self._gravity_outwards(space)
+            np.copyto(torque[block], space.moment.imag.T)
+        return as_batch(torque, leading)
+
+    def _moments_inwards(self, space: "_Space") -> None:
+        """Composite mass moments N_i = n_i + Rx(α_i) Rz(θ_{i+1}) N_{i+1} into space.moment."""
+        z, next_z = space.along
+        last = self.arm.n - 1
+        space.moment[last].fill(self._moments[last])
+        z.fill(0.0)
+        for i in range(last, 0, -1):
+            moment = np.multiply(space.turn[i], space.moment[i], out=space.moment[i - 1])
+            _turn_about_x(*self._twists[i - 1], moment.imag, z, moment.imag, next_z, space.spare)
+            np.add(moment, self._moments[i - 1], out=moment)
+            z, next_z = next_z, z
+
+    def _gravity_outwards(self, space: "_Space") -> None:
+        """Gravity's conjugate ḡ_x − i ḡ_y into each bar frame; its product with N_i has τ_i as imaginary part."""
+        gravity, (z, next_z) = space.gravity, space.along
+        gravity.fill(complex(self.arm.gravity[0], -self.arm.gravity[1]))
+        z.fill(self.arm.gravity[2])
+        for i, (ca, sa) in enumerate(self._twists):
+            np.multiply(space.turn[i], gravity, out=gravity)
+            np.multiply(gravity, space.moment[i], out=space.moment[i])
+            _turn_about_x(ca, sa, gravity.imag, z, gravity.imag, next_z, space.spare)
+            z, next_z = next_z, z
+
+
+class _Space:
+    """Work space for `size` poses of n joints, one row a joint."""
+
+    def __init__(self, n: int, size: int) -> None:
+        self.tangent, self.double = np.empty((2, n, size))
+        self.turn, self.moment = np.empty((2, n, size), dtype=np.complex128)
+        self.gravity: ComplexArray = np.empty(size, dtype=np.complex128)
+        self.along, self.spare = np.empty((2, size)), np.empty(size)
+
+
+_kept = threading.local()
+
+
+def _space_for(n: int, size: int) -> _Space:
+    """Work space for a block, kept by each thread for its next: new memory costs as much as the computation."""
+    space: _Space | None = getattr(_kept, "space", None)
+    if space is None or space.turn.shape != (n, size):
+        space = _kept.space = _Space(n, size)
+    return space
+
+
+def _turn(arm: Arm, q: Array, tangent: Array, double: Array, turn: ComplexArray) -> None:
+    """e^{iθ} (n, K) at poses q (K, n) [rad]."""
+    half_angles(arm, q, tangent, double)
+    np.multiply(tangent, double, out=turn.imag)
+    np.subtract(double, 1.0, out=turn.real)
+
+
+def _turn_about_x(ca: float, sa: float, y: Array, z: Array, to_y: Array, to_z: Array, spare: Array) -> None:
+    """(to_y, to_z) = (ca y − sa z, sa y + ca z), to_y possibly y itself; right angles take two operations of six."""
+    if ca == 0.0:
+        np.multiply(y, sa, out=to_z)
+        np.multiply(z, -sa, out=to_y)
+        return
+    np.multiply(z, ca, out=to_z)
+    np.multiply(y, sa, out=spare)
+    np.add(to_z, spare, out=to_z)
+    np.multiply(z, sa, out=spare)
+    np.multiply(y, ca, out=to_y)
+    np.subtract(to_y, spare, out=to_y)

@@ -1,0 +1,211 @@
+"""Global identification: sensors, mass moments and load point from all data at once (theory note, section 7)."""
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gcomp.arm.arm import Arm
+from gcomp.arrays import Array, Mask
+from gcomp.identify.identifiability import Information, analyse, describe_null_space
+from gcomp.identify.least_squares import Outcome, Problem, solve
+from gcomp.identify.linear_start import linear_start
+from gcomp.identify.natural_units import natural_units
+from gcomp.identify.parameters import Parameters, Prior, family_slices, parameter_names, prior_vectors
+from gcomp.identify.readings import Readings
+from gcomp.identify.sensor_model import predict
+
+MAX_STD = {"gain": 0.2, "offset": 0.5, "position_gain": 0.1, "position_offset": 0.35, "beta": 0.5, "rho": 0.2}
+"""Standard deviation beyond which a value is no answer, per family: shares of the gain; of the readings' size for
+offset and of that size over g for mass moments; rad; m."""
+DOUBT = 2.0
+"""Weighted squares per degree of freedom from which on another start is tried."""
+
+
+@dataclass(frozen=True, eq=False)
+class GlobalFit:
+    """The result of the global identification. Known families keep the values they were given, with std 0."""
+
+    values: Parameters
+    """Estimates; NaN where not identifiable."""
+    std: Parameters
+    """Standard deviations; inf where not identifiable, 0 where known."""
+    complete: Parameters
+    """Estimates with every number finite: what is not identifiable stands where the start left it."""
+    names: tuple[str, ...]
+    """Names of the p estimated parameters."""
+    covariance: Array
+    """Their covariance (p, p); NaN rows and columns where not identifiable."""
+    identifiable: Mask
+    """Which of them the rows (and priors) determine (p,)."""
+    null_space: tuple[str, ...]
+    """What the rows cannot tell apart, one sentence a direction."""
+    hopeless: tuple[str, ...]
+    """Parameters that the rows touch, but with a standard deviation beyond `max_std`."""
+    residual: Array
+    """Reading minus model (K, n) [N·m]; NaN where a reading does not count."""
+    chi2: float
+    """Sum of squared residuals over their variance."""
+    dof: int
+    """Counted readings minus the rank."""
+    iterations: int
+    converged: bool
+
+    @property
+    def not_identifiable(self) -> tuple[str, ...]:
+        """Names of the parameters that these rows do not determine."""
+        return tuple(name for name, found in zip(self.names, self.identifiable, strict=True) if not found)
+
+    def covariance_of(self, *names: str) -> Array:
+        """Covariance of these parameters, in this order; raises KeyError where one was not estimated."""
+        missing = [name for name in names if name not in self.names]
+        if missing:
+            raise KeyError(f"{missing[0]} was not estimated; there are {', '.join(self.names)}")
+        at = [self.names.index(name) for name in names]
+        return self.covariance[np.ix_(at, at)]
+
+    @property
+    def beta_covariance(self) -> Array:
+        """Covariance of all mass moments (2n, 2n); zero where β was known, NaN where not identifiable."""
+        moments = [name for name in self.names if name.startswith("mass_moment")]
+        size = len(self.values.beta)
+        return self.covariance_of(*moments) if moments else np.zeros((size, size))
+
+
+def identify_global(
+    arm: Arm,
+    readings: Readings,
+    *,
+    unknown: Collection[str],
+    start: Parameters | None = None,
+    priors: Mapping[str, Prior] | None = None,
+    loss: str = "linear",
+    position_sigma: ArrayLike = 0.0,
+    max_std: Mapping[str, float] | None = None,
+) -> GlobalFit:
+    """Estimate the families `unknown` by weighted least squares on the readings that count.
+
+    The scale comes from rows with a reference mass or from a prior on the gains. `start` holds the known families'
+    values and the first guess of the others (default Parameters.nominal). `position_sigma` () or (n,) [rad] is the
+    position readings' noise, carried into each row's variance. `loss` is linear, huber or cauchy. Parameters that the
+    rows do not determine are held where the start left them; everything else comes out as if they were known.
+    Raises BadArray on shapes and on names of families or losses that do not exist.
+    """
+    readings.require_arm(arm)
+    begin = start or _start_of(arm.n, priors or {})
+    problem = Problem.of(
+        arm, readings, unknown, priors or {}, loss, position_sigma, natural_units(arm, readings, begin)
+    )
+    starts = _starts(problem, begin)
+    outcome = solve(problem, next(starts))
+    for first in starts:
+        if outcome.converged and outcome.cost < DOUBT * max(1, outcome.dof):
+            break
+        other = solve(problem, first)
+        outcome = other if other.cost < outcome.cost else outcome
+    return _report(problem, outcome, {**MAX_STD, **(max_std or {})})
+
+
+def _starts(problem: Problem, begin: Parameters) -> Iterator[Parameters]:
+    """Starts in the order in which to try them.
+
+    Position errors spoil the linear solution: so first everything but the scale from the rows without a reference mass,
+    then the scale from all rows; next the linear solution of all rows; then the values given.
+    """
+    n, places, loaded = problem.arm.n, family_slices(problem.arm.n), problem.readings.load != 0
+    positions = slice(places["position_gain"].start, places["position_offset"].stop)
+    if problem.free[positions].any() and problem.free[places["beta"]].any() and loaded.any() and not loaded.all():
+        bare = problem.readings.rows(~loaded)
+        if bare.counted.any():
+            plain = linear_start(problem.arm, bare, begin, problem.free)
+            found = Parameters.from_vector(solve(problem.on(bare), plain).vector, n)
+            yield linear_start(problem.arm, problem.readings, found, problem.free, keep_ratios=True)
+    yield linear_start(problem.arm, problem.readings, begin, problem.free)
+    yield begin
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What readings at given poses would determine, before anything moves."""
+
+    std: Parameters
+    """Standard deviations; inf where not identifiable, 0 where known."""
+    names: tuple[str, ...]
+    covariance: Array
+    identifiable: Mask
+    null_space: tuple[str, ...]
+
+
+def predict_covariance(
+    arm: Arm,
+    design: Readings,
+    guess: Parameters,
+    *,
+    unknown: Collection[str],
+    priors: Mapping[str, Prior] | None = None,
+    position_sigma: ArrayLike = 0.0,
+) -> Prediction:
+    """Covariance that identify_global would report for readings at the design's positions and loads.
+
+    Of the design's torques only NaN matters: that reading would not count. `guess` is the parameters expected.
+    """
+    design.require_arm(arm)
+    expected = replace_torque(design, np.where(design.counted, predict(arm, guess, design), np.nan))
+    problem = Problem.of(
+        arm, expected, unknown, priors or {}, "linear", position_sigma, natural_units(arm, expected, guess)
+    )
+    weight = problem.weights(guess.vector)
+    information = analyse(problem.factor(guess.vector, weight)[0], problem.unit[problem.free])
+    names, std = _names_and_std(problem, information)
+    return Prediction(
+        Parameters.from_vector(std, arm.n),
+        names,
+        information.covariance,
+        information.determined,
+        describe_null_space(information.null_basis, names),
+    )
+
+
+def replace_torque(readings: Readings, torque: Array) -> Readings:
+    """The same rows with other torque readings (K, n)."""
+    return Readings(readings.position, torque, readings.sigma, readings.load)
+
+
+def _start_of(n: int, priors: Mapping[str, Prior]) -> Parameters:
+    """Nominal values, but the prior's mean where there is one."""
+    mean, std = prior_vectors(n, priors)
+    return Parameters.from_vector(np.where(np.isfinite(std), mean, Parameters.nominal(n).vector), n)
+
+
+def _names_and_std(problem: Problem, information: Information) -> tuple[tuple[str, ...], Array]:
+    """(Names of the estimated parameters, standard deviation of the whole vector: 0 known, inf not determined)."""
+    names = tuple(name for name, free in zip(parameter_names(problem.arm), problem.free, strict=True) if free)
+    std = np.zeros(len(problem.free))
+    spread = np.sqrt(np.diag(information.covariance))
+    std[problem.free] = np.where(information.determined, spread, np.inf)
+    return names, std
+
+
+def _report(problem: Problem, outcome: Outcome, max_std: Mapping[str, float]) -> GlobalFit:
+    n, information = problem.arm.n, outcome.information
+    names, std = _names_and_std(problem, information)
+    values = np.where(np.isinf(std), np.nan, outcome.vector)
+    limit = np.concatenate([np.full(place.stop - place.start, max_std[f]) for f, place in family_slices(n).items()])
+    beyond = (std > limit * problem.unit)[problem.free] & information.determined
+    complete = Parameters.from_vector(outcome.vector, n)
+    return GlobalFit(
+        values=Parameters.from_vector(values, n),
+        std=Parameters.from_vector(std, n),
+        complete=complete,
+        names=names,
+        covariance=information.covariance,
+        identifiable=information.determined,
+        null_space=describe_null_space(information.null_basis, names),
+        hopeless=tuple(name for name, is_beyond in zip(names, beyond, strict=True) if is_beyond),
+        residual=problem.readings.torque - predict(problem.arm, complete, problem.readings),
+        chi2=outcome.chi2,
+        dof=outcome.dof,
+        iterations=outcome.iterations,
+        converged=outcome.converged,
+    )

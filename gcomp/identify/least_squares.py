@@ -1,0 +1,198 @@
+"""Weighted nonlinear least squares of the sensor model: Levenberg-Marquardt on a QR factor built block by block."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gcomp.arm.arm import Arm
+from gcomp.arrays import Array, Mask, as_array
+from gcomp.errors import BadArray
+from gcomp.identify.block_qr import fold
+from gcomp.identify.identifiability import Information, Spectrum, analyse
+from gcomp.identify.parameters import Parameters, Prior, free_mask, prior_vectors
+from gcomp.identify.readings import Readings
+from gcomp.identify.sensor_model import predict, predict_and_jacobian
+
+MAX_ITERATIONS = 60
+SETTLED, STALLED, EXACT = 1e-7, 1e-5, 1e-16
+"""The last step is the one that can lower the cost by less than this share (a hundredth of it where the weights are
+fixed and convergence is quadratic); that share where no step lowers it at all;
+cost per reading at which the residual is rounding."""
+TUNING = {"huber": 1.345, "cauchy": 2.385}
+"""Where a robust loss starts to doubt a residual, in standard deviations: 95 % efficient on Gaussian noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is fitted to what; vectors are of the whole parameter vector (6n + 3,)."""
+
+    arm: Arm
+    readings: Readings
+    free: Mask
+    prior_mean: Array
+    prior_std: Array
+    loss: str
+    position_sigma: Array
+    unit: Array
+    """Natural units of the parameters: the size of a change that matters."""
+
+    @classmethod
+    def of(
+        cls,
+        arm: Arm,
+        readings: Readings,
+        unknown: Collection[str],
+        priors: Mapping[str, Prior],
+        loss: str,
+        position_sigma: ArrayLike,
+        unit: Array,
+    ) -> "Problem":
+        """Checked and in vector form; raises BadArray on a loss, family or shape that does not exist."""
+        if loss != "linear" and loss not in TUNING:
+            raise BadArray(f"loss is {loss!r}, expected linear, {' or '.join(TUNING)}")
+        noise = as_array("position_sigma", np.broadcast_to(position_sigma, (arm.n,)), (arm.n,))
+        mean, std = prior_vectors(arm.n, priors)
+        return cls(arm, readings, free_mask(arm.n, unknown), mean, std, loss, noise, unit)
+
+    def on(self, readings: Readings) -> "Problem":
+        """The same fitted to other readings."""
+        return replace(self, readings=readings)
+
+    @property
+    def reweighted(self) -> bool:
+        """Whether the weights depend on the parameters."""
+        return self.loss != "linear" or bool(self.position_sigma.any())
+
+    def cost(self, vector: Array, weight: list[Array]) -> float:
+        """Weighted sum of squares (priors included) at a parameter vector, with the weights of each block."""
+        parameters = Parameters.from_vector(vector, self.arm.n)
+        total = float(np.sum(self._prior_residual(vector) ** 2))
+        for block, block_weight in zip(self.readings.blocks(), weight, strict=True):
+            residual = (block.torque - predict(self.arm, parameters, block))[block.counted]
+            total += float(np.sum((residual * block_weight) ** 2))
+        return total
+
+    def weights(self, vector: Array, robust: bool = True) -> list[Array]:
+        """Weight of each counted reading, block by block: 1/σ with position noise, times the loss's root weight."""
+        parameters, weights = Parameters.from_vector(vector, self.arm.n), []
+        for block in self.readings.blocks():
+            variance = block.sigma[block.counted] ** 2
+            if not self.reweighted:
+                weights.append(1 / np.sqrt(variance))
+                continue
+            modelled, _, slope = predict_and_jacobian(self.arm, parameters, block)
+            weight = 1 / np.sqrt(variance + np.sum((slope * self.position_sigma) ** 2, axis=1))
+            size = np.abs(block.torque[block.counted] - modelled) * weight
+            weights.append(weight * np.sqrt(self._loss_weight(size)) if robust else weight)
+        return weights
+
+    def _loss_weight(self, size: Array) -> Array:
+        """ψ(r)/r of the loss at |r| in standard deviations."""
+        if self.loss == "linear":
+            return np.ones_like(size)
+        bound = TUNING[self.loss]
+        if self.loss == "huber":
+            return np.minimum(1.0, bound / np.maximum(size, bound))
+        return 1 / (1 + (size / bound) ** 2)
+
+    def _prior_residual(self, vector: Array) -> Array:
+        return ((self.prior_mean - vector) / self.prior_std)[self.free]
+
+    def factor(self, vector: Array, weight: list[Array]) -> tuple[Array, Array]:
+        """(R (p, p), Qᵀr (p,)) of the weighted Jacobian and residual, priors included."""
+        parameters, size = Parameters.from_vector(vector, self.arm.n), int(self.free.sum())
+        prior = np.diag(1 / self.prior_std[self.free])
+        triangle = np.column_stack([prior, self._prior_residual(vector)])
+        for block, block_weight in zip(self.readings.blocks(), weight, strict=True):
+            modelled, jacobian, _ = predict_and_jacobian(self.arm, parameters, block)
+            residual = block.torque[block.counted] - modelled
+            rows = np.column_stack([jacobian[:, self.free], residual]) * block_weight[:, None]
+            triangle = fold(triangle, rows)
+        square = np.zeros((size, size + 1))
+        square[: min(size, len(triangle))] = triangle[:size]
+        return square[:, :size], square[:, size]
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Where the iteration ended."""
+
+    vector: Array
+    information: Information
+    cost: float
+    chi2: float
+    dof: int
+    iterations: int
+    converged: bool
+
+
+def solve(problem: Problem, first: Parameters) -> Outcome:
+    """Minimise from `first`; directions that the rows do not determine are never moved along."""
+    vector, damping, converged = first.vector, 0.0, False
+    weight = problem.weights(vector)
+    cost = problem.cost(vector, weight)
+    iterations = 0
+    while iterations < MAX_ITERATIONS and not converged:
+        iterations += 1
+        triangle, target = problem.factor(vector, weight)
+        spectrum = Spectrum.of(triangle, problem.unit[problem.free])
+        along = spectrum.left.T @ target
+        gain = float(along @ along)
+        converged = gain <= (SETTLED if problem.reweighted else SETTLED / 100) * cost or cost <= EXACT * sum(
+            map(len, weight)
+        )
+        trial, trial_cost, damping = _step(problem, vector, weight, cost, spectrum, along, damping)
+        if trial is None:
+            converged = converged or gain <= STALLED * cost
+            break
+        vector, cost = trial, trial_cost
+        if problem.reweighted:
+            weight = problem.weights(vector)
+            cost = problem.cost(vector, weight)
+    return _finish(problem, vector, cost, iterations, converged)
+
+
+def _step(
+    problem: Problem, vector: Array, weight: list[Array], cost: float, spectrum: Spectrum, along: Array, damping: float
+) -> tuple[Array | None, float, float]:
+    """(Vector with a lower cost or None, its cost, damping for the next step)."""
+    weakest = float(spectrum.values.min(initial=np.inf)) ** 2
+    for _ in range(12):
+        shrunk = along * spectrum.values / (spectrum.values**2 + damping)
+        trial = vector.copy()
+        trial[problem.free] += problem.unit[problem.free] * (spectrum.right.T @ shrunk)
+        trial_cost = problem.cost(trial, weight)
+        if trial_cost < cost:
+            return trial, trial_cost, damping / 10 if damping > 1e-3 * weakest else 0.0
+        damping = max(10 * damping, 0.1 * weakest)
+    return None, cost, damping
+
+
+def _finish(problem: Problem, vector: Array, cost: float, iterations: int, converged: bool) -> Outcome:
+    """Covariance and goodness of fit at the end, from the weights without the loss."""
+    weight = problem.weights(vector, robust=False)
+    information = analyse(problem.factor(vector, weight)[0], problem.unit[problem.free])
+    residual = [
+        (block.torque - predict(problem.arm, Parameters.from_vector(vector, problem.arm.n), block))[block.counted]
+        for block in problem.readings.blocks()
+    ]
+    scaled = np.concatenate(residual) * np.concatenate(weight)
+    dof = len(scaled) - information.rank
+    if problem.loss != "linear":
+        factor = _robust_factor(problem, np.abs(scaled), information.rank)
+        information = replace(information, covariance=information.covariance * factor)
+    return Outcome(vector, information, cost, float(scaled @ scaled), dof, iterations, converged)
+
+
+def _robust_factor(problem: Problem, size: Array, rank: int) -> float:
+    """What a robust loss multiplies the covariance by: Huber's E[ψ²]/E[ψ']² at the residuals found."""
+    influence = size * problem._loss_weight(size)
+    bound = TUNING[problem.loss]
+    if problem.loss == "huber":
+        slope = (size < bound).astype(np.float64)
+    else:
+        scaled = (size / bound) ** 2
+        slope = (1 - scaled) / (1 + scaled) ** 2
+    return float(np.sum(influence**2) / max(1, len(size) - rank) / np.mean(slope) ** 2)

@@ -1,0 +1,115 @@
+"""Start of the global fit: the model solved in the reciprocal gains, in which it is linear (theory note, (L))."""
+
+import numpy as np
+
+from gcomp.arm.arm import Arm
+from gcomp.arm.mass_moments import payload_columns
+from gcomp.arrays import Array, Mask
+from gcomp.gravity.torque import gravity_regressor
+from gcomp.identify.block_qr import least_squares
+from gcomp.identify.identifiability import NULL_RATIO
+from gcomp.identify.natural_units import natural_units
+from gcomp.identify.parameters import Parameters, family_slices
+from gcomp.identify.readings import Readings
+from gcomp.identify.sensor_model import joint_positions
+
+SANE_GAIN_RATIO = 5.0
+"""A gain that comes out further than this factor from its start was not determined by its rows."""
+
+
+FACTORS = (1.0, 0.7, 1.4, 0.5, 2.0, -1.0, -0.7, -1.4, -0.5, -2.0)
+"""Common factors tried for such gains: position errors make (L) shrink κ towards zero, sign and ratios survive."""
+SMALLEST_RATIO = 1e-2
+"""Below this share of its start a κ does not even tell its sign."""
+
+
+def linear_start(
+    arm: Arm, readings: Readings, start: Parameters, free: Mask, *, keep_ratios: bool = False
+) -> Parameters:
+    """Gains, offsets, mass moments and load point that solve (L) at the start's position gains and offsets.
+
+    κ_i v − ω_i − Y_i (β + μ E_ρ ρ) = μ Y_i E_0 with κ = 1/gain, ω = offset/gain; what `free` (6n + 3,) holds fixed
+    stays as in `start`. Without any reference mass and with β unknown the equation has no scale: then the gain of the
+    joint whose torque varies most stays. Gains that their rows do not determine get the sign that fits and the common
+    factor that fits best. `keep_ratios` leaves only a common factor of the gains free.
+    """
+    places = family_slices(arm.n)
+    free_gain = free[places["gain"]].copy()
+    if free[places["beta"]].any() and not np.any(readings.load != 0):
+        free_gain[_strongest(readings)] = False
+    while True:
+        (kappa, omega, beta, rho), _ = _solve(arm, readings, start, free, free_gain, keep_ratios)
+        ratio = kappa * start.gain
+        lost = free_gain & ~((np.abs(ratio) > 1 / SANE_GAIN_RATIO) & (np.abs(ratio) < SANE_GAIN_RATIO))
+        if not lost.any():
+            break
+        free_gain &= ~lost
+        signed = np.where(ratio < -SMALLEST_RATIO, -1.0, 1.0)
+        tried = [_with_gain(start, np.where(lost, start.gain * signed * factor, start.gain)) for factor in FACTORS]
+        costs = [_solve(arm, readings, each, free, free_gain, keep_ratios)[1] for each in tried]
+        start = tried[int(np.argmin(costs))]
+    gain = np.where(free_gain, 1 / np.where(free_gain, kappa, 1.0), start.gain)
+    found = {"gain": gain, "offset": omega * gain, "beta": beta, "rho": rho}
+    vector = start.vector.copy()
+    for family, value in found.items():
+        vector[places[family]] = np.where(free[places[family]], value, getattr(start, family))
+    return Parameters.from_vector(vector, arm.n)
+
+
+def _solve(
+    arm: Arm, readings: Readings, start: Parameters, free: Mask, free_gain: Mask, keep_ratios: bool
+) -> tuple[list[Array], float]:
+    """([κ (n,), ω (n,), β (2n,), ρ (3,)] of least norm, zero where not free; norm of the weighted residual)."""
+    n = arm.n
+
+    def rows(block: Readings) -> Array:
+        row, joint = np.nonzero(block.counted)
+        columns, target = _linear_rows(arm, block, start, free, free_gain)
+        if keep_ratios:
+            columns[:, 0] = columns[:, :n] @ (1 / start.gain)
+            columns[:, 1:n] = 0.0
+        weight = np.abs(start.gain[joint]) / block.sigma[row, joint]
+        return np.column_stack([columns, target]) * weight[:, None]
+
+    unit, places = natural_units(arm, readings, start), family_slices(n)
+    unit = np.concatenate([1 / unit[places["gain"]], unit[places["offset"]], unit[places["beta"].start :]])
+    solution, residual = least_squares(map(rows, readings.blocks()), unit, rcond=NULL_RATIO)
+    if keep_ratios:
+        solution[:n] = np.where(free_gain, solution[0] / start.gain, 0.0)
+    return np.split(solution, [n, 2 * n, 4 * n]), residual
+
+
+def _with_gain(parameters: Parameters, gain: Array) -> Parameters:
+    """The same with other gains (n,)."""
+    vector = parameters.vector
+    vector[family_slices(len(gain))["gain"]] = gain
+    return Parameters.from_vector(vector, len(gain))
+
+
+def _linear_rows(arm: Arm, readings: Readings, start: Parameters, free: Mask, free_gain: Mask) -> tuple[Array, Array]:
+    """Columns (P, 4n + 3) of (κ, ω, β, ρ) and right-hand side (P,); columns that are not free are zero."""
+    n, places = arm.n, family_slices(arm.n)
+    row, joint = np.nonzero(readings.counted)
+    v, load = readings.torque[row, joint], readings.load[row]
+    regressor = gravity_regressor(arm, joint_positions(start, readings))[row, joint]
+    fixed, by_point = payload_columns(arm)
+    columns = np.zeros((len(row), 4 * n + 3))
+    pairs = np.arange(len(row))
+    columns[pairs, joint] = v
+    columns[pairs, n + joint] = -1.0
+    columns[:, 2 * n : 4 * n] = -regressor
+    columns[:, 4 * n :] = -load[:, None] * (regressor @ by_point)
+    target = load * (regressor @ fixed)
+    offset_known = ~free[places["offset"]]
+    columns[pairs, joint] -= np.where(offset_known, start.offset, 0.0)[joint]
+    is_free = np.concatenate([free_gain, ~offset_known, free[places["beta"]], free[places["rho"]]])
+    known = np.concatenate([1 / start.gain, np.zeros(n), start.beta, start.rho])
+    target -= columns[:, ~is_free] @ known[~is_free]
+    columns[:, ~is_free] = 0.0
+    return columns, target
+
+
+def _strongest(readings: Readings) -> int:
+    """The joint whose counted torque varies most against its noise."""
+    scaled = np.ma.masked_invalid(readings.torque / readings.sigma)
+    return int(np.argmax(scaled.std(axis=0).filled(0.0)))

@@ -1,0 +1,180 @@
+"""Faults between the simulated arm and its bus: stands in for the arm, frame by frame, once a fault is injected."""
+
+import math
+import struct
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+
+from sim_bus.bus.fault_kinds import Fault
+from sim_bus.node.pdo import Frame
+from sim_bus.simulated_arm import SimulatedArm
+
+ERROR_FLAG = 0x20000000
+"""Marks an error frame, as SocketCAN does; the class of error stands below it."""
+PROTOCOL_ERROR, BUS_OFF, RESTARTED = 0x08, 0x40, 0x100
+ABORT_CODE, STORM_CODE = 0x08000022, 0x7305
+BABBLE = (0x001, bytes(8))
+SERVICE, NODE = 0x780, 0x7F
+TPDO1, SDO_ANSWER, SDO_REQUEST = 0x180, 0x580, 0x600
+TO_NODES = (0x200, 0x300, 0x400, 0x500, SDO_REQUEST)
+"""Services of frames to one node: RPDO1 to 4 and SDO."""
+HOST_REFUSES = {
+    "bus.off": "bus-off: check wiring, termination and bit rate",
+    "bus.full": "transmit queue stays full: does any node acknowledge?",
+    "link.down": "cannot send: Network is down",
+}
+"""Faults of the host's own interface, and what a host is told that sends meanwhile."""
+
+
+class Injector:
+    """The arm's side of a faulty bus: on_frame(), advance() and `outbox` as a SimulatedArm has them."""
+
+    def __init__(self, arm: SimulatedArm, seed: int = 0) -> None:
+        """No fault yet; `seed` is of the faults that strike a share of frames."""
+        self.arm = arm
+        self.outbox, arm.outbox = arm.outbox, deque()
+        self.dropped = 0
+        """Frames that the host lost because its receive queue was full."""
+        self._sent = arm.outbox
+        self._random = np.random.default_rng((seed, 2))
+        self._planned: list[Fault] = []
+        self._until: dict[str, float] = {}
+        self._on: dict[tuple[str, int], float] = {}
+        self._owed: dict[tuple[str, int], float] = {}
+
+    def inject(self, fault: Fault) -> None:
+        """Let a fault happen now, or at its time."""
+        self._planned.append(fault)
+        self._planned.sort(key=lambda planned: planned.time)
+        self._begin()
+
+    def clear(self) -> None:
+        """End every fault."""
+        self._planned.clear()
+        for node in self.arm.nodes:
+            node.unplugged = False
+            self.arm.drives.refused_modes[node.place].clear()
+        if "bus.off" in self._until:
+            self._error(RESTARTED)
+        self._until.clear()
+        self._on.clear()
+
+    @property
+    def refusal(self) -> str:
+        """Why the host's interface takes no frame now; empty where it does."""
+        return next((words for fault, words in HOST_REFUSES.items() if fault in self._until), "")
+
+    # ---- as the arm
+
+    def on_frame(self, can_id: int, data: bytes) -> None:
+        """A frame from the host, as far as it gets there."""
+        self._begin()
+        if self.refusal:
+            return
+        place = self._place(can_id)
+        service = can_id & SERVICE
+        if place is not None and service in TO_NODES and self.arm.nodes[place].unplugged:
+            return
+        if place is not None and service == SDO_REQUEST and self._answered(place, data):
+            return
+        self.arm.on_frame(can_id, data)
+        self._carry()
+
+    def advance(self, duration: float) -> None:
+        """Let simulated time pass [s]."""
+        self._begin()
+        self.arm.advance(duration)
+        for (fault, place), rate in self._on.items():
+            if fault in ("node.babbling", "emcy.storm"):
+                self._owed[fault, place] = self._owed.get((fault, place), 0.0) + rate * duration
+                whole = int(self._owed[fault, place])
+                self._owed[fault, place] -= whole
+                node = self.arm.nodes[place].node_id
+                storm = (0x80 + node, struct.pack("<HB5x", STORM_CODE, 0x21))
+                self._sent.extend([BABBLE if fault == "node.babbling" else storm] * whole)
+        self._carry()
+        self._end()
+
+    # ---- inside
+
+    def _begin(self) -> None:
+        while self._planned and self._planned[0].time <= self.arm.time:
+            fault = self._planned.pop(0)
+            place = self.arm.names.index(fault.joint) if fault.joint else -1
+            self._start(fault, place)
+            self._carry()
+
+    def _start(self, fault: Fault, place: int) -> None:
+        arm = self.arm
+        once: dict[str, Callable[[], None]] = {
+            "node.reboot": lambda: arm.reboot(place),
+            "mode.refused": lambda: arm.drives.refused_modes[place].add(int(fault.amount)),
+            "clock.jump": lambda: arm.advance(fault.amount),
+        }
+        if fault.id in once:
+            once[fault.id]()
+        elif fault.id in HOST_REFUSES:
+            self._until[fault.id] = arm.time + fault.amount
+            if fault.id == "bus.off":
+                self._error(BUS_OFF)
+        elif fault.id == "node.silent":
+            arm.nodes[place].unplugged = True
+            self._until[fault.joint] = arm.time + fault.amount
+        else:
+            self._on[fault.id, place] = fault.amount
+
+    def _end(self) -> None:
+        for what in [what for what, until in self._until.items() if until <= self.arm.time + 1e-9]:
+            del self._until[what]
+            if what == "bus.off":
+                self._error(RESTARTED)
+            elif what in self.arm.names:
+                self.arm.nodes[self.arm.names.index(what)].unplugged = False
+
+    def _answered(self, place: int, request: bytes) -> bool:
+        """Whether the faults deal with an SDO request: by an abort, or by no answer."""
+        if ("sdo.abort", place) in self._on:
+            answer = struct.pack("<B3sI", 0x80, request[1:4].ljust(3, b"\0"), ABORT_CODE)
+            self._sent.append((SDO_ANSWER + self.arm.nodes[place].node_id, answer))
+            self._carry()
+            return True
+        return ("sdo.timeout", place) in self._on
+
+    def _carry(self) -> None:
+        """What the nodes sent, to the host, as far as it gets there and as it gets there."""
+        sent, lost = self._sent, bool(self.refusal)
+        most = self._on.get(("reader.slow", -1), math.inf)
+        while sent:
+            frame = sent.popleft()
+            for arriving in () if lost else self._arriving(*frame):
+                if len(self.outbox) < most:
+                    self.outbox.append(arriving)
+                else:
+                    self.dropped += 1
+
+    def _arriving(self, can_id: int, data: bytes) -> tuple[Frame, ...]:
+        place = self._place(can_id)
+        if place is None or can_id < 0x80:
+            return ((can_id, data),)
+        if self.arm.nodes[place].unplugged:
+            return ()
+        is_reading = can_id & SERVICE == TPDO1
+        if self._strikes("frame.corrupt", place):
+            return ((ERROR_FLAG | PROTOCOL_ERROR, bytes(8)),)
+        if is_reading and self._strikes("frame.short", place):
+            return ((can_id, data[:3]),)
+        if ("node.duplicate", place) in self._on:
+            return ((can_id, data), (can_id, bytes(len(data)) if is_reading else data))
+        return ((can_id, data),)
+
+    def _strikes(self, fault: str, place: int) -> bool:
+        share = self._on.get((fault, place))
+        return share is not None and self._random.random() < share
+
+    def _error(self, kind: int) -> None:
+        self.outbox.append((ERROR_FLAG | kind, bytes(8)))
+
+    def _place(self, can_id: int) -> int | None:
+        return self.arm.place_of.get(can_id & NODE)

@@ -1,0 +1,146 @@
+"""An in-process CAN bus with the simulated arm on it: SYNC advances the physics by one period, nothing ever sleeps."""
+
+from threading import RLock
+from typing import Any
+
+import can
+
+from armlink.arm_file import load_arm
+from armlink.errors import BusFault
+from sim_bus.bus.fault_injector import BUS_OFF, ERROR_FLAG, HOST_REFUSES, Injector
+from sim_bus.bus.fault_kinds import Fault, parse_fault
+from sim_bus.bus.wire_timing import Line, Wire
+from sim_bus.simulated_arm import SimulatedArm
+from sim_bus.truth import Truth
+
+SYNC_ID = 0x80
+
+
+class SimulatedClock:
+    """The simulated arm's time as a clock; sleeping lets the arm run."""
+
+    def __init__(self, bus: "LockStepBus", lock: RLock) -> None:
+        """The clock of the arm on `bus`, which `lock` guards."""
+        self._arm, self._bus, self._lock = bus.arm, bus, lock
+
+    def now(self) -> float:
+        """Simulated seconds since power-on."""
+        return self._arm.time
+
+    def sleep_until(self, instant: float) -> None:
+        """Let simulated time pass until `instant` [s]; at once where it is past."""
+        with self._lock:
+            if instant > self._arm.time + 1e-9:
+                self._bus.line.advance(instant - self._arm.time)
+
+
+class LockStepBus(can.BusABC):  # type: ignore[misc]
+    """One endpoint of a CAN bus whose other end is the arm. As a python-can interface: `armlink_sim:ARM`.
+
+    `recv` pops what the nodes sent; where there is nothing and `timeout` is positive, simulated time passes instead,
+    up to the first frame, and None is returned if none comes. A timeout of None is a second.
+
+    With `timing` frames take their time on a wire of `bitrate` [bit/s] (`sim_bus.bus.wire_timing`), else none.
+    """
+
+    def __init__(self, channel: Any = None, *, arm: SimulatedArm | None = None, seed: int = 0, **options: Any) -> None:
+        """On the arm given, or on a new one from the arm file (or bundled arm) `channel`. Raises BadInput."""
+        if arm is None:
+            described = load_arm(str(channel))
+            arm = SimulatedArm(described, Truth.of(described), seed)
+        self.arm = arm
+        self.line: Line = arm
+        """What stands between this end and the arm: the arm itself, faults, a wire."""
+        self.wire: Wire | None = None
+        self.errors = 0
+        """Error frames so far."""
+        self._injector: Injector | None = None
+        self._lock = RLock()
+        self.clock = SimulatedClock(self, self._lock)
+        self.channel_info = f"simulated arm {arm.arm.name}"
+        bitrate = options.pop("bitrate", arm.arm.require_link().bus.bitrate)
+        if options.pop("timing", False):
+            self.line = self.wire = Wire(arm, bitrate)
+        self._outbox = self.line.outbox
+        super().__init__(channel=channel, **options)
+
+    @property
+    def dropped(self) -> int:
+        """Frames that were lost because nobody took them in time."""
+        return self._injector.dropped if self._injector else 0
+
+    def inject(self, fault: Fault | str) -> None:
+        """Let a fault happen, as `armlink sim --fault` writes it. Raises BadInput."""
+        with self._lock:
+            self._faults().inject(parse_fault(fault, self.arm.names) if isinstance(fault, str) else fault)
+
+    def clear_faults(self) -> None:
+        """End every fault."""
+        with self._lock:
+            self._faults().clear()
+
+    def _faults(self) -> Injector:
+        if self._injector is None:
+            self._injector = Injector(self.arm)
+            if self.wire is None:
+                self.line = self._injector
+            else:
+                self.wire.line = self._injector
+        return self._injector
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Deliver a frame to all nodes; a SYNC also advances the arm by one period."""
+        try:
+            self.put(msg.arbitration_id, bytes(msg.data))
+        except BusFault as error:
+            raise can.CanOperationError(str(error)) from None
+
+    def put(self, can_id: int, data: bytes) -> None:
+        """As send, without a message object. Raises BusFault where the interface takes no frame."""
+        line = self.line
+        with self._lock:
+            if self._injector and (why := self._injector.refusal):
+                raise BusFault(f"bus {self.channel_info}: {why}")
+            line.on_frame(can_id, data)
+            if can_id == SYNC_ID:
+                line.advance(self.arm.period)
+
+    def take(self, timeout: float = 0.0) -> tuple[int, bytes] | None:
+        """As recv, without a message object; error frames are counted. Raises BusFault where one says bus-off."""
+        while True:
+            frame = self._next(timeout)
+            if frame is None or not frame[0] & ERROR_FLAG:
+                return frame
+            self.errors += 1
+            if frame[0] & BUS_OFF:
+                raise BusFault(f"bus {self.channel_info}: {HOST_REFUSES['bus.off']}")
+
+    def _next(self, timeout: float) -> tuple[int, bytes] | None:
+        if not self._outbox and timeout > 0:
+            self._wait(timeout)
+        return self._outbox.popleft() if self._outbox else None
+
+    def _wait(self, timeout: float) -> None:
+        """Let time pass until a frame comes; another thread may send meanwhile, as python-can's Notifier has it."""
+        deadline = self.arm.time + timeout
+        while not self._outbox and self.arm.time < deadline - 1e-9:
+            with self._lock:
+                self.line.advance(min(self.arm.period, deadline - self.arm.time))
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """The next frame that a node sent, or None."""
+        frame = self._next(1.0 if timeout is None else timeout)
+        if frame is None:
+            return None
+        return can.Message(
+            arbitration_id=frame[0] & ~ERROR_FLAG,
+            data=frame[1],
+            is_extended_id=False,
+            is_error_frame=bool(frame[0] & ERROR_FLAG),
+            timestamp=self.arm.time,
+            is_rx=True,
+            check=False,
+        )
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        return self.recv(timeout), True

@@ -1,0 +1,173 @@
+"""The joints' drives as CiA 402 sees them: states, modes, readings; for all joints at once."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armlink.arm_file import ArmFile
+from sim_bus.node.cia402 import STATUS, State, command, next_state
+from sim_bus.node.object_arrays import Signals
+from sim_bus.node.position_torque_loops import (
+    CSP,
+    CST,
+    CSV,
+    FEED,
+    KINDS,
+    OFF,
+    POSITION,
+    PROFILE_POSITION,
+    PROFILE_TORQUE,
+    Loops,
+)
+from sim_bus.physics.plant import Plant
+from sim_bus.physics.sensors import Sensors
+
+Array = NDArray[np.float64]
+SUPPORTED_MODES = sum(1 << (mode - 1) for mode in (PROFILE_POSITION, PROFILE_TORQUE, CSP, CSV, CST))
+"""6502h."""
+VELOCITY_FILTER = 0.008
+"""Time constant of the velocity reading's low pass [s]."""
+REMOTE, INTERNAL_LIMIT, FOLLOWS = 0x0210, 0x0800, 0x1000
+FOLLOWING_ERROR = 0x8611
+UNWATCHED = 0xFFFFFFFF
+"""6065h: following errors are not watched."""
+
+
+class Drives:
+    """All joints' drives; arrays (n,)."""
+
+    def __init__(self, arm: ArmFile, plant: Plant, sensors: Sensors, signals: Signals) -> None:
+        """Switched off, at the plant's present position."""
+        self.n = n = plant.n
+        self._plant, self._sensors = plant, sensors
+        self.loops = Loops(arm, plant, sensors, signals)
+        self.rated = self.loops.rated
+        self.state = [State.SWITCH_ON_DISABLED] * n
+        self.quick_stop_option = [6] * n
+        self.following_window = np.full(n, np.inf)
+        """6065h [rad]."""
+        self.refused_modes: list[set[int]] = [set() for _ in range(n)]
+        """Modes that each drive does not enter."""
+        self.gain, self.offset = np.ones(n), np.zeros(n)
+        """Calibration in force (2100h)."""
+        self.on_state: Callable[[int], None] = lambda joint: None
+        self.on_fault: Callable[[int, int], None] = lambda joint, code: None
+        self._words = [0] * n
+        self._status = np.full(n, STATUS[State.SWITCH_ON_DISABLED] | REMOTE, np.uint16)
+        self._counts, self._velocity = sensors.position_counts(plant.motor_position), np.zeros(n)
+        self._position_out, self._velocity_out = signals[0x6064, 0], signals[0x606C, 0]
+        self._reading_out, self._motor_out = signals[0x2100, 1], signals[0x6077, 0]
+        self._status_out, self._mode_out = signals[0x6041, 0], signals[0x6061, 0]
+        self.error_code = signals[0x603F, 0]
+        self._word_in, self._mode_in, self._limit_in = signals[0x6040, 0], signals[0x6060, 0], signals[0x6072, 0]
+        self._seen_words, self._seen_modes = self._word_in.copy(), self._mode_in.copy()
+        self._seen_limit = self._limit_in.copy()
+        self._user_per_count = FEED / sensors.increments
+        self._last_elapsed, self._share = 0.0, 0.0
+
+    # ---- readings
+
+    def sample(self, time: float, elapsed: float) -> None:
+        """Read the sensors at `time` [s], `elapsed` after the last time, into the signals."""
+        plant = self._plant
+        counts = self._sensors.position_counts(plant.motor_position)
+        if elapsed > 0:
+            if elapsed != self._last_elapsed:
+                self._last_elapsed, self._share = elapsed, float(1.0 - np.exp(-elapsed / VELOCITY_FILTER))
+            self._velocity += self._share * ((counts - self._counts) / elapsed - self._velocity)
+            self._counts = counts
+            self._velocity_out[:] = np.rint(self._velocity * self._user_per_count)
+        torque = (self._sensors.torque(plant.link_torque, time) - self.offset) / self.gain
+        motor = plant.drive_torque
+        self._position_out[:] = np.rint(counts * self._user_per_count)
+        self._reading_out[:] = np.rint(torque * 1e6)
+        self._motor_out[:] = np.rint(motor * (1000 / self.rated))
+        limited = np.abs(motor) >= self.loops.limit
+        self._status_out[:] = (
+            self._status | limited * np.uint16(INTERNAL_LIMIT) if np.count_nonzero(limited) else self._status
+        )
+
+    # ---- commands
+
+    def take_commands(self) -> None:
+        """Act on new control words, modes and limits in the signals."""
+        if self._limit_in.tobytes() != self._seen_limit.tobytes():
+            self._seen_limit[:] = self._limit_in
+            self.loops.reconfigure()
+        if self._mode_in.tobytes() != self._seen_modes.tobytes():
+            for joint in np.flatnonzero(self._mode_in != self._seen_modes):
+                self._select_mode(int(joint))
+            self._seen_modes[:] = self._mode_in
+        if self._word_in.tobytes() != self._seen_words.tobytes():
+            for joint in np.flatnonzero(self._word_in != self._seen_words):
+                self._control(int(joint), int(self._word_in[joint]))
+            self._seen_words[:] = self._word_in
+
+    def _control(self, joint: int, word: int) -> None:
+        asked = command(word, self._words[joint])
+        self._words[joint] = word
+        state = next_state(self.state[joint], asked)
+        if self.state[joint] is State.ENABLED and state is State.QUICK_STOP:
+            self.quick_stop(joint)
+        elif state is not self.state[joint]:
+            self.enter(joint, state)
+
+    def enter(self, joint: int, state: State) -> None:
+        """Go to `state`: the power stage follows, the status word too."""
+        self.state[joint] = state
+        mode = int(self.loops.mode[joint])
+        if state is State.ENABLED:
+            self.loops.start(joint, KINDS.get(mode, POSITION), mode)
+        elif state is not State.QUICK_STOP:
+            self.loops.start(joint, OFF, mode)
+        if state is State.SWITCH_ON_DISABLED:
+            self.error_code[joint] = 0
+        self._update_status(joint)
+        self.on_state(joint)
+
+    def quick_stop(self, joint: int) -> None:
+        """Quick stop an enabled drive as 605Ah says: 0 disables; 1, 2 stop then disable; 5 to 8 stop and hold."""
+        if self.quick_stop_option[joint] == 0:
+            self.enter(joint, State.SWITCH_ON_DISABLED)
+            return
+        self.loops.stop(joint)
+        self.enter(joint, State.QUICK_STOP)
+
+    def fault(self, joint: int, code: int) -> None:
+        """Go to fault with error code `code` (603Fh): the torque goes, the brake closes."""
+        self.enter(joint, State.FAULT)
+        self.error_code[joint] = code
+        self.on_fault(joint, code)
+
+    def watch(self) -> None:
+        """What the drives themselves watch: following error (6065h), and the end of a quick stop."""
+        error = self.loops.following_error
+        for joint in np.flatnonzero(np.abs(error) > self.following_window):
+            if self.state[joint] is State.ENABLED:
+                self.fault(int(joint), FOLLOWING_ERROR)
+        for joint in np.flatnonzero(self.loops.stopping):
+            if self.quick_stop_option[joint] < 5 and self.loops.stopped(int(joint)):
+                self.enter(int(joint), State.SWITCH_ON_DISABLED)
+
+    @property
+    def needs_watch(self) -> bool:
+        """Whether watch() has anything to do."""
+        return bool(self.loops.stopping.any() or np.isfinite(self.following_window).any())
+
+    def _select_mode(self, joint: int) -> None:
+        """Enter the mode asked for; an unsupported one is displayed as 0 and holds the position."""
+        asked = int(self._mode_in[joint])
+        mode = asked if asked in KINDS and asked not in self.refused_modes[joint] else 0
+        self._mode_out[joint] = mode
+        self.loops.mode[joint] = mode
+        if self.state[joint] is State.ENABLED:
+            self.loops.start(joint, KINDS.get(mode, POSITION), mode)
+        self._update_status(joint)
+
+    def _update_status(self, joint: int) -> None:
+        word = STATUS[self.state[joint]] | REMOTE
+        if self.state[joint] is State.ENABLED and self.loops.mode[joint]:
+            word |= FOLLOWS
+        self._status[joint] = word
+        self._status_out[joint] = word

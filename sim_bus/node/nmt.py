@@ -1,0 +1,48 @@
+"""Network management of the joints' nodes (CiA 301, 7.3.2): start, stop, pre-operational, the two resets."""
+
+from collections.abc import Callable
+
+from sim_bus.node.cia402 import State
+from sim_bus.node.drives import Drives
+from sim_bus.node.node import OPERATIONAL, PRE_OPERATIONAL, STOPPED, Node
+from sim_bus.node.supervision import Supervision
+
+RESET_NODE, RESET_COMMUNICATION = 0x81, 0x82
+STATES = {0x01: OPERATIONAL, 0x02: STOPPED, 0x80: PRE_OPERATIONAL}
+
+
+class NetworkManagement:
+    """NMT states of all nodes; `operational[j]` tells the process data's side which may use PDOs."""
+
+    def __init__(
+        self, nodes: list[Node], drives: Drives, supervision: Supervision, apply: Callable[[Node], None]
+    ) -> None:
+        """`apply` brings a node's objects into force after a reset."""
+        self._nodes, self._drives, self._supervision, self._apply = nodes, drives, supervision, apply
+        self.operational = bytearray(len(nodes))
+
+    def frame(self, data: bytes, time: float) -> None:
+        """An NMT command."""
+        if len(data) < 2:
+            return
+        for node in self._nodes:
+            if data[1] in (0, node.node_id) and not node.unplugged:
+                self.command(node, data[0], time)
+
+    def command(self, node: Node, asked: int, time: float) -> None:
+        """Bring one node into the state asked for."""
+        if asked in (RESET_NODE, RESET_COMMUNICATION):
+            if asked == RESET_NODE:
+                self._drives.enter(node.place, State.SWITCH_ON_DISABLED)
+            node.reset(communication_only=asked == RESET_COMMUNICATION)
+            self._apply(node)
+            self._drives.take_commands()
+        elif asked in STATES:
+            node.nmt = STATES[asked]
+        self.operational[node.place] = node.nmt == OPERATIONAL
+        if node.nmt != OPERATIONAL:
+            self._supervision.left_operational(node, time)
+
+    def update(self) -> None:
+        """Take over what the nodes did by themselves (1029h)."""
+        self.operational[:] = bytes(node.nmt == OPERATIONAL for node in self._nodes)

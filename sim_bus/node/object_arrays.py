@@ -1,0 +1,54 @@
+"""The objects of all joints that PDOs can carry, as one array per object: the cyclic path works on them whole."""
+
+from functools import cache
+from typing import Any
+
+import canopen
+import numpy as np
+from canopen.objectdictionary import ODVariable
+from numpy.typing import NDArray
+
+from armlink.canopen.eds_file import bundled_path
+
+DTYPES = {0x02: "<i1", 0x03: "<i2", 0x04: "<i4", 0x05: "<u1", 0x06: "<u2", 0x07: "<u4", 0x08: "<f4"}
+"""numpy types of CiA 301 data types."""
+Key = tuple[int, int]
+
+
+@cache
+def data_sheet() -> canopen.ObjectDictionary:
+    """The joint's EDS, for node id 0: an entry whose `relative` is true adds the node's own."""
+    return canopen.import_od(bundled_path(), node_id=0)
+
+
+def variable(index: int, sub: int) -> ODVariable | None:
+    """The EDS's entry, or None where there is none."""
+    item = data_sheet().get(index)
+    if item is None or isinstance(item, ODVariable):
+        return item if sub == 0 else None
+    try:
+        return item.subindices[sub]
+    except KeyError:
+        return None
+
+
+class Signals:
+    """`values[index, sub]` is an (n,) array in the object's own type; the same arrays stay for good."""
+
+    def __init__(self, n: int) -> None:
+        """All joints at the EDS's defaults."""
+        entries = [
+            entry
+            for item in data_sheet().values()
+            for entry in ([item] if isinstance(item, ODVariable) else item.subindices.values())
+            if entry.pdo_mappable
+        ]
+        self.values: dict[Key, NDArray[Any]] = {
+            (entry.index, entry.subindex): np.full(n, entry.default or 0, DTYPES[entry.data_type]) for entry in entries
+        }
+
+    def __getitem__(self, key: Key) -> NDArray[Any]:
+        return self.values[key]
+
+    def __contains__(self, key: Key) -> bool:
+        return key in self.values

@@ -1,0 +1,192 @@
+"""The drives' torque and position loops, for all joints at once.
+
+The motor torque is `drive − stiffness·q − damping·q̇`, clamped to the max torque (6072h); the plant evaluates it at
+every step of the physics. `drive` is the target torque in torque modes and
+`stiffness·target + damping·target rate + integral + feed-forward` in position modes. The integrator rests within a dead
+band and at the clamp, so that it neither hunts under stiction nor winds up on a stop.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armlink.arm_file import ArmFile
+from sim_bus.node.object_arrays import Signals
+from sim_bus.physics.plant import Plant
+from sim_bus.physics.sensors import Sensors
+from sim_bus.sim_section import sim_section
+
+Array = NDArray[np.float64]
+FEED = 1 << 20
+"""User units a joint revolution (6092h)."""
+UNIT = 2 * np.pi / FEED
+OFF, TORQUE, POSITION = 0, 1, 2
+PROFILE_POSITION, PROFILE_TORQUE, CSP, CSV, CST = 1, 4, 8, 9, 10
+KINDS = {PROFILE_POSITION: POSITION, PROFILE_TORQUE: TORQUE, CSP: POSITION, CSV: POSITION, CST: TORQUE}
+LATE_SHARE = 0.5
+"""Most of a motor's inertia that damping may amount to, times the motor's lateness."""
+INTEGRAL_SHARE = 0.3
+"""Integral action: stiffness · bandwidth · this."""
+TUNING_POSES = 50
+"""The loops are tuned for the largest inertia among so many poses, so that they are stable in all of them."""
+SPARE_ACCELERATION = 100.0
+"""The loops are tuned for the inertia of the bare arm plus what rated torque accelerates by this much [rad/s²]."""
+
+
+class Loops:
+    """Targets and integrators; arrays (n,)."""
+
+    def __init__(self, arm: ArmFile, plant: Plant, sensors: Sensors, signals: Signals) -> None:
+        """No joint powered."""
+        section, self.n = sim_section(arm).servo, plant.n
+        self._plant, self._sensors = plant, sensors
+        self.rated = np.array([joint.rated_torque for joint in arm.require_link().joints])
+        self._per_mille = self.rated / 1000
+        poses = np.random.default_rng(0).uniform(plant.lower, plant.upper, (TUNING_POSES, self.n))
+        inertia = np.max([np.diag(plant.inertia(pose)) for pose in poses], axis=0) + self.rated / SPARE_ACCELERATION
+        self._inertia, self._damping_ratio = inertia, section.damping
+        self._deadband, self.deceleration = section.deadband, np.full(self.n, section.quick_stop_deceleration)
+        self._with_brake, self._bandwidth = section.brake, section.bandwidth
+        self.kind, self.mode = np.zeros(self.n, int), np.zeros(self.n, int)
+        self.stopping = np.zeros(self.n, bool)
+        self.limit = np.zeros(self.n)
+        """Max torque in force [N·m]."""
+        self._torque, self._target, self._rate = np.zeros(self.n), plant.motor_position, np.zeros(self.n)
+        self._integral = np.zeros(self.n)
+        self._fresh: dict[int, NDArray[np.bool_]] = {
+            index: np.zeros(self.n, bool) for index in (0x6071, 0x607A, 0x60FF)
+        }
+        self._torque_in, self._position_in, self._velocity_in = (signals[index, 0] for index in self._fresh)
+        self._feed_forward_in, self._profile_velocity = signals[0x60B2, 0], signals[0x6081, 0]
+        self._profile_acceleration, self._torque_slope = signals[0x6083, 0], signals[0x6087, 0]
+        self._max_torque_in = signals[0x6072, 0]
+        self.interpolation = np.zeros(self.n)
+        """60C2h: time over which a cyclic position target is approached [s]."""
+        self.lowest, self.highest = np.full(self.n, -np.inf), np.full(self.n, np.inf)
+        """Software position limits (607Dh) in user units."""
+        self.reconfigure()
+
+    def fresh(self, index: int, rows: NDArray[np.intp] | int) -> None:
+        """Targets in object `index` came for the joints `rows`: from now on they count."""
+        waiting = self._fresh[index]
+        if not waiting[rows].all():
+            waiting[rows] = True
+            self._select()
+
+    def start(self, joint: int, kind: int, mode: int) -> None:
+        """Change a joint's loop without a bump: from the torque it now transmits and the position it now has."""
+        plant = self._plant
+        powered = self.kind[joint] != OFF or not self._with_brake
+        torque = float((plant.drive_torque if powered else plant.link_torque)[joint])
+        velocity = float(plant.motor_velocity[joint])
+        self._torque[joint] = torque if kind == TORQUE else 0.0
+        self._target[joint], self._rate[joint] = plant.motor_position[joint], 0.0
+        self.kind[joint], self.mode[joint], self.stopping[joint] = kind, mode, False
+        for waiting in self._fresh.values():
+            waiting[joint] = False
+        self.reconfigure()
+        self._integral[joint] = torque + self._d[joint] * velocity if kind == POSITION else 0.0
+
+    def stop(self, joint: int) -> None:
+        """Brake a joint to rest with its quick stop deceleration and hold it there."""
+        velocity = self._plant.motor_velocity[joint]
+        self.start(joint, POSITION, int(self.mode[joint]))
+        self._rate[joint] = velocity
+        self._integral[joint] -= self._d[joint] * velocity
+        self.stopping[joint] = True
+        self._select()
+
+    def stopped(self, joint: int) -> bool:
+        """Whether a stopping joint's ramp has come to rest."""
+        return bool(self.stopping[joint] and self._rate[joint] == 0.0)
+
+    @property
+    def following_error(self) -> Array:
+        """How far position-controlled joints are from their targets [rad]; 0 for the others."""
+        return np.where(self.kind == POSITION, self._target - self._plant.motor_position, 0.0)
+
+    def reconfigure(self) -> None:
+        """Pass modes and limits on to the plant."""
+        self.limit = self._max_torque_in * self._per_mille
+        closed, bandwidth = self.kind == POSITION, self._stable_bandwidth()
+        self._closed = closed.astype(float)
+        self._k = self._inertia * bandwidth**2 * self._closed
+        self._d = 2 * self._damping_ratio * self._inertia * bandwidth * self._closed
+        self._ki = INTEGRAL_SHARE * bandwidth * self._k
+        self._powered = self.kind != OFF
+        self._fed_forward = self._per_mille * self._powered
+        self._plant.set_servo(self._k, self._d, np.where(self._powered, self.limit, 0.0))
+        if self._with_brake:
+            self._plant.set_brakes(~self._powered)
+        self._select()
+
+    def _stable_bandwidth(self) -> Array:
+        """The section's bandwidth, or less where the motor is late for what it turns at least."""
+        turned = np.minimum(self._inertia, self._plant.rotor_inertia)
+        damped = 2 * self._damping_ratio * self._inertia
+        most = LATE_SHARE * turned / (damped * np.maximum(self._plant.lateness, 1e-9))
+        return np.asarray(np.minimum(most, self._bandwidth))
+
+    def _select(self) -> None:
+        """Which joints follow which target."""
+        torque, position, velocity = self._fresh.values()
+        free = ~self.stopping
+        self._cyclic_torque = (self.mode == CST) & (self.kind == TORQUE) & torque
+        self._profile_torque = (self.mode == PROFILE_TORQUE) & (self.kind == TORQUE) & torque
+        self._cyclic_position = (self.mode == CSP) & (self.kind == POSITION) & position & free
+        self._profile_position = (self.mode == PROFILE_POSITION) & (self.kind == POSITION) & position & free
+        self._cyclic_velocity = (self.mode == CSV) & (self.kind == POSITION) & velocity & free
+        self._any_closed = bool(self._closed.any())
+        self._any_stopping = bool(self.stopping.any())
+        self._any_position = bool(self._cyclic_position.any())
+        self._any_slow = bool((self._profile_torque | self._profile_position | self._cyclic_velocity).any())
+
+    def advance(self, duration: float, synchronous: bool) -> None:
+        """Run loops and plant for `duration` [s]; `synchronous` where it follows a SYNC, which brings new targets."""
+        np.copyto(self._torque, self._torque_in * self._per_mille, where=self._cyclic_torque)
+        if self._any_slow:
+            self._follow_profiles(duration)
+        level = self._torque + self._feed_forward_in * self._fed_forward
+        if not self._any_closed:
+            self._plant.step(level, level, duration)
+            return
+        self._plan(duration, synchronous)
+        error = (self._target - self._plant.motor_position) * self._closed
+        error *= np.abs(error) > self._deadband
+        self._integral += self._ki * error * duration
+        np.minimum(np.maximum(self._integral, -self.limit, out=self._integral), self.limit, out=self._integral)
+        level += self._k * self._target + self._d * self._rate + self._integral
+        if np.count_nonzero(self._rate):
+            move = self._rate * duration
+            self._plant.step(level, level + self._k * move, duration)
+            self._target += move
+        else:
+            self._plant.step(level, level, duration)
+
+    def _plan(self, duration: float, synchronous: bool) -> None:
+        """Rates at which the position targets move during the next `duration`."""
+        if self._any_position:
+            if synchronous:
+                wanted = np.minimum(np.maximum(self._position_in, self.lowest), self.highest)
+                rate = (self._sensors.angle_of(wanted * UNIT) - self._target) / np.maximum(self.interpolation, duration)
+                np.copyto(self._rate, rate, where=self._cyclic_position)
+            else:
+                self._rate[self._cyclic_position] = 0.0
+        if self._any_stopping:
+            slower = np.maximum(np.abs(self._rate) - self.deceleration * duration, 0.0) * np.sign(self._rate)
+            np.copyto(self._rate, slower, where=self.stopping)
+
+    def _follow_profiles(self, duration: float) -> None:
+        """Profile torque (slope 6087h), profile position (6081h, 6083h) and cyclic velocity (60FFh)."""
+        step = self._torque_slope * (self._per_mille * duration)
+        wanted = self._torque_in * self._per_mille
+        ramped = self._torque + np.clip(wanted - self._torque, -step, step)
+        np.copyto(self._torque, ramped, where=self._profile_torque)
+        gain = self._sensors.position_gain
+        np.copyto(self._rate, self._velocity_in * (UNIT * gain), where=self._cyclic_velocity)
+        target = np.minimum(np.maximum(self._position_in, self.lowest), self.highest)
+        way = self._sensors.angle_of(target * UNIT) - self._target
+        acceleration = self._profile_acceleration * UNIT
+        speed = np.minimum(np.abs(self._rate) + acceleration * duration, self._profile_velocity * UNIT)
+        speed = np.minimum(speed, np.sqrt(2 * acceleration * np.abs(way)))
+        speed = np.minimum(speed, np.abs(way) / duration)
+        np.copyto(self._rate, np.sign(way) * speed, where=self._profile_position)

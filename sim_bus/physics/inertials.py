@@ -1,0 +1,68 @@
+"""Masses, centres of mass and inertias of the links in the physics: nominal, with effects, with what is attached."""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_bus.effects.state import Imperfections
+from sim_bus.physics.mjcf import TINY_INERTIA
+
+Array = NDArray[np.float64]
+
+
+class Inertials:
+    """Keeps the nominal values of a compiled model and writes changed ones into it."""
+
+    def __init__(self, model: Any, bodies: list[int], payload_body: int) -> None:
+        """`bodies` carry the links, base to tip; `payload_body` what is attached."""
+        self._model, self._bodies, self._payload = model, bodies, payload_body
+        self._mass: Array = model.body_mass.copy()
+        self._com: Array = model.body_ipos.copy()
+        self._inertia = _full_inertia(model)
+
+    def apply(self, state: Imperfections, attached: Array) -> None:
+        """Set the model to nominal, plus the effects, plus `attached` (mass [kg], point in the last bar frame [m])."""
+        model, bodies = self._model, self._bodies
+        mass, com, inertia = self._mass.copy(), self._com.copy(), self._inertia.copy()
+        com[bodies] += state.mass_moment / mass[bodies, None]
+        inertia[bodies] += state.inertia
+        points = [item for item in (state.payload, attached) if item[0] != 0.0]
+        load = TINY_INERTIA + sum(item[0] for item in points)
+        mass[self._payload] = load
+        com[self._payload] = sum((item[0] * item[1:] for item in points), np.zeros(3)) / load
+        inertia[self._payload] = np.array([1, 1, 1, 0, 0, 0]) * TINY_INERTIA
+        for item in points:
+            inertia[self._payload] += item[0] * _point_inertia(item[1:] - com[self._payload])
+        model.body_mass[:], model.body_ipos[:] = mass, com
+        for body in (*bodies, self._payload):
+            model.body_inertia[body], model.body_iquat[body] = _principal(inertia[body])
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def _full_inertia(model: mujoco.MjModel) -> Array:
+    """Inertias about the centres of mass along the bodies' axes (bodies, 6): xx, yy, zz, xy, xz, yz."""
+    full, turn = np.empty((model.nbody, 6)), np.empty(9)
+    for body in range(model.nbody):
+        mujoco.mju_quat2Mat(turn, model.body_iquat[body])
+        axes = turn.reshape(3, 3)
+        matrix = axes @ np.diag(model.body_inertia[body]) @ axes.T
+        full[body] = matrix[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    return full
+
+
+def _principal(inertia: Array) -> tuple[Array, Array]:
+    """Principal moments and the quaternion of the principal axes."""
+    xx, yy, zz, xy, xz, yz = inertia
+    moments, axes = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, axes.ravel())
+    return moments, quaternion
+
+
+def _point_inertia(arm: Array) -> Array:
+    x, y, z = arm
+    return np.array([y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z])

@@ -1,0 +1,118 @@
+"""Torque and position sensors of all joints: gain, offset, imperfections, noise, quantisation."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armlink.arm_file import ArmFile
+from sim_bus.effects.state import Imperfections
+from sim_bus.sim_section import NOISE_SHARE, sim_section
+from sim_bus.truth import Truth
+
+Array = NDArray[np.float64]
+TORQUE_RANGE = 2.0
+"""The torque sensors saturate at this many rated torques."""
+NOISE_BLOCK = 512
+
+
+class Sensors:
+    """What the joints' sensors read; all arrays (n,)."""
+
+    def __init__(self, arm: ArmFile, truth: Truth, imperfections: Imperfections, seed: int) -> None:
+        """Sensors of `truth`; `seed` is the noise's."""
+        section, link = sim_section(arm).sensors, arm.require_link()
+        rated = np.array([joint.rated_torque for joint in link.joints])
+        n = len(rated)
+        bits = np.broadcast_to(np.array(section.bits), n)
+        self.noise = NOISE_SHARE * rated if section.noise is None else np.array(section.noise)
+        self.torque_limit = TORQUE_RANGE * rated
+        self.torque_step = 2 * self.torque_limit / 2.0**bits
+        self.increments = (2**bits).astype(int)
+        self.position_step = 2 * np.pi / 2.0**bits
+        self._truth = truth
+        self._random = np.random.default_rng((seed, 1))
+        self._block, self._next = np.empty((NOISE_BLOCK, n)), NOISE_BLOCK
+        self._drift_gain, self._drift_offset = np.ones(n), np.zeros(n)
+        self._play = np.zeros(n)
+        self._late: list[tuple[float, Array]] = []
+        self.set_imperfections(imperfections)
+
+    def set_imperfections(self, imperfections: Imperfections) -> None:
+        """Take over the sensors' part of `imperfections`."""
+        self._imperfections = state = imperfections
+        self.gain = self._truth.gain * state.torque_gain * self._drift_gain
+        self.offset = self._truth.offset + state.torque_offset + self._drift_offset
+        self.position_gain = self._truth.position_gain * state.position_gain
+        self.position_offset = self._truth.position_offset + state.position_offset
+        self._bent = bool(
+            state.crosstalk.any()
+            or state.hysteresis.any()
+            or state.deadband.any()
+            or state.torque_drift.any()
+            or np.isfinite(state.torque_saturation).any()
+        )
+        self._delayed = bool(state.torque_delay.any())
+        self._eccentric = bool(state.eccentricity.any())
+
+    def drift(self, joint: int, gain: float, offset: float) -> None:
+        """From now on the torque sensor's gain is `gain` times as large and its offset `offset` [N·m] larger."""
+        self._drift_gain[joint] *= gain
+        self._drift_offset[joint] += offset
+        self.set_imperfections(self._imperfections)
+
+    def torque(self, link_torque: Array, time: float) -> Array:
+        """The raw readings `v` [N·m] of the transmitted torques at `time` [s]."""
+        if self._delayed:
+            link_torque = self._delay(link_torque, time)
+        if self._bent:
+            link_torque = self._bend(link_torque)
+        reading = self.gain * link_torque + self.offset
+        if self._bent:
+            reading += self._imperfections.torque_drift * time
+        if self._next == NOISE_BLOCK:
+            self._block = self.noise * self._random.standard_normal(self._block.shape)
+            self._next = 0
+        reading += self._block[self._next]
+        self._next += 1
+        np.maximum(np.minimum(reading, self.torque_limit, out=reading), -self.torque_limit, out=reading)
+        counts: Array = np.rint(reading / self.torque_step)
+        return counts * self.torque_step
+
+    def position_counts(self, angle: Array) -> Array:
+        """The readings `φ` of true angles in the encoders' whole increments."""
+        return np.rint(self.reading_of(angle) / self.position_step)
+
+    def reading_of(self, angle: Array) -> Array:
+        """The exact `φ` with `θ = position_gain·φ + position_offset + amplitude·sin(φ + phase)`."""
+        reading = (angle - self.position_offset) / self.position_gain
+        if self._eccentric:
+            amplitude, phase = self._imperfections.eccentricity.T
+            for _ in range(8):  # contracts by amplitude / gain each time
+                bent = amplitude * np.sin(reading + phase)
+                reading = (angle - self.position_offset - bent) / self.position_gain
+        return reading
+
+    def angle_of(self, reading: Array) -> Array:
+        """The true angle θ that shows as `reading`."""
+        angle = self.position_gain * reading + self.position_offset
+        if self._eccentric:
+            amplitude, phase = self._imperfections.eccentricity.T
+            angle = angle + amplitude * np.sin(reading + phase)
+        return angle
+
+    def _bend(self, torque: Array) -> Array:
+        state = self._imperfections
+        torque = torque + state.crosstalk @ torque
+        self._play = np.clip(self._play, torque - state.hysteresis, torque + state.hysteresis)
+        torque = np.where(state.hysteresis > 0, self._play, torque)
+        torque = np.sign(torque) * np.maximum(np.abs(torque) - state.deadband, 0.0)
+        return np.clip(torque, -state.torque_saturation, state.torque_saturation)
+
+    def _delay(self, torque: Array, time: float) -> Array:
+        """Each joint's torque as it was `torque_delay` ago, linear between samples."""
+        delays = self._imperfections.torque_delay
+        self._late.append((time, torque))
+        while len(self._late) > 2 and self._late[1][0] <= time - delays.max():
+            del self._late[0]
+        times, torques = np.array([item[0] for item in self._late]), np.array([item[1] for item in self._late])
+        columns = range(len(torque))
+        return np.array([np.interp(time - delays[j], times, torques[:, j]) for j in columns])

@@ -1,0 +1,125 @@
+"""The arm file's `sim` section: what the simulated arm truly is. Only `sim_bus` reads it; the fit never does."""
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
+
+from armlink.arm_file import ArmFile, Section
+from armlink.errors import BadInput
+from sim_bus.effects.registry import check_entry
+
+Vector3 = Annotated[tuple[FiniteFloat, ...], Field(min_length=3, max_length=3)]
+DEFAULT_BITS = 16
+NOISE_SHARE = 0.002
+"""Standard deviation of the torque sensors' noise where the file gives none, as a share of rated torque."""
+
+
+class LinkBody(Section):
+    """One link as a rigid body, in the frame that turns with its joint, origin on the joint's axis (bar frame)."""
+
+    mass: PositiveFloat
+    """[kg]."""
+    com: Vector3
+    """Centre of mass in the bar frame [m]."""
+    inertia: Annotated[tuple[FiniteFloat, ...], Field(min_length=3, max_length=6)]
+    """About the centre of mass, axes parallel to the bar frame [kg·m²]: xx, yy, zz or xx, yy, zz, xy, xz, yz."""
+
+    @model_validator(mode="after")
+    def _inertia_has_three_or_six(self) -> "LinkBody":
+        if len(self.inertia) not in (3, 6):
+            raise ValueError("inertia: give 3 values (xx, yy, zz) or 6 (xx, yy, zz, xy, xz, yz) [kg·m²]")
+        if min(self.inertia[:3]) <= 0:
+            raise ValueError(f"inertia: xx, yy and zz must be positive, not {list(self.inertia[:3])} [kg·m²]")
+        return self
+
+
+class Sensors(Section):
+    """Sensors, one value a joint: torque `v = gain·τ + offset`, position `θ = position_gain·φ + position_offset`."""
+
+    gain: tuple[FiniteFloat, ...] | None = None
+    """Default 1."""
+    offset: tuple[FiniteFloat, ...] | None = None
+    """[N·m], default 0."""
+    position_gain: tuple[FiniteFloat, ...] | None = None
+    """Default 1."""
+    position_offset: tuple[FiniteFloat, ...] | None = None
+    """[rad], default 0."""
+    noise: tuple[Annotated[FiniteFloat, Field(ge=0)], ...] | None = None
+    """Standard deviation of the torque reading's noise [N·m], default 0.2 % of rated torque."""
+    bits: Annotated[int, Field(ge=8, le=24)] | tuple[Annotated[int, Field(ge=8, le=24)], ...] = DEFAULT_BITS
+    """Resolution of the torque sensor over ±2 rated torques, and of the position sensor over a turn."""
+
+
+class Servo(Section):
+    """The drives' own position loop and ramps."""
+
+    bandwidth: PositiveFloat = 40.0
+    """Natural frequency of the position loop, from the arm's own inertia [rad/s]."""
+    damping: PositiveFloat = 1.0
+    """Damping ratio of the position loop."""
+    deadband: PositiveFloat = 2e-4
+    """Position error below which the integrator rests, so that it does not hunt under stiction [rad]."""
+    quick_stop_deceleration: PositiveFloat = 5.0
+    """[rad/s²]."""
+    brake: bool = True
+    """Whether a holding brake closes where the drive is not enabled."""
+
+
+class Stops(Section):
+    """The mechanical stops."""
+
+    time_constant: PositiveFloat = 0.004
+    """Of the contact's spring and damper, critically damped [s]."""
+
+
+class EffectEntry(BaseModel):
+    """One imperfection: `effect` (an id of contract 4), `joint` (or link) and the effect's parameters by name."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    effect: str
+    joint: str | None = None
+
+    @model_validator(mode="after")
+    def _known(self) -> "EffectEntry":
+        check_entry(self.effect, self.joint, self.parameters)
+        return self
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """The effect's parameters as the file gives them."""
+        return dict(self.model_extra or {})
+
+
+class SimSection(Section):
+    """The `sim` section. `links` may be absent where `kinematics.model` (URDF or MJCF) carries the inertials."""
+
+    links: tuple[LinkBody, ...] | None = None
+    sensors: Sensors = Sensors()
+    effects: tuple[EffectEntry, ...] = ()
+    servo: Servo = Servo()
+    stops: Stops = Stops()
+    step: Annotated[FiniteFloat, Field(gt=0, le=0.005)] = 0.001
+    """Time step of the physics [s]; the SYNC period is a whole number of steps, each at most this."""
+    start: tuple[FiniteFloat, ...] | None = None
+    """Joint angles at power-on [rad]; default the middle of each joint's range."""
+
+
+def sim_section(arm: ArmFile) -> SimSection:
+    """The arm's `sim` section, its lists checked against the number of joints. Raises BadInput."""
+    section = arm.require(SimSection, "sim")
+    count = len(arm.joint_names)
+    lists: dict[str, Any] = {"links": section.links, "start": section.start}
+    lists |= {f"sensors.{key}": getattr(section.sensors, key) for key in Sensors.model_fields}
+    for key, values in lists.items():
+        if isinstance(values, tuple) and len(values) != count:
+            raise BadInput(f"{arm.path}: key sim.{key}: {len(values)} values, expected {count}, one a joint")
+    if section.links is None and arm.kinematics.model is None:
+        raise BadInput(f"{arm.path}: key sim.links is missing: mass, com and inertia of each link")
+    for number, entry in enumerate(section.effects):
+        if entry.joint is not None and entry.joint not in arm.joint_names:
+            raise BadInput(
+                f"{arm.path}: key sim.effects.{number}.joint: no joint {entry.joint!r}; there are "
+                f"{', '.join(arm.joint_names)}"
+            )
+    return section

@@ -1,0 +1,222 @@
+"""From fitted terms to causes: one entry an effect, ordered by what each brings on motion not fitted."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sim_gap.attribution.confidence import confidence
+from sim_gap.attribution.diagnosis import Cause, Signs
+from sim_gap.attribution.law_test import Outside
+from sim_gap.attribution.rivals import Rivals
+from sim_gap.attribution.steadiness import STEADY, steadiness
+from sim_gap.effects.registry import Layout, Row
+from sim_gap.model.rigid_body import Array
+from sim_gap.residuals.residual_set import CARE_NM, ResidualSet
+from sim_gap.search.estimate import Estimate, Value
+from sim_gap.search.normal_equations import ColumnStore, Normal, Term
+
+
+@dataclass(frozen=True)
+class Step:
+    """One effect added to those before it: RMS per joint before and after, (n,)."""
+
+    effect: str
+    terms: tuple[Term, ...]
+    below: tuple[Term, ...]
+    """Those before it."""
+    before: Array
+    after: Array
+
+    @property
+    def fall(self) -> float:
+        """Largest fall on a joint [N·m]."""
+        return float(np.max(self.before - self.after))
+
+
+def ordered(estimate: Estimate, scorer: "_Scorer") -> list[Step]:
+    """Effects in the order in which each, added to those before it, lowers the held-out RMS of some joint most."""
+    groups: dict[str, list[Term]] = defaultdict(list)
+    for term in estimate.terms:
+        groups[_belongs(term, estimate.terms, scorer.heldout.layout.n - 1)].append(term)
+    chosen: list[Term] = []
+    before, steps = scorer.rms([]), []
+    while groups:
+        outcomes = {effect: scorer.rms([*chosen, *terms]) for effect, terms in groups.items()}
+        effect = max(outcomes, key=lambda name: float(np.max(before - outcomes[name])))
+        steps.append(Step(effect, tuple(groups.pop(effect)), tuple(chosen), before, outcomes[effect]))
+        chosen += steps[-1].terms
+        before = outcomes[effect]
+    return steps
+
+
+def _belongs(term: Term, terms: Sequence[Term], tip: int) -> str:
+    """The effect that a term counts to: where there is a payload, its inertia is the payload's."""
+    loaded = any(other.effect == "link.payload" for other in terms)
+    inertia_of_payload = loaded and term.effect == "link.inertia" and term.place == tip
+    return "link.payload" if inertia_of_payload else term.effect
+
+
+FLOOR_KNOWN = 1.05
+"""What is left counts as more than noise from this times the noise floor on: it is no better known."""
+
+
+class _Scorer:
+    def __init__(self, estimate: Estimate, heldout: ResidualSet) -> None:
+        self.estimate, self.heldout = estimate, heldout
+        self.normal = Normal(ColumnStore(heldout), estimate.terms)
+        self.joint = np.array([row[1] for row in self.normal.rows])
+        self.counts = self.normal.count.sum(0) > 0
+
+    def squares(self, terms: list[Term]) -> Array:
+        """Held-out mean square per row after fitting these terms on the training set, (R,)."""
+        return self.normal.mean_square(np.arange(self.normal.size), self.estimate.subset(terms))
+
+    def signs(self, terms: tuple[Term, ...], evidence: float, outside: float) -> Signs:
+        """What speaks for and against a cause, on the row that rises most without its terms."""
+        data, rows = self.heldout, self.normal.rows
+        final = self.squares(list(self.estimate.terms))
+        without = self.squares([term for term in self.estimate.terms if term not in terms])
+        raw = np.maximum(self.squares([]), final)
+        r = int(np.argmax(np.where(self.counts, np.sqrt(without) - np.sqrt(final), -np.inf)))
+        floor = np.array([data.floor[row] for row in rows])
+        above = np.maximum(final - (FLOOR_KNOWN * floor) ** 2, 0.0)
+        gaps = self.counts & (np.sqrt(raw) > np.array([data.margin[row] for row in rows]))
+        elsewhere = float(np.mean(above[gaps] / raw[gaps])) if gaps.any() else 0.0
+        excess = float(np.sqrt(final[r])) / data.care[rows[r]]
+        return Signs(evidence, float(above[r] / max(raw[r], 1e-12)), excess, elsewhere, outside)
+
+    @cached_property
+    def noise(self) -> Array:
+        """Mean square of the noise in each row: its floor's, but no more than what all terms leave, (R,)."""
+        floor = np.array([self.heldout.floor[row] for row in self.normal.rows])
+        return np.asarray(np.minimum(floor**2, self.squares(list(self.estimate.terms))))
+
+    def rms(self, terms: list[Term]) -> Array:
+        """Held-out RMS per joint after fitting these terms on the training set, (n,)."""
+        return self._by_joint(self.squares(terms))
+
+    def falls(self, terms: Sequence[Term], more: Sequence[Term], quiet: bool) -> Array:
+        """What `more` on top of `terms` lowers each joint's RMS by, (n,); where all is quiet, or at a joint some of
+        whose channels drown in noise, noise apart and in the row where it is most."""
+        layout = self.heldout.layout
+        before, after = (self.squares([*chosen]) for chosen in (terms, [*terms, *more]))
+        whole = self._by_joint(before) - self._by_joint(after)
+        before, after = (np.sqrt(np.maximum(squares - self.noise, 0.0)) for squares in (before, after))
+        out = np.zeros(layout.n)
+        np.maximum.at(out, self.joint[self.counts], (before - after)[self.counts])
+        noisy = np.array([quiet or layout.beyond(joint) > 0 for joint in range(layout.n)])
+        return np.where(noisy, out, whole)
+
+    def _by_joint(self, squares: Array) -> Array:
+        out = np.zeros(self.heldout.layout.n)
+        np.add.at(out, self.joint[self.counts], squares[self.counts])
+        return np.asarray(np.sqrt(out))
+
+
+MINOR, MINOR_INNER, MINOR_COMMAND = 0.009, 0.004, 0.001
+"""Share of a joint's torque (RMS) that a cause must lower some joint's RMS by, not to be minor; where the cause shows
+against the model, where only in motor against sensor, and where only in command against motor."""
+
+
+QUIET_NM = 0.08
+"""Least fall on a joint where all rows are within their margins, so that noise, and the little friction that every arm
+has, could be all there is [N·m]."""
+
+
+def materials(step: Step, estimate: Estimate, heldout: ResidualSet, scorer: "_Scorer", quiet: bool) -> tuple[Term, ...]:
+    """Those of a step's terms whose place matters: the rest can go together without a joint's RMS rising by what a
+    user would care about, all else that was found being there."""
+    hit = heldout.struck | estimate.store.data.struck
+    if any(term.bound or (term.effect == "transmission.backlash" and term.place in hit) for term in step.terms):
+        return step.terms
+    shows = {row for term in step.terms for row in estimate.store.columns(term)}
+    least = np.maximum(_minor(shows, heldout.layout) * heldout.usual_torque, QUIET_NM if quiet else CARE_NM)
+    if np.all(scorer.falls(step.below, step.terms, quiet) < least):
+        return ()
+    places = {term.place for term in step.terms}
+    if len(places) == 1:
+        return step.terms
+    small = set[int]()
+
+    def rise(gone: set[int]) -> Array:
+        lost = [term for term in step.terms if term.place in gone]
+        return scorer.falls([term for term in estimate.terms if term not in lost], lost, quiet)
+
+    for place in sorted(places, key=lambda place: float(np.max(rise({place}) / least))):
+        if np.all(rise({*small, place}) < least):
+            small.add(place)
+    return tuple(term for term in step.terms if term.place not in small) or step.terms
+
+
+def _minor(shows: set[Row], layout: Layout) -> Array:
+    """Share of each joint's torque that a cause which shows in these rows must matter by, (n,)."""
+    if any(channel == layout.against_model for channel, _ in shows):
+        return np.full(layout.n, MINOR)
+    inner = {channel for channel, _ in shows} == {layout.command}
+    beyond = [layout.beyond(joint) > 0 for joint in range(layout.n)]
+    return np.where(beyond, MINOR_INNER, MINOR_COMMAND) if inner else np.full(layout.n, MINOR_INNER)
+
+
+def causes(
+    estimate: Estimate, heldout: ResidualSet, rivals: Rivals, names: tuple[str, ...], quiet: bool = False
+) -> tuple[list[Cause], list[Cause]]:
+    """The causes, most important first, and the minor ones: whole effects, and joints at which an effect is small.
+
+    Where all is `quiet`, noise could be all there is: what does not show throughout the held-out motion is minor, too.
+    """
+    found: list[Cause] = []
+    minor: list[Cause] = []
+    scorer = _Scorer(estimate, heldout)
+    fitted = _Scorer(estimate, estimate.store.data)
+    outside = Outside(estimate.store, estimate.terms)
+    for step in ordered(estimate, scorer):
+        main = materials(step, estimate, heldout, scorer, quiet)
+        if quiet and main and steadiness(estimate, heldout, main) < STEADY:
+            main = ()
+        rest = tuple(term for term in step.terms if term not in main)
+        for terms, out in ((main, found), (rest, minor)):
+            if terms:
+                bound = any(term.bound for term in terms)
+                out.append(_cause(step, terms, fitted if bound else scorer, (rivals, outside), names))
+    return found, minor
+
+
+def _cause(
+    step: Step,
+    terms: tuple[Term, ...],
+    scorer: "_Scorer",
+    against: tuple[Rivals, Outside],
+    names: tuple[str, ...],
+) -> Cause:
+    """One cause from the terms of a step that belong together, weighed against the library and what is outside it."""
+    rivals, outside = against
+    places = sorted({term.place for term in terms})
+    whole = rivals.whole_arm(step.effect)
+    touched = np.arange(len(names)) if whole else np.array(places)
+    weighed = rivals.weigh(step.effect, terms)
+    stand_in = outside.weigh(terms)
+    signs = scorer.signs(terms, weighed.evidence, stand_in.worse)
+    parameters: dict[str, dict[str, Value]] = {}
+    for term in sorted(terms, key=lambda t: t.place):
+        parameters.setdefault("arm" if whole else names[term.place], {}).update(scorer.estimate.parameters(term))
+    return Cause(
+        effect=step.effect,
+        joints=names if whole else tuple(names[place] for place in places),
+        parameters=parameters,
+        gap_before=float(np.sqrt(np.mean(step.before[touched] ** 2))),
+        gap_after=float(np.sqrt(np.mean(step.after[touched] ** 2))),
+        confidence=confidence(signs, len(weighed.confounded_with)),
+        fall=step.fall,
+        signs=signs,
+        confounded_with=weighed.confounded_with,
+        separate_by=weighed.separate_by,
+        law=stand_in.law,
+    )
+
+
+def left_over(data: ResidualSet, explained: dict[Row, Array]) -> dict[Row, Array]:
+    """Residual less what the terms explain, (K,) per row."""
+    return {row: values - explained[row] for row, values in data.values.items()}

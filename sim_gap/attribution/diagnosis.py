@@ -1,0 +1,156 @@
+"""The answer of a diagnosis, and its JSON form (contract 5)."""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from sim_gap.model.rigid_body import Array
+from sim_gap.residuals.where import Place
+from sim_gap.search.estimate import Value
+
+SCHEMA = "armlink.gap/1"
+Verdict = Literal["no_gap", "explained", "ambiguous", "unexplained"]
+
+
+@dataclass(frozen=True)
+class Signs:
+    """What speaks for a cause and against it, on the row where it brings most."""
+
+    evidence: float
+    """What is lost without it, whatever stands in its place: fall of ½ log(R² + floor²)."""
+    left: float
+    """Share of that row's squared gap that is left in the end, above the noise, on motion not fitted."""
+    excess: float
+    """What is left there in the end [RMS], in units of what is not worth explaining."""
+    elsewhere: float
+    """Share of the whole squared gap that is left."""
+    outside: float = float("inf")
+    """How much worse the best general law does in its place, in units of `evidence`: the library may lack it."""
+
+
+@dataclass(frozen=True)
+class Cause:
+    """One effect, the joints it sits on, its parameters, and what adding it to those before it does to the gap."""
+
+    effect: str
+    joints: tuple[str, ...]
+    parameters: dict[str, dict[str, Value]]
+    gap_before: float
+    gap_after: float
+    confidence: float
+    fall: float
+    """Largest fall of a joint's held-out RMS [N·m]."""
+    signs: Signs
+    """What the confidence was made from."""
+    confounded_with: tuple[str, ...] = ()
+    separate_by: str | None = None
+    law: str = ""
+    """The general law that could best stand in for it."""
+
+    @property
+    def shrink(self) -> float:
+        """Share of the gap that this cause takes away, on motion not fitted."""
+        return 1.0 - self.gap_after / self.gap_before if self.gap_before > 0 else 0.0
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """Position gap of the forward simulation against the recording [rad], (n,) before and after, and its horizon."""
+
+    horizon_s: float
+    before: Array
+    after: Array
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Where the gap lies, which effects cause it, how far adding them closes it."""
+
+    verdict: Verdict
+    names: tuple[str, ...]
+    where: tuple[Place, ...]
+    causes: tuple[Cause, ...]
+    minor: tuple[Cause, ...]
+    """Small true imperfections that came out besides: none lowers any joint's gap by what a user would care about."""
+    noise_floor: Array
+    train_before: Array
+    train_after: Array
+    heldout_before: Array
+    heldout_after: Array
+    unexplained: float
+    margin: Array
+    """What counts as a gap: RMS per joint above this [N·m]."""
+    heldout_is: str
+    """Which motion `heldout` is."""
+    rollout: Rollout | None = None
+    notes: tuple[str, ...] = ()
+    internals: Any = field(default=None, repr=False, compare=False)
+    """Fit and data behind the answer, for report and export."""
+
+    def to_json(self) -> dict[str, Any]:
+        """The contract's dictionary."""
+        roll = self.rollout
+        return {
+            "schema": SCHEMA,
+            "verdict": self.verdict,
+            "where": [
+                {
+                    "joint": place.joint,
+                    "channel": place.channel,
+                    "regime": place.regime,
+                    "rms": _round(place.rms),
+                    "noise": _round(place.noise),
+                    "share": _round(place.share),
+                }
+                for place in self.where
+            ],
+            "causes": [_cause(cause) for cause in self.causes],
+            "minor": [_cause(cause) for cause in self.minor],
+            "signs": [{name: _round(value) for name, value in vars(cause.signs).items()} for cause in self.causes],
+            "gap": {
+                "unit": "N·m",
+                "joints": list(self.names),
+                "noise_floor": _list(self.noise_floor),
+                "margin": _list(self.margin),
+                "heldout_is": self.heldout_is,
+                "train": {"before": _list(self.train_before), "after": _list(self.train_after)},
+                "heldout": {"before": _list(self.heldout_before), "after": _list(self.heldout_after)},
+            },
+            "rollout": {
+                "unit": "rad",
+                "horizon_s": roll.horizon_s if roll else None,
+                "before": _list(roll.before) if roll else [],
+                "after": _list(roll.after) if roll else [],
+            },
+            "unexplained": _round(self.unexplained),
+            "notes": list(self.notes),
+        }
+
+
+def _cause(cause: Cause) -> dict[str, Any]:
+    return {
+        "effect": cause.effect,
+        "joints": list(cause.joints),
+        "parameters": {
+            joint: {
+                name: {"value": _round(v.value), "ci95": [_round(v.low), _round(v.high)], "unit": v.unit}
+                for name, v in values.items()
+            }
+            for joint, values in cause.parameters.items()
+        },
+        "gap_before": _round(cause.gap_before),
+        "gap_after": _round(cause.gap_after),
+        "shrink": _round(cause.shrink),
+        "confidence": _round(cause.confidence),
+        "confounded_with": list(cause.confounded_with),
+        "separate_by": cause.separate_by,
+    }
+
+
+def _round(x: float) -> float | None:
+    return float(f"{x:.6g}") if np.isfinite(x) else None
+
+
+def _list(x: Array) -> list[float | None]:
+    return [_round(float(value)) for value in x]

@@ -1,0 +1,37 @@
+"""Whether a cause shows steadily: in block after block of motion that was not fitted, not in a few moments."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sim_gap.residuals.residual_set import ResidualSet
+from sim_gap.search.estimate import Estimate
+from sim_gap.search.normal_equations import ColumnStore, Term
+
+STEADY = 2.0
+"""Standard errors by which a cause must lower a row's squares on average over the blocks."""
+
+
+def steadiness(estimate: Estimate, heldout: ResidualSet, terms: Sequence[Term]) -> float:
+    """Standard errors by which these terms lower the squares of some held-out row, all others being fitted.
+
+    The mean over blocks of time of what each block's sum of squares falls by, in standard errors of that mean; the
+    largest of the rows.
+    """
+    store = ColumnStore(heldout)
+    with_them = estimate.subset(list(estimate.terms))
+    without = estimate.subset([term for term in estimate.terms if term not in terms])
+    best = 0.0
+    for row in heldout.rows:
+        valid = heldout.valid[row]
+        touching = [term for term in estimate.terms if row in store.columns(term)]
+        if not valid.any() or not any(row in store.columns(term) for term in terms):
+            continue
+        columns = np.hstack([store.columns(term)[row][valid] for term in touching])
+        index = estimate.normal.index(touching)
+        left, more = (heldout.values[row][valid] - columns @ c[index] for c in (with_them, without))
+        falls = np.bincount(heldout.blocks[valid], more**2 - left**2)
+        falls = falls[np.unique(heldout.blocks[valid])]
+        if len(falls) > 2:
+            best = max(best, float(falls.mean() / (falls.std(ddof=1) / np.sqrt(len(falls)) + 1e-300)))
+    return best

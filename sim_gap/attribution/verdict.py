@@ -1,0 +1,51 @@
+"""The verdict: is there a gap at all, is it explained, and by one effect only."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sim_gap.attribution.confidence import founded
+from sim_gap.attribution.diagnosis import Cause, Verdict
+from sim_gap.effects.registry import Row
+from sim_gap.model.rigid_body import Array
+from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
+
+EXPLAINED = 0.15
+"""Share of the squared gap above the noise that may be left in an explained diagnosis."""
+
+
+def row_rms(data: ResidualSet, left: dict[Row, Array] | None = None) -> dict[Row, float]:
+    """RMS of each row that has valid samples [N·m]; of `left` instead of the raw residual."""
+    values = data.values if left is None else left
+    return {row: root_mean_square(values[row][data.valid[row]]) for row in data.rows if data.valid[row].any()}
+
+
+def is_quiet(data: ResidualSet) -> bool:
+    """Whether no row exceeds what noise, and what nobody cares about, could be."""
+    return all(rms <= data.faint[row] for row, rms in row_rms(data).items())
+
+
+def share_left(data: ResidualSet, left: dict[Row, Array]) -> float:
+    """Share of the squared gap above the noise that is left, over the rows that had a gap, each counted alike."""
+    before, after = row_rms(data), row_rms(data, left)
+    shares, weights = [], []
+    for row, rms in before.items():
+        floor = data.floor[row]
+        if max(rms, after[row]) > data.margin[row]:
+            scale = max(rms, after[row]) ** 2
+            shares.append(max(after[row] ** 2 - floor**2, 0.0) / scale)
+            weights.append(max(rms**2 - floor**2, 0.0) / scale)
+    return float(min(np.sum(shares) / max(np.sum(weights), 1e-9), 1.0)) if shares else 0.0
+
+
+def verdict(found: Sequence[Cause], data: ResidualSet, left: dict[Row, Array]) -> Verdict:
+    """`unexplained` where a gap is left or nothing is well founded, `ambiguous` where the first cause has a rival."""
+    after = row_rms(data, left)
+    quiet = all(rms <= data.margin[row] for row, rms in after.items())
+    if not found:
+        return "no_gap" if quiet else "unexplained"
+    if not quiet and share_left(data, left) > EXPLAINED:
+        return "unexplained"
+    if found[0].confounded_with:
+        return "ambiguous"
+    return "explained" if any(founded(cause.signs) for cause in found) else "unexplained"

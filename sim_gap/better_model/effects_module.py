@@ -1,0 +1,43 @@
+"""Writes the module beside the exported MJCF: the source of `forward_effects` with one arm's effects in it."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from sim_gap.better_model import forward_effects as forward
+from sim_gap.model.load import SimModel
+from sim_gap.search.estimate import Estimate
+from sim_gap.search.normal_equations import Term
+
+
+def module_path(model: Path) -> Path:
+    """Where the module of a written model lies: `closed.xml` → `closed_effects.py`."""
+    return model.with_name(f"{model.stem}_effects.py")
+
+
+def entries(sim: SimModel, estimate: Estimate, terms: Sequence[Term]) -> list[forward.Entry]:
+    """The terms as the module takes them; what is in one recording alone is left out.
+
+    Where there is no torque sensor, an offset of the motor's torque is torque lost.
+    """
+    out: list[forward.Entry] = []
+    for term in terms:
+        if term.bound:
+            continue
+        values = {name: each.value for name, each in estimate.parameters(term).items()}
+        if term.effect == "torque.offset" and estimate.store.data.layout.sensor is None:
+            values = {"lost": values["offset"]}
+        out.append((term.effect, sim.arm.names[term.place], values))
+    return out
+
+
+def module_text(sim: SimModel, estimate: Estimate, terms: Sequence[Term], model: str) -> str:
+    """The module's source for effects that the MJCF file `model` cannot hold."""
+    rows = "".join(f"    {entry!r},\n" for entry in entries(sim, estimate, terms))
+    text = Path(forward.__file__).read_text(encoding="utf-8")
+    for name, declared, value in (
+        ("MODEL", 'MODEL = ""', f"{model!r}"),
+        ("JOINTS", "JOINTS: tuple[str, ...] = ()", f"{sim.arm.names!r}"),
+        ("EFFECTS", "EFFECTS: tuple[Entry, ...] = ()", f"(\n{rows})"),
+    ):
+        text = text.replace(declared, f"{name} = {value}", 1)
+    return text

@@ -1,0 +1,77 @@
+"""What `--out-model` writes: MJCF with the effects in it, and a module for those that MJCF cannot hold."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armlink.errors import BadInput
+from sim_gap.better_model.effects_module import module_path, module_text
+from sim_gap.better_model.with_effects import shared_motors, spec_of, with_effects
+from sim_gap.model.load import SimModel
+from sim_gap.model.tendons import add_to
+from sim_gap.search.estimate import Estimate
+from sim_gap.search.normal_equations import Term
+
+
+def write_model(sim: SimModel, estimate: Estimate | None, path: Path) -> list[str]:
+    """Write the model with the effects as MJCF, and beside it a module for those that MJCF cannot hold, if any.
+
+    Returns a line per effect that MJCF cannot hold; they also stand in a comment. Raises BadInput where the nominal
+    model did not come from a file, or a file cannot be written.
+    """
+    spec, closed = spec_of(sim), with_effects(sim, estimate)
+    for body in list(spec.bodies)[1:]:
+        _set_inertial(body, closed.model)
+    for joint in spec.joints:
+        _set_joint(joint, closed.model)
+    add_to(spec, shared_motors(sim, estimate))
+    gains = _gains(sim, estimate)
+    driven = {actuator.target for actuator in spec.actuators}
+    for actuator in spec.actuators:
+        actuator.gear = [gains.get(actuator.target, 1.0) * actuator.gear[0], *actuator.gear[1:]]
+    spec.option.gravity = closed.model.opt.gravity
+    spec.compile()
+    left = [
+        term for term in closed.not_held if term.effect != "actuator.gain" or sim.arm.names[term.place] not in driven
+    ]
+    lines = [] if estimate is None else [_line(sim, estimate, term) for term in left]
+    module = module_path(path)
+    text = "".join(f"  {line}\n" for line in lines)
+    comment = f"<!-- Effects that MJCF cannot hold ({module.name} applies them):\n{text}-->\n" if lines else ""
+    try:
+        path.write_text(comment + spec.to_xml(), encoding="utf-8")
+        if lines and estimate is not None:
+            module.write_text(module_text(sim, estimate, left, path.name), encoding="utf-8")
+    except OSError as error:
+        raise BadInput(f"{error.filename}: cannot be written: {error.strerror}") from None
+    return lines
+
+
+def _gains(sim: SimModel, estimate: Estimate | None) -> dict[str, float]:
+    """Torque made per torque commanded, by joint name."""
+    terms = [] if estimate is None else [term for term in estimate.terms if term.effect == "actuator.gain"]
+    return {sim.arm.names[t.place]: estimate.parameters(t)["gain"].value for t in terms if estimate is not None}
+
+
+def _line(sim: SimModel, estimate: Estimate, term: Term) -> str:
+    values = estimate.parameters(term)
+    where = f"in recording {term.bound}" if term.bound else sim.arm.names[term.place]
+    told = (f"{name} {v.value:.6g}" + (f" {v.unit}" if v.unit != "1" else "") for name, v in values.items())
+    return f"{term.effect} {where} " + ", ".join(told)
+
+
+def _set_inertial(body: Any, model: Any) -> None:
+    i = body.id
+    body.explicitinertial = True
+    body.mass, body.ipos, body.iquat = float(model.body_mass[i]), model.body_ipos[i], model.body_iquat[i]
+    body.inertia = model.body_inertia[i]
+    body.fullinertia = [np.nan] * 6
+
+
+def _set_joint(joint: Any, model: Any) -> None:
+    dof, adr = model.jnt_dofadr[joint.id], model.jnt_qposadr[joint.id]
+    joint.frictionloss, joint.armature = float(model.dof_frictionloss[dof]), float(model.dof_armature[dof])
+    joint.damping[0] = float(np.reshape(model.dof_damping, (model.nv, -1))[dof, 0])
+    joint.stiffness[0] = float(np.reshape(model.jnt_stiffness, (model.njnt, -1))[joint.id, 0])
+    joint.springref = float(model.qpos_spring[adr])

@@ -1,0 +1,174 @@
+"""Makes blind-check cases in its own process: `python -m sim_gap.blind.cases.make --out DIR --labels DIR`."""
+
+import argparse
+import json
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from sim_gap.blind.cases.arms import Array, mjcf
+from sim_gap.blind.cases.gap import gap, largest_fall, visible
+from sim_gap.blind.cases.recipe import Drawing, Recipe, draw, label, recipes
+from sim_gap.blind.plant.plant import Log, simulate
+from sim_gap.blind.plant.sensors import record
+
+Values = TypeVar("Values")
+BATCH = 12
+"""Cases simulated side by side in one process."""
+TRAIN_S, HELDOUT_S, RATE = 120.0, 40.0, 250.0
+ROUNDS = 4
+"""How often a case that does not show its effects is drawn again."""
+FOLLOWED = 0.3
+"""Largest distance from the commanded trajectory [rad] of an arm under control."""
+DECIMALS = {"t": 6, "q": 7, "dq": 6, "q_cmd": 7}
+
+
+def make_cases(
+    wanted: Sequence[Recipe],
+    out: Path,
+    labels: Path,
+    train_s: float = TRAIN_S,
+    heldout_s: float = HELDOUT_S,
+    rate: float = RATE,
+) -> None:
+    """Draw, simulate and write cases: `out/case_XXXX/{sim.xml,train.csv,heldout.csv}`, `labels/case_XXXX.json`.
+
+    A case whose effects do not stand out on the held-out motion, or whose arm was not under control, is drawn again;
+    one that no arm shows is left out.
+    """
+    labels.mkdir(parents=True, exist_ok=True)
+    todo = dict.fromkeys(wanted, 0)
+    for last in (*[False] * (ROUNDS - 1), True):
+        drawings = [d for recipe, first in todo.items() if (d := draw(recipe, train_s, heldout_s, first)) is not None]
+        if not drawings:
+            return
+        logs = iter(simulate([run for d in drawings for run in (d.heldout, *d.without)]))
+        seen = [_judged(drawing, [next(logs) for _ in range(1 + len(drawing.without))], rate) for drawing in drawings]
+        good = [(d, judged) for d, judged in zip(drawings, seen, strict=True) if last or judged.good]
+        done = set()
+        for (drawing, judged), train in zip(good, simulate([d.train for d, _ in good]) if good else (), strict=True):
+            steady = _steady(drawing.train.command, train)
+            if last or steady:
+                judged = replace(judged, good=judged.good and steady)
+                _write(drawing, judged, train, out / drawing.recipe.name, labels, rate)
+                done.add(drawing.recipe.name)
+        todo = {d.recipe: d.attempt + 1 for d in drawings if d.recipe.name not in done}
+        if not todo:
+            return
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A case's held-out recording, the gaps with and without its effects, and whether it will do."""
+
+    heldout: dict[str, Array]
+    gaps: dict[str, Any]
+    good: bool
+
+
+def _judged(drawing: Drawing, logs: list[Log], rate: float) -> Judged:
+    """Compare the held-out recording with those without each effect."""
+    runs = (drawing.heldout, *drawing.without)
+    recordings = [
+        record(run.truth, log, rate, drawing.columns["velocity"], run.command, _random(drawing, 1))
+        for run, log in zip(runs, logs, strict=True)
+    ]
+    gaps = [gap(drawing.nominal, recording) for recording in recordings]
+    recorded = [_chosen(each, drawing.columns) for each in gaps]  # what nobody records does not make a case clear
+    falls = [largest_fall(recorded[0], less) for less in recorded[1 : 1 + len(drawing.drawn)]]
+    steady = all(_steady(run.command, log) for run, log in zip(runs, logs, strict=True))
+    found = {"with": gaps[0], "without": gaps[-1], "falls": falls}
+    return Judged(recordings[0], found, steady and all(visible(fall) for fall in falls))
+
+
+def _steady(command: Array, log: Log) -> bool:
+    """Whether the controller followed its trajectory without shaking."""
+    shaken = np.abs(np.diff(log.motor, 2, axis=0)).mean(0) > 0.25 * log.motor.std(0) + 0.1
+    return bool(np.abs(log.position - command).max() < FOLLOWED and not shaken.any())
+
+
+def _write(drawing: Drawing, judged: Judged, train: Log, folder: Path, labels: Path, rate: float) -> None:
+    run, name = drawing.train, drawing.recipe.name
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "sim.xml").write_text(mjcf(drawing.nominal), encoding="utf-8")
+    columns = record(run.truth, train, rate, drawing.columns["velocity"], run.command, _random(drawing, 0))
+    write_csv(folder / "train.csv", _chosen(columns, drawing.columns))
+    write_csv(folder / "heldout.csv", _chosen(judged.heldout, drawing.columns))
+    truth = {**label(drawing), "gap": judged.gaps, "clear": judged.good}
+    (labels / f"{name}.json").write_text(json.dumps(truth, indent=1), encoding="utf-8")
+
+
+def _random(drawing: Drawing, number: int) -> np.random.Generator:
+    return np.random.default_rng([*drawing.recipe.seed, drawing.attempt, 1000 + number])
+
+
+def _chosen(columns: dict[str, Values], wanted: dict[str, bool]) -> dict[str, Values]:
+    """Those that the recording has."""
+    dropped = {name for name, key in (("q_cmd", "position_command"), ("tau_cmd", "torque_command")) if not wanted[key]}
+    return {name: values for name, values in columns.items() if name not in dropped}
+
+
+def write_csv(path: Path, columns: dict[str, Array]) -> None:
+    """Columns of contract 2: `t`, then `name_1` … `name_n` of each channel."""
+    import pyarrow as pa
+    from pyarrow.csv import WriteOptions, write_csv
+
+    flat: dict[str, Array] = {}
+    for name, values in columns.items():
+        rounded = np.round(values, DECIMALS.get(name, 5)) + 0.0
+        flat |= {name: rounded} if values.ndim == 1 else {f"{name}_{j + 1}": x for j, x in enumerate(rounded.T)}
+    with path.open("wb") as file:
+        file.write((",".join(flat) + "\n").encode())  # pyarrow would quote the names
+        write_csv(pa.table(flat), file, WriteOptions(include_header=False))
+
+
+def batches(wanted: Sequence[Recipe], size: int = BATCH) -> Iterator[Sequence[Recipe]]:
+    """Cases in groups."""
+    for start in range(0, len(wanted), size):
+        yield wanted[start : start + size]
+
+
+def main() -> None:
+    """Make a whole check's cases."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--cases", type=int, default=150)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--labels", type=Path, required=True)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--train-s", type=float, default=TRAIN_S)
+    parser.add_argument("--heldout-s", type=float, default=HELDOUT_S)
+    given = parser.parse_args()
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    wanted = recipes(given.seed, given.cases)
+    size = max(1, min(BATCH, -(-len(wanted) // given.workers)))
+    with ProcessPoolExecutor(given.workers, mp_context=get_context("spawn")) as pool:
+        jobs = [
+            pool.submit(make_cases, batch, given.out, given.labels, given.train_s, given.heldout_s)
+            for batch in batches(wanted, size)
+        ]
+        for job in jobs:
+            job.result()
+    (given.labels / "withhold.txt").write_text("\n".join(withheld(given.labels)), encoding="utf-8")
+
+
+def withheld(labels: Path, each: int = 2) -> list[str]:
+    """Lines "case effect": the first `each` single-effect cases of every effect that the recording can tell."""
+    chosen: dict[str, list[str]] = {}
+    for path in sorted(labels.glob("*.json")):
+        truth = json.loads(path.read_text(encoding="utf-8"))
+        if truth["kind"] == "single" and not truth["effects"][0]["undecided"]:
+            cases = chosen.setdefault(truth["effects"][0]["effect"], [])
+            if len(cases) < each:
+                cases.append(truth["case"])
+    return [f"{case} {effect}" for effect in sorted(chosen) for case in chosen[effect]]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,170 @@
+"""Which cases a blind check has, and how one is drawn: arm, effects, motions; all from one seed."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from sim_gap.blind.cases.arms import Arm, Array, draw_arm
+from sim_gap.blind.cases.motion import KINDS, Limits, trajectory
+from sim_gap.blind.cases.scene import Scene
+from sim_gap.blind.cases.truth import ordinary
+from sim_gap.blind.effects.drawn import Drawn
+from sim_gap.blind.effects.library import DRAWS, EFFECTS
+from sim_gap.blind.plant.plant import Run
+
+ATTEMPTS = 600
+"""After so many arms that cannot show a case's effects it is left out; play, the rarest, takes some hundred."""
+OTHER_PAIR = 20
+"""After so many arms that cannot show two effects together, two others are drawn."""
+NONE_SHARE, TWO_SHARE = 0.12, 0.18
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """One case before it is drawn: its effects by id; none and two are kinds of their own."""
+
+    name: str
+    effects: tuple[str, ...]
+    seed: tuple[int, int]
+
+    @property
+    def kind(self) -> str:
+        """`none`, `single` or `two`."""
+        return ("none", "single", "two")[len(self.effects)]
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """One case drawn: the nominal arm, what is wrong with the true one, and three runs of it."""
+
+    recipe: Recipe
+    nominal: Arm
+    drawn: tuple[Drawn, ...]
+    motions: dict[str, tuple[str, ...]]
+    train: Run
+    heldout: Run
+    without: tuple[Run, ...]
+    """The held-out motion of the same arm without each effect in turn, then without any; one run for one effect."""
+    attempt: int
+    """Which of the recipe's drawings this is."""
+    columns: dict[str, bool]
+    """Optional columns: `velocity`, `position_command`, `torque_command`."""
+
+
+def recipes(seed: int, count: int) -> list[Recipe]:
+    """`count` cases: every effect in turn, and among them arms without an effect and with two."""
+    random = np.random.default_rng([seed, 0])
+    none, two = round(NONE_SHARE * count), round(TWO_SHARE * count)
+    order = [*random.permutation(EFFECTS).tolist()]
+    singles = [(order[k % len(order)],) for k in range(count - none - two)]
+    pairs = [_pair(random) for _ in range(two)]
+    mixed: list[tuple[str, ...]] = [*singles, *pairs, *([()] * none)]
+    shuffled = [mixed[k] for k in random.permutation(len(mixed))]
+    return [Recipe(f"case_{k:04d}", effects, (seed, k + 1)) for k, effects in enumerate(shuffled)]
+
+
+def _pair(random: np.random.Generator) -> tuple[str, ...]:
+    return tuple(random.choice(EFFECTS, 2, replace=False).tolist())
+
+
+def draw(recipe: Recipe, train_s: float, heldout_s: float, first: int = 0) -> Drawing | None:
+    """Draw one case; arms that cannot show its effects are drawn again, None where there is none in `ATTEMPTS`.
+
+    `first` is the attempt to begin with.
+    """
+    for attempt in range(first, first + ATTEMPTS):
+        random = np.random.default_rng([*recipe.seed, attempt])
+        if recipe.kind == "two" and attempt >= OTHER_PAIR:
+            recipe = replace(recipe, effects=_pair(np.random.default_rng([*recipe.seed, attempt // OTHER_PAIR])))
+        arm = draw_arm(random)
+        limits = _limits(arm, random)
+        held = str(random.choice(KINDS))
+        others = [kind for kind in KINDS if kind != held]
+        training = tuple(others if random.random() < 0.6 else [str(random.choice(others))])
+        training += ("chirp",) * bool(random.random() < 0.5)
+        scene = Scene(arm, trajectory(training, train_s, limits, random))
+        drawn = [DRAWS[effect](scene, random) for effect in recipe.effects]
+        if all(drawn) and _compatible([d for d in drawn if d]):
+            command = trajectory((held,), heldout_s, limits, random)
+            motions = {"train": training, "heldout": (held,)}
+            return _assemble(recipe, scene, tuple(d for d in drawn if d), motions, command, random, attempt)
+    return None
+
+
+def _assemble(
+    recipe: Recipe,
+    scene: Scene,
+    drawn: tuple[Drawn, ...],
+    motions: dict[str, tuple[str, ...]],
+    command: Array,
+    random: np.random.Generator,
+    attempt: int,
+) -> Drawing:
+    nominal = scene.arm
+    for effect in drawn:
+        nominal = effect.nominal(nominal) if effect.nominal else nominal
+    scene = Scene(nominal, scene.command)
+    seed = int(random.integers(2**31))
+    feed = {number: scene.feed_forward(q) for number, q in enumerate((scene.command, command))}
+
+    whole = ordinary(nominal, scene.rated, np.random.default_rng(seed))
+    for effect in drawn:
+        effect.apply(whole)
+    slowest = whole.bandwidth  # the same controller for all runs
+
+    def run(effects: tuple[Drawn, ...], number: int) -> Run:
+        truth = ordinary(nominal, scene.rated, np.random.default_rng(seed))
+        for effect in effects:
+            effect.apply(truth)
+        truth.bandwidth = slowest
+        return Run(truth, (scene.command, command)[number], feed[number], scene.inertia, seed + number)
+
+    columns = {name: bool(random.random() < share) for name, share in (("velocity", 0.5), ("position_command", 0.8))}
+    late = any(effect.startswith("actuator") for effect in recipe.effects)
+    columns["torque_command"] = late or bool(random.random() < 0.8)
+    less = [tuple(d for d in drawn if d is not left) for left in drawn] if len(drawn) > 1 else []
+    without = tuple(run(effects, 1) for effects in (*less, ()))
+    return Drawing(recipe, nominal, drawn, motions, run(drawn, 0), run(drawn, 1), without, attempt, columns)
+
+
+def _limits(arm: Arm, random: np.random.Generator) -> Limits:
+    velocity = np.linspace(random.uniform(0.8, 1.3), random.uniform(1.5, 2.6), arm.n)
+    acceleration = np.linspace(random.uniform(2.5, 4.0), random.uniform(6.0, 10.0), arm.n)
+    return Limits(arm.lower, arm.upper, velocity, acceleration)
+
+
+def _compatible(drawn: list[Drawn]) -> bool:
+    """Two effects may share a joint, but not where one rewrites what the other set."""
+    if len(drawn) < 2:
+        return True
+    first, second = drawn
+    same = set(first.joints) & set(second.joints)
+    rewriting = {"transmission.coupling", "friction.stribeck", "friction.asymmetric", "transmission.elasticity"}
+    rewriting |= {"transmission.backlash"}
+    return not (same and (first.effect in rewriting or second.effect in rewriting))
+
+
+def label(drawing: Drawing) -> dict[str, Any]:
+    """What the case truly is, for the score; gaps are added once it has run."""
+    chirp, nominal = "chirp" in drawing.motions["train"], drawing.nominal
+    effects = [
+        {
+            "effect": d.effect,
+            "joints": list(d.joints),
+            "parameters": d.parameters,
+            "axis": nominal.axis[nominal.names.index(d.joints[0])].tolist() if d.joints else None,
+            "implied": list(d.implied),
+            "undecided": "" if chirp and d.effect in ("actuator.lag", "actuator.delay") else d.undecided,
+            "confused_with": list(d.confused_with),
+        }
+        for d in drawing.drawn
+    ]
+    return {
+        "schema": "armlink.blind-label/1",
+        "case": drawing.recipe.name,
+        "kind": drawing.recipe.kind,
+        "n": nominal.n,
+        "effects": effects,
+        "motions": {name: list(kinds) for name, kinds in drawing.motions.items()},
+    }

@@ -1,0 +1,162 @@
+"""Motors, friction, gears and position sensors of many arms: from commanded torque to what moves the links."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_gap.blind.cases.arms import Array
+from sim_gap.blind.cases.truth import Truth
+from sim_gap.blind.plant.friction import Bristles, padded
+
+SPRING_DAMPING = 0.04
+"""Damping ratio of an elastic transmission."""
+
+
+class Drives:
+    """State of all drives, (B, width); every method works on the first k arms, k the length of what it is given."""
+
+    def __init__(
+        self, truths: Sequence[Truth], inertia: Array, angle: Array, torque: Sequence[Array], step: float
+    ) -> None:
+        """`inertia` (B, width) that each motor moves at least [kg·m²], `angle` and `torque` at rest, `step` [s]."""
+        width = angle.shape[1]
+        self.step, self.count = step, 0
+        self.current = padded(torque, width)
+        lag = padded([t.motor_lag for t in truths], width, step)
+        self.follow = 1.0 - np.exp(-step / np.maximum(lag, 0.1 * step))
+        self.limit = padded([t.motor_limit for t in truths], width, np.inf)
+        self.gain = padded([t.motor_gain for t in truths], width, 1.0)
+        delay = np.rint(padded([t.motor_delay for t in truths], width) / step).astype(int)
+        self.late = _Cells(delay > 0)
+        self.wait = delay[self.late.all]
+        self.queue = np.repeat(self.current[None], int(delay.max()) + 1, axis=0)
+        self.bristles = Bristles(truths, inertia, step)
+        self.ripple = [padded([t.ripple[:, c] for t in truths], width) for c in range(3)]
+        self.spring, self.rest = (padded([t.spring[:, c] for t in truths], width) for c in range(2))
+        self.shared = [(b, s) for b, t in enumerate(truths) for s in t.shared]
+        self.armature = padded([np.where(t.elastic, 0.0, t.arm.armature) for t in truths], width)
+        self.passed = self.current.copy()
+        self.carried = self.current.copy()
+        self._sense(truths, width)
+        self._two_masses(truths, angle)
+
+    def _sense(self, truths: Sequence[Truth], width: int) -> None:
+        self.position_gain = padded([t.position_gain for t in truths], width, 1.0)
+        self.position_offset = padded([t.position_offset for t in truths], width)
+        self.bent = _Cells(padded([t.eccentricity[:, 0] for t in truths], width) != 0.0)
+        self.amplitude, self.phase = (
+            padded([t.eccentricity[:, c] for t in truths], width)[self.bent.all] for c in range(2)
+        )
+
+    def _two_masses(self, truths: Sequence[Truth], angle: Array) -> None:
+        self.soft = _Cells(np.isfinite(padded([t.stiffness for t in truths], angle.shape[1], np.inf)))
+        rows = list(zip(*(cells.tolist() for cells in self.soft.all), strict=True))
+        self.stiffness = np.array([truths[b].stiffness[j] for b, j in rows])
+        self.half_play = np.array([0.5 * truths[b].backlash[j] for b, j in rows])
+        self.rotor = np.array([truths[b].arm.armature[j] for b, j in rows])
+        self.spring_damping = 2.0 * SPRING_DAMPING * np.sqrt(self.stiffness * self.rotor)
+        torque = self.current[self.soft.all]
+        self.motor_angle = angle[self.soft.all] + torque / self.stiffness + self.half_play * np.sign(torque)
+        self.motor_half, self.motor_speed, self.motor_push = (np.zeros(len(rows)) for _ in range(3))
+
+    def reading(self, angle: Array) -> Array:
+        """Exact reading φ of the position sensors, which sit at the motor.
+
+        θ = gain·φ + offset + amplitude·sin(φ + phase).
+        """
+        k = len(angle)
+        turned = angle.copy()
+        soft, few = self.soft.within(k)
+        turned[soft] = self.motor_angle[:few]
+        reading = (turned - self.position_offset[:k]) / self.position_gain[:k]
+        bent, few = self.bent.within(k)
+        if few:
+            straight, gain = reading[bent], self.position_gain[bent]
+            phi = straight
+            for _ in range(6):  # contracts by amplitude each time
+                phi = straight - self.amplitude[:few] / gain * np.sin(phi + self.phase[:few])
+            reading[bent] = phi
+        return np.asarray(reading)
+
+    def forces(self, angle: Array, velocity: Array, command: Array) -> Array:
+        """Generalized forces on the links [N·m] now; `command` is what the controller asks for [N·m]."""
+        k = len(angle)
+        self._follow(command)
+        speed, turned = velocity, angle
+        soft, few = self.soft.within(k)
+        if few or self.shared:
+            speed, turned = velocity.copy(), angle.copy()
+        if few:
+            speed[soft], turned[soft] = self.motor_speed[:few], self.motor_angle[:few]
+        shared = [(b, s) for b, s in self.shared if b < k] if self.shared else ()
+        for b, s in shared:
+            speed[b, s.joint] += s.coefficient * velocity[b, s.other]
+        amplitude, cycles, phase = (part[:k] for part in self.ripple)
+        lost = self.bristles.force(speed, self.carried[:k]) + amplitude * np.sin(cycles * turned + phase)
+        passed = self.passed[:k]
+        np.subtract(self.gain[:k] * self.current[:k], lost, out=passed)
+        for b, s in shared:
+            passed[b, s.other] -= s.coefficient * lost[b, s.joint]
+        if few:
+            through = self._gear(few, angle[soft], velocity[soft])
+            self.motor_push[:few] = (passed[soft] - through) / self.rotor[:few]
+            passed[soft] = through
+        return np.asarray(passed - self.spring[:k] * (angle - self.rest[:k]))
+
+    def move(self, k: int) -> None:
+        """Leapfrog of the motors behind springs, one step."""
+        self.count += 1
+        _, few = self.soft.within(k)
+        if few:
+            push = self.motor_push[:few]
+            self.motor_half[:few] += self.step * push
+            self.motor_angle[:few] += self.step * self.motor_half[:few]
+            self.motor_speed[:few] = self.motor_half[:few] + 0.5 * self.step * push
+
+    def link_torque(self, acceleration: Array) -> Array:
+        """Torque at the link side of each transmission [N·m]: what was passed on less what the rotors took."""
+        k = len(acceleration)
+        torque = self.passed[:k] - self.armature[:k] * acceleration
+        for b, s in self.shared:
+            if b < k:
+                rotor = s.inertia * (acceleration[b, s.joint] + s.coefficient * acceleration[b, s.other])
+                torque[b, s.joint] -= rotor
+                torque[b, s.other] -= s.coefficient * rotor
+        self.carried[:k] = torque
+        return np.asarray(torque)
+
+    def _follow(self, command: Array) -> None:
+        """The current loops: delay, lag, limit."""
+        k, size = len(command), len(self.queue)
+        self.queue[self.count % size, :k] = command
+        late, few = self.late.within(k)
+        if few:
+            command = command.copy()
+            command[late] = self.queue[(self.count - self.wait[:few]) % size, late[0], late[1]]
+        current = self.current[:k]
+        current += self.follow[:k] * (command - current)
+        np.clip(current, -self.limit[:k], self.limit[:k], out=current)
+
+    def _gear(self, few: int, angle: Array, velocity: Array) -> Array:
+        """Torque through springs with play: none within the play, never pulling against the contact."""
+        twist = self.motor_angle[:few] - angle
+        stretch = twist - np.clip(twist, -self.half_play[:few], self.half_play[:few])
+        torque = self.stiffness[:few] * stretch + self.spring_damping[:few] * (self.motor_speed[:few] - velocity)
+        free = (self.half_play[:few] > 0) & (torque * stretch <= 0)
+        return np.asarray(np.where(free, 0.0, torque))
+
+
+class _Cells:
+    """Cells (arm, joint) of a mask in row order; `within(k)` gives those of the first k arms, and how many they are."""
+
+    def __init__(self, mask: NDArray[np.bool_]) -> None:
+        self.rows, self.columns = np.nonzero(mask)
+        self.all = (self.rows, self.columns)
+        self._k, self._found = -1, (self.all, len(self.rows))
+
+    def within(self, k: int) -> tuple[tuple[NDArray[np.intp], NDArray[np.intp]], int]:
+        if k != self._k:
+            few = int(np.searchsorted(self.rows, k))
+            self._k, self._found = k, ((self.rows[:few], self.columns[:few]), few)
+        return self._found

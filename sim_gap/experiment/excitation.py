@@ -1,0 +1,139 @@
+"""Motion that tells effects apart: pieces for single joints and for all, within the arm file's ranges and speeds."""
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from armlink.arm_file import ArmFile
+from armlink.errors import BadInput
+from calib.arm.kinematics import gcomp_arm
+from calib.motion.trajectory import trajectory
+
+Array = npt.NDArray[np.float64]
+
+MARGIN = 0.12
+"""Kept from each stop, as a share of the range."""
+SPEEDS = (0.03, 0.1, 0.3, 0.6)
+"""Constant speeds, as shares of a joint's max_velocity."""
+PACE = 0.5
+"""Speed on the way to a pose, as a share of max_velocity."""
+ACCELERATION = 1.0
+"""At most [rad/s²], for drives that have little torque left over gravity."""
+LONGEST = 25.0
+"""One turn through the range takes no longer [s]: at creeping speed only a part of it is gone through."""
+REST = 1.0
+"""Rest between pieces [s]."""
+TONES, BAND = 4, (0.08, 0.6)
+"""Sines of the motion of all joints, and their frequencies [Hz]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Position targets of an arm, one a cycle."""
+
+    names: tuple[str, ...]
+    rate: float
+    target: Array
+    """(K, n) [rad]."""
+    pieces: tuple[str, ...]
+    """What it consists of, for people."""
+
+    @property
+    def seconds(self) -> float:
+        """How long it takes [s]."""
+        return len(self.target) / self.rate
+
+
+def plan_motion(arm: ArmFile, joints: Iterable[str] = (), poses: int = 2, seed: int = 0) -> Motion:
+    """Each joint (or those named) alone, slow and fast, both ways, the others in `poses` poses; then all at once.
+
+    Constant speeds from creeping to fast part the frictions, reversals under two loads part friction from what depends
+    on load and play, and the sines of all joints part inertia, rotor and lag. Raises BadInput for a joint that the arm
+    does not have.
+    """
+    shape = _Shape(arm)
+    names = list(shape.names)
+    for joint in joints:
+        if joint not in names:
+            raise BadInput(f"no joint {joint} in arm {arm.name}: its joints are {', '.join(names)}")
+    chosen = [names.index(joint) for joint in dict.fromkeys(joints)] or list(range(len(names)))
+    random = np.random.default_rng(seed)
+    for pose in range(poses):
+        share = random.uniform(0.15, 0.85, len(names)) if pose else np.full(len(names), 0.5)
+        for number in chosen:
+            shape.turn(number, shape.low + share * (shape.high - shape.low))
+    shape.sines(chosen, random)
+    return shape.motion()
+
+
+class _Shape:
+    """The motion as far as it is made; begins and goes on from the middle of all ranges."""
+
+    def __init__(self, arm: ArmFile) -> None:
+        section, described = arm.require_link(), gcomp_arm(arm)
+        self.names, self.rate = described.names, float(section.rate)
+        room = MARGIN * (described.upper - described.lower)
+        self.low, self.high = described.lower + room, described.upper - room
+        self.fastest = np.array([joint.max_velocity for joint in section.joints])
+        self.here = (self.low + self.high) / 2
+        self.rows: list[Array] = [self.here[None]]
+        self.pieces: list[str] = []
+
+    def go(self, goal: Array, speed: Array) -> None:
+        """To a pose (n,) [rad], all joints arriving together, and rest there."""
+        way = trajectory(self.here, goal, speed, np.full(len(goal), ACCELERATION), 1 / self.rate)
+        self.rows += [way, np.repeat(goal[None], round(REST * self.rate), axis=0)]
+        self.here = goal
+
+    def turn(self, joint: int, pose: Array) -> None:
+        """One joint through its range at each constant speed, both ways; the others stay at `pose` (n,) [rad]."""
+        for share in SPEEDS:
+            speed = share * self.fastest[joint]
+            middle, half = (self.low[joint] + self.high[joint]) / 2, (self.high[joint] - self.low[joint]) / 2
+            half = min(half, speed * LONGEST / 2)
+            for end in (middle - half, middle + half, middle - half):
+                goal = pose.copy()
+                goal[joint] = end
+                there = np.allclose(np.delete(self.here, joint), np.delete(goal, joint))
+                self.go(goal, np.full(len(goal), speed) if there else PACE * self.fastest)
+        self.pieces.append(f"{self.names[joint]} alone, {len(SPEEDS)} speeds both ways, others at {np.round(pose, 2)}")
+
+    def sines(self, joints: list[int], random: np.random.Generator, seconds: float = 60.0) -> None:
+        """The joints at once, each its own sum of sines about the middle of its range."""
+        self.go((self.low + self.high) / 2, PACE * self.fastest)
+        t = np.arange(round(seconds * self.rate)) / self.rate
+        fade = np.clip(np.minimum(t, seconds - t) / 2.0, 0.0, 1.0)
+        fade = fade * fade * (3 - 2 * fade)
+        rows = np.repeat(self.here[None], len(t), axis=0)
+        for joint in joints:
+            omega = 2 * np.pi * random.uniform(*BAND, TONES)
+            reach = 0.9 * (self.high[joint] - self.low[joint]) / 2
+            size = np.minimum(np.minimum(reach, PACE * self.fastest[joint] / omega), ACCELERATION / omega**2) / TONES
+            rows[:, joint] += fade * (size * np.sin(np.outer(t, omega) + random.uniform(0, 2 * np.pi, TONES))).sum(1)
+        self.rows.append(rows)
+        self.here = rows[-1]
+        self.pieces.append(f"all at once, {TONES} sines each, {seconds:g} s")
+
+    def motion(self) -> Motion:
+        """All of it."""
+        return Motion(self.names, self.rate, np.concatenate(self.rows), tuple(self.pieces))
+
+
+def joints_in_doubt(answer: Path) -> tuple[list[str], list[str]]:
+    """(Joints that a diagnosis leaves open, its sentences on what to record) from its JSON; raises BadInput."""
+    try:
+        told: dict[str, Any] = json.loads(answer.read_text(encoding="utf-8"))
+        causes, where = told["causes"], told["where"]
+        open_causes = [cause for cause in causes if cause["confounded_with"]]
+        joints = [joint for cause in open_causes or causes for joint in cause["joints"]]
+        joints = joints or [place["joint"] for place in where]
+        return list(dict.fromkeys(joints)), [cause["separate_by"] for cause in open_causes if cause["separate_by"]]
+    except OSError as error:
+        raise BadInput(f"{answer}: cannot be read: {error.strerror}") from None
+    except (ValueError, KeyError, TypeError):
+        raise BadInput(f"{answer}: is no answer of armlink gap diagnose --json") from None

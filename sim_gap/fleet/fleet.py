@@ -1,0 +1,142 @@
+"""The diagnosis mapped over a fleet's recordings on dask.distributed: one task a case, answers kept as they come.
+
+A case is a folder with a model (`sim.xml`, `sim.urdf` or `sim.yaml`), `train*` and `heldout*` recordings; or, with one
+model for all, each recording that lies in the folder itself. A worker that dies takes no answer with it: dask runs its
+cases again elsewhere, and an answer that has been written is not made twice.
+"""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from armlink.errors import ArmlinkError, BadInput
+
+MODELS = ("sim.xml", "sim.urdf", "sim.yaml")
+SUFFIXES = (".csv", ".csv.gz", ".parquet", ".mcap")
+
+
+@dataclass(frozen=True)
+class Case:
+    """What one diagnosis is made from; `name` is its path within the folder."""
+
+    name: str
+    sim: Path
+    train: tuple[Path, ...]
+    heldout: tuple[Path, ...] = ()
+
+
+def find_cases(folder: Path, sim: Path | None = None) -> list[Case]:
+    """All cases under a folder, by name. Raises BadInput where there is none."""
+    if not folder.is_dir():
+        raise BadInput(f"{folder}: no such folder: give one that holds cases or recordings")
+    cases = [case for path in sorted(p for p in folder.rglob("*") if p.is_dir()) if (case := _case(path, folder, sim))]
+    if sim is not None:
+        cases += [Case(path.name, sim, (path,)) for path in _recordings(folder)]
+    if not cases:
+        raise BadInput(
+            f"{folder}: holds no case: expected folders with one of {', '.join(MODELS)}, train* and heldout* "
+            "recordings, or recordings and --sim MODEL for all of them"
+        )
+    return cases
+
+
+def _case(path: Path, folder: Path, sim: Path | None) -> Case | None:
+    recordings = _recordings(path)
+    train = tuple(each for each in recordings if each.name.startswith("train"))
+    model = next((path / name for name in MODELS if (path / name).is_file()), sim)
+    if not train or model is None:
+        return None
+    heldout = tuple(each for each in recordings if each.name.startswith("heldout"))
+    return Case(str(path.relative_to(folder)), model, train, heldout)
+
+
+def _recordings(path: Path) -> list[Path]:
+    return sorted(each for each in path.iterdir() if each.is_file() and each.name.endswith(SUFFIXES))
+
+
+def diagnose_case(case: Case) -> dict[str, Any]:
+    """The answer of one case as the contract's dictionary, or `{"error": line}` where it cannot be diagnosed."""
+    from armlink.recording.recording import load_recording
+    from sim_gap.attribution.diagnose import diagnose
+
+    paths = [*case.train, *case.heldout]
+    try:
+        recordings = [load_recording(path) for path in paths]
+        count = len(case.train)
+        answer = diagnose(case.sim, recordings[:count], recordings[count:], labels=[str(path) for path in paths])
+    except ArmlinkError as error:
+        return {"error": str(error)}
+    return answer.to_json()
+
+
+def diagnose_fleet(cases: list[Case], client: Any) -> Iterator[tuple[str, dict[str, Any]]]:
+    """(Case name, answer) as they come in from the cluster of a `distributed.Client`; each case once."""
+    from distributed import as_completed
+
+    names = {client.submit(diagnose_case, case, key=f"gap-{case.name}", pure=False): case.name for case in cases}
+    for future in as_completed(list(names)):
+        if future.status == "finished":
+            yield names[future], future.result()
+        else:
+            yield names[future], {"error": f"the workers failed at it: {future.exception()}"}
+        future.release()
+
+
+class Answers:
+    """Answers by case in a file of JSON lines, only ever added to; a line that a kill cut off does not count."""
+
+    def __init__(self, path: Path) -> None:
+        """Read what is there. Raises BadInput where the file is of something else or cannot be written."""
+        self.path = path
+        self.found: dict[str, dict[str, Any]] = {}
+        try:
+            with path.open("a+b") as stream:
+                stream.seek(0)
+                whole = stream.read()
+                if whole and not whole.endswith(b"\n"):
+                    stream.write(b"\n")
+        except OSError as error:
+            raise BadInput(f"{path}: cannot be written: {error.strerror}") from None
+        for number, line in enumerate(whole.splitlines(), start=1):
+            try:
+                entry = json.loads(line)
+                self.found[str(entry["case"])] = entry["answer"]
+            except ValueError:
+                continue
+            except (KeyError, TypeError):
+                raise BadInput(f"{path}: line {number} is no answer of a fleet: give another file with --out") from None
+
+    def add(self, case: str, answer: dict[str, Any]) -> None:
+        """Keep an answer; raises BadInput where the disk does not take it."""
+        try:
+            with self.path.open("a", encoding="utf-8") as stream:
+                stream.write(json.dumps({"case": case, "answer": answer}, ensure_ascii=False) + "\n")
+        except OSError as error:
+            raise BadInput(f"{self.path}: cannot be written: {error.strerror}") from None
+        self.found[case] = answer
+
+
+def table(answers: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
+    """One row a case and cause, for people and for Parquet; a case without a cause has one row."""
+    rows = []
+    for case, answer in sorted(answers.items()):
+        row: dict[str, Any] = {
+            "arm": case.split("/")[0],
+            "case": case,
+            "verdict": answer.get("verdict", "failed"),
+            "error": answer.get("error"),
+        }
+        row |= {"effect": None, "joints": None, "shrink": None, "confidence": None, "confounded_with": None}
+        causes = answer.get("causes") or [{}]
+        for cause in causes:
+            told = {
+                "effect": cause.get("effect"),
+                "joints": ", ".join(cause.get("joints", [])) or None,
+                "shrink": cause.get("shrink"),
+                "confidence": cause.get("confidence"),
+                "confounded_with": ", ".join(cause.get("confounded_with", [])) or None,
+            }
+            rows.append(row | told)
+    return rows

@@ -1,0 +1,232 @@
+"""Rigid-body torque of an open chain of hinges, and its exact regressor in every link's ten inertial parameters.
+
+Links, joint axes and inertials come from a compiled MuJoCo model; the arithmetic is the Newton-Euler recursion over
+whole recordings at once, so that 10⁵ rows cost less than a second. Checked against `mj_inverse` when a model is loaded.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_gap.model.tendons import Tendons, tendons_of
+
+Array = NDArray[np.float64]
+CREEP = 0.01
+"""Speed [rad/s] below which the sign of a velocity means nothing and friction may take any value."""
+INERTIAL = ("mass", "mx", "my", "mz", "ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+
+
+@dataclass(frozen=True)
+class RigidArm:
+    """An arm of n hinges: geometry, nominal inertial parameters, and what the model's joints carry besides."""
+
+    names: tuple[str, ...]
+    parent: tuple[int, ...]
+    """Index of the link before each link; -1 for the base."""
+    rotation: Array
+    """Link frame at joint angle zero in the parent link's frame, (n, 3, 3)."""
+    offset: Array
+    """Origin of the link frame (on the joint axis) in the parent link's frame [m], (n, 3)."""
+    axis: Array
+    """Joint axis in the link frame, (n, 3)."""
+    zero: Array
+    """Joint position at which the angle is zero (MuJoCo's qpos0) [rad], (n,)."""
+    inertial: Array
+    """Mass [kg], first moment [kg·m], inertia about the origin [kg·m²] in the link frame, (n, 10) as in INERTIAL."""
+    gravity: Array
+    """[m/s²] in the base frame, (3,)."""
+    armature: Array
+    damping: Array
+    frictionloss: Array
+    stiffness: Array
+    rest: Array
+    """The nominal joints' own motor-side terms, (n,) each: kg·m², N·m·s/rad, N·m, N·m/rad, rad."""
+    tendons: Tendons
+    """Motors that turn with several joints."""
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return len(self.names)
+
+    @cached_property
+    def carries(self) -> NDArray[np.bool_]:
+        """(n, n): whether joint i carries link j."""
+        carries = np.eye(self.n, dtype=bool)
+        for link in range(self.n):
+            if self.parent[link] >= 0:
+                carries[:, link] |= carries[:, self.parent[link]]
+        return carries
+
+    def with_inertial(self, inertial: Array) -> "RigidArm":
+        """The same arm with other inertial parameters (n, 10)."""
+        return replace(self, inertial=inertial)
+
+    def torque(self, q: Array, v: Array, a: Array, gravity: Array | None = None) -> Array:
+        """Link-side torque τ = M(q) a + C(q, v) v + ∂V/∂q of the rigid links [N·m], (K, n).
+
+        q, v, a (K, n) in rad, rad/s, rad/s²; gravity (3,) in the base frame, by default the model's.
+        """
+        turns, moves = self._forward(q, v, a, gravity)
+        forces, couples = [], []
+        for j, (omega, alpha, push) in enumerate(moves):
+            mass, moment, inertia = self.inertial[j, 0], self.inertial[j, 1:4], _symmetric(self.inertial[j, 4:])
+            forces.append(mass * push + _cross(alpha, moment) + _cross(omega, _cross(omega, moment)))
+            couples.append(inertia @ alpha + _cross(omega, inertia @ omega) - _cross(push, moment))
+        tau: Array = np.empty_like(q)
+        for j in reversed(range(self.n)):
+            tau[:, j] = self.axis[j] @ couples[j]
+            up = self.parent[j]
+            if up >= 0:
+                force = _out(turns[j], forces[j])
+                forces[up] = forces[up] + force
+                couples[up] = couples[up] + _out(turns[j], couples[j]) - _cross(force, self.offset[j])
+        return tau
+
+    def regressor(self, q: Array, v: Array, a: Array, gravity: Array | None = None) -> Array:
+        """Columns of `torque` in the inertial parameters: τ = Σ_j Y[:, i, j] · inertial[j]; (K, n, n, 10)."""
+        turns, moves = self._forward(q, v, a, gravity)
+        out = np.zeros((self.n, self.n, 10, len(q)))
+        for i in range(self.n):
+            axes = {i: np.repeat(self.axis[i][:, None], len(q), axis=1)}
+            arms = {i: np.zeros((3, len(q)))}
+            for j in range(i, self.n):
+                if j > i and self.parent[j] in axes:
+                    axes[j] = _in(turns[j], axes[self.parent[j]])
+                    arms[j] = _in(turns[j], arms[self.parent[j]] + self.offset[j][:, None])
+                if j in axes:
+                    out[i, j] = _link_columns(axes[j], _cross(axes[j], arms[j]), *moves[j])
+        return np.moveaxis(out, -1, 0)
+
+    def _forward(
+        self, q: Array, v: Array, a: Array, gravity: Array | None
+    ) -> tuple[list[Array], list[tuple[Array, Array, Array]]]:
+        """Each link's rotation to its parent (3, 3, K); its angular velocity and acceleration and the acceleration of
+        its origin less gravity, in its own frame, (3, K) each."""
+        field = self.gravity if gravity is None else gravity
+        still = np.zeros((3, len(q)))
+        base = still, still, still - np.asarray(field, float)[:, None]
+        turns: list[Array] = []
+        moves: list[tuple[Array, Array, Array]] = []
+        for j in range(self.n):
+            turn = _turned(self.rotation[j], self.axis[j], q[:, j] - self.zero[j])
+            omega, alpha, push = moves[self.parent[j]] if self.parent[j] >= 0 else base
+            if self.parent[j] >= 0:
+                lever = self.offset[j]
+                push = push + _cross(alpha, lever) + _cross(omega, _cross(omega, lever))
+            omega, alpha, push = _in(turn, omega), _in(turn, alpha), _in(turn, push)
+            spin = self.axis[j][:, None] * v[:, j]
+            alpha = alpha + self.axis[j][:, None] * a[:, j] + _cross(omega, spin)
+            turns.append(turn)
+            moves.append((omega + spin, alpha, push))
+        return turns, moves
+
+    def nominal_joint_torque(self, q: Array, v: Array, a: Array, direction: Array) -> Array:
+        """What the nominal joints add on the motor side: armature, damping, friction loss, spring, tendons (K, n).
+
+        `direction` is the sign of the velocity, however it is smoothed around rest.
+        """
+        spring = self.stiffness * (q - self.rest)
+        own = self.armature * a + self.damping * v + self.frictionloss * direction + spring
+        return np.asarray(own + self.tendons.torque(v, a, CREEP))
+
+
+def _link_columns(axis: Array, lever: Array, omega: Array, alpha: Array, push: Array) -> Array:
+    """Ten columns of one link for one joint: axis·(torque) + lever·(force), all in the link's frame, (10, K)."""
+    out = np.empty((10, axis.shape[1]))
+    out[0] = (lever * push).sum(0)
+    out[1:4] = _cross(lever, alpha) + _cross(_cross(lever, omega), omega) + _cross(push, axis)
+    gyro = _cross(axis, omega)
+    for column, (r, c) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)), start=4):
+        value = axis[r] * alpha[c] + gyro[r] * omega[c]
+        out[column] = value if r == c else value + axis[c] * alpha[r] + gyro[c] * omega[r]
+    return out
+
+
+def _cross(x: Array, y: Array) -> Array:
+    """Cross product of vectors (3, K) with vectors (3, K) or one vector (3,)."""
+    return np.stack([x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]])
+
+
+def _in(turn: Array, vector: Array) -> Array:
+    """Into the turned frame: Rᵀ x for rotations (3, 3, K) and vectors (3, K)."""
+    return np.stack([turn[0, i] * vector[0] + turn[1, i] * vector[1] + turn[2, i] * vector[2] for i in range(3)])
+
+
+def _out(turn: Array, vector: Array) -> Array:
+    """Out of the turned frame: R x."""
+    return np.stack([turn[i, 0] * vector[0] + turn[i, 1] * vector[1] + turn[i, 2] * vector[2] for i in range(3)])
+
+
+def _turned(start: Array, axis: Array, angle: Array) -> Array:
+    """Rotation `start` (3, 3) followed by angles (K,) about one axis (3,), by Rodrigues' formula, (3, 3, K)."""
+    x, y, z = axis
+    hat = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    sine, versine = np.sin(angle), 1.0 - np.cos(angle)
+    parts = start, start @ hat, start @ hat @ hat
+    return np.asarray(parts[0][..., None] + parts[1][..., None] * sine + parts[2][..., None] * versine)
+
+
+def _symmetric(six: Array) -> Array:
+    """(…, 6) as xx, xy, xz, yy, yz, zz → (…, 3, 3)."""
+    return np.asarray(six[..., [[0, 1, 2], [1, 3, 4], [2, 4, 5]]])
+
+
+def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:
+    """Read the chain of the MuJoCo joints `joints` (hinges, base to tip) out of a compiled model.
+
+    Other joints of the model stay locked at qpos0; bodies on them count to the link that carries them.
+    """
+    import mujoco
+
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    link_of_body = {int(model.jnt_bodyid[joint]): link for link, joint in enumerate(joints)}
+    frames = [(data.xmat[model.jnt_bodyid[j]].reshape(3, 3).copy(), data.xanchor[j].copy()) for j in joints]
+
+    def carrier(body: int) -> int:
+        while body and body not in link_of_body:
+            body = int(model.body_parentid[body])
+        return link_of_body.get(body, -1)
+
+    parent = tuple(carrier(int(model.body_parentid[model.jnt_bodyid[j]])) for j in joints)
+    inertial = np.zeros((len(joints), 10))
+    for body in range(1, model.nbody):
+        link = carrier(body)
+        if link >= 0:
+            turn, origin = frames[link]
+            spin = turn.T @ data.ximat[body].reshape(3, 3)
+            centre = turn.T @ (data.xipos[body] - origin)
+            inertia = spin @ np.diag(model.body_inertia[body]) @ spin.T
+            inertial[link] += inertial_of(float(model.body_mass[body]), centre, inertia)
+    ups = [frames[p] if p >= 0 else (np.eye(3), np.zeros(3)) for p in parent]
+    dof, adr = [int(model.jnt_dofadr[j]) for j in joints], [int(model.jnt_qposadr[j]) for j in joints]
+    return RigidArm(
+        names=tuple(
+            mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, j) or f"joint_{i + 1}" for i, j in enumerate(joints)
+        ),
+        parent=parent,
+        rotation=np.array([up[0].T @ own[0] for up, own in zip(ups, frames, strict=True)]),
+        offset=np.array([up[0].T @ (own[1] - up[1]) for up, own in zip(ups, frames, strict=True)]),
+        axis=np.array([model.jnt_axis[j] / np.linalg.norm(model.jnt_axis[j]) for j in joints]),
+        zero=model.qpos0[adr].copy(),
+        inertial=inertial,
+        gravity=model.opt.gravity.copy(),
+        armature=model.dof_armature[dof].copy(),
+        damping=np.reshape(model.dof_damping, (model.nv, -1))[dof, 0].copy(),
+        frictionloss=model.dof_frictionloss[dof].copy(),
+        stiffness=np.reshape(model.jnt_stiffness, (model.njnt, -1))[list(joints), 0].copy(),
+        rest=model.qpos_spring[adr].copy(),
+        tendons=tendons_of(model, joints),
+    )
+
+
+def inertial_of(mass: float, centre: Array, inertia: Array) -> Array:
+    """Ten parameters about the origin from mass [kg], centre [m] and inertia about the centre [kg·m²] (3, 3)."""
+    about = inertia + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+    return np.concatenate([[mass], mass * centre, about[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]])

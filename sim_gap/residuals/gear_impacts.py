@@ -1,0 +1,36 @@
+"""Hits: where a gear with play changes sides, the residual jumps as no smooth effect does, in that joint and others.
+
+No inverse form follows a hit. Its moments are left out of the comparison, and that there are hits is a finding itself.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_gap.model.rigid_body import Array
+from sim_gap.residuals.preprocess import Signals
+
+BEFORE_S, AFTER_S = 0.4, 0.6
+"""Left out before and after a change of sign of the torque."""
+SHARP = 25.0
+"""So many times sharper (second difference, RMS) than elsewhere the residual must be near these changes."""
+LEAST_LEFT = 0.2
+"""Share of a recording that must be left."""
+
+
+def hits(s: Signals, channel: str, residual: Array) -> dict[int, NDArray[np.bool_]]:
+    """Joints that hit at their torque reversals, and the samples near these, (k,) each.
+
+    `residual` is that of the link-side sensor `channel`, (k, n), at the rate of the comparison.
+    """
+    torque = s.filtered(s.reading[channel])
+    before, after = (round(seconds * s.rate / s.step) for seconds in (BEFORE_S, AFTER_S))
+    out = {}
+    for joint in range(s.n):
+        near = np.zeros(len(torque), bool)
+        for k in np.flatnonzero(np.diff(np.sign(torque[:, joint])) != 0).tolist():
+            near[max(0, k - before) : k + after + 1] = True
+        bend = np.zeros(len(torque))
+        bend[1:-1] = np.diff(residual[:, joint], 2) ** 2
+        if near.any() and (~near).mean() > LEAST_LEFT and bend[near].mean() > SHARP**2 * bend[~near].mean():
+            out[joint] = near
+    return out

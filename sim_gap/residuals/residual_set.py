@@ -1,0 +1,217 @@
+"""Residuals of a set of recordings: one row per channel and joint, with its noise floor, valid samples and folds."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d
+
+from sim_gap.effects.registry import Columns, Effect, Layout, Row, Shape
+from sim_gap.model.rigid_body import Array
+from sim_gap.residuals.gear_impacts import hits
+from sim_gap.residuals.preprocess import Signals
+
+MODEL_FLOOR = 1e-3
+"""Numerical and geometrical error that every model is granted, as a share of its torque."""
+SMALL, SMALL_INNER, SMALL_NM = 0.01, 0.003, 0.01
+"""Residual that is not worth a parameter: share of a joint's torque (RMS) against the model, of motor against sensor
+or command, and [N·m]."""
+CARE_NM = 0.05
+"""Smallest gap that a user would care about [N·m]: every arm has a few hundredths of friction and offset."""
+CARE, CARE_INNER, CARE_COMMAND = 0.016, 0.007, 0.001
+"""A gap that a user would care about, as a share of the joint's torque (RMS): against the model, motor against sensor,
+command against motor."""
+FAINT = 0.5
+"""Share of that below which there is nothing to search for."""
+FOLDS = 6
+MOVING_SHARE = 0.95
+"""A sample of the motor row counts where the joint moves during this share of the filter's window."""
+SETTLE_S, SETTLED_LEAST = 0.08, 0.4
+"""Left out before and after rest and reversal, if at least this share of the motion is left."""
+BLOCK_S = 2.0
+"""Length of the blocks within which errors may be correlated, for confidence intervals [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualSet:
+    """Recordings with a common layout. All arrays are at the decimated rate, recordings one after the other."""
+
+    signals: tuple[Signals, ...]
+    layout: Layout
+
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """Channel and joint of each residual."""
+        return self.layout.rows
+
+    @cached_property
+    def lengths(self) -> tuple[int, ...]:
+        """Samples of each recording."""
+        return tuple(len(s.filtered(s.t)) for s in self.signals)
+
+    @cached_property
+    def time(self) -> Array:
+        """Time since each recording's start [s], (K,)."""
+        return np.concatenate([s.sampled(s.t) for s in self.signals])
+
+    @cached_property
+    def values(self) -> dict[Row, Array]:
+        """Reading minus what it is compared with [N·m], (K,) per row."""
+        return {row: np.concatenate([one[row] for one in self._stacked]) for row in self.rows}
+
+    @cached_property
+    def _stacked(self) -> list[dict[Row, Array]]:
+        """`values` of each recording."""
+        return [self._differences(s) for s in self.signals]
+
+    def _differences(self, s: Signals) -> dict[Row, Array]:
+        layout = self.layout
+        out: dict[Row, Array] = {}
+        joints = s.arm.nominal_joint_torque(s.q, s.v, s.a, s.direction)
+        for channel in (layout.sensor, layout.motor, layout.command):
+            if channel is None:
+                continue
+            against = s.model if channel == layout.sensor else s.model + joints
+            if channel == layout.motor and layout.sensor:
+                against = s.reading[layout.sensor] + joints
+            if channel == layout.command and layout.motor:
+                against = s.reading[layout.motor]
+            difference = s.filtered(s.reading[channel] - against)
+            out |= {(channel, j): difference[:, j] for j in range(layout.n)}
+        return layout.compared(out)
+
+    @cached_property
+    def struck(self) -> dict[int, NDArray[np.bool_]]:
+        """Joints whose gear hits at torque reversals, and the samples near these, (K,) each."""
+        sensor, out = self.layout.sensor, dict[int, NDArray[np.bool_]]()
+        first = 0
+        for s, length in zip(self.signals if sensor else (), self.lengths, strict=False):
+            part = slice(first, first + length)
+            rest = np.stack([self.values[str(sensor), j][part] for j in range(self.layout.n)], axis=1)
+            for joint, near in hits(s, str(sensor), rest).items():
+                row = (str(sensor), joint)
+                if root_mean_square(rest[near, joint]) < self.margin[row] - 2.0 * self.floor[row]:
+                    continue
+                out.setdefault(joint, np.zeros(sum(self.lengths), bool))[part] = near
+            first += length
+        return out
+
+    @cached_property
+    def valid(self) -> dict[Row, NDArray[np.bool_]]:
+        """Samples that count: really read, no gear hitting, and for the motor row with the joint in motion."""
+        out: dict[Row, list[NDArray[np.bool_]]] = {row: [] for row in self.rows}
+        for s in self.signals:
+            moving = sliding(s)
+            for channel, joint in self.rows:
+                there = s.filtered(s.known[channel][:, joint]) > 0.9
+                reference = self.layout.reference((channel, joint))
+                if reference:
+                    there &= s.filtered(s.known[reference][:, joint]) > 0.9
+                if channel == self.layout.motor or (channel == self.layout.command and self.layout.beyond(joint)):
+                    there &= moving[:, joint]
+                out[channel, joint].append(there)
+        calm = ~np.any([np.zeros(sum(self.lengths), bool), *self.struck.values()], axis=0)
+        return {row: np.concatenate(parts) & calm for row, parts in out.items()}
+
+    @cached_property
+    def floor(self) -> dict[Row, float]:
+        """Noise floor of each row [N·m]: sensor noise, noise of the differentiated position, and model's own error."""
+        both = list(zip(self.signals, self._stacked, strict=True))
+        return {row: float(np.mean([self._floor(s, row, rest[row]) for s, rest in both])) for row in self.rows}
+
+    @cached_property
+    def care(self) -> dict[Row, float]:
+        """What is not worth explaining in each row [N·m]: noise, and a small share of the largest torque."""
+        small = {row: SMALL if row[0] == self.layout.against_model else SMALL_INNER for row in self.rows}
+        parts = {row: (self.floor[row], small[row] * self.usual_torque[row[1]], SMALL_NM) for row in self.rows}
+        return {row: float(np.linalg.norm(part)) for row, part in parts.items()}
+
+    @cached_property
+    def usual_torque(self) -> Array:
+        """RMS model torque of each joint, in the recording where it is largest [N·m], (n,)."""
+        return np.asarray(np.max([np.sqrt(np.mean(s.model**2, axis=0)) for s in self.signals], axis=0))
+
+    def _floor(self, s: Signals, row: Row, rest: Array) -> float:
+        channel, joint = row
+        reference = self.layout.reference(row)
+        told = float(np.linalg.norm([s.noise[name][joint] for name in (channel, reference) if name]))
+        inner = channel == self.layout.command and not self.layout.beyond(joint)
+        model = 0.0 if inner else MODEL_FLOOR * float(np.sqrt(np.mean(s.model[:, joint] ** 2)))
+        return float(np.hypot(min(told, float(s.upper_half(rest))), model)) + 1e-6
+
+    @cached_property
+    def folds(self) -> NDArray[np.intp]:
+        """Fold of each sample: contiguous stretches of time, (K,)."""
+        total, out, first = sum(self.lengths), [], 0
+        for length in self.lengths:
+            count = max(1, round(FOLDS * length / total))
+            out.append(first + np.minimum(np.arange(length) * count // length, count - 1))
+            first += count
+        return np.concatenate(out)
+
+    @cached_property
+    def blocks(self) -> NDArray[np.intp]:
+        """Block of each sample: stretches of BLOCK_S, (K,)."""
+        out, first = [], 0
+        for s, length in zip(self.signals, self.lengths, strict=True):
+            own = (np.arange(length) * s.step / s.rate // BLOCK_S).astype(np.intp)
+            out.append(first + own)
+            first += int(own[-1]) + 1
+        return np.concatenate(out)
+
+    def columns(self, effect: Effect, place: int, shape: Shape) -> Columns:
+        """The effect's columns, filtered as the readings are, (K, p) per row that it touches."""
+        layout = self.layout
+        parts = [_filtered(s, layout.compared(effect.columns(s, layout, place, shape))) for s in self.signals]
+        return {row: np.concatenate([part[row] for part in parts]) for row in parts[0]}
+
+    @cached_property
+    def margin(self) -> dict[Row, float]:
+        """Below this a row's RMS is no gap [N·m]: twice its noise and what a user would care about.
+
+        The share is smaller where the motor is compared with the sensor, for no error of the links shows there.
+        """
+        torque = self.usual_torque
+        return {row: 2.0 * self.floor[row] + max(self._care(row) * torque[row[1]], CARE_NM) for row in self.rows}
+
+    def _care(self, row: Row) -> float:
+        """Share of the joint's torque that a gap in this row must have for a user to care."""
+        reference = self.layout.reference(row)
+        if reference is None:
+            return CARE
+        return CARE_COMMAND if (row[0], reference) == (self.layout.command, self.layout.motor) else CARE_INNER
+
+    @cached_property
+    def faint(self) -> dict[Row, float]:
+        """Below this a row's RMS may be noise and what nobody cares about: what is in it must show steadily [N·m]."""
+        noise = {row: 2.0 * floor for row, floor in self.floor.items()}
+        return {row: noise[row] + max(FAINT * (self.margin[row] - noise[row]), CARE_NM) for row in self.rows}
+
+    def spread(self, effect: Effect, place: int) -> Array:
+        """Prior standard deviation of the effect's coefficients."""
+        return effect.spread(self.signals[0], place)
+
+
+def sliding(s: Signals) -> NDArray[np.bool_]:
+    """Samples at which each joint has been, and goes on, sliding: friction is that of the model, (k, n).
+
+    Around rest and reversals it builds up over some way first. Where a joint does hardly anything else they stay.
+    """
+    moving = s.filtered(s.moving) > MOVING_SHARE
+    width = 2 * round(SETTLE_S * s.rate / s.step) + 1
+    settled = minimum_filter1d(moving.astype(np.uint8), width, axis=0, mode="nearest") > 0
+    enough = settled.mean(0) >= SETTLED_LEAST * moving.mean(0)
+    return np.where(enough, settled, moving)
+
+
+def _filtered(s: Signals, columns: Columns) -> Columns:
+    """Columns of all rows through the filter at once."""
+    ends = np.cumsum([x.shape[1] for x in columns.values()])[:-1]
+    pieces = np.split(s.filtered(np.hstack(list(columns.values()))), ends, axis=1)
+    return dict(zip(columns, pieces, strict=True))
+
+
+def root_mean_square(x: Array) -> float:
+    """Root of the mean square; NaN for nothing."""
+    return float(np.sqrt(np.mean(x**2))) if len(x) else float("nan")

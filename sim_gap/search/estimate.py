@@ -1,0 +1,190 @@
+"""The final fit of the chosen terms: coefficients, honest covariance, reported parameters, predictions."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+from sim_gap.effects.registry import Row, effects
+from sim_gap.model.rigid_body import Array
+from sim_gap.residuals.residual_set import ResidualSet
+from sim_gap.search.normal_equations import CORRELATED, ColumnStore, Normal, Term
+from sim_gap.search.stepwise import Search
+
+NOMINAL, WORSE, WORST = 0.01, 0.5, 0.2
+"""Error that the nominal mass moments of all links may have unfound, as a share; where some link's was found wrong, it
+is this share of the largest such error, up to the last."""
+SHAPE_STEP = 1e-2
+SHORT_M = 0.01
+"""A link's centre of mass counts as at least so far from its joint's axis where errors of its moment are judged [m]."""
+SYSTEMATIC = 0.3
+"""Share of a row's residual, and of what is not worth explaining, that may pass for any effect however long one
+records."""
+
+
+@dataclass(frozen=True)
+class Value:
+    """One reported parameter."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+
+
+class Estimate:
+    """Terms fitted to a training set."""
+
+    def __init__(self, store: ColumnStore, terms: list[Term]) -> None:
+        self.store = store
+        self.normal = Normal(store, terms)
+        self.terms = tuple(self.normal.terms)
+        self.search = Search(self.normal, list(self.terms))
+        self.index, self.coefficients = self.search.weighted.fit(self.terms)
+
+    def of(self, term: Term) -> Array:
+        """Coefficients of one term."""
+        return self.coefficients[self.normal.at[term]]
+
+    def subset(self, terms: list[Term]) -> Array:
+        """Coefficients (P,) of a fit of these terms alone, zero elsewhere, under the final weights."""
+        out = np.zeros(self.normal.size)
+        index, values = self.search.weighted.fit(terms)
+        out[index] = values
+        return out
+
+    @cached_property
+    def _jacobian(self) -> list[tuple[float, Array, Array, NDArray[np.intp]]]:
+        """Per row: weight, columns with shape derivatives (k, P + S), residual (k,), block (k,)."""
+        data, out = self.store.data, []
+        weights = self.normal.weights(self.normal.mean_square(self.index, self.coefficients))
+        shaped = [(term, term.free) for term in self._shaped]
+        for weight, row in zip(weights, self.normal.rows, strict=True):
+            valid = data.valid[row]
+            x = np.zeros((len(valid), self.normal.size + len(shaped)))
+            for term in self.terms:
+                if row in (columns := self.store.columns(term)):
+                    x[:, self.normal.at[term]] = columns[row]
+            for k, (term, i) in enumerate(shaped):
+                if row in self.store.columns(term):
+                    assert i is not None
+                    x[:, self.normal.size + k] = self._shape_slope(term, i, row)
+            residual = data.values[row] - x[:, : self.normal.size] @ self.coefficients
+            out.append((float(weight), x[valid], residual[valid], data.blocks[valid]))
+        return out
+
+    @cached_property
+    def _shaped(self) -> list[Term]:
+        """Terms one of whose shape's entries was fitted."""
+        return [term for term in self.terms if term.free is not None]
+
+    def _shape_slope(self, term: Term, i: int, row: Row) -> Array:
+        step = SHAPE_STEP * abs(term.shape[i])
+        sides = []
+        for sign in (1.0, -1.0):
+            shape = tuple(s + sign * step * (k == i) for k, s in enumerate(term.shape))
+            sides.append(self.store.columns(Term(term.effect, term.place, shape))[row] @ self.of(term))
+        return np.asarray((sides[0] - sides[1]) / (2.0 * step))
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Of coefficients and smooth shapes, (P + S, P + S): sandwich over blocks of time, and what the rest of the arm
+        being a little wrong adds: an error of SYSTEMATIC times each row's residual that follows the column itself, mass
+        moments of links that are wrong unfound, and what every arm has of the effect."""
+        size = self._jacobian[0][1].shape[1]
+        bread, scores = np.zeros((size, size)), np.zeros((int(self.store.data.blocks.max()) + 1, size))
+        for weight, x, residual, block in self._jacobian:
+            bread += weight * x.T @ x
+            np.add.at(scores, block, weight * x * residual[:, None])
+        bread[np.arange(self.normal.size), np.arange(self.normal.size)] += self.normal.prior
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(bread), 1e-300))
+        inverse = np.linalg.pinv(bread * scale * scale[:, None], hermitian=True, rcond=1e-10) * scale * scale[:, None]
+        blocks = max(len(scores), 2)
+        seen = sum(len(residual) for _, _, residual, _ in self._jacobian) / max(len(self._jacobian), 1)
+        systematic = SYSTEMATIC**2 * seen / CORRELATED * inverse
+        statistical = inverse @ (scores.T @ scores) @ inverse * blocks / (blocks - 1)
+        ordinary = np.zeros(size)
+        for term in self.terms:
+            ordinary[self.normal.at[term]] = effects()[term.effect].ordinary
+        return np.asarray(statistical + systematic + self._unfound(inverse) + np.diag(ordinary**2))
+
+    def _unfound(self, inverse: Array) -> Array:
+        """What mass moments z of links that are wrong, but were not found so, add to the covariance, (P + S, P + S).
+
+        They pull the coefficients by A⁻¹ XᵀW Z z, A⁻¹ being `inverse`; of z is known what is usual, and what the
+        residual says: its mean square about zero given both.
+        """
+        links, scale = self._other_links()
+        size = len(scale)
+        if not size:
+            return np.zeros_like(inverse)
+        pull, own, seen = np.zeros((len(inverse), size)), np.eye(size), np.zeros(size)
+        for (weight, x, residual, _), row in zip(self._jacobian, self.normal.rows, strict=True):
+            z, valid = np.zeros((len(residual), size)), self.store.data.valid[row]
+            for k, link in enumerate(links):
+                if row in (columns := self.store.columns(Term("link.mass_moment", link))):
+                    z[:, 3 * k : 3 * k + 3] = columns[row][valid]
+            z *= scale
+            pull += weight * x.T @ z
+            own += weight * z.T @ z
+            seen += weight * z.T @ residual
+        moved = inverse @ pull
+        spread = np.linalg.inv(own - pull.T @ moved)
+        mean = spread @ seen
+        return np.asarray(moved @ (spread + np.outer(mean, mean)) @ moved.T)
+
+    def _other_links(self) -> tuple[list[int], Array]:
+        """Links whose mass moment is no term, and how wrong each component of it usually is [kg·m], (3 L,)."""
+        arm = self.store.data.signals[0].arm
+        found = {term.place: self.of(term) for term in self.terms if term.effect == "link.mass_moment"}
+        usual = np.maximum(np.linalg.norm(arm.inertial[:, 1:4], axis=1), SHORT_M * arm.inertial[:, 0])
+        wrong = max((float(np.linalg.norm(found[link]) / usual[link]) for link in found), default=0.0)
+        share = min(max(NOMINAL, WORSE * wrong), WORST)
+        links = [link for link in range(arm.n) if link not in found]
+        return links, np.repeat(share * usual[links], 3)
+
+    def parameters(self, term: Term) -> dict[str, Value]:
+        """Reported parameters with 95 % intervals."""
+        effect = effects()[term.effect]
+        beneath = {other.effect: other for other in self.terms if other.key in term.beneath}
+        shaped, free = self._shaped, term.free
+        chosen = [*self.normal.at[term], *(i for other in beneath.values() for i in self.normal.at[other])]
+        if term in shaped:
+            chosen.append(self.normal.size + shaped.index(term))
+        own = len(self.normal.at[term])
+
+        def evaluate(z: Array) -> Array:
+            shape = term.shape if free is None else term.reshaped(free, float(z[-1])).shape
+            under, at = {"nominal": self.normal.known_friction[term.place, None]}, own
+            for name, other in beneath.items():
+                width = len(self.normal.at[other])
+                under[name], at = z[at : at + width], at + width
+            return np.asarray(effect.values(z[:own], shape, under), float)
+
+        size = () if free is None else (term.shape[free],)
+        start = np.concatenate([self.of(term), *(self.of(other) for other in beneath.values()), size])
+        centre, steps = evaluate(start), 1e-5 * np.maximum(np.abs(start), 1e-3)
+        slopes = [
+            (evaluate(start + d) - evaluate(start - d)) / (2 * s) for s, d in zip(steps, np.diag(steps), strict=True)
+        ]
+        jacobian = np.stack(slopes, axis=1)
+        spread = np.sqrt(np.maximum(np.diag(jacobian @ self.covariance[np.ix_(chosen, chosen)] @ jacobian.T), 0.0))
+        blocks = int(self.store.data.blocks.max()) + 1
+        half = spread * student.ppf(0.975, max(blocks - 1, 1))
+        return {
+            p.name: Value(float(c), float(c - h), float(c + h), p.unit)
+            for p, c, h in zip(effect.parameters, centre, half, strict=True)
+        }
+
+    def predict(
+        self, data: ResidualSet, store: ColumnStore | None = None, terms: tuple[Term, ...] | None = None
+    ) -> dict[Row, Array]:
+        """What the terms explain on another set, (K,) per row."""
+        store = store or ColumnStore(data)
+        out = {row: np.zeros(sum(data.lengths)) for row in data.rows}
+        for term in self.terms if terms is None else terms:
+            for row, columns in store.columns(term).items():
+                out[row] += columns @ self.of(term)
+        return out

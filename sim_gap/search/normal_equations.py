@@ -1,0 +1,263 @@
+"""Normal equations of all candidate terms at once, per row and fold: trying a set of terms costs microseconds."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_gap.effects.registry import Columns, Layout, Row, Shape, effects
+from sim_gap.model.rigid_body import Array
+from sim_gap.residuals.residual_set import ResidualSet
+
+PRICE = 0.012
+"""What a coefficient must at least lower Σ ½ log(R² + floor²) over all rows by: about 1 % of one row's RMS."""
+CORRELATED = 8.0
+"""Samples of one effective observation: residuals of real arms are correlated over a third of a second or more."""
+
+
+@dataclass(frozen=True)
+class Term:
+    """One effect at one place with one shape."""
+
+    effect: str
+    place: int
+    shape: Shape = ()
+
+    @property
+    def key(self) -> tuple[str, int]:
+        """Effect and place, whatever the shape."""
+        return self.effect, self.place
+
+    def reshaped(self, entry: int, value: float) -> "Term":
+        """The same term with one entry of its shape changed."""
+        return Term(self.effect, self.place, (*self.shape[:entry], value, *self.shape[entry + 1 :]))
+
+    @property
+    def free(self) -> int | None:
+        """The one entry of its shape that is fitted beside its coefficients; None where there is none."""
+        effect = effects()[self.effect]
+        entries = [i for i in range(len(self.shape)) if i not in effect.counted]
+        return entries[0] if len(entries) == 1 and not effect.secant else None
+
+    def covers(self, layout: Layout) -> tuple[tuple[str, int], ...]:
+        """Keys of the terms that it contains."""
+        return effects()[self.effect].covers(layout, self.place)
+
+    @property
+    def bound(self) -> int:
+        """The one training recording that it is in, from 1; 0 where it belongs to the arm."""
+        return effects()[self.effect].bound_to(self.shape)
+
+    @property
+    def beneath(self) -> tuple[tuple[str, int], ...]:
+        """Keys of the terms that it stands upon."""
+        return tuple((name, self.place) for name in effects()[self.effect].needs)
+
+
+class ColumnStore:
+    """Filtered columns of terms on one residual set, computed once."""
+
+    def __init__(self, data: ResidualSet) -> None:
+        self.data = data
+        self._columns: dict[Term, Columns] = {}
+
+    def columns(self, term: Term) -> Columns:
+        """Columns per row, (K, p) each; rows that the term does not touch are absent."""
+        if term not in self._columns:
+            self._columns[term] = self.data.columns(effects()[term.effect], term.place, term.shape)
+        return self._columns[term]
+
+
+class Normal:
+    """Gram matrices of the terms' columns with each other and with the residuals, per fold and row."""
+
+    def __init__(self, store: ColumnStore, terms: Sequence[Term]) -> None:
+        data = store.data
+        self.terms = [term for term in terms if store.columns(term)]
+        self.rows, self.layout = data.rows, data.layout
+        self.known_friction = data.signals[0].arm.frictionloss
+        widths = [next(iter(store.columns(term).values())).shape[1] for term in self.terms]
+        ends = np.cumsum([0, *widths])
+        self.at = {term: np.arange(ends[i], ends[i + 1]) for i, term in enumerate(self.terms)}
+        self.size = int(ends[-1])
+        self.folds = int(data.folds.max()) + 1
+        shape = (self.folds, len(self.rows))
+        self.square, self.count = np.zeros(shape), np.zeros(shape)
+        self.blocks: list[_Block] = []
+        self._freedom: dict[Term, float] = {}
+        self.floor = np.array([data.care[row] for row in self.rows])
+        for r, row in enumerate(self.rows):
+            self._accumulate(store, r, row)
+        self.seen = self.count.sum(0) > 25
+        spreads = [data.spread(effects()[term.effect], term.place) for term in self.terms]
+        spread = np.concatenate([np.broadcast_to(s, w) for s, w in zip(spreads, widths, strict=True)] or [np.zeros(0)])
+        mean_square = np.zeros(self.size)
+        for block in self.blocks:
+            mean_square[block.index] += np.diagonal(block.whole) / max(self.count.sum(), 1.0)
+        self.prior = 1.0 / spread**2 + 1e-9 * mean_square
+        self.prior[mean_square == 0.0] += 1.0
+        usual = [np.full(w, effects()[term.effect].usual) for term, w in zip(self.terms, widths, strict=True)]
+        self.pull = self.prior * np.concatenate([*usual, np.zeros(0)])
+
+    @property
+    def price(self) -> float:
+        """What a coefficient must lower Σ ½ log(R² + floor²) over all rows by: more where there is little data.
+
+        ½ log(N)/N for N effective observations of a row (Schwarz), but at least PRICE.
+        """
+        effective = max(float(self.count.sum(0).max(initial=0.0)) / CORRELATED, 3.0)
+        return max(PRICE, 0.5 * float(np.log(effective)) / effective)
+
+    def _accumulate(self, store: ColumnStore, r: int, row: Row) -> None:
+        data = store.data
+        touching = [term for term in self.terms if row in store.columns(term)]
+        valid, y = data.valid[row], data.values[row]
+        index = np.concatenate([self.at[term] for term in touching] or [np.zeros(0, int)]).astype(int)
+        x = np.hstack([store.columns(term)[row] for term in touching]) if touching else np.zeros((len(y), 0))
+        gram, side = np.zeros((self.folds, len(index), len(index))), np.zeros((self.folds, len(index)))
+        for fold in range(self.folds):
+            pick = valid & (data.folds == fold)
+            part, target = x[pick], y[pick]
+            gram[fold], side[fold] = part.T @ part, part.T @ target
+            self.square[fold, r], self.count[fold, r] = target @ target, pick.sum()
+        position = np.full(self.size, -1)
+        position[index] = np.arange(len(index))
+        self.blocks.append(_Block(index, position, gram, side))
+
+    def weights(self, mean_square: Array) -> Array:
+        """Weight of one sample of each row: 1/(floor² + R²), less the correlation of neighbours."""
+        return np.asarray(np.where(self.seen, 1.0 / (self.floor**2 + mean_square) / CORRELATED, 0.0))
+
+    def index(self, terms: Sequence[Term]) -> NDArray[np.intp]:
+        """Positions of the terms' coefficients."""
+        return np.concatenate([self.at[term] for term in terms] or [np.zeros(0, np.intp)]).astype(np.intp)
+
+    def solve(self, index: NDArray[np.intp], gram: Array, side: Array) -> Array:
+        """Coefficients at `index` from the weighted sums (p, p) and (p,) of these, with the prior."""
+        matrix, right = gram + np.diag(self.prior[index]), side + self.pull[index]
+        scale = 1.0 / np.sqrt(np.diag(matrix))
+        return np.asarray(
+            scale * np.linalg.solve(matrix * scale * scale[:, None] + 1e-10 * np.eye(len(index)), scale * right)
+        )
+
+    def mean_square(self, index: NDArray[np.intp], coefficients: Array) -> Array:
+        """Residual's mean square per row after the terms, (R,)."""
+        errors = sum((self.errors(index, coefficients, fold) for fold in range(self.folds)), np.zeros(len(self.rows)))
+        return np.asarray(errors / np.maximum(self.count.sum(0), 1.0))
+
+    def freedom(self, term: Term) -> float:
+        """How many of a term's coefficients can show: those whose plausible size is worth a parameter."""
+        if term not in self._freedom:
+            at = self.at[term]
+            gram = np.zeros((len(at), len(at)))
+            for weight, block in zip(self.weights(np.zeros(len(self.rows))), self.blocks, strict=True):
+                inside = block.position[at]
+                if np.all(inside >= 0):
+                    gram += weight * block.whole[np.ix_(inside, inside)]
+            spread = 1.0 / np.sqrt(self.prior[at])
+            values = np.maximum(np.linalg.eigvalsh(gram * spread * spread[:, None]), 0.0)
+            self._freedom[term] = max(float(np.sum(values / (1.0 + values))), 1.0)
+        return self._freedom[term]
+
+    def size_of(self, term: Term, index: NDArray[np.intp], coefficients: Array) -> Array:
+        """RMS that a term contributes to each row with these coefficients of all terms (0 where it does not), (R,)."""
+        values = dict(zip(index.tolist(), coefficients.tolist(), strict=True))
+        c, out = np.array([values[i] for i in self.at[term].tolist()]), np.zeros(len(self.rows))
+        for r, block in enumerate(self.blocks):
+            at = block.position[self.at[term]]
+            if np.all(at >= 0):
+                out[r] = np.sqrt(max(float(c @ block.whole[np.ix_(at, at)] @ c), 0.0) / max(self.count[:, r].sum(), 1))
+        return out
+
+    def errors(self, index: NDArray[np.intp], coefficients: Array, fold: int) -> Array:
+        """Sum of squares per row after the terms over one fold, (R,)."""
+        out = self.square[fold].copy()
+        for r, block in enumerate(self.blocks):
+            at = block.position[index]
+            there = at >= 0
+            at, c = at[there], coefficients[there]
+            if len(at):
+                out[r] += c @ (block.gram[fold][at[:, None], at] @ c - 2.0 * block.side[fold][at])
+        return np.asarray(np.maximum(out, 0.0))
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Sums of one row over the columns that touch it."""
+
+    index: NDArray[np.intp]
+    """Those columns among all, (p,)."""
+    position: NDArray[np.intp]
+    """Place of every column among those, −1 where it does not touch the row, (P,)."""
+    gram: Array
+    side: Array
+    """(F, p, p) and (F, p)."""
+
+    @cached_property
+    def whole(self) -> Array:
+        """Gram over all folds, (p, p)."""
+        return np.asarray(self.gram.sum(0))
+
+
+class Weighted:
+    """Normal equations under given row weights: fits, cross-validates, screens."""
+
+    def __init__(self, normal: Normal, mean_square: Array) -> None:
+        self.normal = normal
+        self.weights = normal.weights(mean_square)
+        self.gram, self.side = np.zeros((normal.size, normal.size)), np.zeros(normal.size)
+        for weight, block in zip(self.weights, normal.blocks, strict=True):
+            if weight > 0.0 and len(block.index):
+                self.gram[block.index[:, None], block.index] += weight * block.whole
+                self.side[block.index] += weight * block.side.sum(0)
+
+    def fit(self, terms: Sequence[Term]) -> tuple[NDArray[np.intp], Array]:
+        """Indices and coefficients of the terms on all folds."""
+        index = self.normal.index(terms)
+        return index, self.normal.solve(index, self.gram[np.ix_(index, index)], self.side[index])
+
+    def cross_validated(self, terms: Sequence[Term]) -> Array:
+        """Mean square per row, each fold predicted from the others, (R,)."""
+        normal, index = self.normal, self.normal.index(terms)
+        gram, side = self._without_fold(index)
+        errors = np.zeros(len(normal.rows))
+        for fold in range(normal.folds):
+            errors += normal.errors(index, normal.solve(index, gram[fold], side[fold]), fold)
+        return np.asarray(errors / np.maximum(normal.count.sum(0), 1.0))
+
+    def _without_fold(self, index: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Weighted sums over all folds but each, of the columns `index`, (F, p, p) and (F, p)."""
+        folds, size = self.normal.folds, len(index)
+        gram, side = np.zeros((folds, size, size)), np.zeros((folds, size))
+        for weight, block in zip(self.weights, self.normal.blocks, strict=True):
+            at = block.position[index]
+            there = np.flatnonzero(at >= 0)
+            if weight > 0.0 and len(there):
+                at = at[there]
+                gram[:, there[:, None], there] += weight * block.gram[:, at[:, None], at]
+                side[:, there] += weight * block.side[:, at]
+        return self.gram[np.ix_(index, index)] - gram, self.side[index] - side
+
+    def screen(self, terms: Sequence[Term], candidates: Sequence[Term]) -> list[tuple[float, Term]]:
+        """Candidates by the fall of the weighted squares that each would bring on top of `terms`, best first."""
+        normal, index = self.normal, self.normal.index(terms)
+        matrix, left = self.gram + np.diag(normal.prior), self.side
+        if len(index):
+            onto = self.gram[:, index]
+            through = np.linalg.solve(matrix[np.ix_(index, index)], np.column_stack([onto.T, left[index]]))
+            rest = onto @ through
+            floor = 1e-6 * np.diag(matrix)
+            matrix, left = matrix - rest[:, :-1], left - rest[:, -1]
+        else:
+            floor = 1e-6 * np.diag(matrix)
+        falls: list[tuple[float, Term]] = []
+        widths = np.array([len(normal.at[candidate]) for candidate in candidates], int)
+        for width in np.unique(widths).tolist():
+            same = [candidates[i] for i in np.flatnonzero(widths == width).tolist()]
+            own = np.array([normal.at[candidate] for candidate in same])
+            blocks = matrix[own[:, :, None], own[:, None, :]] + (floor[own] + 1e-300)[:, :, None] * np.eye(width)
+            gains = np.einsum("ki,ki->k", left[own], np.linalg.solve(blocks, left[own][..., None])[..., 0])
+            falls += zip(gains.tolist(), same, strict=True)
+        return sorted(falls, key=lambda pair: -pair[0])

@@ -1,0 +1,171 @@
+"""Raw frame logs: replayed they give the samples that were recorded live; cut anywhere they load up to the cut."""
+
+import json
+import struct
+
+import can
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from armlink.bus.frame_log import FrameLog, LogReader, TappedBus
+from armlink.cli import run
+from armlink.errors import BadInput
+from armlink.recording.recorder import Recorder
+from armlink.recording.recording import load_recording
+from armlink.recording.replay import frames_of_log, frames_of_recording, play_onto, recording_of_log
+
+SUFFIXES = (".asc", ".blf", ".log")
+EPOCH = 1_790_000_000.123456
+
+
+class Conversation:
+    """A bus on which two joints (nodes 1, 2) and their host talk, with error frames and others' in between."""
+
+    channel_info = "conversation"
+
+    def __init__(self, cycles, seed=0):
+        rng = np.random.default_rng(seed)
+        self.time, self.messages = 0.0, []
+        for cycle in range(cycles):
+            t = EPOCH + cycle * 0.004 + rng.uniform(0, 0.0004)
+            self.add(t, 0x201, struct.pack("<Hhi", 15, cycle, -cycle))
+            self.add(t + 1e-4, 0x80, b"")
+            for node in (1, 2):
+                self.add(t + 5e-4, 0x180 + node, rng.bytes(8))
+            self.messages.append(can.Message(timestamp=t + 6e-4, is_error_frame=True))
+            self.messages.append(can.Message(timestamp=t + 7e-4, arbitration_id=0x18FF0001, data=b"\x01"))
+            if cycle % 4 == 0:
+                self.add(t + 8e-4, 0x281, struct.pack("<Hhi", 0x27, 3, 4))
+        self.clock = self
+
+    def add(self, t, can_id, data):
+        self.messages.append(can.Message(timestamp=t, arbitration_id=can_id, data=data, is_extended_id=False))
+
+    def now(self):
+        return self.time
+
+    def recv(self, timeout):
+        self.time += timeout if not self.messages else 0.0
+        return self.messages.pop(0) if self.messages else None
+
+    def shutdown(self):
+        pass
+
+
+def record(arm, path, cycles=60):
+    with FrameLog(path) as log:
+        return list(Recorder(arm, TappedBus(Conversation(cycles), log.write)).rows(1.0))
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_replayed_log_gives_the_samples_recorded_live_bit_for_bit(arm_of, tmp_path, suffix):
+    live = record(arm_of(2), tmp_path / f"run{suffix}")
+    again = recording_of_log(arm_of(2), tmp_path / f"run{suffix}")
+    assert len(live) == 59
+    assert again.warning == ""
+    assert again.t.tobytes() == np.array([t for t, _ in live]).tobytes()
+    for name, values in again.channels().items():
+        assert values.tobytes() == np.array([row[name] for _, row in live]).tobytes(), name
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_every_message_is_in_the_log(arm_of, tmp_path, suffix):
+    record(arm_of(2), tmp_path / f"run{suffix}")
+    written = list(can.LogReader(str(tmp_path / f"run{suffix}")))
+    sent = Conversation(60).messages
+    assert [bytes(m.data) for m in written if not m.is_error_frame] == [
+        bytes(m.data) for m in sent if not m.is_error_frame
+    ]
+
+
+@pytest.fixture(scope="module", params=SUFFIXES)
+def whole(request, tmp_path_factory):
+    path = tmp_path_factory.mktemp("logs") / f"run{request.param}"
+    with FrameLog(path) as log:
+        bus = TappedBus(Conversation(250), log.write)
+        while bus.take(0.0):
+            pass
+    return path, path.read_bytes(), list(LogReader(path).frames())
+
+
+@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(data=st.data())
+def test_a_log_cut_at_any_byte_loads_up_to_the_cut_and_says_so(whole, data):
+    path, content, frames = whole
+    cut = data.draw(st.integers(0, len(content) - 1))
+    shorter = path.with_name(f"cut{path.suffix}")
+    shorter.write_bytes(content[:cut])
+    reader = LogReader(shorter)
+    loaded = list(reader.frames())
+    assert loaded == frames[: len(loaded)]
+    between_lines = path.suffix == ".log" and content[:cut][-1:] in (b"\n", b"")  # candump's log has no end
+    assert reader.warning or between_lines
+    lost = cut / len(content) * len(frames) - len(loaded)
+    assert lost < (300 if path.suffix == ".blf" else 20)  # a BLF container holds some 200 frames
+
+
+def test_content_that_is_none_is_said_in_one_line(arm_of, tmp_path):
+    for suffix in SUFFIXES:
+        (tmp_path / f"a{suffix}").write_bytes(b"(1.0) can0 zz#\xff\xff\n1 2 3\n" * 3)
+        with pytest.raises(BadInput, match="0 whole cycles"):
+            recording_of_log(arm_of(2), tmp_path / f"a{suffix}")
+    with pytest.raises(BadInput, match="no frame log"):
+        LogReader(tmp_path / "none.log")
+    with pytest.raises(BadInput, match=r"expected \.asc, \.blf, \.log"):
+        FrameLog(tmp_path / "a.txt")
+
+
+def test_only_what_joints_send_is_played_onto_a_bus_and_only_a_virtual_one(arm_of, tmp_path):
+    record(arm_of(2), tmp_path / "run.log")
+    assert {can_id for _, can_id, _ in frames_of_log(tmp_path / "run.log")} == {0x80, 0x181, 0x182, 0x281}
+    recording = recording_of_log(arm_of(2), tmp_path / "run.log")
+    with pytest.raises(BadInput, match="virtual bus only"):
+        play_onto(arm_of(2), tmp_path / "run.log", recording, "socketcan:can0", 0.0)
+    with can.Bus(interface="virtual", channel="replayed") as listener:
+        count = play_onto(arm_of(2), tmp_path / "run.log", recording, "virtual:replayed", 0.0)
+        heard = [listener.recv(0) for _ in range(count)]
+    assert [bytes(m.data) for m in heard] == [data for _, _, data in frames_of_log(tmp_path / "run.log")]
+
+
+def test_a_recording_goes_onto_a_bus_as_the_frames_that_joints_would_have_sent(arm_of, tmp_path):
+    class Played:
+        channel_info, time = "played", 0.0
+
+        def __init__(self, frames):
+            self.frames, self.clock, self.ended = list(frames), self, False
+
+        def now(self):
+            return self.time
+
+        def take(self, timeout=0.0):
+            self.time, can_id, data = self.frames.pop(0)
+            self.ended = not self.frames
+            return can_id, data
+
+        def put(self, can_id, data):
+            raise AssertionError("a recorder sends nothing")
+
+    record(arm_of(2), tmp_path / "run.log")
+    recording = recording_of_log(arm_of(2), tmp_path / "run.log")
+    rows = list(Recorder(arm_of(2), Played(frames_of_recording(arm_of(2), recording))).rows(10.0))
+    for name in ("position", "torque", "motor_torque"):
+        again = np.array([row[name] for _, row in rows])
+        np.testing.assert_array_equal(again, getattr(recording, name)[: len(rows)])
+    with pytest.raises(BadInput, match="2 joints, but test has 3"):
+        list(frames_of_recording(arm_of(3), recording))
+
+
+def test_the_command_decodes_shows_and_refuses(tmp_path, capsys):
+    assert run(["record", "sarcos", "--bus", "armlink_sim:sarcos"]) == 2
+    assert "nothing to write" in capsys.readouterr().err
+    assert run(["replay", "sarcos", str(tmp_path / "none.blf")]) == 2
+    (tmp_path / "a.csv").write_text("t,q_1,tau_1\n0,1,2\n0.5,1.5,3\n")
+    assert run(["replay", "sarcos", str(tmp_path / "a.csv"), "--speed", "0", "--json", "-"]) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["rows"] == 2
+    assert "+1.5000" in captured.err
+    assert run(["replay", "sarcos", str(tmp_path / "a.csv"), str(tmp_path / "b.mcap")]) == 0
+    assert load_recording(tmp_path / "b.mcap").t.size == 2
+    assert run(["replay", "sarcos", str(tmp_path / "a.csv"), "--bus", "socketcan:can0"]) == 2

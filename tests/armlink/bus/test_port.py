@@ -1,0 +1,179 @@
+"""Ports: CAN FD frames, several buses as one, and what a SocketCAN socket does when its queues are full."""
+
+import errno
+import socket
+import struct
+
+import can
+import pytest
+
+from armlink.arm_file import Bus
+from armlink.bus import socket_port
+from armlink.bus.open import BusGroup, open_bus, open_link_bus
+from armlink.bus.port import GroupPort, MessagePort, open_port
+from armlink.bus.socket_port import BATCH, SocketPort
+from armlink.errors import BadInput, BusFault
+
+
+class SocketBus:
+    """One end of a pair of sockets that carry CAN frames as SocketCAN does."""
+
+    channel_info = "pair"
+
+    def __init__(self):
+        self.socket, self.other = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+
+
+@pytest.fixture
+def pair():
+    bus = SocketBus()
+    yield bus
+    bus.socket.close(), bus.other.close()
+
+
+def raw(can_id, data=b""):
+    return struct.pack("=IB3x8s", can_id, len(data), data)
+
+
+def test_frames_go_out_and_in_in_order(pair):
+    port = SocketPort(pair)
+    port.send_all([(0x200 + i, bytes([i] * i)) for i in range(9)])
+    assert [pair.other.recv(100) for _ in range(9)] == [raw(0x200 + i, bytes([i] * i)) for i in range(9)]
+    for i in range(9):
+        pair.other.send(raw(0x180 + i, bytes([i] * i)))
+    assert [port.receive(0.0) for _ in range(9)] == [(0x180 + i, bytes([i] * i)) for i in range(9)]
+    assert port.receive(0.0) is None
+
+
+def test_more_frames_than_a_batch_are_all_taken(pair):
+    port = SocketPort(pair)
+    for i in range(BATCH + 5):
+        pair.other.send(raw(i))
+    taken = []
+    while (frame := port.receive(0.0)) is not None:
+        taken.append(frame[0])
+    assert taken == list(range(BATCH + 5))
+
+
+def test_a_frame_that_came_after_the_queue_was_empty_is_seen_at_the_next_look(pair):
+    port = SocketPort(pair)
+    pair.other.send(raw(1))
+    assert port.receive(0.0) == (1, b"")
+    assert port.receive(0.0) is None
+    pair.other.send(raw(2))
+    assert port.receive(0.0) == (2, b"")
+    pair.other.send(raw(3))
+    assert port.receive(1.0) == (3, b"")
+
+
+def test_what_is_no_standard_data_frame_is_dropped_and_error_frames_are_counted(pair):
+    port = SocketPort(pair)
+    for can_id in (0x80000001, 0x40000001, 0x20000004, 5):
+        pair.other.send(raw(can_id))
+    assert port.receive(0.0) == (5, b"")
+    assert port.errors == 1
+    assert port.receive(0.0) is None
+    pair.other.send(raw(0x20000040))
+    with pytest.raises(BusFault, match="bus-off: check wiring"):
+        port.receive(0.0)
+
+
+def test_a_full_transmit_queue_is_waited_for_then_said(pair, monkeypatch):
+    monkeypatch.setattr(socket_port, "_RETRY", 0.0)
+    port = SocketPort(pair)
+    real, refusals = port._sendmmsg, [3]
+
+    def sendmmsg(*arguments):
+        if refusals[0]:
+            refusals[0] -= 1
+            socket_port.ctypes.set_errno(errno.ENOBUFS)
+            return -1
+        number, address, _, flags = arguments
+        return real(number, address, 1, flags)  # the kernel takes one at a time
+
+    port._sendmmsg = sendmmsg
+    port.send_all([(1, b"a"), (2, b"b"), (3, b"c")])
+    assert [pair.other.recv(100) for _ in range(3)] == [raw(1, b"a"), raw(2, b"b"), raw(3, b"c")]
+    refusals[0] = 1000
+    with pytest.raises(BusFault, match="transmit queue stays full: does any node acknowledge"):
+        port.send(1, b"")
+
+
+def test_a_socket_that_fails_is_a_bus_fault(pair):
+    port = SocketPort(pair)
+    pair.other.close()
+    with pytest.raises(BusFault, match="cannot send"):
+        port.send(1, b"")
+
+
+def test_can_fd_frames_carry_the_bit_rate_switch(pair):
+    port = SocketPort(pair, fd=True)
+    port.send(0x201, b"abc")
+    frame = pair.other.recv(100)
+    assert (len(frame), frame[4], frame[5] & 1, frame[8:11]) == (72, 3, 1, b"abc")
+    pair.other.send(raw(0x181, b"xy"))
+    pair.other.send(struct.pack("=IBB2x64s", 0x182, 12, 1, bytes(range(12))))
+    assert port.receive(0.0) == (0x181, b"xy")
+    assert port.receive(0.0) == (0x182, bytes(range(12)))
+
+
+def test_an_fd_bus_of_python_can_sends_fd_messages():
+    with (
+        open_bus(None, Bus(interface="virtual", channel="fd", fd=True)) as bus,
+        can.Bus(interface="virtual", channel="fd", protocol=can.CanProtocol.CAN_FD) as other,
+    ):
+        port = open_port(bus)
+        assert isinstance(port, MessagePort)
+        port.send(0x201, b"abc")
+        message = other.recv(0)
+        assert (message.is_fd, message.bitrate_switch, bytes(message.data)) == (True, True, b"abc")
+
+
+@pytest.fixture
+def group(arm_of):
+    section = arm_of(3).require_link()
+    joints = [joint.model_copy(update={"bus": "wrist"}) if joint.node == 3 else joint for joint in section.joints]
+    buses = {"wrist": Bus(interface="virtual", channel="wrist")}
+    bus = Bus(interface="virtual", channel="base")
+    group = open_link_bus(None, section.model_copy(update={"joints": tuple(joints), "buses": buses, "bus": bus}))
+    yield group
+    group.shutdown()
+
+
+def test_a_frame_goes_to_the_bus_of_its_node_and_one_for_all_to_every_bus(group):
+    assert isinstance(group, BusGroup)
+    with (
+        can.Bus(interface="virtual", channel="base") as base,
+        can.Bus(interface="virtual", channel="wrist") as wrist,
+    ):
+        port = open_port(group)
+        assert isinstance(port, GroupPort)
+        port.send_all([(0x201, b"1"), (0x203, b"3"), (0x77F, b"\x05"), (0x80, b"")])
+        port.send(0x000, b"\x01\x00")
+        port.send(0x603, b"x")
+        heard = {bus: [] for bus in (base, wrist)}
+        for bus, frames in heard.items():
+            while (message := bus.recv(0)) is not None:
+                frames.append(message.arbitration_id)
+        assert heard[base] == [0x201, 0x77F, 0x80, 0x000]
+        assert heard[wrist] == [0x203, 0x77F, 0x80, 0x000, 0x603]
+        wrist.send(can.Message(arbitration_id=0x183, data=b"w", is_extended_id=False))
+        base.send(can.Message(arbitration_id=0x181, data=b"b", is_extended_id=False))
+        assert sorted(filter(None, (port.receive(0.1) for _ in range(2)))) == [(0x181, b"b"), (0x183, b"w")]
+        assert port.receive(0.0) is None
+        wrist.send(can.Message(arbitration_id=0x183, data=b"w", is_extended_id=False))
+        assert group.recv(0.1).arbitration_id == 0x183
+        assert group.recv(0.0) is None
+        group.send(can.Message(arbitration_id=0x202, is_extended_id=False))
+        assert (base.recv(0).arbitration_id, wrist.recv(0)) == (0x202, None)
+
+
+def test_one_bus_on_the_command_line_takes_every_joint(arm_of):
+    section = arm_of(3, link={"bus": {"interface": "virtual", "channel": "a"}}).require_link()
+    with open_link_bus("virtual:b", section) as bus:
+        assert not isinstance(bus, BusGroup)
+
+
+def test_a_bus_that_is_not_there_is_named(arm_of):
+    with pytest.raises(BadInput, match=r"joint_1 is on bus 'tool', which link\.buses does not have"):
+        arm_of(1, joint={"bus": "tool"})

@@ -1,0 +1,99 @@
+"""The gate's limits come from the arm file and the controllers' units, exactly."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from armlink.arm_file import LinkJoint, load_arm, parse_arm
+from armlink.canopen.units import Units
+from armlink.errors import BadInput
+from armlink.link.gate_limits import gate_limits, joint_ranges, milliseconds, target_window
+
+UNITS = Units(torque=0.04, position=1e-5, encoder_step=1e-6)
+
+
+def joint(**keys):
+    return LinkJoint(name="elbow", node=3, **{"rated_torque": 40.0, "max_torque": 30.0, **keys})
+
+
+def test_limits_of_one_joint():
+    limits = gate_limits(joint(max_torque_rate=100.0, max_velocity=0.8), (-1.5, 2.5), UNITS, 0.004, 0.1)
+    assert limits.max_torque == 30.0
+    assert limits.torque_step == pytest.approx(0.4)
+    assert limits.position_step == pytest.approx(0.0032)
+    assert (limits.lower, limits.upper) == (-1.5, 2.5)
+    assert (limits.torque_unit, limits.position_unit) == (0.04, 1e-5)
+    assert limits.overspeed == pytest.approx(1.2)  # the stated margin: half as fast again
+    assert limits.outside == 0.1
+    assert limits.max_age == 0.1
+
+
+def test_the_window_has_room_for_the_sensor_and_for_pressing():
+    assert target_window(-2.0, 1.0) == pytest.approx((-2.0 - 0.09, 1.0 + 0.09))
+    assert target_window(-1.0, 3.0) == pytest.approx((-1.0 - 0.11, 3.0 + 0.11))
+    assert target_window(0.0, 0.0) == (-0.05, 0.05)
+    assert target_window(-3.0, -1.0) == pytest.approx((-3.0 - 0.11, -1.0 + 0.11))
+    assert target_window(1.0, 3.0) == pytest.approx((1.0 - 0.11, 3.0 + 0.11))
+
+
+def test_a_torque_that_no_frame_carries_is_refused():
+    most = 32767 * UNITS.torque
+    assert gate_limits(joint(max_torque=most), (-1, 1), UNITS, 0.004, 0.1).max_torque == most
+    with pytest.raises(BadInput, match=r"elbow: max_torque 1310\.7\d* N·m: 6071h carries at most 1310\.68 N·m"):
+        gate_limits(joint(max_torque=most + 0.05), (-1, 1), UNITS, 0.004, 0.1)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_window_that_no_frame_carries_is_refused(side):
+    far = side * (2**31 - 1) * 0.5
+    window = (min(far, 0.0), max(far, 0.0))
+    units = Units(0.04, 0.5, 1e-6)
+    assert gate_limits(joint(), window, units, 0.004, 0.1).lower == window[0]
+    beyond = (window[0] + min(side, 0) * 0.5, window[1] + max(side, 0) * 0.5)  # one user unit more
+    with pytest.raises(BadInput, match=r"elbow: its range is more than 607Ah carries at 0\.5 rad a user unit"):
+        gate_limits(joint(), beyond, units, 0.004, 0.1)
+
+
+def test_milliseconds_are_rounded_up_and_never_zero():
+    assert [milliseconds(s) for s in (0.1, 0.0501, 0.05, 0.0001, 0.0)] == [100, 51, 50, 1, 1]
+    assert milliseconds(0.1 * 3) == 300  # 0.30000000000000004 s is 300 ms
+    assert milliseconds(2.0000001e-3) == 3
+
+
+def test_ranges_of_denavit_hartenberg_joints_are_their_stops():
+    joints = [{"name": "a", "lower": -1.0, "upper": 2.0}, {"name": "b", "lower": 0.5, "upper": 0.75}]
+    rows = [{"name": name, "node": i, "rated_torque": 1.0, "max_torque": 1.0} for i, name in enumerate("ab", 1)]
+    arm = parse_arm({"name": "x", "kinematics": {"joints": joints}, "link": {"joints": rows}}, Path("x.yaml"))
+    assert joint_ranges(arm) == ((-1.0, 2.0), (0.5, 0.75))
+
+
+MODEL = (
+    '<mujoco><compiler angle="degree"/><worldbody><body><joint name="a" range="-90 45"/><geom size="1"/>'
+    '<body><joint name="b" range="-10 10"/><geom size="1"/></body></body></worldbody></mujoco>'
+)
+
+
+def model_arm(folder, model, *names):
+    (folder / "arm.xml").write_text(model)
+    rows = "".join(
+        f"    - {{name: {name}, node: {i}, rated_torque: 1.0, max_torque: 1.0}}\n" for i, name in enumerate(names, 1)
+    )
+    (folder / "arm.yaml").write_text(f"name: m\nkinematics: {{model: arm.xml}}\nlink:\n  joints:\n{rows}")
+    return load_arm(folder / "arm.yaml")
+
+
+def test_ranges_of_a_model_are_by_name_and_in_the_order_of_the_link(tmp_path):
+    np.testing.assert_allclose(np.degrees(joint_ranges(model_arm(tmp_path, MODEL, "b", "a"))), [[-10, 10], [-90, 45]])
+
+
+def test_what_a_model_lacks_is_named(tmp_path):
+    with pytest.raises(BadInput, match=r"link\.joints names wrist, which .*arm\.xml has not"):
+        joint_ranges(model_arm(tmp_path, MODEL, "a", "wrist"))
+    free = MODEL.replace(' range="-10 10"', "")
+    with pytest.raises(BadInput, match=r"arm\.xml: joint b has no range: give its stops \[rad\]"):
+        joint_ranges(model_arm(tmp_path, free, "a", "b"))
+    with pytest.raises(BadInput, match=r"arm\.xml: "):
+        joint_ranges(model_arm(tmp_path, "<mujoco><nonsense/></mujoco>", "a"))
+    assert math.isfinite(joint_ranges(model_arm(tmp_path, MODEL, "a"))[0][0])

@@ -1,0 +1,191 @@
+"""The self-test: what it finds on a controller that does what it should, and on one that does not."""
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from armlink.arm_file import bundled_arms, parse_arm
+from armlink.cli import run
+from armlink.link.link import Link
+from armlink.selftest.with_power import PowerTest
+from armlink.selftest.without_power import SelfTest
+from sim_bus.bus.lock_step import LockStepBus
+from sim_bus.node import supervision
+from sim_bus.node.drives import Drives
+from sim_bus.node.supervision import Supervision
+from sim_bus.simulated_arm import SimulatedArm
+from sim_bus.truth import Truth
+
+QUICK_STOP = 0x07
+
+
+def two_joints(**joint):
+    row = {"rated_torque": 20.0, "max_torque": 20.0, **joint}
+    content = {
+        "name": "pair",
+        "kinematics": {
+            "joints": [
+                {"name": "hinge_1", "alpha": 1.5707963, "d": 0.2, "lower": -2.0, "upper": 2.0},
+                {"name": "hinge_2", "a": 0.3, "lower": -2.0, "upper": 2.0},
+            ]
+        },
+        "link": {"joints": [{"name": "hinge_1", "node": 11, **row}, {"name": "hinge_2", "node": 12, **row}]},
+        "sim": {
+            "links": [
+                {"mass": 2.0, "com": [0.0, 0.0, 0.05], "inertia": [0.01, 0.01, 0.01]},
+                {"mass": 1.0, "com": [0.1, 0.0, 0.0], "inertia": [0.01, 0.01, 0.01]},
+            ],
+            "sensors": {"noise": [0.01, 0.01], "bits": 16},
+        },
+    }
+    return parse_arm(content, Path("pair.yaml"))
+
+
+@pytest.fixture
+def simulated():
+    arm = two_joints()
+    return SimulatedArm(arm, Truth.of(arm), 1)
+
+
+def self_test(simulated, power=True):
+    with Link(simulated.arm, LockStepBus(arm=simulated)) as link:
+        results = SelfTest(link).run(power)
+    return {(each.joint, each.check): each for each in results}
+
+
+def outcomes(results, check):
+    return [each.outcome for (_, name), each in results.items() if name == check]
+
+
+def test_a_simulated_arm_passes_and_says_how_long_it_takes(simulated):
+    results = self_test(simulated)
+    assert {each.outcome for each in results.values()} == {"passed"}
+    for joint in ("hinge_1", "hinge_2"):
+        silent = results[joint, "RPDO deadline"]
+        assert silent.seconds == pytest.approx(0.1, abs=0.0081)
+        assert "quick stop" in silent.found
+        assert "8250h" in silent.found
+        alone = results[joint, "heartbeat of the host"]
+        assert alone.seconds == pytest.approx(0.2, abs=0.0081)
+        assert "8130h" in alone.found
+    simulated.advance(0.5)
+    assert [node.value(0x6041) & 0x6F for node in simulated.nodes] == [QUICK_STOP] * 2
+
+
+def test_the_joints_do_not_move(simulated):
+    before = simulated.plant.position.copy()
+    self_test(simulated)
+    assert np.abs(simulated.plant.position - before).max() < 0.02
+
+
+def test_without_power_nothing_is_enabled(simulated):
+    results = self_test(simulated, power=False)
+    assert [node.value(0x6041) & 0x4F for node in simulated.nodes] == [0x40] * 2
+    for check in PowerTest.CHECKS:
+        assert outcomes(results, check) == ["not run"] * 2
+    assert "failed" not in {each.outcome for each in results.values()}
+
+
+def test_a_latched_torque_offset_is_cleared(simulated):
+    simulated.nodes[0].set_data(0x60B2, 0, struct.pack("<h", 120))
+    results = self_test(simulated, power=False)
+    assert results["hinge_1", "settings: 60B2h:00 torque offset"].outcome == "passed"
+    assert simulated.nodes[0].value(0x60B2) == 0
+
+
+def test_a_device_that_swaps_disable_and_quick_stop_is_found_and_not_tried_again(simulated, monkeypatch):
+    monkeypatch.setattr(supervision, "ABORT_QUICK_STOP", 2)
+    monkeypatch.setattr(supervision, "ABORT_DISABLE", 3)
+    results = self_test(simulated)
+    assert outcomes(results, "RPDO deadline") == ["failed"] * 2
+    assert "goes to switch on disabled, expected quick stop" in results["hinge_1", "RPDO deadline"].found
+    assert "the other way round" in results["hinge_1", "RPDO deadline"].found
+    assert outcomes(results, "heartbeat of the host") == ["not run"] * 2
+    assert "lost its power" in results["hinge_2", "heartbeat of the host"].found
+
+
+def test_a_device_without_a_deadline_is_found(simulated, monkeypatch):
+    monkeypatch.setattr(Supervision, "rpdo", lambda *_: None)
+    results = self_test(simulated)
+    assert outcomes(results, "RPDO deadline") == ["failed"] * 2
+    assert "does nothing within" in results["hinge_1", "RPDO deadline"].found
+    assert outcomes(results, "heartbeat of the host") == ["passed"] * 2
+
+
+def test_a_device_that_does_not_watch_the_host_is_found(simulated, monkeypatch):
+    monkeypatch.setattr(Supervision, "heartbeat", lambda *_: None)
+    results = self_test(simulated)
+    assert outcomes(results, "RPDO deadline") == ["passed"] * 2
+    assert outcomes(results, "heartbeat of the host") == ["failed"] * 2
+
+
+def test_a_device_that_leaves_operational_is_told(simulated):
+    simulated.nodes[1].set_data(0x1029, 1, b"\0")
+    results = self_test(simulated)
+    assert results["hinge_2", "heartbeat of the host"].outcome == "passed"
+    assert "NMT pre-operational (1029h:01)" in results["hinge_2", "heartbeat of the host"].found
+    assert "NMT" not in results["hinge_1", "heartbeat of the host"].found
+
+
+def test_a_device_that_does_not_enter_a_mode_is_found(simulated, monkeypatch):
+    select = Drives._select_mode
+
+    def stubborn(self, joint):
+        if not (joint == 1 and self._mode_in[joint] == 10):
+            select(self, joint)
+
+    monkeypatch.setattr(Drives, "_select_mode", stubborn)
+    results = self_test(simulated)
+    assert results["hinge_1", "mode display"].outcome == "passed"
+    assert results["hinge_2", "mode display"].outcome == "failed"
+    assert "does not enter mode 10 (displays" in results["hinge_2", "mode display"].found
+
+
+def test_another_controller_is_found_and_nothing_is_set(simulated):
+    arm = two_joints(identity={"serial": 7})
+    with Link(arm, LockStepBus(arm=simulated)) as link:
+        results = SelfTest(link).run(power=True)
+    failed = [each for each in results if each.outcome == "failed"]
+    assert [(each.joint, each.check) for each in failed] == [("hinge_1", "identity"), ("hinge_2", "identity")]
+    assert "1018h:04 serial number is 0x" in failed[0].found
+    assert "expected 0x7: connect the right arm" in failed[0].found
+    assert not any(each.check.startswith("settings") for each in results)
+    assert simulated.nodes[0].value(0x1017) == 0
+
+
+def test_a_record_whose_crc_is_wrong_is_found(simulated):
+    simulated.nodes[0].set_data(0x2100, 9, struct.pack("<I", 12345))
+    assert self_test(simulated, power=False)["hinge_1", "calibration"].outcome == "failed"
+
+
+def test_the_command_answers_for_machines(tmp_path, capsys):
+    path = tmp_path / "pair.yaml"
+    content = yaml.safe_load(bundled_arms()["sarcos"].read_text())
+    content["link"]["joints"][1]["identity"] = {"vendor": 0, "serial": 1}
+    path.write_text(yaml.safe_dump(content))
+    assert run(["check", str(path), "--bus", f"armlink_sim:{path}", "--json", "-"]) == 1
+    captured = capsys.readouterr()
+    answer = json.loads(captured.out)
+    assert answer["schema"] == "armlink.check/1"
+    assert not answer["passed"]
+    assert [each["joint"] for each in answer["checks"] if each["outcome"] == "failed"] == ["joint_2"]
+    assert "check: 1 of" in captured.err.splitlines()[-1]
+    assert run(["check", "sarcos", "--bus", "armlink_sim:sarcos", "--passive", "--json", "-"]) == 0
+    assert json.loads(capsys.readouterr().out)["passed"]
+
+
+def test_on_another_bus_it_asks_first(capsys):
+    assert run(["check", "sarcos", "--bus", "virtual:nobody"]) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last == "armlink: check: nobody to ask: give --yes, or --passive for what needs no power"
+
+
+def test_an_arm_that_is_not_there_is_a_bus_fault(capsys):
+    content = yaml.safe_load(bundled_arms()["sarcos"].read_text())
+    assert content
+    assert run(["check", "sarcos", "--bus", "virtual:nobody", "--yes"]) == 3
+    assert "no answer from joint_1" in capsys.readouterr().err.splitlines()[-1]

@@ -1,0 +1,209 @@
+"""Commands sweep, calibrate, identify and verify, as a user runs them, on a simulated arm in lock-step."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from sweep_arms import random_arm
+
+from armlink.arm_file import load_arm
+from armlink.cli import run
+from armlink.link.link import Link
+from calib.arm.drive_limits import Limits
+from calib.records.records import CalibrationRecord
+from calib.records.store import RecordStore
+from calib.sweep.dataset import load_data
+from calib.sweep.run import run_sweep
+from sim_bus.bus.lock_step import LockStepBus
+from sim_bus.simulated_arm import SimulatedArm
+from sim_bus.truth import Truth
+
+
+@pytest.fixture(scope="module")
+def arm_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A two-joint arm file with short sweeps."""
+    arm = random_arm(31, 2)
+    path = tmp_path_factory.mktemp("arm") / "bench.yaml"
+    content = arm.model_dump(mode="json", exclude={"path", "sim", "sweep"}, exclude_none=True)
+    content["kinematics"].pop("model", None)
+    content["sim"] = {
+        "links": [link.model_dump(mode="json") for link in arm.sim.links],
+        "effects": [{"effect": each.effect, "joint": each.joint, **each.parameters} for each in arm.sim.effects],
+    }
+    content["sweep"] = {"steps": 5}
+    path.write_text(yaml.safe_dump(content), encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def swept(arm_path: Path) -> Path:
+    out = arm_path.parent / "bare"
+    assert run(["sweep", str(arm_path), "--bus", f"armlink_sim:{arm_path}", "--out", str(out)]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def loaded(arm_path: Path, swept: Path) -> Path:
+    """The second pass: the same arm with the recommended mass bolted on."""
+    plan = load_data(swept).plan
+    assert plan is not None
+    mass = plan.reference_mass
+    content = yaml.safe_load(arm_path.read_text(encoding="utf-8"))
+    content["sim"]["effects"].append({"effect": "link.payload", "mass": mass, "com": [0.1, 0.12, 0.05]})
+    heavier = arm_path.parent / "heavier.yaml"
+    heavier.write_text(yaml.safe_dump(content), encoding="utf-8")
+    out = arm_path.parent / "loaded"
+    command = ["sweep", str(arm_path), "--bus", f"armlink_sim:{heavier}", "--out", str(out)]
+    assert run([*command, "--reference-mass", str(mass)]) == 0
+    return out
+
+
+def test_from_sweeps_to_a_verified_model(
+    arm_path: Path, swept: Path, loaded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store, bus = ["--store", str(tmp_path / "records.db")], ["--bus", f"armlink_sim:{arm_path}"]
+    passes = [str(swept), str(loaded)]
+    assert run(["calibrate", *passes, *store, "--apply", *bus, "--json", "-"]) == 0
+    calibration = json.loads(capsys.readouterr().out)
+    assert calibration["applied"]
+    for gain, (low, high) in zip(calibration["gain"]["estimated"], calibration["gain"]["ci95"], strict=True):
+        assert gain == pytest.approx(1.0, abs=0.01)
+        assert low < gain < high
+    assert run(["identify", *passes, *store, "--json", "-"]) == 0
+    gravity = json.loads(capsys.readouterr().out)
+    assert all(gravity["identifiable"])
+    assert gravity["recursive"] == pytest.approx(gravity["beta"], abs=0.02)
+    assert run(["verify", str(arm_path), *bus, *store, "--poses", "4", "--json", "-"]) == 0
+    verified = json.loads(capsys.readouterr().out)
+    assert verified["passed"]
+    assert verified["calibration_record"] == calibration["record"]
+    assert verified["gravity_record"] == gravity["record"]
+
+
+def test_plan_prints_and_moves_nothing(arm_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["sweep", str(arm_path), "--plan", "--picture", str(tmp_path / "plan.html"), "--json", "-"]) == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert [sweep["joint"] for sweep in plan["sweeps"]] == [1, 1, 0, 0]
+
+
+def test_a_dry_run_makes_the_whole_sweep_on_the_simulated_arm(
+    arm_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No bus is opened: the arm file's own, socketcan:can0, is not there."""
+    out = tmp_path / "dry"
+    assert run(["sweep", str(arm_path), "--dry-run", "--no-check-stops", "--out", str(out), "--json", "-"]) == 0
+    answer, said = json.loads(capsys.readouterr().out), capsys.readouterr().err
+    data = load_data(out)
+    assert data.complete
+    assert answer["readings"] == len(data.readings)
+    assert answer["recommended_reference_mass"] > 0
+    assert said == ""
+
+
+def test_where_the_model_does_not_hold_nothing_is_written_unless_accepted(
+    arm_path: Path, swept: Path, loaded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A cable over the second joint pulls with 4 % of rated torque a rad."""
+    bent = []
+    for whole in (swept, loaded):
+        copy = tmp_path / whole.name
+        shutil.copytree(whole, copy)
+        bent.append(str(copy))
+        lines = [json.loads(line) for line in (copy / "readings.jsonl").read_text().splitlines()]
+        rated = load_data(copy).manifest.rated_torque[1]
+        for line in lines:
+            if line["kind"] == "reading":
+                line["torque"][1] += 0.04 * rated * line["position"][1]
+        (copy / "readings.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    store, bus = ["--store", str(tmp_path / "records.db")], ["--bus", f"armlink_sim:{arm_path}"]
+    assert run(["calibrate", *bent, *store, *bus, "--apply"]) == 1
+    error = capsys.readouterr().err
+    assert "j2: the sensor model does not hold: torque linear in position" in error
+    assert "nothing was written" in error
+    assert "--accept j2" in error
+    assert run(["calibrate", *bent, *store, *bus, "--apply", "--accept", "j9"]) == 2
+    assert "--accept j9: no such joint" in capsys.readouterr().err
+    assert RecordStore(str(tmp_path / "records.db")).current(CalibrationRecord, load_arm(str(arm_path))) is None
+    assert run(["calibrate", *bent, *store, *bus, "--apply", "--accept", "j2", "--json", "-"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["applied"]
+    assert answer["doubtful"] == ["j2"]
+
+
+def test_recalibrate_writes_what_drifted_to_the_controllers(
+    arm_path: Path, swept: Path, loaded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sensors 4 % up and 3 % down since the sweeps; a new sweep without a mass is enough, and 2100h then holds it."""
+    store, passes = ["--store", str(tmp_path / "records.db")], [str(swept), str(loaded)]
+    assert run(["calibrate", *passes, *store]) == 0
+    assert run(["identify", *passes, *store]) == 0
+    arm = load_arm(str(arm_path))
+    gain, offset = np.array([1.04, 0.97]), 0.01 * Limits.of(arm).rated
+    truth = replace(Truth.of(arm), gain=gain, offset=offset)
+    simulated = SimulatedArm(arm, truth, 5)
+    with Link(arm, LockStepBus(arm=simulated)) as link:
+        link.start()
+        link.enable()
+        again = run_sweep(link, arm, tmp_path / "again")
+    monkeypatch.setattr(Link, "open", lambda *_: Link(arm, LockStepBus(arm=simulated)))
+    assert run(["recalibrate", str(arm_path), str(again.path), *store, "--apply"]) == 0
+    record = RecordStore(str(tmp_path / "records.db")).current(CalibrationRecord, arm)
+    assert record is not None
+    for node, joint, true in zip(simulated.nodes, record.joints, gain, strict=True):
+        held = node.record.active
+        assert (held.gain, held.offset) == (np.float32(joint.gain), np.float32(joint.offset))
+        assert held.gain == pytest.approx(true, rel=0.01)
+    assert [each.offset for each in record.joints] == pytest.approx(
+        offset.tolist(), abs=0.003 * Limits.of(arm).rated.max()
+    )
+
+
+def test_sweep_needs_a_directory(arm_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["sweep", str(arm_path)]) == 2
+    assert "--out DIR" in capsys.readouterr().err
+
+
+def test_a_finished_directory_is_not_swept_over(
+    arm_path: Path, swept: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["sweep", str(arm_path), "--bus", f"armlink_sim:{arm_path}", "--out", str(swept)]) == 2
+    assert "not empty" in capsys.readouterr().err
+
+
+def test_calibrate_without_a_mass_tells_ratios_and_says_why(
+    swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["calibrate", str(swept), "--store", str(tmp_path / "records.db"), "--json", "-"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["gain"]["estimated"] == [None, None]
+    assert all("reference mass" in each["reason"] for each in answer["not_identifiable"] if each["parameter"] == "gain")
+    assert answer["gain_ratio"] == pytest.approx([1.0, 1.0], abs=0.05)
+    assert answer["offset"]["estimated"] == pytest.approx([0.0, 0.0], abs=0.1)
+
+
+def test_identify_without_a_scale_is_refused(swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["identify", str(swept), "--store", str(tmp_path / "records.db")]) == 1
+    assert "--reference-mass" in capsys.readouterr().err
+
+
+def test_verify_without_a_gravity_record_is_refused(
+    arm_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["verify", str(arm_path), "--bus", f"armlink_sim:{arm_path}", "--store", str(tmp_path / "records.db")]
+    assert run(command) == 1
+    assert "armlink identify makes one" in capsys.readouterr().err
+
+
+def test_a_directory_that_is_no_data_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["calibrate", str(tmp_path)]) == 2
+    assert "manifest.json is missing" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["sweep", "calibrate", "identify", "verify"])
+def test_help_has_an_example(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run([name, "--help"]) == 0
+    assert "Example: armlink" in capsys.readouterr().out

@@ -1,0 +1,180 @@
+"""The daemon's bus loop, with frames, physics and the link: driving, listening, faults, and the process that it has."""
+
+from collections import deque
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+from daemon_bench import DaemonBench
+from fast_daemon import QUIET
+
+from armlink.arm_file import load_arm
+from armlink.bus.open import open_link_bus
+from armlink.errors import BadInput, BusFault
+from armlink.link.link import Link
+from armlink.link.listener import Listener
+from armlink.link.types import Command
+from calib.arm.kinematics import gcomp_arm
+from calib.daemon.loop.arm_loop import ArmLoop
+from calib.daemon.loop.loop_messages import Batch, Down, LoopOptions, Up
+from calib.daemon.loop.loop_process import ChildHost
+from calib.daemon.settings import DaemonSection
+from calib.daemon.view.api_models import State
+from calib.motion.random_work import work_targets
+from sim_bus.bus.lock_step import LockStepBus
+from sim_bus.simulated_arm import SimulatedArm
+
+
+def settings(policy: str, **more: object) -> DaemonSection:
+    return DaemonSection.model_validate({"policy": policy, "recording": QUIET, **more})
+
+
+def test_on_the_simulated_arm_with_its_bus(tmp_path: Path) -> None:
+    bench = DaemonBench(tmp_path, settings=settings("propose", observer={"window": 12}))
+    assert bench.view.status().state is State.OBSERVING
+    bench.run(8)
+    assert bench.view.status().rows >= 2
+    assert {joint.state for joint in bench.view.joints()} == {"operation enabled"}
+    bench.bus_there = False
+    bench.host.close()
+    bench.run(2)
+    status = bench.view.status()
+    assert (status.state, status.bus.connected) == (State.FAULT, False)
+    assert "No such device" in (status.bus.fault or "")
+    bench.bus_there = True
+    bench.run(4)
+    assert bench.view.status().state is State.OBSERVING
+    assert [event.kind for event in bench.view.events()][-1] == "recovered"
+    bench.host.close()
+
+
+def test_a_fault_of_a_joint_is_a_message_and_the_bus_is_opened_again(tmp_path: Path) -> None:
+    bench = DaemonBench(tmp_path, settings=settings("observe"), work=False)
+    bench.run(1)
+    bench.host.loop.source.stop()
+    reply = bench.host.loop.run()
+    assert isinstance(reply[0], Down)
+    bench.run(1)
+    assert bench.view.status().state is State.OBSERVING
+
+
+def test_errors_of_the_bus_loop_come_back_as_what_they_are(tmp_path: Path) -> None:
+    bench = DaemonBench(tmp_path, settings=settings("observe"), work=False)
+    with pytest.raises(BadInput, match="gain 9"):
+        bench.host.controllers.write_calibration(0, 9.0, 0.0, 1)
+    bench.host.close()
+    with pytest.raises(BusFault):
+        bench.host.controllers.read_calibration(0)
+
+
+class Recorded(LockStepBus):
+    """The simulated arm's bus, with every frame on it kept."""
+
+    def __init__(self, arm: SimulatedArm) -> None:
+        super().__init__(arm=arm)
+        self.frames: list[tuple[float, int, bytes]] = []
+
+    def put(self, can_id: int, data: bytes) -> None:
+        self.frames.append((self.arm.time, can_id, bytes(data)))
+        super().put(can_id, data)
+
+    def take(self, timeout: float = 0.0) -> tuple[int, bytes] | None:
+        frame = super().take(timeout)
+        if frame is not None:
+            self.frames.append((self.arm.time, frame[0], bytes(frame[1])))
+        return frame
+
+
+class Tap:
+    """Another place on that bus, later: hears every frame at its time; sending is a failure."""
+
+    channel_info = "tap"
+
+    def __init__(self, frames: list[tuple[float, int, bytes]]) -> None:
+        self.frames, self.clock, self.time = deque(frames), self, 0.0
+
+    def now(self) -> float:
+        return self.time
+
+    def put(self, can_id: int, data: bytes) -> None:
+        raise AssertionError("listening only, nothing is sent")
+
+    def take(self, timeout: float = 0.0) -> tuple[int, bytes] | None:
+        if self.frames and self.frames[0][0] <= self.time + timeout:
+            self.time, can_id, data = self.frames.popleft()
+            return can_id, data
+        self.time += timeout
+        return None
+
+    def shutdown(self) -> None:
+        pass
+
+
+def test_beside_another_controller_it_hears_all_and_sends_nothing(tmp_path: Path) -> None:
+    bench = DaemonBench(tmp_path, settings=settings("observe"), work=False)
+    bench.host.close()
+    arm, bus = bench.arm, Recorded(bench.simulated)
+    described = gcomp_arm(arm)
+    with Link(arm, bus) as link:
+        link.start()
+        link.enable()
+        random = np.random.default_rng(3)
+        targets = work_targets(link.position_sent, described.lower, described.upper, np.ones(7), 0.004, random)
+        for _ in range(2000):
+            truth = link.cycle(Command.hold(next(targets)))
+    loop = ArmLoop(LoopOptions(arm, listen_only=True, open_bus=lambda: Tap(bus.frames)))
+    service = bench.service
+    service.listen_only = True
+    messages = [message for _ in range(120) for message in loop.run()]
+    for message in messages:
+        service.take(message)
+    batches = [message for message in messages if isinstance(message, Batch)]
+    assert sum(len(batch.t) for batch in batches) >= 1990
+    assert isinstance(messages[0], Up)
+    assert messages[0].held is None
+    assert "no SYNC" in messages[-1].reason
+    position = np.vstack([batch.channels["position"] for batch in batches])
+    assert np.isfinite(position).all()
+    assert np.abs(position - truth.position).max(axis=1).min() < 1e-3
+    sent = np.vstack([batch.channels["position_command"] for batch in batches])
+    assert np.abs(sent[50:-50] - position[50:-50]).max() < 0.1
+    assert bench.view.status().rows >= 2
+    assert bench.view.status().state is State.FAULT
+    assert batches[-1].stats.load > 0.2
+
+
+def test_a_sync_on_each_of_two_buses_is_one_cycle() -> None:
+    arm = load_arm("sarcos")
+    section = arm.require_link()
+    there = {name: {"interface": "virtual", "channel": name} for name in ("upper", "lower")}
+    joints = [{**each.model_dump(), "bus": "lower" if k < 3 else "upper"} for k, each in enumerate(section.joints)]
+    section = type(section).model_validate({**section.model_dump(), "buses": there, "joints": joints})
+    arm = arm.model_copy(update={"link": section})
+    with Listener(arm, open_link_bus(None, section)) as listener:
+        others = {name: can.Bus(interface="virtual", channel=name) for name in there}
+        for _ in range(4):
+            for name, other in others.items():
+                other.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+                for joint in section.joints:
+                    if joint.bus == name:
+                        reading = can.Message(arbitration_id=0x180 + joint.node, data=bytes(8), is_extended_id=False)
+                        other.send(reading)
+            samples = [listener.next(0.01) for _ in range(2)]
+        for other in others.values():
+            other.shutdown()
+    assert samples[1] is None
+    assert np.isfinite(samples[0].position).all()
+
+
+def no_bus() -> None:
+    raise BusFault("bus socketcan:can9: cannot open it: No such device")
+
+
+def test_the_bus_process_ends_when_the_service_is_gone() -> None:
+    host = ChildHost(LoopOptions(load_arm("sarcos"), open_bus=no_bus), fork=True)
+    assert host._ours.poll(60.0)
+    assert isinstance(host.pump()[0], Down)
+    host._ours.close()  # as the kernel does where the service is killed
+    host._process.join(60.0)
+    assert host._process.exitcode == 0

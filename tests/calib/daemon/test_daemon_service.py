@@ -1,0 +1,443 @@
+"""The daemon's service: what it knows, says and does, on an arm without a bus."""
+
+import itertools
+import json
+import logging
+import os
+import socket
+from datetime import timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fast_daemon import QUIET, FastDaemon
+
+from armlink.arm_file import load_arm
+from armlink.errors import BadInput
+from armlink.recording.recording import load_recording
+from calib.daemon.logs import JsonFormatter
+from calib.daemon.loop.loop_messages import Down, Up
+from calib.daemon.notify import Notifier, watchdog_seconds
+from calib.daemon.settings import DaemonSection
+from calib.daemon.state.journal import Journal
+from calib.daemon.view.api_models import State
+from calib.daemon.view.view import NoSuch, NotPossible
+from calib.records.records import CalibrationRecord
+
+
+def settings(policy: str = "apply", **more: object) -> DaemonSection:
+    return DaemonSection.model_validate({"policy": policy, "recording": QUIET, **more})
+
+
+def drifted(directory: Path, policy: str, seed: int = 1, **more: object) -> FastDaemon:
+    """A daemon whose joint 3 has drifted and been watched until something was made of it."""
+    daemon = FastDaemon(directory, seed, settings(policy), **more)
+    daemon.run(60)
+    daemon.fast.gain[2] *= 1.03
+    daemon.fast.offset[2] += 0.3
+    daemon.run(120)
+    return daemon
+
+
+# ---- what becomes of a drift
+
+
+def test_under_apply_a_drift_is_written_and_every_step_is_kept(tmp_path: Path) -> None:
+    daemon = drifted(tmp_path, "apply")
+    kinds = [event.kind for event in daemon.view.events()]
+    order = ["started", "alarm", "drift", "proposal", "approved", "recalibration", "check"]
+    places = [kinds.index(kind) for kind in order]
+    assert places == sorted(places)
+    gain, offset = daemon.fast.error()
+    assert abs(gain[2]) < 0.003
+    assert abs(offset[2]) < 0.05
+    current = daemon.store.current(CalibrationRecord, daemon.arm)
+    assert current is not None
+    assert daemon.view.status().records.calibration == current.id
+    assert daemon.ids[2] == current.number
+    (proposal,) = daemon.view.proposals()
+    assert (proposal.state, proposal.record, proposal.joint) == ("applied", current.id, "joint_3")
+
+
+def test_under_propose_nothing_is_written_until_a_person_approves(tmp_path: Path) -> None:
+    daemon = drifted(tmp_path, "propose")
+    (proposal,) = daemon.view.proposals()
+    assert proposal.state == "pending"
+    assert daemon.view.status().pending_proposals == 1
+    assert not any(call.startswith("write") for call in daemon.sdo)
+    approved = daemon.view.approve(proposal.id, "ann")
+    assert (approved.state, approved.decided_by) == ("applied", "ann")
+    assert abs(daemon.fast.error()[0][2]) < 0.003
+    assert daemon.store.activations(daemon.arm)[-1].by == "ann"
+    with pytest.raises(NotPossible, match="applied already"):
+        daemon.view.approve(proposal.id, "ann")
+
+
+def test_a_rejected_proposal_changes_nothing(tmp_path: Path) -> None:
+    daemon = drifted(tmp_path, "propose")
+    before = daemon.store.current(CalibrationRecord, daemon.arm)
+    assert daemon.view.reject(daemon.view.proposals()[0].id, "ann").state == "rejected"
+    assert daemon.store.current(CalibrationRecord, daemon.arm) == before
+    assert daemon.of_kind("rejected")[0].evidence["by"] == "ann"
+
+
+def test_under_observe_a_drift_is_an_event_alone(tmp_path: Path) -> None:
+    daemon = drifted(tmp_path, "observe")
+    assert daemon.of_kind("drift")
+    assert daemon.view.proposals() == ()
+    assert daemon.sdo == []
+
+
+def test_listening_only_sends_nothing_until_something_is_approved(tmp_path: Path) -> None:
+    daemon = drifted(tmp_path, "propose", listen_only=True)
+    assert daemon.sdo == []
+    daemon.view.approve(daemon.view.proposals()[0].id, "ann")
+    assert abs(daemon.fast.error()[0][2]) < 0.003
+
+
+def test_a_joint_is_recalibrated_by_itself_no_oftener_than_the_limit(tmp_path: Path) -> None:
+    daemon = drifted(tmp_path, "apply")
+    daemon.fast.offset[2] += 0.5
+    daemon.run(200)
+    states = [proposal.state for proposal in daemon.view.proposals()]
+    assert states[0] == "pending"
+    assert states.count("applied") == 1
+    assert "in 600 s" in daemon.of_kind("undecided")[-1].text
+    daemon.wall_shift = timedelta(hours=-5)  # a clock set back counts as no time
+    daemon.service.tick()
+    assert daemon.of_kind("clock")[0].evidence["seconds"] == pytest.approx(-18000, abs=1)
+
+
+def test_a_write_that_fails_is_said_and_the_old_record_stays(tmp_path: Path) -> None:
+    daemon = drifted(tmp_path, "propose")
+    daemon.on_write = daemon.broken
+    answer = daemon.view.approve(daemon.view.proposals()[0].id, "ann")
+    assert answer.state == "failed"
+    assert "joint gone" in answer.note
+    assert daemon.store.current(CalibrationRecord, daemon.arm).id == answer.base
+    assert daemon.service.state is State.OBSERVING
+
+
+def test_a_recalibration_that_makes_it_worse_is_rolled_back(tmp_path: Path) -> None:
+    """The sensor recovers right after the write: the check at the next rests finds the old pair better."""
+    daemon = FastDaemon(tmp_path, 1, settings("apply"))
+    daemon.run(60)
+    daemon.fast.offset[2] += 0.5
+    daemon.run(200, until=lambda: bool(daemon.of_kind("recalibration")))
+    daemon.fast.offset[2] -= 0.5
+    daemon.run(60, until=lambda: bool(daemon.of_kind("roll-back")))
+    assert daemon.of_kind("roll-back")[0].joint == "joint_3"
+    assert abs(daemon.fast.error()[1][2]) < 0.01
+    assert [line.by for line in daemon.store.activations(daemon.arm)][-1] == "check after recalibration"
+
+
+def test_payload_is_an_event_with_mass_and_centre_and_nothing_is_written(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 2, settings("apply"))
+    daemon.run(60)
+    daemon.fast.carry(1.5, np.array([0.05, -0.1, 0.1]))
+    daemon.run(60)
+    (payload,) = daemon.of_kind("payload")
+    assert payload.evidence["mass"] == pytest.approx(1.5, abs=0.02)
+    assert payload.evidence["com"] == pytest.approx([0.05, -0.1, 0.1], abs=0.02)
+    assert daemon.view.status().held
+    daemon.fast.put_down()
+    daemon.run(60)
+    assert daemon.of_kind("clear")
+    assert not daemon.view.status().held
+    assert daemon.view.proposals() == ()
+
+
+# ---- restarts
+
+
+def test_after_a_kill_it_knows_everything(tmp_path: Path) -> None:
+    daemon = drifted(tmp_path, "propose")
+    daemon.service.keeping.keep()
+    events, estimates, proposals = daemon.view.events(), daemon.view.estimates(), daemon.view.proposals()
+    rows = daemon.view.status().rows
+    daemon.kill()
+    daemon.start()
+    assert daemon.view.events()[: len(events)] == events
+    assert daemon.view.proposals() == proposals
+    assert daemon.view.status().rows == rows
+    for before, after in zip(estimates, daemon.view.estimates(), strict=True):
+        assert after.model_copy(update={"last_accepted": before.last_accepted}) == before
+    daemon.view.approve(proposals[0].id, "ann")
+    assert abs(daemon.fast.error()[0][2]) < 0.003
+
+
+def test_a_kill_loses_at_most_five_seconds_of_the_estimate(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 3, settings())
+    daemon.run(50)
+    rows = daemon.view.status().rows
+    daemon.kill()
+    daemon.start()
+    assert rows - 5 <= daemon.view.status().rows <= rows
+
+
+def test_an_approval_cut_off_before_the_write_is_said_to_have_failed(tmp_path: Path) -> None:
+    daemon = drifted(tmp_path, "propose")
+    number = daemon.view.proposals()[0].id
+    daemon.service.journal.decide(number, daemon.wall(), "approved", "ann")
+    daemon.kill()
+    daemon.start()
+    assert daemon.view.proposals()[0].state == "failed"
+
+
+def test_an_approval_cut_off_after_the_write_is_in_force(tmp_path: Path) -> None:
+    daemon = drifted(tmp_path, "propose")
+    proposal = daemon.view.proposals()[0]
+    daemon.service.journal.decide(proposal.id, daemon.wall(), "approved", "ann")
+    daemon.service.keeping.keep()
+    daemon.service.recalibrations.recalibrator.apply(daemon.store.get(proposal.record), 2, "ann")
+    rows = daemon.view.status().rows
+    daemon.kill()
+    daemon.start()
+    assert daemon.view.proposals()[0].state == "applied"
+    assert daemon.view.status().rows == rows  # the observer went on, with the finding installed
+    assert daemon.view.estimates()[2].gain == 1.0
+    daemon.run(60)
+    assert not daemon.of_kind("alarm")[2:]
+
+
+def test_controllers_that_lost_power_get_the_record_again(tmp_path: Path) -> None:
+    daemon = drifted(tmp_path, "apply")
+    daemon.service.take(Down("no power"))
+    assert daemon.view.status().state is State.FAULT
+    daemon.fast.held_gain[:], daemon.fast.held_offset[:] = 1.0, 0.0
+    daemon.service.take(Up(daemon.held()))
+    assert daemon.of_kind("recalibration")[-1].evidence["restored"]
+    assert abs(daemon.fast.error()[0][2]) < 0.003
+
+
+def test_under_propose_readings_of_other_calibrations_are_converted(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 4, settings("propose"))
+    daemon.fast.held_gain[:], daemon.fast.held_offset[:] = 1.2, 2.0
+    daemon.service.take(Down("gone"))
+    daemon.service.take(Up(daemon.held()))
+    daemon.run(100)
+    assert "hold another calibration" in daemon.of_kind("configuration")[0].text
+    assert not daemon.of_kind("alarm", "drift")
+
+
+# ---- bus, records, configuration, disk
+
+
+def test_a_bus_that_comes_and_goes_is_shown_and_does_not_fill_the_journal(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon.run(5)
+    for number in range(200):
+        daemon.service.take(Down(f"bus socketcan:can0: gone {number}"))
+        status = daemon.view.status()
+        assert (status.state, status.bus.connected) == (State.FAULT, False)
+        assert str(number) in (status.bus.fault or "")
+        daemon.service.take(Up(daemon.held()))
+        assert daemon.view.status().state is not State.FAULT
+    assert len(daemon.view.events()) < 30
+
+
+def test_a_joint_that_falls_silent_is_a_fault(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon.run(5)
+    batch = daemon.service.batch
+    batch.age[3] = 1.7
+    assert daemon.view.status().state is State.FAULT
+    assert daemon.view.status().detail == "joint_4: no reading for 1.7 s"
+    assert daemon.view.joints()[3].sample_age_s == pytest.approx(1.7)
+
+
+def test_without_records_it_waits_and_begins_when_they_come(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings(), records=False)
+    daemon.run(10)
+    status = daemon.view.status()
+    assert status.state is State.STARTING
+    assert "calibration and gravity" in status.detail
+    assert daemon.view.estimates() == ()
+    assert daemon.view.joints()[0].model_torque is None
+    for record in daemon.good_records():
+        daemon.store.put(record, daemon.arm, by="ann", reason="sweep")
+    daemon.run(10)
+    assert daemon.view.status().state is State.OBSERVING
+    assert daemon.view.joints()[0].model_torque is not None
+
+
+def test_a_reload_changes_the_policy_and_keeps_what_was_learnt(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings("observe"))
+    daemon.run(60)
+    rows = daemon.view.status().rows
+    daemon.service.reload(daemon.arm, settings("apply", observer={"window": 16}))
+    status = daemon.view.status()
+    assert (status.policy, status.rows) == ("apply", rows)
+    assert daemon.service.watcher.observer.config.window == 16
+
+
+def test_a_full_disk_is_shown_and_stops_nothing(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon.run(10)
+    daemon.service.journal._db.execute("PRAGMA query_only=ON")
+    daemon.run(30)
+    assert "cannot be written" in daemon.view.status().detail
+    daemon.service.journal._db.execute("PRAGMA query_only=OFF")
+    daemon.run(30)
+    assert daemon.view.status().detail == ""
+
+
+def test_sweeps_are_by_schedule_or_request_and_only_where_the_bus_is_driven(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings(sweep_every_hours=0.02))
+    daemon.run(120, until=lambda: daemon.view.status().state is State.SWEEPING)
+    assert daemon.view.status().state is State.SWEEPING
+    daemon.run(120, until=lambda: daemon.view.status().state is State.OBSERVING)
+    assert [event.kind for event in daemon.of_kind("sweep")][:2] == ["sweep", "sweep"]
+    listening = FastDaemon(tmp_path / "listening", 1, settings(), listen_only=True)
+    listening.service.tours.request("asked for")
+    assert "only listens" in listening.of_kind("refused")[0].text
+
+
+def at_a_job_of_few_poses(tmp_path: Path, **more: object) -> FastDaemon:
+    """A daemon that knows its arm, which then goes to and fro among three poses while joint_3's sensor drifts."""
+    daemon = FastDaemon(tmp_path, 4, settings("apply", **more))
+    daemon.run(150)
+    fast = daemon.fast
+    half = 0.4 * (fast.arm.upper - fast.arm.lower)
+    poses = fast.q.clip(fast.arm.lower + half, fast.arm.upper - half) + half * np.array([[-0.5], [0.0], [0.5]])
+    fast.job = itertools.cycle(poses)
+    daemon.run(60)
+    fast.offset[2] += 0.8
+    return daemon
+
+
+def test_where_watching_cannot_decide_a_sweep_follows_and_decides(tmp_path: Path) -> None:
+    daemon = at_a_job_of_few_poses(tmp_path, sweep_when_undecided=True)
+    daemon.run(900, until=lambda: daemon.view.status().state is State.SWEEPING)
+    assert daemon.view.status().state is State.SWEEPING
+    assert daemon.of_kind("alarm")
+    assert "too few different poses" in daemon.of_kind("undecided")[-1].text
+    assert not daemon.of_kind("recalibration")
+    daemon.run(600, until=lambda: daemon.view.status().state is State.OBSERVING)
+    (written,) = daemon.of_kind("recalibration")
+    assert written.joint == "joint_3"
+    gain, offset = daemon.fast.error()
+    assert np.abs(gain).max() < 0.003
+    assert np.abs(offset).max() < 0.05
+
+
+def test_without_leave_no_sweep_follows_and_nothing_is_written(tmp_path: Path) -> None:
+    daemon = at_a_job_of_few_poses(tmp_path)
+    daemon.run(400)
+    assert daemon.of_kind("undecided")
+    assert not daemon.of_kind("sweep", "recalibration", "proposal")
+
+
+# ---- journal, recordings, settings, systemd
+
+
+def test_events_proposals_and_decisions_cannot_be_changed(tmp_path: Path) -> None:
+    import sqlite3
+
+    daemon = drifted(tmp_path, "propose")
+    daemon.view.reject(1, "ann")
+    for statement in ("UPDATE events SET text = ''", "DELETE FROM proposals", "DELETE FROM decisions"):
+        with pytest.raises(sqlite3.IntegrityError, match="append-only"):
+            daemon.service.journal._db.execute(statement)
+
+
+def test_a_journal_of_another_version_is_refused(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "journal.db")
+    journal._db.execute("PRAGMA user_version=99")
+    journal.close()
+    with pytest.raises(BadInput, match="schema 99"):
+        Journal(tmp_path / "journal.db")
+
+
+def test_history_is_thinned_evenly_and_ends_with_the_newest(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon.run(400)
+    points = daemon.view.history("joint_3")
+    assert len(points) >= 6
+    few = daemon.view.history("joint_3", most=3)
+    assert len(few) <= 3
+    assert few[-1] == points[-1]
+    assert daemon.view.history("joint_3", since=points[-2].time) == points[-2:]
+    with pytest.raises(NoSuch, match="joint_9"):
+        daemon.view.history("joint_9")
+    everything = daemon.view.history(None, most=3)
+    assert [point for point in everything if point.joint == "joint_3"] == list(few)
+
+
+def test_history_older_than_a_month_is_thinned_the_rest_stays_whole(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings())
+    journal, old = daemon.service.journal, daemon.wall() - timedelta(days=31)
+    for minute in range(100):
+        journal.add_history(old + timedelta(minutes=minute), 60.0 * minute, None, {"gain": []})
+    daemon.run(400)
+    times = [point[0] for point in journal.history(None, None, 1000)]
+    assert sum(time < daemon.wall() - timedelta(days=30) for time in times) == 10
+    assert len(daemon.view.history("joint_3")) >= 6
+
+
+def test_recordings_are_rotated_within_their_quota_and_load(tmp_path: Path) -> None:
+    given = {"minutes": 0.25, "quota_mb": 0.25, "rate": 25}
+    daemon = FastDaemon(
+        tmp_path, 1, settings().model_copy(update={"recording": DaemonSection(recording=given).recording})
+    )
+    daemon.run(200)
+    daemon.service.close("test")
+    files = sorted((tmp_path / "state" / "recordings").glob("*.mcap"))
+    assert 2 <= len(files) < 13
+    assert sum(file.stat().st_size for file in files) <= 0.25e6
+    assert int(files[-1].name.partition("-")[0]) > 10
+    recording = load_recording(files[0])
+    assert recording.warning == ""
+    assert np.diff(recording.t).mean() == pytest.approx(0.04, rel=0.02)
+    assert recording.t[-1] == pytest.approx(15.0, abs=4.0)
+
+
+def test_unknown_keys_and_thresholds_of_the_section_are_refused() -> None:
+    with pytest.raises(ValueError, match="no threshold 'windw'"):
+        DaemonSection.model_validate({"observer": {"windw": 3}})
+    with pytest.raises(ValueError, match="polcy"):
+        DaemonSection.model_validate({"polcy": "apply"})
+    assert load_arm("sarcos").daemon is None
+
+
+def test_systemd_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "notify"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(str(path))
+        Notifier(str(path))("READY=1", "STATUS=observing")
+        assert receiver.recv(100) == b"READY=1\nSTATUS=observing"
+    Notifier(str(path))("WATCHDOG=1")  # gone: no reason to stop
+    monkeypatch.setenv("WATCHDOG_USEC", "30000000")
+    monkeypatch.setenv("WATCHDOG_PID", str(os.getpid()))
+    assert watchdog_seconds() == 30.0
+    monkeypatch.setenv("WATCHDOG_PID", "1")
+    assert watchdog_seconds() is None
+
+
+def test_a_log_line_is_one_json_object() -> None:
+    record = logging.makeLogRecord({"name": "armlink.daemon", "levelname": "INFO", "msg": "a\nb", "joint": "joint_1"})
+    line = JsonFormatter().format(record)
+    assert "\n" not in line
+    assert json.loads(line)["joint"] == "joint_1"
+    assert json.loads(line)["message"] == "a\nb"
+
+
+async def _first(client: object) -> object:
+    return await client.get()
+
+
+def test_a_slow_client_loses_the_oldest_and_holds_nobody_up(tmp_path: Path) -> None:
+    import asyncio
+
+    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon.run(5)
+    client = daemon.view.subscribe()
+    for _ in range(1000):
+        daemon.view.publish()
+    last = daemon.view.snapshot()
+    assert asyncio.run(_first(client)).type == "joints"
+    assert len(client._items) < 100
+    client.close()
+    daemon.view.publish()
+    assert len(client._items) < 100
+    assert last.joints[0].joint == "joint_1"

@@ -1,0 +1,194 @@
+"""A daemon's view that tests fill by hand: what the web layer does must not depend on a bus."""
+
+import asyncio
+import math
+from collections import deque
+from datetime import UTC, datetime, timedelta
+
+from calib.daemon.view.api_models import (
+    BusHealth,
+    EventItem,
+    EventRecord,
+    HistoryPoint,
+    JointEstimate,
+    JointNow,
+    JointsItem,
+    Proposal,
+    RecordsInForce,
+    State,
+    Status,
+)
+from calib.daemon.view.view import NoSuch, NotPossible
+
+NOW = datetime(2026, 5, 1, 8, 0, tzinfo=UTC)
+NAMES = tuple(f"joint_{i}" for i in range(1, 8))
+
+
+class MadeUpSubscription:
+    """A queue of a few items."""
+
+    def __init__(self, view: "MadeUpView") -> None:
+        self._view = view
+        self.items: deque[JointsItem | EventItem] = deque([view.item()], maxlen=50)
+        self.more = asyncio.Event()
+
+    async def get(self) -> JointsItem | EventItem:
+        while not self.items:
+            self.more.clear()
+            await self.more.wait()
+        return self.items.popleft()
+
+    def close(self) -> None:
+        self._view.clients.discard(self)
+
+
+class MadeUpView:
+    """Seven joints at rest; `tick()` publishes one item, `happen()` an event."""
+
+    def __init__(self) -> None:
+        self.clients: set[MadeUpSubscription] = set()
+        self.begin()
+
+    def begin(self) -> None:
+        """As it is at the start."""
+        self.state, self.fault, self.t = State.OBSERVING, None, 0.0
+        self.report = None
+        self.log: list[EventRecord] = []
+        self.points: list[HistoryPoint] = []
+        self.offered: list[Proposal] = []
+        self.shift = 0.0
+
+    def tick(self, seconds: float = 0.1) -> None:
+        self.t += seconds
+        item = self.item()
+        for client in self.clients:
+            client.items.append(item)
+            client.more.set()
+
+    def happen(self, kind: str, joint: str | None = None, text: str = "", **evidence: object) -> EventRecord:
+        record = EventRecord(
+            id=len(self.log) + 1, time=self.time(), t=self.t, kind=kind, joint=joint, text=text, evidence=evidence
+        )
+        self.log.append(record)
+        for client in self.clients:
+            client.items.append(EventItem(event=record))
+            client.more.set()
+        return record
+
+    def propose(self, joint: str = "joint_2") -> Proposal:
+        proposal = Proposal(
+            id=len(self.offered) + 1,
+            time=self.time(),
+            state="pending",
+            joint=joint,
+            cause="gain",
+            gain=1.013,
+            gain_std=0.0006,
+            offset=0.004,
+            offset_std=0.012,
+            rows=40,
+            confidence=0.998,
+            record="1f0c9a2b",
+            base="77aa01cd",
+        )
+        self.offered.insert(0, proposal)
+        return proposal
+
+    def time(self) -> datetime:
+        return NOW + timedelta(seconds=self.t)
+
+    def item(self) -> JointsItem:
+        return JointsItem(time=self.time(), t=self.t, state=self.state, bus=self.bus(), joints=self.joints())
+
+    def bus(self) -> BusHealth:
+        if self.fault:
+            return BusHealth(connected=False, fault=self.fault)
+        return BusHealth(connected=True, rate_hz=250.0, load=0.42, frames=1200 + int(self.t * 4000), missed=0)
+
+    def status(self) -> Status:
+        return Status(
+            state=self.state,
+            detail=self.fault or "",
+            arm="sarcos",
+            serial="SIM-0001",
+            version="0.1.0",
+            policy="propose",
+            listen_only=False,
+            time=self.time(),
+            t=self.t,
+            uptime_s=self.t,
+            bus=self.bus(),
+            records=RecordsInForce(calibration="77aa01cd", gravity="0b5c11ee"),
+            rows=120,
+            pending_proposals=sum(each.state == "pending" for each in self.offered),
+            last_event=len(self.log),
+            report=self.report,
+        )
+
+    def joints(self) -> tuple[JointNow, ...]:
+        return tuple(
+            JointNow(
+                joint=name,
+                position=0.3 * math.sin(self.t + k),
+                torque=5.0 * math.cos(self.t + k) + 0.02 + self.shift * (k == 1),
+                model_torque=5.0 * math.cos(self.t + k),
+                residual=0.02 + self.shift * (k == 1),
+                state="operation enabled",
+                sample_age_s=None if self.fault else 0.004,
+            )
+            for k, name in enumerate(NAMES)
+        )
+
+    def estimates(self) -> tuple[JointEstimate, ...]:
+        return tuple(
+            JointEstimate(
+                joint=name,
+                gain=1.0 + 0.012 * (k == 1),
+                gain_std=0.001,
+                offset=0.01,
+                offset_std=0.02,
+                samples=120,
+                last_accepted=NOW,
+                installed_gain=1.04,
+                installed_offset=0.3,
+            )
+            for k, name in enumerate(NAMES)
+        )
+
+    def events(self, after: int = 0, limit: int = 500) -> tuple[EventRecord, ...]:
+        return tuple(event for event in self.log if event.id > after)[:limit]
+
+    def history(
+        self, joint: str | None, since: datetime | None = None, until: datetime | None = None, most: int = 2000
+    ) -> tuple[HistoryPoint, ...]:
+        if joint is None:
+            return tuple(point for name in NAMES for point in self.history(name, since, until, most))
+        if joint not in NAMES:
+            raise NoSuch(f"no joint {joint!r}; there are {', '.join(NAMES)}")
+        points = [point for point in self.points if point.joint == joint]
+        points = [p for p in points if (since is None or p.time >= since) and (until is None or p.time <= until)]
+        return tuple(points[:: max(1, math.ceil(len(points) / most))])
+
+    def proposals(self, limit: int = 200) -> tuple[Proposal, ...]:
+        return tuple(self.offered[:limit])
+
+    def approve(self, proposal: int, by: str) -> Proposal:
+        return self._decide(proposal, "approved", by)
+
+    def reject(self, proposal: int, by: str) -> Proposal:
+        return self._decide(proposal, "rejected", by)
+
+    def subscribe(self) -> MadeUpSubscription:
+        client = MadeUpSubscription(self)
+        self.clients.add(client)
+        return client
+
+    def _decide(self, number: int, state: str, by: str) -> Proposal:
+        for place, proposal in enumerate(self.offered):
+            if proposal.id == number:
+                if proposal.state != "pending":
+                    raise NotPossible(f"proposal {number} is {proposal.state} already")
+                update = {"state": state, "decided_by": by, "decided_at": self.time()}
+                self.offered[place] = proposal.model_copy(update=update)
+                return self.offered[place]
+        raise NoSuch(f"no proposal {number}")

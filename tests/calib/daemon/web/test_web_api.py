@@ -1,0 +1,214 @@
+"""The API as contract 8 has it: every route, its form, and one clear error for what cannot be used."""
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from conftest import Served
+from made_up_view import NAMES, NOW, MadeUpView
+from prometheus_client.parser import text_string_to_metric_families
+
+from calib.daemon.view.api_models import HistoryPoint
+from calib.daemon.web.page import page_files
+from calib.daemon.web.stream import Streams
+
+
+def test_status_says_what_the_contract_lists(server: Served) -> None:
+    status = server.client().get("/api/status").json()
+    assert {"state", "arm", "serial", "version", "uptime_s", "bus", "records"} <= status.keys()
+    assert status["state"] in ("starting", "observing", "sweeping", "recalibrating", "fault")
+    assert {"rate_hz", "load", "frames", "missed", "errors"} <= status["bus"].keys()
+    assert status["records"].keys() == {"calibration", "gravity"}
+    assert status["time"].endswith("Z")
+
+
+def test_joints_and_estimates_are_lists_base_to_tip(server: Served) -> None:
+    client = server.client()
+    joints, estimates = client.get("/api/joints").json(), client.get("/api/estimates").json()
+    assert [one["joint"] for one in joints] == [one["joint"] for one in estimates] == list(NAMES)
+    assert {"position", "torque", "model_torque", "residual", "state", "sample_age_s"} <= joints[0].keys()
+    assert {"gain", "gain_std", "offset", "offset_std", "samples", "last_accepted"} <= estimates[0].keys()
+
+
+def test_events_come_after_an_id(server: Served, view: MadeUpView) -> None:
+    for number in range(5):
+        server.do(lambda number=number: view.happen("drift", "joint_2", f"number {number}", gain=1.01))
+    client = server.client()
+    assert [event["id"] for event in client.get("/api/events").json()] == [1, 2, 3, 4, 5]
+    (event,) = client.get("/api/events", params={"after": 2, "limit": 1}).json()
+    assert (event["id"], event["kind"], event["joint"], event["evidence"]) == (3, "drift", "joint_2", {"gain": 1.01})
+    assert client.get("/api/events?after=99").json() == []
+
+
+@pytest.mark.parametrize(
+    ("query", "expected"),
+    [
+        ("joint=joint_1&from=&to=", [0, 60, 120]),
+        ("joint=joint_1&from=2026-05-01T08:01:00Z", [60, 120]),
+        ("joint=joint_1&to=2026-05-01T10:01:00%2B02:00", [0, 60]),
+        ("joint=joint_1&to=2026-05-01T10:01:00+02:00", [0, 60]),
+        ("", [0, 60, 120] * 7),
+    ],
+    ids=["open", "from", "to", "a plus sent as a space", "every joint"],
+)
+def test_history_between_times(server: Served, view: MadeUpView, query: str, expected: list[float]) -> None:
+    def point(joint: str, t: float) -> HistoryPoint:
+        at = NOW.replace(minute=int(t // 60))
+        return HistoryPoint(time=at, t=t, joint=joint, gain=1, gain_std=0, offset=0, offset_std=0, record=None)
+
+    server.do(lambda: view.points.extend(point(joint, t) for t in (0.0, 60.0, 120.0) for joint in NAMES))
+    assert [point["t"] for point in server.client().get(f"/api/history?{query}").json()] == expected
+
+
+def test_a_proposal_is_decided_once_and_by_somebody(server: Served, view: MadeUpView) -> None:
+    server.do(view.propose)
+    server.do(view.propose)
+    client = server.client()
+    approved = client.post("/api/proposals/1/approve", json={"by": "ann"}).json()
+    assert approved["state"] == "approved"
+    assert approved["decided_by"].startswith("ann (")
+    assert "uid " in approved["decided_by"]
+    rejected = client.post("/api/proposals/2/reject").json()
+    assert (rejected["state"], "on the socket" in rejected["decided_by"]) == ("rejected", True)
+    again = client.post("/api/proposals/1/reject")
+    assert (again.status_code, again.json()) == (409, {"error": "proposal 1 is approved already"})
+    assert client.post("/api/proposals/9/approve").status_code == 404
+    assert [one["state"] for one in client.get("/api/proposals").json()] == ["rejected", "approved"]
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status", "says"),
+    [
+        ("GET", "/api/events?after=-1", 422, "after"),
+        ("GET", "/api/events?after=9223372036854775808", 422, "after"),
+        ("GET", "/api/events?afer=1", 422, "afer: there is no parameter of that name"),
+        ("GET", "/api/history?joint=elbow", 404, "joint_1, joint_2"),
+        ("GET", "/api/history?joint=a%00b", 404, "no joint"),
+        ("GET", "/api/history?from=yesterday", 422, "from"),
+        ("GET", "/api/history?from=2026-05-01T08:00:00", 422, "timezone"),
+        ("GET", "/api/history?from=0001-01-01T00:00:00%2B14:00", 422, "between 1970 and 2999"),
+        ("GET", "/api/history?from=2026-05-02T00:00:00Z&to=2026-05-01T00:00:00Z", 422, "from is later than to"),
+        ("GET", "/api/proposals/0/approve", 405, "GET is not possible"),
+        ("POST", "/api/proposals/0/approve", 422, "id"),
+        ("POST", "/api/proposals/one/approve", 422, "id"),
+        ("POST", "/api/status", 405, "POST is not possible"),
+        ("GET", "/api/stream?after=x", 422, "after"),
+        ("GET", "/api/torque", 404, "/api/torque"),
+        ("GET", "/static/../app.py", 404, "there is no"),
+        ("GET", "/api/report", 404, "no report yet"),
+    ],
+)
+def test_bad_input_is_one_clear_error(server: Served, method: str, path: str, status: int, says: str) -> None:
+    answer = server.client().request(method, path)
+    assert answer.status_code == status
+    assert answer.headers["content-type"] == "application/json"
+    assert answer.json().keys() == {"error"}
+    assert says in answer.json()["error"]
+    assert "\n" not in answer.json()["error"]
+
+
+@pytest.mark.parametrize("body", ["{", "[]", '{"by": ""}', '{"by": "a\\nb"}', '{"torque": 3}', "\xff"])
+def test_a_body_that_cannot_be_used_decides_nothing(server: Served, view: MadeUpView, body: str) -> None:
+    server.do(view.propose)
+    headers = {"content-type": "application/json"}
+    answer = server.client().post("/api/proposals/1/approve", content=body.encode("latin-1"), headers=headers)
+    assert answer.status_code in (400, 422)
+    assert answer.json().keys() == {"error"}
+    assert server.do(lambda: view.offered[0].state) == "pending"
+
+
+def test_the_overview_is_what_the_other_routes_say(server: Served, view: MadeUpView) -> None:
+    for number in range(5):
+        server.do(lambda number=number: view.happen("drift", "joint_2", f"number {number}", gain=1.01))
+    server.do(view.propose)
+    client = server.client()
+    all_of_it = client.get("/api/overview", params={"seconds": 0, "events": 3}).json()
+    for name in ("joints", "estimates", "proposals", "history"):
+        assert all_of_it[name] == client.get(f"/api/{name}").json()
+    assert all_of_it["status"].keys() == client.get("/api/status").json().keys()
+    last = all_of_it["status"]["last_event"]
+    assert [event["id"] for event in all_of_it["events"]] == [last - 2, last - 1, last]
+
+
+def test_a_failure_inside_shows_no_traceback(server: Served, view: MadeUpView, monkeypatch: Any) -> None:
+    def broken() -> None:
+        raise RuntimeError("a secret of the inside")
+
+    monkeypatch.setattr(view, "estimates", broken)
+    answer = server.client().get("/api/estimates")
+    assert answer.status_code == 500
+    assert answer.json() == {"error": "this failed inside the daemon; its log says why"}
+
+
+def test_nothing_commands_torque_or_motion(server: Served, view: MadeUpView) -> None:
+    """Read is separate from control: by the description, by the routes there are, and by what the view offers."""
+    from calib.daemon.view.view import DaemonView
+    from calib.daemon.web.app import open_app
+
+    described = server.client().get("/openapi.json").json()["paths"]
+    writing = {(path, method) for path, methods in described.items() for method in methods if method != "get"}
+    assert writing == {("/api/proposals/{id}/approve", "post"), ("/api/proposals/{id}/reject", "post")}
+    bodies = json.dumps([described[path][method].get("requestBody") for path, method in writing])
+    assert "Decision" in bodies
+    app = open_app(view, Streams(view), page_files())
+    known = {*described, "/openapi.json", *page_files()}
+    assert all(path in known for path in route_paths(app.routes))
+    offered = {name for name in vars(DaemonView) if not name.startswith("_")}
+    reading = {"status", "joints", "estimates", "events", "history", "proposals", "subscribe"}
+    assert offered == reading | {"approve", "reject"}
+
+
+def route_paths(routes: Any) -> set[str]:
+    return {route.path for route in routes if hasattr(route, "path")}
+
+
+def test_every_route_of_the_contract_is_described_and_typed(server: Served) -> None:
+    described = server.client().get("/openapi.json").json()
+    wanted = ("status", "overview", "joints", "estimates", "events", "history", "proposals", "stream")
+    assert {f"/api/{name}" for name in wanted} | {"/metrics"} <= described["paths"].keys()
+    for name in wanted[:-1]:
+        schema = described["paths"][f"/api/{name}"]["get"]["responses"]["200"]["content"]["application/json"]["schema"]
+        assert "$ref" in json.dumps(schema)
+    assert {"JointsItem", "EventItem", "ApiError"} <= described["components"]["schemas"].keys()
+
+
+def test_metrics_are_prometheus_text_and_documented(server: Served, view: MadeUpView) -> None:
+    from pathlib import Path
+
+    server.do(lambda: view.happen("fault", None, "a fault"))
+    answer = server.client().get("/metrics")
+    assert answer.headers["content-type"].startswith("text/plain")
+    families = {family.name: family for family in text_string_to_metric_families(answer.text)}
+    value = {(s.name, *s.labels.values()): s.value for family in families.values() for s in family.samples}
+    assert value["armlink_state", "observing"] == 1
+    assert value["armlink_state", "fault"] == 0
+    assert value["armlink_sensor_gain_ratio", "joint_2"] == pytest.approx(1.012)
+    assert value[("armlink_events_total",)] == 1
+    page = (Path(__file__).parents[4] / "docs" / "daemon-api.md").read_text()
+    ours = {sample.name for family in families.values() for sample in family.samples if "armlink" in sample.name}
+    assert [name for name in sorted(ours) if name not in page] == []
+
+
+def test_the_report_may_ask_nobody_anything(server: Served, view: MadeUpView, tmp_path: Any) -> None:
+    report = tmp_path / "report.html"
+    report.write_text("<h1>A report</h1>")
+    server.do(lambda: setattr(view, "report", report))
+    answer = server.client().get("/api/report")
+    assert answer.text == "<h1>A report</h1>"
+    assert "sandbox" in answer.headers["content-security-policy"]
+    assert "connect-src" not in answer.headers["content-security-policy"]
+
+
+def test_the_page_comes_from_here_alone(server: Served) -> None:
+    client = server.client()
+    page = client.get("/")
+    policy = page.headers["content-security-policy"]
+    assert "default-src 'none'" in policy
+    assert "http" not in policy
+    files: Callable[[str], Any] = client.get
+    for path in page_files():
+        answer = files(path)
+        assert answer.status_code == 200
+        assert "://" not in answer.text.replace("http://www.w3.org/", "")
+        assert client.get(path, headers={"if-none-match": answer.headers["etag"]}).status_code == 304

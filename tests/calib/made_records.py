@@ -1,0 +1,49 @@
+"""Records of a two-joint arm, made by hand."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from armlink.arm_file import ArmFile, parse_arm
+from calib.records.records import CalibrationRecord, GravityRecord, JointCalibration, matrix, provenance
+
+WHEN = datetime(2026, 11, 21, 2, 0, tzinfo=UTC)
+
+
+def arm_file(**changes: object) -> ArmFile:
+    joints = [{"name": name, "a": 0.3, "lower": -1.0, "upper": 1.0} for name in ("shoulder", "elbow")]
+    return parse_arm({"name": "bench", "serial": "7", "kinematics": {"joints": joints}} | changes, Path("bench.yaml"))
+
+
+ARM = arm_file()
+
+
+def calibration(gain: float = 1.02, parent: str | None = None) -> CalibrationRecord:
+    shoulder = JointCalibration(name="shoulder", gain=gain, offset=0.1, position_gain=1.0, position_offset=1e-5)
+    elbow = JointCalibration(
+        name="elbow",
+        gain=None,
+        offset=-0.2,
+        position_gain=1.001,
+        position_offset=0.0,
+        not_identifiable={"gain": "no gravity torque"},
+    )
+    return CalibrationRecord(
+        **provenance(ARM, {"sweep": "ab" * 32}, WHEN),
+        joints=(shoulder, elbow),
+        covariance_of=("shoulder.gain", "elbow.offset"),
+        covariance=matrix(np.diag([1e-6, 4e-6])),
+        parent=parent,
+    )
+
+
+def gravity() -> GravityRecord:
+    return GravityRecord(
+        **provenance(ARM, created=WHEN),
+        names=("shoulder", "elbow"),
+        beta=(1.0, 0.5, 0.0, 0.25),
+        covariance=matrix(np.eye(4) * 1e-6),
+        identifiable=(True, True, False, True),
+        gravity=(0.0, 0.0, -9.80665),
+    )

@@ -1,0 +1,142 @@
+"""Rest detection, filter and alarm, against the figures of theory.md section 6."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.observer.config import ObserverConfig
+from calib.observer.cusum import Cusum
+from calib.observer.rest_detector import RestDetector, Row
+from calib.observer.sensor_filter import SensorFilter
+from gcomp.gravity.torque import gravity_torque
+
+CONFIG = ObserverConfig()
+SIGMA = 0.05
+PERIOD = 0.004
+
+
+def rows_to_alarm(arm, beta, gain, offset, joint, random, most=4000) -> tuple[int, int]:
+    """Rows until the first alarm of a drifted joint, and which joint it names."""
+    cusum = Cusum(arm.n, CONFIG)
+    torque = gravity_torque(arm, beta, random.uniform(arm.lower, arm.upper, (most, arm.n)))
+    residual = SIGMA * random.normal(size=torque.shape)
+    residual[:, joint] += gain * torque[:, joint] + offset
+    for count, (e, tau) in enumerate(zip(residual, torque, strict=True), start=1):
+        alarms = cusum.handle(e, tau, np.full(arm.n, SIGMA**2))
+        if alarms:
+            return count, alarms[0][0]
+    return most, -1
+
+
+@pytest.mark.parametrize(("joint", "median"), list(enumerate([2, 2, 5, 5, 89, 32, 797])))
+def test_a_gain_drift_of_1_percent_raises_an_alarm_as_soon_as_the_theory_says(
+    sarcos, sarcos_beta, joint, median
+) -> None:
+    random = np.random.default_rng(joint)
+    trials = 60 if median < 100 else 25
+    counts = [rows_to_alarm(sarcos, sarcos_beta, 0.01, 0.0, joint, random)[0] for _ in range(trials)]
+    assert abs(np.median(counts) - median) <= max(1, 0.3 * median)
+
+
+@pytest.mark.parametrize("joint", range(7))
+def test_an_offset_drift_raises_an_alarm_within_3_rows_and_names_the_joint(sarcos, sarcos_beta, joint) -> None:
+    random = np.random.default_rng(joint)
+    results = [rows_to_alarm(sarcos, sarcos_beta, 0.0, 0.2, joint, random) for _ in range(40)]
+    assert abs(np.median([count for count, _ in results]) - 2) <= 1
+    assert np.mean([named == joint for _, named in results]) > 0.95
+
+
+def test_false_alarms_are_rarer_than_one_in_5000_rows(sarcos, sarcos_beta) -> None:
+    random, rows = np.random.default_rng(9), 60_000
+    torque = gravity_torque(sarcos, sarcos_beta, random.uniform(sarcos.lower, sarcos.upper, (rows, 7)))
+    noise, cusum, alarms = SIGMA * random.normal(size=torque.shape), Cusum(7, CONFIG), 0
+    for e, tau in zip(noise, torque, strict=True):
+        if cusum.handle(e, tau, np.full(7, SIGMA**2)):
+            alarms += 1
+            cusum.reset()
+    assert alarms < rows / 5000
+
+
+def test_the_filter_tracks_to_the_accuracy_of_its_random_walk(sarcos, sarcos_beta) -> None:
+    """Steady state of theory.md: std(o) about 0.007 N·m, std(k) 0.044 … 0.12 % on joints 1 to 6."""
+    random = np.random.default_rng(2)
+    torque = gravity_torque(sarcos, sarcos_beta, random.uniform(sarcos.lower, sarcos.upper, (900, 7)))
+    tracked = SensorFilter(7, replace(CONFIG, excitation_std=1.0))  # the figures are without the excitation gate
+    errors = []
+    for tau in torque:
+        tracked.handle(1.003 * tau - 0.04 + SIGMA * random.normal(size=7), tau, np.full(7, SIGMA**2))
+        errors.append(tracked.state - (1.003, -0.04))
+    rms = np.sqrt(np.mean(np.array(errors[400:]) ** 2, axis=0))
+    assert (rms[:, 1] < 0.012).all()
+    assert (rms[:6, 0] < 1.5 * np.array([0.044, 0.045, 0.066, 0.069, 0.15, 0.12]) / 100).all()
+
+
+def test_a_joint_without_excitation_keeps_its_gain(sarcos, sarcos_beta) -> None:
+    tracked = SensorFilter(7, CONFIG)
+    torque = gravity_torque(sarcos, sarcos_beta, np.zeros((1, 7)))[0]
+    for _ in range(300):
+        tracked.handle(torque + 0.05, torque, np.full(7, SIGMA**2))
+    np.testing.assert_array_equal(tracked.state[:, 0], 1.0)
+    assert (np.abs(tracked.state[:, 1] - 0.05) < 3 * np.sqrt(tracked.covariance[:, 1, 1])).all()
+    np.testing.assert_allclose(tracked.covariance[:, 0, 0], CONFIG.initial_gain_std**2)
+
+
+def test_an_outlier_is_not_taken_and_is_counted(sarcos) -> None:
+    tracked, torque = SensorFilter(7, CONFIG), np.zeros(7)
+    tracked.handle(torque + 5.0, torque, np.full(7, SIGMA**2))
+    np.testing.assert_array_equal(tracked.state[:, 1], 0.0)
+    np.testing.assert_array_equal(tracked.rejected, 1)
+
+
+def run_detector(positions: np.ndarray, torques: np.ndarray, config: ObserverConfig = CONFIG) -> list[Row]:
+    """Rows of one joint's samples at 250 Hz."""
+    detector, rows = RestDetector(1, config), []
+    for k, (q, tau) in enumerate(zip(positions, torques, strict=True)):
+        row = detector.handle(k * PERIOD, np.array([q]), np.array([tau]))
+        rows += [row] if row else []
+    return rows
+
+
+def rest(q: float, seconds: float) -> np.ndarray:
+    return np.full(round(seconds / PERIOD), q)
+
+
+def move(start: float, end: float, seconds: float) -> np.ndarray:
+    return np.linspace(start, end, round(seconds / PERIOD))
+
+
+def test_each_stop_is_one_row_with_its_mean_and_its_direction() -> None:
+    random = np.random.default_rng(0)
+    q = np.concatenate([rest(0, 1), move(0, 0.5, 1), rest(0.5, 0.6), move(0.5, 0.2, 1), rest(0.2, 30)])
+    torque = 10 * q + 0.1 * random.normal(size=q.size)
+    rows = run_detector(q, torque)
+    np.testing.assert_allclose([row.position[0] for row in rows], [0.0, 0.5, 0.2], atol=1e-9)
+    np.testing.assert_allclose([row.torque[0] for row in rows], [0.0, 5.0, 2.0], atol=0.05)
+    assert [row.direction[0] for row in rows] == [0.0, 1.0, -1.0]
+
+
+def test_a_short_stop_and_slow_motion_give_no_row() -> None:
+    short = np.concatenate([move(-1, 0, 1), rest(0, 0.3), move(0, 1, 1)])
+    assert run_detector(short, np.zeros(short.size)) == []
+    creeping = move(0, 0.4, 10)
+    assert run_detector(creeping, np.zeros(creeping.size)) == []
+
+
+def test_missing_readings_break_a_rest_but_a_lost_frame_does_not() -> None:
+    q = rest(0.0, 0.45)
+    lost = q.copy()
+    lost[20] = np.nan
+    assert len(run_detector(lost, np.zeros(q.size))) == 1
+    lost[60:90] = np.nan
+    assert run_detector(lost, np.zeros(q.size)) == []
+    assert run_detector(q, np.full(q.size, np.nan)) == []
+
+
+def test_the_halves_of_an_average_tell_its_noise() -> None:
+    random = np.random.default_rng(1)
+    q = np.concatenate([np.concatenate([rest(k % 2, 0.5), move(k % 2, 1 - k % 2, 1)]) for k in range(60)])
+    rows = run_detector(q, 0.5 * random.normal(size=q.size))
+    means = np.array([row.torque[0] for row in rows])
+    noise = np.array([row.noise[0] for row in rows if row.noise is not None])
+    assert np.sqrt(np.mean(noise**2)) == pytest.approx(np.std(means), rel=0.25)

@@ -1,0 +1,166 @@
+"""From a finding to a record and to the controller: composed with what is installed, within bounds, never half done."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_controllers import ARM, NAMES, Controllers, joint, record
+
+from armlink.errors import BusFault, Refused
+from calib.observer.check_at_rests import Checked
+from calib.observer.decision import Finding
+from calib.observer.recalibrator import Recalibrator, compose, recalibrated, write_record
+from calib.records.records import CalibrationRecord
+from calib.records.store import RecordStore
+
+
+def finding(gain: float = 1.03, offset: float = 0.3, at: int = 1, cause: str = "drift") -> Finding:
+    return Finding(at, cause, gain, offset, np.array([[4e-8, -1e-8], [-1e-8, 1e-5]]), 40, 0.999)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> RecordStore:
+    store = RecordStore(str(tmp_path / "records.db"))
+    store.put(record(), ARM, by="ann", reason="sweep")
+    return store
+
+
+def test_composition_makes_the_reading_right_again() -> None:
+    """v = K τ + O drifts; the controller sends u = (v − o)/k; the finding has u = g τ + b; the new pair gives τ."""
+    torque, (k, o) = np.array([-20.0, 0.0, 35.0]), (1.1, -0.4)
+    sensor = 1.03 * k * torque + o + 0.33
+    slope, constant = np.polyfit(torque, (sensor - o) / k, 1)
+    gain, offset = compose(k, o, finding(slope, constant))
+    np.testing.assert_allclose((sensor - offset) / gain, torque, atol=1e-12)
+
+
+def test_two_recalibrations_compose_to_the_whole_drift() -> None:
+    once = compose(1.1, -0.4, finding(1.03, 0.3))
+    np.testing.assert_allclose(compose(*once, finding(1 / 1.03, -0.3 / 1.03)), (1.1, -0.4), atol=1e-12)
+
+
+def test_the_new_record_follows_from_the_old(store: RecordStore) -> None:
+    new = recalibrated(record(), ARM, finding(), installed_gain=1.1, by="observer")
+    assert new.parent == record().id
+    assert new.joints[0] == record().joints[0]
+    assert (new.joints[1].gain, new.joints[1].offset) == (1.1 * 1.03, -0.4 + 1.1 * 0.3)
+    assert new.covariance_of == record().covariance_of
+
+
+def test_its_covariance_is_that_of_both_by_monte_carlo() -> None:
+    new = recalibrated(record(), ARM, finding(), installed_gain=1.1, by=None)
+    random = np.random.default_rng(0)
+    old = random.multivariate_normal((1.1, -0.4), np.diag([1e-6, 1e-4]), 200_000)
+    change = random.multivariate_normal((1.03, 0.3), finding().covariance, 200_000)
+    drawn = np.cov(old[:, 0] * change[:, 0], old[:, 1] + old[:, 0] * change[:, 1])
+    np.testing.assert_allclose(np.array(new.covariance)[2:, 2:], drawn, rtol=0.02, atol=4e-8)
+    np.testing.assert_array_equal(np.array(new.covariance)[:2, :2], np.array(record().covariance)[:2, :2])
+
+
+def test_a_joint_without_gain_follows_its_offset_only() -> None:
+    vertical = record(joints=(joint("shoulder", gain=None), joint("elbow")), covariance_of=(), covariance=())
+    new = recalibrated(vertical, ARM, finding(1.0, 0.3, at=0, cause="offset"), installed_gain=1.0, by=None)
+    assert (new.joints[0].gain, new.joints[0].offset) == (None, pytest.approx(-0.1))
+    with pytest.raises(Refused, match="shoulder: record"):
+        recalibrated(vertical, ARM, finding(at=0), installed_gain=1.0, by=None)
+
+
+def test_apply_writes_record_and_controller(store: RecordStore) -> None:
+    controllers = Controllers()
+    done = Recalibrator(ARM, controllers, store, "apply").handle(finding())
+    assert done is not None
+    assert done.applied
+    assert store.current(CalibrationRecord, ARM) == done.record
+    assert controllers.held[1].gain == pytest.approx(1.1 * 1.03, rel=1e-7)
+    assert controllers.held[1].offset == pytest.approx(-0.4 + 0.33, rel=1e-6)
+    assert controllers.held[1].record_id == done.record.number
+    assert done.record.confirmed_by == "observer, policy apply"
+
+
+def test_what_the_check_finds_worse_is_undone(store: RecordStore) -> None:
+    """The old pair is back in the controller, the old record current, and the change is told as a finding."""
+    controllers = Controllers()
+    recalibrator = Recalibrator(ARM, controllers, store, "apply")
+    recalibrator.handle(finding(1.03, 0.3))
+    outcome = recalibrator.undo(Checked("worse", 1, "elbow: RMS 0.9 N·m, 0.2 with the old pair"))
+    assert outcome.record == recalibrator.record == store.current(CalibrationRecord, ARM) == record()
+    assert (controllers.held[1].gain, controllers.held[1].record_id) == (pytest.approx(1.1), record().number)
+    assert store.activations(ARM)[-1].reason.startswith("elbow: RMS 0.9")
+    assert outcome.undo is not None
+    np.testing.assert_allclose(compose(1.1 * 1.03, -0.4 + 1.1 * 0.3, outcome.undo), (1.1, -0.4), atol=1e-6)
+    with pytest.raises(Refused, match="none before it"):
+        recalibrator.undo(Checked("worse", 1, "again"))
+
+
+def test_propose_keeps_the_record_and_touches_nothing(store: RecordStore) -> None:
+    controllers = Controllers()
+    done = Recalibrator(ARM, controllers, store, "propose").handle(finding())
+    assert done is not None
+    assert not done.applied
+    assert done.record.confirmed_by is None
+    assert done.record in store.history(ARM)
+    assert store.current(CalibrationRecord, ARM) == record()
+    assert controllers.held == Controllers().held
+
+
+def test_observe_keeps_nothing(store: RecordStore) -> None:
+    assert Recalibrator(ARM, Controllers(), store, "observe").handle(finding()) is None
+    assert store.history(ARM) == [record()]
+
+
+def test_a_second_drift_is_relative_to_the_first_recalibration(store: RecordStore) -> None:
+    controllers = Controllers()
+    recalibrator = Recalibrator(ARM, controllers, store, "apply")
+    first = recalibrator.handle(finding(1.03, 0.3))
+    second = recalibrator.handle(finding(1.01, -0.1))
+    assert first is not None
+    assert second is not None
+    assert second.record.parent == first.record.id
+    assert second.gain == pytest.approx(1.1 * 1.03 * 1.01)
+    assert [line.record for line in store.activations(ARM)] == [record().id, first.record.id, second.record.id]
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [(finding(1.2, 0.0), r"elbow: gain 1\.3200 is \+20\.0%"), (finding(1.0, 6.0), r"elbow: offset 6\.200 N·m")],
+)
+def test_an_implausible_change_is_refused(store: RecordStore, change: Finding, what: str) -> None:
+    controllers = Controllers()
+    with pytest.raises(Refused, match=what):
+        Recalibrator(ARM, controllers, store, "apply").handle(change)
+    assert controllers.held == Controllers().held
+    assert store.history(ARM) == [record()]
+
+
+def test_bounds_are_against_the_last_sweep_not_the_last_step(store: RecordStore) -> None:
+    recalibrator = Recalibrator(ARM, Controllers(), store, "apply")
+    recalibrator.handle(finding(1.06, 0.0))
+    again = Recalibrator(ARM, recalibrator._controllers, store, "apply")  # after a restart too
+    with pytest.raises(Refused, match="at most 10% is drift"):
+        again.handle(finding(1.06, 0.0))
+
+
+def test_a_controller_that_holds_something_else_is_refused(store: RecordStore) -> None:
+    with pytest.raises(Refused, match="elbow: the controller holds gain 1, record"):
+        Recalibrator(ARM, Controllers(gain=1.0), store, "apply").handle(finding())
+
+
+def test_a_failed_write_leaves_the_old_record_current(store: RecordStore) -> None:
+    controllers = Controllers()
+    controllers.broken = True
+    with pytest.raises(BusFault):
+        Recalibrator(ARM, controllers, store, "apply").handle(finding())
+    assert store.current(CalibrationRecord, ARM) == record()
+
+
+def test_an_arm_without_a_record_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(Refused, match="no calibration record yet"):
+        Recalibrator(ARM, Controllers(), RecordStore(str(tmp_path / "records.db")), "apply")
+
+
+def test_write_record_puts_a_whole_record_on_the_controllers() -> None:
+    controllers = Controllers(gain=1.0, offset=0.0)
+    vertical = record(joints=(joint("shoulder", gain=None), joint("elbow")), covariance_of=(), covariance=())
+    assert write_record(vertical, controllers) == NAMES
+    assert [held.gain for held in controllers.held] == [1.0, pytest.approx(1.1)]
+    assert [held.offset for held in controllers.held] == [pytest.approx(-0.4)] * 2

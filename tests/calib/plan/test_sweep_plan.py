@@ -1,0 +1,122 @@
+"""The plan: every joint swept within its stops, resting joints pressed harder than gravity, never beyond the drive."""
+
+import numpy as np
+import pytest
+from drawn_arms import drawn_arm
+from sweep_arms import random_arm, synthetic_pass, with_section
+
+from armlink.arm_file import ArmFile, load_arm
+from armlink.errors import BadInput
+from calib.arm.drive_limits import Limits
+from calib.plan.sweep_plan import plan_sweep
+from calib.plan.types import SweepPlan
+from calib.sweep.scout import rough_model
+from sim_bus.simulated_arm import SimulatedArm
+from sim_bus.truth import Truth
+
+
+def scouted_plan(arm: ArmFile, truth: Truth) -> SweepPlan:
+    data = synthetic_pass(arm, truth, plan_sweep(arm), 0.0, np.random.default_rng(0))
+    return plan_sweep(arm, rough_model(arm, data.readings))
+
+
+@pytest.mark.parametrize("name", ["sarcos", "parallel6"])
+def test_the_plan_goes_from_tip_to_base_inside_the_stops(name: str) -> None:
+    arm = load_arm(name)
+    plan, limits = plan_sweep(arm), Limits.of(arm)
+    joints = [sweep.joint for sweep in plan.sweeps]
+    assert joints == sorted(joints, reverse=True)
+    assert set(joints) == set(range(len(arm.joint_names)))
+    for sweep in plan.sweeps:
+        assert limits.lower[sweep.joint] < sweep.steps[0] < sweep.steps[-1] < limits.upper[sweep.joint]
+        assert sweep.stops[sweep.joint] == 0
+        assert all(side != 0 for joint, side in enumerate(sweep.stops) if joint != sweep.joint)
+    for pose in plan.scout:
+        assert np.all((limits.lower < pose) & (pose < limits.upper))
+
+
+def test_each_step_is_taken_from_both_sides() -> None:
+    sweep = plan_sweep(random_arm(1, 3)).sweeps[0]
+    targets = [sweep.target(index) for index in range(sweep.readings)]
+    assert [position for position, side in targets if side > 0] == list(sweep.steps)
+    assert [position for position, side in targets if side < 0] == list(reversed(sweep.steps))
+
+
+def test_combinations_that_hide_a_joint_from_gravity_are_avoided() -> None:
+    plan = plan_sweep(load_arm("sarcos"))
+    assert all(sweep.lever >= 0.3 for sweep in plan.sweeps)
+    of_two = [sweep.stops for sweep in plan.sweeps if sweep.joint == 1]
+    assert len(set(of_two)) == 2
+
+
+def test_a_joint_along_gravity_is_swept_once_for_its_offset() -> None:
+    plan = plan_sweep(load_arm("parallel6"))
+    assert [sweep.lever for sweep in plan.sweeps if sweep.joint == 0] == pytest.approx([0.0], abs=1e-6)
+
+
+@pytest.mark.parametrize(("seed", "n", "headroom"), [(1, 4, 1.8), (2, 5, 1.8), (3, 3, 1.3)])
+def test_bias_exceeds_true_gravity_and_friction_and_never_the_limit(seed: int, n: int, headroom: float) -> None:
+    """Checked with MuJoCo's gravity, which the plan has not seen."""
+    arm = random_arm(seed, n, headroom=headroom)
+    truth, limits = Truth.draw(arm, seed), Limits.of(arm)
+    simulated = SimulatedArm(arm, truth)
+    pressed = 0
+    for sweep in scouted_plan(arm, truth).sweeps:
+        assert sweep.bias is not None
+        bias, stops = np.array(sweep.bias), np.array(sweep.stops) * ~np.array(sweep.servo)
+        assert np.all(np.abs(bias) <= limits.max_torque + 1e-9)
+        poses = np.tile(sweep.rest, (30, 1))
+        poses[:, sweep.joint] = np.linspace(sweep.steps[0], sweep.steps[-1], 30)
+        spare = stops * (bias - simulated.gravity_torque(poses))
+        assert np.all(spare[:, stops != 0] > 0.02 * limits.rated[stops != 0])
+        pressed += int(np.count_nonzero(stops))
+    assert pressed > 0
+
+
+def test_joints_are_servo_held_where_the_bias_allowed_cannot_press_them() -> None:
+    arm = with_section(random_arm(4, 4), bias_torque=(0.5, 0.5, 0.5, 0.5))
+    plan = scouted_plan(arm, Truth.draw(arm, 4))
+    assert any(any(sweep.servo) for sweep in plan.sweeps)
+    assert any("servo-held instead" in note for note in plan.notes)
+    assert all(abs(torque) <= 0.5 for sweep in plan.sweeps for torque in sweep.bias or ())
+
+
+def test_the_reference_mass_overloads_no_joint() -> None:
+    arm = random_arm(5, 5, headroom=1.4)
+    truth, limits = Truth.draw(arm, 5), Limits.of(arm)
+    mass = scouted_plan(arm, truth).reference_mass
+    simulated = SimulatedArm(arm, truth)
+    simulated.attach_mass(mass)
+    poses = np.random.default_rng(0).uniform(limits.lower, limits.upper, (300, 5))
+    assert mass > 0.05
+    assert np.all(np.abs(simulated.gravity_torque(poses)).max(axis=0) < limits.max_torque)
+
+
+def test_servo_hold_presses_nothing() -> None:
+    arm = with_section(random_arm(6, 3), hold="servo")
+    for sweep in plan_sweep(arm).sweeps:
+        assert sum(sweep.servo) == 2
+
+
+def test_held_joints_can_bear_the_reaction_of_the_one_that_moves() -> None:
+    """Checked with MuJoCo's inertia, which the plan has not seen; this upright arm's first drive has little torque."""
+    arm, truth = drawn_arm(9, upright=True, hold="servo")
+    limits, simulated, slowed = Limits.of(arm), SimulatedArm(arm, truth), 0
+    for sweep in scouted_plan(arm, truth).sweeps:
+        poses = np.tile(sweep.rest, (len(sweep.steps), 1))
+        poses[:, sweep.joint] = sweep.steps
+        reaction = np.array([np.abs(simulated.plant.inertia(pose)[sweep.joint]) for pose in poses])
+        spare = limits.max_torque - np.abs(simulated.gravity_torque(poses))
+        assert np.all(sweep.acceleration * reaction < spare) or sweep.acceleration == pytest.approx(0.3)
+        slowed += sweep.acceleration < 3.0
+    assert slowed > 0
+
+
+def test_a_range_too_short_to_sweep_names_the_joint() -> None:
+    with pytest.raises(BadInput, match="joint j1: its range"):
+        plan_sweep(with_section(random_arm(7, 3), range_margin=1.5))
+
+
+def test_one_bias_torque_per_joint() -> None:
+    with pytest.raises(BadInput, match=r"sweep\.bias_torque: 2 values, expected 3"):
+        plan_sweep(with_section(random_arm(8, 3), bias_torque=(5.0, 5.0)))

@@ -1,0 +1,188 @@
+"""The record store's database: PostgreSQL as SQLite, old schemas brought up to date, full disks named."""
+
+import resource
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import sqlalchemy as sa
+from made_records import ARM, arm_file, calibration, gravity
+from postgres import NoServer, server
+
+from armlink.errors import BadInput, Refused
+from calib.records.database import open_database
+from calib.records.records import CalibrationRecord, GravityRecord
+from calib.records.schema import TABLES
+from calib.records.store import RecordStore
+
+AS_OF_SESSION_1 = """
+CREATE TABLE records (id VARCHAR(8) NOT NULL, kind VARCHAR NOT NULL, arm VARCHAR NOT NULL, serial VARCHAR NOT NULL,
+  created VARCHAR NOT NULL, body TEXT NOT NULL, PRIMARY KEY (id));
+CREATE TABLE activations (number INTEGER NOT NULL PRIMARY KEY, record VARCHAR(8) NOT NULL REFERENCES records (id),
+  kind VARCHAR NOT NULL, arm VARCHAR NOT NULL, serial VARCHAR NOT NULL, at VARCHAR NOT NULL, "by" VARCHAR NOT NULL,
+  reason VARCHAR NOT NULL);
+CREATE TRIGGER IF NOT EXISTS records_no_update BEFORE UPDATE ON records
+  BEGIN SELECT RAISE(ABORT, 'records is append-only'); END;
+CREATE TRIGGER IF NOT EXISTS records_no_delete BEFORE DELETE ON records
+  BEGIN SELECT RAISE(ABORT, 'records is append-only'); END;
+CREATE TRIGGER IF NOT EXISTS activations_no_update BEFORE UPDATE ON activations
+  BEGIN SELECT RAISE(ABORT, 'activations is append-only'); END;
+CREATE TRIGGER IF NOT EXISTS activations_no_delete BEFORE DELETE ON activations
+  BEGIN SELECT RAISE(ABORT, 'activations is append-only'); END;
+"""
+
+
+@pytest.fixture(scope="session")
+def postgresql() -> Iterator[str]:
+    try:
+        with server() as url:
+            yield url
+    except NoServer as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """URL of an empty database of each kind."""
+    if request.param == "sqlite":
+        return str(tmp_path / "records.db")
+    base = request.getfixturevalue("postgresql")
+    name = f"t{abs(hash(request.node.nodeid)):x}"
+    administration = base.replace("postgresql", "postgresql+psycopg") + "/postgres"
+    engine = sa.create_engine(administration, isolation_level="AUTOCOMMIT")
+    with engine.connect() as connection:
+        connection.execute(sa.text(f"CREATE DATABASE {name}"))
+    engine.dispose()
+    return f"{base}/{name}"
+
+
+def test_records_activations_and_rollback(url: str) -> None:
+    store = RecordStore(url)
+    first = store.put(calibration(), ARM, by="ann", reason="sweep")
+    second = store.put(calibration(1.05, parent=first), ARM, by="bob", reason="sweep")
+    store.put(gravity(), ARM, by="ann", reason="identify")
+    store.rollback(ARM, to=first, by="cy", reason="sensor exchanged")
+    store.close()
+    again = RecordStore(url)
+    assert again.current(CalibrationRecord, ARM) == calibration()
+    assert again.current(GravityRecord, ARM) == gravity()
+    assert len(again.history(ARM)) == 3
+    log = [(line.record, line.by, line.reason) for line in again.activations(ARM) if line.kind == "calibration"]
+    assert log == [(first, "ann", "sweep"), (second, "bob", "sweep"), (first, "cy", "sensor exchanged")]
+    assert again.history(arm_file(serial="8")) == []
+    with pytest.raises(Refused, match="serial is 7"):
+        again.put(calibration(), arm_file(serial="8"), by="ann", reason="")
+
+
+def test_the_database_refuses_change_and_deletion(url: str) -> None:
+    RecordStore(url).put(calibration(), ARM, by="ann", reason="sweep")
+    engine = open_database(url)
+    tables = ("records", "activations")
+    statements = [f"DELETE FROM {table}" for table in tables] + [f"UPDATE {table} SET arm = 'x'" for table in tables]
+    if engine.dialect.name == "postgresql":
+        statements.append("TRUNCATE records, activations, writes")
+    for statement in statements:
+        with pytest.raises(sa.exc.DBAPIError, match="append-only"), engine.begin() as connection:
+            connection.execute(sa.text(statement))
+    assert RecordStore(url).current(CalibrationRecord, ARM) == calibration()
+
+
+def test_writers_at_the_same_time_lose_nothing(url: str) -> None:
+    """Four threads open the empty store at once and put records, the same ones too."""
+    ready, failed = threading.Barrier(4), []
+
+    def work(number: int) -> None:
+        try:
+            ready.wait()
+            store = RecordStore(url)
+            for k in range(5):
+                store.put(calibration(1.0 + 0.001 * k), ARM, by=str(number), reason="together")
+        except Exception as error:
+            failed.append(error)
+
+    threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert failed == []
+    assert len(RecordStore(url).history(ARM)) == 5
+    assert len(RecordStore(url).activations(ARM)) == 20
+
+
+def test_the_schema_is_what_the_code_expects(url: str) -> None:
+    inspector = sa.inspect(open_database(url))
+    for table in TABLES.sorted_tables:
+        assert [column["name"] for column in inspector.get_columns(table.name)] == [c.name for c in table.columns]
+
+
+def test_a_store_of_session_1_is_brought_up_to_date_and_keeps_its_rows(tmp_path: Path) -> None:
+    """The tables as the first version made them, without a version number, and two rows."""
+    path = tmp_path / "records.db"
+    engine = sa.create_engine(f"sqlite:///{path}")
+    record, raw = calibration(), engine.raw_connection()
+    raw.driver_connection.executescript(AS_OF_SESSION_1)
+    row = (record.id, "calibration", "bench", "7", record.created.isoformat(), record.model_dump_json())
+    raw.driver_connection.execute("INSERT INTO records VALUES (?, ?, ?, ?, ?, ?)", row)
+    line = (1, record.id, "calibration", "bench", "7", "2026-11-20T10:00:00+00:00", "ann", "sweep")
+    raw.driver_connection.execute("INSERT INTO activations VALUES (?, ?, ?, ?, ?, ?, ?, ?)", line)
+    raw.commit()
+    raw.close()
+    store = RecordStore(str(path))
+    assert store.current(CalibrationRecord, ARM) == record
+    assert [each.by for each in store.activations(ARM)] == ["ann"]
+    assert store.writes(ARM) == []
+    store.put(calibration(1.05), ARM, by="bob", reason="sweep")
+    assert len(RecordStore(str(path)).activations(ARM)) == 2
+
+
+def test_a_store_of_a_newer_armlink_is_refused_in_one_line(url: str) -> None:
+    RecordStore(url).put(calibration(), ARM, by="ann", reason="sweep")
+    engine = open_database(url)
+    with engine.begin() as connection:
+        connection.execute(sa.text("UPDATE alembic_version SET version_num = '0999'"))
+    with pytest.raises(BadInput, match="schema 0999 is newer than this armlink knows") as refused:
+        RecordStore(url)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_server_that_is_not_there_is_one_line_without_the_password() -> None:
+    with pytest.raises(BadInput, match="cannot be opened") as refused:
+        RecordStore("postgresql://armlink:secret@127.0.0.1:9/records")
+    assert "secret" not in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_full_disk_is_said_and_nothing_is_lost(tmp_path: Path) -> None:
+    """A file may not grow beyond what it is: as a full disk does, the write fails and what was there stands."""
+    path = tmp_path / "records.db"
+    store = RecordStore(str(path))
+    store.put(calibration(), ARM, by="ann", reason="sweep")
+    script = (
+        "import resource, sys, test_records as t\n"
+        "from armlink.errors import BadInput\n"
+        "from calib.records.store import RecordStore\n"
+        "store = RecordStore(sys.argv[1])\n"
+        f"resource.setrlimit(resource.RLIMIT_FSIZE, ({8192}, {resource.RLIM_INFINITY}))\n"
+        "try:\n"
+        "    for k in range(200):\n"
+        "        store.put(t.calibration(1.1 + 0.001 * k), t.ARM, by='ann', reason='sweep')\n"
+        "except BadInput as error:\n"
+        "    print(error)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(path)],
+        cwd=Path(__file__).parents[1],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    assert "nothing was written" in done.stdout
+    assert done.stdout.count("\n") == 1
+    kept = RecordStore(str(path)).history(ARM)
+    assert calibration() in kept
+    assert len(kept) - len(store.activations(ARM)) in (0, 1)  # a put is two transactions: kept, then current

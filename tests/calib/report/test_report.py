@@ -1,0 +1,158 @@
+"""The report to file, the held-out gate and recalibration from sweeps: on one made-up arm of three joints."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sweep_arms import random_arm
+from synthetic_sweeps import passes
+
+from armlink.errors import Refused
+from calib.field.field_fit import fit_field
+from calib.field.field_record import check_field_heldout, field_record
+from calib.field.rows import rows_of_sweeps
+from calib.fit.findings import Finding
+from calib.fit.gravity_fit import identify_gravity
+from calib.fit.sensor_fit import SensorFit, fit_sensors
+from calib.install.plausibility import check_gates, check_heldout, check_holds, heldout_scores
+from calib.records.compare import differences
+from calib.records.records import CalibrationRecord, JointCalibration
+from calib.records.store import RecordStore
+from calib.report.calibration import Calibrated, write_report
+
+ARM = random_arm(1, 3)
+TRUTH, DATA = passes(ARM, 1)
+
+
+@pytest.fixture(scope="module")
+def fit() -> SensorFit:
+    return fit_sensors(ARM, DATA)
+
+
+@pytest.fixture(scope="module")
+def record(fit: SensorFit) -> CalibrationRecord:
+    return fit.record(ARM)
+
+
+def changed(record: CalibrationRecord, joint: int, **pair: float) -> CalibrationRecord:
+    """The record with one joint's gain (a factor) or offset (added) changed."""
+    joints: list[JointCalibration] = list(record.joints)
+    old = joints[joint]
+    assert old.gain is not None
+    assert old.offset is not None
+    new = {"gain": old.gain * pair.get("gain", 1.0), "offset": old.offset + pair.get("offset", 0.0)}
+    joints[joint] = old.model_copy(update=new)
+    return record.model_copy(update={"joints": tuple(joints)})
+
+
+def test_the_report_says_what_from_what_and_per_joint_and_opens_without_complaint(fit, record, tmp_path, look) -> None:
+    before = changed(record, 1, gain=1.05, offset=0.5)
+    path = tmp_path / "calibration.html"
+    write_report(Calibrated(ARM, DATA, fit, record, before), path)
+    seen = look(path, height=4000)
+    assert seen.console == ()
+    assert seen.colours() > 200
+    document = seen.document.partition("<body>")[2]
+    for said in (
+        record.id,
+        before.id,
+        "SHA-256",
+        "the model holds",
+        "Before and after",
+        "Figure 6",
+        "told by the others",
+    ):
+        assert said in document, said
+    for name in ARM.joint_names:
+        assert f"Sweeps of {name}" in document
+    gain, half = fit.value("gain")[1], fit.quantile * fit.std("gain")[1]
+    assert f"{gain:.4f}\u00a0±\u00a0{half:.4f}" in document.replace("&nbsp;", "\u00a0")
+    change = next(
+        each for each in differences(before, record) if (each.joint, each.parameter) == (ARM.joint_names[1], "gain")
+    )
+    assert f"{change.change:+.5f}" in document
+
+
+def test_a_first_report_compares_with_what_the_controllers_had(fit, record, tmp_path) -> None:
+    path = tmp_path / "first.html"
+    write_report(Calibrated(ARM, DATA, fit, record, None), path)
+    assert "had no record before" in path.read_text(encoding="utf-8")
+
+
+def test_held_out_steps_are_as_far_off_as_their_noise(fit, record) -> None:
+    """Fitted without them, they scatter by one standard deviation, and by far more with an old pair that is wrong."""
+    new = heldout_scores(record, ARM, fit.rows, refit=True)
+    assert np.nanstd(new) == pytest.approx(1.0, abs=0.35)
+    wrong = heldout_scores(changed(record, 0, offset=1.0), ARM, fit.rows, refit=False)
+    own = fit.rows.own[:, 0]
+    assert np.nanstd(wrong[own, 0]) > 3 * np.nanstd(new[own, 0])
+
+
+def test_the_gates_let_a_right_calibration_pass_and_name_what_is_wrong(record, tmp_path) -> None:
+    store = RecordStore(str(tmp_path / "records.db"))
+    check_gates(record, ARM, store, DATA)  # the first of this arm
+    store.put(changed(record, 2, gain=1.03, offset=0.2), ARM, by="ann", reason="sweeps")
+    check_gates(record, ARM, store, DATA)
+    jumped = changed(record, 0, gain=1.3)
+    with pytest.raises(Refused, match=f"{ARM.joint_names[0]}: gain .* covariance and history allow"):
+        check_gates(jumped, ARM, store, DATA)
+
+
+def test_a_joint_on_which_the_model_does_not_hold_is_not_written() -> None:
+    cable = Finding("j2", "spring", 0.8, "N·m/rad", "a spring of 0.8 N·m/rad pulls on it: is a cable caught?")
+    outlier = Finding("j1", "outliers", 2.0, "1", "2 readings were left out")
+    check_holds([outlier])
+    check_holds([outlier, cable], accepted=["j2"])
+    with pytest.raises(Refused, match="j2: the sensor model does not hold: a spring of"):
+        check_holds([outlier, cable])
+
+
+def test_sweeps_that_disagree_with_one_another_do_not_replace_a_good_record(fit, record) -> None:
+    """At every other step one joint reads 30 % more: what is fitted to one half fails on the other."""
+    spoilt = []
+    for data in DATA:
+        mine = [reading for reading in data.readings if reading.joint == 1]
+        steps = {r.sweep: sorted({round(o.position[1], 2) for o in mine if o.sweep == r.sweep}) for r in mine}
+        readings = []
+        for reading in data.readings:
+            torque = list(reading.torque)
+            if reading.joint == 1 and steps[reading.sweep].index(round(reading.position[1], 2)) % 2:
+                torque[1] *= 1.3
+            readings.append(reading.model_copy(update={"torque": tuple(torque)}))
+        spoilt.append(type(data)(data.path, data.manifest, tuple(readings), data.plan, data.resolution, data.digest))
+    gravity = identify_gravity(ARM, DATA, fit).record(ARM, record)
+    check_heldout(record.model_copy(update={"note": "new"}), record, ARM, DATA, gravity)
+    with pytest.raises(Refused, match=f"{ARM.joint_names[1]}: readings left out of the fit"):
+        check_heldout(record.model_copy(update={"note": "new"}), record, ARM, spoilt, gravity)
+
+
+def test_sweeps_without_a_mass_recalibrate_against_the_gravity_record(fit, record) -> None:
+    """The unloaded pass alone and an older gravity record: gains and offsets of every joint, within their intervals."""
+    gravity = identify_gravity(ARM, DATA, fit).record(ARM, record)
+    later = changed(record, 1, gain=1.03, offset=0.3)
+    rows = rows_of_sweeps(DATA[0], 0)
+    found = fit_field(ARM, rows, gravity, later)
+    for name in ("gain", "offset"):
+        true, value, std = getattr(TRUTH, name), getattr(found, name), found.std(name)
+        known = np.isfinite(value)
+        assert known.any()
+        assert (np.abs(value - true)[known] < 4 * std[known]).all()
+    new = field_record(ARM, found, later, {"pass": DATA[0].digest})
+    assert new.parent == later.id
+    assert new.joints[1].gain == pytest.approx(TRUTH.gain[1], rel=0.01)
+    for joint, parameter in found.reasons:
+        assert f"{joint} {parameter}" in new.note  # carried over, and said so
+    check_field_heldout(rows, found, later)
+
+
+def test_a_pass_with_a_mass_is_not_taken_for_the_bare_arm() -> None:
+    with pytest.raises(Exception, match="swept with a reference mass"):
+        rows_of_sweeps(DATA[1], 0)
+
+
+def test_pages_are_written_whole(tmp_path: Path, fit, record) -> None:
+    path = tmp_path / "report.html"
+    write_report(Calibrated(ARM, DATA, fit, record, None), path)
+    text = path.read_text(encoding="utf-8")
+    assert text.rstrip().endswith("</html>")
+    assert "http://" not in text.partition("</script>")[2].replace("http://www.w3.org", "")

@@ -1,0 +1,117 @@
+"""Before a sweep: sensors, temperatures and stops of a simulated arm, each trouble named with its joint."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hard_cases import stick
+from sweep_arms import random_arm
+
+from armlink.arm_file import ArmFile
+from armlink.errors import Refused
+from armlink.link.link import Link
+from calib.arm.drive_limits import Limits
+from calib.motion.encoder_check import EncoderFault
+from calib.sweep.preflight import HOT, find_stops, listen
+from sim_bus.bus.lock_step import LockStepBus
+from sim_bus.sim_section import EffectEntry
+from sim_bus.simulated_arm import SimulatedArm
+from sim_bus.truth import Truth
+
+ARM = random_arm(31, 2)
+RATED = float(Limits.of(ARM).rated[1])
+
+
+@contextmanager
+def enabled(simulated: SimulatedArm, arm: ArmFile = ARM) -> Iterator[Link]:
+    with Link(arm, LockStepBus(arm=simulated)) as link:
+        link.start()
+        link.enable()
+        yield link
+
+
+def trouble(name: str, **values: Any) -> SimulatedArm:
+    simulated = SimulatedArm(ARM, Truth.draw(ARM, 1), 1)
+    simulated.set_effects([*simulated.effects, EffectEntry(effect=name, joint="j2", **values)])
+    return simulated
+
+
+def test_noise_is_measured_and_the_drives_are_cool() -> None:
+    simulated = SimulatedArm(ARM, Truth.draw(ARM, 1), 1)
+    with enabled(simulated) as link:
+        found = listen(link, ARM)
+    assert found.noise == pytest.approx(simulated.sensors.noise / simulated.sensors.gain, rel=0.3)
+    assert found.temperature == pytest.approx([31.0, 31.0])
+
+
+def test_a_hot_drive_is_named() -> None:
+    simulated = SimulatedArm(ARM, Truth.of(ARM), 1)
+    simulated.nodes[1].identity[0x2101, 0] = round(10 * HOT) + 5
+    simulated.reboot(1)
+    with enabled(simulated) as link, pytest.raises(Refused, match=r"j2: its drive is at 7\d °C, .*let it cool down"):
+        listen(link, ARM)
+
+
+def test_a_drive_without_a_thermometer_is_not_judged() -> None:
+    simulated = SimulatedArm(ARM, Truth.of(ARM), 1)
+    with enabled(simulated) as link:
+        del link.services[0].remote.object_dictionary[0x2101]  # the sheet that both joints have
+        found = listen(link, ARM)
+    assert np.isnan(found.temperature).all()
+
+
+def test_a_sensor_at_the_end_of_its_range_is_named() -> None:
+    with enabled(trouble("torque.offset", offset=3 * RATED)) as link, pytest.raises(Refused, match=r"j2: .* near the"):
+        listen(link, ARM)
+
+
+def test_a_loud_sensor_is_named() -> None:
+    sensors = ARM.sim.sensors.model_copy(update={"noise": (0.01, 0.08 * RATED)})
+    loud = ARM.model_copy(update={"sim": ARM.sim.model_copy(update={"sensors": sensors})})
+    with (
+        enabled(SimulatedArm(loud, Truth.of(loud), 1)) as link,
+        pytest.raises(Refused, match="j2: its torque sensor's noise is"),
+    ):
+        listen(link, ARM)
+
+
+def test_a_silent_sensor_is_named() -> None:
+    with enabled(SimulatedArm(ARM, Truth.of(ARM), 1)) as link:
+        whole = link.cycle
+
+        def deaf(command: Any) -> Any:
+            sample = whole(command)
+            return replace(sample, torque=np.array([sample.torque[0], np.nan]))
+
+        link.cycle = deaf  # type: ignore[method-assign]
+        with pytest.raises(Refused, match=r"j2: \d+ of \d+ torque readings are missing"):
+            listen(link, ARM)
+
+
+def test_stops_are_found_where_the_arm_file_has_them_and_named_where_not() -> None:
+    simulated = SimulatedArm(ARM, Truth.draw(ARM, 1), 1)
+    rows = list(ARM.kinematics.joints)
+    rows[1] = rows[1].model_copy(update={"upper": rows[1].upper + 0.2})
+    wider = ARM.model_copy(update={"kinematics": ARM.kinematics.model_copy(update={"joints": tuple(rows)})})
+    counted = []
+    with enabled(simulated) as link:
+        listened = listen(link, ARM)
+        found = find_stops(link, ARM, listened, lambda done, total: counted.append((done, total)))
+        limits = Limits.of(ARM)
+        reading = (np.column_stack([limits.lower, limits.upper])) / simulated.truth.position_gain[:, None]
+        np.testing.assert_allclose(found.stops, reading, atol=0.004)
+        assert counted[-1] == (4, 4)
+        with pytest.raises(Refused, match=r"j2: blocked at .* its stop should be at"):
+            find_stops(link, wider, listened)
+
+
+def test_a_stuck_encoder_bit_is_named_before_any_stop_is_pressed() -> None:
+    simulated = SimulatedArm(ARM, Truth.draw(ARM, 1), 1)
+    stick(simulated, 6)
+    with enabled(simulated) as link:
+        found = listen(link, ARM)
+        with pytest.raises(EncoderFault, match=r"^j2: its position reading .*bit 6 of its encoder, which is stuck"):
+            find_stops(link, ARM, found)

@@ -1,0 +1,104 @@
+"""Planning around what stands in the way: an MJCF model with bodies that touch, and what a person is told."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from armlink.arm_file import ArmFile, load_arm
+from armlink.cli import run
+from calib.plan.collisions import Collided, Geometry, check_plan, way
+from calib.plan.sweep_plan import plan_sweep
+
+MODEL = """
+<mujoco><compiler angle="radian"/><worldbody>{obstacle}
+  <body name="upper"><joint name="shoulder" axis="0 1 0" range="-1.2 1.2"/>
+    <geom type="capsule" size="0.03" fromto="0 0 0 0.4 0 0" mass="2"/>
+    <body name="fore" pos="0.4 0 0"><joint name="elbow" axis="0 1 0" range="-1.5 1.5"/>
+      <geom type="capsule" size="0.03" fromto="0.05 0 0 0.35 0 0" mass="1"/></body></body>
+</worldbody></mujoco>"""
+ARM = """
+name: bench
+kinematics: {model: bench.xml, tip: fore}
+link:
+  joints:
+    - {name: shoulder, node: 1, rated_torque: 20.0, max_torque: 30.0}
+    - {name: elbow, node: 2, rated_torque: 10.0, max_torque: 15.0}
+"""
+
+
+def bench(folder: Path, obstacle: str = "") -> ArmFile:
+    """Two joints in a vertical plane: positive angles go down."""
+    (folder / "bench.xml").write_text(MODEL.format(obstacle=obstacle), encoding="utf-8")
+    (folder / "bench.yaml").write_text(ARM, encoding="utf-8")
+    return load_arm(str(folder / "bench.yaml"))
+
+
+def post(x: float, z: float, half: float = 0.05) -> str:
+    """A box on the arm's own plane [m]."""
+    return f'<body name="post" pos="{x} 0 {z}"><geom type="box" size="{half} {half} {half}"/></body>'
+
+
+def along(shoulder: float, elbow: float, share: float) -> tuple[float, float]:
+    """Place (x, z) [m] on the forearm at angles [rad], by plane trigonometry."""
+    reach = 0.05 + 0.3 * share
+    x = 0.4 * np.cos(shoulder) + reach * np.cos(shoulder + elbow)
+    return float(x), float(-0.4 * np.sin(shoulder) - reach * np.sin(shoulder + elbow))
+
+
+def test_a_clear_workspace_is_said_to_be_clear(tmp_path: Path) -> None:
+    arm = bench(tmp_path)
+    assert check_plan(arm, plan_sweep(arm)).startswith("no collision at ")
+
+
+def test_a_stop_at_which_the_arm_touches_is_not_leant_on(tmp_path: Path) -> None:
+    """The post stands where the forearm is when the elbow rests at its upper stop and the shoulder is low."""
+    arm = bench(tmp_path, post(*along(1.1, 1.4, 0.9), half=0.03))
+    plan, free = plan_sweep(arm), bench(tmp_path)
+    shoulder = [sweep for sweep in plan.sweeps if sweep.joint == 0]
+    assert {sweep.stops[1] for sweep in shoulder} == {-1}
+    assert {sweep.stops[1] for sweep in plan_sweep(free).sweeps if sweep.joint == 0} == {-1, 1}
+
+
+@pytest.mark.parametrize("height", [-0.02, 0.13])
+def test_a_body_in_the_middle_of_every_sweep_refuses_the_plan(tmp_path: Path, height: float) -> None:
+    """Even where it stands between the steps of a sweep."""
+    arm = bench(tmp_path, post(0.3, height))
+    with pytest.raises(Collided, match="in every combination of stops something touches, as post does upper"):
+        plan_sweep(arm)
+
+
+def test_a_way_that_touches_is_refused_with_bodies_and_pose(tmp_path: Path) -> None:
+    """No place of the plan touches the post, only the way from one to the next."""
+    plan = plan_sweep(bench(tmp_path))
+    places = [np.array(pose) for pose in plan.scout] + [pose for where, pose in way(plan) if "sweep" in where]
+    for pose in (pose for where, pose in way(plan) if "scout" in where):
+        arm = bench(tmp_path, post(*along(*pose, 0.8), half=0.02))
+        if Geometry(arm).free(np.array(places)).all():
+            with pytest.raises(
+                Collided, match=r"post would touch \w+ on the way to scout pose \d, \d+\.\d mm deep, at -?\d"
+            ):
+                check_plan(arm, plan)
+            return
+    pytest.fail("no way of this plan is clear of all its places")
+
+
+def test_the_command_says_it_in_one_line_and_exits_with_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bench(tmp_path, post(0.3, -0.02))
+    assert run(["sweep", str(tmp_path / "bench.yaml"), "--plan"]) == 1
+    error = capsys.readouterr().err
+    assert "post does upper" in error
+    assert error.strip().count("\n") == 0
+
+
+def test_the_plan_of_a_model_tells_bias_torques_and_what_was_checked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench(tmp_path)
+    picture = tmp_path / "plan.html"
+    assert run(["sweep", str(tmp_path / "bench.yaml"), "--plan", "--picture", str(picture), "--json", "-"]) == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert all(np.abs(sweep["bias"]).max() > 0 for sweep in plan["sweeps"])
+    assert plan["collisions"].startswith("no collision")
+    assert "plotly" in picture.read_text(encoding="utf-8")

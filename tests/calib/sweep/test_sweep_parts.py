@@ -1,0 +1,183 @@
+"""Parts of the sweep that need no arm: trajectories, the settle rule, the data set on disk."""
+
+import json
+import resource
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from sweep_arms import random_arm, synthetic_pass
+
+from armlink.errors import BadInput, Refused
+from calib.arm.sweep_section import SweepSection
+from calib.commands.screen import unsettled_said
+from calib.motion.settle_rule import SettleRule
+from calib.motion.trajectory import trajectory
+from calib.plan.sweep_plan import plan_sweep
+from calib.sweep.dataset import DataWriter, Manifest, PlanLine, Reading, load_data
+from sim_bus.truth import Truth
+
+PERIOD = 0.004
+RULE = SettleRule.of(SweepSection(), np.array([0.05]), PERIOD)
+COUNTS = np.array([True])
+STEP = np.array([1e-4])
+
+
+@given(
+    start=st.lists(st.floats(-2, 2), min_size=3, max_size=3),
+    goal=st.lists(st.floats(-2, 2), min_size=3, max_size=3),
+)
+@example(start=[0.0, 0.0, 0.0], goal=[0.0, 0.0, 1e-308])
+@settings(max_examples=60, deadline=None)
+def test_trajectories_arrive_within_speed_and_acceleration(start: list[float], goal: list[float]) -> None:
+    speed, acceleration = np.array([1.0, 0.5, 0.8]), np.full(3, 2.0)
+    path = trajectory(np.array(start), np.array(goal), speed, acceleration, PERIOD)
+    if not len(path):
+        np.testing.assert_allclose(start, goal, atol=1e-12)
+        return
+    np.testing.assert_allclose(path[-1], goal, atol=1e-12)
+    whole = np.vstack([start, path])
+    velocity = np.diff(whole, axis=0) / PERIOD
+    assert np.all(np.abs(velocity) <= speed * 1.02 + 1e-9)
+    if len(velocity) > 2 and np.abs(np.array(goal) - start).max() > 0.01:
+        assert np.all(np.abs(np.diff(velocity, axis=0)) / PERIOD <= acceleration * 1.1)
+
+
+def test_noise_alone_has_settled() -> None:
+    random = np.random.default_rng(0)
+    settled = [
+        RULE.settled(np.zeros((RULE.window, 1)), random.normal(0, 0.2, (RULE.window, 1)), COUNTS, STEP)
+        for _ in range(200)
+    ]
+    assert np.mean(settled) > 0.7
+
+
+@pytest.mark.parametrize("speed", [0.005, 0.02])
+def test_a_creeping_joint_has_not(speed: float) -> None:
+    position = np.round(np.arange(RULE.window) * PERIOD * speed / STEP[0])[:, None] * STEP[0]
+    assert not RULE.settled(position, np.zeros((RULE.window, 1)), COUNTS, STEP)
+
+
+def test_a_drifting_torque_has_not_but_one_that_does_not_count_may() -> None:
+    noise = np.random.default_rng(1).normal(0, 0.2, (RULE.window, 1))
+    drifting = noise + np.linspace(0, 1.0, RULE.window)[:, None]
+    still = np.zeros((RULE.window, 1))
+    assert not RULE.settled(still, drifting, COUNTS, STEP)
+    assert RULE.settled(still, drifting, ~COUNTS, STEP)
+
+
+def test_averaging_goes_on_until_the_standard_error_is_reached() -> None:
+    noise = np.random.default_rng(2).normal(0, 0.2, (100, 1))
+    assert not RULE.exact(noise[:8], COUNTS)
+    assert RULE.exact(noise, COUNTS)
+
+
+def test_a_data_set_reads_back_as_it_was_written(tmp_path: Path) -> None:
+    arm = random_arm(1, 3)
+    data = synthetic_pass(arm, Truth.of(arm), plan_sweep(arm), 0.0, np.random.default_rng(0))
+    assert data.plan is not None
+    with DataWriter(tmp_path / "set", Manifest.of(arm, 0.0)) as writer:
+        writer.append(PlanLine(plan=data.plan, resolution=(1e-4,) * 3))
+        for reading in data.readings:
+            writer.append(reading)
+    back = load_data(tmp_path / "set").require(arm)
+    assert back.readings == data.readings
+    assert back.plan == data.plan
+    assert back.complete
+
+
+@pytest.mark.parametrize("torn", [1, 17, 200])
+def test_a_torn_last_line_is_left_out_and_overwritten_on_resume(tmp_path: Path, torn: int) -> None:
+    arm = random_arm(1, 3)
+    readings = synthetic_pass(arm, Truth.of(arm), plan_sweep(arm), 0.0, np.random.default_rng(0)).readings[:3]
+    folder = tmp_path / "set"
+    with DataWriter(folder, Manifest.of(arm, 0.0)) as writer:
+        for reading in readings:
+            writer.append(reading)
+    lines = folder / "readings.jsonl"
+    lines.write_bytes(lines.read_bytes()[:-torn])
+    assert load_data(folder).readings == readings[:2]
+    with DataWriter(folder, Manifest.of(arm, 0.0), resume=True) as writer:
+        writer.append(readings[2])
+    assert load_data(folder).readings == readings
+
+
+def test_a_full_disk_is_said_in_one_line_and_loses_one_reading(tmp_path: Path) -> None:
+    """A file may not grow beyond what it is: as on a full disk, the write fails and what was there stands."""
+    arm = random_arm(1, 3)
+    readings = synthetic_pass(arm, Truth.of(arm), plan_sweep(arm), 0.0, np.random.default_rng(0)).readings[:3]
+    folder = tmp_path / "set"
+    with DataWriter(folder, Manifest.of(arm, 0.0)) as writer:
+        writer.append(readings[0])
+        unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
+        size = (folder / "readings.jsonl").stat().st_size
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size + 40, unlimited[1]))
+        try:
+            with pytest.raises(BadInput, match=r"readings\.jsonl: .*the last reading is not kept.*--resume"):
+                writer.append(readings[1])
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
+    assert load_data(folder).readings == readings[:1]
+    with DataWriter(folder, Manifest.of(arm, 0.0), resume=True) as writer:
+        writer.append(readings[1])
+    assert load_data(folder).readings == readings[:2]
+
+
+def test_a_data_set_whose_beginning_was_cut_off_can_be_begun_again(tmp_path: Path) -> None:
+    arm = random_arm(1, 3)
+    (tmp_path / "manifest.json.part").write_text('{"schema": "armlink.sw')
+    with DataWriter(tmp_path, Manifest.of(arm, 0.0)):
+        pass
+    assert load_data(tmp_path).readings == ()
+
+
+def test_unsettled_readings_are_told_with_their_sweeps() -> None:
+    arm = random_arm(1, 3)
+    data = synthetic_pass(arm, Truth.of(arm), plan_sweep(arm), 0.0, np.random.default_rng(0))
+    assert unsettled_said(data) == []
+    swung = data.readings[0].model_copy(update={"settled": False})
+    (line,) = unsettled_said(replace(data, readings=(swung, *data.readings[1:])))
+    assert line.startswith(f"1 of {len(data.readings)} readings had not settled")
+    assert "in scout: they count less" in line
+
+
+def test_a_missing_number_stays_missing(tmp_path: Path) -> None:
+    arm = random_arm(1, 3)
+    reading = synthetic_pass(arm, Truth.of(arm), plan_sweep(arm), 0.0, np.random.default_rng(0)).readings[0]
+    lacking = reading.model_copy(update={"motor_torque": (float("nan"),) * 3})
+    with DataWriter(tmp_path / "set", Manifest.of(arm, 0.0)) as writer:
+        writer.append(lacking)
+    assert np.isnan(load_data(tmp_path / "set").array("motor_torque")).all()
+
+
+def test_bad_data_sets_say_where(tmp_path: Path) -> None:
+    arm = random_arm(1, 3)
+    with pytest.raises(BadInput, match=r"manifest\.json is missing"):
+        load_data(tmp_path)
+    with DataWriter(tmp_path / "set", Manifest.of(arm, 0.0)):
+        pass
+    with pytest.raises(BadInput, match="not empty"):
+        DataWriter(tmp_path / "set", Manifest.of(arm, 0.0))
+    with pytest.raises(Refused, match=r"reference_mass is 0\.0 there, but 2\.0"):
+        DataWriter(tmp_path / "set", Manifest.of(arm, 2.0), resume=True)
+    (tmp_path / "set" / "readings.jsonl").write_text(json.dumps({"kind": "reading", "sweep": "x"}) + "\n")
+    with pytest.raises(BadInput, match="line 1: key"):
+        load_data(tmp_path / "set")
+    with DataWriter(tmp_path / "other", Manifest.of(arm, 0.0)):
+        pass
+    with pytest.raises(Refused, match="arm is random1"):
+        load_data(tmp_path / "other").require(random_arm(2, 3))
+
+
+def test_a_reading_of_the_wrong_width_is_refused(tmp_path: Path) -> None:
+    small, large = random_arm(1, 3), random_arm(1, 4)
+    reading: Reading = synthetic_pass(
+        large, Truth.of(large), plan_sweep(large), 0.0, np.random.default_rng(0)
+    ).readings[0]
+    with DataWriter(tmp_path / "set", Manifest.of(small, 0.0)) as writer:
+        writer.append(reading)
+    with pytest.raises(BadInput, match="not one per joint"):
+        load_data(tmp_path / "set")

@@ -1,0 +1,172 @@
+"""The whole chain on the simulated arm: frames travel, stops push, and only what came over the bus is fitted."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sweep_arms import random_arm, with_section
+
+from armlink.arm_file import ArmFile
+from armlink.errors import Refused
+from armlink.link.link import Link
+from calib.arm.drive_limits import Limits
+from calib.arm.sweep_section import sweep_section
+from calib.fit.gravity_fit import identify_gravity
+from calib.fit.sensor_fit import SensorFit, fit_sensors
+from calib.motion.mover import Mover, Slipped
+from calib.sweep import run as runner
+from calib.sweep.dataset import SweepData, load_data
+from calib.sweep.run import run_sweep
+from calib.sweep.verify import run_verify
+from sim_bus.bus.lock_step import LockStepBus
+from sim_bus.simulated_arm import SimulatedArm
+from sim_bus.truth import Truth
+
+
+class PowerCut(Exception):
+    """What stops the first attempt."""
+
+
+@dataclass
+class Chain:
+    arm: ArmFile
+    simulated: SimulatedArm
+    link: Link
+    data: list[SweepData]
+    fit: SensorFit
+    interrupted_after: int
+
+
+def enabled(simulated: SimulatedArm) -> Link:
+    link = Link(simulated.arm, LockStepBus(arm=simulated))
+    link.start()
+    link.enable()
+    return link
+
+
+@pytest.fixture(scope="module")
+def chain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chain]:
+    """Both passes of a three-joint arm, the first cut off in the middle of a sweep and resumed."""
+    folder: Path = tmp_path_factory.mktemp("sweeps")
+    arm = with_section(random_arm(21, 3), steps=5)
+    simulated = SimulatedArm(arm, Truth.draw(arm, 3), 3)
+
+    def cut(done: int, total: int, left: float, text: str) -> None:
+        if done == 20:
+            raise PowerCut
+
+    link = enabled(simulated)
+    with pytest.raises(PowerCut), link:
+        run_sweep(link, arm, folder / "bare", progress=cut)
+    interrupted_after = len(load_data(folder / "bare").readings)
+    link = enabled(simulated)
+    with link:
+        bare = run_sweep(link, arm, folder / "bare", resume=True)
+        assert bare.plan is not None
+        simulated.attach_mass(bare.plan.reference_mass)
+        loaded = run_sweep(link, arm, folder / "loaded", reference_mass=bare.plan.reference_mass)
+        simulated.detach_mass()
+        data = [bare, loaded]
+        yield Chain(arm, simulated, link, data, fit_sensors(arm, data), interrupted_after)
+
+
+def test_resume_goes_on_with_exactly_the_next_reading(chain: Chain) -> None:
+    assert chain.interrupted_after == 20
+    for data in chain.data:
+        made = [(reading.sweep, reading.index) for reading in data.readings]
+        assert len(made) == len(set(made))
+        assert data.complete
+        assert all(reading.settled for reading in data.readings)
+
+
+def test_resting_joints_stand_at_their_stops(chain: Chain) -> None:
+    limits, truth = Limits.of(chain.arm), chain.simulated.truth
+    plan = chain.data[0].plan
+    assert plan is not None
+    sweeps = {sweep.name: sweep for sweep in plan.sweeps}
+    for reading in chain.data[0].readings:
+        if reading.joint is None:
+            continue
+        angle, sweep = np.array(reading.position) * truth.position_gain, sweeps[reading.sweep]
+        for joint, side in enumerate(sweep.stops):
+            if side and not sweep.servo[joint]:
+                stop = limits.upper[joint] if side > 0 else limits.lower[joint]
+                assert abs(angle[joint] - stop) < 0.002
+
+
+def test_sensors_and_gravity_come_out_right(chain: Chain) -> None:
+    truth, fit = chain.simulated.truth, chain.fit
+    rated = Limits.of(chain.arm).rated
+    assert np.abs(fit.value("gain") / truth.gain - 1).max() < 0.006
+    assert np.all(np.abs(fit.value("offset") - truth.offset) < 0.003 * rated)
+    assert np.abs(fit.value("position_gain") - truth.position_gain).max() < 0.004
+    gravity = identify_gravity(chain.arm, chain.data, fit)
+    limits = Limits.of(chain.arm)
+    poses = np.random.default_rng(0).uniform(limits.lower, limits.upper, (200, 3))
+    true = chain.simulated.gravity_torque(poses)
+    from calib.arm.kinematics import gcomp_arm
+    from gcomp.gravity.torque import gravity_torque
+
+    error = gravity_torque(gcomp_arm(chain.arm), gravity.beta, poses) - true
+    assert np.all(np.sqrt((error**2).mean(axis=0)) < 0.006 * np.abs(true).max(axis=0))
+
+
+def test_the_model_holds_at_poses_that_no_fit_has_seen(chain: Chain) -> None:
+    record = chain.fit.record(chain.arm)
+    gravity = identify_gravity(chain.arm, chain.data, chain.fit).record(chain.arm, record)
+    check = run_verify(chain.link, chain.arm, gravity, record, poses=6, seed=1)
+    assert check.passed
+    assert check.sensor.shape == (6, 3)
+    assert np.all(check.rms < 0.003 * Limits.of(chain.arm).rated)
+
+
+def test_a_joint_that_cannot_be_held_on_its_stop_is_noticed(chain: Chain) -> None:
+    """Pressed with too little torque it slips within the press, and is caught."""
+    mover = Mover(chain.link, sweep_section(chain.arm), Limits.of(chain.arm))
+    mover.hold_all()
+    plan = chain.data[0].plan
+    assert plan is not None
+    sweep = max(plan.sweeps, key=lambda each: abs((each.bias or (0.0,))[0]))
+    goal = np.array(sweep.rest)
+    stops = np.array(sweep.stops, dtype=np.int64)
+    for joint in np.flatnonzero(stops):
+        goal[joint] = mover.before_stop(int(joint), int(stops[joint]), 0.02)
+    mover.travel(goal, 1.0)
+    with pytest.raises(Slipped) as slip:
+        mover.press(stops, -np.array(sweep.bias))
+    assert stops[slip.value.joint] != 0
+    mover.hold_all()
+    mover.cycle()
+
+
+def test_a_joint_that_slips_is_pressed_harder_and_at_its_limit_the_others_move_slower(chain: Chain) -> None:
+    limits = Limits.of(chain.arm)
+    mover = Mover(chain.link, sweep_section(chain.arm), limits)
+    run = runner._Pass(mover, None, [], lambda *_: None, lambda: 0.0)
+    assert chain.data[0].plan is not None
+    sweep = chain.data[0].plan.sweeps[0]
+    joint = int(np.flatnonzero(sweep.stops)[0])
+    side, limit = sweep.stops[joint], float(limits.max_torque[joint])
+    bias = side * 0.5 * limits.max_torque
+    same, more = run._firmer(sweep, bias, joint, 1)
+    assert same == sweep
+    assert more[joint] == pytest.approx(side * 0.6 * limit)
+    slower, most = run._firmer(sweep, side * limits.max_torque, joint, 1)
+    assert most[joint] == side * limit
+    assert slower.acceleration == pytest.approx(0.4 * sweep.acceleration)
+    with pytest.raises(Refused, match="slips off its stop"):
+        run._firmer(sweep, bias, joint, 4)
+
+
+def test_a_stop_that_is_not_where_the_arm_file_has_it_is_named(chain: Chain) -> None:
+    limits = Limits.of(chain.arm)
+    wrong = Limits(limits.lower + 0.3, limits.upper - 0.3, limits.rated, limits.max_torque, limits.speed)
+    mover = Mover(chain.link, sweep_section(chain.arm), wrong)
+    mover.hold_all()
+    mover.travel(np.array([(limits.lower[0] + limits.upper[0]) / 2, wrong.upper[1], 0.0]), 1.0)
+    with pytest.raises(Refused, match="j2: no stop found at"):
+        mover.press(np.array([0, 1, 0]), np.array([0.0, 5.0, 0.0]))
+    mover.hold_all()
+    mover.cycle()

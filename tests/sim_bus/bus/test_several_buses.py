@@ -1,0 +1,140 @@
+"""An arm on two buses: the simulated one answers on both, the link and the scan take both as one."""
+
+import threading
+
+import can
+import numpy as np
+import pytest
+import yaml
+
+from armlink.arm_file import load_arm
+from armlink.bus.open import BusGroup, open_link_bus
+from armlink.cli import run
+from armlink.link.link import Link
+from armlink.link.types import Command
+from sim_bus.bus.server import Server
+from sim_bus.simulated_arm import SimulatedArm
+from sim_bus.truth import Truth
+
+NODES = (11, 12)
+
+
+@pytest.fixture
+def path(tmp_path):
+    row = {"rated_torque": 20.0, "max_torque": 20.0}
+    content = {
+        "name": "pair",
+        "kinematics": {
+            "joints": [
+                {"name": "base", "alpha": 1.5707963, "d": 0.2, "lower": -2.0, "upper": 2.0},
+                {"name": "tip", "a": 0.3, "lower": -2.0, "upper": 2.0},
+            ]
+        },
+        "link": {
+            "bus": {"interface": "virtual", "channel": f"{tmp_path}/a"},
+            "buses": {"tool": {"interface": "virtual", "channel": f"{tmp_path}/b"}},
+            "joints": [{"name": "base", "node": 11, **row}, {"name": "tip", "node": 12, "bus": "tool", **row}],
+        },
+        "sim": {
+            "links": [
+                {"mass": 2.0, "com": [0.0, 0.0, 0.05], "inertia": [0.01, 0.01, 0.01]},
+                {"mass": 1.0, "com": [0.1, 0.0, 0.0], "inertia": [0.01, 0.01, 0.01]},
+            ],
+            "sensors": {"noise": [0.01, 0.01], "bits": 16},
+        },
+    }
+    (tmp_path / "pair.yaml").write_text(yaml.safe_dump(content))
+    return tmp_path / "pair.yaml"
+
+
+@pytest.fixture
+def served(path):
+    """The arm on both buses, served by a thread in lock-step with SYNC."""
+    described = load_arm(path)
+    arm = SimulatedArm(described, Truth.of(described))
+    group = open_link_bus(None, described.require_link())
+    server, done = Server(arm, group, lockstep=True), threading.Event()
+
+    def serve():
+        while not done.is_set():
+            server.turn()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    yield arm, described
+    done.set()
+    thread.join()
+    group.shutdown()
+
+
+class Pumped:
+    """A bus on which the simulated arm gets its turn whenever the host finds nothing there; no thread, no waiting."""
+
+    channel_info = "pumped"
+
+    def __init__(self, bus, turn):
+        self.bus, self.turn, self.send, self.shutdown = bus, turn, bus.send, bus.shutdown
+
+    def recv(self, timeout=None):
+        message = self.bus.recv(0)
+        if message is None:
+            self.turn()
+            message = self.bus.recv(0)
+        return message
+
+
+class ArmTime:
+    """The simulated arm's time, which SYNC alone moves on."""
+
+    def __init__(self, arm):
+        self.arm = arm
+
+    def now(self):
+        return self.arm.time
+
+    def sleep_until(self, instant):
+        pass
+
+
+def test_the_joints_of_both_buses_move_as_one_arm(path):
+    described = load_arm(path)
+    arm = SimulatedArm(described, Truth.of(described))
+    nodes, host = (open_link_bus(None, described.require_link()) for _ in range(2))
+    server = Server(arm, nodes, lockstep=True, now=lambda: 0.0)
+    pumped = BusGroup([Pumped(bus, server.turn) for bus in host.members], host.route)
+    pumped.clock = ArmTime(arm)
+    with Link(described, pumped) as link:
+        link.start()
+        link.enable()
+        command = Command.hold(link.position_sent)
+        began = arm.time
+        for _ in range(100):
+            command.position += 0.002
+            sample = link.cycle(command)
+        assert np.isfinite(sample.position).all()
+        assert sample.position == pytest.approx(command.position, abs=0.03)
+        # SYNC comes on both buses, and is one period all the same
+        assert arm.time - began == pytest.approx(100 * link.period, abs=3 * link.period)
+        assert link.stats.missed == 0
+    nodes.shutdown()
+
+
+def test_each_node_answers_on_its_own_bus_alone(served, path):
+    heard = {}
+    for name in "ab":
+        with can.Bus(interface="virtual", channel=f"{path.parent}/{name}") as bus:
+            for node in NODES:
+                bus.send(can.Message(arbitration_id=0x600 + node, data=b"\x40\0\x10\0\0\0\0\0", is_extended_id=False))
+            came = []
+            while (message := bus.recv(0.5)) is not None:
+                came.append(message.arbitration_id)
+            heard[name] = [each for each in came if each & 0x780 == 0x580]
+    assert heard == {"a": [0x58B], "b": [0x58C]}
+
+
+def test_the_scan_finds_the_joints_of_both_buses(served, path, capsys):
+    assert run(["scan", str(path)]) == 0
+    shown = capsys.readouterr().err
+    assert "base" in shown
+    assert "tip" in shown
+    assert "no answer" not in shown

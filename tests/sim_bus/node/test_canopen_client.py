@@ -1,0 +1,67 @@
+"""The stock canopen package operates the simulated arm through a python-can bus."""
+
+import threading
+
+import can
+import canopen
+import numpy as np
+import pytest
+
+from armlink.canopen.eds_file import bundled_path
+from sim_bus.bus.lock_step import LockStepBus
+
+
+@pytest.fixture
+def network() -> canopen.Network:
+    bus = can.Bus(interface="armlink_sim", channel="sarcos")
+    network = canopen.Network(bus=bus)
+    network.connect()
+    yield network
+    network.disconnect()
+
+
+def test_remote_node_reads_and_writes_objects(network: canopen.Network) -> None:
+    node = network.add_node(3, bundled_path())
+    node.sdo.RESPONSE_TIMEOUT = 5.0
+    assert node.sdo["Manufacturer device name"].raw == "armlink joint"
+    assert node.sdo["Motor rated torque"].raw == 60_000
+    node.sdo["Producer heartbeat time"].raw = 50
+    assert node.sdo[0x1017].raw == 50
+    with pytest.raises(canopen.SdoAbortedError, match="0x06010002"):
+        node.sdo[0x6041].raw = 0
+
+
+def test_remote_node_reads_maps_and_receives_pdos(network: canopen.Network) -> None:
+    node = network.add_node(3, bundled_path())
+    node.sdo.RESPONSE_TIMEOUT = 5.0
+    node.tpdo.read()
+    assert [variable.name for variable in node.tpdo[1]] == ["Position actual value", "Torque sensor.Reading"]
+    node.tpdo[4].clear()
+    node.tpdo[4].add_variable("Statusword")
+    node.tpdo[4].add_variable("Torque sensor", "Reading")
+    node.tpdo[4].cob_id = 0x480 + 3
+    node.tpdo[4].trans_type = 1
+    node.tpdo[4].enabled = True
+    node.tpdo[4].save()
+    received = threading.Event()
+    node.tpdo[4].add_callback(lambda _: received.set())
+    node.nmt.state = "OPERATIONAL"
+    network.sync.transmit()
+    assert received.wait(10.0)
+    assert node.tpdo[4]["Statusword"].raw & 0x4F == 0x40
+
+
+def test_a_bus_of_a_bundled_arm_opens_by_name_and_its_clock_is_simulated() -> None:
+    with can.Bus(interface="armlink_sim", channel="parallel6") as bus:
+        assert isinstance(bus, LockStepBus)
+        assert bus.recv(0).arbitration_id == 0x70B
+        while bus.recv(0) is not None:
+            pass
+        assert bus.recv(0.5) is None
+        assert bus.clock.now() == pytest.approx(0.5)
+        bus.clock.sleep_until(2.0)
+        assert bus.clock.now() == pytest.approx(2.0)
+        bus.clock.sleep_until(1.0)
+        bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+        assert bus.clock.now() == pytest.approx(2.004)
+        np.testing.assert_allclose(bus.arm.plant.velocity, 0.0, atol=1e-3)

@@ -1,0 +1,110 @@
+"""The arm file's sim section: what is wrong with it is said in one line."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rig import one_joint
+
+from armlink.arm_file import load_arm, parse_arm
+from armlink.errors import BadInput
+from sim_bus.bus.effect_options import parse_drift, parse_effect
+from sim_bus.effects.registry import described, effects
+from sim_bus.sim_section import sim_section
+from sim_bus.simulated_arm import SimulatedArm
+from sim_bus.truth import Truth
+
+URDF = """<robot name="two"><link name="world"/>
+<link name="upper"><inertial><origin xyz="0.2 0 0"/><mass value="2"/>
+<inertia ixx="0.01" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="lower"><inertial><origin xyz="0.1 0 0"/><mass value="1"/>
+<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="shoulder" type="revolute"><parent link="world"/><child link="upper"/><axis xyz="0 1 0"/>
+<limit lower="-1" upper="1" effort="50" velocity="2"/></joint>
+<joint name="elbow" type="revolute"><parent link="upper"/><child link="lower"/><origin xyz="0.4 0 0"/>
+<axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="50" velocity="2"/></joint></robot>"""
+
+
+def test_a_missing_length_an_unknown_effect_and_a_wrong_unit_are_named() -> None:
+    with pytest.raises(BadInput, match=r"sensors\.gain: 2 values, expected 1"):
+        sim_section(one_joint(sensors={"gain": [1.0, 1.0]}))
+    for entry, message in [
+        ({"effect": "friction.columb", "joint": "hinge", "torque": 1.0}, "no effect 'friction.columb'"),
+        ({"effect": "friction.coulomb", "joint": "hinge"}, r"parameter torque is missing; it has torque \[N·m\]"),
+        ({"effect": "friction.coulomb", "joint": "hinge", "torque": 1.0, "speed": 2}, "no parameter 'speed'"),
+        ({"effect": "friction.coulomb", "torque": 1.0}, "key joint is missing"),
+        ({"effect": "link.mass_moment", "joint": "hinge", "moment": [1.0]}, "expected 3 numbers"),
+        ({"effect": "base.tilt", "joint": "hinge", "angles": [0.1, 0.2]}, "acts on the whole arm"),
+    ]:
+        with pytest.raises(BadInput, match=message):
+            one_joint(effects=[entry])
+    with pytest.raises(BadInput, match="no joint 'knee'"):
+        sim_section(one_joint(effects=[{"effect": "friction.coulomb", "joint": "knee", "torque": 1.0}]))
+    with pytest.raises(BadInput, match=r"sim\.links\.0\.inertia"):
+        one_joint(links=[{"mass": 1.0, "com": [0, 0, 0], "inertia": [0.1, 0.1]}])
+
+
+def test_an_arm_from_a_model_file_takes_its_inertials_and_stops_from_there(tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text(URDF)
+    controllers = [
+        {"name": name, "node": node, "rated_torque": 20.0, "max_torque": 30.0}
+        for name, node in (("shoulder", 3), ("elbow", 4))
+    ]
+    content: dict[str, Any] = {
+        "name": "two",
+        "kinematics": {"gravity": [0.0, 0.0, -9.81], "model": "arm.urdf"},
+        "link": {"joints": controllers},
+        "sim": {},
+    }
+    described = parse_arm(content, tmp_path / "arm.yaml")
+    arm = SimulatedArm(described, Truth.of(described))
+    expected = [-9.81 * (2 * 0.2 + 0.5), -9.81 * 0.1]
+    np.testing.assert_allclose(arm.gravity_torque(np.zeros((1, 2)))[0], expected, atol=1e-6)
+    np.testing.assert_allclose(arm.plant.upper, [1.0, 2.0])
+
+
+def test_truth_is_drawn_within_its_ranges_and_frozen() -> None:
+    arm = load_arm("sarcos")
+    rated = np.array([joint.rated_torque for joint in arm.require_link().joints])
+    drawn = [Truth.draw(arm, seed) for seed in range(200)]
+    for truth in drawn:
+        assert ((truth.gain >= 0.9) & (truth.gain <= 1.1)).all()
+        assert (np.abs(truth.offset) <= 0.05 * rated).all()
+        assert ((truth.position_gain >= 0.99) & (truth.position_gain <= 1.01)).all()
+        assert (np.abs(truth.attachment[:2]) <= 0.15).all()
+        assert truth.attachment[2] == -0.4
+    assert np.std([truth.gain for truth in drawn]) == pytest.approx(0.2 / 12**0.5, rel=0.05)
+    np.testing.assert_array_equal(Truth.draw(arm, 7).gain, drawn[7].gain)
+    with pytest.raises(ValueError, match="read-only"):
+        drawn[0].gain[0] = 1.0
+
+
+def test_effects_and_drifts_of_the_command_line() -> None:
+    joints = ("joint_1", "joint_2")
+    entry = parse_effect("friction.stribeck:joint_2:0.4,0.05", joints)
+    assert (entry.effect, entry.joint) == ("friction.stribeck", "joint_2")
+    assert entry.parameters == {"breakaway": 0.4, "velocity": 0.05}
+    assert parse_effect("link.payload::0.5,0.1,0,0.2", joints).parameters == {"mass": 0.5, "com": [0.1, 0.0, 0.2]}
+    named = parse_effect("torque.crosstalk:joint_1:source=joint_2,coefficient=0.1", joints)
+    assert named.parameters == {"source": "joint_2", "coefficient": 0.1}
+    drift = parse_drift("joint_1:1.03:0.3@20", joints)
+    assert (drift.joint, drift.gain, drift.offset, drift.time) == ("joint_1", 1.03, 0.3, 20.0)
+    for wrong in (
+        "friction.coulomb",
+        "friction.coulomb:joint_9:1",
+        "nothing:joint_1:1",
+        "friction.coulomb:joint_1:x y",
+    ):
+        with pytest.raises(BadInput, match="--effect"):
+            parse_effect(wrong, joints)
+    for wrong in ("joint_1:1.03", "joint_1:a:0@1", "knee:1:0@1", "joint_1:0:0@1"):
+        with pytest.raises(BadInput, match="--drift"):
+            parse_drift(wrong, joints)
+
+
+def test_the_documentation_lists_every_effect_with_its_parameters_and_units() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "simulated-arm.md").read_text(encoding="utf-8")
+    for effect in effects().values():
+        whose = "joint" if effect.per_joint else "arm"
+        assert f"| `{effect.id}` | {whose} | {described(effect)} |" in page

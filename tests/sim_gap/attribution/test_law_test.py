@@ -1,0 +1,65 @@
+"""What the library may lack: general laws stand in for causes that this motion cannot tell from them."""
+
+import numpy as np
+import pytest
+from wrong_arms import Wrong, model, record
+
+from sim_gap.attribution.diagnose import diagnose
+from sim_gap.attribution.law_test import Outside
+from sim_gap.effects.laws import LAWS
+from sim_gap.effects.registry import effects, layout_of, library_without
+from sim_gap.model.load import load_model
+from sim_gap.residuals.preprocess import prepare
+from sim_gap.residuals.residual_set import ResidualSet
+from sim_gap.search.normal_equations import ColumnStore, Term
+
+
+def outside(wrong: Wrong, *active: Term) -> Outside:
+    signals = prepare(record(model(), wrong, seed=1, seconds=40, rate=50.0), load_model(model()).arm, "a recording")
+    return Outside(ColumnStore(ResidualSet((signals,), layout_of([signals]))), active)
+
+
+def test_laws_are_in_no_library():
+    assert not set(LAWS) & set(library_without([]))
+    assert set(LAWS) < set(effects())
+
+
+def test_mass_moments_of_two_links_that_are_one_payload_are_no_better_than_a_body():
+    moments = Term("link.mass_moment", 1), Term("link.mass_moment", 2)
+    found = outside(Wrong(payload=1.0), *moments).weigh(moments)
+    assert found.law == "law.body"
+    assert found.worse < 0.1
+
+
+def test_a_payload_is_a_body_and_loses_nothing_by_it():
+    payload = (Term("link.payload", 0),)
+    assert outside(Wrong(payload=1.0), *payload).weigh(payload).worse > 0.5
+
+
+def test_friction_is_like_no_law():
+    friction = (Term("friction.coulomb", 1),)
+    assert outside(Wrong(coulomb=np.array([0.0, 0.8, 0.0])), *friction).weigh(friction).worse > 0.5
+
+
+def test_where_a_law_does_for_a_crowd_of_small_causes_the_crowd_gives_way():
+    """A sensor's offset, told as a spring and asymmetric friction of the same joint."""
+    spring = Term("transmission.spring", 1)
+    crowd = spring, Term("friction.coulomb", 1), Term("friction.asymmetric", 1)
+    wrong = Wrong(offset=np.array([0.0, 0.6, 0.0]), coulomb=np.array([0.0, 0.4, 0.0]))
+    found = outside(wrong, *crowd).weigh([spring])
+    assert found.law == "law.load"
+    assert found.worse < 0.0
+
+
+HIDDEN = (("link.payload", Wrong(payload=1.0)), ("base.tilt", Wrong(tilt=(0.05, 0.04))))
+
+
+@pytest.mark.parametrize(("withheld", "wrong"), HIDDEN)
+def test_what_a_law_says_as_well_is_not_said_with_confidence(withheld, wrong):
+    recordings = [record(model(), wrong, seed=seed, seconds=40, rate=50.0) for seed in (1, 2)]
+    answer = diagnose(model(), recordings[:1], recordings[1:], withhold=[withheld])
+    assert not [cause for cause in answer.causes if cause.confidence > 0.8]
+    assert any("would look the same" in note or "are left" in note for note in answer.notes)
+    whole = diagnose(model(), recordings[:1], recordings[1:])
+    assert whole.causes[0].effect == withheld
+    assert whole.causes[0].confidence > 0.8

@@ -1,0 +1,80 @@
+"""The model with the effects added: MuJoCo then gives the torque that the recording shows."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+from wrong_arms import THREE, Wrong, motion, record
+
+from sim_gap.attribution.diagnose import diagnose
+from sim_gap.better_model.export import write_model
+from sim_gap.better_model.with_effects import shared_motors
+from sim_gap.model.load import load_model
+from sim_gap.model.tendons import SharedMotor, add_to, tendons_of
+
+CASES = {
+    "payload": Wrong(payload=0.8),
+    "moved mass": Wrong(moved={1: (0.02, 0.02, 0.0)}),
+    "rotor and friction": Wrong(rotor=np.array([0.8, 0.0, 0.0]), viscous=np.array([0.0, 1.0, 0.0])),
+    "tilt": Wrong(tilt=(0.03, 0.02)),
+    "spring": Wrong(spring=np.array([0.0, 2.0, 0.0])),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_written_model_has_no_gap_any_more(tmp_path, name):
+    (tmp_path / "arm.xml").write_text(THREE)
+    nominal = load_model(tmp_path / "arm.xml")
+    train, other = (
+        record(nominal.mujoco_model, CASES[name], seed=s, seconds=30, noise=0.002, channels=("tau_motor",))
+        for s in (1, 2)
+    )
+    answer = diagnose(tmp_path / "arm.xml", [train], [other])
+    assert write_model(nominal, answer.internals.estimate, tmp_path / "closed.xml") == []
+    closed = diagnose(tmp_path / "closed.xml", [other], [train])
+    assert closed.verdict == "no_gap"
+    assert np.all(closed.heldout_before < 0.1 * answer.heldout_before.max() + 0.02)
+    assert answer.rollout.after.max() < 0.2 * answer.rollout.before.max()
+
+
+def test_a_shared_motor_becomes_a_fixed_tendon(tmp_path):
+    """Its inertia and friction load both joints; the model with it can be diagnosed again."""
+    (tmp_path / "arm.xml").write_text(THREE)
+    shared = SharedMotor("joint_3", "joint_2", 0.8, inertia=0.05, coulomb=0.8, viscous=0.3)
+    nominal = load_model(tmp_path / "arm.xml")
+    recordings = []
+    for seed in (1, 2):
+        one = record(nominal.mujoco_model, Wrong(), seed=seed, seconds=30, noise=0.002, channels=("tau_motor",))
+        _, _, v, a = motion(3, 30, 100.0, seed)
+        speed, push = v[:, 2] + 0.8 * v[:, 1], a[:, 2] + 0.8 * a[:, 1]
+        lost = 0.05 * push + 0.8 * np.tanh(speed / 0.002) + 0.3 * speed
+        recordings.append(replace(one, motor_torque=one.motor_torque + lost[:, None] * np.array([0.0, 0.8, 1.0])))
+    answer = diagnose(tmp_path / "arm.xml", recordings[:1], recordings[1:])
+    assert answer.causes[0].effect == "transmission.coupling"
+    assert write_model(nominal, answer.internals.estimate, tmp_path / "closed.xml") == []
+    assert answer.rollout.after.max() < 0.2 * answer.rollout.before.max()
+    (fitted,) = shared_motors(nominal, answer.internals.estimate)
+    assert (fitted.joint, fitted.other) == (shared.joint, shared.other)
+    assert [fitted.lever, fitted.inertia, fitted.coulomb, fitted.viscous] == pytest.approx(
+        [0.8, 0.05, 0.8, 0.3], rel=0.05
+    )
+    assert diagnose(tmp_path / "closed.xml", recordings[1:], recordings[:1]).verdict == "no_gap"
+
+
+def test_two_motors_may_turn_with_the_same_pair_of_joints():
+    spec = mujoco.MjSpec.from_string(THREE)
+    pair = [SharedMotor("joint_3", "joint_2", lever, inertia=0.05, coulomb=0.8, viscous=0.3) for lever in (0.8, -0.6)]
+    add_to(spec, pair)
+    model = spec.compile()
+    assert tendons_of(model, range(3)).turns == pytest.approx(np.array([[0.0, 0.8, 1.0], [0.0, -0.6, 1.0]]))
+
+
+def test_an_arm_files_model_can_be_written_too(tmp_path):
+    nominal = load_model("sarcos")
+    write_model(nominal, None, tmp_path / "sarcos.xml")
+    same = load_model(tmp_path / "sarcos.xml")
+    q, v, a = np.random.default_rng(0).uniform(-1, 1, (3, 4, nominal.n))
+    assert same.arm.torque(q, v, a) == pytest.approx(
+        nominal.arm.torque(q, v, a), rel=1e-4, abs=1e-4
+    )  # six digits are written

@@ -1,0 +1,108 @@
+"""The rigid arm against MuJoCo and Pinocchio: torque, regressor, payload and moved masses."""
+
+import mujoco
+import numpy as np
+import pytest
+from wrong_arms import THREE
+
+from armlink.errors import BadInput
+from sim_gap.effects.link import moment_to_inertia
+from sim_gap.model.load import load_model
+from sim_gap.model.rigid_body import RigidArm, rigid_arm
+
+
+def random_arm(n: int, seed: int) -> str:
+    """MJCF of a chain with random frames, axes, offset joints, inertias and a fixed body on every other link."""
+    random = np.random.default_rng(seed)
+    xml, close = "", ""
+    for i in range(n):
+        numbers = lambda k, low=-0.3, high=0.3: " ".join(f"{x:.6f}" for x in random.uniform(low, high, k))  # noqa: E731
+        xml += f'<body name="b{i}" pos="{numbers(3)}" euler="{numbers(3, -2, 2)}">'
+        xml += f'<joint name="j{i}" axis="{numbers(3, 0.2, 1)}" pos="{numbers(3)}" ref="{numbers(1)}"/>'
+        xml += f'<inertial pos="{numbers(3)}" mass="{random.uniform(0.3, 4):.4f}" '
+        xml += f'diaginertia="0.03 0.025 {random.uniform(0.01, 0.05):.4f}" euler="{numbers(3, -2, 2)}"/>'
+        if i % 2:
+            xml += f'<body pos="{numbers(3)}" euler="{numbers(3)}"><inertial pos="{numbers(3)}" mass="0.4" '
+            xml += 'diaginertia="0.002 0.003 0.004"/></body>'
+        close += "</body>"
+    option = '<compiler angle="radian"/><option gravity="1.0 -2.0 -9.0"/>'
+    return f"<mujoco>{option}<worldbody>{xml}{close}</worldbody></mujoco>"
+
+
+def inverse(model: mujoco.MjModel, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+    data, out = mujoco.MjData(model), np.empty_like(q)
+    for k in range(len(q)):
+        data.qpos[:], data.qvel[:], data.qacc[:] = q[k], v[k], a[k]
+        mujoco.mj_inverse(model, data)
+        out[k] = data.qfrc_inverse
+    return out
+
+
+def states(n: int, rows: int = 20, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-2, 2, (3, rows, n))
+
+
+@pytest.mark.parametrize("n", [2, 3, 5, 7])
+def test_torque_is_that_of_mujoco_on_random_arms(n: int):
+    model = mujoco.MjModel.from_xml_string(random_arm(n, seed=n))
+    arm = rigid_arm(model, range(n))
+    q, v, a = states(n)
+    np.testing.assert_allclose(arm.torque(q, v, a), inverse(model, q, v, a), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("n", [3, 6])
+def test_regressor_times_parameters_is_the_torque(n: int):
+    arm = rigid_arm(mujoco.MjModel.from_xml_string(random_arm(n, seed=10 + n)), range(n))
+    q, v, a = states(n)
+    product = np.einsum("kijp,jp->ki", arm.regressor(q, v, a), arm.inertial)
+    np.testing.assert_allclose(product, arm.torque(q, v, a), rtol=1e-9, atol=1e-9)
+
+
+def test_regressor_columns_are_finite_differences_of_mujocos_torque():
+    model = mujoco.MjModel.from_xml_string(THREE)
+    arm, (q, v, a) = rigid_arm(model, range(3)), states(3)
+    columns, before = arm.regressor(q, v, a), inverse(model, q, v, a)
+    for link in range(3):
+        shift, centre, mass = 1e-6, model.body_ipos[link + 1].copy(), model.body_mass[link + 1]
+        model.body_ipos[link + 1, 1] += shift
+        slope = (inverse(model, q, v, a) - before) / (mass * shift)
+        model.body_ipos[link + 1] = centre
+        own = columns[:, :, link]
+        moved = own[..., 1:4] + own[..., 4:] @ moment_to_inertia(arm.inertial[link])
+        np.testing.assert_allclose(slope, moved[..., 1], atol=1e-4)
+
+
+def test_torque_is_that_of_pinocchio(tmp_path):
+    pin = pytest.importorskip("pinocchio")
+    path = tmp_path / "arm.xml"
+    path.write_text(THREE)
+    model = pin.buildModelFromMJCF(str(path))
+    arm, (q, v, a) = load_model(path).arm, states(3)
+    expected = [pin.rnea(model, model.createData(), *row) for row in zip(q, v, a, strict=True)]
+    np.testing.assert_allclose(arm.torque(q, v, a), expected, atol=1e-9)
+
+
+def test_joint_terms_of_the_model_count_on_the_motor_side_only():
+    xml = THREE.replace('name="joint_2"', 'name="joint_2" armature="0.3" damping="0.7" stiffness="2" springref="0"')
+    model = mujoco.MjModel.from_xml_string(xml)
+    arm, (q, v, a) = rigid_arm(model, range(3)), states(3)
+    extra = inverse(model, q, v, a) - arm.torque(q, v, a)
+    np.testing.assert_allclose(arm.nominal_joint_torque(q, v, a, np.sign(v)), extra, atol=1e-9)
+
+
+def test_a_model_that_is_not_a_plain_chain_is_refused(tmp_path):
+    path = tmp_path / "arm.xml"
+    path.write_text(THREE.replace('<body name="link_3"', '<body gravcomp="1" name="link_3"'))
+    with pytest.raises(BadInput, match=r"joint_\d.*expected a plain hinge chain"):
+        load_model(path)
+
+
+def test_joints_are_found_by_name_and_the_others_stay_locked(tmp_path):
+    path = tmp_path / "arm.xml"
+    path.write_text(THREE)
+    some = load_model(path, ("joint_1", "joint_3"), 2)
+    assert some.arm.names == ("joint_1", "joint_3")
+    q, v, a = states(2)
+    whole: RigidArm = load_model(path).arm
+    full = [np.insert(x, 1, 0.0, axis=1) for x in (q, v, a)]
+    np.testing.assert_allclose(some.arm.torque(q, v, a), whole.torque(*full)[:, [0, 2]], atol=1e-9)

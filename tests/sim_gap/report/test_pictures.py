@@ -1,0 +1,39 @@
+"""Pictures of a diagnosis: each residual over velocity, position, load and time, and a figure for each cause."""
+
+import numpy as np
+import pytest
+from wrong_arms import Wrong, model, record
+
+from sim_gap.attribution.diagnose import diagnose
+from sim_gap.report.cause_figures import finding_figure
+from sim_gap.report.figures import residual_panels
+from sim_gap.report.page import sections
+
+WRONG = Wrong(coulomb=np.array([0.0, 0.8, 0.0]), spring=np.array([0.0, 0.0, 2.0]))
+
+
+@pytest.fixture(scope="module")
+def answer():
+    train, other = (record(model(), WRONG, seed=seed, seconds=30, rate=50) for seed in (1, 2))
+    return diagnose(model(), [train], [other])
+
+
+def test_a_residual_is_shown_over_velocity_position_load_and_time_for_every_joint(answer):
+    figure = residual_panels(answer, "tau")
+    grey = [trace for trace in figure.data if trace.name == "residual"]
+    assert len(grey) == 4 * 3
+    shown = answer.internals.heldout
+    for trace, x in zip(grey[4:7], (shown.signals[0].v, shown.signals[0].q, shown.signals[0].model), strict=True):
+        assert np.ptp(trace.x) == pytest.approx(np.ptp(shown.signals[0].filtered(x)[:, 1]), rel=0.05)
+    assert grey[7].x[-1] == pytest.approx(30.0, abs=1.0)
+
+
+def test_every_cause_has_its_figure_and_lies_in_the_middle_of_what_it_explains(answer):
+    figures = {cause.effect: finding_figure(answer, cause) for cause in answer.causes}
+    assert figures.keys() == {"friction.coulomb", "transmission.spring"}
+    for effect, axis in (("friction.coulomb", "velocity"), ("transmission.spring", "position")):
+        left, explained = figures[effect].data
+        assert figures[effect].layout.xaxis.title.text.startswith(axis)
+        assert np.std(left.y - explained.y) < 0.1 * np.std(left.y)
+    (section,) = [s for s in sections(answer) if s.title == "The causes one by one"]
+    assert len(section.figures) == 2
