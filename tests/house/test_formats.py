@@ -21,6 +21,8 @@ from tests.house.conftest import keyed, part, rows
 
 NOTHING = "–"
 SECTIONS = {point.name: point.load() for point in entry_points(group="armlink.sections")}
+OBSERVER = SECTIONS["daemon"]().observer_config()
+"""The observer's thresholds: a dataclass whose fields are the keys of daemon.observer."""
 
 
 # ---- models of pydantic
@@ -68,7 +70,7 @@ def range_of(schema: dict) -> str:
 
 
 def nested(schema: dict) -> tuple[str, str] | None:
-    """Name of the model that a key holds, and what stands between both keys; None where it holds none."""
+    """Name of the model that a key holds, and what joins both keys; None if it holds none."""
     for each in variants(schema):
         for inside, between in ((each, "."), (each.get("items"), "[]."), (each.get("additionalProperties"), ".*.")):
             if isinstance(inside, dict) and "$ref" in inside:
@@ -77,7 +79,7 @@ def nested(schema: dict) -> tuple[str, str] | None:
 
 
 def keys_of(schema: dict, at: str = "", all_of: dict | None = None, seen: set[str] | None = None):
-    """Key → (type, range, default) of a JSON schema and of what it holds; a model that comes again is left out."""
+    """Key → (type, range, default) of a JSON schema and all that it holds; each model is listed once."""
     all_of, seen = schema.get("$defs", {}) if all_of is None else all_of, set() if seen is None else seen
     found = {}
     for name, value in schema["properties"].items():
@@ -103,14 +105,14 @@ def arm_file_keys() -> dict[str, tuple[str, str, str]]:
     return found
 
 
-def units_said(model: type) -> dict[str, list[str]]:
-    """Attribute → units in brackets in its docstring, where there are any."""
+def units_in_docstrings(model: type) -> dict[str, list[str]]:
+    """Attribute → units in brackets in its docstring, if any."""
     body = ast.parse(inspect.getsource(model)).body[0].body
     found = {}
     for line, after in itertools.pairwise(body):
-        told = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) and str(after.value.value)
-        if isinstance(line, ast.AnnAssign) and told:
-            found[line.target.id] = re.findall(r"\[([^\]]+)\]", told)
+        text = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) and str(after.value.value)
+        if isinstance(line, ast.AnnAssign) and text:
+            found[line.target.id] = re.findall(r"\[([^\]]+)\]", text)
     return {name: units for name, units in found.items() if units}
 
 
@@ -138,13 +140,9 @@ def test_every_key_of_the_arm_file_with_type_range_and_default():
     compare(keyed("1"), arm_file_keys())
 
 
-OBSERVER = SECTIONS["daemon"]().observer_config()
-"""The observer's thresholds: a dataclass whose fields are the keys of daemon.observer."""
-
-
 @pytest.mark.parametrize("model", [*(m for s in (ArmFile, *SECTIONS.values()) for m in models_in(s)), type(OBSERVER)])
 def test_units_of_the_arm_file(model):
-    for name, units in units_said(model).items():
+    for name, units in units_in_docstrings(model).items():
         given = {row["unit"] for key, row in keyed("1").items() if key.rpartition(".")[2] == name}
         assert given & set(units), f"{model.__name__}.{name}: {given} on the page, {units} in the code"
 
@@ -172,7 +170,7 @@ def test_data_sets_and_records(number, model, common):
 
 def test_recording_channels_columns_units_and_topics():
     page = {row["channel"].strip("`"): row for row in rows("2.1")}
-    units = units_said(Recording)
+    units = units_in_docstrings(Recording)
     assert list(page) == ["time", *COLUMNS]
     for name, prefix in COLUMNS.items():
         lists = {topic: channels.index(name) for topic, channels in TOPICS.items() if name in channels}
@@ -196,7 +194,7 @@ def test_effects_with_their_parameters_and_units():
             high = f"> {parameter.above:g}" if parameter.above is not None else ""
             assert rest.split() == f"{f'× {sizes}' if sizes else ''} {low}{high}".split(), name
             assert default == ("" if parameter.default is None else f"{parameter.default:g}"), name
-        told = re.findall(r"`(\w+)` \[([^\]]+)\]", row["reported by the diagnosis"])
-        assert [(parameter.name, parameter.unit) for parameter in inverse[name].parameters] == told
+        reported = re.findall(r"`(\w+)` \[([^\]]+)\]", row["reported by the diagnosis"])
+        assert [(parameter.name, parameter.unit) for parameter in inverse[name].parameters] == reported
         assert row["of"] == ("joint" if forward[name].per_joint else "arm")
         assert inverse[name].whole_arm is not forward[name].per_joint
