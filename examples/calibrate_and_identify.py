@@ -3,12 +3,12 @@
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from armlink.armfile import load_arm
-from armlink.link import Link
-from calib.identify import identify_gravity
-from calib.runner import run_sweep
-from calib.sensors import fit_sensors
-from sim_bus.bus import LockStepBus
+from armlink.arm_file import load_arm
+from armlink.link.link import Link
+from calib.fit.gravity_fit import identify_gravity
+from calib.fit.sensor_fit import fit_sensors
+from calib.sweep.run import run_sweep
+from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 

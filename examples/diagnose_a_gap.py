@@ -5,12 +5,12 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from armlink.armfile import load_arm
-from armlink.link import Link
-from armlink.recording import load_recording
-from sim_bus.bus import LockStepBus
-from sim_gap.collect import collect
-from sim_gap.diagnose import diagnose
+from armlink.arm_file import load_arm
+from armlink.link.link import Link
+from armlink.recording.recording import load_recording
+from sim_bus.bus.lock_step import LockStepBus
+from sim_gap.attribution.diagnose import diagnose
+from sim_gap.experiment.collect import collect
 
 path = Path(__file__).with_name("planar3.yaml")  # its sim.effects belong to the simulated arm, not to the model
 arm, bus = load_arm(str(path)), LockStepBus(str(path))

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
-from armlink.armfile import load_arm
-from armlink.link import Link
-from calib.description import gcomp_arm
-from calib.observer import Observer
-from calib.watch import watch
-from calib.work import work_targets
-from sim_bus.bus import LockStepBus
+from armlink.arm_file import load_arm
+from armlink.link.link import Link
+from calib.arm.kinematics import gcomp_arm
+from calib.motion.random_work import work_targets
+from calib.observer.observer import Observer
+from calib.observer.watch_loop import watch
+from sim_bus.bus.lock_step import LockStepBus
 
 arm = load_arm(str(Path(__file__).with_name("planar3.yaml")))
 kinematics, bus = gcomp_arm(arm), LockStepBus(str(arm.path))
