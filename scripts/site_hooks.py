@@ -24,7 +24,7 @@ ROOT = Path(__file__).parent.parent
 OUTSIDE = ("CHANGELOG.md", "CONTRIBUTING.md", "LICENSE", "CITATION.cff", "examples/*.*", "packaging/*.service")
 """Files of the site that lie outside docs/."""
 HOME = {"README.md": "index.md"}
-"""Pages of the repository that another page stands in for."""
+"""Pages that are not in the site, and the page that a link to them leads to instead."""
 COMMANDS = "<!-- commands -->"
 """Replaced by the help of every command."""
 LINK = re.compile(r"(\]\()([^)\s:#]+)((?:#[^)\s]*)?\))")

@@ -1,4 +1,4 @@
-"""The examples run as they stand, are short, and print what they promise."""
+"""The examples run unchanged, are short, and print what they promise."""
 
 import re
 import subprocess
