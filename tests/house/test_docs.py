@@ -88,7 +88,7 @@ def test_a_list_or_table_follows_an_empty_line_or_a_heading(page):
     """GitHub does not ask for it, but the site would show the rows as one paragraph."""
     before, inside = "", False
     for line in FENCE.sub("", page.read_text()).splitlines():
-        starts = re.match(r"[-*] |\d+\. |\|", line)
+        starts = re.match(r"[-*] |\d+\. |\|.*\|$", line)
         assert not starts or inside or not before.strip() or before.startswith("#"), f"{name(page)}: {line}"
         inside = bool(starts) or (inside and bool(line.strip()))
         before = line
