@@ -50,6 +50,13 @@ class BusWatch:
         self._double_cycles = [0] * len(self._double_cycles)
         self._crowded_cycles = 0
 
+    def settle(self) -> None:
+        """After an interruption: replies that are owed will not come, and what crowded the bus has passed."""
+        self.readings = [self.syncs] * len(self.readings)
+        self.flooded, self._crowded_cycles = False, 0
+        self._doubled.clear()
+        self._double_cycles = [0] * len(self._double_cycles)
+
     def again(self, joint: int) -> None:
         """A second reading of a joint came in this cycle: a late one, or one too many for the SYNCs there were."""
         self.readings[joint] = max(self.readings[joint], self.syncs - FORGIVEN)

@@ -1,6 +1,6 @@
 """The link: an arm's joint controllers on a CAN bus; samples in SI units out, limited commands in."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property
 from types import TracebackType
@@ -9,6 +9,7 @@ from typing import Any, Self
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.arrays import Array
 from armlink.bus.port import open_port
 from armlink.canopen import object_dictionary as objects
 from armlink.canopen.cia402 import State
@@ -22,7 +23,7 @@ from armlink.link.cyclic_exchange import Loop
 from armlink.link.faults import bus_fault
 from armlink.link.gate import start_from
 from armlink.link.gate_limits import gate_limits, joint_ranges, target_window
-from armlink.link.types import Array, Calibration, Command, Identity, Sample, Stats
+from armlink.link.types import Calibration, Command, Controller, Identity, Sample, Setpoints, Stats
 
 LISTEN_PERIODS, LISTEN_SECONDS = 2, 0.1
 """Before anything is sent to the nodes, another host is listened for: so many periods, and at least so long [s]: a host
@@ -173,12 +174,20 @@ class Link:
         """
         self._require_start()
         self._loop.emergencies.clear()
+        self.commander.settle()
         sample = self.commander.walk(State.ENABLED)
         self._loop.emergencies.clear()
         self._loop.node_states.clear()
         self._enabled = True
         self._last = Command.hold(np.array(self._loop.latest_position))
         return sample
+
+    def recover(self) -> Sample:
+        """After a Stall: start the nodes that left operation, and enable every joint where it stands."""
+        self._require_start()
+        for node in self.nodes:
+            self.send_nmt(objects.NMT_START, node)
+        return self.enable()
 
     def disable(self) -> None:
         """Take the power from every joint: a joint without a brake falls. Raises BusFault."""
@@ -194,16 +203,35 @@ class Link:
         """One cycle: wait for its time, gate, RPDOs, SYNC, TPDOs.
 
         Raises Refused where the gate refuses the command, BusFault for a fault of bus or joint; the joints have been
-        sent to quick stop before either is raised.
+        sent to quick stop before either is raised. Raises Crossed if a joint crossed a bound of the command's guard:
+        the joints then keep the command until the next.
         """
         if not self._enabled:
             raise BusFault("the joints are not enabled: start() and enable() come before cycle()")
         self._last = command
         try:
-            return self.commander.command(command)
+            sample = self.commander.command(command)
         except BaseException:
             self.stop()
             raise
+        if command.guard is not None:
+            command.guard.check(self.names, np.array(self._loop.latest_position), command.position)
+        return sample
+
+    def play(self, setpoints: Setpoints) -> Iterator[Sample]:
+        """One row a cycle, and the sample of each; raises as cycle. To stop early, close the iterator."""
+        for row in range(len(setpoints)):
+            yield self.cycle(setpoints.command(row))
+
+    def run(self, controller: Controller) -> Iterator[Sample]:
+        """A controller in the loop, cycle by cycle, until the iterator is closed; raises as cycle."""
+        sample = self.cycle(self._last or Command.hold(self.position_sent))
+        while True:
+            sample = self.cycle(controller.command(sample))
+            yield sample
+
+    def catch_up(self) -> None:
+        """Forget samples of the past: in process there are none."""
 
     def stop(self) -> None:
         """Quick stop of every joint, as far as the bus still carries it; the joints stay in it, holding."""

@@ -16,6 +16,7 @@ from typing import Any, Self
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.arrays import Array
 from armlink.bus.stamped_port import StampedGroup, StampedPort, open_listening_port
 from armlink.canopen import object_dictionary as objects
 from armlink.canopen.pdo import RPDO1
@@ -23,7 +24,7 @@ from armlink.canopen.sdo import NodeServices, PumpedNetwork, joint_services
 from armlink.clock import Clock, MonotonicClock
 from armlink.link import torque_sensor_record as calibration
 from armlink.link.cyclic_exchange import Loop
-from armlink.link.types import Array, Calibration, Sample, Stats
+from armlink.link.types import Calibration, Sample, Stats
 from armlink.monitor.monitor import assumed_units
 
 SLEEP = 0.04

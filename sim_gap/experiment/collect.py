@@ -5,8 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from armlink.arrays import Array
 from armlink.link.link import Link
-from armlink.link.types import Array, Command
+from armlink.link.types import Command
 from armlink.recording.mcap import RecordingWriter
 from calib.motion.trajectory import trajectory
 from sim_gap.experiment.excitation import ACCELERATION, PACE
