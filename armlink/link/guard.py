@@ -1,6 +1,7 @@
 """Bounds that a command carries along, checked in every cycle: whoever sent it may be busy when they are crossed."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,7 @@ class Guard:
         """Raise Crossed for the joint that is furthest beyond a bound; NaN is beyond none."""
         beyond = np.fmax(self.lower - position, position - self.upper)
         if (beyond > 0).any():
-            joint = int(np.nanargmax(beyond))
+            joint = int(np.argmax(beyond > 0))
             raise Crossed(names[joint], joint, "range", float(position[joint]), float(target[joint]))
         lag = np.abs(target - position) - self.lag
         if (lag > 0).any():
@@ -44,7 +45,9 @@ class Crossed(Refused):
         what = "left the range that its command allows" if bound == "range" else f"does not follow to {target:.3f} rad"
         super().__init__(f"{name}: at {position:.3f} rad it {what}")
         self.name, self.joint, self.bound, self.position, self.target = name, joint, bound, position, target
+        self.sample: Any = None
+        """The Sample that showed it."""
 
-    def __reduce__(self) -> tuple[type["Crossed"], tuple[str, int, str, float, float]]:
+    def __reduce__(self) -> tuple[Any, ...]:
         """Passes from process to process."""
-        return type(self), (self.name, self.joint, self.bound, self.position, self.target)
+        return type(self), (self.name, self.joint, self.bound, self.position, self.target), {"sample": self.sample}

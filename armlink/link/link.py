@@ -1,10 +1,10 @@
 """The link: an arm's joint controllers on a CAN bus; samples in SI units out, limited commands in."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 import numpy as np
 
@@ -23,11 +23,18 @@ from armlink.link.cyclic_exchange import Loop
 from armlink.link.faults import bus_fault
 from armlink.link.gate import start_from
 from armlink.link.gate_limits import gate_limits, joint_ranges, target_window
-from armlink.link.types import Calibration, Command, Controller, Identity, Sample, Setpoints, Stats
+from armlink.link.guard import Crossed
+from armlink.link.types import Calibration, Command, Controller, Identity, Sample, Samples, Setpoints, Stats
 
+PATIENCE = 2.5
+"""Readings may be so many periods old while a motion goes on; a reply that comes a period late is within it."""
 LISTEN_PERIODS, LISTEN_SECONDS = 2, 0.1
 """Before anything is sent to the nodes, another host is listened for: so many periods, and at least so long [s]: a host
 on a busy computer may well pause for some 0.05 s."""
+
+
+R = TypeVar("R")
+P = ParamSpec("P")
 
 
 class Link:
@@ -74,6 +81,21 @@ class Link:
             self.stop()
         finally:
             self.bus.shutdown()
+
+    @property
+    def enabled(self) -> bool:
+        """Whether the joints are enabled and cycles must go on."""
+        return self._enabled
+
+    @property
+    def last(self) -> Command | None:
+        """The newest command."""
+        return self._last
+
+    @property
+    def latest_position(self) -> Array:
+        """Newest position readings, whenever they came (n,) [rad]."""
+        return np.array(self._loop.latest_position)
 
     @property
     def stats(self) -> Stats:
@@ -215,15 +237,27 @@ class Link:
             self.stop()
             raise
         if command.guard is not None:
-            command.guard.check(self.names, np.array(self._loop.latest_position), command.position)
+            try:
+                command.guard.check(self.names, self.latest_position, command.position)
+            except Crossed as crossed:
+                crossed.sample = sample
+                raise
         return sample
 
-    def play(self, setpoints: Setpoints) -> Iterator[Sample]:
-        """One row a cycle, and the sample of each; raises as cycle. To stop early, close the iterator."""
-        for row in range(len(setpoints)):
-            yield self.cycle(setpoints.command(row))
+    def play(self, setpoints: Setpoints) -> Samples:
+        """One row a cycle, and the sample of each; raises as cycle. To stop early, close the iterator.
 
-    def run(self, controller: Controller) -> Iterator[Sample]:
+        While readings are late the row is repeated, so that the motion waits for the arm.
+        """
+        patience = PATIENCE * self.period
+        for row in range(len(setpoints)):
+            command = setpoints.command(row)
+            sample = self.cycle(command)
+            yield sample
+            while not self._lock_step and sample.age.max() > patience:
+                sample = self.cycle(command)
+
+    def run(self, controller: Controller) -> Samples:
         """A controller in the loop, cycle by cycle, until the iterator is closed; raises as cycle."""
         sample = self.cycle(self._last or Command.hold(self.position_sent))
         while True:
@@ -240,9 +274,17 @@ class Link:
         self._enabled = False
         self.commander.quick_stop()
 
+    def inside(self, function: "Callable[Concatenate[Link, P], R]", *args: P.args, **kwargs: P.kwargs) -> R:
+        """Call `function(link, ...)`: in the process that makes the cycles, which is this one."""
+        return function(self, *args, **kwargs)
+
     def read_calibration(self, joint: int) -> Calibration:
         """The torque sensor record (2100h) that joint 0 … n−1 works with; raises BusFault."""
         return calibration.read_record(self.services[joint])
+
+    def read_temperatures(self) -> Array:
+        """Temperatures of the drives (n,) [°C]; NaN for a drive that does not report one. Raises BusFault."""
+        return np.array([device.read_temperature(services) for services in self.services])
 
     def write_calibration(
         self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False

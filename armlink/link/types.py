@@ -1,5 +1,6 @@
 """What goes into and comes out of a cycle of the link, in SI units."""
 
+from collections.abc import Generator
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -162,3 +163,7 @@ class Stats:
     """Cycles a second, measured."""
     load: float = 0.0
     """Share of the bus that the frames take at its bit rate, without stuff bits, which are a tenth more."""
+
+
+Samples = Generator[Sample, None, None]
+"""Samples as they come; close it to end what brings them."""

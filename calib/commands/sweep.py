@@ -7,7 +7,7 @@ import typer
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
-    from armlink.link.link import Link
+    from armlink.loop.driver import ArmDriver
 
 
 def sweep(
@@ -46,7 +46,7 @@ def sweep(
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
-    from armlink.link.link import Link
+    from armlink.loop.open import open_arm
     from calib.arm.kinematics import model_arm
     from calib.arm.sweep_section import with_hold
     from calib.commands.screen import SweepScreen, confirm, print_lines, print_plan, print_preflight, unsettled_said
@@ -76,7 +76,7 @@ def sweep(
         raise BadInput("sweep: give --out DIR for the data set, or --plan to print the plan alone")
     if not dry_run and not yes:
         confirm(f"{arm_file.name} will move through its whole range, {reference_mass:g} kg attached. Is it clear?")
-    with _dry_link(arm_file, reference_mass) if dry_run else Link.open(arm_file, bus) as link:
+    with _dry_link(arm_file, reference_mass) if dry_run else open_arm(arm_file, bus) as link:
         link.start()
         with SweepScreen(f"{arm_file.name}, {reference_mass:g} kg attached") as screen:
             link.enable()
@@ -109,11 +109,11 @@ def sweep(
     write_json(json_file, answer)
 
 
-def _dry_link(arm_file: "ArmFile", reference_mass: float) -> "Link":
-    """A link to the simulated arm that the arm file describes, with the mass attached where there is one."""
-    from armlink.link.link import Link
+def _dry_link(arm_file: "ArmFile", reference_mass: float) -> "ArmDriver":
+    """The simulated arm that the arm file describes, in this process, with the mass attached."""
+    from armlink.arm_file import Bus
+    from armlink.loop.open import open_arm
 
-    link = Link.open(arm_file, f"armlink_sim:{arm_file.path}")
-    if reference_mass:
-        link.bus.arm.attach_mass(reference_mass)
-    return link
+    bus = Bus(interface="armlink_sim", channel=str(arm_file.path), options={"load": reference_mass})
+    link = arm_file.require_link().model_copy(update={"bus": bus, "buses": {}})
+    return open_arm(arm_file.model_copy(update={"link": link}))

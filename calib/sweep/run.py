@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
-from armlink.link.link import Link
+from armlink.loop.driver import ArmDriver
 from calib.arm.drive_limits import Limits
 from calib.arm.sweep_section import SweepSection, sweep_section
 from calib.motion.mover import Mover, Slipped, Stalled
@@ -34,7 +34,7 @@ RETRIES = 3
 
 
 def run_sweep(
-    link: Link,
+    link: ArmDriver,
     arm: ArmFile,
     out: Path,
     *,
