@@ -49,9 +49,10 @@ def main(seconds: float = 20.0, rate: float = 250.0) -> None:
                 link.cycle(command)
             missed, count = link.stats.missed, int(seconds * rate)
             started, host, simulated = time.monotonic(), time.process_time(), cpu_seconds(arm_process.pid)
-            ages = np.empty(count)
+            ages, delays = np.empty(count), np.empty(count)
             for cycle in range(count):
-                ages[cycle] = link.cycle(command).age.max()
+                sample = link.cycle(command)
+                ages[cycle], delays[cycle] = sample.age.max(), sample.delay
             elapsed = time.monotonic() - started
             answer = {
                 "rate_hz": count / elapsed,
@@ -60,6 +61,7 @@ def main(seconds: float = 20.0, rate: float = 250.0) -> None:
                 "missed_share": (link.stats.missed - missed) / count / link.n,
                 "dropped": link._loop.dropped,
                 "oldest_reading_ms": ages.max() * 1e3,
+                "sync_to_readings_ms": dict(zip(("p50", "p99"), np.percentile(delays, (50, 99)) * 1e3, strict=True)),
             }
             link.disable()
     finally:

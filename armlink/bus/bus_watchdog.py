@@ -13,6 +13,8 @@ DOUBLE_CYCLES = 3
 """So many cycles running with two readings of one joint are a second node with its id."""
 FORGIVEN = 25
 """So many readings that did not come in their cycle may come later, two at a time, as from a node that caught up."""
+IN_FLIGHT = 5
+"""So many replies that were owed before an interruption may still come after it."""
 
 
 class BusWatch:
@@ -51,8 +53,8 @@ class BusWatch:
         self._crowded_cycles = 0
 
     def settle(self) -> None:
-        """After an interruption: replies that are owed will not come, and what crowded the bus has passed."""
-        self.readings = [self.syncs] * len(self.readings)
+        """After an interruption: most replies that are owed will not come, and what crowded the bus has passed."""
+        self.readings = [min(max(count, self.syncs - IN_FLIGHT), self.syncs) for count in self.readings]
         self.flooded, self._crowded_cycles = False, 0
         self._doubled.clear()
         self._double_cycles = [0] * len(self._double_cycles)

@@ -37,6 +37,7 @@ _TRIES = 25
 _FULL = (errno.ENOBUFS, errno.EAGAIN)
 _DONTWAIT = int(socket.MSG_DONTWAIT)
 _SO_RCVBUFFORCE, _SO_RXQ_OVFL = 33, 40
+_STAMP_ALONE = 32  # bytes of control messages if there is nothing but a time stamp
 _CONTROL_HEADER = struct.Struct("@Nii")
 _LENGTH = struct.Struct("@56xI4x")
 
@@ -215,7 +216,7 @@ class DatagramPort(ABC):
             fault = InterfaceDown if number == errno.ENETDOWN else BusFault
             raise fault(f"bus {self._name}: cannot receive: {os.strerror(number)}")
         length = self._first.control_length
-        if length:
+        if length not in (0, _STAMP_ALONE):
             self._read_drops(length)
         return count
 

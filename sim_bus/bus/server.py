@@ -21,7 +21,7 @@ from sim_bus.simulated_arm import SYNC_ID, SimulatedArm
 LARGEST_LAG = 0.25
 """What the physics lags behind the clock by more than this is dropped, as after a stopped process [s]."""
 TICK = 0.01
-"""Longest wait for a frame [s]: physics and timers go on meanwhile; a timer that is due earlier ends the wait."""
+"""Without a frame that needs it, physics lag behind the clock by this much at most [s], or until a timer is due."""
 MOST_FRAMES = 1000
 """Frames dealt with in one turn: a flood does not keep physics and timers waiting for ever."""
 LOCKSTEP_PATIENCE = 1.0
@@ -83,7 +83,7 @@ class Server:
         """Wait for at most a tick, then deal with everything that is there."""
         receive = self._leading.receive
         try:
-            frame = receive(self._longest_wait())
+            frame = receive(TICK if self._lockstep else max(self._until_tick(), 0.0))
             for _ in range(MOST_FRAMES):
                 if frame is None:
                     break
@@ -93,18 +93,17 @@ class Server:
             self._take_from_others()
         except InterfaceDown:  # it may come up again, and until then nodes hear nothing
             pass
-        self._let_time_pass()
+        if self._lockstep or self._until_tick() <= 0.0:
+            self._let_time_pass()
         if self._control is not None and self._injector is not None:
             for wrong in self._control.poll(self._injector):
                 self.on_wrong(wrong)
         self._flush()
 
-    def _longest_wait(self) -> float:
-        """Until the next timer of a node, within a tick [s]; in lock-step timers wait for SYNC."""
-        if self._lockstep:
-            return TICK
-        due = self._arm.supervision.due + self._offset - self._now()
-        return min(max(due, 0.0), TICK)
+    def _until_tick(self) -> float:
+        """Time until physics and timers must go on without a frame [s]."""
+        due = min(self._arm.supervision.due, self._arm.time + TICK)
+        return due + self._offset - self._now()
 
     def _take_from_others(self) -> None:
         for port in self._others:
