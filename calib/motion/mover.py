@@ -79,6 +79,8 @@ class Mover:
         link.catch_up()
         first = link.cycle(self.command)
         self.position: Array = first.position.copy()
+        self.seen_at = first.t
+        """Link time of the newest sample [s]."""
         self._encoders = EncoderCheck(link.names, link.position_step, limits.speed, first.t)
         self.pressed: Flags = np.zeros(link.n, dtype=bool)
         self.side = np.zeros(link.n)
@@ -88,6 +90,15 @@ class Mover:
         self._produced = np.zeros(link.n)
         self.contacts: dict[tuple[int, int], float] = {}
         """(joint, side) → reading at which that stop was found [rad]."""
+
+    def resume(self) -> None:
+        """After the link has recovered: take over where the arm stands, nothing pressed."""
+        self.pressed[:] = False
+        self.side[:] = 0.0
+        self.command = Command.hold(self.link.position_sent)
+        self.link.catch_up()
+        self._encoders.forget()
+        self.cycle()
 
     @property
     def known_resolution(self) -> Array:
@@ -116,6 +127,7 @@ class Mover:
                 self.command.position, self.command.torque = now.position.copy(), now.torque.copy()
 
     def _see(self, sample: Sample) -> Sample:
+        self.seen_at = sample.t
         self._encoders.see(sample, self.position)
         np.copyto(self.position, sample.position, where=np.isfinite(sample.position))
         return sample
