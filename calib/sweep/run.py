@@ -106,7 +106,7 @@ class _Pass:
         readings: list[Reading],
         progress: Progress,
         clock: Callable[[], float],
-        on_stall: OnStall,
+        on_stall: OnStall = give_up,
     ) -> None:
         self._on_stall = on_stall
         self.mover, self.writer, self.readings = mover, writer, readings
