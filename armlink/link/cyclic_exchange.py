@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armlink.arrays import Array
-from armlink.bus.bus_watchdog import FORGIVEN, MOST_FRAMES, BusWatch
+from armlink.bus.bus_watchdog import MOST_FRAMES, BusWatch
 from armlink.bus.frame_bits import FIXED_BITS
 from armlink.bus.port import Port
 from armlink.canopen import emcy
@@ -22,6 +22,8 @@ from armlink.link.types import Sample, Stats
 COLLECT_SHARE = 0.8
 """Share of a period after SYNC in which TPDOs of this cycle are waited for."""
 
+OWED_CYCLES = 25
+"""A reply that has been owed for so many cycles is lost."""
 NO_STATUS = 0xFFFF
 """Stands for the status word of a joint that has sent none; no state of CiA 402."""
 NO_MODE = 0
@@ -71,6 +73,8 @@ class Loop:
         self.displays: list[int] = [NO_MODE] * self.n
         """Newest mode of operation display (6061h) of each joint."""
         self._awaited = self._counted = self._dropped = 0
+        self._came = [0] * self.n
+        """Readings of each joint that came, in their cycle or late."""
         self.bits = 0
         """Bits that the frames so far took on the wire, without stuff bits (bus_load.frame_bits has them)."""
         self._slow_came = False
@@ -97,6 +101,7 @@ class Loop:
     def reset_counters(self) -> None:
         """Begin to count anew."""
         self.stats, self.bits, self._first, self._counted = Stats(), 0, None, 0
+        self._came = [0] * self.n
         self._dropped = self._port.dropped
 
     @property
@@ -182,6 +187,7 @@ class Loop:
             self._first = now
         self._awaited = self.n
         self.watch.syncs += 1
+        self.stats.asked += 1
         self._port.send_all(frames)
         self.count(len(frames), sum([len(data) for _, data in frames]))
         self.synced = now
@@ -207,7 +213,7 @@ class Loop:
         timely = np.array([here and not owed for here, owed in zip(came, self._owed, strict=True)])
         self._owed = [owed + (not here) for here, owed in zip(came, self._owed, strict=True)]
         self._owed_for = self._owed_for + 1 if any(self._owed) else 0
-        if self._owed_for > FORGIVEN:
+        if self._owed_for > OWED_CYCLES:
             self._owed, self._owed_for = [0] * self.n, 0
         return timely
 
@@ -224,6 +230,7 @@ class Loop:
         if elapsed > 0:
             self.stats.rate_hz = self.stats.cycles / elapsed
             self.stats.load = self.bits / (bitrate * elapsed)
+        self.stats.came = tuple(self._came)
 
     def take(self, can_id: int, data: bytes) -> None:
         """Take one frame in, for what it is; who takes it counts it."""
@@ -236,6 +243,7 @@ class Loop:
             self.stats.errors += 1
         elif kind == 0:
             self.watch.readings[joint] += 1
+            self._came[joint] += 1
             if self._position[joint] != self._position[joint]:  # NaN: the first in this cycle
                 self._awaited -= 1
             else:

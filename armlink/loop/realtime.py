@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 PRIORITY = 20
 """Of SCHED_FIFO: above everything ordinary, below the kernel's own threads (50)."""
+SIMULATED = 10
+"""Of a simulated arm, which must leave its host the first place."""
 _LOCK_CURRENT, _LOCK_FUTURE = 1, 2
 
 
@@ -30,17 +32,17 @@ class Realtime:
         )
 
 
-def prepare() -> Realtime:
+def prepare(priority: int = PRIORITY) -> Realtime:
     """Make this process ready to keep a cycle. Never fails: says what was permitted."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 50, 100)
-    return Realtime(_schedule(), _lock_memory())
+    return Realtime(_schedule(priority), _lock_memory())
 
 
-def _schedule() -> bool:
+def _schedule(priority: int) -> bool:
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except (AttributeError, OSError):
         return False
     return True

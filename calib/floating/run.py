@@ -9,8 +9,8 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.canopen.cia402 import Mode
 from armlink.errors import ArmlinkError, Refused
-from armlink.loop.driver import ArmDriver
 from armlink.link.types import Command, Sample
+from armlink.loop.driver import ArmDriver
 from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm
 from calib.floating.controller import FloatConfig, FloatControl

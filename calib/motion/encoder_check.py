@@ -37,6 +37,10 @@ class EncoderCheck:
         self._unsure = np.zeros(len(names), dtype=bool)
         """Whether the last reading of each joint was not timely: nothing is said of the way from there."""
 
+    def forget(self) -> None:
+        """Begin anew after an interruption: nothing is said of what happened meanwhile."""
+        self._unsure[:] = True
+
     def see(self, sample: Sample, before: Array) -> None:
         """Raise EncoderFault if a position reading differs from the last one `before` it (n,) [rad] by more than its
         joint can have turned meanwhile. Only timely readings count, and of those the time between their SYNCs and what

@@ -31,6 +31,8 @@ CONTACT_LEAD = 0.015
 """A joint that its target leads by so much, and that does not move, stands at its stop [rad]."""
 CONTACT_STILL = 0.15
 """Share of the approach speed below which a joint does not move."""
+CREEP_AHEAD = 10
+"""Rows that creeping is ahead of its samples: a job that is held up stops the creep after so many."""
 CHECK_EVERY = 5
 """Cycles from one look at the settle rule to the next."""
 COAST, COAST_LOOK, COAST_STILL = 5.0, 0.1, 0.002
@@ -79,6 +81,8 @@ class Mover:
         link.catch_up()
         first = link.cycle(self.command)
         self.position: Array = first.position.copy()
+        self.seen_at = first.t
+        """Link time of the newest sample [s]."""
         self._encoders = EncoderCheck(link.names, link.position_step, limits.speed, first.t)
         self.pressed: Flags = np.zeros(link.n, dtype=bool)
         self.side = np.zeros(link.n)
@@ -88,6 +92,15 @@ class Mover:
         self._produced = np.zeros(link.n)
         self.contacts: dict[tuple[int, int], float] = {}
         """(joint, side) → reading at which that stop was found [rad]."""
+
+    def resume(self) -> None:
+        """After the link has recovered: take over where the arm stands, nothing pressed."""
+        self.pressed[:] = False
+        self.side[:] = 0.0
+        self.command = Command.hold(self.link.position_sent)
+        self.link.catch_up()
+        self._encoders.forget()
+        self.cycle()
 
     @property
     def known_resolution(self) -> Array:
@@ -116,6 +129,7 @@ class Mover:
                 self.command.position, self.command.torque = now.position.copy(), now.torque.copy()
 
     def _see(self, sample: Sample) -> Sample:
+        self.seen_at = sample.t
         self._encoders.see(sample, self.position)
         np.copyto(self.position, sample.position, where=np.isfinite(sample.position))
         return sample
@@ -222,7 +236,9 @@ class Mover:
     def rest(self, counts: Flags) -> Rest:
         """Wait until all has settled and the torque averages that `counts` (n,) are exact enough; raises Slipped."""
         rule, samples, resolution = self.rule, list[Sample](), self.known_resolution
+        window, timeout = rule.window * self.link.period, rule.timeout * self.link.period
         begin: int | None = None
+        self.link.catch_up()
 
         def settled(some: list[Sample]) -> bool:
             return rule.settled(stack(some, "position"), stack(some, "torque"), counts, resolution)
@@ -230,19 +246,29 @@ class Mover:
         while True:
             samples.append(self.cycle())
             count = len(samples)
-            if count < rule.window or (count - rule.window) % CHECK_EVERY:
+            if not self._lasted(samples, window) or (count - rule.window) % CHECK_EVERY:
                 continue
-            if count >= rule.timeout:
+            if self._lasted(samples, timeout):
                 return average(samples[-rule.max_samples :], settled=False)
             if begin is None:
-                if settled(samples[-rule.window :]):
-                    begin = count - rule.window // 2  # what settled last still decays in the first half
-            elif count - begin >= rule.window:
+                if settled(samples[self._since(samples, window) :]):
+                    # what settled last still decays in the first half
+                    begin = self._since(samples, rule.window // 2 * self.link.period)
+            elif self._lasted(samples[begin:], window):
                 enough = count - begin >= rule.max_samples
                 if enough or rule.exact(stack(samples[begin:], "torque"), counts):
                     if settled(samples[begin:]):
                         return average(samples[begin:], settled=True)
                     begin = None  # it only stood at a turning point
+
+    def _lasted(self, samples: list[Sample], seconds: float) -> bool:
+        """Whether the samples cover so much time, a period each at least."""
+        return bool(samples) and samples[-1].t - samples[0].t > seconds - 1.5 * self.link.period
+
+    def _since(self, samples: list[Sample], seconds: float) -> int:
+        """Index of the first sample of the last `seconds`."""
+        begin = samples[-1].t - seconds + 0.5 * self.link.period
+        return next(index for index, sample in enumerate(samples) if sample.t > begin)
 
     def _stand(self, joints: Flags) -> None:
         """Wait until pressed joints stand, `BOUNCE_SECONDS` at most; raises Slipped where one leaves its stop."""
@@ -258,28 +284,33 @@ class Mover:
 
     def _creep(self, stops: npt.NDArray[np.int64], joints: Flags) -> None:
         """Move each joint towards its stop until it does not follow any more."""
-        period = self.link.period
-        stride = np.minimum(self.section.approach_speed, self.limits.speed) * period * stops
-        window = max(int(0.1 / period), 4)
-        history, open_joints = [self.position.copy()], joints.copy()
+        stride = np.minimum(self.section.approach_speed, self.limits.speed) * self.link.period * stops
+        window = max(int(0.1 / self.link.period), 4)
+        read, asked, open_joints = [self.position.copy()], [self.command.position.copy()], joints.copy()
         while open_joints.any():
-            self.command.position[open_joints] += stride[open_joints]
-            sample = self.cycle()
-            np.copyto(self._produced, sample.motor_torque, where=np.isfinite(sample.motor_torque))
-            history.append(self.position.copy())
-            if len(history) <= window:
-                continue
-            moved = (self.position - history[-window]) * stops
-            lead = (self.command.position - self.position) * stops
-            still = moved < CONTACT_STILL * np.abs(stride) * window
-            open_joints &= ~(still & (lead > CONTACT_LEAD))
-            for joint in np.flatnonzero(open_joints):
-                self._check_creep(int(joint), int(stops[joint]))
+            ahead = np.tile(np.where(open_joints, stride, 0.0), (CREEP_AHEAD, 1))
+            rows = np.cumsum(np.vstack([self.command.position, ahead]), axis=0)[1:]
+            command = self.command
+            with closing(self._play(Setpoints(command.mode, command.torque, rows, command.guard))) as samples:
+                for row, sample in zip(rows, samples, strict=True):
+                    np.copyto(self._produced, sample.motor_torque, where=np.isfinite(sample.motor_torque))
+                    read.append(self.position.copy())
+                    asked.append(row)
+                    if len(read) <= window:
+                        continue
+                    moved, wanted = (self.position - read[-window]) * stops, np.abs(row - asked[-window - 1])
+                    still = moved < CONTACT_STILL * wanted
+                    touched = open_joints & still & ((row - self.position) * stops > CONTACT_LEAD)
+                    for joint in np.flatnonzero(open_joints & ~touched):
+                        self._check_creep(int(joint), int(stops[joint]), float(row[joint]))
+                    if touched.any():
+                        open_joints = open_joints & ~touched
+                        break
 
-    def _check_creep(self, joint: int, side: int) -> None:
-        """Raise Refused where a joint has gone beyond the place at which its stop should have been."""
+    def _check_creep(self, joint: int, side: int, target: float) -> None:
+        """Raise Refused if a joint's target [rad] has gone beyond the place at which its stop should have been."""
         limit = float(self.limits.upper[joint] if side > 0 else self.limits.lower[joint])
-        beyond = side * (self.command.position[joint] - limit)
+        beyond = side * (target - limit)
         if beyond > 2 * STOP_TOLERANCE + 0.03 * abs(limit):
             raise Refused(
                 f"{self.link.names[joint]}: no stop found at {limit:.3f} rad (went to {self.position[joint]:.3f}):"

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
+from armlink.link.types import Stats
 from armlink.loop.driver import ArmDriver
 from calib.arm.drive_limits import Limits
 from calib.arm.sweep_section import sweep_section
@@ -19,6 +20,8 @@ from calib.motion.mover import Mover, Stalled
 Array = npt.NDArray[np.float64]
 LISTEN = 0.5
 """Seconds for which the sensors are listened to at rest, after as long again in which switching on dies down."""
+MISSING, LATE = 0.1, 0.5
+"""Shares of readings from which on they are said to be missing, and to be late."""
 LOUD = 0.05
 """Noise of a torque sensor, as a share of rated torque, from which it is not fit for a calibration."""
 NEAR_LIMIT = 1.9
@@ -54,16 +57,14 @@ def listen(link: ArmDriver, arm: ArmFile) -> Preflight:
     temperature = read_temperatures(link)
     limits, mover = Limits.of(arm), Mover(link, sweep_section(arm), Limits.of(arm))
     cycles = max(int(LISTEN / link.period), 20)
-    samples = [mover.cycle() for _ in range(2 * cycles)][cycles:]
+    for _ in range(cycles):
+        mover.cycle()
+    before = link.stats
+    samples = [mover.cycle() for _ in range(cycles)]
     torque = np.array([sample.torque for sample in samples])
     position = np.array([sample.position for sample in samples])
+    _check_readings(link.names, before, link.stats, torque, position)
     for joint, name in enumerate(link.names):
-        for what, values in (("torque", torque[:, joint]), ("position", position[:, joint])):
-            missing = int(np.isnan(values).sum())
-            if missing > 0.1 * len(values):
-                raise Refused(
-                    f"{name}: {missing} of {len(values)} {what} readings are missing: check its TPDO and cable"
-                )
         if np.nanmax(np.abs(torque[:, joint])) > NEAR_LIMIT * limits.rated[joint]:
             raise Refused(
                 f"{name}: its torque sensor reads {torque[-1, joint]:.3g} N·m at rest, near the end of its range:"
@@ -79,6 +80,30 @@ def listen(link: ArmDriver, arm: ArmFile) -> Preflight:
     expected = np.column_stack([limits.lower, limits.upper])
     mean = np.nanmean(torque, axis=0)
     return Preflight(link.names, np.array([_noise(each) for each in torque.T]), mean, nowhere, expected, temperature)
+
+
+def _check_readings(names: tuple[str, ...], before: Stats, after: Stats, torque: Array, position: Array) -> None:
+    """Raise Refused naming the joint whose readings are missing: lost on the way, or late.
+
+    `before` and `after` count what was asked for and what came while torque and position (K, n) were read.
+    """
+    asked = after.asked - before.asked
+    for joint, name in enumerate(names):
+        lost = asked - (after.came[joint] - before.came[joint])
+        for what, values in (("torque", torque[:, joint]), ("position", position[:, joint])):
+            missing = int(np.isnan(values).sum())
+            if missing <= MISSING * len(values):
+                continue
+            empty = int((np.isnan(values) & ~(np.isnan(torque[:, joint]) & np.isnan(position[:, joint]))).sum())
+            if max(lost, empty) > MISSING * asked:
+                raise Refused(
+                    f"{name}: {max(lost, empty)} of {asked} {what} readings are missing: check its TPDO and cable"
+                )
+            if missing > LATE * len(values):
+                raise Refused(
+                    f"{name}: {missing} of {len(values)} {what} readings came after their cycle was over: the arm or"
+                    " this machine does not keep pace: lower link.rate, or give them more processor time"
+                )
 
 
 def read_temperatures(link: ArmDriver) -> Array:

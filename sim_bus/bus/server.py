@@ -22,6 +22,8 @@ LARGEST_LAG = 0.25
 """What the physics lags behind the clock by more than this is dropped, as after a stopped process [s]."""
 TICK = 0.01
 """Without a frame that needs it, physics lag behind the clock by this much at most [s], or until a timer is due."""
+LATE = 2 * TICK
+"""Longer than this without a turn and it was this process that did not listen, not the host that was silent [s]."""
 MOST_FRAMES = 1000
 """Frames dealt with in one turn: a flood does not keep physics and timers waiting for ever."""
 LOCKSTEP_PATIENCE = 1.0
@@ -137,6 +139,8 @@ class Server:
         if lag > LARGEST_LAG:
             self._offset += lag - LARGEST_LAG
             lag = LARGEST_LAG
+        if lag > LATE:
+            self._arm.supervision.postpone(lag - LATE)
         if lag > 0:
             self._line.advance(lag)
         while self._drifts and self._drifts[0].time <= self._arm.time:
