@@ -7,7 +7,7 @@ import typer
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
-    from armlink.link.link import Link
+    from armlink.loop.driver import ArmDriver
 
 
 def sweep(
@@ -31,6 +31,9 @@ def sweep(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Run the whole plan on the simulated arm of the arm file's sim section.")
     ] = False,
+    keep_going: Annotated[
+        int, typer.Option(min=0, help="Enable the joints again by itself up to N times after a stall of the cycle.")
+    ] = 0,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the arm moves.")] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the plan's search.")] = 0,
     json_file: Annotated[
@@ -46,16 +49,26 @@ def sweep(
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
-    from armlink.link.link import Link
+    from armlink.loop.open import open_arm
     from calib.arm.kinematics import model_arm
     from calib.arm.sweep_section import with_hold
-    from calib.commands.screen import SweepScreen, confirm, print_lines, print_plan, print_preflight, unsettled_said
+    from calib.commands.screen import (
+        SweepScreen,
+        confirm,
+        print_lines,
+        print_plan,
+        print_preflight,
+        stalls_said,
+        unsettled_said,
+    )
     from calib.plan.collisions import check_plan
     from calib.plan.drawing import draw_plan, seconds
     from calib.plan.rough_gravity import guess_of_model
     from calib.plan.sweep_plan import plan_sweep
+    from calib.sweep.dataset import require_vacant
     from calib.sweep.preflight import find_stops, listen
     from calib.sweep.run import run_sweep
+    from calib.sweep.stalls import bridged
 
     arm_file = with_hold(load_arm(arm), hold)
     if plan:
@@ -74,22 +87,32 @@ def sweep(
         return
     if out is None:
         raise BadInput("sweep: give --out DIR for the data set, or --plan to print the plan alone")
+    require_vacant(out, resume)
     if not dry_run and not yes:
         confirm(f"{arm_file.name} will move through its whole range, {reference_mass:g} kg attached. Is it clear?")
-    with _dry_link(arm_file, reference_mass) if dry_run else Link.open(arm_file, bus) as link:
+    with _dry_link(arm_file, reference_mass) if dry_run else open_arm(arm_file, bus) as link:
         link.start()
         with SweepScreen(f"{arm_file.name}, {reference_mass:g} kg attached") as screen:
             link.enable()
-            found = listen(link, arm_file)
+            on_stall = screen.on_stall(keep_going)
+            found = bridged(link, on_stall, lambda: listen(link, arm_file))
             if check_stops and not resume and not reference_mass:
-                found = find_stops(link, arm_file, found, screen.count)
+                heard = found
+                found = bridged(link, on_stall, lambda: find_stops(link, arm_file, heard, screen.count))
             data = run_sweep(
-                link, arm_file, out, reference_mass=reference_mass, resume=resume, progress=screen.update, seed=seed
+                link,
+                arm_file,
+                out,
+                reference_mass=reference_mass,
+                resume=resume,
+                progress=screen.update,
+                seed=seed,
+                on_stall=on_stall,
             )
     print_preflight(found)
     assert data.plan is not None
     print_plan(arm_file, data.plan)
-    print_lines(unsettled_said(data), "yellow")
+    print_lines([*unsettled_said(data), *stalls_said(data)], "yellow")
     if not reference_mass:
         screen.say(
             f"{out} is complete. Now attach {data.plan.reference_mass:g} kg and sweep again with"
@@ -101,6 +124,7 @@ def sweep(
         "serial": arm_file.serial,
         "readings": len(data.readings),
         "unsettled": len(data.unsettled),
+        "stalls": [stall.model_dump(include={"t", "late_ms", "reading"}) for stall in data.stalls],
         "seconds": data.readings[-1].t,
         "reference_mass": reference_mass,
         "recommended_reference_mass": data.plan.reference_mass,
@@ -109,11 +133,11 @@ def sweep(
     write_json(json_file, answer)
 
 
-def _dry_link(arm_file: "ArmFile", reference_mass: float) -> "Link":
-    """A link to the simulated arm that the arm file describes, with the mass attached where there is one."""
-    from armlink.link.link import Link
+def _dry_link(arm_file: "ArmFile", reference_mass: float) -> "ArmDriver":
+    """The simulated arm that the arm file describes, in this process, with the mass attached."""
+    from armlink.arm_file import Bus
+    from armlink.loop.open import open_arm
 
-    link = Link.open(arm_file, f"armlink_sim:{arm_file.path}")
-    if reference_mass:
-        link.bus.arm.attach_mass(reference_mass)
-    return link
+    bus = Bus(interface="armlink_sim", channel=str(arm_file.path), options={"load": reference_mass})
+    link = arm_file.require_link().model_copy(update={"bus": bus, "buses": {}})
+    return open_arm(arm_file.model_copy(update={"link": link}))

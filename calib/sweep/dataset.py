@@ -108,7 +108,21 @@ class PlanLine(_Model):
     """Smallest step seen in each joint's position reading [rad]."""
 
 
-_LINE: TypeAdapter[Reading | PlanLine] = TypeAdapter(Annotated[Reading | PlanLine, Field(discriminator="kind")])
+class StallLine(_Model):
+    """The joints had to be stopped, were enabled again, and the interrupted reading was repeated."""
+
+    kind: Literal["stall"] = "stall"
+    t: float
+    """Link time of the last sample before it [s]."""
+    late_ms: float | None
+    """How late the host was [ms]; None if it was not the host."""
+    reading: str
+    """Sweep and number of the reading that was interrupted."""
+    reason: str
+
+
+Line = Reading | PlanLine | StallLine
+_LINE: TypeAdapter[Line] = TypeAdapter(Annotated[Line, Field(discriminator="kind")])
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +138,8 @@ class SweepData:
     """Smallest step seen in each joint's position reading (n,) [rad]; 0 where it is not known."""
     digest: str = field(repr=False)
     """SHA-256 (hex) of the lines read."""
+    stalls: tuple[StallLine, ...] = ()
+    """Interruptions, in their order."""
 
     @property
     def complete(self) -> bool:
@@ -166,14 +182,26 @@ def load_data(path: Path) -> SweepData:
     content = (path / LINES).read_bytes() if (path / LINES).is_file() else b""
     whole = content[: content.rfind(b"\n") + 1]
     readings: list[Reading] = []
+    stalls: list[StallLine] = []
     plan, resolution = None, np.zeros(len(manifest.names))
     for line in _parse(whole.splitlines(), path / LINES):
         if isinstance(line, PlanLine):
             plan, resolution = line.plan, np.array(line.resolution)
+        elif isinstance(line, StallLine):
+            stalls.append(line)
         else:
             _check_width(line, len(manifest.names), path)
             readings.append(line)
-    return SweepData(path, manifest, tuple(readings), plan, resolution, hashlib.sha256(whole).hexdigest())
+    digest = hashlib.sha256(whole).hexdigest()
+    return SweepData(path, manifest, tuple(readings), plan, resolution, digest, tuple(stalls))
+
+
+def require_vacant(path: Path, resume: bool = False) -> None:
+    """Raise BadInput unless a new data set can begin at `path`, or with `resume` one is there to go on with."""
+    if resume:
+        _read_manifest(path)
+    elif path.exists() and (not path.is_dir() or any(each != part_of(path / MANIFEST) for each in path.iterdir())):
+        raise BadInput(f"{path}: not empty: choose another directory, or continue the sweep there with --resume")
 
 
 class DataWriter:
@@ -181,10 +209,9 @@ class DataWriter:
 
     def __init__(self, path: Path, manifest: Manifest, resume: bool = False) -> None:
         """Make the directory, or with `resume` go on with the one there; raises BadInput where that cannot be."""
+        require_vacant(path, resume)
         if resume:
             _require_same(_read_manifest(path), manifest, path)
-        elif path.exists() and any(each != part_of(path / MANIFEST) for each in path.iterdir()):
-            raise BadInput(f"{path}: not empty: choose another directory, or continue the sweep there with --resume")
         else:
             path.mkdir(parents=True, exist_ok=True)
             write_whole(path / MANIFEST, manifest.model_dump_json(by_alias=True, indent=1))
@@ -192,7 +219,7 @@ class DataWriter:
         self._drop_torn_line()
         _keep_names(path)
 
-    def append(self, line: Reading | PlanLine) -> None:
+    def append(self, line: Line) -> None:
         """Write one line and wait until it is on disk; raises BadInput where the disk is full or fails."""
         content = line.model_dump_json().encode() + b"\n"
         try:
@@ -239,7 +266,7 @@ def _read_manifest(path: Path) -> Manifest:
         raise BadInput(f"{file}: not readable as JSON: {error}") from None
 
 
-def _parse(lines: Sequence[bytes], file: Path) -> Iterator[Reading | PlanLine]:
+def _parse(lines: Sequence[bytes], file: Path) -> Iterator[Line]:
     for number, line in enumerate(lines, start=1):
         try:
             yield _LINE.validate_json(line)
