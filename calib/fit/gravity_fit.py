@@ -16,7 +16,7 @@ from calib.sweep.dataset import SweepData
 from gcomp.errors import GcompError
 from gcomp.identify.global_fit import GlobalFit, identify_global
 from gcomp.identify.parameters import Parameters
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 from gcomp.identify.recursive import RecursiveFit, identify_recursive
 
 Array = npt.NDArray[np.float64]
@@ -85,14 +85,14 @@ def identify_gravity(arm: ArmFile, data: Sequence[SweepData], sensors: SensorFit
     )
 
 
-def calibrated(rows: FitRows, calibration: Parameters, which: Flags) -> Readings:
+def calibrated(rows: FitRows, calibration: Parameters, which: Flags) -> StaticReadings:
     """Rows as true angles [rad] and torques [N·m] by the calibration, own sensors of swept joints alone."""
     readings = rows.readings
     own = rows.own
     torque = np.where(own, (readings.torque - calibration.offset) / calibration.gain, np.nan)
     position = readings.position * calibration.position_gain + calibration.position_offset
     sigma = readings.sigma / np.abs(calibration.gain)
-    return Readings(position, torque, sigma, readings.load).rows(which & own.any(axis=1))
+    return StaticReadings(position, torque, sigma, readings.load).rows(which & own.any(axis=1))
 
 
 def _recursion(arm: ArmFile, rows: FitRows, calibration: Parameters) -> RecursiveFit | None:

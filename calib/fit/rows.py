@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from armlink.errors import BadInput
 from calib.sweep.dataset import SweepData
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -24,7 +24,7 @@ FLOOR = 2e-5
 class FitRows:
     """K static readings of n joints, all passes together."""
 
-    readings: Readings
+    readings: StaticReadings
     swept: npt.NDArray[np.int64]
     """Index of the swept joint (K,); -1 where all were held."""
     direction: npt.NDArray[np.int64]
@@ -84,7 +84,7 @@ def fit_rows(data: Sequence[SweepData]) -> FitRows:
     load = np.array([each.manifest.reference_mass for each, _ in rows])
     resolution = np.max([each.resolution for each in data], axis=0)
     return FitRows(
-        Readings.of(position, np.where(counts, raw, np.nan), sigma, load),
+        StaticReadings.of(position, np.where(counts, raw, np.nan), sigma, load),
         swept,
         np.array([reading.direction for _, reading in rows]),
         tuple(f"{each.path.name}/{reading.sweep}" for each, reading in rows),

@@ -10,7 +10,7 @@ from scipy import stats
 from calib.fit.refinement import Extra, Refined
 from calib.fit.rows import FitRows
 from gcomp.arm.arm import Arm
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict, predict_and_jacobian
 
 Array = npt.NDArray[np.float64]
@@ -158,7 +158,9 @@ def lag(arm: Arm, rows: FitRows, refined: Refined, joint: int) -> Array:
     shares = np.linspace(0, 1, PATH + 1)[1:]
     way = position[:-1, None] + shares[:, None] * (position[1:] - position[:-1])[:, None]
     way = np.concatenate([np.repeat(position[:1, None], PATH, axis=1), way])
-    flat = Readings.of(way.reshape(-1, arm.n), np.zeros((len(position) * PATH, arm.n)), 1.0, np.repeat(load, PATH))
+    flat = StaticReadings.of(
+        way.reshape(-1, arm.n), np.zeros((len(position) * PATH, arm.n)), 1.0, np.repeat(load, PATH)
+    )
     torque = predict(arm, refined.fit.complete, flat)[:, joint].reshape(-1, PATH)
     residual = refined.fit.residual[:, joint]
     width = max(float(np.nanmedian(np.abs(residual))) * 1.5, 1e-9)

@@ -17,7 +17,7 @@ from calib.sweep.dataset import SweepData
 from gcomp.errors import GcompError
 from gcomp.identify.global_fit import identify_global
 from gcomp.identify.parameters import Parameters, Prior
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict
 
 LARGEST_OFFSET = 0.5
@@ -194,7 +194,7 @@ def heldout_scores(
                 complete = identify_global(described, kept, unknown=unknown, start=start, priors=priors).complete
         except GcompError:
             continue
-        held: Readings = rows.readings.rows(fold == left_out)
+        held: StaticReadings = rows.readings.rows(fold == left_out)
         score[fold == left_out] = (held.torque - predict(described, complete, held)) / held.sigma
     return score
 

@@ -9,7 +9,7 @@ from calib.plan.rough_gravity import GravityGuess
 from calib.plan.types import Sweep
 from gcomp.identify.global_fit import predict_covariance
 from gcomp.identify.parameters import Parameters, Prior
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 
 Array = npt.NDArray[np.float64]
 SIDE = 0.05
@@ -47,7 +47,7 @@ def predicted_gain_std(
     position, counts = np.concatenate(positions), np.concatenate(counted)
     torque = np.where(counts, 0.0, np.nan)
     rows = len(position)
-    both = Readings.of(
+    both = StaticReadings.of(
         np.concatenate([position, position]),
         np.concatenate([torque, torque]),
         SCATTER * sigma,

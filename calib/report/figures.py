@@ -10,7 +10,7 @@ from plotly.subplots import make_subplots
 from calib.fit.sensor_fit import SensorFit
 from calib.sweep.verify import Verification
 from gcomp.arm.arm import Arm
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict
 
 Array = npt.NDArray[np.float64]
@@ -71,7 +71,7 @@ def curve(arm: Arm, fit: SensorFit, rows: Indices, joint: int) -> tuple[Array, A
     position[:, joint] = np.linspace(
         readings.position[rows[0], joint], readings.position[rows[-1], joint], CURVE_POINTS
     )
-    asked = Readings.of(position, np.zeros_like(position), 1.0, readings.load[rows[0]])
+    asked = StaticReadings.of(position, np.zeros_like(position), 1.0, readings.load[rows[0]])
     return position[:, joint], predict(arm, fit.fit.complete, asked)[:, joint]
 
 

@@ -19,8 +19,8 @@ from gcomp.gravity.torque import gravity_levers
 from gcomp.identify.global_fit import Prediction, predict_covariance
 from gcomp.identify.natural_units import natural_units
 from gcomp.identify.parameters import Parameters, free_mask
-from gcomp.identify.readings import Readings
-from gcomp.identify.sensor_model import predict, predict_and_jacobian
+from gcomp.identify.readings import StaticReadings
+from gcomp.identify.sensor_model import expected_readings, predict_and_jacobian
 
 MINIMUM_LEVER = 0.3
 """Γ/g of the swept joint below which a stop combination is taken only where there is no better one."""
@@ -91,13 +91,13 @@ def well_felt(lever: Array) -> Mask:
     return good if good.any() else lever >= np.median(lever)
 
 
-def readings_of(arm: Arm, sweeps: Sequence[Sweep], sigma: ArrayLike, loads: Sequence[float] = (0.0,)) -> Readings:
+def readings_of(arm: Arm, sweeps: Sequence[Sweep], sigma: ArrayLike, loads: Sequence[float] = (0.0,)) -> StaticReadings:
     """Rows of these sweeps, made once with each load, in which only the swept joint's torque counts (torque 0)."""
     positions = np.concatenate([sweep.positions() for sweep in sweeps])
     torque = np.full(positions.shape, np.nan)
     swept = np.concatenate([np.full(len(sweep.angles), sweep.joint) for sweep in sweeps])
     torque[np.arange(len(torque)), swept] = 0.0
-    return Readings.of(
+    return StaticReadings.of(
         np.tile(positions, (len(loads), 1)),
         np.tile(torque, (len(loads), 1)),
         as_array("sigma", np.broadcast_to(sigma, (arm.n,)), (arm.n,)),
@@ -215,12 +215,6 @@ def _scaled(
         _, jacobian, _ = predict_and_jacobian(arm, guess, rows)
         scaled.append(jacobian[:, free] * unit / rows.sigma[rows.counted][:, None])
     return scaled
-
-
-def expected_readings(arm: Arm, guess: Parameters, design: Readings) -> Readings:
-    """The design's rows with the torques that `guess` makes the sensors read."""
-    torque = np.where(design.counted, predict(arm, guess, design), np.nan)
-    return Readings(design.position, torque, design.sigma, design.load)
 
 
 def _best(total: Array, information: Array, taken: Collection[int], criterion: Criterion) -> int:
