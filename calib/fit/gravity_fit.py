@@ -1,7 +1,7 @@
 """Gravity identification from sweeps: recursive from the tip to the base, then global, in calibrated torque."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -9,8 +9,8 @@ import numpy.typing as npt
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from calib.arm.kinematics import gcomp_arm
-from calib.fit.rows import FitRows, fit_rows
 from calib.fit.sensor_fit import SensorFit
+from calib.fit.sweep_readings import SweepReadings, sweep_readings
 from calib.records.records import CalibrationRecord, GravityRecord, matrix, provenance
 from calib.sweep.dataset import SweepData
 from gcomp.errors import GcompError
@@ -18,6 +18,7 @@ from gcomp.identify.global_fit import GlobalFit, identify_global
 from gcomp.identify.parameters import Parameters
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.recursive import RecursiveFit, identify_recursive
+from gcomp.identify.sensor_model import joint_positions
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -64,7 +65,7 @@ def identify_gravity(arm: ArmFile, data: Sequence[SweepData], sensors: SensorFit
     With a sensor fit the global result is its own: sensors and moments were estimated together. With a record its
     gains hold, and offsets are estimated anew. Raises Refused where no torque scale is known, BadInput on bad data.
     """
-    rows = fit_rows([each.require(arm) for each in data])
+    rows = sweep_readings([each.require(arm) for each in data])
     if isinstance(sensors, SensorFit):
         fit, calibration = sensors.fit, sensors.fit.complete
         _require_scale(sensors.names, np.isnan(sensors.value("gain")))
@@ -85,19 +86,22 @@ def identify_gravity(arm: ArmFile, data: Sequence[SweepData], sensors: SensorFit
     )
 
 
-def calibrated(rows: FitRows, calibration: Parameters, which: Flags) -> StaticReadings:
+def calibrated(rows: SweepReadings, calibration: Parameters, which: Flags) -> StaticReadings:
     """Rows as true angles [rad] and torques [N·m] by the calibration, own sensors of swept joints alone."""
     readings = rows.readings
     own = rows.own
-    torque = np.where(own, (readings.torque - calibration.offset) / calibration.gain, np.nan)
-    position = readings.position * calibration.position_gain + calibration.position_offset
-    sigma = readings.sigma / np.abs(calibration.gain)
-    return StaticReadings(position, torque, sigma, readings.load).rows(which & own.any(axis=1))
+    true = replace(
+        readings,
+        position=joint_positions(calibration, readings),
+        torque=np.where(own, (readings.torque - calibration.offset) / calibration.gain, np.nan),
+        sigma=readings.sigma / np.abs(calibration.gain),
+    )
+    return true.rows(which & own.any(axis=1))
 
 
-def _recursion(arm: ArmFile, rows: FitRows, calibration: Parameters) -> RecursiveFit | None:
+def _recursion(arm: ArmFile, rows: SweepReadings, calibration: Parameters) -> RecursiveFit | None:
     readings = calibrated(rows, calibration, rows.readings.load == 0)
-    if len(readings.load) == 0 or not readings.counted.any(axis=0).all():
+    if len(readings) == 0 or not readings.counted.any(axis=0).all():
         return None
     try:
         return identify_recursive(gcomp_arm(arm), readings)
@@ -105,7 +109,7 @@ def _recursion(arm: ArmFile, rows: FitRows, calibration: Parameters) -> Recursiv
         return None
 
 
-def _global(arm: ArmFile, rows: FitRows, calibration: Parameters) -> GlobalFit:
+def _global(arm: ArmFile, rows: SweepReadings, calibration: Parameters) -> GlobalFit:
     """Mass moments, offsets and, where there is a load, its point, with gains and position sensors known."""
     unknown = {"beta", "offset"} | ({"rho"} if any(rows.masses) else set())
     return identify_global(
