@@ -75,7 +75,7 @@ def _options(planned: PlannedArm, joint: int) -> tuple[Candidates, list[str]]:
 
 
 def _without_collision(candidates: Candidates, geometry: Geometry, name: str) -> Candidates:
-    """The combinations along which nothing touches, at the poses that `check_plan` looks at; raises Collided if none."""
+    """The combinations along which nothing touches, at the poses `check_plan` looks at; raises Collided if none."""
     shares = np.linspace(0, 1, POINTS + 1)[:, None]
     begin, end = candidates.poses[:, :1], candidates.poses[:, -1:]
     flat = (begin + shares * (end - begin)).reshape(-1, candidates.poses.shape[-1])
