@@ -11,12 +11,11 @@ from calib.fit.refinement import Extra, Refined, refine
 from calib.fit.sweep_readings import SweepReadings
 from calib.fit.unmodelled_effects import Effect, size_of, strongest
 from gcomp.arm.arm import Arm
+from gcomp.arrays import Array, Mask
 from gcomp.identify.global_fit import GlobalFit
 from gcomp.identify.parameters import Prior
 from gcomp.identify.sensor_model import predict
 
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 MOST_EFFECTS = 6
 """Effects that are looked for one after the other."""
 OUTLIER = 6.0
@@ -53,7 +52,7 @@ class Goodness:
 
     refined: Refined
     findings: tuple[Finding, ...]
-    outliers: Flags
+    outliers: Mask
     """Readings left out (K, n)."""
     left_out: tuple[LeftOut, ...]
 
@@ -159,7 +158,7 @@ def leave_out(refined: Refined, rows: SweepReadings) -> tuple[LeftOut, ...]:
     return tuple(found)
 
 
-def _outliers(arm: Arm, refined: Refined, rows: SweepReadings, extras: list[Extra]) -> Flags:
+def _outliers(arm: Arm, refined: Refined, rows: SweepReadings, extras: list[Extra]) -> Mask:
     """Readings (K, n) that no noise explains: deleted residuals, in robust standard deviations of their joint.
 
     Those left out before are judged again, for an effect found since may explain them.

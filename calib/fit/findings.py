@@ -4,15 +4,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from calib.fit.refinement import Refined
 from calib.fit.sweep_readings import SweepReadings
 from calib.fit.unmodelled_effects import Effect, size_of
 from calib.motion.encoder_bits import stuck_bits
+from gcomp.arrays import Array, Mask
 
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 Kind = Literal[
     "spring",
     "direction",
@@ -94,7 +92,7 @@ def encoders_said(names: tuple[str, ...], rows: SweepReadings) -> list[Finding]:
     return found
 
 
-def outliers_said(names: tuple[str, ...], rows: SweepReadings, outliers: Flags) -> list[Finding]:
+def outliers_said(names: tuple[str, ...], rows: SweepReadings, outliers: Mask) -> list[Finding]:
     """Outliers by joint and sweep, with what a run of them looks like."""
     found = []
     for joint in np.flatnonzero(outliers.any(axis=0)):

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
@@ -13,15 +12,13 @@ from calib.fit.sensor_fit import SensorFit
 from calib.fit.sweep_readings import SweepReadings, sweep_readings
 from calib.records.records import CalibrationRecord, GravityRecord, matrix, provenance
 from calib.sweep.dataset import SweepData
+from gcomp.arrays import Array, Mask
 from gcomp.errors import GcompError
 from gcomp.identify.global_fit import GlobalFit, identify_global
 from gcomp.identify.parameters import Parameters
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.recursive import RecursiveFit, identify_recursive
 from gcomp.identify.sensor_model import joint_positions
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +30,7 @@ class GravityFit:
     """From the global fit (2n,) [kg·m]; 0 where gravity cannot determine it."""
     covariance: Array
     """(2n, 2n), the sensors' own uncertainty included; 0 where not determined."""
-    identifiable: Flags
+    identifiable: Mask
     """(2n,)"""
     recursive: RecursiveFit | None
     """The recursion from tip to base on the calibrated unloaded sweeps; None where there was no full unloaded pass."""
@@ -86,7 +83,7 @@ def identify_gravity(arm: ArmFile, data: Sequence[SweepData], sensors: SensorFit
     )
 
 
-def calibrated(rows: SweepReadings, calibration: Parameters, which: Flags) -> StaticReadings:
+def calibrated(rows: SweepReadings, calibration: Parameters, which: Mask) -> StaticReadings:
     """Rows as true angles [rad] and torques [N·m] by the calibration, own sensors of swept joints alone."""
     readings = rows.readings
     own = rows.own
@@ -129,7 +126,7 @@ def _parameters(record: CalibrationRecord) -> Parameters:
     )
 
 
-def _require_scale(names: tuple[str, ...], lost: Flags) -> None:
+def _require_scale(names: tuple[str, ...], lost: Mask) -> None:
     """Raise Refused where no joint's gain is known: then mass moments are known up to a factor only."""
     if lost.all():
         raise Refused(

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gcomp.arm.arm import Arm
+from gcomp.arrays import Array
 from gcomp.identify.global_fit import GlobalFit
 from gcomp.identify.identifiability import analyse, describe_null_space
 from gcomp.identify.natural_units import natural_units
@@ -20,7 +21,6 @@ from gcomp.identify.parameters import Parameters, Prior, parameter_names, prior_
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict_and_jacobian
 
-Array = npt.NDArray[np.float64]
 ROUNDS = 4
 """Gauss-Newton steps, with the noise brought up to date after each."""
 NEGLIGIBLE = 0.1

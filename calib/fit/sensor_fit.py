@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy import stats
 
 from armlink.arm_file import ArmFile
@@ -16,11 +15,11 @@ from calib.fit.missing_values import reasons_of
 from calib.fit.sweep_readings import SweepReadings, sweep_readings
 from calib.records.records import PARAMETERS, CalibrationRecord, JointCalibration, Parameter, matrix, provenance
 from calib.sweep.dataset import SweepData
+from gcomp.arrays import Array
 from gcomp.identify.global_fit import GlobalFit, identify_global
 from gcomp.identify.parameters import Prior
 from gcomp.identify.sensor_model import predict
 
-Array = npt.NDArray[np.float64]
 WIDE = 0.005
 """Half width of a gain's 95 % interval, as a share of it, from which the user is told."""
 COMMON = (
@@ -192,8 +191,7 @@ def _fit(arm: ArmFile, rows: SweepReadings, **extra: Prior) -> Goodness:
         if section.known_point is not None:
             priors["rho"] = section.known_point
     fit = identify_global(described, rows.readings, unknown=unknown, priors=priors, position_sigma=rows.position_sigma)
-    rated = np.array([joint.rated_torque for joint in arm.require_link().joints])
-    return examine(described, rows, fit, priors, rated)
+    return examine(described, rows, fit, priors, arm.require_link().rated_torques)
 
 
 def _modelled(arm: ArmFile, fit: GlobalFit, rows: SweepReadings) -> Array:

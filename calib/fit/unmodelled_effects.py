@@ -4,17 +4,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy import stats
 
 from calib.fit.refinement import Extra, Refined
 from calib.fit.sweep_readings import SweepReadings
 from gcomp.arm.arm import Arm
+from gcomp.arrays import Array, Mask
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict, predict_and_jacobian
 
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 CHANCE = 1e-7
 """Probability of an F ratio at which an effect is held for real: some fifty are tried on each fit."""
 MATERIAL = 0.0005
@@ -50,7 +48,7 @@ def size_of(coefficients: Array) -> float:
     return float(np.sqrt(np.mean(coefficients**2)))
 
 
-def strongest(arm: Arm, rows: SweepReadings, kept: Flags, refined: Refined, rated: Array) -> Effect | None:
+def strongest(arm: Arm, rows: SweepReadings, kept: Mask, refined: Refined, rated: Array) -> Effect | None:
     """The effect that explains most beyond chance of what `refined` left over, None where there is no material one.
 
     rated (n,) [N·m]; kept (K, n) are the readings that `refined` was made from, outliers left out.

@@ -3,15 +3,14 @@
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from calib.plan.rough_gravity import GravityGuess
 from calib.plan.types import Sweep
+from gcomp.arrays import Array
 from gcomp.identify.global_fit import predict_covariance
 from gcomp.identify.parameters import Parameters, Prior
 from gcomp.identify.readings import StaticReadings
 
-Array = npt.NDArray[np.float64]
 SIDE = 0.05
 """Lateral place at which the reference mass is assumed to hang [m]."""
 SCATTER = 1.3

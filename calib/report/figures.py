@@ -10,10 +10,10 @@ from plotly.subplots import make_subplots
 from calib.fit.sensor_fit import SensorFit
 from calib.sweep.verify import Verification
 from gcomp.arm.arm import Arm
+from gcomp.arrays import Array
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict
 
-Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
 COLOURS = ("#1f5fa8", "#d9622b", "#3c8d5a", "#8a4fa3", "#b8912b", "#4f7f95", "#a83248", "#5b6b7a")

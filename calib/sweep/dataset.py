@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from armlink.arm_file import ArmFile, describe, load_arm
@@ -20,8 +19,8 @@ from armlink.errors import BadInput, Refused
 from calib.motion.static_reading import StaticReading, stack
 from calib.plan.types import SweepPlan
 from calib.records.atomic_file import part_of, write_whole
+from gcomp.arrays import Array
 
-Array = npt.NDArray[np.float64]
 MANIFEST, LINES = "manifest.json", "readings.jsonl"
 
 
@@ -61,7 +60,7 @@ class Manifest(_Model):
             arm_file=str(arm.path),
             names=arm.joint_names,
             reference_mass=reference_mass,
-            rated_torque=tuple(joint.rated_torque for joint in arm.require_link().joints),
+            rated_torque=tuple(arm.require_link().rated_torques.tolist()),
             installed_gain=tuple(gain for gain, _ in pairs),
             installed_offset=tuple(offset for _, offset in pairs),
             created=datetime.now(UTC).replace(microsecond=0),

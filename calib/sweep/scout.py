@@ -3,7 +3,6 @@
 from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from calib.arm.drive_limits import Limits
@@ -14,7 +13,6 @@ from calib.motion.static_reading import StaticReading, stack
 from calib.plan.rough_gravity import GravityGuess, guess_gravity
 from calib.plan.types import SweepPlan
 
-Array = npt.NDArray[np.float64]
 SCOUT = "scout"
 SCOUT_ACCELERATION = 1.0
 """Nothing is known of the arm's weight yet [rad/s²]."""

@@ -77,7 +77,7 @@ def synthetic_pass(arm: ArmFile, truth: Truth, plan: SweepPlan, mass: float, ran
     if mass:
         simulated.attach_mass(mass)
     n = len(arm.joint_names)
-    noise = 0.002 * np.array([joint.rated_torque for joint in arm.require_link().joints])
+    noise = 0.002 * arm.require_link().rated_torques
     rows: list[tuple[str, int, int | None, int, np.ndarray, tuple[bool, ...]]] = [
         ("scout", index, None, 0, np.array(pose), (True,) * n) for index, pose in enumerate(plan.scout)
     ]

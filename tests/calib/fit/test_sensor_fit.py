@@ -29,7 +29,7 @@ def test_random_arms_are_calibrated_and_identified(seed: int, n: int) -> None:
     fit = fit_sensors(arm, data)
     assert fit.reasons == {}
     assert np.abs(fit.value("gain") / truth.gain - 1).max() < 0.005
-    rated = np.array([joint.rated_torque for joint in arm.require_link().joints])
+    rated = arm.require_link().rated_torques
     assert np.all(np.abs(fit.value("offset") - truth.offset) < 0.003 * rated)
     assert np.abs(fit.value("position_gain") - truth.position_gain).max() < 0.003
     gravity = identify_gravity(arm, data, fit)
