@@ -1,4 +1,4 @@
-"""The simulation model: MJCF, URDF or an arm file, compiled by MuJoCo, its joints matched to a recording's."""
+"""The simulation model (MJCF, URDF or arm file), compiled by MuJoCo, its joints matched to those of a recording."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -8,11 +8,12 @@ import numpy as np
 
 from armlink.errors import BadInput
 from sim_gap.model.rigid_body import RigidArm, rigid_arm
+from sim_gap.model.spec import compiled
 
 
 @dataclass(frozen=True)
 class SimModel:
-    """A compiled MuJoCo model, the joints of it that the recordings hold, and the rigid arm read out of it."""
+    """A compiled MuJoCo model, those of its joints that the recordings have, and its rigid arm."""
 
     mujoco_model: Any
     joints: tuple[int, ...]
@@ -29,8 +30,8 @@ class SimModel:
 def load_model(source: Any, names: tuple[str, ...] = (), count: int | None = None) -> SimModel:
     """Compile a model from a path (.xml, .urdf, .yaml arm file), or take a compiled `mujoco.MjModel`.
 
-    `names` are the recording's joint names where it has any; `count` its number of joints. Joints are taken by name if
-    the model has them all, else in order. Raises BadInput where the model cannot be read or does not fit.
+    `names` are the recording's joint names if it has any; `count` is its number of joints. Joints are matched by name
+    if the model has all of them, else in order. Raises BadInput if the model cannot be read or does not fit.
     """
     import mujoco
 
@@ -45,51 +46,20 @@ def load_model(source: Any, names: tuple[str, ...] = (), count: int | None = Non
         if count is not None and count != len(hinges):
             raise BadInput(
                 f"{label}: has {len(hinges)} hinge joints ({', '.join(map(str, known))}), the recording {count}: "
-                "give the model of the recorded arm, or a recording whose joints bear the model's names"
+                "give the model of the recorded arm, or a recording with the model's joint names"
             )
         joints = hinges
     if not joints:
         raise BadInput(f"{label}: no hinge joint in the model: expected the arm as a chain of hinges")
     arm = rigid_arm(model, joints)
     if any(up >= j for j, up in enumerate(arm.parent)):
-        raise BadInput(f"{label}: joints {', '.join(arm.names)} do not run from base to tip: order them so")
+        raise BadInput(f"{label}: joints {', '.join(arm.names)} do not run from base to tip: reorder them")
     _check(model, joints, arm, label)
     return SimModel(model, tuple(joints), arm, path)
 
 
-def compiled(path: Path) -> Any:
-    """Compile an MJCF, URDF or arm file (by path or bundled name) to a `mujoco.MjModel`. Raises BadInput."""
-    try:
-        return read_spec(path).compile()
-    except ValueError as error:
-        raise BadInput(f"{path}: MuJoCo cannot compile it: {_line(error)}") from None
-
-
-def read_spec(path: Path) -> Any:
-    """Read an MJCF, URDF or arm file (by path or bundled name) as a `mujoco.MjSpec`. Raises BadInput."""
-    import mujoco
-
-    from armlink.arm_file import bundled_arms
-
-    if path.suffix in (".yaml", ".yml") or str(path) in bundled_arms():
-        from sim_gap.model.from_arm import nominal_spec
-
-        return nominal_spec(path)
-    if not path.is_file():
-        raise BadInput(f"no model file {path}: give an MJCF, URDF or arm file")
-    try:
-        return mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
-        raise BadInput(f"{path}: MuJoCo cannot read it: {_line(error)}") from None
-
-
-def _line(error: ValueError) -> str:
-    """MuJoCo's message, which runs over several lines, in one."""
-    return " ".join(str(error).split())
-
-
 def _check(model: Any, joints: list[int], arm: RigidArm, label: str) -> None:
-    """Compare with mj_inverse at random states: a model with parts that the chain leaves out is refused."""
+    """Compare with mj_inverse at random states. Raises BadInput for a model with parts that the chain leaves out."""
     import mujoco
 
     data, random = mujoco.MjData(model), np.random.default_rng(0)

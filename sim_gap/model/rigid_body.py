@@ -1,7 +1,7 @@
 """Rigid-body torque of an open chain of hinges, and its exact regressor in every link's ten inertial parameters.
 
-Links, joint axes and inertials come from a compiled MuJoCo model; the arithmetic is the Newton-Euler recursion over
-whole recordings at once, so that 10⁵ rows cost less than a second. Checked against `mj_inverse` when a model is loaded.
+Links, joint axes and inertials come from a compiled MuJoCo model. The Newton-Euler recursion runs over whole recordings
+at once, so that 10⁵ rows take less than a second. It is checked against `mj_inverse` when a model is loaded.
 """
 
 from collections.abc import Sequence
@@ -16,13 +16,13 @@ from sim_gap.model.tendons import Tendons, tendons_of
 
 Array = NDArray[np.float64]
 CREEP = 0.01
-"""Speed [rad/s] below which the sign of a velocity means nothing and friction may take any value."""
+"""Speed [rad/s] below which the sign of a velocity is not defined and friction may take any value."""
 INERTIAL = ("mass", "mx", "my", "mz", "ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 @dataclass(frozen=True)
 class RigidArm:
-    """An arm of n hinges: geometry, nominal inertial parameters, and what the model's joints carry besides."""
+    """An arm of n hinges: geometry, nominal inertial parameters, and the model's own joint terms."""
 
     names: tuple[str, ...]
     parent: tuple[int, ...]
@@ -34,7 +34,7 @@ class RigidArm:
     axis: Array
     """Joint axis in the link frame, (n, 3)."""
     zero: Array
-    """Joint position at which the angle is zero (MuJoCo's qpos0) [rad], (n,)."""
+    """Joint position at angle zero (MuJoCo's qpos0) [rad], (n,)."""
     inertial: Array
     """Mass [kg], first moment [kg·m], inertia about the origin [kg·m²] in the link frame, (n, 10) as in INERTIAL."""
     gravity: Array
@@ -44,9 +44,9 @@ class RigidArm:
     frictionloss: Array
     stiffness: Array
     rest: Array
-    """The nominal joints' own motor-side terms, (n,) each: kg·m², N·m·s/rad, N·m, N·m/rad, rad."""
+    """Motor-side terms of the nominal joints, (n,) each: kg·m², N·m·s/rad, N·m, N·m/rad, rad."""
     tendons: Tendons
-    """Motors that turn with several joints."""
+    """Motors coupled to several joints."""
 
     @property
     def n(self) -> int:
@@ -63,7 +63,7 @@ class RigidArm:
         return carries
 
     def with_inertial(self, inertial: Array) -> "RigidArm":
-        """The same arm with other inertial parameters (n, 10)."""
+        """The arm with other inertial parameters (n, 10)."""
         return replace(self, inertial=inertial)
 
     def torque(self, q: Array, v: Array, a: Array, gravity: Array | None = None) -> Array:
@@ -105,8 +105,8 @@ class RigidArm:
     def _forward(
         self, q: Array, v: Array, a: Array, gravity: Array | None
     ) -> tuple[list[Array], list[tuple[Array, Array, Array]]]:
-        """Each link's rotation to its parent (3, 3, K); its angular velocity and acceleration and the acceleration of
-        its origin less gravity, in its own frame, (3, K) each."""
+        """Each link's rotation to its parent (3, 3, K); its angular velocity, angular acceleration and the acceleration
+        of its origin less gravity, in its own frame, (3, K) each."""
         field = self.gravity if gravity is None else gravity
         still = np.zeros((3, len(q)))
         base = still, still, still - np.asarray(field, float)[:, None]
@@ -126,9 +126,9 @@ class RigidArm:
         return turns, moves
 
     def nominal_joint_torque(self, q: Array, v: Array, a: Array, direction: Array) -> Array:
-        """What the nominal joints add on the motor side: armature, damping, friction loss, spring, tendons (K, n).
+        """Torque of the nominal joints on the motor side: armature, damping, friction loss, spring, tendons (K, n).
 
-        `direction` is the sign of the velocity, however it is smoothed around rest.
+        `direction` is the sign of the velocity, smoothed around rest by the caller.
         """
         spring = self.stiffness * (q - self.rest)
         own = self.armature * a + self.damping * v + self.frictionloss * direction + spring
@@ -153,12 +153,12 @@ def _cross(x: Array, y: Array) -> Array:
 
 
 def _in(turn: Array, vector: Array) -> Array:
-    """Into the turned frame: Rᵀ x for rotations (3, 3, K) and vectors (3, K)."""
+    """Into the rotated frame: Rᵀ x for rotations (3, 3, K) and vectors (3, K)."""
     return np.stack([turn[0, i] * vector[0] + turn[1, i] * vector[1] + turn[2, i] * vector[2] for i in range(3)])
 
 
 def _out(turn: Array, vector: Array) -> Array:
-    """Out of the turned frame: R x."""
+    """Out of the rotated frame: R x."""
     return np.stack([turn[i, 0] * vector[0] + turn[i, 1] * vector[1] + turn[i, 2] * vector[2] for i in range(3)])
 
 
@@ -177,9 +177,9 @@ def _symmetric(six: Array) -> Array:
 
 
 def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:
-    """Read the chain of the MuJoCo joints `joints` (hinges, base to tip) out of a compiled model.
+    """The chain of the MuJoCo joints `joints` (hinges, base to tip) of a compiled model.
 
-    Other joints of the model stay locked at qpos0; bodies on them count to the link that carries them.
+    Other joints of the model are locked at qpos0; bodies on them belong to the link that carries them.
     """
     import mujoco
 

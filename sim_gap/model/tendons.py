@@ -1,4 +1,4 @@
-"""Motors that turn with two joints, as MuJoCo has them: fixed tendons with inertia, damping and friction loss."""
+"""Motors coupled to two joints, in MuJoCo fixed tendons with inertia, damping and friction loss."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class SharedMotor:
-    """A motor that turns with q_joint + lever·q_other, and so loads both joints."""
+class CoupledMotor:
+    """A motor that turns by q_joint + lever·q_other and so loads both joints."""
 
     joint: str
     other: str
@@ -27,24 +27,24 @@ class SharedMotor:
 
 @dataclass(frozen=True)
 class Tendons:
-    """The fixed tendons of a model, as far as joints of an arm of n hinges go, (m, …)."""
+    """The m fixed tendons of a model, restricted to the n joints of an arm."""
 
     turns: Array
-    """Turn of each per turn of each joint, (m, n)."""
+    """Turn of each tendon per turn of each joint, (m, n)."""
     armature: Array
     damping: Array
     frictionloss: Array
     """(m,) each: kg·m², N·m·s/rad, N·m."""
 
     def torque(self, v: Array, a: Array, creep: float) -> Array:
-        """What they take of the motors' torque [N·m], (…, n); friction's sign passes through zero within `creep`."""
+        """Motor torque that they take [N·m], (…, n); the sign of friction is linear within `creep` [rad/s]."""
         speed, push = v @ self.turns.T, a @ self.turns.T
         along = np.clip(speed / creep, -1.0, 1.0)
         return np.asarray((self.armature * push + self.damping * speed + self.frictionloss * along) @ self.turns)
 
 
-def add_to(spec: Any, motors: Sequence[SharedMotor]) -> None:
-    """Put the motors into a `mujoco.MjSpec`."""
+def add_to(spec: Any, motors: Sequence[CoupledMotor]) -> None:
+    """Add the motors to a `mujoco.MjSpec`."""
     for number, motor in enumerate(motors, start=1):
         tendon = spec.add_tendon(name=f"motor_{number}_of_{motor.joint}_and_{motor.other}")
         tendon.wrap_joint(motor.joint, 1.0)
@@ -54,7 +54,7 @@ def add_to(spec: Any, motors: Sequence[SharedMotor]) -> None:
 
 
 def tendons_of(model: Any, joints: Sequence[int]) -> Tendons:
-    """Read the fixed tendons of a compiled model, seen by its joints `joints`; those with springs are not this."""
+    """The fixed tendons of a compiled model over its joints `joints`; spatial tendons are left out."""
     import mujoco
 
     rows, which = [], []
