@@ -1,4 +1,4 @@
-"""Test of causes against general laws (effects/laws.py), which stand for effects that the library lacks."""
+"""Test of causes against general laws (effects/laws.py), which represent effects that the library lacks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sim_gap.effects.effect import Beneath, Effect, Plausibility, Shape, at_motor, between, motor_channel, not_negative
+from sim_gap.effects.effect import Beneath, Effect, Plausibility, Shape, Signature, between, not_negative
 from sim_gap.model.rigid_body import Array
 
 
@@ -14,7 +14,7 @@ def _gain(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:
 EFFECTS = (
     Effect(  # the whole nominal motor torque: known rotor inertia and friction are scaled too
         "actuator.gain",
-        at_motor(lambda s, j, _: s.motor_model[:, j], motor_channel),
+        Signature.at_motor(lambda s, j, _: s.motor_model[:, j], "motor"),
         Plausibility(
             background_std=0.002, prior_std=lambda _signals, _place: np.full(1, 0.5), allows=between(-0.5, 1.0)
         ),
@@ -22,7 +22,7 @@ EFFECTS = (
     ),
     Effect(
         "actuator.rotor_inertia",
-        at_motor(lambda s, j, _: s.a[:, j], motor_channel),
+        Signature.at_motor(lambda s, j, _: s.a[:, j], "motor"),
         Plausibility(prior_penalty=0, allows=not_negative),
     ),
 )

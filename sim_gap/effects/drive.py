@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.signal import lfilter
 
-from sim_gap.effects.effect import Effect, Plausibility, SearchHints, Shape, Signature, as_shape, at_command, between
+from sim_gap.effects.effect import Effect, Plausibility, SearchHints, Shape, Signature, as_shape, between
 from sim_gap.effects.timing import late
 from sim_gap.model.rigid_body import Array
 from sim_gap.residuals.preprocess import Signals
@@ -22,7 +22,7 @@ NEAR_ONE = between(0.6, 1.6)
 
 def _missing(lost: Callable[[Array, float, float], Array]) -> Signature:
     """Command less motor torque, `lost(command (K,), shape, rate)`."""
-    return at_command(lambda s, joint, shape: lost(s.reading["tau_cmd"][:, joint], shape[0], s.rate))
+    return Signature.at_command(lambda s, joint, shape: lost(s.reading["tau_cmd"][:, joint], shape[0], s.rate))
 
 
 def _lag(command: Array, time: float, rate: float) -> Array:
@@ -56,7 +56,7 @@ EFFECTS = (
         "actuator.saturation",
         _missing(_clipped),
         Plausibility(prior_mean=1.0, prior_std=lambda _signals, _place: np.full(1, CLIPPED), allows=NEAR_ONE),
-        SearchHints(grid=_levels),
+        SearchHints(shapes_for=_levels),
         parameters_of=as_shape,
     ),
 )

@@ -6,7 +6,8 @@ effects compete.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -25,23 +26,8 @@ Beneath = Mapping[str, Array]
 """Coefficients of the effects that one needs, by id; `nominal` holds the model's own friction loss."""
 
 
-Channel = Callable[[Layout], str | None]
-"""The channel without which an effect cannot show; None if the data set does not have it."""
-
-
-def any_channel(layout: Layout) -> str | None:
-    """Every data set has a channel that shows the effect."""
-    return layout.motor_side
-
-
-def sensor_channel(layout: Layout) -> str | None:
-    """The torque sensor's channel."""
-    return layout.sensor
-
-
-def motor_channel(layout: Layout) -> str | None:
-    """The motor's channel, for effects that look like the link's without it."""
-    return layout.motor
+Channel = Literal["any", "sensor", "motor", "command"]
+"""The channel without which an effect cannot show."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +36,7 @@ class Signature:
 
     columns: Callable[[Signals, Layout, int, Shape], Columns]
     """Columns at the work rate, by row."""
-    channel: Channel = any_channel
+    channel: Channel = "any"
     whole_arm: bool = False
     """Whether it belongs to the arm as a whole instead of to one joint or link."""
     recording: Callable[[Shape], int] = lambda _shape: 0
@@ -58,38 +44,34 @@ class Signature:
 
     def places(self, layout: Layout) -> range:
         """Joints or links at which it may be; empty if these channels cannot show it."""
-        if self.whole_arm:
-            return range(1)
-        return range(layout.n if self.channel(layout) else 0)
+        channels = {"sensor": layout.sensor, "motor": layout.motor, "command": layout.commanded}
+        if self.channel != "any" and channels[self.channel] is None:
+            return range(0)
+        return range(1 if self.whole_arm else layout.n)
+
+    @classmethod
+    def at_motor(cls, column: Column, channel: Channel = "any") -> "Signature":
+        """An effect between motor and torque sensor, of one joint."""
+        return cls(lambda s, layout, j, shape: {(layout.motor_side, j): _2d(column(s, j, shape))}, channel)
+
+    @classmethod
+    def at_sensor(cls, column: Column, channel: Channel = "sensor") -> "Signature":
+        """An effect on the torque sensor's reading, of one joint."""
+        return cls(lambda s, layout, j, shape: layout.sensor_columns(j, _2d(column(s, j, shape))), channel)
+
+    @classmethod
+    def at_link(cls, column: Column) -> "Signature":
+        """An effect on the link side, of one joint: it shows against the model."""
+        return cls(lambda s, layout, j, shape: {(layout.against_model, j): _2d(column(s, j, shape))})
+
+    @classmethod
+    def at_command(cls, column: Column) -> "Signature":
+        """An effect between command and motor torque, of one joint."""
+        return cls(lambda s, layout, j, shape: {(str(layout.commanded), j): _2d(column(s, j, shape))}, "command")
 
 
-def _vertical(columns: Array) -> Array:
+def _2d(columns: Array) -> Array:
     return columns[:, None] if columns.ndim == 1 else columns
-
-
-def at_motor(column: Column, channel: Channel = any_channel) -> Signature:
-    """An effect between motor and torque sensor, of one joint."""
-    return Signature(lambda s, layout, j, shape: {(layout.motor_side, j): _vertical(column(s, j, shape))}, channel)
-
-
-def at_sensor(column: Column, channel: Channel = sensor_channel) -> Signature:
-    """An effect on the torque sensor's reading, of one joint."""
-    return Signature(lambda s, layout, j, shape: layout.sensor_columns(j, _vertical(column(s, j, shape))), channel)
-
-
-def at_link(column: Column) -> Signature:
-    """An effect on the link side, of one joint: it shows against the model."""
-    return Signature(lambda s, layout, j, shape: {(layout.against_model, j): _vertical(column(s, j, shape))})
-
-
-def at_command(column: Column) -> Signature:
-    """An effect between command and motor torque, of one joint."""
-
-    def columns(s: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
-        assert layout.commanded is not None
-        return {(layout.commanded, place): _vertical(column(s, place, shape))}
-
-    return Signature(columns, lambda layout: layout.commanded)
 
 
 def always(_coefficients: Array, _shape: Shape, _beneath: Beneath) -> bool:
@@ -132,8 +114,10 @@ class Plausibility:
 class SearchHints:
     """Where the search starts, what it refines, and which simpler effects compete."""
 
-    grid: Callable[[Sequence[Signals], int], tuple[Shape, ...]] = lambda _signals, _place: ((),)
+    shapes: tuple[Shape, ...] = ((),)
     """Shapes to start with; the best one is then refined between its neighbours."""
+    shapes_for: Callable[[Sequence[Signals], int], tuple[Shape, ...]] | None = None
+    """The same for given recordings and place."""
     discrete: frozenset[int] = frozenset()
     """Entries of the shape that are the number of something (a joint, a recording): they are not refined."""
     linearised_at: int | None = None
@@ -147,11 +131,9 @@ class SearchHints:
     canonical: Callable[[int, Shape], tuple[int, Shape]] = lambda place, shape: (place, shape)
     """Place and shape under which it is reported, if two of them show alike."""
 
-
-def at_shapes(*values: float) -> Callable[[Sequence[Signals], int], tuple[Shape, ...]]:
-    """A starting grid of one nonlinear parameter."""
-    grid = tuple((value,) for value in values)
-    return lambda _signals, _place: grid
+    def grid(self, signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
+        """Shapes to start with on these recordings."""
+        return self.shapes if self.shapes_for is None else self.shapes_for(signals, place)
 
 
 def as_fitted(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:
@@ -169,6 +151,11 @@ def as_shape(_coefficients: Array, shape: Shape, _beneath: Beneath) -> Array:
     return np.array([shape[0]])
 
 
+def as_fitted_and_shape(coefficients: Array, shape: Shape, _beneath: Beneath) -> Array:
+    """The coefficient and the shape are the reported parameters."""
+    return np.array([coefficients[0], shape[0]])
+
+
 def as_share_of_shape(coefficients: Array, shape: Shape, _beneath: Beneath) -> Array:
     """The coefficient is a factor on the shape."""
     return coefficients * shape[0]
@@ -180,8 +167,8 @@ class Effect:
 
     id: str
     signature: Signature
-    plausibility: Plausibility = field(default_factory=Plausibility)
-    hints: SearchHints = field(default_factory=SearchHints)
+    plausibility: Plausibility = Plausibility()
+    hints: SearchHints = SearchHints()
     needs: tuple[str, ...] = ()
     """Effects at the same place that it builds on: the simpler model."""
     parameters_of: Callable[[Array, Shape, Beneath], Array] = as_fitted

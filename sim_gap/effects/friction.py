@@ -7,7 +7,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sim_gap.effects.effect import Beneath, Effect, Key, Plausibility, SearchHints, Shape, at_motor, not_negative
+from sim_gap.effects.effect import (
+    Beneath,
+    Effect,
+    Key,
+    Plausibility,
+    SearchHints,
+    Shape,
+    Signature,
+    as_fitted_and_shape,
+    not_negative,
+)
 from sim_gap.model.rigid_body import Array
 from sim_gap.residuals.layout import Layout
 from sim_gap.residuals.preprocess import Signals
@@ -55,10 +65,6 @@ def _viscous_or_load(_layout: Layout, place: int, _shape: Shape) -> tuple[Key, .
     return ("friction.viscous", place), ("friction.load", place)
 
 
-def _breakaway_and_velocity(coefficients: Array, shape: Shape, _beneath: Beneath) -> Array:
-    return np.array([coefficients[0], shape[0]])
-
-
 def _ratio(coefficients: Array, _shape: Shape, beneath: Beneath) -> Array:
     """Friction is (1 + ratio) times as large in one direction and (1 − ratio) in the other; of its Coulomb part."""
     return coefficients / max(abs(dry(beneath)), 1e-9)
@@ -67,32 +73,32 @@ def _ratio(coefficients: Array, _shape: Shape, beneath: Beneath) -> Array:
 EFFECTS = (
     Effect(
         "friction.coulomb",
-        at_motor(lambda s, joint, _: s.direction[:, joint]),
+        Signature.at_motor(lambda s, joint, _: s.direction[:, joint]),
         Plausibility(prior_penalty=0, background_std=0.03, allows=_above_minus_nominal),
     ),
     Effect(
         "friction.viscous",
-        at_motor(lambda s, joint, _: s.v[:, joint]),
+        Signature.at_motor(lambda s, joint, _: s.v[:, joint]),
         Plausibility(prior_penalty=0, background_std=0.02, allows=not_negative),
     ),
     Effect(
         "friction.stribeck",
-        at_motor(_stribeck),
+        Signature.at_motor(_stribeck),
         Plausibility(allows=_above_minus_dry),
-        SearchHints(grid=_velocities, alternatives=_viscous_or_load),
+        SearchHints(shapes_for=_velocities, alternatives=_viscous_or_load),
         needs=COULOMB,
-        parameters_of=_breakaway_and_velocity,
+        parameters_of=as_fitted_and_shape,
     ),
     Effect(
         "friction.asymmetric",
-        at_motor(lambda s, joint, _: np.abs(s.direction[:, joint])),
+        Signature.at_motor(lambda s, joint, _: np.abs(s.direction[:, joint])),
         Plausibility(allows=_below_dry),
         needs=COULOMB,
         parameters_of=_ratio,
     ),
     Effect(
         "friction.load",
-        at_motor(lambda s, joint, _: s.direction[:, joint] * np.abs(s.model[:, joint])),
+        Signature.at_motor(lambda s, joint, _: s.direction[:, joint] * np.abs(s.model[:, joint])),
         Plausibility(allows=not_negative),
     ),
 )

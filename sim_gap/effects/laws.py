@@ -9,18 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim_gap.effects.effect import (
-    Effect,
-    Plausibility,
-    Shape,
-    Signature,
-    any_channel,
-    at_command,
-    at_link,
-    at_motor,
-    at_sensor,
-    motor_channel,
-)
+from sim_gap.effects.effect import Effect, Plausibility, Shape, Signature
 from sim_gap.model.rigid_body import Array
 from sim_gap.residuals.layout import Columns, Layout
 from sim_gap.residuals.preprocess import Signals
@@ -76,55 +65,55 @@ _LAWS = (
         "law.position",
         "transmission",
         "any torque on the link that is a smooth function of the joint's position",
-        at_link(_smooth_in_position),
+        Signature.at_link(_smooth_in_position),
     ),
     Law(
         "law.motor_position",
         "transmission",
         "any loss in the drive train that is a smooth function of the joint's position",
-        at_motor(_smooth_in_position, motor_channel),
+        Signature.at_motor(_smooth_in_position, "motor"),
     ),
     Law(
         "law.load",
         "torque",
         "any sensor error that is constant or proportional to the torque",
-        at_sensor(lambda s, joint, _: _linear(s.model[:, joint]), any_channel),
+        Signature.at_sensor(lambda s, joint, _: _linear(s.model[:, joint]), "any"),
     ),
     Law(
         "law.motor_load",
         "actuator",
         "any drive error that is constant or proportional to the torque",
-        at_motor(lambda s, joint, _: _linear(s.motor_model[:, joint]), motor_channel),
+        Signature.at_motor(lambda s, joint, _: _linear(s.motor_model[:, joint]), "motor"),
     ),
     Law(
         "law.motor_velocity",
         "friction",
         "any loss in the drive train that is a smooth function of the joint's velocity",
-        at_motor(_smooth_in_velocity),
+        Signature.at_motor(_smooth_in_velocity),
     ),
     Law(
         "law.motor_acceleration",
         "actuator",
         "any torque in the drive train that is proportional to the joint's acceleration",
-        at_motor(lambda s, joint, _: s.a[:, joint], motor_channel),
+        Signature.at_motor(lambda s, joint, _: s.a[:, joint], "motor"),
     ),
     Law(
         "law.time",
         "torque",
         "any sensor error that drifts with time",
-        at_sensor(lambda s, _joint, _shape: _linear(s.t), any_channel),
+        Signature.at_sensor(lambda s, _joint, _shape: _linear(s.t), "any"),
     ),
     Law(
         "law.late_reading",
         "timing",
         "any delay or lag of the sensor's reading",
-        at_sensor(lambda s, joint, _: _derivatives(s.smooth_model[:, joint], s.rate), any_channel),
+        Signature.at_sensor(lambda s, joint, _: _derivatives(s.smooth_model[:, joint], s.rate), "any"),
     ),
     Law(
         "law.late_drive",
         "actuator",
         "any delay or lag of the drive",
-        at_command(lambda s, joint, _: _derivatives(s.reading["tau_cmd"][:, joint], s.rate)),
+        Signature.at_command(lambda s, joint, _: _derivatives(s.reading["tau_cmd"][:, joint], s.rate)),
     ),
     Law("law.body", "link", "any rigid body fixed to a link", Signature(_body)),
     Law("law.gravity", "base", "gravity of another direction or size", Signature(_gravity, whole_arm=True)),

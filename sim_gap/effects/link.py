@@ -111,7 +111,9 @@ EFFECTS = (
         Plausibility(
             prior_penalty=0, prior_std=lambda _signals, _place: np.array([20.0, 4.0, 4.0, 4.0]), allows=_near_the_tip
         ),
-        SearchHints(grid=_recordings, discrete=frozenset({0}), covers=_tip_mass_moment, alternatives=_all_mass_moments),
+        SearchHints(
+            shapes_for=_recordings, discrete=frozenset({0}), covers=_tip_mass_moment, alternatives=_all_mass_moments
+        ),
         parameters_of=_mass_and_centre,
     ),
 )

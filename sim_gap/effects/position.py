@@ -8,26 +8,14 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from sim_gap.effects.effect import (
-    Beneath,
-    Effect,
-    Plausibility,
-    SearchHints,
-    Shape,
-    Signature,
-    always,
-    as_fitted,
-    as_gain,
-    at_shapes,
-    between,
-)
+from sim_gap.effects.effect import Beneath, Effect, Plausibility, SearchHints, Shape, Signature, as_gain, between
 from sim_gap.model.rigid_body import Array
 from sim_gap.residuals.layout import Columns, Layout
 from sim_gap.residuals.preprocess import Signals
 
 EPSILON = 1e-4
 PART_OF_TURN = 2.0
-"""Range [rad] from which an error with a period of one turn can be told from a gain."""
+"""Range [rad] from which an error with a period of one turn can be separated from a gain."""
 WORST_GAIN = 0.15
 """Largest scale error of a position sensor."""
 
@@ -68,30 +56,35 @@ def _amplitude_and_phase(coefficients: Array, _shape: Shape, _beneath: Beneath) 
     return np.array([np.hypot(*coefficients), np.arctan2(coefficients[1], coefficients[0])])
 
 
-def _linearised(
-    effect_id: str,
-    error: Error,
-    allows: Callable[[Array, Shape, Beneath], bool],
-    parameters_of: Callable[[Array, Shape, Beneath], Array],
-) -> Effect:
+def _secant(error: Error) -> Signature:
     """An error of one parameter; the shape is the size over which its secant is taken."""
-    return Effect(
-        effect_id,
-        Signature(lambda s, layout, place, shape: _response(s, layout, place, error, shape[0])),
-        Plausibility(prior_std=lambda _signals, _place: np.full(1, 0.2), allows=allows),
-        SearchHints(grid=at_shapes(0.0), linearised_at=0),
-        parameters_of=parameters_of,
-    )
+    return Signature(lambda s, layout, place, shape: _response(s, layout, place, error, shape[0]))
 
 
+def _small(_signals: Signals, _place: int) -> Array:
+    return np.full(1, 0.2)
+
+
+FROM_ZERO = SearchHints(shapes=((0.0,),), linearised_at=0)
 EFFECTS = (
-    _linearised("position.offset", lambda q: (np.ones_like(q), 0 * q, 0 * q), always, as_fitted),
-    _linearised("position.gain", lambda q: (q, np.ones_like(q), 0 * q), between(-WORST_GAIN, WORST_GAIN), as_gain),
+    Effect(
+        "position.offset",
+        _secant(lambda q: (np.ones_like(q), 0 * q, 0 * q)),
+        Plausibility(prior_std=_small),
+        FROM_ZERO,
+    ),
+    Effect(
+        "position.gain",
+        _secant(lambda q: (q, np.ones_like(q), 0 * q)),
+        Plausibility(prior_std=_small, allows=between(-WORST_GAIN, WORST_GAIN)),
+        FROM_ZERO,
+        parameters_of=as_gain,
+    ),
     Effect(
         "position.eccentricity",
         Signature(_eccentricity),
         Plausibility(prior_std=lambda _signals, _place: np.full(2, 0.1)),
-        SearchHints(grid=_far_enough),
+        SearchHints(shapes_for=_far_enough),
         parameters_of=_amplitude_and_phase,
     ),
 )

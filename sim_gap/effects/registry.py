@@ -32,7 +32,7 @@ FAMILIES = (
     drive,
 )
 """Modules with an `EFFECTS`; effects are searched in this order."""
-NOT_DIAGNOSED = {"torque.nonlinearity": "`law.load` stands for it: a smooth error in the load is not attributed"}
+NOT_DIAGNOSED = {"torque.nonlinearity": "noted as the general law `law.load`, which is not attributed"}
 """Catalogue ids without an inverse form, and why."""
 _LIBRARY: dict[str, Effect] = {each.id: each for family in FAMILIES for each in family.EFFECTS}
 _EFFECTS = _LIBRARY | {law.id: law.effect for law in LAWS.values()}

@@ -6,15 +6,14 @@ import numpy as np
 
 from sim_gap.effects.drive import CLIPPED, NEAR_ONE
 from sim_gap.effects.effect import (
-    Beneath,
     Effect,
     Plausibility,
     SearchHints,
     Shape,
     Signature,
+    as_fitted_and_shape,
     as_shape,
     as_share_of_shape,
-    at_sensor,
     between,
 )
 from sim_gap.model.rigid_body import Array
@@ -33,13 +32,9 @@ def _other_joints(signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
     return tuple((float(source + 1),) for source in range(signals[0].n) if source != place)
 
 
-def _coefficient_and_source(coefficients: Array, shape: Shape, _beneath: Beneath) -> Array:
-    return np.array([coefficients[0], shape[0]])
-
-
 def _distorted(distort: Callable[[Array, float, float], Array]) -> Signature:
     """Reading less true torque, `distort(torque (K,), level, rate)`."""
-    return at_sensor(lambda s, joint, shape: distort(s.smooth_model[:, joint], shape[0], s.rate))
+    return Signature.at_sensor(lambda s, joint, shape: distort(s.smooth_model[:, joint], shape[0], s.rate))
 
 
 def _shares(*shares: float) -> Callable[[Sequence[Signals], int], tuple[Shape, ...]]:
@@ -67,30 +62,30 @@ def play(x: Array, half: float, rate: float) -> Array:
 EFFECTS = (
     Effect(
         "torque.crosstalk",
-        at_sensor(lambda s, _joint, shape: s.model[:, int(shape[0]) - 1]),
+        Signature.at_sensor(lambda s, _joint, shape: s.model[:, int(shape[0]) - 1]),
         Plausibility(allows=between(-0.5, 0.5)),
-        SearchHints(grid=_other_joints, discrete=frozenset({0})),
-        parameters_of=_coefficient_and_source,
+        SearchHints(shapes_for=_other_joints, discrete=frozenset({0})),
+        parameters_of=as_fitted_and_shape,
     ),
     Effect(  # the width is the deviation after a long way: real hysteresis sets in less abruptly than a play
         "torque.hysteresis",
         _distorted(lambda torque, half, rate: play(torque, half, rate) - torque),
         Plausibility(allows=NEAR_ONE),
-        SearchHints(grid=_shares(0.01, 0.03, 0.06, 0.12, 0.25)),
+        SearchHints(shapes_for=_shares(0.01, 0.03, 0.06, 0.12, 0.25)),
         parameters_of=as_share_of_shape,
     ),
     Effect(
         "torque.deadband",
         _distorted(lambda torque, half, _rate: -np.clip(torque, -half, half)),
         Plausibility(allows=NEAR_ONE),
-        SearchHints(grid=_shares(0.02, 0.05, 0.1, 0.2, 0.4)),
+        SearchHints(shapes_for=_shares(0.02, 0.05, 0.1, 0.2, 0.4)),
         parameters_of=as_shape,
     ),
     Effect(
         "torque.saturation",
         _distorted(lambda torque, limit, _rate: np.clip(torque, -limit, limit) - torque),
         Plausibility(prior_mean=1.0, prior_std=lambda _signals, _place: np.full(1, CLIPPED), allows=NEAR_ONE),
-        SearchHints(grid=_exceeded),
+        SearchHints(shapes_for=_exceeded),
         parameters_of=as_shape,
     ),
 )

@@ -2,18 +2,7 @@
 
 import numpy as np
 
-from sim_gap.effects.effect import (
-    Beneath,
-    Effect,
-    Plausibility,
-    SearchHints,
-    Shape,
-    Signature,
-    any_channel,
-    as_share_of_shape,
-    at_sensor,
-    at_shapes,
-)
+from sim_gap.effects.effect import Beneath, Effect, Plausibility, SearchHints, Shape, Signature, as_share_of_shape
 from sim_gap.model.rigid_body import Array
 from sim_gap.residuals.preprocess import Signals
 
@@ -34,7 +23,7 @@ def late(effect_id: str, signature: Signature, start: float, longest: float) -> 
         effect_id,
         signature,
         Plausibility(allows=allows),
-        SearchHints(grid=at_shapes(start), linearised_at=0, relinearise=relinearise),
+        SearchHints(shapes=((start,),), linearised_at=0, relinearise=relinearise),
         parameters_of=as_share_of_shape,
     )
 
@@ -44,4 +33,4 @@ def _delayed(signals: Signals, joint: int, shape: Shape) -> Array:
     return np.asarray(np.interp(signals.t - shape[0], signals.t, torque) - torque)
 
 
-EFFECTS = (late("timing.delay", at_sensor(_delayed, any_channel), 0.005, LONGEST),)
+EFFECTS = (late("timing.delay", Signature.at_sensor(_delayed, "any"), 0.005, LONGEST),)

@@ -2,19 +2,19 @@
 
 import numpy as np
 
-from sim_gap.effects.effect import Effect, Plausibility, any_channel, as_gain, at_sensor, between
+from sim_gap.effects.effect import Effect, Plausibility, Signature, as_gain, between
 
 EFFECTS = (
     Effect(  # without a sensor, an offset of the motor's torque
         "torque.offset",
-        at_sensor(lambda s, _joint, _shape: np.ones(len(s.t)), any_channel),
+        Signature.at_sensor(lambda s, _joint, _shape: np.ones(len(s.t)), "any"),
         Plausibility(prior_penalty=0, background_std=0.02),
     ),
     Effect(
         "torque.gain",
-        at_sensor(lambda s, joint, _shape: s.model[:, joint]),
+        Signature.at_sensor(lambda s, joint, _shape: s.model[:, joint]),
         Plausibility(prior_penalty=0, background_std=0.002, allows=between(-0.5, 1.0)),
         parameters_of=as_gain,
     ),
-    Effect("torque.drift", at_sensor(lambda s, _joint, _shape: s.t), needs=("torque.offset",)),
+    Effect("torque.drift", Signature.at_sensor(lambda s, _joint, _shape: s.t), needs=("torque.offset",)),
 )

@@ -12,8 +12,6 @@ from sim_gap.effects.effect import (
     SearchHints,
     Shape,
     Signature,
-    at_link,
-    at_motor,
     positive,
 )
 from sim_gap.model.rigid_body import CREEP, Array
@@ -94,13 +92,20 @@ def _coupled(coefficients: Array, shape: Shape, _beneath: Beneath) -> Array:
 
 
 EFFECTS = (
-    Effect("transmission.ripple", at_motor(_ripple), hints=SearchHints(grid=_cycles), parameters_of=_wave),
-    Effect("transmission.spring", at_link(_spring), Plausibility(allows=positive), parameters_of=_stiffness_and_rest),
+    Effect(
+        "transmission.ripple", Signature.at_motor(_ripple), hints=SearchHints(shapes_for=_cycles), parameters_of=_wave
+    ),
+    Effect(
+        "transmission.spring",
+        Signature.at_link(_spring),
+        Plausibility(allows=positive),
+        parameters_of=_stiffness_and_rest,
+    ),
     Effect(
         "transmission.coupling",
         Signature(_coupling),
         Plausibility(allows=_all_positive),
-        SearchHints(grid=_neighbours, discrete=frozenset({0}), alternatives=_own_rotors, canonical=_outer_joint),
+        SearchHints(shapes_for=_neighbours, discrete=frozenset({0}), alternatives=_own_rotors, canonical=_outer_joint),
         parameters_of=_coupled,
     ),
 )
