@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from armlink.errors import BadInput
+from sim_gap.better_model.coupled_motors import add_to, coupled_motors
 from sim_gap.better_model.effects_module import module_path, module_text
-from sim_gap.better_model.with_effects import coupled_motors, spec_of, with_effects
+from sim_gap.better_model.with_effects import spec_of, with_effects
 from sim_gap.model.load import SimModel
-from sim_gap.model.tendons import add_to
 from sim_gap.search.estimate import Estimate
 from sim_gap.search.normal_equations import Term
 

@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 
 from armlink.errors import BadInput
+from sim_gap.better_model.coupled_motors import CoupledMotor, add_to, coupled_motors
 from sim_gap.effects.base import across
-from sim_gap.model.load import SimModel
+from sim_gap.model.load import SimModel, read_spec
 from sim_gap.model.rigid_body import Array, inertial_of
-from sim_gap.model.spec import read_spec
-from sim_gap.model.tendons import CoupledMotor, add_to
 from sim_gap.search.estimate import Estimate
 from sim_gap.search.normal_equations import Term
 
@@ -67,17 +66,6 @@ def with_effects(sim: SimModel, estimate: Estimate | None) -> CorrectedModel:
         elif term.effect != "transmission.coupling":
             _joint(model, joint, term.effect, c)
     return CorrectedModel(model, held, tuple(term for term in estimate.terms if term not in held))
-
-
-def coupled_motors(sim: SimModel, estimate: Estimate | None) -> list[CoupledMotor]:
-    """Motors coupled to two joints."""
-    terms = [] if estimate is None else [t for t in estimate.terms if t.effect == "transmission.coupling"]
-    names = sim.arm.names
-    return [
-        CoupledMotor(names[t.place], names[int(t.shape[0]) - 1], t.shape[1], *estimate.of(t).tolist())
-        for t in terms
-        if estimate is not None
-    ]
 
 
 def _base(sim: SimModel, motors: list[CoupledMotor]) -> tuple[Any, bool]:

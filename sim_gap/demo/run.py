@@ -31,7 +31,7 @@ from sim_gap.demo.narrator import Narrator, Report
 from sim_gap.demo.report import write_report
 from sim_gap.demo.show import calibration_table, drift_line, gap_line, verify_table
 from sim_gap.demo.summary import DemoResult, summary
-from sim_gap.model.spec import compiled
+from sim_gap.model.load import compiled
 
 TRAIN_SECONDS, HELDOUT_SECONDS = 40.0, 25.0
 """Length of the gap's recordings [s]."""

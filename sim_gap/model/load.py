@@ -1,5 +1,6 @@
 """The simulation model (MJCF, URDF or arm file), compiled by MuJoCo, its joints matched to those of a recording."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -7,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from armlink.errors import BadInput
-from sim_gap.model.rigid_body import RigidArm, rigid_arm
-from sim_gap.model.spec import compiled
+from sim_gap.model.rigid_body import RigidArm, Tendons, inertial_of
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,114 @@ def load_model(source: Any, names: tuple[str, ...] = (), count: int | None = Non
         raise BadInput(f"{label}: joints {', '.join(arm.names)} do not run from base to tip: reorder them")
     _check(model, joints, arm, label)
     return SimModel(model, tuple(joints), arm, path)
+
+
+def compiled(path: Path) -> Any:
+    """Compile an MJCF, URDF or arm file (by path or bundled name) to a `mujoco.MjModel`. Raises BadInput."""
+    try:
+        return read_spec(path).compile()
+    except ValueError as error:
+        raise BadInput(f"{path}: MuJoCo cannot compile it: {_line(error)}") from None
+
+
+def read_spec(path: Path) -> Any:
+    """Read an MJCF, URDF or arm file (by path or bundled name) as a `mujoco.MjSpec`. Raises BadInput."""
+    import mujoco
+
+    from armlink.arm_file import bundled_arms
+
+    if path.suffix in (".yaml", ".yml") or str(path) in bundled_arms():
+        from sim_gap.model.from_arm import nominal_model
+
+        nominal = nominal_model(path)
+        if not isinstance(nominal, Path):
+            return nominal
+        path = nominal
+    if not path.is_file():
+        raise BadInput(f"no model file {path}: give an MJCF, URDF or arm file")
+    try:
+        return mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise BadInput(f"{path}: MuJoCo cannot read it: {_line(error)}") from None
+
+
+def _line(error: ValueError) -> str:
+    """MuJoCo's message, which spans several lines, in one."""
+    return " ".join(str(error).split())
+
+
+def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:
+    """The chain of the MuJoCo joints `joints` (hinges, base to tip) of a compiled model.
+
+    Other joints of the model are locked at qpos0; bodies on them belong to the link that carries them.
+    """
+    import mujoco
+
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    link_of_body = {int(model.jnt_bodyid[joint]): link for link, joint in enumerate(joints)}
+    frames = [(data.xmat[model.jnt_bodyid[j]].reshape(3, 3).copy(), data.xanchor[j].copy()) for j in joints]
+
+    def carrier(body: int) -> int:
+        while body and body not in link_of_body:
+            body = int(model.body_parentid[body])
+        return link_of_body.get(body, -1)
+
+    parent = tuple(carrier(int(model.body_parentid[model.jnt_bodyid[j]])) for j in joints)
+    inertial = np.zeros((len(joints), 10))
+    for body in range(1, model.nbody):
+        link = carrier(body)
+        if link >= 0:
+            turn, origin = frames[link]
+            spin = turn.T @ data.ximat[body].reshape(3, 3)
+            centre = turn.T @ (data.xipos[body] - origin)
+            inertia = spin @ np.diag(model.body_inertia[body]) @ spin.T
+            inertial[link] += inertial_of(float(model.body_mass[body]), centre, inertia)
+    ups = [frames[p] if p >= 0 else (np.eye(3), np.zeros(3)) for p in parent]
+    dof, adr = [int(model.jnt_dofadr[j]) for j in joints], [int(model.jnt_qposadr[j]) for j in joints]
+    return RigidArm(
+        names=tuple(
+            mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, j) or f"joint_{i + 1}" for i, j in enumerate(joints)
+        ),
+        parent=parent,
+        rotation=np.array([up[0].T @ own[0] for up, own in zip(ups, frames, strict=True)]),
+        offset=np.array([up[0].T @ (own[1] - up[1]) for up, own in zip(ups, frames, strict=True)]),
+        axis=np.array([model.jnt_axis[j] / np.linalg.norm(model.jnt_axis[j]) for j in joints]),
+        zero=model.qpos0[adr].copy(),
+        inertial=inertial,
+        gravity=model.opt.gravity.copy(),
+        armature=model.dof_armature[dof].copy(),
+        damping=np.reshape(model.dof_damping, (model.nv, -1))[dof, 0].copy(),
+        frictionloss=model.dof_frictionloss[dof].copy(),
+        stiffness=np.reshape(model.jnt_stiffness, (model.njnt, -1))[list(joints), 0].copy(),
+        rest=model.qpos_spring[adr].copy(),
+        tendons=tendons_of(model, joints),
+    )
+
+
+def tendons_of(model: Any, joints: Sequence[int]) -> Tendons:
+    """The fixed tendons of a compiled model over its joints `joints`; spatial tendons are left out."""
+    import mujoco
+
+    rows, which = [], []
+    for tendon in range(model.ntendon):
+        wraps = range(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
+        if any(model.wrap_type[w] != mujoco.mjtWrap.mjWRAP_JOINT for w in wraps):
+            continue
+        turns = np.zeros(len(joints))
+        for w in wraps:
+            if model.wrap_objid[w] in joints:
+                turns[list(joints).index(model.wrap_objid[w])] += model.wrap_prm[w]
+        rows.append(turns)
+        which.append(tendon)
+    damping = np.reshape(model.tendon_damping, (model.ntendon, -1))[which, 0] if which else np.zeros(0)
+    return Tendons(
+        turns=np.reshape(rows, (len(which), len(joints))),
+        armature=model.tendon_armature[which].copy(),
+        damping=damping.copy(),
+        frictionloss=model.tendon_frictionloss[which].copy(),
+    )
 
 
 def _check(model: Any, joints: list[int], arm: RigidArm, label: str) -> None:

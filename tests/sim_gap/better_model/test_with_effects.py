@@ -8,10 +8,9 @@ import pytest
 from wrong_arms import THREE, Wrong, motion, record
 
 from sim_gap.attribution.diagnose import diagnose
+from sim_gap.better_model.coupled_motors import CoupledMotor, add_to, coupled_motors
 from sim_gap.better_model.export import write_model
-from sim_gap.better_model.with_effects import coupled_motors
-from sim_gap.model.load import load_model
-from sim_gap.model.tendons import CoupledMotor, add_to, tendons_of
+from sim_gap.model.load import load_model, tendons_of
 
 CASES = {
     "payload": Wrong(payload=0.8),
@@ -22,7 +21,9 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+pytest.mark.parametrize("name", CASES)
+
+
 def test_the_written_model_has_no_gap_any_more(tmp_path, name):
     (tmp_path / "arm.xml").write_text(THREE)
     nominal = load_model(tmp_path / "arm.xml")

@@ -1,0 +1,26 @@
+"""The nominal model of an arm file: its URDF or MJCF, or its joints with the masses of its `sim` section."""
+
+from pathlib import Path
+from typing import Any
+
+from armlink.arm_file import load_arm
+from armlink.errors import BadInput
+
+
+def nominal_model(path: Path) -> Any:
+    """Path of the model of an arm file (by path or bundled name), or the `mujoco.MjSpec` of its `sim` section.
+
+    The section's effects are left out. Raises BadInput if the file has no masses.
+    """
+    arm = load_arm(str(path))
+    if arm.sim is not None:
+        from sim_bus.effects.state import Imperfections
+        from sim_bus.physics.mjcf import build_model
+
+        spec = build_model(arm, Imperfections(arm.joint_names)).spec
+        for joint in spec.joints:
+            joint.frictionloss = 0.0  # the simulated arm sets its friction at run time
+        return spec
+    if arm.model_path is None:
+        raise BadInput(f"{path}: has no masses: give kinematics.model (URDF or MJCF), a sim section, or --sim MJCF")
+    return arm.model_path
