@@ -7,17 +7,17 @@ import numpy as np
 
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
-from gcomp.design.sweep_design import SKETCH_STEPS, Sweep, candidate_sweeps, expected_readings, readings_of
+from gcomp.design.sweep_design import SKETCH_STEPS, Sweep, candidate_sweeps, readings_of
 from gcomp.identify.block_qr import fold
 from gcomp.identify.identifiability import NULL_STD, analyse, describe_null_space
 from gcomp.identify.natural_units import natural_units
 from gcomp.identify.parameters import Parameters, free_mask, parameter_names
-from gcomp.identify.readings import Readings
-from gcomp.identify.sensor_model import predict_and_jacobian
+from gcomp.identify.readings import StaticReadings
+from gcomp.identify.sensor_model import expected_readings, predict_and_jacobian
 
 
 def cures(
-    arm: Arm, readings: Readings, guess: Parameters, *, unknown: Collection[str], load: float = 1.0
+    arm: Arm, readings: StaticReadings, guess: Parameters, *, unknown: Collection[str], load: float = 1.0
 ) -> Mapping[str, str]:
     """For each parameter that these readings do not determine, one sentence: which sweeps would, or why none does.
 
@@ -69,7 +69,7 @@ class _Trial:
     triangle: Array
 
     @classmethod
-    def of(cls, arm: Arm, readings: Readings, guess: Parameters, free: Mask) -> "_Trial":
+    def of(cls, arm: Arm, readings: StaticReadings, guess: Parameters, free: Mask) -> "_Trial":
         unit = natural_units(arm, expected_readings(arm, guess, readings), guess)[free]
         names = tuple(name for name, is_free in zip(parameter_names(arm), free, strict=True) if is_free)
         empty = cls(arm, guess, free, np.median(readings.sigma, axis=0), unit, names, np.zeros((len(unit),) * 2))
@@ -77,7 +77,7 @@ class _Trial:
             empty = empty.with_rows(empty.weighted(block))
         return empty
 
-    def weighted(self, readings: Readings) -> Array:
+    def weighted(self, readings: StaticReadings) -> Array:
         """Weighted Jacobian (P, p) of the readings that count."""
         _, jacobian, _ = predict_and_jacobian(self.arm, self.guess, readings)
         return jacobian[:, self.free] / readings.sigma[readings.counted][:, None]

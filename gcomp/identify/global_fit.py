@@ -13,8 +13,8 @@ from gcomp.identify.least_squares import Outcome, Problem, solve
 from gcomp.identify.linear_start import linear_start
 from gcomp.identify.natural_units import natural_units
 from gcomp.identify.parameters import Parameters, Prior, family_slices, parameter_names, prior_vectors
-from gcomp.identify.readings import Readings
-from gcomp.identify.sensor_model import predict
+from gcomp.identify.readings import StaticReadings
+from gcomp.identify.sensor_model import expected_readings, predict
 
 MAX_STD = {"gain": 0.2, "offset": 0.5, "position_gain": 0.1, "position_offset": 0.35, "beta": 0.5, "rho": 0.2}
 """Standard deviation beyond which a value is no answer, per family: shares of the gain; of the readings' size for
@@ -75,7 +75,7 @@ class GlobalFit:
 
 def identify_global(
     arm: Arm,
-    readings: Readings,
+    readings: StaticReadings,
     *,
     unknown: Collection[str],
     start: Parameters | None = None,
@@ -139,7 +139,7 @@ class Prediction:
 
 def predict_covariance(
     arm: Arm,
-    design: Readings,
+    design: StaticReadings,
     guess: Parameters,
     *,
     unknown: Collection[str],
@@ -151,7 +151,7 @@ def predict_covariance(
     Of the design's torques only NaN matters: that reading would not count. `guess` is the parameters expected.
     """
     design.require_arm(arm)
-    expected = replace_torque(design, np.where(design.counted, predict(arm, guess, design), np.nan))
+    expected = expected_readings(arm, guess, design)
     problem = Problem.of(
         arm, expected, unknown, priors or {}, "linear", position_sigma, natural_units(arm, expected, guess)
     )
@@ -165,11 +165,6 @@ def predict_covariance(
         information.determined,
         describe_null_space(information.null_basis, names),
     )
-
-
-def replace_torque(readings: Readings, torque: Array) -> Readings:
-    """The same rows with other torque readings (K, n)."""
-    return Readings(readings.position, torque, readings.sigma, readings.load)
 
 
 def _start_of(n: int, priors: Mapping[str, Prior]) -> Parameters:

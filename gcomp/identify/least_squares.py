@@ -12,7 +12,7 @@ from gcomp.errors import BadArray
 from gcomp.identify.block_qr import fold
 from gcomp.identify.identifiability import Information, Spectrum, analyse
 from gcomp.identify.parameters import Parameters, Prior, free_mask, prior_vectors
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict, predict_and_jacobian
 
 MAX_ITERATIONS = 60
@@ -29,7 +29,7 @@ class Problem:
     """What is fitted to what; vectors are of the whole parameter vector (6n + 3,)."""
 
     arm: Arm
-    readings: Readings
+    readings: StaticReadings
     free: Mask
     prior_mean: Array
     prior_std: Array
@@ -42,7 +42,7 @@ class Problem:
     def of(
         cls,
         arm: Arm,
-        readings: Readings,
+        readings: StaticReadings,
         unknown: Collection[str],
         priors: Mapping[str, Prior],
         loss: str,
@@ -56,7 +56,7 @@ class Problem:
         mean, std = prior_vectors(arm.n, priors)
         return cls(arm, readings, free_mask(arm.n, unknown), mean, std, loss, noise, unit)
 
-    def on(self, readings: Readings) -> "Problem":
+    def on(self, readings: StaticReadings) -> "Problem":
         """The same fitted to other readings."""
         return replace(self, readings=readings)
 

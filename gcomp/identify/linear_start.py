@@ -10,7 +10,7 @@ from gcomp.identify.block_qr import least_squares
 from gcomp.identify.identifiability import NULL_RATIO
 from gcomp.identify.natural_units import natural_units
 from gcomp.identify.parameters import Parameters, family_slices
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import joint_positions
 
 SANE_GAIN_RATIO = 5.0
@@ -24,7 +24,7 @@ SMALLEST_RATIO = 1e-2
 
 
 def linear_start(
-    arm: Arm, readings: Readings, start: Parameters, free: Mask, *, keep_ratios: bool = False
+    arm: Arm, readings: StaticReadings, start: Parameters, free: Mask, *, keep_ratios: bool = False
 ) -> Parameters:
     """Gains, offsets, mass moments and load point that solve (L) at the start's position gains and offsets.
 
@@ -57,12 +57,12 @@ def linear_start(
 
 
 def _solve(
-    arm: Arm, readings: Readings, start: Parameters, free: Mask, free_gain: Mask, keep_ratios: bool
+    arm: Arm, readings: StaticReadings, start: Parameters, free: Mask, free_gain: Mask, keep_ratios: bool
 ) -> tuple[list[Array], float]:
     """([κ (n,), ω (n,), β (2n,), ρ (3,)] of least norm, zero where not free; norm of the weighted residual)."""
     n = arm.n
 
-    def rows(block: Readings) -> Array:
+    def rows(block: StaticReadings) -> Array:
         row, joint = np.nonzero(block.counted)
         columns, target = _linear_rows(arm, block, start, free, free_gain)
         if keep_ratios:
@@ -86,7 +86,9 @@ def _with_gain(parameters: Parameters, gain: Array) -> Parameters:
     return Parameters.from_vector(vector, len(gain))
 
 
-def _linear_rows(arm: Arm, readings: Readings, start: Parameters, free: Mask, free_gain: Mask) -> tuple[Array, Array]:
+def _linear_rows(
+    arm: Arm, readings: StaticReadings, start: Parameters, free: Mask, free_gain: Mask
+) -> tuple[Array, Array]:
     """Columns (P, 4n + 3) of (κ, ω, β, ρ) and right-hand side (P,); columns that are not free are zero."""
     n, places = arm.n, family_slices(arm.n)
     row, joint = np.nonzero(readings.counted)
@@ -109,7 +111,7 @@ def _linear_rows(arm: Arm, readings: Readings, start: Parameters, free: Mask, fr
     return columns, target
 
 
-def _strongest(readings: Readings) -> int:
+def _strongest(readings: StaticReadings) -> int:
     """The joint whose counted torque varies most against its noise."""
     scaled = np.ma.masked_invalid(readings.torque / readings.sigma)
     return int(np.argmax(scaled.std(axis=0).filled(0.0)))

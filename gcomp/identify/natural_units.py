@@ -5,10 +5,10 @@ import numpy as np
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 from gcomp.identify.parameters import Parameters
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 
 
-def natural_units(arm: Arm, readings: Readings, start: Parameters) -> Array:
+def natural_units(arm: Arm, readings: StaticReadings, start: Parameters) -> Array:
     """Natural units of the parameter vector (6n + 3,): changes that matter.
 
     The gain as it starts, 1 rad, 1 m, the readings' size, that size over g.

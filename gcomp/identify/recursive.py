@@ -8,7 +8,7 @@ from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
 from gcomp.errors import BadArray
 from gcomp.gravity.torque import gravity_regressor
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 
 DEAD_COLUMN = 1e-6
 """A column whose norm is below this share of g·√K says nothing: the axis stood along gravity in every row."""
@@ -28,7 +28,7 @@ class RecursiveFit:
     """Which mass moments were found (2n,)."""
 
 
-def identify_recursive(arm: Arm, readings: Readings, *, fit_offset: bool = True) -> RecursiveFit:
+def identify_recursive(arm: Arm, readings: StaticReadings, *, fit_offset: bool = True) -> RecursiveFit:
     """Mass moments from each joint's own torque, from the last joint to the first; equations (8) to (18) of [MH97].
 
     A joint's sweep is every row in which its torque counts: several sweeps of a joint are stacked. Rows carry no

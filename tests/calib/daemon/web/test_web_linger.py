@@ -10,8 +10,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from served_page import TOKEN, Served, served
 from made_up_view import MadeUpView
+from served_page import TOKEN, Served, served
 
 from calib.daemon.web import guard as guard_module
 from calib.daemon.web import linger as linger_module
