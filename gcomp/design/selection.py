@@ -22,7 +22,7 @@ designs (the paper's arm and ten random ones, both criteria)."""
 
 Criterion = Literal["D", "A"]
 Cost = Callable[[list[list[int]], int, int], Array]
-"""(selected so far, group, slot) → what each candidate of the group would cost there (C,), as log determinant."""
+"""(selection until now, group, slot) → cost of each candidate of the group there (C,), as log determinant."""
 
 
 def select(
@@ -38,8 +38,8 @@ def select(
     """Indices of the `counts` candidates of each group that together are best: a greedy selection, then exchanges.
 
     `information` holds JᵀJ (G, C, p, p) of each group's candidates, for G guesses at the parameters over which the
-    criterion is averaged; `prior` (G, p, p) is what is known without any. `unit` (p,) is the natural unit of each
-    parameter, for the A criterion; `cost` is subtracted from the criterion.
+    criterion is averaged; `prior` (G, p, p) is the information without any candidate. `unit` (p,) is the natural unit
+    of each parameter, for the A criterion; `cost` is subtracted from the criterion.
     """
     total = prior.copy()
     chosen: list[list[int]] = [[] for _ in information]

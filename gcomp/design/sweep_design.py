@@ -1,8 +1,4 @@
-"""Which sweeps to make: stops for the resting joints to lean on and steps to take, chosen before anything moves.
-
-D-optimal designs make the volume of the parameters' confidence ellipsoid smallest, A-optimal ones the sum of their
-variances in natural units.
-"""
+"""Design of sweeps before anything moves: stops of the resting joints, steps (docs/theory.md, section 7.4)."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -23,14 +19,14 @@ from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import expected_readings
 
 MINIMUM_LEVER = 0.3
-"""Γ/g of the swept joint below which a stop combination is taken only where there is no better one."""
+"""Γ/g of the swept joint below which a combination is used only if none is better (docs/theory.md, section 2.5)."""
 SKETCH_STEPS = 7
-"""Steps by which a candidate sweep is judged."""
+"""Steps by which a candidate sweep is judged: more than a sinusoid's three unknowns (docs/theory.md, section 5.3)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """Joint `joint` moves through `angles` (K,) [rad] while the others stand as in `pose` (n,) [rad]."""
+    """Joint `joint` moves through `angles` (K,) [rad] while the others rest as in `pose` (n,) [rad]."""
 
     joint: int
     pose: Array
@@ -49,7 +45,7 @@ class Sweep:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """Chosen sweeps, and what they would determine."""
+    """Chosen sweeps, and the precision that they would give."""
 
     sweeps: tuple[Sweep, ...]
     prediction: Prediction
@@ -58,11 +54,11 @@ class Design:
 def stop_combinations(arm: Arm, joint: int) -> Array:
     """The 2^(n-1) poses (C, n) [rad] with the other joints at a limit and `joint` in the middle.
 
-    Raises BadArray where a joint has no limits.
+    Raises BadArray if a joint has no limits.
     """
     for name, low, high in zip(arm.names, arm.lower, arm.upper, strict=True):
         if not (np.isfinite(low) and np.isfinite(high)):
-            raise BadArray(f"joint {name} has no limits ({low} to {high} rad): there is no stop to lean on")
+            raise BadArray(f"joint {name} has no limits ({low} to {high} rad): there is no stop to rest on")
     choices = [
         [(low + high) / 2] if i == joint else [low, high]
         for i, (low, high) in enumerate(zip(arm.lower, arm.upper, strict=True))
@@ -71,9 +67,9 @@ def stop_combinations(arm: Arm, joint: int) -> Array:
 
 
 def candidate_sweeps(arm: Arm, joint: int, steps: int, margin: float = 0.0) -> list[Sweep]:
-    """A sweep of `joint`, `margin` [rad] off its limits, for each stop combination in which it feels gravity well.
+    """A sweep of `joint`, `margin` [rad] off its limits, for each stop combination with a sufficient lever of gravity.
 
-    Well is Γ ≥ 0.3 g; where no combination has that, the better half is taken.
+    Sufficient is Γ ≥ 0.3 g; if no combination has that, the better half is taken.
     """
     poses = stop_combinations(arm, joint)
     good = well_felt(gravity_levers(arm, poses)[:, joint] / max(float(np.linalg.norm(arm.gravity)), 1e-9))
@@ -82,13 +78,13 @@ def candidate_sweeps(arm: Arm, joint: int, steps: int, margin: float = 0.0) -> l
 
 
 def well_felt(lever: Array) -> Mask:
-    """Which levers Γ/g (C,) are at least `MINIMUM_LEVER`; where none is, the better half."""
+    """Levers Γ/g (C,) of at least `MINIMUM_LEVER`; if there is none, the better half."""
     good: Mask = lever >= MINIMUM_LEVER
     return good if good.any() else lever >= np.median(lever)
 
 
 def readings_of(arm: Arm, sweeps: Sequence[Sweep], sigma: ArrayLike, loads: Sequence[float] = (0.0,)) -> StaticReadings:
-    """Rows of these sweeps, made once with each load, in which only the swept joint's torque counts (torque 0)."""
+    """Readings of these sweeps, repeated with each load [kg]; only the swept joint's torque counts and is 0."""
     positions = np.concatenate([sweep.positions() for sweep in sweeps])
     torque = np.full(positions.shape, np.nan)
     swept = np.concatenate([np.full(len(sweep.angles), sweep.joint) for sweep in sweeps])
@@ -116,7 +112,7 @@ def choose_sweeps(
     """`poses` sweeps of every joint, stops chosen together so that the families `unknown` come out best.
 
     `guess` is the parameters expected, sigma () or (n,) [N·m] the noise of a reading, loads [kg] the reference masses
-    of the passes. Greedy choice, then exchanges. Raises BadArray on a joint without limits.
+    of the passes. Raises BadArray on a joint without limits.
     """
     candidates = [candidate_sweeps(arm, joint, SKETCH_STEPS, margin) for joint in reversed(range(arm.n))]  # tip first
     judge = _Judge.of(arm, guess, [sweep for each in candidates for sweep in each], sigma, unknown, loads)
@@ -140,8 +136,8 @@ def choose_steps(
 ) -> Design:
     """The same sweeps with `count` of their steps each, those that serve the families `unknown` best.
 
-    Give sweeps of many steps to choose from. Ends and turning points of the sinusoids win; keep 13 or more where
-    harmonics are to show in the residual.
+    Give sweeps of many steps to choose from: ends and turning points of the sinusoids win. Keep 13 or more if harmonics
+    are to show in the residual (docs/theory.md, section 5.3).
     """
     judge = _Judge.of(arm, guess, sweeps, sigma, unknown, loads)
     information = []
@@ -156,7 +152,7 @@ def choose_steps(
 
 @dataclass(frozen=True, eq=False)
 class _Judge:
-    """By what sweeps are compared: the parameters expected, which of them are unknown, and their natural units."""
+    """Comparison of sweeps: the parameters expected, which of them are unknown, and their natural units."""
 
     arm: Arm
     guess: Parameters
@@ -192,7 +188,7 @@ class _Judge:
         return select([each[None] for each in information], prior, counts, criterion=criterion, unit=self.unit)
 
     def design(self, sweeps: Sequence[Sweep]) -> Design:
-        """The sweeps with what they would determine."""
+        """The sweeps with their predicted precision."""
         readings = readings_of(self.arm, sweeps, self.sigma, self.loads)
         return Design(tuple(sweeps), predict_covariance(self.arm, readings, self.guess, unknown=self.unknown))
 

@@ -1,4 +1,4 @@
-"""What the sensors read at given parameters, and how each parameter changes that (theory note, section 7)."""
+"""Sensor readings at given parameters, and their Jacobian (docs/theory.md, section 7.1)."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ def row_moments(arm: Arm, parameters: Parameters, load: Array) -> Array:
 
 
 def predict(arm: Arm, parameters: Parameters, readings: StaticReadings) -> Array:
-    """Modelled torque readings (K, n) [N·m] of every joint, counted or not."""
+    """Modelled torque readings (K, n) [N·m] of every joint, whether they count or not."""
     frames = bar_frames(arm, joint_positions(parameters, readings))
     composite = composite_moments(frames.rotation, row_moments(arm, parameters, readings.load))
     reading: Array = parameters.gain * np.einsum("kid,kid->ki", frames.lever, composite) + parameters.offset
@@ -39,7 +39,7 @@ def expected_readings(arm: Arm, parameters: Parameters, design: StaticReadings) 
 def predict_and_jacobian(arm: Arm, parameters: Parameters, readings: StaticReadings) -> tuple[Array, Array, Array]:
     """(Modelled counted readings (P,), their Jacobian (P, 6n + 3), their slope by position reading (P, n)).
 
-    The P counted readings stand in row order, then joint order.
+    The P counted readings are in row order, then joint order.
     """
     n, counted = arm.n, readings.counted
     row, joint = np.nonzero(counted)
