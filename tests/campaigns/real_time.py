@@ -4,8 +4,8 @@
 
 A simulated arm in real time on a bus, and one after the other: sweep, mass bolted on by the control pipe, loaded sweep,
 calibrate, identify, apply, verify, float, a daemon that finds an injected drift and corrects it, gap plan, collect,
-diagnose. Estimates are compared with the arm's truth. Prints a line a step and a JSON summary; exit status 1 if a bound is not met.
-With --busy both cores are kept busy and a file is written all the while.
+diagnose. Estimates are compared with the arm's truth. Prints a line a step and a JSON summary; exit status 1 if a bound
+is not met. With --busy both cores are kept busy and a file is written all the while.
 """
 
 import argparse
@@ -27,6 +27,7 @@ import numpy as np
 from armlink.arm_file import ArmFile, load_arm
 from sim_bus.truth import Truth
 
+ARMLINK = str(Path(sys.executable).parent / "armlink")
 GROUP = "239.74.163.{}"
 FALSE = re.compile(r"encoder|cable|too weak|TPDO|babbles|second node|stuck", re.IGNORECASE)
 """What no message may say of this sound arm."""
@@ -57,7 +58,7 @@ class Run:
         """One command; its JSON answer."""
         begin, answer = time.monotonic(), self.folder / f"{step.replace(' ', '-')}.json"
         options = [] if words[0] in ("rollback",) else ["--json", str(answer)]
-        command = [sys.executable, "-m", "armlink", *words, *options]
+        command = [ARMLINK, *words, *options]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         (self.folder / f"{answer.stem}.log").write_text(done.stdout + done.stderr)
         took = time.monotonic() - begin
@@ -79,7 +80,7 @@ class Run:
         """Start the arm."""
         words = ["sim", self.arm, "--bus", self.bus, "--seed", str(self.seed), "--control", str(self._pipe)]
         with (self.folder / "sim.log").open("w") as log:
-            self._arm = subprocess.Popen([sys.executable, "-m", "armlink", *words], stdout=log, stderr=log)
+            self._arm = subprocess.Popen([ARMLINK, *words], stdout=log, stderr=log)
         while not self._pipe.exists():
             time.sleep(0.1)
         time.sleep(1.0)
@@ -105,7 +106,7 @@ class Run:
         self.found["late_ms"] = {"sweep": first.get("late_ms"), "loaded sweep": second.get("late_ms")}
         self.calibrated(self.armlink("calibrate", "calibrate", unloaded, loaded, *store))
         self.armlink("identify", "identify", unloaded, loaded, *store)
-        self.armlink("apply", "calibrate", unloaded, loaded, *store, "--apply", *bus, "--yes")
+        self.armlink("apply", "calibrate", unloaded, loaded, *store, "--apply", *bus)
         if sweeps_only:
             return
         check = self.armlink("verify", "verify", self.arm, *bus, *store, ok=(0, 1))
@@ -141,7 +142,7 @@ class Run:
         joint = min(2, len(self.described.joint_names) - 1)
         name = self.described.joint_names[joint]
         with (self.folder / "daemon.log").open("w") as log:
-            process = subprocess.Popen([sys.executable, "-m", "armlink", *words], stdout=log, stderr=log)
+            process = subprocess.Popen([ARMLINK, *words], stdout=log, stderr=log)
         begin = time.monotonic()
         try:
             running = self._until(api, lambda status, _: status["state"] == "running", 60)
@@ -184,7 +185,7 @@ class Run:
         motion, train, heldout = (str(self.folder / name) for name in ("motion.csv", "train.mcap", "heldout.mcap"))
         self.armlink("gap plan", "gap", "plan", self.arm, "--out", motion)
         for name, out in (("collect", train), ("collect again", heldout)):
-            self.armlink(name, "gap", "collect", self.arm, motion, *("--bus", self.bus), "--out", out)
+            self.armlink(name, "gap", "collect", self.arm, "--motion", motion, *("--bus", self.bus), "--out", out)
         words = ("gap", "diagnose", "--sim", self.arm, "--train", train, "--heldout", heldout)
         answer = self.armlink("diagnose", *words, ok=(0, 1))
         self.found["gap"] = {"verdict": answer["verdict"], "causes": [each["effect"] for each in answer["causes"]][:3]}
