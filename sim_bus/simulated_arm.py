@@ -90,6 +90,11 @@ class SimulatedArm:
         elif 0x700 < can_id < 0x780 and data:
             self.supervision.heartbeat(can_id - 0x700, self.time)
 
+    def waits_for_sync(self, can_id: int) -> bool:
+        """Whether such a frame is only kept until the next SYNC: a synchronous RPDO."""
+        slot = self._pdos.receive.get(can_id)
+        return slot is not None and slot[0].kind <= 240
+
     def advance(self, duration: float) -> None:
         """Let simulated time pass [s], in pieces of at most one SYNC period."""
         remaining = duration

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.observer.rest_detector import Row
+from calib.motion.static_reading import StaticReading
 from calib.records.records import Array
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
@@ -35,7 +35,7 @@ class Window:
     direction: Array
 
     @classmethod
-    def of(cls, rows: list[Row]) -> "Window":
+    def of(cls, rows: list[StaticReading]) -> "Window":
         """From K rows whose positions are true angles."""
         columns = ([getattr(row, name) for row in rows] for name in ("position", "torque", "direction"))
         return cls(*map(np.array, columns))

@@ -25,7 +25,7 @@ def collect(
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
-    from armlink.link.link import Link
+    from armlink.loop.open import open_arm
     from sim_gap.experiment.collect import collect as run
     from sim_gap.experiment.motion_file import load_motion
 
@@ -34,7 +34,7 @@ def collect(
     arm_file = load_arm(arm)
     target = load_motion(motion, arm_file)
     console = Console(stderr=True)
-    with Link.open(arm_file, bus) as link, Progress(console=console) as bars:
+    with open_arm(arm_file, bus) as link, Progress(console=console) as bars:
         task = bars.add_task(f"{arm_file.name}: {motion.name}", total=len(target))
         link.start()
         link.enable()

@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_gap.blind.cases.arms import Arm, Array, perturbed
+from gcomp.arrays import Array
+from sim_gap.blind.cases.arms import Arm, perturbed
 
 
 @dataclass(frozen=True)
