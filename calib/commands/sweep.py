@@ -7,7 +7,7 @@ import typer
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
-    from armlink.link.link import Link
+    from armlink.loop.driver import ArmDriver
     from calib.commands.screen import SweepScreen
     from calib.sweep.dataset import SweepData
     from calib.sweep.preflight import Preflight
@@ -34,6 +34,9 @@ def sweep(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Run the whole plan on the simulated arm of the arm file's sim section.")
     ] = False,
+    keep_going: Annotated[
+        int, typer.Option(min=0, help="Enable the joints again by itself up to N times after a stall of the cycle.")
+    ] = 0,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the arm moves.")] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the plan's search.")] = 0,
     json_file: Annotated[
@@ -49,9 +52,10 @@ def sweep(
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
-    from armlink.link.link import Link
+    from armlink.loop.open import open_arm
     from calib.arm.sweep_section import with_hold
     from calib.commands.screen import SweepScreen, confirm
+    from calib.sweep.dataset import require_vacant
 
     arm_file = with_hold(load_arm(arm), hold)
     if plan:
@@ -59,9 +63,10 @@ def sweep(
         return
     if out is None:
         raise BadInput("sweep: give --out DIR for the data set, or --plan to print the plan alone")
+    require_vacant(out, resume)
     if not dry_run and not yes:
         confirm(f"{arm_file.name} will move through its whole range, {reference_mass:g} kg attached. Is it clear?")
-    with _dry_link(arm_file, reference_mass) if dry_run else Link.open(arm_file, bus) as link:
+    with _dry_link(arm_file, reference_mass) if dry_run else open_arm(arm_file, bus) as link:
         link.start()
         with SweepScreen(f"{arm_file.name}, {reference_mass:g} kg attached") as screen:
             found, data = _run(
@@ -69,6 +74,7 @@ def sweep(
                 arm_file,
                 out,
                 screen,
+                keep_going,
                 reference_mass,
                 resume,
                 seed,
@@ -97,10 +103,11 @@ def _plan(arm_file: "ArmFile", seed: int, picture: Path) -> dict[str, Any]:
 
 
 def _run(
-    link: "Link",
+    link: "ArmDriver",
     arm_file: "ArmFile",
     out: Path,
     screen: "SweepScreen",
+    keep_going: int,
     reference_mass: float,
     resume: bool,
     seed: int,
@@ -109,24 +116,34 @@ def _run(
     """Enable the arm, check it and sweep it."""
     from calib.sweep.preflight import find_stops, listen
     from calib.sweep.run import run_sweep
+    from calib.sweep.stalls import bridged
 
     link.enable()
-    found = listen(link, arm_file)
+    on_stall = screen.on_stall(keep_going)
+    heard = bridged(link, on_stall, lambda: listen(link, arm_file))
+    found = heard
     if check_stops:
-        found = find_stops(link, arm_file, found, screen.count)
+        found = bridged(link, on_stall, lambda: find_stops(link, arm_file, heard, screen.count))
     data = run_sweep(
-        link, arm_file, out, reference_mass=reference_mass, resume=resume, progress=screen.update, seed=seed
+        link,
+        arm_file,
+        out,
+        reference_mass=reference_mass,
+        resume=resume,
+        progress=screen.update,
+        seed=seed,
+        on_stall=on_stall,
     )
     return found, data
 
 
 def _show(arm_file: "ArmFile", found: "Preflight", data: "SweepData", screen: "SweepScreen") -> None:
-    from calib.commands.screen import print_lines, print_plan, print_preflight, unsettled_said
+    from calib.commands.screen import print_lines, print_plan, print_preflight, stalls_said, unsettled_said
 
     assert data.plan is not None
     print_preflight(found)
     print_plan(arm_file, data.plan)
-    print_lines(unsettled_said(data), "yellow")
+    print_lines([*unsettled_said(data), *stalls_said(data)], "yellow")
     if not data.manifest.reference_mass:
         mass = data.plan.reference_mass
         screen.say(
@@ -143,6 +160,7 @@ def _answer(arm_file: "ArmFile", data: "SweepData") -> dict[str, Any]:
         "serial": arm_file.serial,
         "readings": len(data.readings),
         "unsettled": len(data.unsettled),
+        "stalls": [stall.model_dump(include={"t", "late_ms", "reading"}) for stall in data.stalls],
         "seconds": data.readings[-1].t,
         "reference_mass": data.manifest.reference_mass,
         "recommended_reference_mass": data.plan.reference_mass,
@@ -150,11 +168,11 @@ def _answer(arm_file: "ArmFile", data: "SweepData") -> dict[str, Any]:
     }
 
 
-def _dry_link(arm_file: "ArmFile", reference_mass: float) -> "Link":
-    """A link to the simulated arm that the arm file describes, with the mass attached where there is one."""
-    from armlink.link.link import Link
+def _dry_link(arm_file: "ArmFile", reference_mass: float) -> "ArmDriver":
+    """The simulated arm that the arm file describes, in this process, with the mass attached."""
+    from armlink.arm_file import Bus
+    from armlink.loop.open import open_arm
 
-    link = Link.open(arm_file, f"armlink_sim:{arm_file.path}")
-    if reference_mass:
-        link.bus.arm.attach_mass(reference_mass)
-    return link
+    bus = Bus(interface="armlink_sim", channel=str(arm_file.path), options={"load": reference_mass})
+    link = arm_file.require_link().model_copy(update={"bus": bus, "buses": {}})
+    return open_arm(arm_file.model_copy(update={"link": link}))

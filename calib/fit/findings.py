@@ -51,28 +51,28 @@ def effect_said(names: tuple[str, ...], effect: Effect, coefficient: Array, refi
     """One effect in words."""
     name, gain = names[effect.joint], float(refined.fit.complete.gain[effect.joint]) or 1.0
     value = float(coefficient[0])
-    if effect.kind == "spring":
+    if effect.id == "transmission.spring":
         text = (
             f"{name}: torque linear in position that gravity does not explain, {value / gain:+.3g} N·m/rad: a cable or"
             " spring over the joint? It is taken out; its pull at 0 rad is part of the offset"
         )
         return Finding(name, "spring", value / gain, "N·m/rad", text)
-    if effect.kind == "direction":
+    if effect.each_sweep:
         size = size_of(coefficient)
         text = f"{name}: readings differ by {2 * size:.3g} N·m with the side of approach; taken out"
         return Finding(name, "direction", size, "N·m", text)
-    if effect.kind == "hysteresis":
+    if effect.id == "torque.hysteresis":
         text = (
             f"{name}: the torque sensor lags by {abs(value):.3g} N·m behind changes of torque (hysteresis); taken out"
         )
         return Finding(name, "hysteresis", abs(value), "N·m", text)
-    if effect.kind == "saturation":
+    if effect.id == "torque.saturation":
         text = f"{name}: the torque sensor flattens beyond {effect.knee:.3g} N·m: does it saturate?"
         return Finding(name, "saturation", effect.knee, "N·m", text)
-    if effect.kind == "drift":
+    if effect.id == "torque.drift":
         text = f"{name}: the torque reading drifts by {value * 3600:+.3g} N·m an hour: warm up, then sweep again"
         return Finding(name, "drift", value * 3600, "N·m/h", text)
-    if effect.kind == "eccentricity":
+    if effect.id == "position.eccentricity":
         size = float(np.hypot(*coefficient))
         text = f"{name}: the position reading is wrong by {size:.3g} rad once a turn: an eccentric encoder disc?"
         return Finding(name, "eccentricity", size, "rad", text)

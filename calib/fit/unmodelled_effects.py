@@ -1,4 +1,4 @@
-"""Effects that the sensor model does not have, as columns: which of them the residuals of a fit ask for."""
+"""Effects of the catalogue that the sensor model does not have: which of them the residuals of a fit show."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -31,16 +31,19 @@ PATH = 12
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """An effect found: its columns, in the kind's own units, and what it explains."""
+    """An effect found: its columns, in the effect's own units, and its significance."""
 
     joint: int
-    kind: str
+    id: str
+    """In `armlink.effect_catalogue`."""
     extras: tuple[Extra, ...]
     p_value: float
     knee: float = np.nan
     """Torque at which a sensor begins to saturate [N·m]."""
     doubt: Array | None = None
-    """What the columns leave open of each reading of the joint (K,), as a share of the effect's size."""
+    """Standard deviation that the columns leave at each reading of the joint (K,), as a share of the effect's size."""
+    each_sweep: bool = False
+    """Whether a hysteresis has its own size in each sweep (side of approach) instead of one width."""
 
 
 def size_of(coefficients: Array) -> float:
@@ -97,30 +100,33 @@ def _candidates(arm: Arm, rows: SweepReadings, refined: Refined) -> Iterator[Eff
         if here.sum() < FEWEST:
             continue
         angle, own = readings.position[:, joint], torque[:, joint]
-        yield _one(arm.n, joint, "spring", here * angle)
+        yield _one(arm.n, joint, "transmission.spring", here * angle)
         doubt = _lag_doubt(rows, joint)
         sides = [here * side for side in _sides(rows, joint)]
         if sides:
-            columns = tuple(_one(arm.n, joint, "direction", side).extras[0] for side in sides)
-            yield Effect(joint, "direction", columns, 1.0, doubt=doubt)
-        yield replace(_one(arm.n, joint, "hysteresis", here * lag(arm, rows, refined, joint)), doubt=doubt)
+            columns = tuple(_one(arm.n, joint, "torque.hysteresis", side).extras[0] for side in sides)
+            yield Effect(joint, "torque.hysteresis", columns, 1.0, doubt=doubt, each_sweep=True)
+        yield replace(_one(arm.n, joint, "torque.hysteresis", here * lag(arm, rows, refined, joint)), doubt=doubt)
         largest = float(np.abs(own[here]).max())
-        yield _one(arm.n, joint, "nonlinear", here * own * np.abs(own) / max(largest, 1e-9))
+        yield _one(arm.n, joint, "torque.nonlinearity", here * own * np.abs(own) / max(largest, 1e-9))
         for share in KNEES:
             bent = np.where(here, np.sign(own) * np.maximum(np.abs(own) - share * largest, 0.0), 0.0)
             if np.count_nonzero(bent) >= FEWEST // 2:
-                yield _one(arm.n, joint, "saturation", bent, share * largest / max(abs(complete.gain[joint]), 1e-9))
-        yield _one(arm.n, joint, "drift", here * (rows.time - rows.time.mean()))
+                yield _one(
+                    arm.n, joint, "torque.saturation", bent, share * largest / max(abs(complete.gain[joint]), 1e-9)
+                )
+        yield _one(arm.n, joint, "torque.drift", here * (rows.time - rows.time.mean()))
         if float(np.ptp(angle[here])) > TURN:
             turn = (slope[..., joint] * np.sin(angle)[:, None], slope[..., joint] * np.cos(angle)[:, None])
-            yield Effect(joint, "eccentricity", tuple(Extra(joint, "eccentricity", each) for each in turn), 1.0)
+            extras = tuple(Extra(joint, "position.eccentricity", each) for each in turn)
+            yield Effect(joint, "position.eccentricity", extras, 1.0)
 
 
-def _one(n: int, joint: int, kind: str, values: Array, knee: float = np.nan) -> Effect:
+def _one(n: int, joint: int, effect_id: str, values: Array, knee: float = np.nan) -> Effect:
     """An effect that shows in one joint's sensor alone, `values` (K,)."""
     column = np.zeros((len(values), n))
     column[:, joint] = values
-    return Effect(joint, kind, (Extra(joint, kind, column),), 1.0, knee)
+    return Effect(joint, effect_id, (Extra(joint, effect_id, column),), 1.0, knee)
 
 
 def _sides(rows: SweepReadings, joint: int) -> Iterator[Array]:

@@ -77,7 +77,20 @@ class PlanLine(_Model):
     """Smallest step seen in each joint's position reading [rad]."""
 
 
-Line = StaticReading | PlanLine
+class StallLine(_Model):
+    """The joints had to be stopped, were enabled again, and the interrupted reading was repeated."""
+
+    kind: Literal["stall"] = "stall"
+    t: float
+    """Link time of the last sample before it [s]."""
+    late_ms: float | None
+    """How late the host was [ms]; None if it was not the host."""
+    reading: str
+    """Sweep and number of the reading that was interrupted."""
+    reason: str
+
+
+Line = StaticReading | PlanLine | StallLine
 _LINE: TypeAdapter[Line] = TypeAdapter(
     Annotated[Line, Field(discriminator="kind")], config=ConfigDict(ser_json_inf_nan="constants")
 )
@@ -101,6 +114,8 @@ class SweepData:
     """Smallest step seen in each joint's position reading (n,) [rad]; 0 where it is not known."""
     digest: str = field(repr=False)
     """SHA-256 (hex) of the lines read."""
+    stalls: tuple[StallLine, ...] = ()
+    """Interruptions, in their order."""
 
     @property
     def complete(self) -> bool:
@@ -143,14 +158,26 @@ def load_data(path: Path) -> SweepData:
     content = (path / LINES).read_bytes() if (path / LINES).is_file() else b""
     whole = content[: content.rfind(b"\n") + 1]
     readings: list[StaticReading] = []
+    stalls: list[StallLine] = []
     plan, resolution = None, np.zeros(len(manifest.names))
     for line in _parse(whole.splitlines(), path / LINES):
         if isinstance(line, PlanLine):
             plan, resolution = line.plan, np.array(line.resolution)
+        elif isinstance(line, StallLine):
+            stalls.append(line)
         else:
             _check_width(line, len(manifest.names), path)
             readings.append(line)
-    return SweepData(path, manifest, tuple(readings), plan, resolution, hashlib.sha256(whole).hexdigest())
+    digest = hashlib.sha256(whole).hexdigest()
+    return SweepData(path, manifest, tuple(readings), plan, resolution, digest, tuple(stalls))
+
+
+def require_vacant(path: Path, resume: bool = False) -> None:
+    """Raise BadInput unless a new data set can begin at `path`, or with `resume` one is there to go on with."""
+    if resume:
+        _read_manifest(path)
+    elif path.exists() and (not path.is_dir() or any(each != part_of(path / MANIFEST) for each in path.iterdir())):
+        raise BadInput(f"{path}: not empty: choose another directory, or continue the sweep there with --resume")
 
 
 class DataWriter:
@@ -158,10 +185,9 @@ class DataWriter:
 
     def __init__(self, path: Path, manifest: Manifest, resume: bool = False) -> None:
         """Make the directory, or with `resume` go on with the one there; raises BadInput where that cannot be."""
+        require_vacant(path, resume)
         if resume:
             _require_same(_read_manifest(path), manifest, path)
-        elif path.exists() and any(each != part_of(path / MANIFEST) for each in path.iterdir()):
-            raise BadInput(f"{path}: not empty: choose another directory, or continue the sweep there with --resume")
         else:
             path.mkdir(parents=True, exist_ok=True)
             write_whole(path / MANIFEST, manifest.model_dump_json(by_alias=True, indent=1))

@@ -7,7 +7,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
-from armlink.link.link import Link
+from armlink.loop.driver import ArmDriver
 from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import SweepSection, sweep_section
@@ -61,7 +61,7 @@ class Verification:
 
 
 def run_verify(
-    link: Link,
+    link: ArmDriver,
     arm: ArmFile,
     gravity: GravityRecord,
     calibration: CalibrationRecord | None = None,
@@ -124,7 +124,7 @@ class _Sensors:
     position_offset: Array
 
     @classmethod
-    def of(cls, link: Link, record: CalibrationRecord | None) -> "_Sensors":
+    def of(cls, link: ArmDriver, record: CalibrationRecord | None) -> "_Sensors":
         installed = [link.read_calibration(joint) for joint in range(link.n)]
         gain, offset = np.array([each.gain for each in installed]), np.array([each.offset for each in installed])
         if record is None:

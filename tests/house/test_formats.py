@@ -16,6 +16,7 @@ from armlink.recording.recording import COLUMNS, SUFFIXES, Recording
 from calib.records.records import CalibrationRecord, GravityRecord, Record
 from calib.sweep.dataset import Manifest, PlanLine, Reading
 from sim_bus.effects.registry import effects as forward_effects
+from sim_gap.effects.laws import LAWS
 from sim_gap.effects.registry import effects as inverse_effects
 from tests.house.conftest import keyed, part, rows
 
@@ -183,18 +184,19 @@ def test_recording_channels_columns_units_and_topics():
 
 def test_effects_with_their_parameters_and_units():
     page = {row["effect"].strip("`"): row for row in rows("5.1")}
-    forward, inverse = forward_effects(), {name: each for name, each in inverse_effects().items() if not each.general}
+    forward, inverse = forward_effects(), {name: each for name, each in inverse_effects().items() if name not in LAWS}
     assert page.keys() == forward.keys() == inverse.keys()
     for name, row in page.items():
         given = re.findall(r"`(\w+)` \[([^\]]+)\]([^,`]*)(?:, default `([^`]+)`)?", row["parameters"])
         assert [(parameter.name, parameter.unit) for parameter in forward[name].parameters] == [g[:2] for g in given]
         for parameter, (_, _, rest, default) in zip(forward[name].parameters, given, strict=True):
             sizes = " or ".join(str(size) for size in parameter.sizes if size)
-            low = f"≥ {parameter.least:g}" if parameter.least is not None else ""
-            high = f"> {parameter.above:g}" if parameter.above is not None else ""
+            domain = parameter.domain
+            low = f"≥ {domain.least:g}" if domain.least is not None else ""
+            high = f"> {domain.above:g}" if domain.above is not None else ""
             assert rest.split() == f"{f'× {sizes}' if sizes else ''} {low}{high}".split(), name
-            assert default == ("" if parameter.default is None else f"{parameter.default:g}"), name
+            assert default == ("" if domain.default is None else f"{domain.default:g}"), name
         reported = re.findall(r"`(\w+)` \[([^\]]+)\]", row["reported by the diagnosis"])
-        assert [(parameter.name, parameter.unit) for parameter in inverse[name].parameters] == reported
+        assert [*inverse[name].reported] == reported
         assert row["of"] == ("joint" if forward[name].per_joint else "arm")
-        assert inverse[name].whole_arm is not forward[name].per_joint
+        assert inverse[name].signature.whole_arm is not forward[name].per_joint
