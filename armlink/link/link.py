@@ -16,7 +16,7 @@ from armlink.canopen.sdo import NodeServices, PumpedNetwork, joint_services
 from armlink.clock import Clock, MonotonicClock
 from armlink.errors import BusFault
 from armlink.link import controller_setup as device
-from armlink.link import torque_sensor_record as calibration
+from armlink.link import torque_sensor_record
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.faults import bus_fault
@@ -214,16 +214,14 @@ class Link:
 
     def read_calibration(self, joint: int) -> Calibration:
         """The torque sensor record (2100h) that joint 0 … n−1 works with; raises BusFault."""
-        return calibration.read_record(self.services[joint])
+        return torque_sensor_record.read_record(self.services[joint])
 
-    def write_calibration(
-        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
-    ) -> Calibration:
-        """Make gain and offset [N·m] active in joint 0 … n−1 (`store`: to flash too); raises BadInput, BusFault.
+    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
+        """Make a calibration active in joint 0 … n−1 (`store`: in flash too); raises BadInput, BusFault.
 
         While the joints are enabled the cycle goes on with the last command.
         """
-        return calibration.write_record(self.services[joint], gain, offset, record_id, date, store)
+        return torque_sensor_record.write_record(self.services[joint], calibration, store)
 
     @cached_property
     def services(self) -> tuple[NodeServices, ...]:

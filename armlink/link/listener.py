@@ -21,7 +21,7 @@ from armlink.canopen import object_dictionary as objects
 from armlink.canopen.pdo import RPDO1
 from armlink.canopen.sdo import NodeServices, PumpedNetwork, joint_services
 from armlink.clock import Clock, MonotonicClock
-from armlink.link import torque_sensor_record as calibration
+from armlink.link import torque_sensor_record
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.types import Array, Calibration, Sample, Stats
 from armlink.monitor.monitor import assumed_units
@@ -122,13 +122,11 @@ class Listener:
 
     def read_calibration(self, joint: int) -> Calibration:
         """The torque sensor record (2100h) of joint 0 … n−1, by SDO: sends; raises BusFault."""
-        return calibration.read_record(self._services[joint])
+        return torque_sensor_record.read_record(self._services[joint])
 
-    def write_calibration(
-        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
-    ) -> Calibration:
-        """Make gain and offset [N·m] active in joint 0 … n−1, by SDO: sends; raises BadInput, BusFault."""
-        return calibration.write_record(self._services[joint], gain, offset, record_id, date, store)
+    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
+        """Make a calibration active in joint 0 … n−1, by SDO: sends; raises BadInput, BusFault."""
+        return torque_sensor_record.write_record(self._services[joint], calibration, store)
 
     def _hear(self, seconds: float, at_once: bool = False) -> None:
         """Take in what comes, for at most so long; `at_once`: somebody waits for the very next frame."""

@@ -1,4 +1,4 @@
-"""What an arm's drives may do and where its stops are, as arrays."""
+"""Joint range and drive limits of an arm as arrays."""
 
 from dataclasses import dataclass
 
@@ -11,15 +11,25 @@ from calib.arm.kinematics import gcomp_arm
 Array = npt.NDArray[np.float64]
 
 
+def rated_torques(arm: ArmFile) -> Array:
+    """Rated torque of every joint (n,) [N·m]; raises BadInput if the arm file has no link section."""
+    return np.array([joint.rated_torque for joint in arm.require_link().joints])
+
+
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """What the drives may do, and where the stops are; all (n,)."""
+    """Stops, and what the drives are capable of; all (n,)."""
 
     lower: Array
+    """[rad]"""
     upper: Array
+    """[rad]"""
     rated: Array
+    """[N·m]"""
     max_torque: Array
+    """[N·m]"""
     speed: Array
+    """[rad/s]"""
 
     @classmethod
     def of(cls, arm: ArmFile) -> "Limits":
@@ -28,7 +38,7 @@ class Limits:
         return cls(
             described.lower,
             described.upper,
-            np.array([joint.rated_torque for joint in joints]),
+            rated_torques(arm),
             np.array([joint.max_torque for joint in joints]),
             np.array([joint.max_velocity for joint in joints]),
         )

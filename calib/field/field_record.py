@@ -5,13 +5,9 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from calib.field.field_fit import FieldFit
-from calib.field.rows import FieldRows
-from calib.install.plausibility import FEWEST, worse_by
 from calib.records.records import Array, CalibrationRecord, JointCalibration, Parameter, matrix, provenance
 
 PAIR: tuple[Parameter, Parameter] = ("gain", "offset")
-BLOCK = 24
-"""Neighbouring rows that are held out together: they are alike."""
 
 
 def field_record(
@@ -35,33 +31,6 @@ def field_record(
         parent=None if before is None else before.id,
         note=note,
     )
-
-
-def check_field_heldout(rows: FieldRows, fit: FieldFit, before: CalibrationRecord) -> None:
-    """Raise Refused where rows left out of it are predicted worse than with the pairs in force.
-
-    Every joint's line through the model torque is drawn on every second block of rows and tried on the others.
-    """
-    block = np.arange(len(rows.torque)) // min(BLOCK, max(len(rows.torque) // 6, 1)) % 2
-    gain, offset = before.values("gain"), before.values("offset")
-    for j, name in enumerate(fit.names):
-        if np.isnan(fit.gain[j]) or np.isnan(gain[j]) or np.isnan(offset[j]):
-            continue
-        counted = np.isfinite(rows.torque[:, j]) & np.isfinite(fit.torque[:, j])
-        new, old = [], []
-        for held in (0, 1):
-            train, test = counted & (block != held), counted & (block == held)
-            if train.sum() < FEWEST or not test.any():
-                continue
-            line = np.polyfit(fit.torque[train, j], rows.torque[train, j], 1)
-            new.append(rows.torque[test, j] - np.polyval(line, fit.torque[test, j]))
-            old.append(rows.torque[test, j] - gain[j] * fit.torque[test, j] - offset[j])
-        ratio = worse_by(np.concatenate(new), np.concatenate(old)) if new else None
-        if ratio is not None:
-            raise Refused(
-                f"{name}: rows left out of the fit are {ratio:.2f} times as far off with the new pair as with record"
-                f" {before.id}: they do not agree with one another; nothing was written"
-            )
 
 
 def _joint(name: str, j: int, fit: FieldFit, before: CalibrationRecord | None) -> JointCalibration:

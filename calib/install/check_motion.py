@@ -95,7 +95,7 @@ class CheckMotion:
         """Whether some controller does not send what its new pair makes of the old reading."""
         assert self._before is not None
         for j, name in enumerate(self._names):
-            expected = (self._before.torque[:, j] * old[j].gain + old[j].offset - new[j].offset) / new[j].gain
+            expected = new[j].invert(old[j].apply(self._before.torque[:, j]))
             away = float(np.mean(rows.torque[:, j] - expected))
             if abs(away) > FLOOR * self._limits.rated[j]:
                 return f"{name}: sends {away:+.3f} N·m more than its new pair makes of the same readings"

@@ -13,6 +13,7 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, FiniteFloat, V
 
 from armlink.arm_file import ArmFile, describe
 from armlink.errors import BadInput, Refused
+from armlink.torque_calibration import UNKNOWN, TorqueCalibration
 
 Array = npt.NDArray[np.float64]
 Matrix = tuple[tuple[FiniteFloat, ...], ...]
@@ -102,6 +103,12 @@ class JointCalibration(_Frozen):
             raise ValueError(f"joint {self.name}: a gain of 0 is not a sensor")
         return self
 
+    def torque_calibration(self, missing: TorqueCalibration[float] = UNKNOWN) -> TorqueCalibration[float]:
+        """Gain and offset of the torque sensor, from `missing` where they are not identifiable."""
+        return TorqueCalibration(
+            missing.gain if self.gain is None else self.gain, missing.offset if self.offset is None else self.offset
+        )
+
 
 class CalibrationRecord(Record):
     """Sensor gains and offsets of all joints, base to tip."""
@@ -125,6 +132,20 @@ class CalibrationRecord(Record):
         """One parameter of all joints (n,), `missing` where it is not identifiable."""
         found = [getattr(joint, parameter) for joint in self.joints]
         return np.array([missing if value is None else value for value in found])
+
+    def torque_calibration(
+        self, missing: TorqueCalibration[float] | TorqueCalibration[Array] = UNKNOWN
+    ) -> TorqueCalibration[Array]:
+        """Gains and offsets of all torque sensors (n,), from `missing` where they are not identifiable."""
+        gain, offset = self.values("gain"), self.values("offset")
+        return TorqueCalibration(
+            np.where(np.isnan(gain), missing.gain, gain), np.where(np.isnan(offset), missing.offset, offset)
+        )
+
+    def is_installed(self, held: Sequence[TorqueCalibration[float]]) -> bool:
+        """Whether controllers that hold `held`, joint by joint, hold this record, as REAL32 keeps it."""
+        pairs = zip(self.joints, held, strict=True)
+        return all(joint.torque_calibration(now).matches(now) for joint, now in pairs)
 
     def std(self, parameter: Parameter) -> Array:
         """Standard deviations of one parameter of all joints (n,), NaN where it was not estimated."""

@@ -43,7 +43,7 @@ class ControllerWrite:
     by: str
     stage: str
     body: dict[str, Any]
-    """begun: `before`, what each controller held; undone: `reason`."""
+    """begun: `before` (what each controller held), `reason`, `gates`; undone: `reason`."""
 
 
 class RecordStore:
@@ -78,21 +78,11 @@ class RecordStore:
             raise Refused(f"no record {record_id} in {self.url}; armlink history ARM lists those that there are")
         return parse_record(json.loads(body), f"record {record_id}")
 
-    def activate(
-        self, record_id: str, arm: ArmFile, by: str, reason: str, finishes: ControllerWrite | None = None
-    ) -> Activation:
-        """Make a kept record the current one of its kind; raises Refused if it is of another arm.
-
-        `finishes` is the journal's write to the controllers that ends well with it, in the same transaction.
-        """
+    def activate(self, record_id: str, arm: ArmFile, by: str, reason: str) -> Activation:
+        """Make a kept record the current one of its kind; raises Refused if it is of another arm."""
         record = self.get(record_id).require(arm)
-        row = {"record": record.id, "kind": record.kind, "arm": arm.name, "serial": arm.serial, "by": by}
-        row |= {"reason": reason, "at": _now()}
         with transaction(self._engine) as connection:
-            number = connection.execute(ACTIVATIONS.insert().values(row).returning(ACTIVATIONS.c.number)).scalar_one()
-            if finishes is not None:
-                connection.execute(WRITES.insert().values(_write_row(finishes, arm, record.id, "finished", {})))
-        return Activation(number, record.id, record.kind, row["at"], by, reason)
+            return _activate(connection, record, arm, by, reason)
 
     def put(self, record: AnyRecord, arm: ArmFile, by: str, reason: str) -> str:
         """Append a record and make it current; returns its id."""
@@ -118,13 +108,16 @@ class RecordStore:
 
         Raises Refused where it is of another description of this arm: a changed arm needs a new calibration.
         """
-        wanted = kind.model_fields["kind"].default
-        log = [line for line in self.activations(arm) if line.kind == wanted]
-        if not log:
+        found = self._current_id(kind.model_fields["kind"].default, arm)
+        if found is None:
             return None
-        record = self.get(log[-1].record).require(arm)
+        record = self.get(found).require(arm)
         assert isinstance(record, kind)
         return record
+
+    def _current_id(self, kind: str, arm: ArmFile) -> str | None:
+        log = [line.record for line in self.activations(arm) if line.kind == kind]
+        return log[-1] if log else None
 
     def activations(self, arm: ArmFile) -> list[Activation]:
         """The activation log of this arm (name and serial), oldest first."""
@@ -142,13 +135,35 @@ class RecordStore:
             found = connection.execute(wanted.order_by(rows.created, rows.id)).all()
         return [parse_record(json.loads(body), f"record {record_id}") for record_id, body in found]
 
-    def begin_write(self, record_id: str, arm: ArmFile, by: str, before: Sequence[dict[str, Any]]) -> ControllerWrite:
-        """Note, before any controller is touched, what each holds: what a write that is killed is undone by."""
-        line = ControllerWrite(0, record_id, _now(), by, "begun", {"before": list(before)})
+    def begin_write(
+        self, record_id: str, arm: ArmFile, by: str, before: Sequence[dict[str, Any]], *, reason: str, gates: str
+    ) -> ControllerWrite:
+        """Note, before any controller is touched, what each holds: an interrupted write is undone by that."""
+        body = {"before": list(before), "reason": reason, "gates": gates}
+        line = ControllerWrite(0, record_id, _now(), by, "begun", body)
         with transaction(self._engine) as connection:
             row = _write_row(line, arm, record_id, line.stage, line.body)
             number = connection.execute(WRITES.insert().values(row).returning(WRITES.c.number)).scalar_one()
         return replace(line, number=number)
+
+    def finish_write(self, line: ControllerWrite, arm: ArmFile) -> None:
+        """End a write well and make its record current, unless it is already; both or neither."""
+        record, current = self.get(line.record), self._current_id("calibration", arm)
+        with transaction(self._engine) as connection:
+            if record.id != current:
+                _activate(connection, record, arm, line.by, str(line.body["reason"]))
+            connection.execute(WRITES.insert().values(_write_row(line, arm, record.id, "finished", {})))
+
+    def last_write(self, arm: ArmFile) -> ControllerWrite | None:
+        """The newest write to this arm's controllers that ended well, as it was begun; None if there is none."""
+        begun: ControllerWrite | None = None
+        last: ControllerWrite | None = None
+        for line in self.writes(arm):
+            if line.stage == "begun":
+                begun = line
+            elif line.stage == "finished":
+                last = begun
+        return last
 
     def undo_write(self, line: ControllerWrite, arm: ArmFile, reason: str) -> None:
         """Note that the controllers hold again what they held before that write."""
@@ -193,6 +208,13 @@ def export_yaml(record: Record, path: Path) -> None:
 
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def _activate(connection: sa.Connection, record: AnyRecord, arm: ArmFile, by: str, reason: str) -> Activation:
+    row = {"record": record.id, "kind": record.kind, "arm": arm.name, "serial": arm.serial, "by": by}
+    row |= {"reason": reason, "at": _now()}
+    number = connection.execute(ACTIVATIONS.insert().values(row).returning(ACTIVATIONS.c.number)).scalar_one()
+    return Activation(number, record.id, record.kind, row["at"], by, reason)
 
 
 def _write_row(line: ControllerWrite, arm: ArmFile, record: str, stage: str, body: dict[str, Any]) -> dict[str, Any]:

@@ -9,8 +9,8 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from calib.arm.kinematics import gcomp_arm
+from calib.fit.heldout import heldout_scores
 from calib.fit.sensor_fit import SensorFit
-from calib.install.plausibility import heldout_scores
 from calib.records.compare import differences
 from calib.records.records import Array, CalibrationRecord, Parameter
 from calib.report.figures import before_after_figure, joint_figure, left_out_figure, sweep_rows, sweeps_of

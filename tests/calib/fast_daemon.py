@@ -96,13 +96,12 @@ class FastDaemon:
             float(self.fast.held_gain[joint]), float(self.fast.held_offset[joint]), self.ids[joint], 0, 0
         )
 
-    def write_calibration(
-        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
-    ) -> Calibration:
+    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
         self.sdo.append(f"write {joint}")
         self.on_write(joint)
-        self.fast.held_gain[joint], self.fast.held_offset[joint] = np.float32(gain), np.float32(offset)
-        self.ids[joint] = record_id
+        self.fast.held_gain[joint] = np.float32(calibration.gain)
+        self.fast.held_offset[joint] = np.float32(calibration.offset)
+        self.ids[joint] = calibration.record_id
         return self.read_calibration(joint)
 
     def sweep(self, poses: int, seed: int) -> Reply | None:

@@ -1,0 +1,30 @@
+"""Held-out data in the field: rows left out, predicted by a line through the others and by the record before."""
+
+import numpy as np
+
+from calib.field.field_fit import FieldFit
+from calib.field.rows import FieldRows
+from calib.fit.heldout import FEWEST
+from calib.records.records import Array, CalibrationRecord
+
+BLOCK = 24
+"""Neighbouring rows that are held out together, since they are alike: six seconds of a recording."""
+
+
+def heldout_errors(rows: FieldRows, fit: FieldFit, before: CalibrationRecord) -> tuple[Array, Array]:
+    """Errors (K, n) [N·m] of held-out rows, by a new pair and by the record before; NaN where none counts.
+
+    Every joint's line through the model torque is drawn on every second block of rows and tried on the others.
+    """
+    block = np.arange(len(rows.torque)) // min(BLOCK, max(len(rows.torque) // 6, 1)) % 2
+    old = rows.torque - before.torque_calibration().apply(fit.torque)
+    new = np.full_like(old, np.nan)
+    counted = np.isfinite(old) & np.isfinite(fit.gain)
+    for j in range(old.shape[1]):
+        for held in (0, 1):
+            train, test = counted[:, j] & (block != held), counted[:, j] & (block == held)
+            if train.sum() < FEWEST:
+                continue
+            line = np.polyfit(fit.torque[train, j], rows.torque[train, j], 1)
+            new[test, j] = rows.torque[test, j] - np.polyval(line, fit.torque[test, j])
+    return new, old
