@@ -1,5 +1,6 @@
 """Torque sensor calibration: reading = gain · torque + offset, of one joint or of all joints of an arm."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Generic, TypeVar, overload
 
@@ -54,6 +55,13 @@ class TorqueCalibration(Generic[V]):
     def matches(self: "TorqueCalibration[float]", held: "TorqueCalibration[float]") -> bool:
         """Whether `held`, read from a controller, is this one as REAL32 keeps it; never with NaN."""
         return same_real32(self.gain, held.gain) and same_real32(self.offset, held.offset)
+
+
+def stack(calibrations: Iterable[TorqueCalibration[float]]) -> TorqueCalibration[Array]:
+    """Calibrations of single joints as one of n joints."""
+    pairs = [(each.gain, each.offset) for each in calibrations]
+    gain, offset = np.array(pairs, dtype=np.float64).reshape(-1, 2).T.copy()
+    return TorqueCalibration(gain, offset)
 
 
 def same_real32(wanted: float, found: float) -> bool:

@@ -75,15 +75,15 @@ def _rows(
     """Rows of all recordings and sweeps, and the SHA-256 of each."""
     import hashlib
 
-    import numpy as np
-
     from armlink.errors import BadInput
     from armlink.recording.recording import load_recording
+    from armlink.torque_calibration import UNCALIBRATED, stack
     from calib.field.rows import join, rows_of_recording, rows_of_sweeps
     from calib.sweep.dataset import load_data
 
     n = len(arm_file.joint_names)
-    gain, offset = (np.ones(n), np.zeros(n)) if held is None else (held.values("gain", 1.0), held.values("offset", 0.0))
+    blank = stack([UNCALIBRATED] * n)
+    installed = blank if held is None else held.torque_calibration(blank)
     parts, sources = [], {}
     for number, path in enumerate(data):
         if path.is_dir():
@@ -94,7 +94,7 @@ def _rows(
         recording = load_recording(path)
         if recording.n != n:
             raise BadInput(f"{path}: {recording.n} joints, but {arm_file.name} has {n}")
-        parts.append(rows_of_recording(recording, gain, offset, number, str(path)))
+        parts.append(rows_of_recording(recording, installed, number, str(path)))
         sources[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
     return join(parts), sources
 

@@ -75,7 +75,7 @@ def fit_field(arm: ArmFile, rows: FieldRows, gravity: GravityRecord, calibration
     n, q = belief.arm.n, rows.position * belief.position_gain + belief.position_offset
     if not np.isfinite(rows.torque).any():
         raise BadInput("no torque reading counts")
-    gain, sigma = belief.installed[0], rows.sigma
+    gain, sigma = belief.installed.gain, rows.sigma
     noise, prior = sigma, belief.prior(np.ones(n))
     for _ in range(ROUNDS):
         columns = field_columns(belief, rows, q, gain)
@@ -85,7 +85,7 @@ def fit_field(arm: ArmFile, rows: FieldRows, gravity: GravityRecord, calibration
         gain, noise = solved.value[:n], sigma * np.maximum(factor, 1.0)
     unseen = np.sqrt(np.diag(solved.covariance)[:n]) > GAIN_STD * np.abs(gain)
     if unseen.any():
-        columns = field_columns(belief, rows, q, np.where(unseen, belief.installed[0], gain))
+        columns = field_columns(belief, rows, q, np.where(unseen, belief.installed.gain, gain))
         solved = solve(columns, rows.torque, noise, belief.prior(np.where(unseen, DRIFT, 1.0)))
     if calibration is not None:
         _refuse_payload(belief, rows, q, noise, solved.chi2)
@@ -120,10 +120,10 @@ def _correlation(residual: Array, series: npt.NDArray[np.int64]) -> Array:
 def _refuse_payload(belief: Belief, rows: FieldRows, q: Array, noise: Array, chi2: float) -> None:
     """Raise Refused where the installed pairs do not fit, and a payload with them does as well as new pairs do."""
     n = belief.arm.n
-    base = field_columns(belief, rows, q, belief.installed[0])
+    base = field_columns(belief, rows, q, belief.installed.gain)
     held = belief.prior_installed()
     fixed, by_point = payload_columns(belief.arm)
-    load = gravity_regressor(belief.arm, q) @ np.column_stack([fixed, by_point]) * belief.installed[0][:, None]
+    load = gravity_regressor(belief.arm, q) @ np.column_stack([fixed, by_point]) * belief.installed.gain[:, None]
     with_load = solve(
         np.concatenate([base, load], axis=2),
         rows.torque,

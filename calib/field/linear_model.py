@@ -5,10 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, stack
+from calib.arm.drive_limits import rated_torques
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.field.rows import FieldRows
-from calib.records.records import PARAMETERS, Array, CalibrationRecord, GravityRecord
+from calib.records.records import Array, CalibrationRecord, GravityRecord
 from gcomp.arm.arm import Arm
 from gcomp.gravity.torque import gravity_regressor, gravity_stiffness
 
@@ -30,28 +32,26 @@ class Belief:
     position_gain: Array
     position_offset: Array
     position_std: Array
-    installed: tuple[Array, Array]
-    """Gain and offset of the record in force (n,)."""
+    installed: TorqueCalibration[Array]
+    """By the record in force (n,)."""
     spread: tuple[Array, Array] | None
     """Their standard deviations (n,), NaN where not known; None where there is no record."""
 
     def prior(self, gain_share: Array) -> tuple[Array, Array]:
         """(mean, std) of all parameters with gains around those in force by a share of them, offsets unknown."""
-        gain, offset = self.installed
-        return self._prior(gain_share * np.abs(gain), 10 * self.rated, (gain, offset))
+        return self._prior(gain_share * np.abs(self.installed.gain), 10 * self.rated)
 
     def prior_installed(self) -> tuple[Array, Array]:
         """(mean, std) with gains and offsets as the record in force has them."""
-        gain, offset = self.installed
-        of_gain, of_offset = self.spread or (np.zeros_like(gain), np.zeros_like(offset))
-        tight = np.fmax(of_gain, 1e-3 * np.abs(gain)), np.fmax(of_offset, 1e-3 * self.rated)
-        return self._prior(*tight, (gain, offset))
+        of_gain, of_offset = self.spread or (np.zeros_like(self.rated), np.zeros_like(self.rated))
+        tight = np.fmax(of_gain, 1e-3 * np.abs(self.installed.gain)), np.fmax(of_offset, 1e-3 * self.rated)
+        return self._prior(*tight)
 
-    def _prior(self, gain_std: Array, offset_std: Array, mean: tuple[Array, Array]) -> tuple[Array, Array]:
+    def _prior(self, gain_std: Array, offset_std: Array) -> tuple[Array, Array]:
         others = self.root.shape[1] + len(self.rated)
         zeros = np.zeros(len(self.rated) + others)
         return (
-            np.concatenate([*mean, zeros]),
+            np.concatenate([self.installed.gain, self.installed.offset, zeros]),
             np.concatenate([gain_std, offset_std, HYSTERESIS * self.rated, np.ones(others)]),
         )
 
@@ -93,20 +93,17 @@ def belief_of(arm: ArmFile, gravity: GravityRecord, calibration: CalibrationReco
     if calibration is not None:
         calibration.require(arm)
         zero_std = np.where(np.isnan(calibration.std("position_offset")), zero_std, calibration.std("position_offset"))
-    values_of = {}
-    for name in PARAMETERS:
-        default = 1.0 if name.endswith("gain") else 0.0
-        values_of[name] = np.full(n, default) if calibration is None else calibration.values(name, default)
+    blank = stack([UNCALIBRATED] * n)
     spread = None if calibration is None else (calibration.std("gain"), calibration.std("offset"))
     return Belief(
         arm=described,
-        rated=np.array([joint.rated_torque for joint in arm.require_link().joints]),
+        rated=rated_torques(arm),
         beta=np.array(gravity.beta),
         root=np.hstack([root, unknown]),
-        position_gain=values_of["position_gain"],
-        position_offset=values_of["position_offset"],
+        position_gain=np.ones(n) if calibration is None else calibration.values("position_gain", 1.0),
+        position_offset=np.zeros(n) if calibration is None else calibration.values("position_offset", 0.0),
         position_std=np.maximum(zero_std, 1e-6),
-        installed=(values_of["gain"], values_of["offset"]),
+        installed=blank if calibration is None else calibration.torque_calibration(blank),
         spread=spread,
     )
 

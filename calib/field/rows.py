@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording
+from armlink.torque_calibration import TorqueCalibration
 from calib.fit.rows import fit_rows
 from calib.sweep.dataset import SweepData
 
@@ -41,17 +42,17 @@ class FieldRows:
     """Which recording or data set a row is of (K,)."""
 
 
-def rows_of_recording(recording: Recording, gain: Array, offset: Array, number: int, source: str) -> FieldRows:
+def rows_of_recording(recording: Recording, held: TorqueCalibration[Array], number: int, source: str) -> FieldRows:
     """Windows of a recording in which all joints move slowly and steadily.
 
-    `gain` and `offset` (n,) are the pairs that the controllers held: what they sent is turned back to the sensors' own
-    readings. Raises BadInput where there is no joint torque, or nothing slow enough.
+    `held` (n,) is what the controllers held: what they sent is turned back into the sensors' own readings. Raises
+    BadInput if there is no joint torque, or nothing slow enough.
     """
     if recording.torque is None:
         raise BadInput(f"{source}: no joint torque (columns tau_1 …): calibration needs the torque sensors' readings")
     keep = np.isfinite(recording.position).all(axis=1) & np.isfinite(recording.torque).all(axis=1)
     t, position = recording.t[keep], recording.position[keep]
-    torque = recording.torque[keep] * gain + offset
+    torque = held.apply(recording.torque[keep])
     windows = _windows(t)
     if not windows:
         raise BadInput(f"{source}: no {WINDOW} s with {FEWEST_SAMPLES} samples of every joint in it")

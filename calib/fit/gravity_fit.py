@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
+from armlink.torque_calibration import TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
 from calib.fit.rows import FitRows, fit_rows
 from calib.fit.sensor_fit import SensorFit
@@ -89,7 +90,8 @@ def calibrated(rows: FitRows, calibration: Parameters, which: Flags) -> Readings
     """Rows as true angles [rad] and torques [N·m] by the calibration, own sensors of swept joints alone."""
     readings = rows.readings
     own = rows.own
-    torque = np.where(own, (readings.torque - calibration.offset) / calibration.gain, np.nan)
+    sensors = TorqueCalibration(calibration.gain, calibration.offset)
+    torque = np.where(own, sensors.invert(readings.torque), np.nan)
     position = readings.position * calibration.position_gain + calibration.position_offset
     sigma = readings.sigma / np.abs(calibration.gain)
     return Readings(position, torque, sigma, readings.load).rows(which & own.any(axis=1))

@@ -141,6 +141,4 @@ def _rounding(position: Array, resolution: Array) -> Array:
 
 def _raw(data: SweepData) -> Array:
     """Torque readings (K, n) as the sensor gives them, the controllers' own calibration taken out [N·m]."""
-    gain, offset = np.array(data.manifest.installed_gain), np.array(data.manifest.installed_offset)
-    raw: Array = data.array("torque") * gain + offset
-    return raw
+    return data.manifest.installed.apply(data.array("torque"))

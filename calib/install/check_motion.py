@@ -113,9 +113,7 @@ class CheckMotion:
         return f"{self._names[j]}: in the check motion {after[j]:.3f} N·m RMS against the model, {before[j]:.3f} before"
 
     def _rms(self, rows: CheckRows, beta: Array) -> Array:
-        record = self._record
-        q = rows.position * record.values("position_gain", 1.0) + record.values("position_offset", 0.0)
-        residual: Array = rows.torque - gravity_torque(gcomp_arm(self._arm), beta, q)
+        residual: Array = rows.torque - gravity_torque(gcomp_arm(self._arm), beta, self._record.angle(rows.position))
         rms: Array = np.sqrt(np.mean(residual**2, axis=0))
         return rms
 

@@ -48,7 +48,7 @@ class AfterWrite:
     ) -> None:
         """`old` and `new` are what the controllers of the joints written held before and hold now."""
         self._arm, self._beta = gcomp_arm(arm), np.array(gravity.require(arm).beta)
-        self._position = record.values("position_gain", 1.0), record.values("position_offset", 0.0)
+        self._record = record
         self._rests = RestDetector(len(record.joints), ObserverConfig())
         self._joints, self._names = list(old), [record.joints[j].name for j in old]
         self._pairs = [(old[j], new[j]) for j in old]
@@ -61,8 +61,7 @@ class AfterWrite:
         row = self._rests.handle(t, position, torque)
         if row is None:
             return None
-        q = row.position * self._position[0] + self._position[1]
-        model = gravity_torque(self._arm, self._beta, q[None])[0, self._joints].tolist()
+        model = gravity_torque(self._arm, self._beta, self._record.angle(row.position)[None])[0, self._joints].tolist()
         sent = row.torque[self._joints].tolist()
         as_before = [old.invert(new.apply(now)) for (old, new), now in zip(self._pairs, sent, strict=True)]
         self._before.append([value - at for value, at in zip(as_before, model, strict=True)])

@@ -142,6 +142,11 @@ class CalibrationRecord(Record):
             np.where(np.isnan(gain), missing.gain, gain), np.where(np.isnan(offset), missing.offset, offset)
         )
 
+    def angle(self, reading: Array) -> Array:
+        """Joint angles (…, n) [rad] from position readings, which count as exact where they are not calibrated."""
+        angle: Array = reading * self.values("position_gain", 1.0) + self.values("position_offset", 0.0)
+        return angle
+
     def is_installed(self, held: Sequence[TorqueCalibration[float]]) -> bool:
         """Whether controllers that hold `held`, joint by joint, hold this record, as REAL32 keeps it."""
         pairs = zip(self.joints, held, strict=True)

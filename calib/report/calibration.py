@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
 from calib.fit.heldout import heldout_scores
 from calib.fit.sensor_fit import SensorFit
@@ -94,14 +95,10 @@ def _comparison(done: Calibrated) -> Section:
     n = len(names)
     if before is None:
         manifest = done.data[0].manifest
-        old, label = (
-            (np.array(manifest.installed_gain), np.array(manifest.installed_offset)),
-            "the controllers' pairs",
-        )
+        old, label = manifest.installed, "the controllers' pairs"
     else:
-        old, label = (before.values("gain", 1.0), before.values("offset", 0.0)), f"record {before.id}"
-    new = _or(record.values("gain"), old[0]), _or(record.values("offset"), old[1])
-    rms = [_rms_of_pair(done, *pair) for pair in (old, new)]
+        old, label = before.torque_calibration(UNCALIBRATED), f"record {before.id}"
+    rms = [_rms_of_pair(done, pair) for pair in (old, record.torque_calibration(old))]
     shown = np.isfinite(rms[0]) & np.isfinite(rms[1])
     text = (
         "Calibrated torque less model torque over all readings without load: with the pairs in force until now, and"
@@ -137,14 +134,14 @@ def _changes(before: CalibrationRecord, record: CalibrationRecord) -> ReportTabl
     return ReportTable(header, rows, f"Against record {before.id} of {before.created:%Y-%m-%d %H:%M} UTC.", texts=2)
 
 
-def _rms_of_pair(done: Calibrated, gain: Array, offset: Array) -> Array:
+def _rms_of_pair(done: Calibrated, pair: TorqueCalibration[Array]) -> Array:
     """RMS (n,) of torque by a pair less model over own readings without load [N·m]; NaN where there is none."""
     fit, rows = done.fit, done.fit.rows
     complete = fit.fit.complete
     counted = np.isfinite(rows.readings.torque) & (rows.readings.load == 0)[:, None]
     q = rows.readings.position * complete.position_gain + complete.position_offset
     model = gravity_torque(gcomp_arm(done.arm), complete.beta, q)
-    left = np.where(counted, (rows.readings.torque - offset) / gain - model, np.nan)
+    left = np.where(counted, pair.invert(rows.readings.torque) - model, np.nan)
     total = np.where(counted, left, 0.0)
     rms: Array = np.sqrt((total**2).sum(axis=0) / np.maximum(counted.sum(axis=0), 1))
     return np.where(counted.any(axis=0), rms, np.nan)
@@ -200,7 +197,8 @@ def _left_out(done: Calibrated) -> Section:
     score = heldout_scores(done.record, done.arm, rows, refit=True)
     own = rows.own & (rows.readings.load == 0)[:, None]
     complete = fit.fit.complete
-    sensor = np.where(own, (rows.readings.torque - complete.offset) / complete.gain, np.nan)
+    pair = TorqueCalibration(complete.gain, complete.offset)
+    sensor = np.where(own, pair.invert(rows.readings.torque), np.nan)
     model = sensor - np.where(own, score * rows.readings.sigma, np.nan) / complete.gain
     text = (
         "Torque at steps that were left out (every second step of each sweep, then the others): the model fitted"
@@ -209,11 +207,6 @@ def _left_out(done: Calibrated) -> Section:
     return Section(
         "Model against sensor (the paper's Figure 6)", paragraph(text), [left_out_figure(fit.names, sensor, model)]
     )
-
-
-def _or(found: Array, held: Array) -> Array:
-    """What was found, and what is held where nothing was."""
-    return np.where(np.isnan(found), held, found)
 
 
 def _interval(value: float, half: float) -> str:
