@@ -17,7 +17,7 @@ REAL32_STEP = 1e-6
 class TorqueCalibration(Generic[V]):
     """Gain and offset of one torque sensor (floats) or of n sensors ((n,) arrays, applied along the last axis).
 
-    With v the reading of the sensor and τ the torque [N·m]: v = gain · τ + offset (docs/theory.md, section 4). A joint
+    With v the reading of the sensor and τ the torque [N·m]: v = gain · τ + offset (docs/theory.md, section 1.4). A joint
     controller that holds it sends τ = (v − offset) / gain. NaN marks an unknown value and passes through.
     """
 
@@ -42,18 +42,18 @@ class TorqueCalibration(Generic[V]):
         return (reading - self.offset) / self.gain
 
     def compose(self, change: "TorqueCalibration[V]") -> "TorqueCalibration[V]":
-        """The calibration v = self(change(τ)): the new one of a sensor calibrated by `self` that changed by `change`.
+        """The calibration v = self(change(τ)) of a sensor that was calibrated by `self` and has changed by `change`.
 
-        A controller that holds `self` then sends change(τ) instead of τ; one that holds the result sends τ again.
+        A controller with the calibration `self` sends change(τ) instead of τ; with the result it sends τ again.
         """
         return TorqueCalibration(self.gain * change.gain, self.offset + self.gain * change.offset)
 
     def relative_to(self, held: "TorqueCalibration[V]") -> "TorqueCalibration[V]":
-        """What a controller that holds `held` makes of this sensor: it sends result(τ). Inverse of `compose`."""
+        """The change c(τ) that a controller with the calibration `held` sends for this sensor; inverse of `compose`."""
         return TorqueCalibration(self.gain / held.gain, (self.offset - held.offset) / held.gain)
 
     def matches(self: "TorqueCalibration[float]", held: "TorqueCalibration[float]") -> bool:
-        """Whether `held`, read from a controller, is this one as REAL32 keeps it; never with NaN."""
+        """Whether `held`, read from a controller, equals this in REAL32; False with NaN."""
         return same_real32(self.gain, held.gain) and same_real32(self.offset, held.offset)
 
 
@@ -65,11 +65,11 @@ def stack(calibrations: Iterable[TorqueCalibration[float]]) -> TorqueCalibration
 
 
 def same_real32(wanted: float, found: float) -> bool:
-    """Whether a value read from a controller is the one written, as REAL32 keeps it."""
+    """Whether a value read from a controller equals the one wanted in REAL32."""
     return abs(found - wanted) <= REAL32_STEP * max(1.0, abs(wanted))
 
 
 UNCALIBRATED = TorqueCalibration(1.0, 0.0)
-"""What a new controller holds: it sends the sensor's own reading."""
+"""The calibration of a new controller, which sends the sensor's own reading."""
 UNKNOWN = TorqueCalibration(float("nan"), float("nan"))
-"""Stands for values that no data determine."""
+"""Gain and offset not identifiable."""

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from calib.commands.options import Bus, Check, Flash, JsonFile, Replaced, Store
+from calib.commands.options import Arm, Bus, Check, Flash, JsonFile, Replaced, Store
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def recalibrate(
-    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
+    arm: Arm,
     data: Annotated[list[Path], typer.Argument(help="Recordings of slow motion or rests, or sweep directories.")],
     held: Annotated[
         Literal["record", "raw"],
@@ -32,9 +32,9 @@ def recalibrate(
     store: Store = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Find gains and offsets against the current gravity record, and keep them; --apply also makes them current.
+    """Find gains and offsets from the current gravity record, and keep them; --apply also makes them current.
 
-    The arm carries nothing, and every joint moves slowly (below 0.1 rad/s) or rests, in both directions.
+    The arm must carry nothing, and every joint must move slowly (below 0.1 rad/s), in both directions, or rest.
 
     Example: armlink recalibrate sarcos slow.mcap --json -
     """
@@ -65,14 +65,14 @@ def recalibrate(
         apply_field(record, arm_file, records, rows, fit, np.array(gravity.beta), how)
     else:
         records.add(record)
-        typer.echo(f"record {record.id} is kept; the controllers hold what they held (--apply writes it)", err=True)
+        typer.echo(f"record {record.id} is kept, not written to the controllers (--apply does that)", err=True)
     write_json(json_file, _answer(fit, record, gravity.id, apply))
 
 
 def _rows(
     arm_file: "ArmFile", data: list[Path], held: "CalibrationRecord | None"
 ) -> "tuple[FieldRows, dict[str, str]]":
-    """Rows of all recordings and sweeps, and the SHA-256 of each."""
+    """Rows of all recordings and sweeps, and the SHA-256 of each source."""
     import hashlib
 
     from armlink.errors import BadInput
@@ -129,7 +129,7 @@ def _show(fit: "FieldFit") -> None:
     print_intervals("Sensors in the field, ± half of the 95 % interval", fit.names, columns)
     lines = [f"{joint} {parameter}: {reason}" for (joint, parameter), reason in fit.reasons.items()]
     lines.append(
-        f"a factor common to all gains is known to ± {1.96 * fit.common_scale_std:.2%} only (within the intervals):"
-        " these readings cannot tell it from the scale of the gravity record"
+        f"a factor common to all gains is known to ± {1.96 * fit.common_scale_std:.2%} only (within the intervals): in"
+        " these readings it looks the same as the scale of the gravity record"
     )
     print_lines(lines)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calib.commands.options import Bus, Check, Replaced, Store
+from calib.commands.options import Arm, Bus, Check, Replaced, Store
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def rollback(
-    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
+    arm: Arm,
     to: Annotated[str, typer.Option(help="Id of a record that was current before (armlink history ARM).")],
     reason: Annotated[str, typer.Option(help="Why; kept in the log.")] = "rollback",
     apply: Annotated[

@@ -1,4 +1,4 @@
-"""A calibration record out of a field fit: what the rows show is new, the rest is carried over from before."""
+"""Calibration record from a field fit: identified values are new, the others are carried over from the last record."""
 
 import numpy as np
 
@@ -13,10 +13,10 @@ PAIR: tuple[Parameter, Parameter] = ("gain", "offset")
 def field_record(
     arm: ArmFile, fit: FieldFit, before: CalibrationRecord | None, sources: dict[str, str]
 ) -> CalibrationRecord:
-    """The record of a fit; `before` is the one in force. Raises Refused where nothing at all was separated."""
+    """The record of a fit; `before` is the current one. Raises Refused if no value was identified."""
     if np.isnan(fit.gain).all() and np.isnan(fit.offset).all():
         first = next(iter(fit.reasons.items()))
-        raise Refused(f"no gain and no offset is determined; {first[0][0]} {first[0][1]}: {first[1]}")
+        raise Refused(f"no gain and no offset is identifiable; {first[0][0]} {first[0][1]}: {first[1]}")
     joints = tuple(_joint(name, j, fit, before) for j, name in enumerate(fit.names))
     names, covariance = _covariance(fit, before)
     carried = [f"{name} {parameter}" for name, parameter in fit.reasons]
@@ -41,8 +41,8 @@ def _joint(name: str, j: int, fit: FieldFit, before: CalibrationRecord | None) -
         found = float(getattr(fit, parameter)[j])
         values[parameter] = found if np.isfinite(found) else (None if old is None else getattr(old, parameter))
         if values[parameter] is None:
-            told = None if old is None else old.not_identifiable.get(parameter)
-            reasons[parameter] = told or fit.reasons[name, parameter]
+            known = None if old is None else old.not_identifiable.get(parameter)
+            reasons[parameter] = known or fit.reasons[name, parameter]
     for parameter, default in (("position_gain", 1.0), ("position_offset", 0.0)):
         values[parameter] = default if old is None else getattr(old, parameter)
     if old is not None:
@@ -54,7 +54,7 @@ def _joint(name: str, j: int, fit: FieldFit, before: CalibrationRecord | None) -
 
 
 def _covariance(fit: FieldFit, before: CalibrationRecord | None) -> tuple[tuple[str, ...], Array]:
-    """Names and covariance: the fit's pairs, and of the record before what was carried over, independent of them."""
+    """Names and covariance: of the fit's values, and, independent of them, of those carried over."""
     new = {f"{name}.{p}": (j, k) for j, name in enumerate(fit.names) for k, p in enumerate(PAIR)}
     new = {name: at for name, at in new.items() if np.isfinite(fit.covariance[at[0], at[1], at[1]])}
     old = () if before is None else tuple(name for name in before.covariance_of if name not in new)

@@ -1,4 +1,4 @@
-"""Held-out data in the field: rows left out, predicted by a line through the others and by the record before."""
+"""Held-out rows in the field, predicted by a fit without them and by the record before."""
 
 import numpy as np
 
@@ -8,13 +8,14 @@ from calib.fit.heldout import FEWEST
 from calib.records.records import Array, CalibrationRecord
 
 BLOCK = 24
-"""Neighbouring rows that are held out together, since they are alike: six seconds of a recording."""
+"""Rows that are held out together, since neighbours are correlated: six seconds of a recording."""
 
 
 def heldout_errors(rows: FieldRows, fit: FieldFit, before: CalibrationRecord) -> tuple[Array, Array]:
-    """Errors (K, n) [N·m] of held-out rows, by a new pair and by the record before; NaN where none counts.
+    """Errors (K, n) [N·m] of held-out rows with a new calibration and with the one before; NaN if they do not count.
 
-    Every joint's line through the model torque is drawn on every second block of rows and tried on the others.
+    For every joint a line of readings over model torque is fitted to every second block of rows and predicts the
+    others.
     """
     block = np.arange(len(rows.torque)) // min(BLOCK, max(len(rows.torque) // 6, 1)) % 2
     old = rows.torque - before.torque_calibration().apply(fit.torque)

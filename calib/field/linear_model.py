@@ -1,4 +1,4 @@
-"""The field calibration's linear problem: what is believed beforehand, its columns, and least squares with a prior."""
+"""Linear problem of the field calibration: prior, columns, and least squares with that prior."""
 
 from dataclasses import dataclass
 
@@ -15,14 +15,14 @@ from gcomp.arm.arm import Arm
 from gcomp.gravity.torque import gravity_regressor, gravity_stiffness
 
 HYSTERESIS = 0.01
-"""Standard deviation of f_i believed beforehand, as a share of rated torque."""
+"""Prior standard deviation of f_i, as a share of rated torque (docs/theory.md, section 4.3)."""
 UNKNOWN_MOMENT = 10.0
-"""Standard deviation of a mass moment that the gravity record could not determine [kg·m]."""
+"""Prior standard deviation of a mass moment that is not identifiable in the gravity record [kg·m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """What is known before the rows are looked at."""
+    """Prior knowledge, from the records."""
 
     arm: Arm
     rated: Array
@@ -33,16 +33,16 @@ class Belief:
     position_offset: Array
     position_std: Array
     installed: TorqueCalibration[Array]
-    """By the record in force (n,)."""
+    """The current record's (n,)."""
     spread: tuple[Array, Array] | None
-    """Their standard deviations (n,), NaN where not known; None where there is no record."""
+    """Its standard deviations of gain and offset (n,), NaN if unknown; None without a record."""
 
     def prior(self, gain_share: Array) -> tuple[Array, Array]:
-        """(mean, std) of all parameters with gains around those in force by a share of them, offsets unknown."""
+        """(mean, std) of all parameters: gains around the installed ones within a share of them, offsets unknown."""
         return self._prior(gain_share * np.abs(self.installed.gain), 10 * self.rated)
 
     def prior_installed(self) -> tuple[Array, Array]:
-        """(mean, std) with gains and offsets as the record in force has them."""
+        """(mean, std) of all parameters, gains and offsets as in the current record."""
         of_gain, of_offset = self.spread or (np.zeros_like(self.rated), np.zeros_like(self.rated))
         tight = np.fmax(of_gain, 1e-3 * np.abs(self.installed.gain)), np.fmax(of_offset, 1e-3 * self.rated)
         return self._prior(*tight)
@@ -67,7 +67,7 @@ class Solution:
 
 
 def solve(columns: Array, torque: Array, sigma: Array, prior: tuple[Array, Array]) -> Solution:
-    """Parameters (p,) of torque = columns @ parameters, columns (K, n, p), prior (mean, std); NaN is left out."""
+    """Parameters (p,) of torque = columns @ parameters, columns (K, n, p), prior (mean, std); NaN rows are left out."""
     counted = np.isfinite(torque)
     design = columns[counted] / sigma[counted][:, None]
     target = torque[counted] / sigma[counted]
@@ -82,7 +82,7 @@ def solve(columns: Array, torque: Array, sigma: Array, prior: tuple[Array, Array
 
 
 def belief_of(arm: ArmFile, gravity: GravityRecord, calibration: CalibrationRecord | None) -> Belief:
-    """From the records; raises Refused where one is of another arm."""
+    """From the records; raises Refused if one is of another arm."""
     described, n = gcomp_arm(arm), len(arm.joint_names)
     values, vectors = np.linalg.eigh(np.array(gravity.require(arm).covariance))
     root = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -109,7 +109,7 @@ def belief_of(arm: ArmFile, gravity: GravityRecord, calibration: CalibrationReco
 
 
 def field_columns(belief: Belief, rows: FieldRows, q: Array, gain: Array) -> Array:
-    """(K, n, p): by gain, offset, hysteresis of each joint, by β in units of its root, by position offsets [std]."""
+    """Columns (K, n, p): gains, offsets, hysteresis, β in units of its root, position offsets in units of their std."""
     n, each = belief.arm.n, np.eye(belief.arm.n)
     regressor = gravity_regressor(belief.arm, q)
     torque = regressor @ belief.beta

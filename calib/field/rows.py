@@ -1,4 +1,4 @@
-"""Rows for a calibration in the field: slow instants of a recording, or the readings of sweeps."""
+"""Rows for a field calibration: slow windows of a recording, or the readings of sweeps."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,36 +10,37 @@ from armlink.errors import BadInput
 from armlink.recording.recording import Recording
 from armlink.torque_calibration import TorqueCalibration
 from calib.fit.rows import fit_rows
+from calib.records.records import Array
 from calib.sweep.dataset import SweepData
 
-Array = npt.NDArray[np.float64]
-
 WINDOW = 0.25
-"""Samples are averaged over so long: one row [s]."""
+"""Length of a window, which is averaged to one row [s]."""
 FEWEST_SAMPLES = 3
+"""Samples of a window; its slope and scatter need as many."""
 SLOW = 0.1
-"""A window counts where no joint moves faster: centrifugal torque is then at most 0.1 N·m at 10 kg·m² [rad/s]."""
+"""Largest speed of any joint in a window that counts: centrifugal torque is then below 0.1 N·m at 10 kg·m² [rad/s]."""
 STEADY = 0.05
-"""And where no joint's speed changes faster [rad/s²]."""
+"""Largest change of any joint's speed [rad/s²] (docs/theory.md, section 6.1)."""
 MOVED = 0.004
-"""Way of a joint from which on its direction counts as changed [rad]."""
+"""Motion of a joint after which its direction counts as changed [rad]."""
 FEWEST_ROWS = 12
+"""Rows that a recording must have: three unknowns a joint, and some more for the scatter."""
 
 
 @dataclass(frozen=True, eq=False)
 class FieldRows:
-    """K static or slow rows of n joints, in time order; NaN torque where a sensor does not count."""
+    """K static or slow rows of n joints, in time order; NaN torque for a sensor that does not count."""
 
     position: Array
     """Position readings (K, n) [rad]."""
     torque: Array
-    """Torque as the sensors themselves read it, no controller's calibration in it (K, n) [N·m]."""
+    """Readings of the sensors themselves, the controllers' calibration removed (K, n) [N·m]."""
     sigma: Array
     """Standard deviation of a torque row (K, n) [N·m]."""
     direction: Array
-    """Sign of each joint's last motion (K, n); 0 where it has not moved yet."""
+    """Sign of each joint's last motion (K, n); 0 before the first."""
     series: npt.NDArray[np.int64]
-    """Which recording or data set a row is of (K,)."""
+    """Number of the recording or data set (K,)."""
 
 
 def rows_of_recording(recording: Recording, held: TorqueCalibration[Array], number: int, source: str) -> FieldRows:
@@ -55,7 +56,7 @@ def rows_of_recording(recording: Recording, held: TorqueCalibration[Array], numb
     torque = held.apply(recording.torque[keep])
     windows = _windows(t)
     if not windows:
-        raise BadInput(f"{source}: no {WINDOW} s with {FEWEST_SAMPLES} samples of every joint in it")
+        raise BadInput(f"{source}: no window of {WINDOW} s has {FEWEST_SAMPLES} samples of every joint")
     slopes = np.array([_slope(t[each], position[each]) for each in windows])
     middles = np.array([t[each].mean() for each in windows])
     change = np.abs(np.diff(slopes, axis=0)) / np.diff(middles)[:, None]
@@ -64,7 +65,7 @@ def rows_of_recording(recording: Recording, held: TorqueCalibration[Array], numb
     slow = (np.abs(slopes).max(axis=1) <= SLOW) & steady
     if slow.sum() < FEWEST_ROWS:
         raise BadInput(
-            f"{source}: {int(slow.sum())} instants of {WINDOW} s are slow enough, at least {FEWEST_ROWS} are needed:"
+            f"{source}: {int(slow.sum())} windows of {WINDOW} s are slow enough, at least {FEWEST_ROWS} are needed:"
             f" record rests, or motion below {SLOW} rad/s without jerks"
         )
     means = np.array([position[each].mean(axis=0) for each in windows])
@@ -81,11 +82,11 @@ def rows_of_recording(recording: Recording, held: TorqueCalibration[Array], numb
 
 
 def rows_of_sweeps(data: SweepData, number: int) -> FieldRows:
-    """The unloaded readings of a sweep data set; raises BadInput where a reference mass was attached."""
+    """The unloaded readings of a sweep data set; raises BadInput if a reference mass was attached."""
     if data.manifest.reference_mass > 0:
         raise BadInput(
-            f"{data.path}: swept with a reference mass of {data.manifest.reference_mass:g} kg: this takes the arm as"
-            " its gravity record knows it, without a mass (armlink calibrate takes both)"
+            f"{data.path}: swept with a reference mass of {data.manifest.reference_mass:g} kg: the field"
+            " calibration needs the arm without a mass (armlink calibrate takes both)"
         )
     rows = fit_rows([data])
     direction = np.zeros(rows.readings.position.shape)
@@ -102,13 +103,13 @@ def rows_of_sweeps(data: SweepData, number: int) -> FieldRows:
 
 
 def join(parts: Sequence[FieldRows]) -> FieldRows:
-    """All rows together."""
+    """Rows of several recordings and data sets as one."""
     names = ("position", "torque", "sigma", "direction", "series")
     return FieldRows(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def _windows(t: Array) -> list[slice]:
-    """Windows of WINDOW seconds with enough samples and no gap in them."""
+    """Windows of WINDOW seconds with enough samples and without gaps."""
     windows, begin = [], 0
     while begin < len(t):
         end = int(np.searchsorted(t, t[begin] + WINDOW))

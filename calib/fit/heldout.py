@@ -14,13 +14,13 @@ from gcomp.identify.readings import Readings
 from gcomp.identify.sensor_model import predict
 
 NOT_BY_CHANCE = 3.0
-"""Standard errors by which the held-out error must be larger to be called worse: once in 700 joints by chance."""
+"""Standard errors by which the held-out error must be larger to be called worse: by chance once in 740."""
 WORSE = 1.05
 """Ratio of held-out RMS, new over old, below which it is not worse."""
 FEWEST = 6
-"""Readings of a joint from which that is judged: fewer give no standard error to speak of."""
+"""Readings of a joint below which this is not judged: the standard error would be meaningless."""
 LOOSE = 0.2
-"""Prior of a gain that is estimated anew: it only fixes the scale where no mass does, which no prediction shows."""
+"""Prior standard deviation of gains in the refit: without a mass it fixes the scale, which no prediction depends on."""
 
 
 def worse_joint(new: Array, old: Array) -> tuple[int, float] | None:
@@ -43,10 +43,10 @@ def worse_by(new: Array, old: Array) -> float | None:
 def heldout_scores(
     record: CalibrationRecord, arm: ArmFile, rows: FitRows, refit: bool, beta: Array | None = None
 ) -> Array:
-    """Prediction errors (K, n) of held-out steps over their standard deviation; NaN where none counts.
+    """Prediction errors (K, n) of held-out steps over their standard deviation; NaN if they do not count.
 
-    Every second step of each sweep is held out, then the other half. With `refit` gains and offsets are estimated on
-    the remaining steps, else the record's are held; likewise mass moments unless `beta` (2n,) [kg·m] is given.
+    Every second step of each sweep is held out, then the other half. With `refit` gains and offsets are estimated from
+    the remaining steps, else they are the record's; likewise mass moments unless `beta` (2n,) [kg·m] is given.
     """
     described, score = gcomp_arm(arm), np.full(rows.readings.torque.shape, np.nan)
     known = {} if beta is None else {"beta": beta}

@@ -128,8 +128,8 @@ def check_heldout(
 ) -> None:
     """Raise GateRefused if held-out readings of a joint are predicted worse than by the old record.
 
-    New gains, offsets and mass moments are estimated on the other steps. The old record's pairs are held, and the mass
-    moments of `gravity` with them; without it those are estimated too.
+    New gains, offsets and mass moments are estimated from the other steps; the old record's gains and offsets are
+    fixed, and so are the mass moments of `gravity`; without it those are estimated too.
     """
     rows = fit_rows([each.require(arm) for each in data])
     beta = None if gravity is None else np.array(gravity.require(arm).beta)

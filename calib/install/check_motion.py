@@ -1,8 +1,8 @@
-"""The check after a calibration was written: a small motion before and after, and what is worse afterwards.
+"""Check of a write: the same small motion before and after it, and whether the readings are worse afterwards.
 
-Each joint goes at most `AMPLITUDE` from where it stands, all stay `MARGIN` from their stops, and the arm returns to
-where it was. Two things are judged: whether every controller now sends what its new pair makes of the old readings,
-and, where there is a gravity model, whether readings fit it worse than before.
+Each joint moves at most `AMPLITUDE` from its present position, stays `MARGIN` off its stops, and returns. Two things
+are judged: whether every controller now sends the old readings converted by its new calibration, and, if there is a
+gravity model, whether the readings fit it worse than before.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from calib.records.records import Array, CalibrationRecord
 from gcomp.gravity.torque import gravity_torque
 
 AMPLITUDE = 0.2
-"""Largest way of a joint from where it stands [rad]."""
+"""Largest excursion of a joint [rad]."""
 MARGIN = 0.1
 """Distance kept from the stops [rad]; a joint nearer to one moves away from it."""
 SPEED = 0.3
@@ -29,11 +29,12 @@ SPEED = 0.3
 ACCELERATION = 1.0
 """[rad/s²]"""
 POSES = 4
+"""Two patterns of signs, each both ways."""
 FLOOR = 0.004
-"""Difference of readings or of RMS that does not count, as a share of rated torque: friction of the drives' servo that
-holds a joint a little elsewhere the second time, and the torque noise."""
+"""Difference of readings or of RMS that does not count, as a share of rated torque: twice the torque noise of the
+simulated arm (0.2 %), as the servo's friction holds a joint a little off the first position the second time."""
 WORSE = 1.1
-"""RMS against the model afterwards over before from which on it is worse, beside the floor."""
+"""Ratio of RMS against the model, after over before, above which the fit is worse if the FLOOR is exceeded too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +51,7 @@ class CheckMotion:
     """The same small motion before and after a write; the link must have been enabled."""
 
     def __init__(self, link: Link, arm: ArmFile, record: CalibrationRecord, beta: Array | None) -> None:
-        """Where the arm stands now is its middle; `beta` (2n,) [kg·m] is None where no gravity model is known."""
+        """The motion is around the arm's present pose; `beta` (2n,) [kg·m] is None if no gravity model is known."""
         self._link, self._arm, self._record, self._beta = link, arm, record, beta
         self._limits, self._names = Limits.of(arm), arm.joint_names
         self._installed: list[Calibration] = []
@@ -58,14 +59,14 @@ class CheckMotion:
         self._poses: Array = np.empty((0, link.n))
 
     def before(self) -> None:
-        """Make the motion and keep its readings; raises Refused where the arm cannot move, BusFault."""
+        """Make the motion and keep its readings; raises Refused if the arm cannot move, BusFault."""
         self._installed = [self._link.read_calibration(joint) for joint in range(self._link.n)]
         mover = self._mover()
         self._poses = check_poses(mover.position, self._limits)
         self._before = self._run(mover)
 
     def after(self) -> str | None:
-        """Make it again: what is worse now, None where nothing is; raises Refused, BusFault."""
+        """Make it again; a complaint if something is worse now, else None. Raises Refused, BusFault."""
         assert self._before is not None
         old = self._installed
         new = [self._link.read_calibration(joint) for joint in range(self._link.n)]
@@ -92,13 +93,15 @@ class CheckMotion:
         return CheckRows(np.array(positions), np.array(torques))
 
     def _not_converted(self, rows: CheckRows, old: list[Calibration], new: list[Calibration]) -> str | None:
-        """Whether some controller does not send what its new pair makes of the old reading."""
+        """A complaint about a controller that does not send the old reading converted by its new calibration."""
         assert self._before is not None
         for j, name in enumerate(self._names):
             expected = new[j].invert(old[j].apply(self._before.torque[:, j]))
             away = float(np.mean(rows.torque[:, j] - expected))
             if abs(away) > FLOOR * self._limits.rated[j]:
-                return f"{name}: sends {away:+.3f} N·m more than its new pair makes of the same readings"
+                return (
+                    f"{name}: its readings differ by {away:+.3f} N·m from the old ones converted by its new calibration"
+                )
         return None
 
     def _fits_worse(self, rows: CheckRows) -> str | None:

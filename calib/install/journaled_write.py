@@ -32,7 +32,7 @@ class Controllers(Protocol):
 
 
 Check = Callable[[], str | None]
-"""Made once the new calibration is active: what is worse than before, None if nothing is."""
+"""Called once the new calibration is active: a complaint if something is worse than before, else None."""
 
 
 def install(
@@ -120,11 +120,11 @@ def _restore(controllers: Controllers, entry: dict[str, Any], store: bool) -> No
 
 
 def _entry(name: str, joint: int, held: Calibration) -> dict[str, Any]:
-    """What a controller held, for the journal."""
+    """A controller's calibration as the journal keeps it."""
     content = asdict(held)
     return {"joint": joint, "name": name, **{key: content[key] for key in ("gain", "offset", "record_id", "date")}}
 
 
 def _calibration(entry: dict[str, Any]) -> Calibration:
-    """What a controller held, by the journal."""
+    """A controller's calibration from the journal."""
     return Calibration(float(entry["gain"]), float(entry["offset"]), int(entry["record_id"]), int(entry["date"]))

@@ -24,14 +24,14 @@ LARGEST_OFFSET = 0.5
 """Largest offset of a working sensor, as a share of rated torque: beyond, half of its range is lost on one side."""
 USUAL = {"gain": 0.02, "offset": 0.02}
 """Standard deviation of a change between two calibrations before there is history: gain as a ratio, offset as a share
-of rated torque. DEVIATIONS times that is DRIFT."""
+of rated torque. DEVIATIONS times that is LARGEST_DRIFT."""
 USUAL_COUNTS = 4
-"""Number of past changes that USUAL weighs as much as: the history dominates from the fifth change on."""
+"""Number of past changes that USUAL weighs as much as: history dominates from the fifth change on."""
 DEVIATIONS = 5.0
 """Largest change in standard deviations of covariance and history; 10 % of gain without history."""
-DRIFT = 0.1
+LARGEST_DRIFT = 0.1
 """Largest change that is a drift and not a broken or exchanged sensor: of a gain as a ratio, of an offset as a share of
-rated torque (docs/theory.md, section 6: rules for a write)."""
+rated torque (docs/theory.md, section 6.6)."""
 
 
 class Refusal(Enum):
@@ -83,10 +83,10 @@ def admit(
     replaced: Sequence[str] = (),
     held: Sequence[Calibration] = (),
 ) -> Admitted:
-    """Ask for bounds and for the change from the record that this one replaces; raises GateRefused.
+    """Gate of bounds and of the change from the record that this one replaces; raises GateRefused.
 
-    The sensors of `replaced` joints were exchanged: their change is not judged. `held` is what the controllers hold,
-    joint by joint; a record that is current but not installed needs it.
+    `replaced` are joints with an exchanged sensor, whose change is not judged; `held` the controllers' calibrations,
+    joint by joint, which a record needs that was made current before it was installed.
     """
     check_bounds(record.require(arm), arm)
     before = replaced_record(record, arm, store, held)
@@ -96,7 +96,7 @@ def admit(
 
 
 def admit_drift(record: CalibrationRecord, reference: CalibrationRecord, j: int, arm: ArmFile) -> Admitted:
-    """Ask whether joint j's change from `reference`, the last sweep, is no more than a drift; raises GateRefused."""
+    """Gate of a drift: joint j's change from `reference`, the last sweep's record; raises GateRefused."""
     check_bounds(record.require(arm), arm)
     new, old = record.joints[j].torque_calibration(), reference.joints[j].torque_calibration()
     for difference, limit in _too_far(new, old, float(rated_torques(arm)[j])):
@@ -111,9 +111,9 @@ def admit_rollback(
     held: Mapping[int, Calibration],
     replaced: Sequence[str] = (),
 ) -> Admitted:
-    """Ask only whether a record is far from what the controllers of some joints hold; raises GateRefused.
+    """Gate of a roll-back: only the distance from what the controllers of some joints hold; raises GateRefused.
 
-    A pair that a controller held before its last write is not far, and a blank controller holds nothing to compare.
+    The calibration from before the last write is never far, and a blank controller has nothing to compare with.
     """
     last, rated = store.last_write(arm), rated_torques(arm)
     entries = [] if last is None else last.body["before"]
@@ -129,16 +129,16 @@ def admit_rollback(
 
 
 def _too_far(new: TorqueCalibration[float], old: TorqueCalibration[float], rated: float) -> Iterator[tuple[str, str]]:
-    """(Difference, limit) in words for gain and offset [N·m], if further apart than DRIFT; NaN is not."""
+    """(Difference, limit) in words for gain and offset [N·m], if further apart than LARGEST_DRIFT; NaN is not."""
     gain, offset = new.gain / old.gain - 1, new.offset - old.offset
-    if abs(gain) > DRIFT:
-        yield f"gain {new.gain:.4f} is {gain:+.1%}", f"{DRIFT:.0%}"
-    if abs(offset) > DRIFT * rated:
-        yield f"offset {new.offset:.3f} N·m is {offset:+.3f} N·m", f"{DRIFT * rated:.3f} N·m"
+    if abs(gain) > LARGEST_DRIFT:
+        yield f"gain {new.gain:.4f} is {gain:+.1%}", f"{LARGEST_DRIFT:.0%}"
+    if abs(offset) > LARGEST_DRIFT * rated:
+        yield f"offset {new.offset:.3f} N·m is {offset:+.3f} N·m", f"{LARGEST_DRIFT * rated:.3f} N·m"
 
 
 def check_bounds(record: CalibrationRecord, arm: ArmFile) -> None:
-    """Raise GateRefused if a gain or an offset is none that a working sensor has."""
+    """Raise GateRefused if a gain or an offset is outside of what a working sensor has."""
     lower, upper = GAIN_RANGE
     for joint, rated in zip(record.joints, rated_torques(arm).tolist(), strict=True):
         if joint.gain is not None and not lower <= joint.gain <= upper:
@@ -215,9 +215,9 @@ def check_change(
 
 
 def history_std(past: Array, usual: float) -> Array:
-    """Standard deviation (n,) of a joint's change, from its past ones (R, n) and, at first, from what is usual.
+    """Standard deviation (n,) of a joint's change, from past changes (R, n) and, at first, from the usual one.
 
-    Changes beyond what the usual allows were an exchanged sensor's and count as the largest that it allows.
+    Changes beyond DEVIATIONS times the usual one come from exchanged sensors and are clipped to it.
     """
     known = np.clip(np.nan_to_num(past), -DEVIATIONS * usual, DEVIATIONS * usual)
     counts = USUAL_COUNTS + np.isfinite(past).sum(axis=0)

@@ -30,13 +30,13 @@ class Checked:
 
     verdict: Literal["kept", "worse"]
     joint: int
-    """The one whose fit suffered most, or improved least."""
+    """Joint with the largest increase of RMS, or the smallest decrease."""
     why: str
     """RMS against the model with the old and the new calibration, in words."""
 
 
 class AfterWrite:
-    """Feed every sample to `handle`; it moves nothing, so the arm's own work must bring it to other poses."""
+    """Check at rests of the arm's own work: feed every sample to `handle`. It moves nothing itself."""
 
     def __init__(
         self,
@@ -46,7 +46,7 @@ class AfterWrite:
         old: Mapping[int, Calibration],
         new: Mapping[int, Calibration],
     ) -> None:
-        """`old` and `new` are what the controllers of the joints written held before and hold now."""
+        """`old` and `new`: calibrations of the joints written, before and after. Raises Refused for another arm."""
         self._arm, self._beta = gcomp_arm(arm), np.array(gravity.require(arm).beta)
         self._record = record
         self._rests = RestDetector(len(record.joints), ObserverConfig())

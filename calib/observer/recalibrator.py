@@ -25,7 +25,7 @@ RESTORED_BY = "daemon, policy apply"
 
 @dataclass(frozen=True)
 class Recalibration:
-    """What became of a finding."""
+    """Result of a finding or of a roll-back."""
 
     joint: str
     record: CalibrationRecord
@@ -35,8 +35,7 @@ class Recalibration:
     """New offset [N·m]."""
     applied: bool
     undo: Finding | None = None
-    """If an earlier recalibration was rolled back: the change that this was, for `Observer.install`; None if a whole
-    record was."""
+    """After a roll-back of one joint: the change of its sensor, for `Observer.install`; None for a whole record."""
 
 
 def recalibrated(
@@ -84,7 +83,7 @@ class Recalibrator:
         self._check: AfterWrite | None = None
 
     def handle(self, finding: Finding) -> Recalibration | None:
-        """Do with a finding what the policy says; None under observe. Raises Refused, as propose and apply do."""
+        """Treat a finding as the policy demands; None under observe. Raises Refused, as propose and apply do."""
         if self._policy == "observe":
             return None
         apply = self._policy == "apply"
@@ -97,8 +96,8 @@ class Recalibrator:
     def propose(self, finding: Finding, by: str | None = None, ask: bool = True) -> Recalibration:
         """Keep the record that a finding leads to, without making it current; `by` is who confirms it, if anybody does.
 
-        With `ask` the controller is asked what it holds; without, it is taken to hold the current record. Raises
-        Refused if the change is implausible, or the controller does not hold what the current record says.
+        With `ask` the controller's calibration is read; without, it is taken to be the current record's. Raises Refused
+        if the change is implausible, or the controller's calibration is not the current record's.
         """
         j = finding.joint
         held = require_installed(self.record, self._controllers, j) if ask else Calibration(1.0, 0.0)
@@ -112,7 +111,7 @@ class Recalibrator:
         """Write joint j of a kept record to its controller and make the record current.
 
         From then on `sample` checks it. Raises Refused if the record does not follow from the current one, a gate
-        refuses it, or the controller holds something else; BusFault.
+        refuses it, or the controller's calibration is not the current record's; BusFault.
         """
         if new.parent != self.record.id:
             raise Refused(f"record {new.id} follows from {new.parent}, but {self.record.id} is current: superseded")
@@ -191,7 +190,7 @@ class Recalibrator:
 
 
 def require_installed(record: CalibrationRecord, controllers: Controllers, j: int) -> Calibration:
-    """What joint j's controller holds; raises Refused if that is another calibration than the record's."""
+    """The calibration in joint j's controller; raises Refused if it is not the record's."""
     joint, held = record.joints[j], controllers.read_calibration(j)
     wanted = joint.torque_calibration(held)
     for what, value, found in (("gain", wanted.gain, held.gain), ("offset", wanted.offset, held.offset)):

@@ -120,7 +120,7 @@ def test_a_torque_that_does_not_vary_gives_no_gain_and_under_load_no_offset() ->
     )  # a drift of 5 % would be more than the 0.5 % of rated torque asked of an offset
     assert heavy.any()
     assert np.isnan(fit.offset[heavy]).all()
-    assert "cannot be told from the gain" in fit.reasons[ARM.joint_names[int(np.argmax(heavy))], "offset"]
+    assert "cannot be separated from the gain" in fit.reasons[ARM.joint_names[int(np.argmax(heavy))], "offset"]
 
 
 def test_an_axis_along_gravity_has_an_offset_and_no_gain() -> None:

@@ -62,7 +62,7 @@ def test_the_report_says_what_from_what_and_per_joint_and_opens_without_complain
         "the model holds",
         "Before and after",
         "Figure 6",
-        "told by the others",
+        "cross-validation RMS",
     ):
         assert said in document, said
     for name in ARM.joint_names:
