@@ -17,8 +17,8 @@ REAL32_STEP = 1e-6
 class TorqueCalibration(Generic[V]):
     """Gain and offset of one torque sensor (floats) or of n sensors ((n,) arrays, applied along the last axis).
 
-    With v the reading of the sensor and τ the torque [N·m]: v = gain · τ + offset (docs/theory.md, section 1.4). A joint
-    controller that holds it sends τ = (v − offset) / gain. NaN marks an unknown value and passes through.
+    With v the reading of the sensor and τ the torque [N·m]: v = gain · τ + offset (docs/theory.md, section 1.4). A
+    joint controller that holds it sends τ = (v − offset) / gain. NaN marks an unknown value and passes through.
     """
 
     gain: V

@@ -97,7 +97,7 @@ def admit(
 
 def admit_drift(record: CalibrationRecord, reference: CalibrationRecord, j: int, arm: ArmFile) -> Admitted:
     """Gate of a drift: joint j's change from `reference`, the last sweep's record; raises GateRefused."""
-    check_bounds(record.require(arm), arm)
+    check_bounds(record.require(arm), arm, (j,))
     new, old = record.joints[j].torque_calibration(), reference.joints[j].torque_calibration()
     for difference, limit in _too_far(new, old, float(rated_torques(arm)[j])):
         raise GateRefused(Refusal.DRIFT, record.joints[j].name, difference=difference, limit=limit, record=reference.id)
@@ -137,13 +137,14 @@ def _too_far(new: TorqueCalibration[float], old: TorqueCalibration[float], rated
         yield f"offset {new.offset:.3f} N·m is {offset:+.3f} N·m", f"{LARGEST_DRIFT * rated:.3f} N·m"
 
 
-def check_bounds(record: CalibrationRecord, arm: ArmFile) -> None:
-    """Raise GateRefused if a gain or an offset is outside of what a working sensor has."""
-    lower, upper = GAIN_RANGE
-    for joint, rated in zip(record.joints, rated_torques(arm).tolist(), strict=True):
+def check_bounds(record: CalibrationRecord, arm: ArmFile, joints: Sequence[int] | None = None) -> None:
+    """Raise GateRefused if a gain or an offset of `joints` (default: all) is outside of a working sensor's range."""
+    (lower, upper), rated = GAIN_RANGE, rated_torques(arm)
+    for j in range(len(record.joints)) if joints is None else joints:
+        joint = record.joints[j]
         if joint.gain is not None and not lower <= joint.gain <= upper:
             raise GateRefused(Refusal.GAIN, joint.name, value=joint.gain, lower=lower, upper=upper)
-        limit = LARGEST_OFFSET * rated
+        limit = LARGEST_OFFSET * float(rated[j])
         if joint.offset is not None and abs(joint.offset) > limit:
             raise GateRefused(Refusal.OFFSET, joint.name, value=joint.offset, limit=limit)
 
