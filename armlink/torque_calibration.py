@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar, overload
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from armlink.arrays import Array
+
 V = TypeVar("V", float, Array)
 REAL32_STEP = 1e-6
 """Relative difference that REAL32 in a controller may make to a value, the rounding of decimal output included."""
@@ -57,7 +57,7 @@ class TorqueCalibration(Generic[V]):
         return same_real32(self.gain, held.gain) and same_real32(self.offset, held.offset)
 
 
-def stack(calibrations: Iterable[TorqueCalibration[float]]) -> TorqueCalibration[Array]:
+def per_joint(calibrations: Iterable[TorqueCalibration[float]]) -> TorqueCalibration[Array]:
     """Calibrations of single joints as one of n joints."""
     pairs = [(each.gain, each.offset) for each in calibrations]
     gain, offset = np.array(pairs, dtype=np.float64).reshape(-1, 2).T.copy()

@@ -1,7 +1,7 @@
 """Listening to an arm that another controller commands: one sample a SYNC of that controller; nothing is sent.
 
-On SocketCAN it sleeps for several cycles and then takes all that came, each SYNC with the kernel's own time of it; on
-other buses it wakes for each frame, whose time is when it was read.
+On SocketCAN and udp_multicast it sleeps for several cycles and then takes all that came, each SYNC with the kernel's
+own time of it; on other buses it wakes for each frame, whose time is when it was read.
 
 The one exception is asked for by name: `write_calibration` and `read_calibration` use SDO on object 2100h.
 """
@@ -16,14 +16,15 @@ from typing import Any, Self
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from armlink.bus.stamped_port import StampedGroup, StampedPort, open_listening_port
+from armlink.arrays import Array
+from armlink.bus.stamped_port import StampedGroup, Stamping, open_listening_port
 from armlink.canopen import object_dictionary as objects
 from armlink.canopen.pdo import RPDO1
 from armlink.canopen.sdo import NodeServices, PumpedNetwork, joint_services
 from armlink.clock import Clock, MonotonicClock
-from armlink.link import torque_sensor_record
 from armlink.link.cyclic_exchange import Loop
-from armlink.link.types import Array, Calibration, Sample, Stats
+from armlink.link.torque_sensor_record import TorqueSensorRecords
+from armlink.link.types import Sample, Stats
 from armlink.monitor.monitor import assumed_units
 
 SLEEP = 0.04
@@ -35,7 +36,7 @@ NO_COMMAND = bytes(8)
 """Stands for the RPDO1 that has not come yet; this object, not its value."""
 
 
-class Listener:
+class Listener(TorqueSensorRecords):
     """Context manager: `with Listener(arm, bus) as listener: sample = listener.next(0.1)`."""
 
     def __init__(self, arm: ArmFile, bus: Any) -> None:
@@ -120,18 +121,10 @@ class Listener:
         sample, self._sent = self._ready.popleft()
         return sample
 
-    def read_calibration(self, joint: int) -> Calibration:
-        """The torque sensor record (2100h) of joint 0 … n−1, by SDO: sends; raises BusFault."""
-        return torque_sensor_record.read_record(self._services[joint])
-
-    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
-        """Make a calibration active in joint 0 … n−1, by SDO: sends; raises BadInput, BusFault."""
-        return torque_sensor_record.write_record(self._services[joint], calibration, store)
-
     def _hear(self, seconds: float, at_once: bool = False) -> None:
         """Take in what comes, for at most so long; `at_once`: somebody waits for the very next frame."""
         port = self._port
-        if isinstance(port, StampedPort | StampedGroup):
+        if isinstance(port, Stamping | StampedGroup):
             if at_once:
                 port.wait(seconds)
             else:
@@ -170,7 +163,8 @@ class Listener:
         self._sync, self._given = now, tuple(self._commands.values())
 
     @cached_property
-    def _services(self) -> tuple[NodeServices, ...]:
+    def services(self) -> tuple[NodeServices, ...]:
+        """SDO access to each joint's controller, in joint order; using it sends."""
         network = PumpedNetwork(self._loop.send)
         self._notify = network.notify
         return joint_services(network, self.arm, self._pump)

@@ -56,3 +56,24 @@ def write_record(services: NodeServices, calibration: Calibration, store: bool =
     if store:
         services.write(objects.STORE_MANUFACTURER, objects.STORE_SIGNATURE)
     return read_record(services)
+
+
+class TorqueSensorRecords:
+    """Calibrations of all joints' controllers, by SDO: a part of whatever has `services` for them."""
+
+    @property
+    def services(self) -> tuple[NodeServices, ...]:
+        """SDO access to each joint's controller, in joint order."""
+        raise NotImplementedError
+
+    def read_calibration(self, joint: int) -> Calibration:
+        """The active calibration of joint 0 … n−1; raises BusFault."""
+        return read_record(self.services[joint])
+
+    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
+        """Make a calibration active in joint 0 … n−1 (`store`: in flash too); raises BadInput, BusFault.
+
+        While the joints are enabled, the cycle goes on with the last command. Only
+        `calib.install.journaled_write` calls this.
+        """
+        return write_record(self.services[joint], calibration, store)

@@ -7,8 +7,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.canopen.cia402 import state_of
-from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, stack
-from calib.arm.drive_limits import rated_torques
+from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, per_joint
 from calib.arm.kinematics import gcomp_arm
 from calib.daemon.loop.loop_messages import Array, Batch
 from calib.daemon.view.api_models import JointNow
@@ -34,18 +33,18 @@ class Watcher:
         section = arm.require_link()
         self.arm, self.gravity, self.calibration = gcomp_arm(arm), gravity.require(arm), calibration.require(arm)
         self.names = self.arm.names
-        rated = rated_torques(arm)
+        rated = arm.require_link().rated_torques
         self.observer = Observer.of_records(self.arm, self.calibration, self.gravity, rated, config)
         self._group = max(1, round(section.rate / OBSERVED_RATE))
         self._position_gain = self.calibration.values("position_gain", 1.0)
         self._position_offset = self.calibration.values("position_offset", 0.0)
-        self._change = stack([UNCALIBRATED] * self.arm.n)
+        self._change = per_joint([UNCALIBRATED] * self.arm.n)
         self._left: tuple[Array, Array, Array] | None = None
 
     def follow(self, calibration: CalibrationRecord) -> None:
         """Another record follows from the one in force, the controllers hold it: readings are by it from now on."""
         self.calibration = calibration
-        self._change = stack([UNCALIBRATED] * self.arm.n)
+        self._change = per_joint([UNCALIBRATED] * self.arm.n)
 
     def controllers_hold(self, held: tuple[tuple[float, float, int], ...] | None) -> list[str]:
         """What the controllers hold (gain, offset, record id); readings are brought to the record in force.
@@ -53,9 +52,9 @@ class Watcher:
         Returns the joints that hold another pair than the record's; none where it is not known (None).
         """
         if held is None:
-            self._change = stack([UNCALIBRATED] * self.arm.n)
+            self._change = per_joint([UNCALIBRATED] * self.arm.n)
             return []
-        installed = stack(TorqueCalibration(gain, offset) for gain, offset, _ in held)
+        installed = per_joint(TorqueCalibration(gain, offset) for gain, offset, _ in held)
         wanted = self.calibration.torque_calibration(installed)
         same = np.isclose(installed.gain, wanted.gain, rtol=1e-6, atol=0)
         differ = ~(same & np.isclose(installed.offset, wanted.offset, atol=1e-6))

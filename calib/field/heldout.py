@@ -3,15 +3,15 @@
 import numpy as np
 
 from calib.field.field_fit import FieldFit
-from calib.field.rows import FieldRows
 from calib.fit.heldout import FEWEST
 from calib.records.records import Array, CalibrationRecord
+from gcomp.identify.readings import StaticReadings
 
 BLOCK = 24
 """Rows that are held out together, since neighbours are correlated: six seconds of a recording."""
 
 
-def heldout_errors(rows: FieldRows, fit: FieldFit, before: CalibrationRecord) -> tuple[Array, Array]:
+def heldout_errors(rows: StaticReadings, fit: FieldFit, before: CalibrationRecord) -> tuple[Array, Array]:
     """Errors (K, n) [N·m] of held-out rows with a new calibration and with the one before; NaN if they do not count.
 
     For every joint a line of readings over model torque is fitted to every second block of rows and predicts the

@@ -5,14 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, stack
-from calib.arm.drive_limits import rated_torques
+from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, per_joint
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
-from calib.field.rows import FieldRows
 from calib.records.records import Array, CalibrationRecord, GravityRecord
 from gcomp.arm.arm import Arm
 from gcomp.gravity.torque import gravity_regressor, gravity_stiffness
+from gcomp.identify.readings import StaticReadings
 
 HYSTERESIS = 0.01
 """Prior standard deviation of f_i, as a share of rated torque (docs/theory.md, section 4.3)."""
@@ -93,11 +92,11 @@ def belief_of(arm: ArmFile, gravity: GravityRecord, calibration: CalibrationReco
     if calibration is not None:
         calibration.require(arm)
         zero_std = np.where(np.isnan(calibration.std("position_offset")), zero_std, calibration.std("position_offset"))
-    blank = stack([UNCALIBRATED] * n)
+    blank = per_joint([UNCALIBRATED] * n)
     spread = None if calibration is None else (calibration.std("gain"), calibration.std("offset"))
     return Belief(
         arm=described,
-        rated=rated_torques(arm),
+        rated=arm.require_link().rated_torques,
         beta=np.array(gravity.beta),
         root=np.hstack([root, unknown]),
         position_gain=np.ones(n) if calibration is None else calibration.values("position_gain", 1.0),
@@ -108,7 +107,7 @@ def belief_of(arm: ArmFile, gravity: GravityRecord, calibration: CalibrationReco
     )
 
 
-def field_columns(belief: Belief, rows: FieldRows, q: Array, gain: Array) -> Array:
+def field_columns(belief: Belief, rows: StaticReadings, q: Array, gain: Array) -> Array:
     """Columns (K, n, p): gains, offsets, hysteresis, β in units of its root, position offsets in units of their std."""
     n, each = belief.arm.n, np.eye(belief.arm.n)
     regressor = gravity_regressor(belief.arm, q)

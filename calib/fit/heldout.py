@@ -5,12 +5,12 @@ import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from calib.arm.kinematics import gcomp_arm
-from calib.fit.rows import FitRows
+from calib.fit.sweep_readings import SweepReadings
 from calib.records.records import Array, CalibrationRecord
 from gcomp.errors import GcompError
 from gcomp.identify.global_fit import identify_global
 from gcomp.identify.parameters import Parameters, Prior
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict
 
 NOT_BY_CHANCE = 3.0
@@ -41,7 +41,7 @@ def worse_by(new: Array, old: Array) -> float | None:
 
 
 def heldout_scores(
-    record: CalibrationRecord, arm: ArmFile, rows: FitRows, refit: bool, beta: Array | None = None
+    record: CalibrationRecord, arm: ArmFile, rows: SweepReadings, refit: bool, beta: Array | None = None
 ) -> Array:
     """Prediction errors (K, n) of held-out steps over their standard deviation; NaN if they do not count.
 
@@ -69,16 +69,16 @@ def heldout_scores(
                 complete = identify_global(described, kept, unknown=unknown, start=start, priors=priors).complete
         except GcompError:
             continue
-        held: Readings = rows.readings.rows(fold == left_out)
+        held: StaticReadings = rows.readings.rows(fold == left_out)
         score[fold == left_out] = (held.torque - predict(described, complete, held)) / held.sigma
     return score
 
 
-def _folds(rows: FitRows) -> npt.NDArray[np.int64]:
+def _folds(rows: SweepReadings) -> npt.NDArray[np.int64]:
     """0 or 1 for every row: the steps of each sweep alternate, both directions of one step together."""
-    fold = np.zeros(len(rows.sweep), dtype=np.int64)
-    for name in set(rows.sweep):
-        here = np.array([each == name for each in rows.sweep])
+    fold = np.zeros(len(rows.readings), dtype=np.int64)
+    for sweep in range(len(rows.sweeps)):
+        here = rows.readings.series == sweep
         joint = int(rows.swept[here][0])
         if joint < 0:
             fold[here] = np.arange(here.sum()) % 2

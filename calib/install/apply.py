@@ -10,17 +10,17 @@ from armlink.errors import BadInput, Refused
 from armlink.link.link import Link
 from calib.field.field_fit import FieldFit
 from calib.field.heldout import heldout_errors
-from calib.field.rows import FieldRows
 from calib.fit.findings import Finding
 from calib.fit.heldout import heldout_scores, worse_joint
-from calib.fit.rows import fit_rows
 from calib.fit.sensor_fit import SensorFit
+from calib.fit.sweep_readings import sweep_readings
 from calib.install.check_motion import CheckMotion
 from calib.install.journaled_write import install, recover
 from calib.install.plausibility import Admitted, GateRefused, Refusal, admit, admit_rollback
 from calib.records.records import Array, CalibrationRecord, GravityRecord
 from calib.records.store import RecordStore
 from calib.sweep.dataset import SweepData
+from gcomp.identify.readings import StaticReadings
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def apply_field(
     record: CalibrationRecord,
     arm: ArmFile,
     store: RecordStore,
-    rows: FieldRows,
+    rows: StaticReadings,
     fit: FieldFit,
     beta: Array,
     how: Apply,
@@ -131,7 +131,7 @@ def check_heldout(
     New gains, offsets and mass moments are estimated from the other steps; the old record's gains and offsets are
     fixed, and so are the mass moments of `gravity`; without it those are estimated too.
     """
-    rows = fit_rows([each.require(arm) for each in data])
+    rows = sweep_readings([each.require(arm) for each in data])
     beta = None if gravity is None else np.array(gravity.require(arm).beta)
     fresh = heldout_scores(new, arm, rows, refit=True)
     _refuse_worse(arm, old, fresh, heldout_scores(old, arm, rows, refit=False, beta=beta))

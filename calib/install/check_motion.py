@@ -5,8 +5,6 @@ are judged: whether every controller now sends the old readings converted by its
 gravity model, whether the readings fit it worse than before.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from armlink.arm_file import ArmFile
@@ -17,6 +15,7 @@ from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.motion.mover import Mover, Stalled
+from calib.motion.static_reading import StaticReading, stack
 from calib.records.records import Array, CalibrationRecord
 from gcomp.gravity.torque import gravity_torque
 
@@ -37,16 +36,6 @@ WORSE = 1.1
 """Ratio of RMS against the model, after over before, above which the fit is worse if the FLOOR is exceeded too."""
 
 
-@dataclass(frozen=True, eq=False)
-class CheckRows:
-    """Readings at P rests, as the controllers send them."""
-
-    position: Array
-    """(P, n) [rad]"""
-    torque: Array
-    """(P, n) [N·m]"""
-
-
 class CheckMotion:
     """The same small motion before and after a write; the link must have been enabled."""
 
@@ -55,7 +44,7 @@ class CheckMotion:
         self._link, self._arm, self._record, self._beta = link, arm, record, beta
         self._limits, self._names = Limits.of(arm), arm.joint_names
         self._installed: list[Calibration] = []
-        self._before: CheckRows | None = None
+        self._before: list[StaticReading] = []
         self._poses: Array = np.empty((0, link.n))
 
     def before(self) -> None:
@@ -67,11 +56,11 @@ class CheckMotion:
 
     def after(self) -> str | None:
         """Make it again; a complaint if something is worse now, else None. Raises Refused, BusFault."""
-        assert self._before is not None
+        assert self._before
         old = self._installed
         new = [self._link.read_calibration(joint) for joint in range(self._link.n)]
-        rows = self._run(self._mover())
-        return self._not_converted(rows, old, new) or self._fits_worse(rows)
+        readings = self._run(self._mover())
+        return self._not_converted(readings, old, new) or self._fits_worse(readings)
 
     def _mover(self) -> Mover:
         mover = Mover(self._link, sweep_section(self._arm), self._limits)
@@ -79,44 +68,44 @@ class CheckMotion:
         mover.speed = SPEED * self._limits.speed
         return mover
 
-    def _run(self, mover: Mover) -> CheckRows:
-        begin, positions, torques = mover.position.copy(), [], []
+    def _run(self, mover: Mover) -> list[StaticReading]:
+        begin, readings = mover.position.copy(), list[StaticReading]()
         try:
             for pose in self._poses:
                 mover.travel(pose, ACCELERATION)
-                rest = mover.rest(np.ones(self._link.n, dtype=bool))
-                positions.append(rest.position)
-                torques.append(rest.torque)
+                readings.append(mover.rest(np.ones(self._link.n, dtype=bool)))
             mover.travel(begin, ACCELERATION)
         except Stalled as error:
             raise Refused(f"check motion: {error}") from None
-        return CheckRows(np.array(positions), np.array(torques))
+        return readings
 
-    def _not_converted(self, rows: CheckRows, old: list[Calibration], new: list[Calibration]) -> str | None:
+    def _not_converted(
+        self, readings: list[StaticReading], old: list[Calibration], new: list[Calibration]
+    ) -> str | None:
         """A complaint about a controller that does not send the old reading converted by its new calibration."""
-        assert self._before is not None
+        before, after = stack(self._before, "torque"), stack(readings, "torque")
         for j, name in enumerate(self._names):
-            expected = new[j].invert(old[j].apply(self._before.torque[:, j]))
-            away = float(np.mean(rows.torque[:, j] - expected))
+            expected = new[j].invert(old[j].apply(before[:, j]))
+            away = float(np.mean(after[:, j] - expected))
             if abs(away) > FLOOR * self._limits.rated[j]:
                 return (
                     f"{name}: its readings differ by {away:+.3f} N·m from the old ones converted by its new calibration"
                 )
         return None
 
-    def _fits_worse(self, rows: CheckRows) -> str | None:
+    def _fits_worse(self, readings: list[StaticReading]) -> str | None:
         if self._beta is None:
             return None
-        assert self._before is not None
-        before, after = self._rms(self._before, self._beta), self._rms(rows, self._beta)
+        before, after = self._rms(self._before, self._beta), self._rms(readings, self._beta)
         worse = (after > WORSE * before) & (after - before > FLOOR * self._limits.rated)
         if not worse.any():
             return None
         j = int(np.argmax(np.where(worse, after - before, -np.inf)))
         return f"{self._names[j]}: in the check motion {after[j]:.3f} N·m RMS against the model, {before[j]:.3f} before"
 
-    def _rms(self, rows: CheckRows, beta: Array) -> Array:
-        residual: Array = rows.torque - gravity_torque(gcomp_arm(self._arm), beta, self._record.angle(rows.position))
+    def _rms(self, readings: list[StaticReading], beta: Array) -> Array:
+        q = self._record.angle(stack(readings, "position"))
+        residual: Array = stack(readings, "torque") - gravity_torque(gcomp_arm(self._arm), beta, q)
         rms: Array = np.sqrt(np.mean(residual**2, axis=0))
         return rms
 

@@ -16,7 +16,6 @@ from armlink.errors import Refused
 from armlink.link.torque_sensor_record import GAIN_RANGE
 from armlink.link.types import Calibration
 from armlink.torque_calibration import UNKNOWN, TorqueCalibration
-from calib.arm.drive_limits import rated_torques
 from calib.records.records import Array, CalibrationRecord, Parameter
 from calib.records.store import RecordStore
 
@@ -99,7 +98,7 @@ def admit_drift(record: CalibrationRecord, reference: CalibrationRecord, j: int,
     """Gate of a drift: joint j's change from `reference`, the last sweep's record; raises GateRefused."""
     check_bounds(record.require(arm), arm, (j,))
     new, old = record.joints[j].torque_calibration(), reference.joints[j].torque_calibration()
-    for difference, limit in _too_far(new, old, float(rated_torques(arm)[j])):
+    for difference, limit in _too_far(new, old, float(arm.require_link().rated_torques[j])):
         raise GateRefused(Refusal.DRIFT, record.joints[j].name, difference=difference, limit=limit, record=reference.id)
     return Admitted(record, arm, "bounds and drift", reference)
 
@@ -115,7 +114,7 @@ def admit_rollback(
 
     The calibration from before the last write is never far, and a blank controller has nothing to compare with.
     """
-    last, rated = store.last_write(arm), rated_torques(arm)
+    last, rated = store.last_write(arm), arm.require_link().rated_torques
     entries = [] if last is None else last.body["before"]
     former = {entry["name"]: TorqueCalibration(entry["gain"], entry["offset"]) for entry in entries}
     for j, now in held.items():
@@ -139,7 +138,7 @@ def _too_far(new: TorqueCalibration[float], old: TorqueCalibration[float], rated
 
 def check_bounds(record: CalibrationRecord, arm: ArmFile, joints: Sequence[int] | None = None) -> None:
     """Raise GateRefused if a gain or an offset of `joints` (default: all) is outside of a working sensor's range."""
-    (lower, upper), rated = GAIN_RANGE, rated_torques(arm)
+    (lower, upper), rated = GAIN_RANGE, arm.require_link().rated_torques
     for j in range(len(record.joints)) if joints is None else joints:
         joint = record.joints[j]
         if joint.gain is not None and not lower <= joint.gain <= upper:
@@ -182,7 +181,7 @@ def past_changes(store: RecordStore, arm: ArmFile, until: str | None = None) -> 
 
     `until` is the id of the last one that counts; default: all.
     """
-    rated, kept = rated_torques(arm), _calibrations(store, arm)
+    rated, kept = arm.require_link().rated_torques, _calibrations(store, arm)
     places = [place for place, each in enumerate(kept) if each.id == until]
     kept = kept[: places[-1] + 1] if places else kept
     gain = np.array([each.values("gain") for each in kept]).reshape(-1, len(rated))
@@ -194,7 +193,7 @@ def check_change(
     new: CalibrationRecord, old: CalibrationRecord, past: dict[str, Array], arm: ArmFile, replaced: Sequence[str] = ()
 ) -> None:
     """Raise GateRefused if a value changed by more than both records' covariances and the arm's history allow."""
-    scales = {"gain": np.abs(old.values("gain")), "offset": rated_torques(arm)}
+    scales = {"gain": np.abs(old.values("gain")), "offset": arm.require_link().rated_torques}
     parameters: tuple[Parameter, ...] = ("gain", "offset")
     for parameter in parameters:
         scale, values = scales[parameter], new.values(parameter)

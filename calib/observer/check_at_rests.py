@@ -8,7 +8,6 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.link.types import Calibration
-from calib.arm.drive_limits import rated_torques
 from calib.arm.kinematics import gcomp_arm
 from calib.observer.config import ObserverConfig
 from calib.observer.rest_detector import RestDetector
@@ -52,7 +51,7 @@ class AfterWrite:
         self._rests = RestDetector(len(record.joints), ObserverConfig())
         self._joints, self._names = list(old), [record.joints[j].name for j in old]
         self._pairs = [(old[j], new[j]) for j in old]
-        self._floor = FLOOR * rated_torques(arm)[self._joints]
+        self._floor = FLOOR * arm.require_link().rated_torques[self._joints]
         self._before: list[list[float]] = []
         self._after: list[list[float]] = []
 

@@ -4,21 +4,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
-from armlink.link.link import Link
-from armlink.torque_calibration import TorqueCalibration, stack
+from armlink.loop.driver import ArmDriver
+from armlink.torque_calibration import TorqueCalibration, per_joint
 from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import SweepSection, sweep_section
 from calib.motion.mover import Mover, Stalled
 from calib.plan.poses import short_way, sweep_range
 from calib.records.records import CalibrationRecord, GravityRecord
+from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque, torque_covariance
 
-Array = npt.NDArray[np.float64]
 ACCELERATION = 2.0
 TOLERANCE = 0.01
 """RMS that passes, as a share of the joint's largest model torque, beside the noise floor."""
@@ -63,7 +62,7 @@ class Verification:
 
 
 def run_verify(
-    link: Link,
+    link: ArmDriver,
     arm: ArmFile,
     gravity: GravityRecord,
     calibration: CalibrationRecord | None = None,
@@ -123,8 +122,8 @@ class _Sensors:
     record: CalibrationRecord | None
 
     @classmethod
-    def of(cls, link: Link, record: CalibrationRecord | None) -> "_Sensors":
-        installed = stack(link.read_calibration(joint) for joint in range(link.n))
+    def of(cls, link: ArmDriver, record: CalibrationRecord | None) -> "_Sensors":
+        installed = per_joint(link.read_calibration(joint) for joint in range(link.n))
         return cls(installed, installed if record is None else record.torque_calibration(installed), record)
 
     def angle(self, reading: Array) -> Array:

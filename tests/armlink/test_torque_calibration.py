@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from armlink.link.types import Calibration
-from armlink.torque_calibration import UNCALIBRATED, UNKNOWN, TorqueCalibration, stack
+from armlink.torque_calibration import UNCALIBRATED, UNKNOWN, TorqueCalibration, per_joint
 
 GAINS = st.floats(0.5, 2.0) | st.floats(-2.0, -0.5)
 TORQUES = st.floats(-200.0, 200.0)
@@ -37,11 +37,11 @@ def test_relative_to_is_the_inverse_of_compose(old: TorqueCalibration[float], ne
 
 
 def test_arrays_go_joint_by_joint_and_nan_passes_through() -> None:
-    both = stack([TorqueCalibration(2.0, 1.0), UNKNOWN])
+    both = per_joint([TorqueCalibration(2.0, 1.0), UNKNOWN])
     torque = np.array([[3.0, 1.0], [-1.0, 0.0]])
     np.testing.assert_array_equal(both.apply(torque), [[7.0, np.nan], [-1.0, np.nan]])
     np.testing.assert_array_equal(both.invert(both.apply(torque))[:, 0], torque[:, 0])
-    np.testing.assert_array_equal(stack([UNCALIBRATED] * 2).apply(torque), torque)
+    np.testing.assert_array_equal(per_joint([UNCALIBRATED] * 2).apply(torque), torque)
 
 
 def test_real32_matches_what_it_came_from_and_nothing_else() -> None:

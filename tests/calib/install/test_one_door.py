@@ -79,10 +79,8 @@ def test_only_a_forwarder_asks_the_bus_process_to_write() -> None:
     assert {function for _, function in asking - {("calib/daemon/loop/arm_loop.py", "_do")}} == {"write_calibration"}
 
 
-def test_only_links_use_the_wire_format_and_only_in_write_calibration() -> None:
-    uses = {use for use in users("write_record") if use[0] != WIRE}
-    assert {path for path, _ in uses} == {"armlink/link/link.py", "armlink/link/listener.py"}
-    assert {function for _, function in uses} == {"write_calibration"}
+def test_only_write_calibration_uses_the_wire_format() -> None:
+    assert users("write_record") == {(WIRE, "write_calibration")}
     for name in OBJECTS:
         uses = {use for use in users(name) if not use[0].endswith("object_dictionary.py")}
         assert uses == {(WIRE, "write_record")}
