@@ -13,7 +13,6 @@ from calib.daemon.view.api_models import JointNow
 from calib.observer.config import ObserverConfig
 from calib.observer.events import Event
 from calib.observer.observer import Observer
-from calib.observer.state import restore_observer, save_observer
 from calib.records.records import CalibrationRecord, GravityRecord
 
 NO_STATUS = 0xFFFF
@@ -35,8 +34,6 @@ class Watcher:
         rated = np.array([joint.rated_torque for joint in section.joints])
         self.observer = Observer.of_records(self.arm, self.calibration, self.gravity, rated, config)
         self._group = max(1, round(section.rate / OBSERVED_RATE))
-        self._position_gain = self.calibration.values("position_gain", 1.0)
-        self._position_offset = self.calibration.values("position_offset", 0.0)
         self._gain, self._offset = np.ones(self.arm.n), np.zeros(self.arm.n)
         self._left: tuple[Array, Array, Array] | None = None
 
@@ -92,17 +89,15 @@ class Watcher:
 
     def save(self) -> dict[str, Any]:
         """The observer's state as JSON values."""
-        return save_observer(self.observer)
+        return self.observer.save()
 
     def restore(self, state: dict[str, Any]) -> bool:
         """Go on from a saved state; False where it does not fit."""
-        return restore_observer(self.observer, state)
+        return self.observer.restore(state)
 
     def model_torque(self, position: Array) -> Array:
         """Gravity torque (n,) [N·m] at position readings (n,); NaN where any reading is missing."""
-        angle = self._position_gain * position + self._position_offset
-        torque: Array = self.observer.belief.torque(angle[None])[0]
-        return torque
+        return self.observer.model_torque(position)
 
     def reading(self, torque: Array) -> Array:
         """A torque reading (n,) by the record in force [N·m]."""

@@ -190,10 +190,10 @@ class Service:
         samples = watcher.decimated(batch)
         if recalibrations.busy:
             return  # the calibration changes under these readings
-        before = watcher.observer.filter.accepted.copy()
+        before = watcher.observer.estimate().accepted
         events = watcher.observe(samples)
         now = self.around.wall()
-        for name, more in zip(self.names, watcher.observer.filter.accepted > before, strict=True):
+        for name, more in zip(self.names, watcher.observer.estimate().accepted > before, strict=True):
             if more:
                 self.accepted[name] = now
         if events:

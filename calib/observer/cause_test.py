@@ -7,7 +7,7 @@ import numpy as np
 
 from calib.observer.config import ObserverConfig
 from calib.observer.effect_dictionary import DRIFT, Entry, Window, class_of, dictionary, kin
-from calib.observer.gravity_belief import ModelBelief
+from calib.observer.gravity_belief import GravityBelief
 from calib.records.records import Array
 from gcomp.gravity.torque import gravity_levers
 
@@ -58,7 +58,7 @@ class _Fit:
 class CauseTest:
     """The dictionary fitted to one window, the model's error marginalised: covariance σ²I + Y Cov(β) Yᵀ + H Σ_q Hᵀ."""
 
-    def __init__(self, belief: ModelBelief, window: Window, sigma: Array, config: ObserverConfig) -> None:
+    def __init__(self, belief: GravityBelief, window: Window, sigma: Array, config: ObserverConfig) -> None:
         """sigma (n,) [N·m]: standard deviation of one row."""
         self.belief, self.window, self._config = belief, window, config
         residual, nuisance = belief.residual(window.position, window.torque, config.position_std)

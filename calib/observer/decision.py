@@ -1,6 +1,7 @@
 """From a drift verdict to what may be written: the rules at the end of theory.md section 6."""
 
 from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 
@@ -32,6 +33,23 @@ class Finding:
         """Standard deviations of gain and offset [N·m]."""
         gain, offset = np.sqrt(np.diag(self.covariance))
         return float(gain), float(offset)
+
+    def as_json(self) -> dict[str, Any]:
+        """JSON values, without the reasons for a refusal."""
+        return {
+            "joint": int(self.joint),
+            "cause": self.cause,
+            "gain": float(self.gain),
+            "offset": float(self.offset),
+            "rows": int(self.rows),
+            "confidence": float(self.confidence),
+            "covariance": self.covariance.tolist(),
+        }
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> Self:
+        """The finding that `as_json` wrote."""
+        return cls(**{**values, "covariance": np.array(values["covariance"])})
 
 
 @dataclass(frozen=True)

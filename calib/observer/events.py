@@ -7,7 +7,6 @@ import numpy as np
 
 from calib.observer.cause_test import Verdict
 from calib.observer.decision import Finding
-from calib.records.records import Array
 
 
 @dataclass(frozen=True)
@@ -20,19 +19,6 @@ class Event:
     evidence: dict[str, Any] = field(default_factory=dict)
     finding: Finding | None = None
     """What to write, for a proposal."""
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """Gain and offset of every joint against the installed calibration, with standard deviations; (n,) each."""
-
-    gain: Array
-    gain_std: Array
-    offset: Array
-    """[N·m]"""
-    offset_std: Array
-    accepted: Array
-    """Rows that went into each."""
 
 
 def verdict_evidence(verdict: Verdict, names: tuple[str, ...]) -> dict[str, Any]:

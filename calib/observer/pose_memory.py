@@ -1,58 +1,80 @@
-"""Places that the arm has been to: what a pose seen again can still teach."""
+"""Memory of the poses that the arm has visited: a repeated pose adds no information, but shows change."""
+
+from typing import Any
 
 import numpy as np
 
-from calib.records.records import Array
+from calib.observer.config import ObserverConfig
+from calib.observer.saved_values import UNREADABLE
+from gcomp.arrays import Array, as_array
 
 
-class Places:
-    """Mean torque residual of every place, the latest `most` of them. Poses within `size` of one another are one place.
+class PoseMemory:
+    """Mean torque residual at each of the latest poses. Poses closer than `place_size` in every joint count as one.
 
-    At a place seen before, the model's own error is known, so that a change shows without it; and one more row there
-    tells nothing new about the rest of the arm's range.
+    At a pose visited before, the error of the gravity model is known, so that a change stands out from it; another row
+    there adds no information about the rest of the joint range.
     """
 
-    def __init__(self, n: int, size: float, most: int, rows: int) -> None:
-        """n joints; size [rad] in the largest joint; after `rows` a place's mean stands, so as not to drift along."""
-        self._size, self._most, self._rows = size, most, rows
-        self.position: Array = np.empty((0, n))
-        self.mean: Array = np.empty((0, n))
-        self.count = np.empty(0, dtype=int)
+    def __init__(self, n: int, config: ObserverConfig) -> None:
+        """n joints."""
+        self._config = config
+        self._position: Array = np.empty((0, n))
+        self._mean: Array = np.empty((0, n))
+        self._count = np.empty(0, dtype=int)
 
     def seen(self, position: Array) -> int:
-        """How many rows of this place are known, at most those that are kept."""
+        """Number of rows known at this pose (n,), at most `place_memory`."""
         at = self._find(position)
-        return 0 if at is None else int(self.count[at])
+        return 0 if at is None else int(self._count[at])
 
     def expected(self, position: Array, variance: Array, noise: Array) -> tuple[Array, Array]:
-        """Model error expected at a pose and its variance (n,), from rows seen there.
+        """Model error (n,) [N·m] expected at a pose, from the rows seen there, and its variance (n,) [N²·m²].
 
-        `variance` (n,) is that of the model's error where the arm has not been, `noise` (n,) that of one row.
+        `variance` (n,) is that of the model error at an unvisited pose, `noise` (n,) that of one row.
         """
         at = self._find(position)
         if at is None:
             return np.zeros_like(variance), variance
-        share = variance / (variance + noise / self.count[at])
-        return share * self.mean[at], (1 - share) * variance
+        share = variance / (variance + noise / self._count[at])
+        return share * self._mean[at], (1 - share) * variance
 
     def add(self, position: Array, residual: Array) -> None:
-        """Take a row without alarm."""
-        at = self._find(position)
+        """Take a row without alarm: pose (n,) [rad], reading less model (n,) [N·m]."""
+        at, most = self._find(position), self._config.places
         if at is None:
-            self.position = np.vstack([self.position, position])[-self._most :]
-            self.mean = np.vstack([self.mean, residual])[-self._most :]
-            self.count = np.append(self.count, 1)[-self._most :]
-        elif self.count[at] < self._rows:
-            self.count[at] += 1
-            self.mean[at] += (residual - self.mean[at]) / self.count[at]
+            self._position = np.vstack([self._position, position])[-most:]
+            self._mean = np.vstack([self._mean, residual])[-most:]
+            self._count = np.append(self._count, 1)[-most:]
+        elif self._count[at] < self._config.place_memory:  # then frozen, so as not to follow a drift
+            self._count[at] += 1
+            self._mean[at] += (residual - self._mean[at]) / self._count[at]
 
     def forget(self) -> None:
-        """Start again: another calibration or model is in force."""
-        self.position, self.mean, self.count = self.position[:0], self.mean[:0], self.count[:0]
+        """Drop every pose: another calibration or gravity model is in use."""
+        self._position, self._mean, self._count = self._position[:0], self._mean[:0], self._count[:0]
+
+    def save(self) -> dict[str, Any]:
+        """Poses, mean residuals and counts as JSON values."""
+        return {"places": [self._position.tolist(), self._mean.tolist(), self._count.tolist()]}
+
+    def restore(self, values: dict[str, Any]) -> bool:
+        """Continue from saved values; False, and nothing changed, if they do not fit."""
+        n = self._position.shape[1]
+        try:
+            position, mean, count = values["places"]
+            poses = len(position)
+            position = as_array("position", np.reshape(position, (-1, n)), (poses, n))
+            mean = as_array("mean", np.reshape(mean, (-1, n)), (poses, n))
+            count = as_array("count", count, (poses,)).astype(int)
+        except UNREADABLE:
+            return False
+        self._position, self._mean, self._count = position, mean, count
+        return True
 
     def _find(self, position: Array) -> int | None:
-        if not len(self.position):
+        if not len(self._position):
             return None
-        away = np.abs(self.position - position).max(axis=1)
+        away = np.abs(self._position - position).max(axis=1)
         nearest = int(away.argmin())
-        return nearest if away[nearest] < self._size else None
+        return nearest if away[nearest] < self._config.place_size else None
