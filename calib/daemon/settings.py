@@ -1,6 +1,6 @@
 """What a person may set of the daemon: the arm file's section `daemon`, read again at SIGHUP."""
 
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import Annotated, Literal
 
 from pydantic import Field, FiniteFloat, PositiveFloat, field_validator
@@ -62,3 +62,17 @@ class DaemonSection(Section):
 def daemon_section(arm: ArmFile) -> DaemonSection:
     """The arm file's section, or the defaults."""
     return arm.daemon if isinstance(arm.daemon, DaemonSection) else DaemonSection()
+
+
+@dataclass
+class Configuration:
+    """Arm file, settings and mode in use. A reload replaces arm and settings; every part reads them here."""
+
+    arm: ArmFile
+    settings: DaemonSection
+    listen_only: bool
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Joints, base to tip."""
+        return self.arm.joint_names

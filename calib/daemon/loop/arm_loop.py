@@ -12,8 +12,9 @@ from armlink.link.link import Link
 from armlink.link.listener import Listener
 from armlink.link.types import Calibration, Command, Sample
 from calib.arm.kinematics import gcomp_arm
-from calib.daemon.loop.loop_messages import Array, Batch, Down, LoopOptions, Message, Progress, Reply, Request, Up
+from calib.daemon.loop.loop_messages import Batch, Down, LoopOptions, Message, Progress, Reply, Request, Up
 from calib.motion.random_work import WorkMotion, work_pieces
+from gcomp.arrays import Array
 
 BATCH_SECONDS = 0.1
 """Samples go to the service so often: the snapshot rate of contract 8."""

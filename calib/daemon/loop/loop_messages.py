@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from armlink.arm_file import ArmFile
 from armlink.link.types import Sample, Stats
+from gcomp.arrays import Array
 
-Array = NDArray[np.float64]
 CHANNELS = ("position", "velocity", "torque", "motor_torque", "torque_command", "position_command")
 
 

@@ -1,4 +1,4 @@
-"""Where the bus loop runs: in this thread (`InlineHost`, lock-step) or in a process of its own (`ChildHost`)."""
+"""Where the bus loop runs: in this thread (`InlineLoop`, lock-step) or in a process of its own (`LoopProcess`)."""
 
 import gc
 import itertools
@@ -56,7 +56,7 @@ def error_of(reply: Reply) -> ArmlinkError:
     return kinds.get(reply.status, BusFault)(reply.error)
 
 
-class InlineHost:
+class InlineLoop:
     """The loop in this thread: `pump` makes a tenth of a second of cycles."""
 
     def __init__(self, options: LoopOptions) -> None:
@@ -78,7 +78,7 @@ class InlineHost:
         self.loop.close()
 
 
-class ChildHost:
+class LoopProcess:
     """The loop in a process of its own, so that nothing here can hold up a cycle."""
 
     def __init__(self, options: LoopOptions, fork: bool = False) -> None:
@@ -93,7 +93,6 @@ class ChildHost:
         theirs.close()
         self._waiting: dict[int, Future[Reply]] = {}
         self._sending = threading.Lock()
-        self.controllers = LoopControllers(self._ask)
 
     @property
     def pid(self) -> int | None:
@@ -136,7 +135,8 @@ class ChildHost:
         self._give_up()
         self._ours.close()
 
-    def _ask(self, request: Request) -> Reply:
+    def ask(self, request: Request) -> Reply:
+        """Send a request and wait for its reply."""
         answer: Future[Reply] = Future()
         self._waiting[request.id] = answer
         if not self._send(request):

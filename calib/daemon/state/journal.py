@@ -5,8 +5,9 @@ transaction: a kill at any moment leaves all of it or none.
 """
 
 import json
+import logging
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from armlink.errors import BadInput
+from calib.observer.decision import Finding
 
 SCHEMA = 1
 CACHE_KB = 256
@@ -37,6 +39,8 @@ CREATE INDEX IF NOT EXISTS decisions_proposal ON decisions(proposal);
 """
 _APPEND_ONLY = ("events", "proposals", "decisions")
 
+log = logging.getLogger("armlink.daemon")
+
 
 @dataclass(frozen=True)
 class ProposalRow:
@@ -47,7 +51,7 @@ class ProposalRow:
     joint: str
     record: str
     base: str
-    finding: dict[str, Any]
+    finding: Finding
     state: str
     by: str | None
     decided: datetime | None
@@ -69,6 +73,8 @@ class Journal:
     def __init__(self, path: Path) -> None:
         """Open or make it; raises BadInput where that cannot be."""
         self.path = path
+        self.trouble = ""
+        """Why nothing can be written, in one line; empty while it can."""
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._db = sqlite3.connect(path, isolation_level=None, timeout=10.0)
@@ -107,6 +113,16 @@ class Journal:
             self._db.execute("ROLLBACK")
             raise
         self._db.execute("COMMIT")
+        self.trouble = ""
+
+    def guard(self, act: Callable[[], object]) -> None:
+        """Do something that writes; a disk that fails is logged and shown in the status, and stops nothing."""
+        try:
+            act()
+        except sqlite3.Error as error:
+            if not self.trouble:
+                log.error("journal: %s", error)
+            self.trouble = f"the journal cannot be written: {error}"
 
     # ---- events
 
@@ -138,7 +154,7 @@ class Journal:
 
     # ---- proposals
 
-    def add_proposal(self, time: datetime, joint: str, record: str, base: str, finding: dict[str, Any]) -> int:
+    def add_proposal(self, time: datetime, joint: str, record: str, base: str, finding: Finding) -> int:
         """Append a proposal, pending, and return its id; earlier pending ones of the joint are superseded."""
         with self.transaction():
             for earlier in self.proposals():
@@ -146,7 +162,7 @@ class Journal:
                     self.decide(earlier.id, time, "superseded", "daemon", "a newer proposal")
             cursor = self._db.execute(
                 "INSERT INTO proposals(time, joint, record, base, finding) VALUES (?, ?, ?, ?, ?)",
-                (_iso(time), joint, record, base, json.dumps(finding)),
+                (_iso(time), joint, record, base, json.dumps(finding.as_json())),
             )
         assert cursor.lastrowid is not None
         return cursor.lastrowid
@@ -230,7 +246,7 @@ def _proposal(row: tuple[Any, ...]) -> ProposalRow:
         joint=joint,
         record=record,
         base=base,
-        finding=json.loads(finding),
+        finding=Finding.from_json(json.loads(finding)),
         state=state or "pending",
         by=by,
         decided=None if decided is None else datetime.fromisoformat(decided),

@@ -1,13 +1,12 @@
-"""What the observer says, as the event log has it: kind, one line for people, evidence as JSON."""
+"""The observer's events as the event log has them: kind, one line for people, evidence."""
 
-import math
 from dataclasses import replace
 from typing import Any
 
 from calib.observer.effect_dictionary import DRIFT
 from calib.observer.events import Event
 
-Told = tuple[str, str, dict[str, Any]]
+Description = tuple[str, str, dict[str, Any]]
 """(kind, text, evidence)"""
 
 _EFFECTS = {
@@ -20,10 +19,9 @@ _EFFECTS = {
 }
 
 
-def told(event: Event) -> Told:
-    """An observer's event in the terms of contract 8."""
-    evidence = clean(event.evidence)
-    joint = event.joint or "the arm"
+def describe(event: Event) -> Description:
+    """An observer's event in the terms of the API (docs/daemon-api.md)."""
+    joint, evidence = event.joint or "the arm", event.evidence
     if event.kind == "alarm":
         return "alarm", f"{joint}: sensor and model disagree ({evidence.get('channel', '?')})", evidence
     if event.kind == "outliers":
@@ -50,21 +48,7 @@ def one_alarm_a_joint(events: list[Event]) -> list[Event]:
     return merged
 
 
-def clean(value: Any) -> Any:
-    """A value that JSON can carry: numbers that are not finite become None."""
-    if isinstance(value, dict):
-        return {str(key): clean(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [clean(item) for item in value]
-    if isinstance(value, bool | str) or value is None:
-        return value
-    if isinstance(value, int):
-        return value
-    value = float(value)
-    return value if math.isfinite(value) else None
-
-
-def _verdict(joint: str, evidence: dict[str, Any]) -> Told:
+def _verdict(joint: str, evidence: dict[str, Any]) -> Description:
     cause, sure = evidence["cause"], f"confidence {evidence['confidence']:.1%}"
     if cause in DRIFT:
         beside = f", and {evidence['beside']}" if "beside" in evidence else ""

@@ -22,6 +22,7 @@ from calib.daemon.settings import DaemonSection
 from calib.daemon.state.journal import Journal
 from calib.daemon.view.api_models import State
 from calib.daemon.view.view import NoSuch, NotPossible
+from calib.observer.recalibrator import Recalibrator
 from calib.records.records import CalibrationRecord
 
 
@@ -152,7 +153,7 @@ def test_payload_is_an_event_with_mass_and_centre_and_nothing_is_written(tmp_pat
 
 def test_after_a_kill_it_knows_everything(tmp_path: Path) -> None:
     daemon = drifted(tmp_path, "propose")
-    daemon.service.keeping.keep()
+    daemon.service.save()
     events, estimates, proposals = daemon.view.events(), daemon.view.estimates(), daemon.view.proposals()
     rows = daemon.view.status().rows
     daemon.kill()
@@ -188,8 +189,9 @@ def test_an_approval_cut_off_after_the_write_is_in_force(tmp_path: Path) -> None
     daemon = drifted(tmp_path, "propose")
     proposal = daemon.view.proposals()[0]
     daemon.service.journal.decide(proposal.id, daemon.wall(), "approved", "ann")
-    daemon.service.keeping.keep()
-    daemon.service.recalibrations.recalibrator.apply(daemon.store.get(proposal.record), 2, "ann")
+    daemon.service.save()
+    recalibrator = Recalibrator(daemon.arm, daemon, daemon.store, "propose")
+    recalibrator.apply(daemon.store.get(proposal.record), 2, "ann")
     rows = daemon.view.status().rows
     daemon.kill()
     daemon.start()
@@ -239,7 +241,7 @@ def test_a_bus_that_comes_and_goes_is_shown_and_does_not_fill_the_journal(tmp_pa
 def test_a_joint_that_falls_silent_is_a_fault(tmp_path: Path) -> None:
     daemon = FastDaemon(tmp_path, 1, settings())
     daemon.run(5)
-    batch = daemon.service.batch
+    batch = daemon.service.arm_state.batch
     batch.age[3] = 1.7
     assert daemon.view.status().state is State.FAULT
     assert daemon.view.status().detail == "joint_4: no reading for 1.7 s"
@@ -268,7 +270,7 @@ def test_a_reload_changes_the_policy_and_keeps_what_was_learnt(tmp_path: Path) -
     daemon.service.reload(daemon.arm, settings("apply", observer={"window": 16}))
     status = daemon.view.status()
     assert (status.policy, status.rows) == ("apply", rows)
-    assert daemon.service.watcher.observer.config.window == 16
+    assert daemon.service.records.observation.feed.observer.config.window == 16
 
 
 def test_a_full_disk_is_shown_and_stops_nothing(tmp_path: Path) -> None:

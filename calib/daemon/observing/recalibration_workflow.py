@@ -1,0 +1,238 @@
+"""From findings to calibrations in the controllers: policy, rate limit, approval, write, check, roll-back."""
+
+from collections import deque
+from collections.abc import Callable
+from datetime import datetime
+
+from armlink.errors import ArmlinkError, Refused
+from calib.daemon.observing.observer_feed import Samples
+from calib.daemon.settings import Configuration
+from calib.daemon.state.bus_jobs import BusJobs
+from calib.daemon.state.event_log import EventLog
+from calib.daemon.state.journal import Journal, ProposalRow
+from calib.daemon.view.view import NoSuch, NotPossible
+from calib.observer.check_at_rests import Checked
+from calib.observer.decision import Finding
+from calib.observer.recalibrator import APPLIED_BY, Recalibration, Recalibrator
+from calib.records.records import CalibrationRecord
+from calib.records.store import RecordStore
+
+DAY = 86400.0
+WAITING = 1000
+"""Batches that wait for an alarm to be explained: 100 s; a cause test takes 40 s (`ObserverConfig.window`)."""
+
+
+class RecalibrationWorkflow:
+    """Carries proposals through, one at a time; every step is kept in the journal."""
+
+    def __init__(
+        self,
+        configuration: Configuration,
+        recalibrator: Recalibrator,
+        store: RecordStore,
+        journal: Journal,
+        events: EventLog,
+        jobs: BusJobs,
+        installed: Callable[[CalibrationRecord, Finding], None],
+    ) -> None:
+        """`installed` is called once a record is current and its finding written to the controller."""
+        self._configuration, self._recalibrator, self._store = configuration, recalibrator, store
+        self._journal, self._events, self._jobs, self._installed = journal, events, jobs, installed
+        self._waiting: list[Finding] = []
+        self._checking: str | None = None
+        self._unexplained: deque[Samples] = deque(maxlen=WAITING)
+
+    # ---- what the observer found
+
+    def found(self, finding: Finding) -> None:
+        """Do with a finding what the policy says."""
+        policy = self._configuration.settings.policy
+        if policy == "observe":
+            return
+        if self._jobs.busy:
+            self._waiting.append(finding)
+            return
+        automatic = policy == "apply"
+        by, ask = (APPLIED_BY if automatic else None), not self._configuration.listen_only or automatic
+
+        def done(outcome: Recalibration | ArmlinkError) -> None:
+            if isinstance(outcome, ArmlinkError):
+                self._refused(finding, outcome)
+            else:
+                self._proposed(finding, outcome, automatic)
+            self._next()
+
+        self._jobs.start(lambda: self._recalibrator.propose(finding, by, ask), done)
+
+    def _proposed(self, finding: Finding, outcome: Recalibration, automatic: bool) -> None:
+        joint, record = outcome.joint, outcome.record
+        now = self._events.now()
+        with self._journal.transaction():
+            number = self._journal.add_proposal(now, joint, record.id, record.parent or "", finding)
+            std = dict(zip(("gain_std", "offset_std"), finding.std, strict=True))
+            evidence = {"proposal": number, "record": record.id, "gain": finding.gain, "offset": finding.offset, **std}
+            text = f"{joint}: record {record.id} proposed: gain {outcome.gain:.5f}, offset {outcome.offset:.3f} N·m"
+            self._events.say("proposal", joint, text, evidence)
+        if not automatic:
+            return
+        limit = self._limit(joint, now)
+        if limit:
+            self._events.say("undecided", joint, f"{joint}: not written by itself: {limit}", {"proposal": number})
+            return
+        try:
+            self.approve(number, APPLIED_BY)
+        except NotPossible as error:
+            self._events.say("refused", joint, f"not recalibrated: {error}", {"proposal": number})
+
+    def _limit(self, joint: str, now: datetime) -> str:
+        """The rate limit that forbids a write now, empty if none does; a clock that was set back counts as no time."""
+        applied = [row for row in self._journal.proposals() if row.state == "applied" and row.decided is not None]
+        ages = [(row.joint, abs((now - row.decided).total_seconds())) for row in applied if row.decided is not None]
+        settings = self._configuration.settings
+        if any(name == joint and age < settings.rest_between_writes for name, age in ages):
+            return f"at most one recalibration of a joint in {settings.rest_between_writes:g} s"
+        if sum(age < DAY for _, age in ages) >= settings.writes_per_day:
+            return f"{settings.writes_per_day} recalibrations in a day already"
+        return ""
+
+    # ---- what a person decides
+
+    def approve(self, number: int, by: str) -> ProposalRow:
+        """Write a pending proposal and make its record current; raises NoSuch, NotPossible."""
+        row = self._pending(number)
+        if self._jobs.busy:
+            raise NotPossible("another recalibration is under way: try again in a moment")
+        current = self._recalibrator.record.id
+        if row.base != current:
+            raise NotPossible(f"proposal {number} follows from record {row.base}, but {current} is in force by now")
+        with self._journal.transaction():
+            self._journal.decide(number, self._events.now(), "approved", by)
+            self._events.say("approved", row.joint, f"{row.joint}: approved by {by}", {"proposal": number, "by": by})
+
+        def work() -> CalibrationRecord:
+            record = self._store.get(row.record)
+            assert isinstance(record, CalibrationRecord)
+            self._recalibrator.apply(record, row.finding.joint, by)
+            return record
+
+        def done(outcome: CalibrationRecord | ArmlinkError) -> None:
+            if isinstance(outcome, ArmlinkError):
+                with self._journal.transaction():
+                    self._journal.decide(number, self._events.now(), "failed", "daemon", str(outcome))
+                    self._refused(row.finding, outcome, number)
+            else:
+                with self._journal.transaction():
+                    self._applied(row, by, outcome)
+                    self._installed(outcome, row.finding)
+            self._next()
+
+        self._jobs.start(work, done)
+        return self._row(number)
+
+    def reject(self, number: int, by: str) -> ProposalRow:
+        """Drop a pending proposal; raises NoSuch, NotPossible."""
+        row = self._pending(number)
+        with self._journal.transaction():
+            self._journal.decide(number, self._events.now(), "rejected", by)
+            self._events.say("rejected", row.joint, f"{row.joint}: rejected by {by}", {"proposal": number, "by": by})
+        return self._row(number)
+
+    # ---- after a write
+
+    def settle(self) -> Finding | None:
+        """Close approvals that a kill interrupted; returns the finding that led to the current record, if one did."""
+        current, installed = self._recalibrator.record, None
+        for row in self._journal.proposals():
+            if row.record == current.id and row.state in ("applied", "approved"):
+                installed = row.finding
+            if row.state != "approved":
+                continue
+            if row.record == current.id:
+                with self._journal.transaction():
+                    self._applied(row, row.by or "daemon", current)
+            else:
+                note = "interrupted before it was in force"
+                self._journal.decide(row.id, self._events.now(), "failed", "daemon", note)
+        return installed
+
+    def _applied(self, row: ProposalRow, by: str, record: CalibrationRecord) -> None:
+        """Keep and report that a proposal's record is current."""
+        self._checking = row.joint
+        joint = record.joints[row.finding.joint]
+        gain = "as before" if joint.gain is None else f"{joint.gain:.5f}"
+        text = f"{row.joint}: record {record.id} in force: gain {gain}, offset {joint.offset or 0.0:.3f} N·m"
+        evidence = {"proposal": row.id, "record": record.id, "replaces": row.base, "by": by, "applied": True}
+        self._journal.decide(row.id, self._events.now(), "applied", by)
+        self._events.say("recalibration", row.joint, text, evidence)
+
+    def watch(self, samples: Samples, held: bool) -> None:
+        """Give decimated samples to the check after a write; a write that made the readings worse is taken back.
+
+        While an alarm is open (`held`) they wait until its cause is `explained`: a payload says nothing of the sensor.
+        """
+        if self._checking is None or self._jobs.busy:
+            return
+        if held:
+            self._unexplained.append(samples)
+            return
+        self._unexplained.clear()
+        self._check(samples)
+
+    def explained(self, kind: str, joint: str | None) -> None:
+        """An alarm's cause is known: samples that waited count if it is a drift of the joint just recalibrated."""
+        waiting, self._unexplained = list(self._unexplained), deque(maxlen=WAITING)
+        if kind != "drift" or joint != self._checking:
+            return
+        for samples in waiting:
+            self._check(samples)
+
+    def _check(self, samples: Samples) -> None:
+        for t, position, torque in zip(*samples, strict=True):
+            checked = self._recalibrator.sample(float(t), position, torque)
+            if checked is not None:
+                self._checking = None
+                self._checked(checked)
+                return
+
+    def _checked(self, checked: Checked) -> None:
+        joint = self._configuration.names[checked.joint]
+        why = checked.why.removeprefix(f"{joint}: ")
+        if checked.verdict == "kept":
+            self._events.say("check", joint, f"{joint}: recalibration holds: {why}", {"kept": True})
+            return
+
+        def done(outcome: Recalibration | ArmlinkError) -> None:
+            if isinstance(outcome, ArmlinkError):
+                self._events.say("refused", joint, f"{joint}: roll-back failed: {outcome}", {})
+            else:
+                text = f"{joint}: rolled back to record {outcome.record.id}: {why}"
+                self._events.say("roll-back", joint, text, {"record": outcome.record.id, "why": checked.why})
+                assert outcome.undo is not None
+                self._installed(outcome.record, outcome.undo)
+            self._next()
+
+        self._jobs.start(lambda: self._recalibrator.undo(checked), done)
+
+    # ---- inside
+
+    def _next(self) -> None:
+        if self._waiting and not self._jobs.busy:
+            self.found(self._waiting.pop(0))
+
+    def _refused(self, finding: Finding, error: ArmlinkError, number: int | None = None) -> None:
+        joint = self._configuration.names[finding.joint]
+        kind = "refused" if isinstance(error, Refused) else "fault"
+        evidence = {} if number is None else {"proposal": number}
+        self._events.say(kind, joint, f"not recalibrated: {error}", evidence)
+
+    def _pending(self, number: int) -> ProposalRow:
+        row = self._row(number)
+        if row.state != "pending":
+            raise NotPossible(f"proposal {number} is {row.state} already")
+        return row
+
+    def _row(self, number: int) -> ProposalRow:
+        row = self._journal.proposal(number)
+        if row is None:
+            raise NoSuch(f"no proposal {number}")
+        return row

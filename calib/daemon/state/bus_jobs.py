@@ -1,0 +1,34 @@
+"""Work that waits for the bus: one job at a time, outside of the service's thread."""
+
+from collections.abc import Callable
+from typing import TypeVar
+
+from armlink.errors import ArmlinkError
+from calib.daemon.environment import RunAside
+from calib.daemon.state.journal import Journal
+
+T = TypeVar("T")
+
+
+class BusJobs:
+    """`busy` while a job is under way; the calibration in the controllers may change during that time."""
+
+    def __init__(self, run: RunAside, journal: Journal) -> None:
+        self.busy = False
+        self._run, self._journal = run, journal
+
+    def start(self, work: Callable[[], T], done: Callable[[T | ArmlinkError], None]) -> None:
+        """Run `work` aside, then call `done` with its value or its ArmlinkError; any other error is raised."""
+
+        def back(outcome: T | Exception) -> None:
+            self.busy = False
+            self._journal.guard(lambda: finish(outcome))
+
+        def finish(outcome: T | Exception) -> None:
+            if isinstance(outcome, Exception) and not isinstance(outcome, ArmlinkError):
+                raise outcome
+            done(outcome)
+
+        assert not self.busy
+        self.busy = True
+        self._run(work, back)
