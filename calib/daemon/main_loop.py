@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TypeVar
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import ArmlinkError, BadInput
@@ -19,9 +18,9 @@ from calib.daemon.notify import Notifier, watchdog_seconds
 from calib.daemon.options import Options
 from calib.daemon.service import Service
 from calib.daemon.service_view import ServiceView
+from calib.daemon.state.bus_jobs import InThread
 from calib.records.store import RecordStore
 
-T = TypeVar("T")
 SNAPSHOT_SECONDS = 0.1
 SILENT_SECONDS = 15.0
 """A bus process that has said nothing for so long hangs: it is killed and begun anew."""
@@ -39,9 +38,8 @@ class Daemon:
         self._ended = asyncio.Event()
         self._heard = time.monotonic() + BEGIN_SECONDS
         self._notify, self._watchdog = Notifier(), watchdog_seconds()
-        self._tasks: set[asyncio.Future[Any]] = set()
         port = _CurrentProcess(lambda: self.process)
-        environment = Environment(time.monotonic, lambda: datetime.now(UTC), self._run_aside, port)
+        environment = Environment(time.monotonic, lambda: datetime.now(UTC), InThread(self._loop), port)
         settings = options.settings(arm)
         self.service = Service(arm, settings, options.listen_only, state, RecordStore(options.store), environment)
         self.view = ServiceView(self.service)
@@ -145,20 +143,6 @@ class Daemon:
             if bus_changed:
                 self._restart("the arm file's link section or the work has changed")
         self._notify("READY=1")
-
-    def _run_aside(self, work: Callable[[], T], done: Callable[[T | Exception], None]) -> None:
-        """Run work that waits for the bus in a thread; its outcome comes back on this loop."""
-
-        def back(future: asyncio.Future[T]) -> None:
-            self._tasks.discard(future)
-            if future.cancelled():
-                return
-            error = future.exception()
-            done(error if isinstance(error, Exception) else future.result())
-
-        future = self._loop.run_in_executor(None, work)
-        self._tasks.add(future)
-        future.add_done_callback(back)
 
 
 class _CurrentProcess:

@@ -50,6 +50,9 @@ class Service:
         self.arm_state = ArmState(arm.joint_names, self.events, monotonic)
         self.recordings = Recordings(directory / "recordings", self.configuration)
         self.storage = ObserverStorage(self.journal, environment)
+        self.recalibrations = RecalibrationWorkflow(
+            self.configuration, store, self.arm_state, self.journal, self.events, self.jobs
+        )
         self.tours = PoseTours(self.configuration, self.events, environment, lambda: self.state)
         self.records = ActiveRecords(
             self.configuration, environment, store, self.arm_state, self.events, self.jobs, self._observe
@@ -139,11 +142,8 @@ class Service:
             feed.install(record, finding)
             self.storage.save(feed, history=True)
 
-        recalibrations = RecalibrationWorkflow(
-            configuration, recalibrator, self._store, self.journal, self.events, self.jobs, installed
-        )
-        self.storage.restore(feed, recalibrations.settle())
-        observation = Observation(feed, recalibrations, self.storage, self.events, self.jobs, self.tours.wish)
+        self.storage.restore(feed, self.recalibrations.begin(recalibrator, installed))
+        observation = Observation(feed, self.recalibrations, self.storage, self.events, self.jobs, self.tours.wish)
         if before is not None:
             observation.last_accepted = before.last_accepted
         return observation

@@ -10,9 +10,7 @@ import numpy as np
 
 from armlink.canopen.cia402 import state_of
 from calib.daemon.observing.observation import Observation
-from calib.daemon.observing.recalibration_workflow import RecalibrationWorkflow
 from calib.daemon.service import Service
-from calib.daemon.state.journal import ProposalRow
 from calib.daemon.view.api_models import (
     BusHealth,
     EventRecord,
@@ -25,7 +23,7 @@ from calib.daemon.view.api_models import (
     Status,
 )
 from calib.daemon.view.fan_out import Client
-from calib.daemon.view.view import NoSuch, NotPossible
+from calib.daemon.view.view import Decisions, NoSuch
 
 NO_STATUS = 0xFFFF
 """Stands for the status word of a joint that has sent none."""
@@ -36,6 +34,7 @@ class ServiceView:
 
     def __init__(self, service: Service) -> None:
         self._service, self._version = service, version("armlink")
+        self.decisions: Decisions = service.recalibrations
 
     @property
     def _observation(self) -> Observation | None:
@@ -122,20 +121,7 @@ class ServiceView:
 
     def proposals(self, limit: int = 200) -> tuple[Proposal, ...]:
         """Newest first."""
-        return tuple(_proposal(row) for row in self._service.journal.proposals(limit))
-
-    def approve(self, proposal: int, by: str) -> Proposal:
-        """Write a pending proposal and make its record current; raises NoSuch, NotPossible."""
-        arm_state = self._service.arm_state
-        if not arm_state.connected:
-            self._require(proposal)
-            reason = arm_state.fault or "starting"
-            raise NotPossible(f"the bus is not there ({reason}): nothing can be written")
-        return _proposal(self._recalibrations(proposal).approve(proposal, by))
-
-    def reject(self, proposal: int, by: str) -> Proposal:
-        """Drop a pending proposal; raises NoSuch, NotPossible."""
-        return _proposal(self._recalibrations(proposal).reject(proposal, by))
+        return tuple(row.answer() for row in self._service.journal.proposals(limit))
 
     def subscribe(self) -> Client:
         """A new client of the stream; it begins with the present joints."""
@@ -158,16 +144,6 @@ class ServiceView:
         """Give the stream its item: ten times a second, bus or no bus."""
         if self._service.hub.clients:
             self._service.hub.publish(self.snapshot())
-
-    def _recalibrations(self, proposal: int) -> RecalibrationWorkflow:
-        if self._observation is None:
-            self._require(proposal)
-            raise NotPossible(self._service.records.detail)
-        return self._observation.recalibrations
-
-    def _require(self, proposal: int) -> None:
-        if self._service.journal.proposal(proposal) is None:
-            raise NoSuch(f"no proposal {proposal}")
 
     def _bus(self) -> BusHealth:
         arm_state = self._service.arm_state
@@ -208,26 +184,3 @@ def _point(
 ) -> HistoryPoint:
     values = {name: estimate[name][j] for name in ("gain", "gain_std", "offset", "offset_std")}
     return HistoryPoint(time=time, t=t, joint=joint, record=record, **values)
-
-
-def _proposal(row: ProposalRow) -> Proposal:
-    finding = row.finding
-    gain_std, offset_std = finding.std
-    return Proposal(
-        id=row.id,
-        time=row.time,
-        state=row.state,  # type: ignore[arg-type]
-        joint=row.joint,
-        cause=finding.cause,
-        gain=finding.gain,
-        gain_std=gain_std,
-        offset=finding.offset,
-        offset_std=offset_std,
-        rows=finding.rows,
-        confidence=finding.confidence,
-        record=row.record,
-        base=row.base,
-        decided_at=row.decided,
-        decided_by=row.by,
-        note=row.note,
-    )

@@ -7,15 +7,20 @@ from datetime import datetime
 from armlink.errors import ArmlinkError, Refused
 from calib.daemon.observing.observer_feed import Samples
 from calib.daemon.settings import Configuration
+from calib.daemon.state.arm_state import ArmState
 from calib.daemon.state.bus_jobs import BusJobs
 from calib.daemon.state.event_log import EventLog
-from calib.daemon.state.journal import Journal, ProposalRow
+from calib.daemon.state.journal import Journal
+from calib.daemon.state.proposal_row import ProposalRow
+from calib.daemon.view.api_models import Proposal
 from calib.daemon.view.view import NoSuch, NotPossible
 from calib.observer.check_at_rests import Checked
 from calib.observer.decision import Finding
 from calib.observer.recalibrator import APPLIED_BY, Recalibration, Recalibrator
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
+
+Installed = Callable[[CalibrationRecord, Finding], None]
 
 DAY = 86400.0
 WAITING = 1000
@@ -28,19 +33,42 @@ class RecalibrationWorkflow:
     def __init__(
         self,
         configuration: Configuration,
-        recalibrator: Recalibrator,
         store: RecordStore,
+        arm_state: ArmState,
         journal: Journal,
         events: EventLog,
         jobs: BusJobs,
-        installed: Callable[[CalibrationRecord, Finding], None],
     ) -> None:
-        """`installed` is called once a record is current and its finding written to the controller."""
-        self._configuration, self._recalibrator, self._store = configuration, recalibrator, store
-        self._journal, self._events, self._jobs, self._installed = journal, events, jobs, installed
+        self._configuration, self._names = configuration, configuration.names
+        self._store, self._arm_state = store, arm_state
+        self._journal, self._events, self._jobs = journal, events, jobs
+        self._recalibrator: Recalibrator | None = None
+        self._installed: Installed = lambda record, finding: None
         self._waiting: list[Finding] = []
         self._checking: str | None = None
         self._unexplained: deque[Samples] = deque(maxlen=WAITING)
+
+    def begin(self, recalibrator: Recalibrator, installed: Installed) -> Finding | None:
+        """Follow other records from now on; approvals that a kill interrupted are closed.
+
+        `installed` is called with each record that becomes current, once its finding is written. Returns the finding
+        that led to the record now in force, if one did.
+        """
+        self._recalibrator, self._installed = recalibrator, installed
+        self._waiting, self._checking, self._unexplained = [], None, deque(maxlen=WAITING)
+        current, last = recalibrator.record, None
+        for row in self._journal.proposals():
+            if row.record == current.id and row.state in ("applied", "approved"):
+                last = row.finding
+            if row.state != "approved":
+                continue
+            if row.record == current.id:
+                with self._journal.transaction():
+                    self._applied(row, row.by or "daemon", current)
+            else:
+                note = "interrupted before it was in force"
+                self._journal.decide(row.id, self._events.now(), "failed", "daemon", note)
+        return last
 
     # ---- what the observer found
 
@@ -52,7 +80,7 @@ class RecalibrationWorkflow:
         if self._jobs.busy:
             self._waiting.append(finding)
             return
-        automatic = policy == "apply"
+        recalibrator, automatic = self._active(), policy == "apply"
         by, ask = (APPLIED_BY if automatic else None), not self._configuration.listen_only or automatic
 
         def done(outcome: Recalibration | ArmlinkError) -> None:
@@ -62,7 +90,7 @@ class RecalibrationWorkflow:
                 self._proposed(finding, outcome, automatic)
             self._next()
 
-        self._jobs.start(lambda: self._recalibrator.propose(finding, by, ask), done)
+        self._jobs.start(lambda: recalibrator.propose(finding, by, ask), done)
 
     def _proposed(self, finding: Finding, outcome: Recalibration, automatic: bool) -> None:
         joint, record = outcome.joint, outcome.record
@@ -80,7 +108,7 @@ class RecalibrationWorkflow:
             self._events.say("undecided", joint, f"{joint}: not written by itself: {limit}", {"proposal": number})
             return
         try:
-            self.approve(number, APPLIED_BY)
+            self._write(self._row(number), APPLIED_BY)
         except NotPossible as error:
             self._events.say("refused", joint, f"not recalibrated: {error}", {"proposal": number})
 
@@ -97,22 +125,32 @@ class RecalibrationWorkflow:
 
     # ---- what a person decides
 
-    def approve(self, number: int, by: str) -> ProposalRow:
+    def approve(self, number: int, by: str) -> Proposal:
         """Write a pending proposal and make its record current; raises NoSuch, NotPossible."""
-        row = self._pending(number)
+        row = self._row(number)
+        if not self._arm_state.connected:
+            reason = self._arm_state.fault or "starting"
+            raise NotPossible(f"the bus is not there ({reason}): nothing can be written")
+        self._write(row, by)
+        return self._row(number).answer()
+
+    def _write(self, row: ProposalRow, by: str) -> None:
+        recalibrator, number = self._active(), row.id
+        _require_pending(row)
         if self._jobs.busy:
             raise NotPossible("another recalibration is under way: try again in a moment")
-        current = self._recalibrator.record.id
+        current = recalibrator.record.id
         if row.base != current:
             raise NotPossible(f"proposal {number} follows from record {row.base}, but {current} is in force by now")
         with self._journal.transaction():
             self._journal.decide(number, self._events.now(), "approved", by)
             self._events.say("approved", row.joint, f"{row.joint}: approved by {by}", {"proposal": number, "by": by})
+        joint = self._names.index(row.joint)
 
         def work() -> CalibrationRecord:
             record = self._store.get(row.record)
             assert isinstance(record, CalibrationRecord)
-            self._recalibrator.apply(record, row.finding.joint, by)
+            recalibrator.apply(record, joint, by)
             return record
 
         def done(outcome: CalibrationRecord | ArmlinkError) -> None:
@@ -127,33 +165,18 @@ class RecalibrationWorkflow:
             self._next()
 
         self._jobs.start(work, done)
-        return self._row(number)
 
-    def reject(self, number: int, by: str) -> ProposalRow:
+    def reject(self, number: int, by: str) -> Proposal:
         """Drop a pending proposal; raises NoSuch, NotPossible."""
-        row = self._pending(number)
+        row = self._row(number)
+        self._active()
+        _require_pending(row)
         with self._journal.transaction():
             self._journal.decide(number, self._events.now(), "rejected", by)
             self._events.say("rejected", row.joint, f"{row.joint}: rejected by {by}", {"proposal": number, "by": by})
-        return self._row(number)
+        return self._row(number).answer()
 
     # ---- after a write
-
-    def settle(self) -> Finding | None:
-        """Close approvals that a kill interrupted; returns the finding that led to the current record, if one did."""
-        current, installed = self._recalibrator.record, None
-        for row in self._journal.proposals():
-            if row.record == current.id and row.state in ("applied", "approved"):
-                installed = row.finding
-            if row.state != "approved":
-                continue
-            if row.record == current.id:
-                with self._journal.transaction():
-                    self._applied(row, row.by or "daemon", current)
-            else:
-                note = "interrupted before it was in force"
-                self._journal.decide(row.id, self._events.now(), "failed", "daemon", note)
-        return installed
 
     def _applied(self, row: ProposalRow, by: str, record: CalibrationRecord) -> None:
         """Keep and report that a proposal's record is current."""
@@ -188,14 +211,14 @@ class RecalibrationWorkflow:
 
     def _check(self, samples: Samples) -> None:
         for t, position, torque in zip(*samples, strict=True):
-            checked = self._recalibrator.sample(float(t), position, torque)
+            checked = self._active().sample(float(t), position, torque)
             if checked is not None:
                 self._checking = None
                 self._checked(checked)
                 return
 
     def _checked(self, checked: Checked) -> None:
-        joint = self._configuration.names[checked.joint]
+        joint = self._names[checked.joint]
         why = checked.why.removeprefix(f"{joint}: ")
         if checked.verdict == "kept":
             self._events.say("check", joint, f"{joint}: recalibration holds: {why}", {"kept": True})
@@ -211,7 +234,8 @@ class RecalibrationWorkflow:
                 self._installed(outcome.record, outcome.undo)
             self._next()
 
-        self._jobs.start(lambda: self._recalibrator.undo(checked), done)
+        recalibrator = self._active()
+        self._jobs.start(lambda: recalibrator.undo(checked), done)
 
     # ---- inside
 
@@ -220,19 +244,23 @@ class RecalibrationWorkflow:
             self.found(self._waiting.pop(0))
 
     def _refused(self, finding: Finding, error: ArmlinkError, number: int | None = None) -> None:
-        joint = self._configuration.names[finding.joint]
+        joint = self._names[finding.joint]
         kind = "refused" if isinstance(error, Refused) else "fault"
         evidence = {} if number is None else {"proposal": number}
         self._events.say(kind, joint, f"not recalibrated: {error}", evidence)
 
-    def _pending(self, number: int) -> ProposalRow:
-        row = self._row(number)
-        if row.state != "pending":
-            raise NotPossible(f"proposal {number} is {row.state} already")
-        return row
+    def _active(self) -> Recalibrator:
+        if self._recalibrator is None:
+            raise NotPossible("no calibration and gravity records are in force yet: the status says what is missing")
+        return self._recalibrator
 
     def _row(self, number: int) -> ProposalRow:
         row = self._journal.proposal(number)
         if row is None:
             raise NoSuch(f"no proposal {number}")
         return row
+
+
+def _require_pending(row: ProposalRow) -> None:
+    if row.state != "pending":
+        raise NotPossible(f"proposal {row.id} is {row.state} already")

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from armlink.errors import BadInput
+from calib.daemon.state.proposal_row import ProposalRow
 from calib.observer.decision import Finding
 
 SCHEMA = 1
@@ -40,22 +41,6 @@ CREATE INDEX IF NOT EXISTS decisions_proposal ON decisions(proposal);
 _APPEND_ONLY = ("events", "proposals", "decisions")
 
 log = logging.getLogger("armlink.daemon")
-
-
-@dataclass(frozen=True)
-class ProposalRow:
-    """A proposal with the newest decision on it."""
-
-    id: int
-    time: datetime
-    joint: str
-    record: str
-    base: str
-    finding: Finding
-    state: str
-    by: str | None
-    decided: datetime | None
-    note: str
 
 
 @dataclass(frozen=True)
@@ -246,7 +231,7 @@ def _proposal(row: tuple[Any, ...]) -> ProposalRow:
         joint=joint,
         record=record,
         base=base,
-        finding=Finding.from_json(json.loads(finding)),
+        values=json.loads(finding),
         state=state or "pending",
         by=by,
         decided=None if decided is None else datetime.fromisoformat(decided),

@@ -26,6 +26,21 @@ class NoSuch(Exception):
     """No proposal or joint of that id or name; the message lists what there is (HTTP 404)."""
 
 
+class Decisions(Protocol):
+    """What a person may decide through the API. Raises NoSuch, NotPossible."""
+
+    def approve(self, number: int, by: str) -> Proposal:
+        """Write a pending proposal and make its record current.
+
+        It is `approved` at once, and `applied` or `failed` a moment later (an event).
+        """
+        ...
+
+    def reject(self, number: int, by: str) -> Proposal:
+        """Drop a pending proposal."""
+        ...
+
+
 class Subscription(Protocol):
     """One client's stream: bounded; a client that is too slow loses the oldest items, never holds the daemon up."""
 
@@ -40,6 +55,11 @@ class Subscription(Protocol):
 
 class DaemonView(Protocol):
     """What the web layer may ask. Nothing here commands torque or motion."""
+
+    @property
+    def decisions(self) -> Decisions:
+        """Approval and rejection of proposals."""
+        ...
 
     def status(self) -> Status:
         """State, bus and records."""
@@ -68,17 +88,6 @@ class DaemonView(Protocol):
 
     def proposals(self, limit: int = 200) -> tuple[Proposal, ...]:
         """Newest first."""
-        ...
-
-    def approve(self, proposal: int, by: str) -> Proposal:
-        """Put a pending proposal in force; it is `approved` at once, `applied` or `failed` a moment later (an event).
-
-        Raises NoSuch, NotPossible.
-        """
-        ...
-
-    def reject(self, proposal: int, by: str) -> Proposal:
-        """Drop a pending proposal. Raises NoSuch, NotPossible."""
         ...
 
     def subscribe(self) -> Subscription:

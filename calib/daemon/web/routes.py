@@ -146,12 +146,12 @@ def _add_proposals(router: APIRouter, view: DaemonView) -> None:
     @router.post("/api/proposals/{id}/approve", responses=NO_SUCH | NOT_NOW, tags=["proposals"])
     async def approve(request: Request, id: ProposalId, decision: OptionalDecision = None) -> Proposal:
         """Let a pending proposal be written to the controller; `applied` or `failed` follows as an event."""
-        return view.approve(id, _who(decision, peer_of(request.scope)))
+        return view.decisions.approve(id, _who(decision, peer_of(request.scope)))
 
     @router.post("/api/proposals/{id}/reject", responses=NO_SUCH | NOT_NOW, tags=["proposals"])
     async def reject(request: Request, id: ProposalId, decision: OptionalDecision = None) -> Proposal:
         """Drop a pending proposal."""
-        return view.reject(id, _who(decision, peer_of(request.scope)))
+        return view.decisions.reject(id, _who(decision, peer_of(request.scope)))
 
 
 def _who(decision: Decision | None, peer: Peer) -> str:

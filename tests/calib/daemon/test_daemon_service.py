@@ -66,18 +66,18 @@ def test_under_propose_nothing_is_written_until_a_person_approves(tmp_path: Path
     assert proposal.state == "pending"
     assert daemon.view.status().pending_proposals == 1
     assert not any(call.startswith("write") for call in daemon.sdo)
-    approved = daemon.view.approve(proposal.id, "ann")
+    approved = daemon.view.decisions.approve(proposal.id, "ann")
     assert (approved.state, approved.decided_by) == ("applied", "ann")
     assert abs(daemon.fast.error()[0][2]) < 0.003
     assert daemon.store.activations(daemon.arm)[-1].by == "ann"
     with pytest.raises(NotPossible, match="applied already"):
-        daemon.view.approve(proposal.id, "ann")
+        daemon.view.decisions.approve(proposal.id, "ann")
 
 
 def test_a_rejected_proposal_changes_nothing(tmp_path: Path) -> None:
     daemon = drifted(tmp_path, "propose")
     before = daemon.store.current(CalibrationRecord, daemon.arm)
-    assert daemon.view.reject(daemon.view.proposals()[0].id, "ann").state == "rejected"
+    assert daemon.view.decisions.reject(daemon.view.proposals()[0].id, "ann").state == "rejected"
     assert daemon.store.current(CalibrationRecord, daemon.arm) == before
     assert daemon.of_kind("rejected")[0].evidence["by"] == "ann"
 
@@ -92,7 +92,7 @@ def test_under_observe_a_drift_is_an_event_alone(tmp_path: Path) -> None:
 def test_listening_only_sends_nothing_until_something_is_approved(tmp_path: Path) -> None:
     daemon = drifted(tmp_path, "propose", listen_only=True)
     assert daemon.sdo == []
-    daemon.view.approve(daemon.view.proposals()[0].id, "ann")
+    daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann")
     assert abs(daemon.fast.error()[0][2]) < 0.003
 
 
@@ -112,7 +112,7 @@ def test_a_joint_is_recalibrated_by_itself_no_oftener_than_the_limit(tmp_path: P
 def test_a_write_that_fails_is_said_and_the_old_record_stays(tmp_path: Path) -> None:
     daemon = drifted(tmp_path, "propose")
     daemon.on_write = daemon.broken
-    answer = daemon.view.approve(daemon.view.proposals()[0].id, "ann")
+    answer = daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann")
     assert answer.state == "failed"
     assert "joint gone" in answer.note
     assert daemon.store.current(CalibrationRecord, daemon.arm).id == answer.base
@@ -163,7 +163,7 @@ def test_after_a_kill_it_knows_everything(tmp_path: Path) -> None:
     assert daemon.view.status().rows == rows
     for before, after in zip(estimates, daemon.view.estimates(), strict=True):
         assert after.model_copy(update={"last_accepted": before.last_accepted}) == before
-    daemon.view.approve(proposals[0].id, "ann")
+    daemon.view.decisions.approve(proposals[0].id, "ann")
     assert abs(daemon.fast.error()[0][2]) < 0.003
 
 
@@ -337,7 +337,7 @@ def test_events_proposals_and_decisions_cannot_be_changed(tmp_path: Path) -> Non
     import sqlite3
 
     daemon = drifted(tmp_path, "propose")
-    daemon.view.reject(1, "ann")
+    daemon.view.decisions.reject(1, "ann")
     for statement in ("UPDATE events SET text = ''", "DELETE FROM proposals", "DELETE FROM decisions"):
         with pytest.raises(sqlite3.IntegrityError, match="append-only"):
             daemon.service.journal._db.execute(statement)

@@ -143,7 +143,7 @@ def test_a_failure_inside_shows_no_traceback(server: Served, view: MadeUpView, m
 
 def test_nothing_commands_torque_or_motion(server: Served, view: MadeUpView) -> None:
     """Read is separate from control: by the description, by the routes there are, and by what the view offers."""
-    from calib.daemon.view.view import DaemonView
+    from calib.daemon.view.view import DaemonView, Decisions
     from calib.daemon.web.app import open_app
 
     described = server.client().get("/openapi.json").json()["paths"]
@@ -154,9 +154,10 @@ def test_nothing_commands_torque_or_motion(server: Served, view: MadeUpView) -> 
     app = open_app(view, Streams(view), page_files())
     known = {*described, "/openapi.json", *page_files()}
     assert all(path in known for path in route_paths(app.routes))
-    offered = {name for name in vars(DaemonView) if not name.startswith("_")}
+    offered, decided = ({name for name in vars(seen) if not name.startswith("_")} for seen in (DaemonView, Decisions))
     reading = {"status", "joints", "estimates", "events", "history", "proposals", "subscribe"}
-    assert offered == reading | {"approve", "reject"}
+    assert offered == reading | {"decisions"}
+    assert decided == {"approve", "reject"}
 
 
 def route_paths(routes: Any) -> set[str]:
