@@ -1,4 +1,4 @@
-"""The dictionary of effects that the cause test fits: what each adds to the torque readings (theory.md section 6)."""
+"""The effects that the cause test fits, and their columns in the torque readings (docs/theory.md, section 6)."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ DRIFT = ("gain", "offset", "drift")
 
 @dataclass(frozen=True)
 class Window:
-    """K rows: true-angle positions (K, n) [rad], torque readings as installed (K, n) [N·m], directions (K, n)."""
+    """K rows: true angles (K, n) [rad], torque readings as installed (K, n) [N·m], directions of approach (K, n)."""
 
     position: Array
     torque: Array
@@ -36,17 +36,17 @@ class Entry:
     cause: str
     """gain, offset, drift (both), friction, spring, slip, payload, tilt or scale."""
     joint: int | None
-    """Index of the joint, None where it concerns the arm."""
+    """Index of the joint, None if it concerns the whole arm."""
     columns: Array
-    """What a unit of each parameter adds to the torque readings, (K·n, p)."""
+    """Change of the torque readings per unit of each parameter, (K·n, p)."""
     contains: tuple[str, ...] = ()
     """Causes of the same joint that are special cases of this one."""
     price: int | None = None
-    """Parameters that it is charged for in the BIC; by default those that it has."""
+    """Parameters charged in the BIC; by default the number of columns."""
 
 
 def dictionary(arm: Arm, beta: Array, window: Window) -> Iterator[Entry]:
-    """Every entry of the dictionary for the poses of a window; beta (2n,) [kg·m] is the model believed."""
+    """Every entry of the dictionary for the poses of a window; beta (2n,) [kg·m] is the present gravity model."""
     q, n = window.position, arm.n
     regressor = gravity_regressor(arm, q)
     torque = regressor @ beta
@@ -72,16 +72,16 @@ def dictionary(arm: Arm, beta: Array, window: Window) -> Iterator[Entry]:
     across = np.linalg.svd(arm.gravity[None])[2][1:] * np.linalg.norm(arm.gravity)
     tilted = [gravity_regressor(replace(arm, gravity=direction), q) @ beta for direction in across]
     yield Entry("tilt", None, np.stack(tilted, axis=-1).reshape(-1, 2))
-    # a payload explains nine tenths of a common scale and is far more frequent: same price, so that it wins
+    # a payload explains nine tenths of a common scale and is far more frequent: at the same price it wins
     yield Entry("scale", None, torque.reshape(-1, 1), price=4)
 
 
 def class_of(entry: Entry) -> str:
-    """What an entry counts as when verdicts compete: gain, offset and both of one joint are one class."""
+    """Class in which an entry competes: gain, offset and both of one joint are one class."""
     cause = "drift" if entry.cause in DRIFT else entry.cause
     return cause if entry.joint is None else f"{cause}_{entry.joint + 1}"
 
 
 def kin(entry: Entry, winner: Entry) -> bool:
-    """Whether an entry is no rival: same class, or the winner is a special case of it."""
+    """Whether an entry is not a rival: it is of the same class, or the winner is a special case of it."""
     return class_of(entry) == class_of(winner) or (entry.joint == winner.joint and winner.cause in entry.contains)

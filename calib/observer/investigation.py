@@ -32,7 +32,7 @@ class Investigation:
         """Whether the last window had no single cause."""
         self.first: Agreeing | None = None
         """Rows that found a drift, to be confirmed by the next window."""
-        self.said: tuple[str, tuple[int, ...]] | None = None
+        self.reported: tuple[str, tuple[int, ...]] | None = None
         """The last verdict reported: cause and joints."""
         self.reasons: tuple[str, ...] = ()
         """The last reasons reported for not deciding."""
@@ -65,7 +65,7 @@ class Investigation:
 
     def save(self) -> dict[str, Any]:
         """Rows and results as JSON values."""
-        first, said = self.first, self.said
+        first, said = self.first, self.reported
         return {
             "held": self.held,
             "carrying": self.carrying,
@@ -94,7 +94,7 @@ class Investigation:
             held, doubtful, reasons = bool(values["held"]), bool(values["doubtful"]), tuple(values["reasons"])
         except UNREADABLE:
             return False
-        self.window, self.first, self.said, self.reasons = window, first, said, reasons
+        self.window, self.first, self.reported, self.reasons = window, first, said, reasons
         self.fresh, self.repeated, self.carrying = fresh, repeated, carrying
         self.held, self.doubtful = held, doubtful
         return True

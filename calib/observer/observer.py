@@ -1,7 +1,7 @@
-"""The observer: watches ordinary motion and says when a joint's torque sensor has drifted, and by how much.
+"""The observer: watches ordinary motion and reports when a joint's torque sensor has drifted, and by how much.
 
-Pure: samples in, events out; no bus, clock, file or thread. Readings are those of the installed calibration, so that
-every estimate is relative to it: reading = gain·τ + offset with gain 1 and offset 0 while nothing has drifted.
+Pure: samples in, events out; no bus, clock, file or thread. Readings are those of the installed calibration, and every
+estimate is relative to it: reading = gain·τ + offset, with gain 1 and offset 0 while nothing has drifted.
 """
 
 from copy import copy
@@ -28,7 +28,7 @@ SCHEMA = 1
 
 
 class Observer:
-    """`handle(sample)` → events; `estimate()`; `install(joint)` after a new calibration was written."""
+    """`handle(sample)` → events; `estimate()`; `install(finding)` after a new calibration was written."""
 
     def __init__(
         self,
@@ -43,8 +43,8 @@ class Observer:
         """Watch an arm.
 
         beta (2n,) [kg·m] and its covariance (2n, 2n) as the gravity record has them; sigma (n,) [N·m], standard
-        deviation of one averaged torque reading to begin with, which the readings themselves tell afterwards; position
-        gains and offsets (n,) of the calibration record.
+        deviation of one averaged torque reading to begin with, replaced by the measured one; position gains and offsets
+        (n,) of the calibration record.
         """
         self.arm, self.config = arm, config or ObserverConfig()
         self._position_gain = np.ones(arm.n) if position_gain is None else position_gain
@@ -73,7 +73,7 @@ class Observer:
         rated_torque: Array,
         config: ObserverConfig | None = None,
     ) -> "Observer":
-        """Observer of an arm with these records in force; rated_torque (n,) [N·m] scales the noise assumed at first."""
+        """Observer against these records; rated_torque (n,) [N·m] scales the noise assumed at first."""
         config = config or ObserverConfig()
         sigma = config.noise_share * np.asarray(rated_torque, dtype=float)
         position = (calibration.values("position_gain", 1.0), calibration.values("position_offset", 0.0))
@@ -231,8 +231,8 @@ class Observer:
 
     def _report(self, t: float, verdict: Verdict) -> list[Event]:
         """The verdict as an event, reported when it changes."""
-        before, now = self._investigation.said, (verdict.cause, verdict.joints)
-        self._investigation.said = now
+        before, now = self._investigation.reported, (verdict.cause, verdict.joints)
+        self._investigation.reported = now
         return [] if before == now else [self._verdict(t, verdict)]
 
     def _verdict(self, t: float, verdict: Verdict) -> Event:
