@@ -23,14 +23,14 @@ from calib.records.store import RecordStore
 
 SNAPSHOT_SECONDS = 0.1
 SILENT_SECONDS = 15.0
-"""A bus process that has said nothing for so long hangs: it is killed and begun anew."""
+"""A bus process that sends nothing for this time hangs: it is killed and started again [s]."""
 BEGIN_SECONDS = 30.0
-"""A new bus process may take so long to say its first word."""
+"""Time for a new bus process to send its first message [s]."""
 log = logging.getLogger("armlink.daemon")
 
 
 class Daemon:
-    """Everything that lives as long as the process does."""
+    """Connects the service to process, clock, signals and web server."""
 
     def __init__(self, options: Options, arm: ArmFile, process: LoopProcess, state: Path) -> None:
         self.options, self.arm, self.process = options, arm, process
@@ -46,7 +46,7 @@ class Daemon:
         self._why = "stopped"
 
     async def run(self) -> None:
-        """Until SIGTERM or SIGINT; leaves the joints safe."""
+        """Run until SIGTERM or SIGINT; leaves the joints safe."""
         for number, act in {
             signal.SIGTERM: lambda: self._end("SIGTERM"),
             signal.SIGINT: lambda: self._end("SIGINT"),
@@ -74,7 +74,7 @@ class Daemon:
             self.service.close(self._why)
 
     async def _serve(self) -> None:
-        """API and page; what they need is loaded aside, while the arm is observed already."""
+        """API and page; their modules are loaded in a thread, while the arm is observed already."""
         server = await asyncio.to_thread(importlib.import_module, "calib.daemon.web.server")
         given = self.options
         await server.serve(self.view, socket=given.socket, tcp=given.tcp, token=given.token)
@@ -84,16 +84,16 @@ class Daemon:
         self._ended.set()
 
     async def _timer(self) -> None:
-        """Snapshots, the service's second, the watchdog, and a look after the bus process."""
-        ticked, kept_alive, said = 0.0, 0.0, ""
+        """Snapshots, the service's tick, the watchdog, and supervision of the bus process."""
+        ticked, kept_alive, notified = 0.0, 0.0, ""
         due = time.monotonic()
         while True:
             now = time.monotonic()
             self.view.publish()
             why = self.service.arm_state.fault or self.service.records.detail
             status = f"STATUS={self.service.state} {why}".strip()
-            if status != said:
-                said = status
+            if status != notified:
+                notified = status
                 self._notify(status)
             if now - ticked >= 1.0:
                 ticked = now
@@ -117,7 +117,7 @@ class Daemon:
             self.service.take(message)
 
     def _restart(self, why: str) -> None:
-        """Begin the bus process anew; until then its joints are held by their own deadlines."""
+        """Replace the bus process; meanwhile the joints' own deadlines hold them."""
         log.error(why)
         self._loop.remove_reader(self.process.fileno())
         self.process.close()
@@ -127,7 +127,7 @@ class Daemon:
         self._loop.add_reader(self.process.fileno(), self._messages)
 
     def _reload(self) -> None:
-        """SIGHUP: the arm file and the records anew; a file that cannot be used changes nothing."""
+        """SIGHUP: read the arm file and the records again; an unusable file changes nothing."""
         self._notify("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
         try:
             arm = load_arm(self.options.arm)
@@ -158,7 +158,7 @@ class _CurrentProcess:
 
 
 def run_daemon(options: Options, arm: ArmFile, state: Path, process: LoopProcess) -> None:
-    """Run until told to stop, with a bus process that is there already; it has ended when this returns."""
+    """Run until a signal to stop, with a bus process already started; it has ended when this returns."""
 
     async def main() -> None:
         try:

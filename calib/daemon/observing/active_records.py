@@ -81,7 +81,7 @@ class ActiveRecords:
         self.detail = ""
         if before is not None:
             evidence = {"calibration": calibration.id, "gravity": gravity.id}
-            self._events.say("configuration", None, "other records are in force: observing anew against them", evidence)
+            self._events.say("configuration", None, "other records are in force and observed against now", evidence)
         self._check_controllers()
 
     def renew(self) -> None:
@@ -128,7 +128,7 @@ class ActiveRecords:
                 return
             undone, self._held = outcome
             if undone:
-                self._events.say("roll-back", None, "a write to the controllers that was cut off is undone", {})
+                self._events.say("roll-back", None, "an interrupted write to the controllers was undone", {})
             self._compare()
 
         self._jobs.start(work, done)
@@ -153,7 +153,7 @@ class ActiveRecords:
                 return
             feed.controllers_hold(None)
             evidence = {"record": record.id, "joints": differ, "applied": True, "restored": True}
-            text = f"record {record.id} written anew to {', '.join(outcome)}"
+            text = f"record {record.id} written again to {', '.join(outcome)}"
             self._events.say("recalibration", None, text, evidence)
 
         self._jobs.start(lambda: self._write(record), done)

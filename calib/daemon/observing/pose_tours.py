@@ -31,7 +31,7 @@ class PoseTours:
         """Begin a tour, so that the observer gets enough poses."""
         state = self._state()
         if self._configuration.listen_only or state is not State.OBSERVING:
-            reason = "it only listens" if self._configuration.listen_only else f"it is {state}"
+            reason = "the daemon only listens" if self._configuration.listen_only else f"the daemon is {state}"
             self._events.say("refused", None, f"no sweep ({why}): {reason}", {})
             return
         self.progress, self._last = Progress(0, TOUR_POSES), self._environment.monotonic()

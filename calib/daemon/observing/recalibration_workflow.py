@@ -105,7 +105,7 @@ class RecalibrationWorkflow:
             return
         limit = self._limit(joint, now)
         if limit:
-            self._events.say("undecided", joint, f"{joint}: not written by itself: {limit}", {"proposal": number})
+            self._events.say("undecided", joint, f"{joint}: not written automatically: {limit}", {"proposal": number})
             return
         try:
             self._write(self._row(number), APPLIED_BY)
@@ -120,7 +120,7 @@ class RecalibrationWorkflow:
         if any(name == joint and age < settings.rest_between_writes for name, age in ages):
             return f"at most one recalibration of a joint in {settings.rest_between_writes:g} s"
         if sum(age < DAY for _, age in ages) >= settings.writes_per_day:
-            return f"{settings.writes_per_day} recalibrations in a day already"
+            return f"{settings.writes_per_day} recalibrations within a day are the limit"
         return ""
 
     # ---- what a person decides
@@ -130,7 +130,7 @@ class RecalibrationWorkflow:
         row = self._row(number)
         if not self._arm_state.connected:
             reason = self._arm_state.fault or "starting"
-            raise NotPossible(f"the bus is not there ({reason}): nothing can be written")
+            raise NotPossible(f"the bus is not connected ({reason}): nothing can be written")
         self._write(row, by)
         return self._row(number).answer()
 
@@ -141,7 +141,7 @@ class RecalibrationWorkflow:
             raise NotPossible("another recalibration is under way: try again in a moment")
         current = recalibrator.record.id
         if row.base != current:
-            raise NotPossible(f"proposal {number} follows from record {row.base}, but {current} is in force by now")
+            raise NotPossible(f"proposal {number} follows from record {row.base}, but {current} is in force now")
         with self._journal.transaction():
             self._journal.decide(number, self._events.now(), "approved", by)
             self._events.say("approved", row.joint, f"{row.joint}: approved by {by}", {"proposal": number, "by": by})

@@ -1,4 +1,4 @@
-"""Recordings that the daemon keeps by itself: MCAP files of some minutes, the oldest dropped when the quota is full."""
+"""The daemon's own recordings: MCAP files of some minutes each; the oldest are dropped when the quota is full."""
 
 import logging
 from datetime import UTC, datetime
@@ -9,7 +9,7 @@ from calib.daemon.settings import Configuration, RecordingSettings
 
 log = logging.getLogger("armlink.daemon")
 GAP = 1.0
-"""A pause in the samples longer than this begins another file [s]."""
+"""A pause in the samples longer than this begins a new file [s]."""
 RETRY_SECONDS = 60.0
 """After a failure nothing is written for this time [s]."""
 
@@ -79,7 +79,7 @@ class Recordings:
         self._begun = self._due = t
 
     def _keep_quota(self) -> None:
-        """Drop the oldest files until the rest, one more of the largest size included, fits the quota."""
+        """Drop the oldest files until the rest and one more of the largest size fit the quota."""
         files = sorted(self._directory.glob("*.mcap"), key=lambda path: path.name)
         sizes = [path.stat().st_size for path in files]
         room = self._settings.quota_mb * 1e6 - max(sizes, default=0)

@@ -1,4 +1,4 @@
-"""What stands before every request: Host, rate, token, origin, size; and the headers that go on every answer."""
+"""Checks before every request: Host, rate, token, origin, size; and the headers of every answer."""
 
 import asyncio
 import hmac
@@ -53,7 +53,7 @@ class Access:
 
 
 class Denied(Exception):
-    """A request that goes no further."""
+    """A request that is refused here."""
 
     def __init__(self, status: int, why: str, headers: dict[str, str] | None = None) -> None:
         super().__init__(why)

@@ -89,10 +89,10 @@ def test_a_proposal_is_decided_once_and_by_somebody(server: Served, view: MadeUp
         ("GET", "/api/history?from=2026-05-01T08:00:00", 422, "timezone"),
         ("GET", "/api/history?from=0001-01-01T00:00:00%2B14:00", 422, "between 1970 and 2999"),
         ("GET", "/api/history?from=2026-05-02T00:00:00Z&to=2026-05-01T00:00:00Z", 422, "from is later than to"),
-        ("GET", "/api/proposals/0/approve", 405, "GET is not possible"),
+        ("GET", "/api/proposals/0/approve", 405, "GET is not allowed"),
         ("POST", "/api/proposals/0/approve", 422, "id"),
         ("POST", "/api/proposals/one/approve", 422, "id"),
-        ("POST", "/api/status", 405, "POST is not possible"),
+        ("POST", "/api/status", 405, "POST is not allowed"),
         ("GET", "/api/stream?after=x", 422, "after"),
         ("GET", "/api/torque", 404, "/api/torque"),
         ("GET", "/static/../app.py", 404, "there is no"),
@@ -138,7 +138,7 @@ def test_a_failure_inside_shows_no_traceback(server: Served, view: MadeUpView, m
     monkeypatch.setattr(view, "estimates", broken)
     answer = server.client().get("/api/estimates")
     assert answer.status_code == 500
-    assert answer.json() == {"error": "this failed inside the daemon; its log says why"}
+    assert answer.json() == {"error": "internal error; the daemon's log says why"}
 
 
 def test_nothing_commands_torque_or_motion(server: Served, view: MadeUpView) -> None:
