@@ -63,7 +63,7 @@ class Service:
 
     @property
     def state(self) -> State:
-        """What the daemon is doing."""
+        """Activity of the daemon."""
         connected = self.arm_state.connected
         if self.jobs.busy:
             return State.RECALIBRATING

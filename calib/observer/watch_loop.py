@@ -35,7 +35,7 @@ class WatchHistory:
     recalibrations: list[tuple[float, Recalibration]] = field(default_factory=list)
 
     def first(self, kind: str, joint: str, after: float = 0.0) -> float | None:
-        """Time of the first event of a kind on a joint from `after` on, None where there was none."""
+        """Time of the first event of a kind on a joint from `after` on; None if there was none."""
         times = (event.t for event in self.events if event.kind == kind and event.joint == joint and event.t >= after)
         return next(times, None)
 

@@ -50,6 +50,7 @@ class FastDaemon:
         self.controllers, self.port = self, self
         self.ids = [0] * self.fast.n
         self.sdo: list[str] = []
+        self.run_aside = run_now
         self.on_write: Callable[[int], None] = lambda joint: None
         self.touring, self.job_after = 0, self.fast.job
         if records:
@@ -73,7 +74,7 @@ class FastDaemon:
         return CalibrationRecord(**provenance(self.arm, created=START), joints=joints), gravity
 
     def start(self, up: bool = True) -> None:
-        environment = Environment(self.now, self.wall, run_now, self)
+        environment = Environment(self.now, self.wall, lambda work, done: self.run_aside(work, done), self)
         state = self.directory / "state"
         self.service = Service(self.arm, self.settings, self.listen_only, state, self.store, environment)
         self.view = ServiceView(self.service)

@@ -73,6 +73,7 @@ class ActiveRecords:
                 return
             before = self.observation
             if before is not None and before.feed.measures_against(calibration, gravity):
+                self.detail = ""
                 return
             self.observation = self._observe(calibration, gravity)
         except ArmlinkError as error:

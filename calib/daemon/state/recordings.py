@@ -4,6 +4,7 @@ import logging
 from datetime import UTC, datetime
 from pathlib import Path
 
+from armlink.recording.mcap import RecordingWriter
 from calib.daemon.loop.loop_messages import Batch
 from calib.daemon.settings import Configuration, RecordingSettings
 
@@ -22,9 +23,6 @@ class Recordings:
 
     def __init__(self, directory: Path, configuration: Configuration) -> None:
         """Files go to `directory`, which is made with the first one."""
-        from armlink.recording.mcap import RecordingWriter
-
-        self._make = RecordingWriter
         self._directory, self._configuration = directory, configuration
         self._writer: RecordingWriter | None = None
         self._begun = self._last = self._due = -float("inf")
@@ -75,7 +73,7 @@ class Recordings:
         last = max((path.name for path in self._directory.glob("*.mcap")), default="0")
         number = int(last.partition("-")[0]) + 1 if last.partition("-")[0].isdigit() else 1
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-        self._writer = self._make(self._directory / f"{number:08d}-{stamp}.mcap", self._configuration.names)
+        self._writer = RecordingWriter(self._directory / f"{number:08d}-{stamp}.mcap", self._configuration.names)
         self._begun = self._due = t
 
     def _keep_quota(self) -> None:

@@ -77,7 +77,7 @@ class Status(Answer):
     """Rests of the arm that the observer has used since the daemon first ran with these records."""
     pending_proposals: int = 0
     last_event: int = 0
-    """Id of the newest event, 0 where there is none."""
+    """Id of the newest event; 0 if there is none."""
     report: Path | None = None
     """The newest report (HTML) of a sweep, if there is one."""
 

@@ -27,7 +27,7 @@ class NoSuch(Exception):
 
 
 class Decisions(Protocol):
-    """What a person may decide through the API. Raises NoSuch, NotPossible."""
+    """Decisions that a person may take through the API. Raises NoSuch, NotPossible."""
 
     def approve(self, number: int, by: str) -> Proposal:
         """Write a pending proposal and make its record current.

@@ -7,9 +7,11 @@ import os
 import socket
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from daemon_bench import run_now
 from fast_daemon import QUIET, FastDaemon
 
 from armlink.arm_file import load_arm
@@ -210,6 +212,30 @@ def test_controllers_that_lost_power_get_the_record_again(tmp_path: Path) -> Non
     daemon.service.take(Up(daemon.held()))
     assert daemon.of_kind("recalibration")[-1].evidence["restored"]
     assert abs(daemon.fast.error()[0][2]) < 0.003
+
+
+def test_a_bus_that_comes_back_during_a_write_is_compared_after_it(tmp_path: Path) -> None:
+    daemon = drifted(tmp_path, "propose")
+    jobs: list[tuple[Any, Any]] = []
+    daemon.run_aside = lambda work, done: jobs.append((work, done))
+    daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann")
+    daemon.fast.held_gain[5] = 1.3
+    daemon.service.take(Down("no power"))
+    daemon.service.take(Up(daemon.held()))
+    daemon.service.tick()
+    assert not daemon.of_kind("configuration")
+    (write,) = jobs
+    run_now(*write)
+    daemon.run_aside = run_now
+    daemon.service.tick()
+    assert daemon.of_kind("configuration")[0].evidence["joints"] == ["joint_6"]
+
+
+def test_an_error_that_is_no_fault_of_the_bus_is_raised(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings())
+    with pytest.raises(ZeroDivisionError):
+        daemon.service.jobs.start(lambda: 1 / 0, lambda outcome: None)
+    assert not daemon.service.jobs.busy
 
 
 def test_under_propose_readings_of_other_calibrations_are_converted(tmp_path: Path) -> None:

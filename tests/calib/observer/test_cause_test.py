@@ -1,4 +1,4 @@
-"""The cause test against the Monte Carlo table of theory.md section 6."""
+"""The cause test against the Monte Carlo table of docs/theory.md, section 6."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from gcomp.arm.mass_moments import payload_columns
 from gcomp.gravity.torque import gravity_regressor, gravity_stiffness, gravity_torque
 
 MODEL_STD = np.repeat([4.4, 4.5, 1.3, 0.9, 0.5, 0.4, 0.3], 2) * 1e-3
-"""Errors of a good calibration, kg·m (theory.md section 6)."""
+"""Errors of a good calibration, kg·m (docs/theory.md, section 6)."""
 
 Effect = Callable[[Arm, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.random.Generator], str]
 """(arm, beta, q, direction, readings to change, random) -> the right answer."""

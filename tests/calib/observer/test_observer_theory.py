@@ -1,4 +1,4 @@
-"""What theory.md promises of the observer as a whole (section 8, item 9) that no part of it shows alone."""
+"""Properties of the observer as a whole that no part shows alone (docs/theory.md, section 8, item 9)."""
 
 from collections import Counter
 
