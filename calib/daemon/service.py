@@ -1,4 +1,15 @@
-"""The service: makes the daemon's parts, connects them, and routes the bus loop's messages. One thread, no waiting."""
+"""The service: makes the daemon's parts, connects them, and routes the bus loop's messages. One thread, no waiting.
+
+Each part holds its own state and calls only parts further down:
+
+    ActiveRecords          records in force, and whether the controllers hold them
+    Observation            one observer against one pair of records: ObserverFeed
+    RecalibrationWorkflow  proposals, decisions, writes, the check after a write
+    PoseTours, ObserverStorage, ArmState, Recordings
+    BusJobs                work that waits for the bus, one job at a time
+    EventLog               events to the journal, the stream's Hub and the process's log
+    Journal                the file; Configuration and Environment are given
+"""
 
 from importlib.metadata import version
 from pathlib import Path

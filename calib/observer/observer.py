@@ -17,8 +17,8 @@ from calib.observer.events import Event, verdict_evidence
 from calib.observer.gravity_belief import GravityBelief
 from calib.observer.investigation import Investigation
 from calib.observer.rest_detector import RestDetector, Row
-from calib.observer.sensor_filter import Estimate
-from calib.observer.tracking import Tracking
+from calib.observer.tracking.sensor_filter import Estimate
+from calib.observer.tracking.tracking import Tracking
 from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from calib.observer.config import ObserverConfig
-from calib.observer.cusum import Cusum
 from calib.observer.rest_detector import RestDetector, Row
-from calib.observer.sensor_filter import SensorFilter
+from calib.observer.tracking.cusum import Cusum
+from calib.observer.tracking.sensor_filter import SensorFilter
 from gcomp.gravity.torque import gravity_torque
 
 CONFIG = ObserverConfig()

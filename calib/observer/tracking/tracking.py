@@ -7,14 +7,14 @@ import numpy as np
 
 from calib.observer.cause_test import CauseTest
 from calib.observer.config import ObserverConfig
-from calib.observer.cusum import Cusum
 from calib.observer.decision import Finding
 from calib.observer.effect_dictionary import Window
 from calib.observer.gravity_belief import GravityBelief
-from calib.observer.pose_memory import PoseMemory
 from calib.observer.rest_detector import Row
 from calib.observer.saved_values import UNREADABLE
-from calib.observer.sensor_filter import SensorFilter
+from calib.observer.tracking.cusum import Cusum
+from calib.observer.tracking.pose_memory import PoseMemory
+from calib.observer.tracking.sensor_filter import SensorFilter
 from gcomp.arrays import Array, as_array
 
 Alarm = tuple[str, int, dict[str, Any]]
