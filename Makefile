@@ -49,7 +49,8 @@ blind: .venv/.dev ## Long campaign outside make test: the diagnosis against seal
 mutants: .venv/.dev ## Long campaign outside make test: each change of the gate's source must make a test fail
 	$(BIN)/python tests/campaigns/mutants.py $(ARGS)
 
-docs: .venv/.dev ## Check the documentation: links, and that its commands run
+docs: .venv/.dev ## Build the documentation site into site/ and check it: warnings are errors, links hold, commands run
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 	$(BIN)/python -m pytest -q tests/house/test_docs.py
 
 constraints: .venv/.dev ## Write constraints.txt anew from what .venv holds
@@ -58,4 +59,4 @@ constraints: .venv/.dev ## Write constraints.txt anew from what .venv holds
 	@mv constraints.new constraints.txt
 
 clean: ## Remove what was made, .venv included
-	rm -rf .venv .venv.log armlink-demo .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf .venv .venv.log armlink-demo site .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

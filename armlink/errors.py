@@ -21,3 +21,24 @@ class BusFault(ArmlinkError):
     """The bus or a device on it failed; the joints were left safe."""
 
     exit_status = 3
+
+
+class Stall(BusFault):
+    """The cycle stood still and the joints were stopped. Nothing is known to be broken: the work can be repeated."""
+
+
+class HostLate(Stall):
+    """This host did not keep the cycle."""
+
+    def __init__(self, late: float, limit: float, then: str = "") -> None:
+        """How late its SYNC was and how late it may be [s], and what a joint did about it."""
+        super().__init__(f"the host was {late * 1e3:.0f} ms late (limit {limit * 1e3:.0f} ms){then and f'; {then}'}")
+        self.late, self.limit, self.then = late, limit, then
+
+    def __reduce__(self) -> tuple[type["HostLate"], tuple[float, float, str]]:
+        """Passes from process to process."""
+        return type(self), (self.late, self.limit, self.then)
+
+
+class Silence(Stall):
+    """No reading came from a joint for longer than `link.deadline`."""

@@ -17,7 +17,7 @@ import can
 from armlink.bus.socket_port import SocketPort
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "armlink"))
-from conftest import FakeBus, make_arm
+from fake_joints import FakeBus, make_arm
 
 __all__ = ["NODES", "answer_in_kernel", "make_arm", "remove_gateway", "start_nodes"]
 

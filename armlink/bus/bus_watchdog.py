@@ -11,8 +11,9 @@ CROWDED_CYCLES = 10
 """So many cycles running that have more are a babbling node."""
 DOUBLE_CYCLES = 3
 """So many cycles running with two readings of one joint are a second node with its id."""
-FORGIVEN = 25
-"""So many readings that did not come in their cycle may come later, two at a time, as from a node that caught up."""
+FORGIVEN = 250
+"""Readings that did not come in their cycle and may come later, several at a time, as from an arm that was late itself
+and catches up with a second of SYNCs."""
 
 
 class BusWatch:
@@ -49,6 +50,12 @@ class BusWatch:
         self.flooded = False
         self._double_cycles = [0] * len(self._double_cycles)
         self._crowded_cycles = 0
+
+    def settle(self) -> None:
+        """After an interruption: what crowded the bus has passed; replies that are owed may still come."""
+        self.flooded, self._crowded_cycles = False, 0
+        self._doubled.clear()
+        self._double_cycles = [0] * len(self._double_cycles)
 
     def again(self, joint: int) -> None:
         """A second reading of a joint came in this cycle: a late one, or one too many for the SYNCs there were."""

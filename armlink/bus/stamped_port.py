@@ -1,4 +1,4 @@
-"""SocketCAN for who only listens: now and then all that came, each frame with the time at which the kernel had it."""
+"""Ports for listeners: batches of frames with the kernel's timestamps, on SocketCAN and udp_multicast."""
 
 import ctypes
 import select
@@ -7,8 +7,10 @@ import struct
 import time
 from typing import Any
 
-from armlink.bus.port import GroupPort, Port, is_fd, is_socketcan, open_port
-from armlink.bus.socket_port import BATCH, CONTROL, FLAGS, SocketPort
+from armlink.bus.datagram_port import BATCH, CONTROL, FLAGS, DatagramPort
+from armlink.bus.multicast_port import MulticastPort
+from armlink.bus.port import GroupPort, Port, is_fd, is_multicast, is_socketcan, open_port
+from armlink.bus.socket_port import SocketPort
 from armlink.canopen.object_dictionary import SYNC_ID
 
 Stamped = tuple[float, int, bytes]
@@ -21,13 +23,12 @@ _STAMP = struct.Struct("=16xqq32x")  # the first control message of a frame, by 
 _CLOCK_TRIES, _CLOCK_SECONDS = 5, 1e-4  # two clocks are read so close together, or so often tried
 
 
-class StampedPort(SocketPort):
-    """A SocketPort whose frames are taken in batches, with their times: by `wait` and `take_all`, not by `receive`."""
+class Stamping(DatagramPort):
+    """A port whose frames are taken in batches, with their times: by `wait` and `take_all`, not by `receive`."""
 
-    def __init__(self, bus: Any, fd: bool = False) -> None:
-        """The raw socket of a python-can SocketCAN bus; every frame has room for its control messages."""
-        super().__init__(bus, fd)
-        self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+    def stamp(self, receiving: socket.socket) -> None:
+        """Let the kernel stamp what comes; every datagram has room for its control messages."""
+        receiving.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         self._control = ctypes.create_string_buffer(BATCH * CONTROL)
         base = ctypes.addressof(self._control)
         for i, message in enumerate(self._in.messages):
@@ -54,12 +55,11 @@ class StampedPort(SocketPort):
             ctypes.memmove(self._in.address, self._headers, len(self._headers))
             count = self._take_batch()
             stamps = _STAMP.iter_unpack(self._stamps[: count * CONTROL])
-            layouts = self._layout.iter_unpack(self._received[: count * self._layout.size])
-            for (can_id, length, _, data), (seconds, nano) in zip(layouts, stamps, strict=True):
+            for (can_id, data), (seconds, nano) in zip(self._decode(count), stamps, strict=True):
                 if can_id & FLAGS:
                     others.append(can_id)
                 else:
-                    frames.append((seconds - ahead + 1e-9 * nano, can_id, data[:length]))
+                    frames.append((seconds - ahead + 1e-9 * nano, can_id, data))
             if count < BATCH:
                 break
         if others:
@@ -70,13 +70,31 @@ class StampedPort(SocketPort):
         return frames
 
 
+class StampedSocketPort(Stamping, SocketPort):
+    """SocketCAN with times."""
+
+    def __init__(self, bus: Any, fd: bool = False) -> None:
+        """The raw socket of a python-can SocketCAN bus."""
+        super().__init__(bus, fd)
+        self.stamp(bus.socket)
+
+
+class StampedMulticastPort(Stamping, MulticastPort):
+    """udp_multicast with times."""
+
+    def __init__(self, bus: Any, fd: bool = True) -> None:
+        """The socket of a python-can UdpMulticastBus."""
+        super().__init__(bus, fd)
+        self.stamp(bus._multicast._socket)
+
+
 class StampedGroup(GroupPort):
     """Several buses as one, their frames in the order of their times; the SYNC of the first bus stands for all."""
 
     def __init__(self, group: Any) -> None:
-        """Take `group.members` (SocketCAN buses) and `group.route` (node id → index of its bus)."""
-        self._members = tuple(StampedPort(bus, is_fd(bus)) for bus in group.members)
-        super().__init__(group, self._members)
+        """Take `group.members` (buses that can be stamped) and `group.route` (node id → index of its bus)."""
+        self._stamping = tuple(_stamped(bus) for bus in group.members)
+        super().__init__(group, self._stamping)
         self._early: list[Stamped] = []
 
     def wait(self, timeout: float) -> None:
@@ -84,10 +102,10 @@ class StampedGroup(GroupPort):
         select.select(self._numbers, [], [], timeout)
 
     def take_all(self) -> list[Stamped]:
-        """All frames that came before this call, as StampedPort.take_all; later ones wait for those of every bus."""
+        """All frames that came before this call, as Stamping.take_all; later ones wait for those of every bus."""
         end = time.monotonic()
         frames, self._early = self._early, []
-        for index, member in enumerate(self._members):
+        for index, member in enumerate(self._stamping):
             for frame in member.take_all():
                 if not (index and frame[1] == SYNC_ID):
                     (frames if frame[0] <= end else self._early).append(frame)
@@ -95,14 +113,19 @@ class StampedGroup(GroupPort):
 
 
 def open_listening_port(bus: Any) -> Port:
-    """A StampedPort or StampedGroup where every bus is SocketCAN, else as open_port; a group counts SYNC once."""
+    """A Stamping port or StampedGroup where every bus can be stamped, else as open_port; a group counts SYNC once."""
     members = getattr(bus, "members", (bus,))
-    if all(map(is_socketcan, members)):
-        return StampedGroup(bus) if hasattr(bus, "members") else StampedPort(bus, is_fd(bus))
+    if all(is_socketcan(member) or is_multicast(member) for member in members):
+        return StampedGroup(bus) if hasattr(bus, "members") else _stamped(bus)
     port = open_port(bus)
     if isinstance(port, GroupPort):
         port.one_sync = True
     return port
+
+
+def _stamped(bus: Any) -> Stamping:
+    kind = StampedSocketPort if is_socketcan(bus) else StampedMulticastPort
+    return kind(bus, is_fd(bus))
 
 
 def _clocks() -> tuple[float, float]:

@@ -74,6 +74,8 @@ ACTIVATE = Entry(0x2100, 6, "B", "activate")
 RECORD_ID = Entry(0x2100, 7, "I", "record id")
 RECORD_DATE = Entry(0x2100, 8, "I", "record date")
 RECORD_CRC = Entry(0x2100, 9, "I", "record CRC-32")
+TEMPERATURE = Entry(0x2101, 0, "h", "drive temperature")
+"""0.1 °C; not every controller has it."""
 
 SYNC_ID = 0x80
 NMT_ID = 0x000

@@ -6,11 +6,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
+    from armlink.arm_file import ArmFile
     from armlink.selftest.without_power import Result
 
 SCHEMA = "armlink.check/1"
+HOST_SCHEMA = "armlink.check-host/1"
 WARNING = (
     "This test enables every joint of {arm} and lets it hold where it stands (at most its max_torque). One after the "
     "other is then quick-stopped, and left without commands for {deadline:.0f} ms; then all are left without the "
@@ -25,6 +28,10 @@ def check(
     bus: Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the joints are enabled.")] = False,
     passive: Annotated[bool, typer.Option("--passive", help="Only what needs no power: read, configure.")] = False,
+    host: Annotated[
+        bool, typer.Option("--host", help="Measure how well this machine keeps the cycle instead; needs no bus.")
+    ] = False,
+    seconds: Annotated[float, typer.Option(min=1.0, max=3600.0, help="How long --host measures [s].")] = 20.0,
     json: Annotated[Path | None, typer.Option(help="Write the answer here; - is standard output.")] = None,
 ) -> int:
     """Check identity, objects, PDO mapping, limits, calibration; then, with power, quick stop, deadline and heartbeat.
@@ -32,6 +39,9 @@ def check(
     It shows that each controller stops by itself when its host falls silent, and how long it takes. It says what it
     does to the joints and asks first, unless --yes or on a simulated arm in this process. Exit status 1 where a check
     fails; the joints are left in quick stop, holding.
+
+    With --host nothing is sent anywhere: cycles are made at the arm's rate while a job computes and writes beside them;
+    exit status 1 if this machine is too late for the arm's deadline or rate.
 
     Example: armlink check sarcos --bus socketcan:vcan0 --yes --json -
     """
@@ -45,6 +55,8 @@ def check(
 
     console = Console(stderr=True)
     described = load_arm(arm)
+    if host:
+        return _check_host(console, described, seconds, json)
     with Link.open(described, bus) as link:
         simulated = hasattr(link.bus, "clock")
         if not (passive or yes or simulated):
@@ -72,6 +84,43 @@ def check(
         raise Refused(
             f"check: {len(failed)} of {len(results)} failed, first {first.joint}: {first.check}: {first.found}"
         )
+    return 0
+
+
+def _check_host(console: "Console", arm: "ArmFile", seconds: float, json: Path | None) -> int:
+    """Lateness of this machine's cycle at the arm's rate, and the rate that it holds."""
+    from armlink.commands.output import write_json
+    from armlink.errors import Refused
+    from armlink.selftest.host import WARN_SHARE, measure_host
+
+    with console.status(f"{arm.name}: cycles at {arm.require_link().rate:g} Hz for {seconds:g} s, with a job beside"):
+        report = measure_host(arm, seconds)
+    late, section = report.lateness.in_ms(), arm.require_link()
+    answer = {
+        "schema": HOST_SCHEMA,
+        "arm": arm.name,
+        "rate_hz": report.rate,
+        "seconds": seconds,
+        "late_ms": late,
+        "holds_hz": report.holds_hz,
+        "realtime": str(report.realtime),
+    }
+    write_json(json, answer)
+    console.print(
+        f"cycles began late by {late['p50']:.2f} ms (median), {late['p99']:.2f} (99 %), {late['p99_9']:.2f} (99.9 %),"
+        f" {late['max']:.2f} (longest); {report.busy * 1e3:.2f} ms of processor time each; {report.realtime}",
+        markup=False,
+        highlight=False,
+    )
+    console.print(f"this machine holds {report.holds_hz:g} Hz; the arm file asks for {section.rate:g}", highlight=False)
+    limit = WARN_SHARE * section.deadline * 1e3
+    if late["p99_9"] > limit:
+        raise Refused(
+            f"check --host: 99.9 % of the cycles are within {late['p99_9']:.1f} ms, expected {limit:g} (half of"
+            " link.deadline): lower link.rate, raise link.deadline, or stop what else runs here"
+        )
+    if report.holds_hz < section.rate:
+        raise Refused(f"check --host: this machine holds {report.holds_hz:g} Hz: lower link.rate ({section.rate:g})")
     return 0
 
 

@@ -210,3 +210,14 @@ def interpolation(period: float) -> tuple[int, int]:
             return value, exponent
     exponent = math.ceil(math.log10(period / 255))
     return round(period / 10.0**exponent), exponent
+
+
+def read_temperature(services: NodeServices) -> float:
+    """Temperature of a drive [°C], NaN if its data sheet or the device has none.
+
+    CiA 402 has no object for it, so it is read if the data sheet has one at 2101h (INTEGER16, 0.1 °C).
+    """
+    told = services.remote.object_dictionary.get_variable(objects.TEMPERATURE.index, objects.TEMPERATURE.sub)
+    if told is None or "temperature" not in told.name.lower() or not services.has(objects.TEMPERATURE):
+        return math.nan
+    return float(services.read(objects.TEMPERATURE)) / 10

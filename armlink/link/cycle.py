@@ -9,9 +9,9 @@ import numpy as np
 from armlink.canopen.cia402 import Control, Mode, State, next_control, set_point_control, state_of, supports
 from armlink.canopen.pdo import STATUS_DECIMATION
 from armlink.clock import Clock
-from armlink.errors import BusFault, Refused
+from armlink.errors import BusFault, HostLate, Refused, Silence
 from armlink.link.cyclic_exchange import Loop
-from armlink.link.faults import Known, bus_fault, find_fault, node_fault, refusal, stuck
+from armlink.link.faults import Known, bus_fault, find_fault, node_fault, refusal, stopped_itself, stuck
 from armlink.link.gate import JointLimits, Passed, Seen, pass_gate, start_from
 from armlink.link.types import Command, Sample
 
@@ -19,6 +19,11 @@ ENABLE_SECONDS = 3.0
 """The joints must reach a commanded CiA 402 state within this time."""
 STOP_CYCLES = 25
 """Cycles in which a quick stop is repeated until every joint reports it."""
+MEMORY = 1.0
+"""So long after the host was late, joints that stop by themselves are put down to it [s]: their watches run on the
+heartbeat too, which they may miss for twice `link.deadline`."""
+BLAME_SHARE = 0.5
+"""A host that was late by this share of `link.deadline` explains a watchdog that acts at the whole of it."""
 OFF, PROFILE_POSITION, PROFILE_TORQUE = int(Mode.OFF), int(Mode.PROFILE_POSITION), int(Mode.PROFILE_TORQUE)
 ENABLE, QUICK_STOP = int(Control.ENABLE), int(Control.QUICK_STOP)
 DISABLE_VOLTAGE = int(Control.DISABLE_VOLTAGE)
@@ -52,6 +57,10 @@ class Commander:
             loop.watch.restarted,
         )
         self._due = 0.0
+        self.late = 0.0
+        """How late the present cycle began [s]."""
+        self._gap, self._gap_at = 0.0, -math.inf
+        """Longest time without a SYNC of late, less a period, and when it ended [s]."""
 
     def begin(self, limits: list[JointLimits], passed: list[Passed], supported: list[int]) -> None:
         """Take over configured nodes: limits, what the first cycle starts from, supported modes (6502h)."""
@@ -81,12 +90,13 @@ class Commander:
                     control[joint] = set_point_control(loop.statuses[joint])
         self._commanded = modes
         sample = loop.exchange(control, [each.torque_wire for each in passed], [each.position_wire for each in passed])
+        sample.late = self.late
         why = stopped and refusal(self.names, command, age, passed, seen, self.limits)
         if why:
             raise Refused(f"gate: {why}")
         fault = fault or self._fault(now, modes)
         if fault:
-            raise BusFault(fault)
+            raise fault
         return sample
 
     def stand(self, control: list[int]) -> Sample:
@@ -186,14 +196,35 @@ class Commander:
         self.loop.send_mode(joint, mode)
         self._modes[joint], self._mode_since[joint] = mode, now
 
-    def _fault(self, now: float, modes: Sequence[int]) -> str | None:
+    def _fault(self, now: float, modes: Sequence[int]) -> BusFault | None:
+        """The fault at time `now`; what the host's own lateness explains is put down to that and to nothing else."""
         fault = find_fault(self._known, now, modes, self.max_age)
-        return fault or bus_fault(self.names, self.loop.watch, self.loop.dropped)
+        shown = bus_fault(self.names, self.loop.watch, self.loop.dropped)
+        if self._gap_at + MEMORY >= now and self._gap > self.max_age:
+            return HostLate(self._gap, self.max_age, stopped_itself(self._known))
+        if fault is None:
+            return None if shown is None else BusFault(shown)
+        if self._gap_at + MEMORY >= now and self._gap > BLAME_SHARE * self.max_age:
+            stopped = stopped_itself(self._known)
+            if stopped or isinstance(fault, Silence):
+                return HostLate(self._gap, self.max_age, stopped)
+        return fault
+
+    def settle(self) -> None:
+        """Begin anew after an interruption: what came meanwhile, and how late the host was, is forgotten."""
+        self.loop.settle()
+        self._gap, self._gap_at = 0.0, -math.inf
+        self._due = self.clock.now()
 
     def _await_turn(self) -> None:
         if not self._lock_step:
             self.clock.sleep_until(self._due)
-            now = self.clock.now()
-            self.loop.stats.late += now - self._due > 0.1 * self.period
+            now, stats = self.clock.now(), self.loop.stats
+            self.late = now - self._due
+            stats.late += self.late > 0.1 * self.period
+            stats.lateness.add(self.late)
+            gap = now - self.loop.synced - self.period
+            if gap > self.period and math.isfinite(gap) and (gap >= self._gap or now > self._gap_at + MEMORY):
+                self._gap, self._gap_at = gap, now
             self._due = max(self._due, now - self.period) + self.period
         self.loop.drain()

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from armlink.arrays import Array
 from armlink.bus.bus_watchdog import MOST_FRAMES, BusWatch
 from armlink.bus.frame_bits import FIXED_BITS
 from armlink.bus.port import Port
@@ -16,11 +17,13 @@ from armlink.canopen import object_dictionary as objects
 from armlink.canopen.pdo import RPDO1, RPDO2, TPDO1, TPDO2, decoding_table
 from armlink.canopen.units import TORQUE_PER_MICRO, Units
 from armlink.clock import Clock
-from armlink.link.types import Array, Sample, Stats
+from armlink.link.types import Sample, Stats
 
 COLLECT_SHARE = 0.8
 """Share of a period after SYNC in which TPDOs of this cycle are waited for."""
 
+OWED_CYCLES = 25
+"""A reply that has been owed for so many cycles is lost."""
 NO_STATUS = 0xFFFF
 """Stands for the status word of a joint that has sent none; no state of CiA 402."""
 NO_MODE = 0
@@ -70,6 +73,8 @@ class Loop:
         self.displays: list[int] = [NO_MODE] * self.n
         """Newest mode of operation display (6061h) of each joint."""
         self._awaited = self._counted = self._dropped = 0
+        self._came = [0] * self.n
+        """Readings of each joint that came, in their cycle or late."""
         self.bits = 0
         """Bits that the frames so far took on the wire, without stuff bits (bus_load.frame_bits has them)."""
         self._slow_came = False
@@ -85,11 +90,18 @@ class Loop:
         """Newest velocity of each joint whenever it came [rad/s]; for the gate, never for a sample."""
         self.slow_seen = [-math.inf] * self.n
         """When motor torque and velocity of each joint last came, by the clock [s]."""
+        self.synced = -math.inf
+        """When the last SYNC left, by the clock [s]."""
+        self._owed = [0] * self.n
+        """Replies of each joint to earlier SYNCs that are still to come, or lost."""
+        self._owed_for = 0
+        """Cycles for which some reply has been owed."""
         self.set_units((Units(1.0, 1.0, 1.0),) * self.n)
 
     def reset_counters(self) -> None:
         """Begin to count anew."""
         self.stats, self.bits, self._first, self._counted = Stats(), 0, None, 0
+        self._came = [0] * self.n
         self._dropped = self._port.dropped
 
     @property
@@ -101,6 +113,7 @@ class Loop:
         """Scales of the joints."""
         self._torque_unit = np.array([unit.torque for unit in units])
         self._position_unit = np.array([unit.position for unit in units])
+        self._position_scale = [unit.position for unit in units]
 
     def send(self, can_id: int, data: bytes) -> None:
         """Send one frame and count it."""
@@ -122,9 +135,10 @@ class Loop:
         return True
 
     def drain(self) -> None:
-        """Take in all that came between cycles; sensor frames among it missed their cycle and are dropped."""
+        """Take in all that came between cycles; readings among it are late: newest known, but of no sample."""
         self._awaited = 0
         self._take_what_is_there()
+        self._keep_late()
         self.watch.cycle_ends(self.stats.frames - self._counted)
         self._counted = self.stats.frames
         if self._slow_came:
@@ -140,6 +154,22 @@ class Loop:
     def drop_readings(self) -> None:
         """Forget position and torque that came: what comes from now on belongs to the next sample."""
         self._position, self._torque = [math.nan] * self.n, [math.nan] * self.n
+
+    def _keep_late(self) -> None:
+        """Readings that came after their cycle: as old as the last SYNC at least."""
+        for joint, raw in enumerate(self._position):
+            if raw == raw:  # not NaN
+                self.latest_position[joint] = raw * self._position_scale[joint]
+                self.seen[joint] = max(self.seen[joint], self.synced)
+                self._owed[joint] = max(self._owed[joint] - 1, 0)
+
+    def settle(self) -> None:
+        """After an interruption: nothing is owed, nothing was lost, no node is crowding the bus."""
+        self.drain()
+        self.synced = -math.inf
+        self._owed, self._owed_for = [0] * self.n, 0
+        self._dropped = self._port.dropped
+        self.watch.settle()
 
     def exchange(self, control: list[int], torque_wire: list[int], position_wire: list[int]) -> Sample:
         """One cycle: RPDO1 of every joint, heartbeat when due, SYNC, then the TPDOs that it brings."""
@@ -157,8 +187,10 @@ class Loop:
             self._first = now
         self._awaited = self.n
         self.watch.syncs += 1
+        self.stats.asked += 1
         self._port.send_all(frames)
         self.count(len(frames), sum([len(data) for _, data in frames]))
+        self.synced = now
         end = now + self._patience
         for _ in range(MOST_FRAMES):
             if self._awaited <= 0:
@@ -167,9 +199,23 @@ class Loop:
                 remaining = end - self._clock.now()
                 if remaining <= 0 or not self.receive(remaining):
                     break
+        delay = self._clock.now() - now
         self._take_what_is_there()
         self.stats.missed += self._awaited
-        return self.sample(now)
+        timely = None if self._awaited <= 0 and not self._owed_for else self._timely()
+        sample = self.sample(now)
+        sample.timely, sample.delay = timely, delay
+        return sample
+
+    def _timely(self) -> NDArray[np.bool_]:
+        """Which readings are replies to this cycle's SYNC; replies that are owed for long are lost."""
+        came = [raw == raw for raw in self._position]
+        timely = np.array([here and not owed for here, owed in zip(came, self._owed, strict=True)])
+        self._owed = [owed + (not here) for here, owed in zip(came, self._owed, strict=True)]
+        self._owed_for = self._owed_for + 1 if any(self._owed) else 0
+        if self._owed_for > OWED_CYCLES:
+            self._owed, self._owed_for = [0] * self.n, 0
+        return timely
 
     def listen(self, seconds: float) -> Sample:
         """Take in what comes within `seconds` without sending anything; of each reading the newest."""
@@ -184,6 +230,7 @@ class Loop:
         if elapsed > 0:
             self.stats.rate_hz = self.stats.cycles / elapsed
             self.stats.load = self.bits / (bitrate * elapsed)
+        self.stats.came = tuple(self._came)
 
     def take(self, can_id: int, data: bytes) -> None:
         """Take one frame in, for what it is; who takes it counts it."""
@@ -196,9 +243,11 @@ class Loop:
             self.stats.errors += 1
         elif kind == 0:
             self.watch.readings[joint] += 1
+            self._came[joint] += 1
             if self._position[joint] != self._position[joint]:  # NaN: the first in this cycle
                 self._awaited -= 1
             else:
+                self._owed[joint] = max(self._owed[joint] - 1, 0)
                 self.watch.again(joint)
             self._position[joint], self._torque[joint] = unpack(data)
         elif kind == 1:

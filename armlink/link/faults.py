@@ -8,11 +8,14 @@ from armlink.bus.bus_watchdog import BusWatch
 from armlink.canopen import emcy
 from armlink.canopen import object_dictionary as objects
 from armlink.canopen.cia402 import MODE_NAMES, Mode, State, state_of
+from armlink.errors import BusFault, Silence
 from armlink.link import gate
 from armlink.link.gate import OFF, JointLimits, Passed, Seen
 from armlink.link.types import Command
 
 ENABLED_BITS = 0x27
+WATCHDOGS = frozenset({0x8130, 0x8250, 0x8700})
+"""Emergencies of a node that does not hear its host: heartbeat, RPDO deadline, SYNC (CiA 301)."""
 _FAULTS = (State.FAULT, State.FAULT_REACTION)
 _MODES = ", ".join(f"{int(mode)} ({name})" for mode, name in MODE_NAMES.items())
 
@@ -38,28 +41,54 @@ class Known:
     """Joints whose controller has sent its boot-up message."""
 
 
-def find_fault(known: Known, now: float, modes: Sequence[int], max_age: float) -> str | None:
-    """The first fault at time `now` where every joint with a mode was to be enabled in it, or None.
+def find_fault(known: Known, now: float, modes: Sequence[int], max_age: float) -> BusFault | None:
+    """The first fault at time `now` if every joint with a mode was to be enabled in it, or None.
 
-    A mode must be displayed, and a reading come, within `max_age` [s].
+    A mode must be displayed, and a reading must have come, within `max_age` [s].
     """
     if known.emergencies or known.restarted or known.node_states:
         fault = node_fault(known)
         if fault:
-            return fault
+            return BusFault(fault)
     oldest = min(known.seen)
     if not now - oldest <= max_age:
-        name, age = known.names[known.seen.index(oldest)], now - oldest
-        return f"{name}: no reading for {age * 1e3:.0f} ms, limit {max_age * 1e3:.0f} ms"
+        return _silence(known, now, max_age)
     for joint, (mode, status, display) in enumerate(zip(modes, known.statuses, known.displays, strict=True)):
         if mode != OFF and display != mode and not now - known.mode_since[joint] <= max_age:
-            return f"{known.names[joint]}: {refused_mode(mode, display)}"
+            return BusFault(f"{known.names[joint]}: {refused_mode(mode, display)}")
         if status & 0x6F == ENABLED_BITS:
             continue
         state = state_of(status)
         if mode != OFF or state in _FAULTS:
-            return f"{known.names[joint]}: {state.value} (status word {status:#06x}), expected operation enabled"
+            told = f"{state.value} (status word {status:#06x}), expected operation enabled"
+            return BusFault(f"{known.names[joint]}: {told}")
     return None
+
+
+def _silence(known: Known, now: float, max_age: float) -> Silence:
+    """Which joints have sent no reading for longer than `max_age` [s]."""
+    silent = [name for name, seen in zip(known.names, known.seen, strict=True) if not now - seen <= max_age]
+    who = "no joint" if len(silent) == len(known.names) > 1 else silent[0]
+    what = "has sent a reading" if who == "no joint" else "no reading"
+    age = now - min(known.seen)
+    colon = "" if who == "no joint" else ":"
+    return Silence(f"{who}{colon} {what} for {age * 1e3:.0f} ms, limit {max_age * 1e3:.0f} ms")
+
+
+def is_own_watchdog(known: Known, joint: int) -> bool:
+    """Whether a joint stopped by itself, as it must when it does not hear its host."""
+    codes = {code for place, code, _ in known.emergencies if place == joint}
+    return bool(codes & WATCHDOGS) or (not codes and state_of(known.statuses[joint]) is State.QUICK_STOP)
+
+
+def stopped_itself(known: Known) -> str:
+    """The first joint that its own watch of the host has stopped, in words; empty if there is none."""
+    for joint, name in enumerate(known.names):
+        if is_own_watchdog(known, joint):
+            codes = [code for place, code, _ in known.emergencies if place == joint and code in WATCHDOGS]
+            why = f" (emergency {codes[0]:04X}h, {emcy.name_of(codes[0])})" if codes else ""
+            return f"{name} stopped itself{why}"
+    return ""
 
 
 def node_fault(known: Known) -> str | None:

@@ -4,11 +4,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.arrays import Array
 from armlink.bus.port import open_port
 from armlink.canopen import object_dictionary as objects
 from armlink.canopen.cia402 import State
@@ -22,11 +23,18 @@ from armlink.link.cyclic_exchange import Loop
 from armlink.link.faults import bus_fault
 from armlink.link.gate import start_from
 from armlink.link.gate_limits import gate_limits, joint_ranges, target_window
-from armlink.link.types import Array, Calibration, Command, Identity, Sample, Stats
+from armlink.link.guard import Crossed
+from armlink.link.types import Calibration, Command, Controller, Identity, Sample, Samples, Setpoints, Stats
 
+PATIENCE = 2.5
+"""Readings may be so many periods old while a motion goes on; a reply that comes a period late is within it."""
 LISTEN_PERIODS, LISTEN_SECONDS = 2, 0.1
 """Before anything is sent to the nodes, another host is listened for: so many periods, and at least so long [s]: a host
 on a busy computer may well pause for some 0.05 s."""
+
+
+R = TypeVar("R")
+P = ParamSpec("P")
 
 
 class Link:
@@ -73,6 +81,21 @@ class Link:
             self.stop()
         finally:
             self.bus.shutdown()
+
+    @property
+    def enabled(self) -> bool:
+        """Whether the joints are enabled and cycles must go on."""
+        return self._enabled
+
+    @property
+    def last(self) -> Command | None:
+        """The newest command."""
+        return self._last
+
+    @property
+    def latest_position(self) -> Array:
+        """Newest position readings, whenever they came (n,) [rad]."""
+        return np.array(self._loop.latest_position)
 
     @property
     def stats(self) -> Stats:
@@ -173,12 +196,20 @@ class Link:
         """
         self._require_start()
         self._loop.emergencies.clear()
+        self.commander.settle()
         sample = self.commander.walk(State.ENABLED)
         self._loop.emergencies.clear()
         self._loop.node_states.clear()
         self._enabled = True
         self._last = Command.hold(np.array(self._loop.latest_position))
         return sample
+
+    def recover(self) -> Sample:
+        """After a Stall: start the nodes that left operation, and enable every joint where it stands."""
+        self._require_start()
+        for node in self.nodes:
+            self.send_nmt(objects.NMT_START, node)
+        return self.enable()
 
     def disable(self) -> None:
         """Take the power from every joint: a joint without a brake falls. Raises BusFault."""
@@ -194,16 +225,47 @@ class Link:
         """One cycle: wait for its time, gate, RPDOs, SYNC, TPDOs.
 
         Raises Refused where the gate refuses the command, BusFault for a fault of bus or joint; the joints have been
-        sent to quick stop before either is raised.
+        sent to quick stop before either is raised. Raises Crossed if a joint crossed a bound of the command's guard:
+        the joints then keep the command until the next.
         """
         if not self._enabled:
             raise BusFault("the joints are not enabled: start() and enable() come before cycle()")
         self._last = command
         try:
-            return self.commander.command(command)
+            sample = self.commander.command(command)
         except BaseException:
             self.stop()
             raise
+        if command.guard is not None:
+            try:
+                command.guard.check(self.names, self.latest_position, command.position)
+            except Crossed as crossed:
+                crossed.sample = sample
+                raise
+        return sample
+
+    def play(self, setpoints: Setpoints) -> Samples:
+        """One row a cycle, and the sample of each; raises as cycle. To stop early, close the iterator.
+
+        While readings are late the row is repeated, so that the motion waits for the arm.
+        """
+        patience = PATIENCE * self.period
+        for row in range(len(setpoints)):
+            command = setpoints.command(row)
+            sample = self.cycle(command)
+            yield sample
+            while not self._lock_step and sample.age.max() > patience:
+                sample = self.cycle(command)
+
+    def run(self, controller: Controller) -> Samples:
+        """A controller in the loop, cycle by cycle, until the iterator is closed; raises as cycle."""
+        sample = self.cycle(self._last or Command.hold(self.position_sent))
+        while True:
+            sample = self.cycle(controller.command(sample))
+            yield sample
+
+    def catch_up(self) -> None:
+        """Forget samples of the past: in process there are none."""
 
     def stop(self) -> None:
         """Quick stop of every joint, as far as the bus still carries it; the joints stay in it, holding."""
@@ -212,9 +274,17 @@ class Link:
         self._enabled = False
         self.commander.quick_stop()
 
+    def inside(self, function: "Callable[Concatenate[Link, P], R]", *args: P.args, **kwargs: P.kwargs) -> R:
+        """Call `function(link, ...)`: in the process that makes the cycles, which is this one."""
+        return function(self, *args, **kwargs)
+
     def read_calibration(self, joint: int) -> Calibration:
         """The torque sensor record (2100h) that joint 0 … n−1 works with; raises BusFault."""
         return calibration.read_record(self.services[joint])
+
+    def read_temperatures(self) -> Array:
+        """Temperatures of the drives (n,) [°C]; NaN for a drive that does not report one. Raises BusFault."""
+        return np.array([device.read_temperature(services) for services in self.services])
 
     def write_calibration(
         self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False

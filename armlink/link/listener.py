@@ -1,7 +1,7 @@
 """Listening to an arm that another controller commands: one sample a SYNC of that controller; nothing is sent.
 
-On SocketCAN it sleeps for several cycles and then takes all that came, each SYNC with the kernel's own time of it; on
-other buses it wakes for each frame, whose time is when it was read.
+On SocketCAN and udp_multicast it sleeps for several cycles and then takes all that came, each SYNC with the kernel's
+own time of it; on other buses it wakes for each frame, whose time is when it was read.
 
 The one exception is asked for by name: `write_calibration` and `read_calibration` use SDO on object 2100h.
 """
@@ -16,14 +16,15 @@ from typing import Any, Self
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from armlink.bus.stamped_port import StampedGroup, StampedPort, open_listening_port
+from armlink.arrays import Array
+from armlink.bus.stamped_port import StampedGroup, Stamping, open_listening_port
 from armlink.canopen import object_dictionary as objects
 from armlink.canopen.pdo import RPDO1
 from armlink.canopen.sdo import NodeServices, PumpedNetwork, joint_services
 from armlink.clock import Clock, MonotonicClock
 from armlink.link import torque_sensor_record as calibration
 from armlink.link.cyclic_exchange import Loop
-from armlink.link.types import Array, Calibration, Sample, Stats
+from armlink.link.types import Calibration, Sample, Stats
 from armlink.monitor.monitor import assumed_units
 
 SLEEP = 0.04
@@ -133,7 +134,7 @@ class Listener:
     def _hear(self, seconds: float, at_once: bool = False) -> None:
         """Take in what comes, for at most so long; `at_once`: somebody waits for the very next frame."""
         port = self._port
-        if isinstance(port, StampedPort | StampedGroup):
+        if isinstance(port, Stamping | StampedGroup):
             if at_once:
                 port.wait(seconds)
             else:

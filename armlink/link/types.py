@@ -1,13 +1,16 @@
 """What goes into and comes out of a cycle of the link, in SI units."""
 
-from dataclasses import dataclass
+from collections.abc import Generator
+from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from armlink.arrays import Array
 from armlink.canopen.cia402 import Mode, State
-
-Array = NDArray[np.float64]
+from armlink.link.guard import Guard
+from armlink.link.lateness import Lateness
 
 
 @dataclass(eq=False)
@@ -22,12 +25,55 @@ class Command:
     """Target position by the joint's own sensor [rad], (n,)."""
     t: float | None = None
     """When it was decided, by the link's clock [s]; None: now. The gate refuses a command that is too old."""
+    guard: Guard | None = None
+    """Bounds within which the command holds; the cycle that finds one crossed raises Crossed."""
 
     @classmethod
     def hold(cls, position: Array) -> "Command":
         """Every joint under position control at `position` [rad]."""
         n = position.size
         return cls(np.full(n, Mode.POSITION, np.int8), np.zeros(n), position.copy())
+
+
+@dataclass(eq=False)
+class Setpoints:
+    """Commands of K cycles to come."""
+
+    mode: NDArray[np.int8]
+    """(n,), see Command."""
+    torque: Array
+    """[N·m], (K, n), or (n,) for all rows."""
+    position: Array
+    """[rad], (K, n)."""
+    guard: Guard | None = None
+
+    @classmethod
+    def follow(cls, position: Array, guard: Guard | None = None) -> "Setpoints":
+        """Every joint under position control along position (K, n) [rad]."""
+        n = position.shape[1]
+        return cls(np.full(n, Mode.POSITION, np.int8), np.zeros(n), position, guard)
+
+    def __len__(self) -> int:
+        """Rows."""
+        return len(self.position)
+
+    def __getitem__(self, rows: slice) -> "Setpoints":
+        """Some of the rows."""
+        torque = self.torque if self.torque.ndim == 1 else self.torque[rows]
+        return Setpoints(self.mode, torque, self.position[rows], self.guard)
+
+    def command(self, row: int) -> Command:
+        """The command of one row."""
+        torque = self.torque if self.torque.ndim == 1 else self.torque[row]
+        return Command(self.mode, torque, self.position[row], guard=self.guard)
+
+
+class Controller(Protocol):
+    """Decides each cycle's command in the process that makes the cycles; must be picklable."""
+
+    def command(self, sample: "Sample") -> Command:
+        """The next command, from the newest sample; within a fraction of a period."""
+        ...
 
 
 @dataclass(eq=False)
@@ -48,6 +94,18 @@ class Sample:
     """Newest status word 6041h, (n,); sent when it changes, so the last one stands."""
     age: Array
     """Time since position and torque last came [s], (n,); 0 where they came in this cycle, inf before the first."""
+    timely: NDArray[np.bool_] | None = None
+    """(n,) whether the reading came in the cycle that asked for it, of a host on time; None: all. Only such readings
+    tell anything about an encoder, a cable or a drive."""
+    delay: float = 0.0
+    """Time from SYNC to the last reading of the cycle [s]: the readings were taken within it."""
+    late: float = 0.0
+    """How late the SYNC left [s]."""
+
+    @property
+    def all_timely(self) -> bool:
+        """Whether the readings of all joints are timely."""
+        return self.timely is None or bool(self.timely.all())
 
 
 @dataclass(frozen=True)
@@ -93,9 +151,19 @@ class Stats:
     """Sensor frames (TPDO1) that did not come in their cycle."""
     late: int = 0
     """Cycles that began more than a tenth of a period late."""
+    lateness: Lateness = field(default_factory=Lateness)
+    """How late the cycles began."""
+    asked: int = 0
+    """SYNCs sent while cycling."""
+    came: tuple[int, ...] = ()
+    """Readings of each joint that came, in their cycle or late."""
     errors: int = 0
     """Error frames and frames of a wrong length."""
     rate_hz: float = 0.0
     """Cycles a second, measured."""
     load: float = 0.0
     """Share of the bus that the frames take at its bit rate, without stuff bits, which are a tenth more."""
+
+
+Samples = Generator[Sample, None, None]
+"""Samples as they come; close it to end what brings them."""

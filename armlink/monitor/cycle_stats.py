@@ -6,10 +6,10 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from armlink.arrays import Array
 from armlink.bus.frame_bits import frame_bits
 from armlink.canopen import object_dictionary as objects
 from armlink.canopen.pdo import TPDO1
-from armlink.link.types import Array
 
 KEPT = 1_000_000
 """Cycles whose times are kept; over an hour at 250 Hz."""

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.arrays import Array
 from armlink.bus.port import open_port
 from armlink.canopen import object_dictionary as objects
 from armlink.canopen.pdo import RPDO1
 from armlink.clock import Clock, MonotonicClock
 from armlink.link.cyclic_exchange import Loop
-from armlink.link.types import Array
 from armlink.monitor.monitor import assumed_units
 
 WAIT_SECONDS = 0.1

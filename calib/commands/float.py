@@ -32,13 +32,13 @@ def hold_afloat(
 
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
-    from armlink.link.link import Link
+    from armlink.loop.open import open_arm
     from calib.floating.run import run_float
 
     arm_file = load_arm(arm)
     beta, calibration, source = _model(arm_file, record, store)
     screen = Console(stderr=True)
-    with Link.open(arm_file, bus) as link:
+    with open_arm(arm_file, bus) as link:
         link.start()
         link.enable()
         screen.print(f"{arm_file.name}: floating by {source}; Ctrl-C ends it, the joints hold then")

@@ -1,6 +1,7 @@
 """What the sweep commands show to people: progress with time left, plans and results as tables on standard error."""
 
 import sys
+from collections.abc import Callable
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
@@ -12,6 +13,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from armlink.arm_file import ArmFile
+from armlink.errors import Stall
 from calib.plan.types import SweepPlan
 
 if TYPE_CHECKING:
@@ -43,6 +45,26 @@ class SweepScreen:
     def count(self, done: int, total: int) -> None:
         """As run_verify's progress."""
         self._progress.update(self._task, completed=done, total=total, left="", text="poses")
+
+    def on_stall(self, keep_going: int) -> Callable[[Stall], bool]:
+        """An OnStall that goes on by itself so often, then asks; without a terminal it then gives up."""
+        left = keep_going
+
+        def on_stall(stall: Stall) -> bool:
+            nonlocal left
+            self.say(f"{stall}: the joints were stopped")
+            if left > 0:
+                left -= 1
+                self.say(f"enabling them again and repeating the reading ({left} more times by itself)")
+                return True
+            if sys.stdin is None or not sys.stdin.isatty():
+                return False
+            self._progress.stop()
+            again = typer.confirm("Enable the joints again and repeat the reading?", err=True)
+            self._progress.start()
+            return again
+
+        return on_stall
 
     def say(self, text: str) -> None:
         """One line below the bar."""
@@ -113,6 +135,14 @@ def unsettled_said(data: "SweepData") -> list[str]:
         f"{len(data.unsettled)} of {len(data.readings)} readings had not settled when their time was up, in"
         f" {', '.join(places)}: they count less. Does a joint swing under its position loop?"
     ]
+
+
+def stalls_said(data: "SweepData") -> list[str]:
+    """In one line, how often the joints had to be stopped; nothing if they never were."""
+    if not data.stalls:
+        return []
+    places = list(dict.fromkeys(stall.reading for stall in data.stalls))
+    return [f"the joints were stopped {len(data.stalls)} times and the reading was repeated: {', '.join(places)}"]
 
 
 def _short(names: tuple[str, ...]) -> list[str]:

@@ -30,13 +30,13 @@ def verify(
     """
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
-    from armlink.link.link import Link
+    from armlink.loop.open import open_arm
     from calib.commands.screen import SweepScreen
     from calib.records.store import RecordStore
     from calib.sweep.verify import run_verify
 
     arm_file = load_arm(arm)
-    with Link.open(arm_file, bus) as link:
+    with open_arm(arm_file, bus) as link:
         gravity, calibration = _records(RecordStore(store), arm_file, record or [])
         link.start()
         with SweepScreen(f"{arm_file.name}: verify") as screen:

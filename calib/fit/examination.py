@@ -8,15 +8,14 @@ import numpy.typing as npt
 
 from calib.fit.findings import Finding, effect_said, encoders_said, outliers_said, scattered
 from calib.fit.refinement import Extra, Refined, refine
-from calib.fit.rows import FitRows
+from calib.fit.sweep_readings import SweepReadings
 from calib.fit.unmodelled_effects import Effect, size_of, strongest
 from gcomp.arm.arm import Arm
+from gcomp.arrays import Array, Mask
 from gcomp.identify.global_fit import GlobalFit
 from gcomp.identify.parameters import Prior
 from gcomp.identify.sensor_model import predict
 
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 MOST_EFFECTS = 6
 """Effects that are looked for one after the other."""
 OUTLIER = 6.0
@@ -53,12 +52,12 @@ class Goodness:
 
     refined: Refined
     findings: tuple[Finding, ...]
-    outliers: Flags
+    outliers: Mask
     """Readings left out (K, n)."""
     left_out: tuple[LeftOut, ...]
 
 
-def examine(arm: Arm, rows: FitRows, fit: GlobalFit, priors: Mapping[str, Prior], rated: Array) -> Goodness:
+def examine(arm: Arm, rows: SweepReadings, fit: GlobalFit, priors: Mapping[str, Prior], rated: Array) -> Goodness:
     """Refine a global fit, one effect after another that its residuals ask for, without outliers. rated (n,) [N·m]."""
     rows, findings = _without_plateaus(arm.names, rows)
     encoders = encoders_said(arm.names, rows)
@@ -109,7 +108,7 @@ def _doubted(sigma: Array, effects: list[Effect], refined: Refined) -> Array:
     return np.sqrt(square)
 
 
-def _without_plateaus(names: tuple[str, ...], rows: FitRows) -> tuple[FitRows, list[Finding]]:
+def _without_plateaus(names: tuple[str, ...], rows: SweepReadings) -> tuple[SweepReadings, list[Finding]]:
     """The rows without readings at a torque beyond which a sensor never went though the arm moved: it saturates."""
     torque, flat, found = rows.readings.torque, np.zeros(rows.readings.torque.shape, dtype=bool), []
     for joint, name in enumerate(names):
@@ -130,21 +129,21 @@ def _without_plateaus(names: tuple[str, ...], rows: FitRows) -> tuple[FitRows, l
     return (replace(rows, readings=readings) if found else rows), found
 
 
-def _sharp(rows: FitRows, joint: int) -> npt.NDArray[np.intp]:
+def _sharp(rows: SweepReadings, joint: int) -> npt.NDArray[np.intp]:
     """The rows in which a joint's reading counts and is exact enough to show a limit."""
     counted = np.flatnonzero(rows.readings.counted[:, joint])
     sigma = rows.readings.sigma[counted, joint]
     return counted[sigma <= BLURRED * np.median(sigma)] if len(counted) else counted
 
 
-def leave_out(refined: Refined, rows: FitRows) -> tuple[LeftOut, ...]:
+def leave_out(refined: Refined, rows: SweepReadings) -> tuple[LeftOut, ...]:
     """Each sweep's readings against a fit of all others, by the block form of the leave-one-out residual."""
     linear, found = refined.linear, []
     count = len(linear.row)
-    sweeps = np.array(rows.sweep)[linear.row]
+    series = rows.readings.series[linear.row]
     own = rows.swept[linear.row] == linear.joint
-    for name in dict.fromkeys(rows.sweep):
-        here = np.flatnonzero((sweeps == name) & own)
+    for sweep, name in enumerate(rows.sweeps):
+        here = np.flatnonzero((series == sweep) & own)
         if not len(here):
             continue
         part = linear.basis[:count][here]
@@ -159,7 +158,7 @@ def leave_out(refined: Refined, rows: FitRows) -> tuple[LeftOut, ...]:
     return tuple(found)
 
 
-def _outliers(arm: Arm, refined: Refined, rows: FitRows, extras: list[Extra]) -> Flags:
+def _outliers(arm: Arm, refined: Refined, rows: SweepReadings, extras: list[Extra]) -> Mask:
     """Readings (K, n) that no noise explains: deleted residuals, in robust standard deviations of their joint.
 
     Those left out before are judged again, for an effect found since may explain them.

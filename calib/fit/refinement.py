@@ -13,14 +13,14 @@ import numpy as np
 import numpy.typing as npt
 
 from gcomp.arm.arm import Arm
+from gcomp.arrays import Array
 from gcomp.identify.global_fit import GlobalFit
 from gcomp.identify.identifiability import analyse, describe_null_space
 from gcomp.identify.natural_units import natural_units
 from gcomp.identify.parameters import Parameters, Prior, parameter_names, prior_vectors
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict_and_jacobian
 
-Array = npt.NDArray[np.float64]
 ROUNDS = 4
 """Gauss-Newton steps, with the noise brought up to date after each."""
 NEGLIGIBLE = 0.1
@@ -87,7 +87,7 @@ class Refined:
 
 def refine(
     arm: Arm,
-    readings: Readings,
+    readings: StaticReadings,
     fit: GlobalFit,
     priors: Mapping[str, Prior],
     resolution: Array,
@@ -143,7 +143,7 @@ class _Problem:
     def __init__(
         self,
         arm: Arm,
-        readings: Readings,
+        readings: StaticReadings,
         fit: GlobalFit,
         priors: Mapping[str, Prior],
         resolution: Array,
@@ -197,7 +197,7 @@ def _scatter(linear: Linear, n: int) -> tuple[Array, Array]:
     return ratio, free
 
 
-def _rounding_columns(readings: Readings, resolution: Array, slope: Array) -> Array:
+def _rounding_columns(readings: StaticReadings, resolution: Array, slope: Array) -> Array:
     """What one standard deviation of each distinct position's rounding does to the readings (P, m), in their own.
 
     slope (P, n) is that of each reading by each position, in standard deviations per rad. Joints whose rounding does

@@ -9,8 +9,8 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.canopen.cia402 import Mode
 from armlink.errors import ArmlinkError, Refused
-from armlink.link.link import Link
 from armlink.link.types import Command, Sample
+from armlink.loop.driver import ArmDriver
 from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm
 from calib.floating.controller import FloatConfig, FloatControl
@@ -40,7 +40,7 @@ class Floated:
 
 
 def run_float(
-    link: Link,
+    link: ArmDriver,
     arm: ArmFile,
     beta: Array,
     calibration: CalibrationRecord | None = None,
@@ -81,7 +81,7 @@ class _Run:
 
     def __init__(
         self,
-        link: Link,
+        link: ArmDriver,
         control: FloatControl,
         reflect: Callable[[Sample], Array] | None,
         on_sample: Callable[[Sample, Array], None] | None,

@@ -10,6 +10,8 @@ from calib.motion.encoder_bits import bit_of, missing_bit
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
+MISSING = 0.02
+"""Share of a motion's cycles without timely readings above which nothing is said of its encoders."""
 JUMP, JUMP_STEPS = 3.0, 4.0
 """A position reading that goes so many times as far as the speed limit allows, and so many increments, is no motion."""
 
@@ -31,17 +33,31 @@ class EncoderCheck:
         self._names, self._step = names, step
         self._fastest, self._slack = JUMP * speed, JUMP_STEPS * step
         self._read_at = np.full(len(names), now)
+        self._delay = 0.0
+        self._unsure = np.zeros(len(names), dtype=bool)
+        """Whether the last reading of each joint was not timely: nothing is said of the way from there."""
+
+    def forget(self) -> None:
+        """Begin anew after an interruption: nothing is said of what happened meanwhile."""
+        self._unsure[:] = True
 
     def see(self, sample: Sample, before: Array) -> None:
-        """Raise EncoderFault where a position reading differs from the last one `before` it (n,) [rad] by more than its
-        joint can have turned meanwhile."""
+        """Raise EncoderFault if a position reading differs from the last one `before` it (n,) [rad] by more than its
+        joint can have turned meanwhile. Only timely readings count, and of those the time between their SYNCs and what
+        it took them to come."""
+        if sample.timely is not None:
+            self._unsure |= ~sample.timely
         moved = sample.position - before
-        jumped = np.abs(moved) > self._fastest * (sample.t - self._read_at) + self._slack
+        elapsed = sample.t - self._read_at + max(sample.delay, self._delay)
+        jumped = (np.abs(moved) > self._fastest * elapsed + self._slack) & ~self._unsure
+        self._delay = sample.delay
         if jumped.any():  # never of a reading that did not come: NaN
             joint = int(np.argmax(jumped))
             what = f"its position reading jumped by {moved[joint]:+.3g} rad between two cycles, which no motion does"
             raise EncoderFault(self._names[joint], what, bit_of(float(abs(moved[joint]) / self._step[joint])))
-        self._read_at[np.isfinite(sample.position)] = sample.t
+        came = np.isfinite(sample.position)
+        self._read_at[came] = sample.t
+        self._unsure &= ~came | (False if sample.timely is None else ~sample.timely)
 
     def judge(self, seen: Array, path: Array, movable: Flags, resolution: Array) -> None:
         """Raise EncoderFault where what a joint read on its way leaves out what one bit would have shown.
@@ -49,6 +65,8 @@ class EncoderCheck:
         seen (K, n) is what was read and path (K, n) where the `movable` joints were sent [rad]; `resolution` (n,) is
         the smallest change that was ever read, inf where none was: bits below it are never used.
         """
+        if np.isnan(seen).any(axis=1).mean() > MISSING:
+            return
         step = np.where(np.isfinite(resolution), resolution, self._step)
         for joint in np.flatnonzero(movable):
             counts = np.rint(seen[:, joint] / step[joint])

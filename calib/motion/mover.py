@@ -1,16 +1,20 @@
 """Moves the arm through the link: travel, creeping onto stops, pressing, resting until a reading is exact."""
 
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+
 import numpy as np
 import numpy.typing as npt
 
 from armlink.errors import Refused
-from armlink.link.link import Link
-from armlink.link.types import Command, Sample
+from armlink.link.guard import Crossed, Guard
+from armlink.link.types import Command, Sample, Samples, Setpoints
+from armlink.loop.driver import ArmDriver
 from calib.arm.drive_limits import Limits
 from calib.arm.sweep_section import SweepSection
 from calib.motion.encoder_check import EncoderCheck
 from calib.motion.settle_rule import SettleRule
-from calib.motion.static_reading import Rest, average, stack
+from calib.motion.static_reading import StaticReading, average, stack
 from calib.motion.trajectory import trajectory
 
 Array = npt.NDArray[np.float64]
@@ -27,6 +31,8 @@ CONTACT_LEAD = 0.015
 """A joint that its target leads by so much, and that does not move, stands at its stop [rad]."""
 CONTACT_STILL = 0.15
 """Share of the approach speed below which a joint does not move."""
+CREEP_AHEAD = 10
+"""Rows that creeping is ahead of its samples: a job that is held up stops the creep after so many."""
 CHECK_EVERY = 5
 """Cycles from one look at the settle rule to the next."""
 COAST, COAST_LOOK, COAST_STILL = 5.0, 0.1, 0.002
@@ -45,8 +51,9 @@ STOP_TOLERANCE = 0.06
 class Stalled(Refused):
     """A joint did not follow."""
 
-    def __init__(self, name: str, position: float, target: float) -> None:
-        """Joint's name, where it stands and where it should go [rad]."""
+    def __init__(self, name: str, position: float, target: float, joint: int) -> None:
+        """Joint's name, where it stands and where it should go [rad], and its index."""
+        self.name, self.position, self.joint = name, position, joint
         super().__init__(
             f"{name}: stopped at {position:.3f} rad on the way to {target:.3f}: its drive is too weak there,"
             " its position loop does not bear the load, or something is in the way"
@@ -65,23 +72,35 @@ class Slipped(Refused):
 class Mover:
     """Holds the arm's command and changes it in small, safe ways. The link must be enabled."""
 
-    def __init__(self, link: Link, section: SweepSection, limits: Limits) -> None:
+    def __init__(self, link: ArmDriver, section: SweepSection, limits: Limits) -> None:
         """Take over an enabled link: every joint is held at its last target."""
         self.link, self.section, self.limits = link, section, limits
         self.average_to(section.standard_error)
         self.speed = section.travel_speed * limits.speed
         self.command = Command.hold(link.position_sent)
+        link.catch_up()
         first = link.cycle(self.command)
         self.position: Array = first.position.copy()
+        self.seen_at = first.t
+        """Link time of the newest sample [s]."""
         self._encoders = EncoderCheck(link.names, link.position_step, limits.speed, first.t)
         self.pressed: Flags = np.zeros(link.n, dtype=bool)
         self.side = np.zeros(link.n)
         self.resolution = np.full(link.n, np.inf)
-        self._slack = SLIP
+        self._nothing = np.full(link.n, np.nan)
         self._contact = self.position.copy()
         self._produced = np.zeros(link.n)
         self.contacts: dict[tuple[int, int], float] = {}
         """(joint, side) → reading at which that stop was found [rad]."""
+
+    def resume(self) -> None:
+        """After the link has recovered: take over where the arm stands, nothing pressed."""
+        self.pressed[:] = False
+        self.side[:] = 0.0
+        self.command = Command.hold(self.link.position_sent)
+        self.link.catch_up()
+        self._encoders.forget()
+        self.cycle()
 
     @property
     def known_resolution(self) -> Array:
@@ -93,21 +112,51 @@ class Mover:
         self.rule = SettleRule.of(self.section, share * self.limits.rated, self.link.period)
 
     def cycle(self) -> Sample:
-        """One cycle of the present command; raises Slipped when a pressed joint has left its stop, EncoderFault."""
-        sample = self.link.cycle(self.command)
+        """A cycle of the present command; raises Slipped when a pressed joint has left its stop, EncoderFault."""
+        with self._named():
+            return self._see(self.link.cycle(self.command))
+
+    def _play(self, setpoints: Setpoints) -> Samples:
+        """The samples of commands that are sent ahead; raises Slipped, Stalled, EncoderFault."""
+        row = 0
+        with self._named(), closing(self.link.play(setpoints)) as samples:
+            try:
+                for row, sample in enumerate(samples):
+                    yield self._see(sample)
+                    row += 1
+            finally:
+                now = setpoints.command(min(row, len(setpoints) - 1))
+                self.command.position, self.command.torque = now.position.copy(), now.torque.copy()
+
+    def _see(self, sample: Sample) -> Sample:
+        self.seen_at = sample.t
         self._encoders.see(sample, self.position)
         np.copyto(self.position, sample.position, where=np.isfinite(sample.position))
-        if self.pressed.any():
-            off = self.side * (self._contact - self.position) > self._slack
-            if off.any():
-                joint = int(np.argmax(off & self.pressed))
-                raise Slipped(self.link.names[joint], joint)
         return sample
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        """A crossed bound as what it means here."""
+        try:
+            yield
+        except Crossed as crossed:
+            if crossed.sample is not None:
+                self._see(crossed.sample)
+            if crossed.bound == "range":
+                raise Slipped(crossed.name, crossed.joint) from None
+            raise Stalled(crossed.name, crossed.position, crossed.target, crossed.joint) from None
+
+    def _guard_stops(self, slack: float) -> None:
+        """From now on a pressed joint that leaves its stop by more than `slack` [rad] raises Slipped."""
+        lower = np.where(self.pressed & (self.side > 0), self._contact - slack, -np.inf)
+        upper = np.where(self.pressed & (self.side < 0), self._contact + slack, np.inf)
+        self.command.guard = Guard(lower, upper, np.full(self.link.n, np.inf)) if self.pressed.any() else None
 
     def hold_all(self) -> None:
         """Every joint under position control where it stands."""
         self.pressed[:] = False
         self.side[:] = 0.0
+        self.command.guard = None
         lost = np.abs(self.command.position - self.position) > LOST
         joints = (self.command.mode != POSITION) | lost
         self.command.mode[:] = POSITION
@@ -131,14 +180,14 @@ class Mover:
         path = trajectory(
             self.command.position.copy(), goal, self.speed, np.full(len(goal), acceleration), self.link.period
         )
-        seen = []
-        for target in path:
-            self.command.position[movable] = target[movable]
-            seen.append(self.cycle().position)
-            lag = np.abs(self.command.position - self.position)
-            if lag[movable].max() > STALL:
-                joint = int(np.argmax(np.where(movable, lag, 0.0)))
-                raise Stalled(self.link.names[joint], float(self.position[joint]), float(goal[joint]))
+        held = self.command.guard or Guard.none(self.link.n)
+        guard = Guard(held.lower, held.upper, np.where(movable, STALL, np.inf))
+        targets = np.where(movable, path, self.command.position)
+        try:
+            samples = list(self._play(Setpoints(self.command.mode, self.command.torque, targets, guard)))
+        except Stalled as stalled:
+            raise Stalled(stalled.name, stalled.position, float(goal[stalled.joint]), stalled.joint) from None
+        seen = [sample.position if sample.all_timely else self._nothing for sample in samples]
         self._learn_resolution(seen)
         self._encoders.judge(np.reshape(seen, path.shape), path, movable, self.resolution)
 
@@ -148,19 +197,23 @@ class Mover:
         self._creep(stops, joints)
         self._contact = self.position.copy()
         self.side = np.where(joints, stops, 0).astype(float)
-        self.pressed, self._slack = joints.copy(), BOUNCE
+        self.pressed = joints.copy()
+        self._guard_stops(BOUNCE)
         self.command.mode[joints] = TORQUE
         cycles = max(int(PRESS_SECONDS / self.link.period), 1)
         start = np.where(joints, self._produced, 0.0)
-        for share in np.linspace(1 / cycles, 1.0, cycles):
-            self.command.torque[joints] = (start + share * (bias - start))[joints]
-            self.cycle()
+        shares = np.linspace(1 / cycles, 1.0, cycles)[:, None]
+        ramp = np.where(joints, start + shares * (bias - start), self.command.torque)
+        position = np.tile(self.command.position, (cycles, 1))
+        for _ in self._play(Setpoints(self.command.mode, ramp, position, self.command.guard)):
+            pass
         self._stand(joints)
-        self._slack = SLIP
+        self._guard_stops(SLIP)
         self.cycle()
         for joint in np.flatnonzero(joints):
             self._check_stop(int(joint), int(stops[joint]))
         self._contact = self.position.copy()
+        self._guard_stops(SLIP)
 
     def touch(self, stops: npt.NDArray[np.int64]) -> Array:
         """Creep the joints with stops ±1 onto them and leave them there under position control; positions (n,) [rad].
@@ -180,10 +233,12 @@ class Mover:
         limit = float(self.limits.upper[joint] if side > 0 else self.limits.lower[joint])
         return limit - side * (gap + 0.02 * abs(limit))
 
-    def rest(self, counts: Flags) -> Rest:
+    def rest(self, counts: Flags) -> StaticReading:
         """Wait until all has settled and the torque averages that `counts` (n,) are exact enough; raises Slipped."""
         rule, samples, resolution = self.rule, list[Sample](), self.known_resolution
+        window, timeout = rule.window * self.link.period, rule.timeout * self.link.period
         begin: int | None = None
+        self.link.catch_up()
 
         def settled(some: list[Sample]) -> bool:
             return rule.settled(stack(some, "position"), stack(some, "torque"), counts, resolution)
@@ -191,19 +246,29 @@ class Mover:
         while True:
             samples.append(self.cycle())
             count = len(samples)
-            if count < rule.window or (count - rule.window) % CHECK_EVERY:
+            if not self._lasted(samples, window) or (count - rule.window) % CHECK_EVERY:
                 continue
-            if count >= rule.timeout:
+            if self._lasted(samples, timeout):
                 return average(samples[-rule.max_samples :], settled=False)
             if begin is None:
-                if settled(samples[-rule.window :]):
-                    begin = count - rule.window // 2  # what settled last still decays in the first half
-            elif count - begin >= rule.window:
+                if settled(samples[self._since(samples, window) :]):
+                    # what settled last still decays in the first half
+                    begin = self._since(samples, rule.window // 2 * self.link.period)
+            elif self._lasted(samples[begin:], window):
                 enough = count - begin >= rule.max_samples
                 if enough or rule.exact(stack(samples[begin:], "torque"), counts):
                     if settled(samples[begin:]):
                         return average(samples[begin:], settled=True)
                     begin = None  # it only stood at a turning point
+
+    def _lasted(self, samples: list[Sample], seconds: float) -> bool:
+        """Whether the samples cover so much time, a period each at least."""
+        return bool(samples) and samples[-1].t - samples[0].t > seconds - 1.5 * self.link.period
+
+    def _since(self, samples: list[Sample], seconds: float) -> int:
+        """Index of the first sample of the last `seconds`."""
+        begin = samples[-1].t - seconds + 0.5 * self.link.period
+        return next(index for index, sample in enumerate(samples) if sample.t > begin)
 
     def _stand(self, joints: Flags) -> None:
         """Wait until pressed joints stand, `BOUNCE_SECONDS` at most; raises Slipped where one leaves its stop."""
@@ -219,28 +284,33 @@ class Mover:
 
     def _creep(self, stops: npt.NDArray[np.int64], joints: Flags) -> None:
         """Move each joint towards its stop until it does not follow any more."""
-        period = self.link.period
-        stride = np.minimum(self.section.approach_speed, self.limits.speed) * period * stops
-        window = max(int(0.1 / period), 4)
-        history, open_joints = [self.position.copy()], joints.copy()
+        stride = np.minimum(self.section.approach_speed, self.limits.speed) * self.link.period * stops
+        window = max(int(0.1 / self.link.period), 4)
+        read, asked, open_joints = [self.position.copy()], [self.command.position.copy()], joints.copy()
         while open_joints.any():
-            self.command.position[open_joints] += stride[open_joints]
-            sample = self.cycle()
-            np.copyto(self._produced, sample.motor_torque, where=np.isfinite(sample.motor_torque))
-            history.append(self.position.copy())
-            if len(history) <= window:
-                continue
-            moved = (self.position - history[-window]) * stops
-            lead = (self.command.position - self.position) * stops
-            still = moved < CONTACT_STILL * np.abs(stride) * window
-            open_joints &= ~(still & (lead > CONTACT_LEAD))
-            for joint in np.flatnonzero(open_joints):
-                self._check_creep(int(joint), int(stops[joint]))
+            ahead = np.tile(np.where(open_joints, stride, 0.0), (CREEP_AHEAD, 1))
+            rows = np.cumsum(np.vstack([self.command.position, ahead]), axis=0)[1:]
+            command = self.command
+            with closing(self._play(Setpoints(command.mode, command.torque, rows, command.guard))) as samples:
+                for row, sample in zip(rows, samples, strict=True):
+                    np.copyto(self._produced, sample.motor_torque, where=np.isfinite(sample.motor_torque))
+                    read.append(self.position.copy())
+                    asked.append(row)
+                    if len(read) <= window:
+                        continue
+                    moved, wanted = (self.position - read[-window]) * stops, np.abs(row - asked[-window - 1])
+                    still = moved < CONTACT_STILL * wanted
+                    touched = open_joints & still & ((row - self.position) * stops > CONTACT_LEAD)
+                    for joint in np.flatnonzero(open_joints & ~touched):
+                        self._check_creep(int(joint), int(stops[joint]), float(row[joint]))
+                    if touched.any():
+                        open_joints = open_joints & ~touched
+                        break
 
-    def _check_creep(self, joint: int, side: int) -> None:
-        """Raise Refused where a joint has gone beyond the place at which its stop should have been."""
+    def _check_creep(self, joint: int, side: int, target: float) -> None:
+        """Raise Refused if a joint's target [rad] has gone beyond the place at which its stop should have been."""
         limit = float(self.limits.upper[joint] if side > 0 else self.limits.lower[joint])
-        beyond = side * (self.command.position[joint] - limit)
+        beyond = side * (target - limit)
         if beyond > 2 * STOP_TOLERANCE + 0.03 * abs(limit):
             raise Refused(
                 f"{self.link.names[joint]}: no stop found at {limit:.3f} rad (went to {self.position[joint]:.3f}):"

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from calib.motion.static_reading import StaticReading
 from calib.observer.cause_test import CauseTest
 from calib.observer.config import ObserverConfig
 from calib.observer.decision import Agreeing
-from calib.observer.rest_detector import Row
 from calib.observer.saved_values import UNREADABLE
 from gcomp.arrays import as_array
 
@@ -25,7 +25,7 @@ class Investigation:
 
     def clear(self) -> None:
         """Forget every row and result."""
-        self.window: list[Row] = []
+        self.window: list[StaticReading] = []
         self.fresh = self.repeated = self.carrying = 0
         """New rows since the last test; repeated poses; consecutive windows that found the same payload."""
         self.doubtful = False
@@ -47,7 +47,7 @@ class Investigation:
         self.clear()
         self.held = False
 
-    def add(self, row: Row) -> bool:
+    def add(self, row: StaticReading) -> bool:
         """Take a row; False if the window has enough rows of this pose already."""
         away = [np.abs(kept.position - row.position).max() for kept in self.window]
         if sum(bool(far < self._config.place_size) for far in away) >= self._config.place_rows:
@@ -78,7 +78,7 @@ class Investigation:
             "reasons": list(self.reasons),
         }
 
-    def restore(self, values: dict[str, Any], cause_test: Callable[[list[Row]], CauseTest]) -> bool:
+    def restore(self, values: dict[str, Any], cause_test: Callable[[list[StaticReading]], CauseTest]) -> bool:
         """Continue from saved values; False, and nothing changed, if they do not fit.
 
         `cause_test` makes the test of the rows to be confirmed, by the restored belief.
@@ -100,12 +100,12 @@ class Investigation:
         return True
 
 
-def _save_rows(rows: list[Row]) -> list[list[Any]]:
+def _save_rows(rows: list[StaticReading]) -> list[list[Any]]:
     return [[row.t, row.position.tolist(), row.torque.tolist(), row.direction.tolist()] for row in rows]
 
 
-def _read_rows(values: Any, n: int) -> list[Row]:
+def _read_rows(values: Any, n: int) -> list[StaticReading]:
     return [
-        Row(float(t), *(as_array("row", column, (n,)) for column in (position, torque, direction)))
+        StaticReading.of(float(t), *(as_array("row", column, (n,)) for column in (position, torque, direction)))
         for t, position, torque, direction in values
     ]

@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from calib.motion.static_reading import StaticReading
 from calib.observer.cause_test import CauseTest, Verdict
 from calib.observer.config import ObserverConfig
 from calib.observer.decision import Agreeing, Finding, agreed, decide
 from calib.observer.events import Event, verdict_evidence
 from calib.observer.gravity_belief import GravityBelief
 from calib.observer.investigation import Investigation
-from calib.observer.rest_detector import RestDetector, Row
+from calib.observer.rest_detector import RestDetector
 from calib.observer.tracking.sensor_filter import Estimate
 from calib.observer.tracking.tracking import Tracking
 from calib.records.records import CalibrationRecord, GravityRecord
@@ -84,7 +85,7 @@ class Observer:
         row = self._rest.handle(t, position, torque)
         return [] if row is None else self.handle_row(row)
 
-    def handle_row(self, row: Row) -> list[Event]:
+    def handle_row(self, row: StaticReading) -> list[Event]:
         """Take one row: the average over one stop, as the rest detector makes it."""
         row = replace(row, position=self._angle(row.position))
         self._tracking.count(row)
@@ -178,7 +179,7 @@ class Observer:
         self._resume()
         return [self._verdict(t, replace(verdict, cause="tool", joint=None))]
 
-    def _confirm(self, t: float, window: list[Row], test: CauseTest, verdict: Verdict) -> list[Event]:
+    def _confirm(self, t: float, window: list[StaticReading], test: CauseTest, verdict: Verdict) -> list[Event]:
         """A window found a drift: once the window before it agrees, decide on the rows of both."""
         first, agreeing = self._investigation.first, Agreeing(window, test, frozenset(verdict.joints))
         self._investigation.first = agreeing

@@ -1,29 +1,13 @@
 """Rest detection: turns samples into rows, one averaged row per stop of the arm."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from calib.motion.static_reading import StaticReading
 from calib.observer.config import ObserverConfig
 from calib.observer.saved_values import UNREADABLE
 from gcomp.arrays import Array, as_array
-
-
-@dataclass(frozen=True)
-class Row:
-    """One stop of the arm."""
-
-    t: float
-    """Middle of the average [s]."""
-    position: Array
-    """Mean position reading (n,) [rad]."""
-    torque: Array
-    """Mean torque reading (n,) [N·m]."""
-    direction: Array
-    """Sign of each joint's last motion (n,): +1, -1, or 0 if it has not moved yet."""
-    noise: Array | None = None
-    """Half the difference between the two halves of the average (n,) [N·m]: same standard deviation as the average."""
 
 
 class RestDetector:
@@ -42,7 +26,7 @@ class RestDetector:
         self._samples: list[tuple[float, Array, Array]] = []
         self._done = False
 
-    def handle(self, t: float, position: Array, torque: Array) -> Row | None:
+    def handle(self, t: float, position: Array, torque: Array) -> StaticReading | None:
         """Take one sample (SI, (n,) each, NaN if missing); returns the row of this rest once complete, else None."""
         config = self._config
         if np.isnan(position).any() or np.isnan(torque).any():
@@ -83,11 +67,13 @@ class RestDetector:
         away = np.abs(position - self._last_stop).max()
         self._done = self._done and bool(away < self._config.new_pose)
 
-    def _complete(self) -> Row:
+    def _complete(self) -> StaticReading:
         times, positions, torques = (np.array(column) for column in zip(*self._samples, strict=True))
         self._samples.clear()
         half = len(times) // 2
-        noise = (torques[:half].mean(axis=0) - torques[half:].mean(axis=0)) / 2
+        error = np.abs(torques[:half].mean(axis=0) - torques[half:].mean(axis=0)) / 2
         here: Array = positions.mean(axis=0)
         self._last_stop, self._done = here, True
-        return Row(float(times.mean()), here, torques.mean(axis=0), self._direction, noise)
+        return StaticReading.of(
+            float(times.mean()), here, torques.mean(axis=0), self._direction, count=len(times), torque_error=error
+        )

@@ -9,8 +9,8 @@ import numpy.typing as npt
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from calib.plan.types import Sweep, SweepPlan
+from gcomp.arrays import Array
 
-Array = npt.NDArray[np.float64]
 POINTS = 15
 """Poses looked at on each way from one place to the next."""
 DEPTH = 0.0005

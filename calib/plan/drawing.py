@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from calib.arm.drive_limits import Limits
@@ -15,8 +14,8 @@ from calib.motion.trajectory import trajectory
 from calib.plan.collisions import ends
 from calib.plan.types import SweepPlan
 from gcomp.arm.arm import Arm, bar_frames
+from gcomp.arrays import Array
 
-Array = npt.NDArray[np.float64]
 PRESS, READ = 1.0, 0.5
 """Seconds that creeping onto stops and pressing take, and that one reading takes to settle and average."""
 COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#e377c2", "#8c564b")

@@ -3,15 +3,14 @@
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from calib.plan.rough_gravity import GravityGuess
 from calib.plan.types import Sweep
+from gcomp.arrays import Array
 from gcomp.identify.global_fit import predict_covariance
 from gcomp.identify.parameters import Parameters, Prior
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 
-Array = npt.NDArray[np.float64]
 SIDE = 0.05
 """Lateral place at which the reference mass is assumed to hang [m]."""
 SCATTER = 1.3
@@ -47,7 +46,7 @@ def predicted_gain_std(
     position, counts = np.concatenate(positions), np.concatenate(counted)
     torque = np.where(counts, 0.0, np.nan)
     rows = len(position)
-    both = Readings.of(
+    both = StaticReadings.of(
         np.concatenate([position, position]),
         np.concatenate([torque, torque]),
         SCATTER * sigma,

@@ -1,7 +1,6 @@
 """Which reference masses suit an arm and its drives."""
 
 import numpy as np
-import numpy.typing as npt
 
 from calib.arm.drive_limits import Limits
 from calib.plan.rough_gravity import GravityGuess, reach
@@ -10,7 +9,6 @@ from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.gravity.torque import gravity_regressor
 
-Array = npt.NDArray[np.float64]
 MASS_SHARES = (0.3, 0.5, 0.7)
 """Shares of the torque left over gravity that the reference mass may take; the least that is precise enough."""
 ASSUMED_GRAVITY = 0.6

@@ -3,12 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from gcomp.arm.arm import Arm
+from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_regressor
-
-Array = npt.NDArray[np.float64]
 
 GAIN_STD = 0.3
 """What is assumed of an uncalibrated torque gain: 1 ± 0.3."""

@@ -12,15 +12,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from armlink.arm_file import ArmFile, describe, load_arm
 from armlink.errors import BadInput, Refused
+from calib.motion.static_reading import StaticReading, stack
 from calib.plan.types import SweepPlan
 from calib.records.atomic_file import part_of, write_whole
+from gcomp.arrays import Array
 
-Array = npt.NDArray[np.float64]
 MANIFEST, LINES = "manifest.json", "readings.jsonl"
 
 
@@ -60,43 +60,12 @@ class Manifest(_Model):
             arm_file=str(arm.path),
             names=arm.joint_names,
             reference_mass=reference_mass,
-            rated_torque=tuple(joint.rated_torque for joint in arm.require_link().joints),
+            rated_torque=tuple(arm.require_link().rated_torques.tolist()),
             installed_gain=tuple(gain for gain, _ in pairs),
             installed_offset=tuple(offset for _, offset in pairs),
             created=datetime.now(UTC).replace(microsecond=0),
             software=f"armlink {version('armlink')}",
         )
-
-
-class Reading(_Model):
-    """One static reading: averages over samples taken at rest, (n,) per joint."""
-
-    kind: Literal["reading"] = "reading"
-    sweep: str
-    """Name of the sweep, or "scout"."""
-    index: int
-    """Number of the reading within its sweep."""
-    joint: int | None
-    """Index of the swept joint; None where all joints were held."""
-    direction: Literal[-1, 0, 1]
-    """Side from which the swept joint came: 1 upwards, -1 downwards; 0 where none was swept."""
-    t: float
-    """Link time at its end [s]."""
-    count: int
-    """Samples averaged."""
-    settled: bool
-    """False where the settle rule's time was up."""
-    servo: tuple[bool, ...]
-    """Which joints were servo-held at rest: only their torque sensors read gravity."""
-    position: tuple[float, ...]
-    """Mean position reading [rad]."""
-    position_std: tuple[float, ...]
-    torque: tuple[float, ...]
-    """Mean torque reading of the sensor [N·m]."""
-    torque_std: tuple[float, ...]
-    """Standard deviation of one sample [N·m]."""
-    motor_torque: tuple[float, ...]
-    """Mean of the drive's own estimate [N·m]."""
 
 
 class PlanLine(_Model):
@@ -108,7 +77,28 @@ class PlanLine(_Model):
     """Smallest step seen in each joint's position reading [rad]."""
 
 
-_LINE: TypeAdapter[Reading | PlanLine] = TypeAdapter(Annotated[Reading | PlanLine, Field(discriminator="kind")])
+class StallLine(_Model):
+    """The joints had to be stopped, were enabled again, and the interrupted reading was repeated."""
+
+    kind: Literal["stall"] = "stall"
+    t: float
+    """Link time of the last sample before it [s]."""
+    late_ms: float | None
+    """How late the host was [ms]; None if it was not the host."""
+    reading: str
+    """Sweep and number of the reading that was interrupted."""
+    reason: str
+
+
+Line = StaticReading | PlanLine | StallLine
+_LINE: TypeAdapter[Line] = TypeAdapter(
+    Annotated[Line, Field(discriminator="kind")], config=ConfigDict(ser_json_inf_nan="constants")
+)
+
+
+def encoded(line: Line) -> bytes:
+    """A line of a data set as it stands in the file."""
+    return _LINE.dump_json(line) + b"\n"
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,13 +107,15 @@ class SweepData:
 
     path: Path
     manifest: Manifest
-    readings: tuple[Reading, ...]
+    readings: tuple[StaticReading, ...]
     plan: SweepPlan | None
     """The plan as run; None where the scout had not been finished."""
     resolution: Array
     """Smallest step seen in each joint's position reading (n,) [rad]; 0 where it is not known."""
     digest: str = field(repr=False)
     """SHA-256 (hex) of the lines read."""
+    stalls: tuple[StallLine, ...] = ()
+    """Interruptions, in their order."""
 
     @property
     def complete(self) -> bool:
@@ -131,7 +123,7 @@ class SweepData:
         return self.plan is not None and len(self.readings) >= self.plan.readings
 
     @property
-    def unsettled(self) -> tuple[Reading, ...]:
+    def unsettled(self) -> tuple[StaticReading, ...]:
         """Readings that were taken before the arm stood still."""
         return tuple(reading for reading in self.readings if not reading.settled)
 
@@ -157,7 +149,7 @@ class SweepData:
 
     def array(self, name: str) -> Array:
         """One field of all readings, (K,) or (K, n), as numbers."""
-        return np.array([getattr(reading, name) for reading in self.readings], dtype=float)
+        return stack(self.readings, name).astype(float)
 
 
 def load_data(path: Path) -> SweepData:
@@ -165,15 +157,27 @@ def load_data(path: Path) -> SweepData:
     manifest = _read_manifest(path)
     content = (path / LINES).read_bytes() if (path / LINES).is_file() else b""
     whole = content[: content.rfind(b"\n") + 1]
-    readings: list[Reading] = []
+    readings: list[StaticReading] = []
+    stalls: list[StallLine] = []
     plan, resolution = None, np.zeros(len(manifest.names))
     for line in _parse(whole.splitlines(), path / LINES):
         if isinstance(line, PlanLine):
             plan, resolution = line.plan, np.array(line.resolution)
+        elif isinstance(line, StallLine):
+            stalls.append(line)
         else:
             _check_width(line, len(manifest.names), path)
             readings.append(line)
-    return SweepData(path, manifest, tuple(readings), plan, resolution, hashlib.sha256(whole).hexdigest())
+    digest = hashlib.sha256(whole).hexdigest()
+    return SweepData(path, manifest, tuple(readings), plan, resolution, digest, tuple(stalls))
+
+
+def require_vacant(path: Path, resume: bool = False) -> None:
+    """Raise BadInput unless a new data set can begin at `path`, or with `resume` one is there to go on with."""
+    if resume:
+        _read_manifest(path)
+    elif path.exists() and (not path.is_dir() or any(each != part_of(path / MANIFEST) for each in path.iterdir())):
+        raise BadInput(f"{path}: not empty: choose another directory, or continue the sweep there with --resume")
 
 
 class DataWriter:
@@ -181,10 +185,9 @@ class DataWriter:
 
     def __init__(self, path: Path, manifest: Manifest, resume: bool = False) -> None:
         """Make the directory, or with `resume` go on with the one there; raises BadInput where that cannot be."""
+        require_vacant(path, resume)
         if resume:
             _require_same(_read_manifest(path), manifest, path)
-        elif path.exists() and any(each != part_of(path / MANIFEST) for each in path.iterdir()):
-            raise BadInput(f"{path}: not empty: choose another directory, or continue the sweep there with --resume")
         else:
             path.mkdir(parents=True, exist_ok=True)
             write_whole(path / MANIFEST, manifest.model_dump_json(by_alias=True, indent=1))
@@ -192,9 +195,9 @@ class DataWriter:
         self._drop_torn_line()
         _keep_names(path)
 
-    def append(self, line: Reading | PlanLine) -> None:
+    def append(self, line: Line) -> None:
         """Write one line and wait until it is on disk; raises BadInput where the disk is full or fails."""
-        content = line.model_dump_json().encode() + b"\n"
+        content = encoded(line)
         try:
             if self._file.write(content) < len(content):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -239,7 +242,7 @@ def _read_manifest(path: Path) -> Manifest:
         raise BadInput(f"{file}: not readable as JSON: {error}") from None
 
 
-def _parse(lines: Sequence[bytes], file: Path) -> Iterator[Reading | PlanLine]:
+def _parse(lines: Sequence[bytes], file: Path) -> Iterator[Line]:
     for number, line in enumerate(lines, start=1):
         try:
             yield _LINE.validate_json(line)
@@ -247,7 +250,7 @@ def _parse(lines: Sequence[bytes], file: Path) -> Iterator[Reading | PlanLine]:
             raise BadInput(f"{file}: line {number}: {describe(error)}") from None
 
 
-def _check_width(reading: Reading, n: int, path: Path) -> None:
+def _check_width(reading: StaticReading, n: int, path: Path) -> None:
     for key in ("servo", "position", "position_std", "torque", "torque_std", "motor_torque"):
         if len(getattr(reading, key)) != n:
             raise BadInput(f"{path}: sweep {reading.sweep}, reading {reading.index}: {key} is not one per joint ({n})")

@@ -1,7 +1,6 @@
 """Before a sweep: are the sensors alive and quiet, the drives cool, and is every stop where the arm file has it?
 
-CiA 402 has no object for a drive's temperature, so it is read where the joint's data sheet has one at 2101h and the
-device too (INTEGER16, 0.1 °C). Every drive that gets too hot says so by an emergency, which ends any sweep.
+A drive that gets too hot later says so by an emergency, which ends any sweep.
 """
 
 from collections.abc import Callable
@@ -11,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
-from armlink.canopen.object_dictionary import Entry
 from armlink.errors import Refused
-from armlink.link.link import Link
+from armlink.link.types import Stats
+from armlink.loop.driver import ArmDriver
 from calib.arm.drive_limits import Limits
 from calib.arm.sweep_section import sweep_section
 from calib.motion.mover import Mover, Stalled
@@ -21,13 +20,14 @@ from calib.motion.mover import Mover, Stalled
 Array = npt.NDArray[np.float64]
 LISTEN = 0.5
 """Seconds for which the sensors are listened to at rest, after as long again in which switching on dies down."""
+MISSING, LATE = 0.1, 0.5
+"""Shares of readings from which on they are said to be missing, and to be late."""
 LOUD = 0.05
 """Noise of a torque sensor, as a share of rated torque, from which it is not fit for a calibration."""
 NEAR_LIMIT = 1.9
 """Reading, in rated torques, at which a torque sensor is about to saturate."""
 APPROACH = 0.08
 """Distance from the arm file's stop from which a joint creeps [rad]."""
-TEMPERATURE = Entry(0x2101, 0, "h", "drive temperature")
 HOT = 70.0
 """Temperature of a drive from which no sweep is begun: it would fall or rise while the sensors are read [°C]."""
 
@@ -49,7 +49,7 @@ class Preflight:
     """Of the drives (n,) [°C]; NaN where a drive does not report it."""
 
 
-def listen(link: Link, arm: ArmFile) -> Preflight:
+def listen(link: ArmDriver, arm: ArmFile) -> Preflight:
     """Listen to an enabled arm at rest.
 
     Raises Refused naming the joint whose sensor is silent, loud or at the end of its range, or whose drive is hot.
@@ -57,16 +57,14 @@ def listen(link: Link, arm: ArmFile) -> Preflight:
     temperature = read_temperatures(link)
     limits, mover = Limits.of(arm), Mover(link, sweep_section(arm), Limits.of(arm))
     cycles = max(int(LISTEN / link.period), 20)
-    samples = [mover.cycle() for _ in range(2 * cycles)][cycles:]
+    for _ in range(cycles):
+        mover.cycle()
+    before = link.stats
+    samples = [mover.cycle() for _ in range(cycles)]
     torque = np.array([sample.torque for sample in samples])
     position = np.array([sample.position for sample in samples])
+    _check_readings(link.names, before, link.stats, torque, position)
     for joint, name in enumerate(link.names):
-        for what, values in (("torque", torque[:, joint]), ("position", position[:, joint])):
-            missing = int(np.isnan(values).sum())
-            if missing > 0.1 * len(values):
-                raise Refused(
-                    f"{name}: {missing} of {len(values)} {what} readings are missing: check its TPDO and cable"
-                )
         if np.nanmax(np.abs(torque[:, joint])) > NEAR_LIMIT * limits.rated[joint]:
             raise Refused(
                 f"{name}: its torque sensor reads {torque[-1, joint]:.3g} N·m at rest, near the end of its range:"
@@ -84,24 +82,41 @@ def listen(link: Link, arm: ArmFile) -> Preflight:
     return Preflight(link.names, np.array([_noise(each) for each in torque.T]), mean, nowhere, expected, temperature)
 
 
-def read_temperatures(link: Link) -> Array:
+def _check_readings(names: tuple[str, ...], before: Stats, after: Stats, torque: Array, position: Array) -> None:
+    """Raise Refused naming the joint whose readings are missing: lost on the way, or late.
+
+    `before` and `after` count what was asked for and what came while torque and position (K, n) were read.
+    """
+    asked = after.asked - before.asked
+    for joint, name in enumerate(names):
+        lost = asked - (after.came[joint] - before.came[joint])
+        for what, values in (("torque", torque[:, joint]), ("position", position[:, joint])):
+            missing = int(np.isnan(values).sum())
+            if missing <= MISSING * len(values):
+                continue
+            empty = int((np.isnan(values) & ~(np.isnan(torque[:, joint]) & np.isnan(position[:, joint]))).sum())
+            if max(lost, empty) > MISSING * asked:
+                raise Refused(
+                    f"{name}: {max(lost, empty)} of {asked} {what} readings are missing: check its TPDO and cable"
+                )
+            if missing > LATE * len(values):
+                raise Refused(
+                    f"{name}: {missing} of {len(values)} {what} readings came after their cycle was over: the arm or"
+                    " this machine does not keep pace: lower link.rate, or give them more processor time"
+                )
+
+
+def read_temperatures(link: ArmDriver) -> Array:
     """Temperatures of the drives (n,) [°C], NaN where one does not report it; raises Refused naming one that is hot."""
-    temperature = np.full(link.n, np.nan)
-    for joint, services in enumerate(link.services):
-        told = services.remote.object_dictionary.get_variable(TEMPERATURE.index, TEMPERATURE.sub)
-        if told is None or "temperature" not in told.name.lower() or not services.has(TEMPERATURE):
-            continue
-        temperature[joint] = services.read(TEMPERATURE) / 10
-        if temperature[joint] >= HOT:
-            raise Refused(
-                f"{link.names[joint]}: its drive is at {temperature[joint]:.0f} °C, a sweep begins below {HOT:.0f}:"
-                " let it cool down"
-            )
+    temperature = link.read_temperatures()
+    for name, degrees in zip(link.names, temperature, strict=True):
+        if degrees >= HOT:
+            raise Refused(f"{name}: its drive is at {degrees:.0f} °C, a sweep begins below {HOT:.0f}: let it cool down")
     return temperature
 
 
 def find_stops(
-    link: Link, arm: ArmFile, found: Preflight, report: Callable[[int, int], None] | None = None
+    link: ArmDriver, arm: ArmFile, found: Preflight, report: Callable[[int, int], None] | None = None
 ) -> Preflight:
     """Push each joint slowly onto both its stops, no harder than its position loop does 15 mrad off, others mid-range.
 

@@ -8,17 +8,18 @@ import numpy as np
 import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
-from armlink.errors import Refused
-from armlink.link.link import Link
+from armlink.errors import Refused, Stall
+from armlink.loop.driver import ArmDriver
 from calib.arm.drive_limits import Limits
 from calib.arm.sweep_section import SweepSection, sweep_section
 from calib.motion.mover import Mover, Slipped, Stalled
-from calib.motion.static_reading import Rest
+from calib.motion.static_reading import StaticReading
 from calib.plan.collisions import check_plan
 from calib.plan.sweep_plan import plan_sweep
 from calib.plan.types import Sweep, SweepPlan
-from calib.sweep.dataset import DataWriter, Manifest, PlanLine, Reading, SweepData, load_data
-from calib.sweep.scout import SCOUT, SLOWER, as_reading, rough_model, run_scout
+from calib.sweep.dataset import DataWriter, Manifest, PlanLine, SweepData, load_data
+from calib.sweep.scout import SCOUT, SLOWER, rough_model, run_scout
+from calib.sweep.stalls import OnStall, give_up, stall_line
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[int, int, float, str], None]
@@ -34,7 +35,7 @@ RETRIES = 3
 
 
 def run_sweep(
-    link: Link,
+    link: ArmDriver,
     arm: ArmFile,
     out: Path,
     *,
@@ -43,19 +44,21 @@ def run_sweep(
     progress: Progress | None = None,
     clock: Callable[[], float] = time.monotonic,
     seed: int = 0,
+    on_stall: OnStall = give_up,
 ) -> SweepData:
     """One pass over all joints with `reference_mass` [kg] attached (0 for none), into the directory `out`.
 
     The link must have been enabled; the joints hold at the end. First the scout, then the plan with its bias torques,
     then the sweeps, tip to base. With `resume` it goes on after the last reading
-    on disk. Raises BadInput, Refused where the arm cannot be swept, BusFault; every reading made is on disk.
+    on disk. After a Stall that `on_stall` accepts the joints are enabled again and the interrupted reading is repeated.
+    Raises BadInput, Refused if the arm cannot be swept, BusFault; every reading made is on disk.
     """
     installed = [link.read_calibration(joint) for joint in range(link.n)]
     manifest = Manifest.of(arm, reference_mass, [(each.gain, each.offset) for each in installed])
     with DataWriter(out, manifest, resume) as writer:
         data = load_data(out)
         mover = Mover(link, sweep_section(arm), Limits.of(arm))
-        run = _Pass(mover, writer, list(data.readings), progress or (lambda *_: None), clock)
+        run = _Pass(mover, writer, list(data.readings), progress or (lambda *_: None), clock, on_stall)
         if data.plan is None:
             first = plan_sweep(arm, seed=seed, reference_mass=reference_mass)
             check_plan(arm, first)
@@ -78,7 +81,7 @@ def run_sweep(
 
 
 def _final_plan(
-    arm: ArmFile, first: SweepPlan, readings: list[Reading], mass: float, seed: int, resolution: Array
+    arm: ArmFile, first: SweepPlan, readings: list[StaticReading], mass: float, seed: int, resolution: Array
 ) -> SweepPlan:
     """The plan with bias torques, and the scout poses that were reached."""
     plan = plan_sweep(arm, rough_model(arm, readings), seed=seed, reference_mass=mass, resolution=resolution)
@@ -100,10 +103,12 @@ class _Pass:
         self,
         mover: Mover,
         writer: DataWriter,
-        readings: list[Reading],
+        readings: list[StaticReading],
         progress: Progress,
         clock: Callable[[], float],
+        on_stall: OnStall = give_up,
     ) -> None:
+        self._on_stall = on_stall
         self.mover, self.writer, self.readings = mover, writer, readings
         self.section: SweepSection = mover.section
         self.total, self.acceleration = 0, 1.0
@@ -111,7 +116,7 @@ class _Pass:
         self._progress, self._clock = progress, clock
         self._began, self._at_start = clock(), len(readings)
 
-    def save(self, reading: Reading) -> None:
+    def save(self, reading: StaticReading) -> None:
         """Put a reading on disk and report."""
         self.writer.append(reading)
         self.readings.append(reading)
@@ -119,45 +124,60 @@ class _Pass:
         left = (self._clock() - self._began) / made * max(self.total - len(self.readings), 0)
         self._progress(len(self.readings), self.total, left, self._text(reading))
 
-    def _text(self, reading: Reading) -> str:
+    def _text(self, reading: StaticReading) -> str:
         """What is being done, with a plot of the swept joint's torque in the sweep so far."""
         if reading.joint is None:
             return f"{reading.sweep} {reading.index + 1}"
         curve = [each.torque[reading.joint] for each in self.readings if each.sweep == reading.sweep]
         return f"{reading.sweep} {reading.index + 1} {sparkline(curve)}"
 
+    def bridge(self, stall: Stall, reading: str) -> None:
+        """Note a stall, enable the joints again and hold them where they stand; raises it if that is not wanted."""
+        if not self._on_stall(stall):
+            raise stall
+        self.writer.append(stall_line(stall, self.mover.seen_at, reading))
+        self.mover.link.recover()
+        self.mover.resume()
+
     def scout(self, plan: SweepPlan) -> None:
         """Take the scout poses that are still to be taken."""
-        done = {reading.index for reading in self.readings if reading.sweep == SCOUT}
-        run_scout(self.mover, plan, done, self.save)
+        while True:
+            done = {reading.index for reading in self.readings if reading.sweep == SCOUT}
+            try:
+                return run_scout(self.mover, plan, done, self.save)
+            except Stall as stall:
+                self.bridge(stall, f"{SCOUT} {len(done) + 1}")
 
     def sweep(self, sweep: Sweep) -> None:
         """Take the readings of one sweep that are still to be taken; a joint that slips is pressed again."""
         done = {reading.index for reading in self.readings if reading.sweep == sweep.name}
         open_readings = [index for index in range(sweep.readings) if index not in done]
         bias = np.array(sweep.bias)
-        retries, standing = 0, False
+        retries, standing, detour = 0, False, False
         while open_readings:
             index = open_readings[0]
             try:
                 if not standing:
-                    self._rest_others(sweep, bias, *sweep.target(index), detour=retries > 0)
+                    self._rest_others(sweep, bias, *sweep.target(index), detour=detour)
                     standing = True
                 rest = self._step(sweep, *sweep.target(index))
+            except Stall as stall:
+                standing, detour = False, True
+                self.bridge(stall, f"{sweep.name} {index + 1}")
+                continue
             except Slipped as slip:
                 retries += 1
-                standing = False
+                standing, detour = False, True
                 sweep, bias = self._firmer(sweep, bias, slip.joint, retries)
                 continue
             except Stalled:
                 retries += 1
-                standing = False
+                standing, detour = False, True
                 self.acceleration *= SLOWER
                 if retries > RETRIES:
                     raise
                 continue
-            counts = np.array(sweep.servo)
-            self.save(as_reading(rest, sweep.name, index, sweep.joint, sweep.target(index)[1], counts))
+            self.save(rest.within(sweep.name, index, np.array(sweep.servo), sweep.joint, sweep.target(index)[1]))
             open_readings.pop(0)
 
     def _rest_others(self, sweep: Sweep, bias: Array, target: float, direction: int, *, detour: bool = False) -> None:
@@ -176,7 +196,7 @@ class _Pass:
         if stops.any():
             mover.press(stops, bias)
 
-    def _step(self, sweep: Sweep, target: float, direction: int) -> Rest:
+    def _step(self, sweep: Sweep, target: float, direction: int) -> StaticReading:
         """Bring the swept joint to a step from its side and read."""
         mover, joint = self.mover, sweep.joint
         goal = mover.command.position.copy()

@@ -4,20 +4,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
-from armlink.link.link import Link
+from armlink.loop.driver import ArmDriver
 from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import SweepSection, sweep_section
 from calib.motion.mover import Mover, Stalled
 from calib.plan.poses import short_way, sweep_range
 from calib.records.records import CalibrationRecord, GravityRecord
+from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque, torque_covariance
 
-Array = npt.NDArray[np.float64]
 ACCELERATION = 2.0
 TOLERANCE = 0.01
 """RMS that passes, as a share of the joint's largest model torque, beside the noise floor."""
@@ -62,7 +61,7 @@ class Verification:
 
 
 def run_verify(
-    link: Link,
+    link: ArmDriver,
     arm: ArmFile,
     gravity: GravityRecord,
     calibration: CalibrationRecord | None = None,
@@ -125,7 +124,7 @@ class _Sensors:
     position_offset: Array
 
     @classmethod
-    def of(cls, link: Link, record: CalibrationRecord | None) -> "_Sensors":
+    def of(cls, link: ArmDriver, record: CalibrationRecord | None) -> "_Sensors":
         installed = [link.read_calibration(joint) for joint in range(link.n)]
         gain, offset = np.array([each.gain for each in installed]), np.array([each.offset for each in installed])
         if record is None:

@@ -43,11 +43,18 @@ class LockStepBus(can.BusABC):  # type: ignore[misc]
     With `timing` frames take their time on a wire of `bitrate` [bit/s] (`sim_bus.bus.wire_timing`), else none.
     """
 
-    def __init__(self, channel: Any = None, *, arm: SimulatedArm | None = None, seed: int = 0, **options: Any) -> None:
-        """On the arm given, or on a new one from the arm file (or bundled arm) `channel`. Raises BadInput."""
+    def __init__(
+        self, channel: Any = None, *, arm: SimulatedArm | None = None, seed: int = 0, load: float = 0.0, **options: Any
+    ) -> None:
+        """On the arm given, or on a new one from the arm file (or bundled arm) `channel`; `load` [kg] is at its tip.
+
+        Raises BadInput.
+        """
         if arm is None:
             described = load_arm(str(channel))
             arm = SimulatedArm(described, Truth.of(described), seed)
+            if load:
+                arm.attach_mass(load)
         self.arm = arm
         self.line: Line = arm
         """What stands between this end and the arm: the arm itself, faults, a wire."""

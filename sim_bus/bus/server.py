@@ -1,6 +1,5 @@
 """A simulated arm on a bus of python-can's, in a process of its own: real time, or in lock-step with SYNC."""
 
-import errno
 import signal
 import time
 from collections.abc import Callable, Sequence
@@ -9,23 +8,26 @@ from types import FrameType
 import can
 
 from armlink.bus.open import BusGroup
+from armlink.bus.port import Frame, GroupPort, InterfaceDown, Port, open_port
 from armlink.canopen.object_dictionary import NMT_ID
 from armlink.errors import BusFault
 from sim_bus.bus.control_pipe import ControlPipe
 from sim_bus.bus.effect_options import Drift
-from sim_bus.bus.fault_injector import ERROR_FLAG, Injector
+from sim_bus.bus.fault_injector import Injector
 from sim_bus.bus.fault_kinds import Fault
 from sim_bus.bus.wire_timing import Line
 from sim_bus.simulated_arm import SYNC_ID, SimulatedArm
 
 LARGEST_LAG = 0.25
 """What the physics lags behind the clock by more than this is dropped, as after a stopped process [s]."""
-TICK = 0.002
-"""Longest wait for a frame: timers and physics go on meanwhile [s]."""
+TICK = 0.01
+"""Without a frame that needs it, physics lag behind the clock by this much at most [s], or until a timer is due."""
+LATE = 2 * TICK
+"""Longer than this without a turn and it was this process that did not listen, not the host that was silent [s]."""
+MOST_FRAMES = 1000
+"""Frames dealt with in one turn: a flood does not keep physics and timers waiting for ever."""
 LOCKSTEP_PATIENCE = 1.0
 """In lock-step, so long without a SYNC and time goes on by itself, so that nodes notice a host that died [s]."""
-SEND_PATIENCE = 0.1
-"""How long a full transmit queue is waited for [s]; a frame that still does not go is lost, as on a dead bus."""
 INTERRUPTED, TERMINATED = 130, 0
 
 
@@ -44,22 +46,21 @@ class Server:
     ) -> None:
         """`now` is the clock that the physics follows unless `lockstep`; `control` gives orders while it runs."""
         self._arm, self._bus, self._lockstep, self._now = arm, bus, lockstep, now
-        members: tuple[can.BusABC, ...] = getattr(bus, "members", (bus,))
-        self._others, self._leading = members[:-1], members[-1]
+        self._port = open_port(bus, as_node=True)
+        ports = self._port.members if isinstance(self._port, GroupPort) else (self._port,)
+        *self._others, self._leading = ports
         """Of several buses the last gives SYNC: a host fills them in their order."""
-        self._of_bus: dict[can.BusABC, set[int]] = {}
+        self._of_port: dict[Port, set[int]] = {port: set() for port in ports}
         """Nodes on each of several buses."""
         if isinstance(bus, BusGroup):
             for node, place in bus.route.items():
-                self._of_bus.setdefault(members[place], set()).add(node)
+                self._of_port[ports[place]].add(node)
         self._line: Line = arm
         self._control, self._injector = control, None if control is None and not faults else Injector(arm)
         if self._injector is not None:
             self._line = self._injector
             for fault in faults:
                 self._injector.inject(fault)
-        self._fd = False
-        """Nodes answer as they are spoken to: in classical frames or in CAN FD's."""
         self.on_wrong: Callable[[str], None] = lambda wrong: None
         """Takes what was wrong with an order."""
         self._synced = now()
@@ -67,7 +68,7 @@ class Server:
         self._offset = now() - arm.time
         self._ended: int | None = None
         self.lost = 0
-        """Frames that the bus did not take."""
+        """Frames that the bus did not take, at most."""
 
     def run(self) -> int:
         """Serve until SIGINT (130) or SIGTERM (0). Raises BusFault where the bus goes away."""
@@ -82,46 +83,50 @@ class Server:
 
     def turn(self) -> None:
         """Wait for at most a tick, then deal with everything that is there."""
+        receive = self._leading.receive
         try:
-            message = self._leading.recv(TICK)
-            while message is not None:
+            frame = receive(TICK if self._lockstep else max(self._until_tick(), 0.0))
+            for _ in range(MOST_FRAMES):
+                if frame is None:
+                    break
                 self._take_from_others()
-                self._heard(message, self._leading)
-                message = self._leading.recv(0)
+                self._heard(frame, self._leading)
+                frame = receive(0.0)
             self._take_from_others()
-        except can.CanError as error:
-            if error.error_code != errno.ENETDOWN:  # else it may come up again, and until then nodes hear nothing
-                raise BusFault(f"bus {self._bus.channel_info}: {error}") from None
-        except OSError as error:
-            raise BusFault(f"bus {self._bus.channel_info}: {error.strerror or error}") from None
-        self._let_time_pass()
+        except InterfaceDown:  # it may come up again, and until then nodes hear nothing
+            pass
+        if self._lockstep or self._until_tick() <= 0.0:
+            self._let_time_pass()
         if self._control is not None and self._injector is not None:
             for wrong in self._control.poll(self._injector):
                 self.on_wrong(wrong)
         self._flush()
 
+    def _until_tick(self) -> float:
+        """Time until physics and timers must go on without a frame [s]."""
+        due = min(self._arm.supervision.due, self._arm.time + TICK)
+        return due + self._offset - self._now()
+
     def _take_from_others(self) -> None:
-        for bus in self._others:
-            while (message := bus.recv(0)) is not None:
-                self._heard(message, bus)
+        for port in self._others:
+            while (frame := port.receive(0.0)) is not None:
+                self._heard(frame, port)
 
-    def _heard(self, message: can.Message, bus: can.BusABC) -> None:
+    def _heard(self, frame: Frame, port: Port) -> None:
         """What a host sends on every bus counts once: SYNC on the leading one, NMT commands on each node's own."""
-        if self._others and message.arbitration_id == NMT_ID and len(message.data) == 2:
-            command, addressed = message.data
-            for node in self._of_bus[bus] if addressed == 0 else self._of_bus[bus] & {addressed}:
+        can_id, data = frame
+        if self._others and can_id == NMT_ID and len(data) == 2:
+            command, addressed = data
+            for node in self._of_port[port] if addressed == 0 else self._of_port[port] & {addressed}:
                 self._line.on_frame(NMT_ID, bytes([command, node]))
-        elif bus is self._leading or message.arbitration_id != SYNC_ID:
-            self._frame(message)
+        elif port is self._leading or can_id != SYNC_ID:
+            self._frame(can_id, data)
 
-    def _frame(self, message: can.Message) -> None:
-        if message.is_error_frame or message.is_remote_frame or message.is_extended_id:
-            return
-        self._fd = message.is_fd
-        if not self._lockstep:
+    def _frame(self, can_id: int, data: bytes) -> None:
+        if not (self._lockstep or self._arm.waits_for_sync(can_id)):
             self._let_time_pass()
-        self._line.on_frame(message.arbitration_id, bytes(message.data))
-        if self._lockstep and message.arbitration_id == SYNC_ID:
+        self._line.on_frame(can_id, data)
+        if self._lockstep and can_id == SYNC_ID:
             self._synced = self._now()
             self._line.advance(self._arm.period)
         self._flush()
@@ -134,6 +139,8 @@ class Server:
         if lag > LARGEST_LAG:
             self._offset += lag - LARGEST_LAG
             lag = LARGEST_LAG
+        if lag > LATE:
+            self._arm.supervision.postpone(lag - LATE)
         if lag > 0:
             self._line.advance(lag)
         while self._drifts and self._drifts[0].time <= self._arm.time:
@@ -142,22 +149,13 @@ class Server:
 
     def _flush(self) -> None:
         outbox = self._line.outbox
-        while outbox:
-            can_id, data = outbox.popleft()
-            is_error = bool(can_id & ERROR_FLAG)
-            message = can.Message(
-                arbitration_id=can_id & ~ERROR_FLAG,
-                data=data,
-                is_extended_id=False,
-                is_error_frame=is_error,
-                is_fd=self._fd and not is_error,
-                bitrate_switch=self._fd and not is_error,
-                check=False,
-            )
+        if outbox:
+            frames = list(outbox)
+            outbox.clear()
             try:
-                self._bus.send(message, timeout=SEND_PATIENCE)
-            except can.CanOperationError:
-                self.lost += 1
+                self._port.send_all(frames)
+            except BusFault:  # as on a dead bus
+                self.lost += len(frames)
 
     def _end(self, number: int, _frame: FrameType | None) -> None:
         self._ended = INTERRUPTED if number == signal.SIGINT else TERMINATED

@@ -45,6 +45,7 @@ def sim(
     from armlink.arm_file import load_arm
     from armlink.bus.open import open_link_bus, resolve_bus
     from armlink.errors import BadInput
+    from armlink.loop.realtime import SIMULATED, prepare
     from sim_bus.bus.control_pipe import ControlPipe
     from sim_bus.bus.effect_options import parse_drift, parse_effect
     from sim_bus.bus.fault_kinds import parse_fault
@@ -65,6 +66,8 @@ def sim(
     if resolve_bus(bus or None, described.require_link().bus).interface == "armlink_sim":
         raise BadInput("sim: bus armlink_sim is a simulated arm itself; give --bus socketcan:vcan0, for example")
     endpoint = open_link_bus(bus or None, described.require_link())
+    if not lockstep:
+        prepare(SIMULATED)
     pipe = None
     try:
         pipe = None if control is None else ControlPipe(control)

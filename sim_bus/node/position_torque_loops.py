@@ -28,6 +28,8 @@ INTEGRAL_SHARE = 0.3
 """Integral action: stiffness · bandwidth · this."""
 TUNING_POSES = 50
 """The loops are tuned for the largest inertia among so many poses, so that they are stable in all of them."""
+UNFINISHED = 0.05
+"""An approach to a cyclic position target goes on between SYNCs if at least this share of its time is left."""
 SPARE_ACCELERATION = 100.0
 """The loops are tuned for the inertia of the bare arm plus what rated torque accelerates by this much [rad/s²]."""
 
@@ -61,6 +63,9 @@ class Loops:
         self._max_torque_in = signals[0x6072, 0]
         self.interpolation = np.zeros(self.n)
         """60C2h: time over which a cyclic position target is approached [s]."""
+        self._left = np.zeros(self.n)
+        """Time left of an approach that one piece after SYNC did not finish [s]."""
+        self._approaching = False
         self.lowest, self.highest = np.full(self.n, -np.inf), np.full(self.n, np.inf)
         """Software position limits (607Dh) in user units."""
         self.reconfigure()
@@ -167,8 +172,16 @@ class Loops:
         if self._any_position:
             if synchronous:
                 wanted = np.minimum(np.maximum(self._position_in, self.lowest), self.highest)
-                rate = (self._sensors.angle_of(wanted * UNIT) - self._target) / np.maximum(self.interpolation, duration)
+                time = np.maximum(self.interpolation, duration)
+                rate = (self._sensors.angle_of(wanted * UNIT) - self._target) / time
                 np.copyto(self._rate, rate, where=self._cyclic_position)
+                np.subtract(time, duration, out=self._left)
+                self._approaching = bool((self._left > UNFINISHED * time).any())
+            elif self._approaching:
+                share = np.minimum(np.maximum(self._left, 0.0) / duration, 1.0)
+                np.copyto(self._rate, self._rate * share, where=self._cyclic_position)
+                self._left -= duration
+                self._approaching = bool((self._left > 0.0).any())
             else:
                 self._rate[self._cyclic_position] = 0.0
         if self._any_stopping:

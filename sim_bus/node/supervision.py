@@ -75,6 +75,14 @@ class Supervision:
                     self._sync_due[node.place] = time + period if period else math.inf
             self.due = min(self.due, *self._sync_due)
 
+    def postpone(self, seconds: float) -> None:
+        """Let all deadlines of the host begin later: the simulated arm itself did not listen for so long."""
+        for table in (*self._consume_due, *self._rpdo_due):
+            for key in table:
+                table[key] += seconds
+        self._sync_due = [due + seconds for due in self._sync_due]
+        self._schedule()
+
     def left_operational(self, node: Node, time: float) -> None:
         """NMT took the node out of operational: deadlines of PDOs rest, and an enabled drive acts as 6007h says."""
         self._rpdo_due[node.place] = {}

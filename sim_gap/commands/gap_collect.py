@@ -1,4 +1,4 @@
-"""Runs a planned motion on the arm through the link, and records it for a diagnosis."""
+"""Runs a planned motion on the arm and records it for a diagnosis."""
 
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +15,7 @@ def collect(
         Path | None, typer.Option("--json", help="Write rows and seconds here; - is standard output.")
     ] = None,
 ) -> int:
-    """Move the arm along a planned motion under position control, every cycle recorded; Ctrl-C leaves it safe.
+    """Move the arm along a planned motion under position control and record every cycle; Ctrl-C stops it safely.
 
     Example: armlink gap collect sarcos --motion settle.csv --out settle.mcap --bus socketcan:can0
     """
@@ -25,16 +25,16 @@ def collect(
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
-    from armlink.link.link import Link
+    from armlink.loop.open import open_arm
     from sim_gap.experiment.collect import collect as run
     from sim_gap.experiment.motion_file import load_motion
 
     if out.suffix != ".mcap" or not out.resolve().parent.is_dir():
-        raise BadInput(f"--out {out}: expected a .mcap file in a folder that is there")
+        raise BadInput(f"--out {out}: expected a .mcap file in an existing folder")
     arm_file = load_arm(arm)
     target = load_motion(motion, arm_file)
     console = Console(stderr=True)
-    with Link.open(arm_file, bus) as link, Progress(console=console) as bars:
+    with open_arm(arm_file, bus) as link, Progress(console=console) as bars:
         task = bars.add_task(f"{arm_file.name}: {motion.name}", total=len(target))
         link.start()
         link.enable()

@@ -1,31 +1,32 @@
-"""Runs a planned motion on the arm through the link, and records what comes."""
+"""Runs a planned motion on the arm through the link and records it."""
 
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from armlink.link.link import Link
-from armlink.link.types import Array, Command
+from armlink.arrays import Array
+from armlink.link.types import Setpoints
+from armlink.loop.driver import ArmDriver
 from armlink.recording.mcap import RecordingWriter
 from calib.motion.trajectory import trajectory
 from sim_gap.experiment.excitation import ACCELERATION, PACE
 
 
-def collect(link: Link, target: Array, out: Path, progress: Callable[[int, int], None] = lambda k, n: None) -> int:
-    """Bring the arm to the first target, follow them all under position control, record each cycle; returns rows.
+def collect(link: ArmDriver, target: Array, out: Path, progress: Callable[[int, int], None] = lambda k, n: None) -> int:
+    """Move to the first target, follow all targets under position control, record each cycle; returns the row count.
 
-    The link is started and enabled by the caller, and leaves the joints safe however this ends. A kill loses at most
-    the recording's last second. Raises BusFault, Refused.
+    The caller starts and enables the link, which stops the joints safely in every case. A kill loses at most the last
+    second of the recording. Raises BusFault, Refused.
     """
     section = link.arm.require_link()
     speed = PACE * np.array([joint.max_velocity for joint in section.joints])
-    for row in trajectory(link.position_sent, target[0], speed, np.full(link.n, ACCELERATION), link.period):
-        link.cycle(Command.hold(row))
+    way = trajectory(link.position_sent, target[0], speed, np.full(link.n, ACCELERATION), link.period)
+    for _ in link.play(Setpoints.follow(way)):
+        pass
     start: float | None = None
     with RecordingWriter(out, link.names) as writer:
-        for k, row in enumerate(target):
-            sample = link.cycle(Command.hold(row))
+        for k, sample in enumerate(link.play(Setpoints.follow(target))):
             start = sample.t if start is None else start
             channels = {
                 "position": sample.position,
@@ -33,7 +34,7 @@ def collect(link: Link, target: Array, out: Path, progress: Callable[[int, int],
                 "torque": sample.torque,
                 "motor_torque": sample.motor_torque,
                 "torque_command": link.torque_sent,
-                "position_command": row,
+                "position_command": target[k],
             }
             writer.append(sample.t - start, channels)
             progress(k + 1, len(target))

@@ -1,4 +1,4 @@
-"""Channels that stand still while the arm moves: a reading that repeats itself to the last bit tells nothing."""
+"""Stuck channels: a reading that repeats to the last bit while the arm moves carries no information."""
 
 from dataclasses import dataclass, replace
 
@@ -10,14 +10,14 @@ from sim_gap.model.rigid_body import Array
 from sim_gap.residuals.preprocess import CHANNELS, Signals
 
 LONGEST_S = 2.0
-"""A reading may repeat itself so long."""
+"""Longest time for which a reading may repeat [s]."""
 MOVED, MOVED_NM = 0.1, 0.2
-"""The model torque must have changed meanwhile by this share of its range, and by this [N·m]."""
+"""Least change of the model torque meanwhile: as a share of its range, and [N·m]."""
 
 
 @dataclass(frozen=True)
 class Stuck:
-    """One joint's channel that stood still, and how long in all."""
+    """One joint's stuck channel, and for how long in total."""
 
     channel: str
     joint: int
@@ -25,7 +25,7 @@ class Stuck:
 
 
 def without_stuck(s: Signals, recording: Recording) -> tuple[Signals, tuple[Stuck, ...]]:
-    """The signals with readings that stand still marked as not read, and which these are."""
+    """The signals with stuck readings marked as not known, and the list of them."""
     known, found = dict(s.known), []
     for channel in s.channels:
         values = getattr(recording, CHANNELS[channel])
@@ -43,10 +43,10 @@ def without_stuck(s: Signals, recording: Recording) -> tuple[Signals, tuple[Stuc
 
 
 def _still(s: Signals, joint: int, held: NDArray[np.bool_], t: Array, x: Array) -> list[tuple[float, float]]:
-    """Stretches of time in which the reading repeats itself and should not.
+    """Intervals of time in which the reading repeats although the torque changes.
 
-    At zero and at the largest reading it may: a dead band and a clipped sensor do that. So may the motor of a joint
-    that is `held` at rest, (K,): friction takes up what changes.
+    At zero and at the largest reading it may repeat, as with a dead band and a clipped sensor. So may the motor of a
+    joint that is `held` at rest, (K,): friction takes up the change.
     """
     changes = np.flatnonzero(np.diff(x) != 0.0)
     starts, ends = np.r_[0, changes + 1], np.r_[changes, len(x) - 1]

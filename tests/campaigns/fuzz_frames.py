@@ -13,15 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parent.parent.parent))
-from tests.armlink.test_gate_bytes import ENABLE, MAX_TORQUE, TORQUE_UNIT, N, Observed, check
-
+sys.path.insert(0, str(Path(__file__).parents[2]))
+sys.path.insert(0, str(Path(__file__).parents[1] / "armlink"))
 from armlink.bus.port import open_port
 from armlink.errors import ArmlinkError
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.link import Link
 from armlink.link.types import Command
-from tests.armlink.conftest import make_arm
+from tests.armlink.fake_joints import make_arm
+from tests.armlink.link.test_gate_bytes import ENABLE, MAX_TORQUE, TORQUE_UNIT, N, Observed, check
 
 BATCH = 25
 """Frames a cycle."""

@@ -24,7 +24,7 @@ import httpx
 import yaml
 
 TESTS = Path(__file__).parent.parent
-sys.path[:0] = [str(TESTS / "calib" / "web"), str(TESTS / "calib")]  # "conftest" is that of the web tests
+sys.path[:0] = [str(TESTS / "calib" / "daemon" / "web"), str(TESTS / "calib")]
 
 LOAD_SECONDS = 1.0
 """A page must show its numbers by then."""
@@ -183,8 +183,8 @@ def page(port: int, token: str) -> dict[str, Any]:
 
 def requests(examples: int) -> dict[str, Any]:
     """schemathesis at length; what it found wrong."""
-    from conftest import served
     from made_up_view import MadeUpView
+    from served_page import served
     from test_web_schema import SETTINGS, check_all
 
     from calib.daemon.web.rate import RateLimit

@@ -19,7 +19,7 @@ from armlink import cli
 from armlink.arm_file import parse_arm
 
 ROOT = Path(__file__).parent.parent.parent
-PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 FENCE = re.compile(r"^```(?P<info>[^\n`]*)\n(?P<text>.*?)^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"!?\[[^\]]*\]\((?P<target>[^)\s]+)\)")
 COMMANDS = {point.name for point in entry_points(group="armlink.commands")}
@@ -81,6 +81,17 @@ def test_a_page_is_reached_from_the_readme(page):
             if there.suffix == ".md" and there.is_file():
                 queue.append(there)
     assert page in reached
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_a_list_or_table_follows_an_empty_line_or_a_heading(page):
+    """GitHub does not ask for it, but the site would show the rows as one paragraph."""
+    before, inside = "", False
+    for line in FENCE.sub("", page.read_text()).splitlines():
+        starts = re.match(r"[-*] |\d+\. |\|.*\|$", line)
+        assert not starts or inside or not before.strip() or before.startswith("#"), f"{name(page)}: {line}"
+        inside = bool(starts) or (inside and bool(line.strip()))
+        before = line
 
 
 def test_commands_and_options_in_the_documentation_exist(capsys):

@@ -10,6 +10,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
+import yaml
 
 from armlink import cli
 
@@ -50,6 +51,33 @@ def test_a_command_s_help_has_its_purpose_and_an_example(name, capsys):
         tree = ast.parse(Path(importlib.util.find_spec(COMMANDS[name].module).origin).read_text())
         text = " ".join(ast.get_docstring(node) or "" for node in tree.body if isinstance(node, ast.FunctionDef))
     assert f"armlink {name}" in " ".join(text.split())
+
+
+def test_version_and_date_are_the_same_everywhere():
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    newest = re.search(r"^## (\d\S*) – (\S+)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert newest.groups() == (version, str(citation["date-released"]))
+    assert str(citation["version"]) == version
+    assert citation["license"] == "Apache-2.0"
+
+
+def test_commit_hooks_use_the_tools_of_make_lint_and_fetch_nothing():
+    config = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())
+    assert [repository["repo"] for repository in config["repos"]] == ["local"]
+    tools = {hook["entry"].split()[0] for hook in config["repos"][0]["hooks"]}
+    lint = (ROOT / "Makefile").read_text().partition("\nlint:")[2].partition("\n\n")[0]
+    assert tools == {f".venv/bin/{name}" for name in re.findall(r"\$\(BIN\)/(\S+)", lint)}
+
+
+@pytest.mark.parametrize(
+    ("form", "asks"),
+    [("bug_report", {"happened", "version", "arm", "drive", "log"}), ("feature_request", {"problem", "proposal"})],
+)
+def test_an_issue_form_asks_for_what_is_needed(form, asks):
+    body = yaml.safe_load((ROOT / ".github" / "ISSUE_TEMPLATE" / f"{form}.yml").read_text())["body"]
+    required = {field["id"] for field in body if field.get("validations", {}).get("required")}
+    assert asks <= required
 
 
 def test_the_licence_is_apache_2():

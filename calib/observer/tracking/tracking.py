@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
+from calib.motion.static_reading import StaticReading
 from calib.observer.cause_test import CauseTest
 from calib.observer.config import ObserverConfig
 from calib.observer.decision import Finding
 from calib.observer.effect_dictionary import Window
 from calib.observer.gravity_belief import GravityBelief
-from calib.observer.rest_detector import Row
 from calib.observer.saved_values import UNREADABLE
 from calib.observer.tracking.cusum import Cusum
 from calib.observer.tracking.pose_memory import PoseMemory
@@ -34,14 +34,14 @@ class Tracking:
         self._cusum = Cusum(n, config)
         self._poses = PoseMemory(n, config)
 
-    def count(self, row: Row) -> None:
+    def count(self, row: StaticReading) -> None:
         """Count a row, and average its measured noise into sigma."""
         self.rows += 1
-        if row.noise is not None:
+        if np.isfinite(row.torque_error).all():
             weight = 1 / min(self.rows + self._config.noise_rows, self._config.noise_memory)
-            self.sigma = np.sqrt((1 - weight) * self.sigma**2 + weight * row.noise**2)
+            self.sigma = np.sqrt((1 - weight) * self.sigma**2 + weight * row.torque_error**2)
 
-    def watch(self, row: Row) -> list[Alarm]:
+    def watch(self, row: StaticReading) -> list[Alarm]:
         """Take a row while no alarm is open: update the filter unless the row raises an alarm."""
         q, noise = row.position, self.sigma**2
         torque = self.belief.torque(q[None])[0]
@@ -56,11 +56,11 @@ class Tracking:
         most = self._config.outliers_in_a_row
         return [("outliers", int(joint), {"rows": most}) for joint in np.flatnonzero(self.filter.rejected >= most)]
 
-    def cause_test(self, rows: list[Row]) -> CauseTest:
+    def cause_test(self, rows: list[StaticReading]) -> CauseTest:
         """The cause test of these rows, by the present belief."""
         return CauseTest(self.belief, Window.of(rows), self.sigma, self._config)
 
-    def learn(self, rows: list[Row]) -> None:
+    def learn(self, rows: list[StaticReading]) -> None:
         """Adapt the model to rows that are free of drift."""
         window = Window.of(rows)
         self.belief.learn(window.position, window.torque, self.sigma)

@@ -8,10 +8,11 @@ import can
 import pytest
 
 from armlink.arm_file import Bus
-from armlink.bus import socket_port
+from armlink.bus import datagram_port
+from armlink.bus.datagram_port import BATCH
 from armlink.bus.open import BusGroup, open_bus, open_link_bus
 from armlink.bus.port import GroupPort, MessagePort, open_port
-from armlink.bus.socket_port import BATCH, SocketPort
+from armlink.bus.socket_port import SocketPort
 from armlink.errors import BadInput, BusFault
 
 
@@ -79,14 +80,14 @@ def test_what_is_no_standard_data_frame_is_dropped_and_error_frames_are_counted(
 
 
 def test_a_full_transmit_queue_is_waited_for_then_said(pair, monkeypatch):
-    monkeypatch.setattr(socket_port, "_RETRY", 0.0)
+    monkeypatch.setattr(datagram_port, "_RETRY", 0.0)
     port = SocketPort(pair)
     real, refusals = port._sendmmsg, [3]
 
     def sendmmsg(*arguments):
         if refusals[0]:
             refusals[0] -= 1
-            socket_port.ctypes.set_errno(errno.ENOBUFS)
+            datagram_port.ctypes.set_errno(errno.ENOBUFS)
             return -1
         number, address, _, flags = arguments
         return real(number, address, 1, flags)  # the kernel takes one at a time

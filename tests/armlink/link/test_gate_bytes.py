@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from fake_joints import FAULT, FakeBus, make_arm
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -13,7 +14,6 @@ from armlink.errors import ArmlinkError, Refused
 from armlink.link.gate_limits import OVERSPEED
 from armlink.link.link import Link
 from armlink.link.types import Command
-from tests.armlink.conftest import FAULT, FakeBus, make_arm
 
 N = 2
 RATED, MAX_TORQUE, RATE, SPEED, PERIOD = 40.0, 30.0, 200.0, 1.0, 0.004
@@ -51,7 +51,9 @@ def commands(draw):
     if draw(st.booleans()):
         modes = [draw(st.sampled_from([8, 10]))] * N  # long runs in one mode are what is worth most
     fields = [shaped(draw(numbers), draw(shapes), float) for _ in range(2)]
-    return SimpleNamespace(mode=shaped(modes, draw(shapes), np.int8), torque=fields[0], position=fields[1], t=draw(age))
+    return SimpleNamespace(
+        mode=shaped(modes, draw(shapes), np.int8), torque=fields[0], position=fields[1], t=draw(age), guard=None
+    )
 
 
 wire = st.one_of(st.integers(-(2**31), 2**31 - 1), st.integers(-400_000, 400_000))
@@ -97,14 +99,13 @@ class Observed(FakeBus):
         self.told = {node: {"position": math.nan, "motor": math.nan, "velocity": math.nan} for node in nodes}
         self.mode = dict.fromkeys(nodes, 0)
         self.left = []  # (id, data, what was known when it left)
-        self.collecting = False  # a position counts in the cycle whose SYNC asked for it, and not when it comes late
 
     def take(self, timeout=0.0):
         frame = super().take(timeout)
         if frame is not None:
             can_id, data = frame
             told = self.told.get(can_id & 0x7F)
-            if told is not None and can_id & 0x780 == 0x180 and len(data) == 8 and self.collecting:
+            if told is not None and can_id & 0x780 == 0x180 and len(data) == 8:
                 told["position"] = struct.unpack("<ii", data)[0] * UNIT
             if told is not None and can_id & 0x780 == 0x280 and len(data) == 8:
                 _, motor, velocity = struct.unpack("<Hhi", data)
@@ -117,8 +118,6 @@ class Observed(FakeBus):
         if can_id & 0x780 in (0x200, 0x300) and can_id & 0x7F in self.told:
             self.left.append((can_id, bytes(data), dict(self.told[can_id & 0x7F])))
         super().put(can_id, data)
-        if can_id == 0x80 or can_id & 0x780 == 0x200:
-            self.collecting = can_id == 0x80
 
 
 def check(frame_mode, now, before, told):
@@ -159,7 +158,6 @@ def test_no_byte_that_leaves_exceeds_a_limit(steps):
                 happen(bus, event)
             last = {node: (bus.mode[node], each.control) for node, each in bus.nodes.items()}
             bus.left.clear()
-            bus.collecting = False
             if command.t is not None:
                 command.t = bus.clock.time - command.t
             try:

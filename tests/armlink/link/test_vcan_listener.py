@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import FakeBus
+from fake_joints import FakeBus
 
 from armlink.arm_file import Bus
 from armlink.bus.open import open_bus, open_link_bus

@@ -5,9 +5,9 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from conftest import Served
 from made_up_view import NAMES, NOW, MadeUpView
 from prometheus_client.parser import text_string_to_metric_families
+from served_page import Served
 
 from calib.daemon.view.api_models import HistoryPoint
 from calib.daemon.web.page import page_files

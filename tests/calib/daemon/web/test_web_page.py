@@ -8,10 +8,10 @@ from datetime import timedelta
 from pathlib import Path
 
 import pytest
-from conftest import TOKEN, Served, open_page, served
 from daemon_bench import DaemonBench
 from made_up_view import NAMES, NOW, MadeUpView
 from playwright.sync_api import Browser, Page, expect
+from served_page import TOKEN, Served, open_page, served
 from small_arm import small_arm
 
 from calib.daemon.settings import DaemonSection

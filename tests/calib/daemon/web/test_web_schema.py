@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 import schemathesis
-from conftest import TOKEN, Served, served
 from daemon_bench import DaemonBench
 from hypothesis import HealthCheck, Phase, given, settings
 from schemathesis.checks import not_a_server_error
@@ -13,6 +12,7 @@ from schemathesis.specs.openapi.checks import (
     response_schema_conformance,
     status_code_conformance,
 )
+from served_page import TOKEN, Served, served
 from small_arm import small_arm
 
 from calib.daemon.service_view import ServiceView

@@ -7,8 +7,8 @@ import stat
 from pathlib import Path
 
 import pytest
-from conftest import TOKEN, Served, served
 from made_up_view import MadeUpView
+from served_page import TOKEN, Served, served
 
 from armlink.errors import BadInput
 from calib.daemon.web import guard as guard_module

@@ -10,9 +10,9 @@ from typing import Any
 
 import httpx
 import pytest
-from conftest import Served, served
 from daemon_bench import DaemonBench
 from made_up_view import NAMES, MadeUpView
+from served_page import Served, served
 from small_arm import small_arm
 
 from calib.daemon.service_view import ServiceView

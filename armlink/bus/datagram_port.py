@@ -1,0 +1,241 @@
+"""Frames as datagrams of a socket, without an object or a system call a frame: whole batches by sendmmsg and recvmmsg.
+
+What a datagram looks like is the subclass's: SocketCAN's own frames, or python-can's udp_multicast.
+"""
+
+import ctypes
+import errno
+import os
+import select
+import socket
+import struct
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+
+from armlink.bus.port import ERROR, Frame, InterfaceDown
+from armlink.errors import BusFault
+
+BATCH = 64
+"""Datagrams a system call takes."""
+MOST_BATCHES = 16
+"""Batches taken for one frame: a flood of datagrams that are no frames does not keep a reader for ever."""
+RECEIVE_BUFFER = 1 << 21
+"""Bytes of the socket's receive queue, which the kernel counts with its own overhead: some thousand frames."""
+CONTROL = 64
+"""Bytes for the control messages of one datagram."""
+NAME = 32
+"""Bytes for the sender's address of one datagram."""
+BUS_OFF = 0x40
+"""Class of error that an error frame's identifier tells."""
+NOT_OURS = 1 << 32
+"""Marks a datagram that is no frame for us: its own echo, or one that cannot be understood."""
+FLAGS = 0xE0000000 | NOT_OURS
+"""Identifiers of extended, remote and error frames have one of these, as in SocketCAN."""
+_RETRY = 0.002  # [s] between tries while the transmit queue is full
+_TRIES = 25
+_FULL = (errno.ENOBUFS, errno.EAGAIN)
+_DONTWAIT = int(socket.MSG_DONTWAIT)
+_SO_RCVBUFFORCE, _SO_RXQ_OVFL = 33, 40
+_STAMP_ALONE = 32  # bytes of control messages if there is nothing but a time stamp
+_CONTROL_HEADER = struct.Struct("@Nii")
+_LENGTH = struct.Struct("@56xI4x")
+
+
+class _Vector(ctypes.Structure):
+    _fields_ = (("base", ctypes.c_void_p), ("length", ctypes.c_size_t))
+
+
+class _Header(ctypes.Structure):
+    _fields_ = (
+        ("name", ctypes.c_void_p),
+        ("name_length", ctypes.c_uint32),
+        ("vectors", ctypes.c_void_p),
+        ("vector_count", ctypes.c_size_t),
+        ("control", ctypes.c_void_p),
+        ("control_length", ctypes.c_size_t),
+        ("flags", ctypes.c_int),
+    )
+
+
+class _Message(ctypes.Structure):
+    _fields_ = (("header", _Header), ("length", ctypes.c_uint))
+
+
+class Batch:
+    """Preallocated datagrams and the headers that point at them, as sendmmsg and recvmmsg take them."""
+
+    def __init__(self, size: int, names: bool = False) -> None:
+        """BATCH datagrams of at most `size` bytes; `names`: with room for each sender's address."""
+        self.size = size
+        self.content = bytearray(BATCH * size)
+        self.names = bytearray(BATCH * NAME if names else 0)
+        base, name = _address(self.content), _address(self.names) if names else None
+        vectors, messages = (bytearray(BATCH * ctypes.sizeof(each)) for each in (_Vector, _Message))
+        self._vectors, self._messages = memoryview(vectors).cast("Q"), memoryview(messages)
+        self.messages = (_Message * BATCH).from_buffer(messages)
+        self.address = ctypes.addressof(self.messages)
+        first, step = _address(vectors), ctypes.sizeof(_Vector)
+        for i, message in enumerate(self.messages):
+            self._vectors[2 * i], self._vectors[2 * i + 1] = base + i * size, size
+            message.header.vectors, message.header.vector_count = first + i * step, 1
+            if name is not None:
+                message.header.name, message.header.name_length = name + i * NAME, NAME
+
+    def put(self, place: int, datagram: bytes) -> None:
+        """Make `datagram` the one at `place`."""
+        size, start = len(datagram), place * self.size
+        self.content[start : start + size] = datagram
+        self._vectors[2 * place + 1] = size
+
+    def lengths(self, count: int) -> Iterator[tuple[int]]:
+        """Bytes received in each of the first `count` datagrams."""
+        return _LENGTH.iter_unpack(self._messages[: count * _LENGTH.size])
+
+
+class DatagramPort(ABC):
+    """A Port on sockets: batches out and in; counts error frames and what the receive queue lost."""
+
+    def __init__(
+        self, name: str, receiving: socket.socket, sending: socket.socket, out: Batch, into: Batch, as_node: bool
+    ) -> None:
+        """`name` of the bus for messages; both sockets may be the same one; `as_node` as in open_port."""
+        self.errors = 0
+        self.dropped = 0
+        """Frames that the receive queue lost because they were not read in time (SO_RXQ_OVFL)."""
+        self._as_node, self._name, self._out, self._in = as_node, name, out, into
+        self._number, self._out_number = receiving.fileno(), sending.fileno()
+        self._control = ctypes.create_string_buffer(CONTROL)
+        self._first = into.messages[0].header
+        self._first.control = ctypes.addressof(self._control)
+        self._waiting: list[Frame] = []
+        self._dry = False
+        """The last batch was all that there was: it need not be asked again at once."""
+        library = ctypes.CDLL(None, use_errno=True)
+        self._sendmmsg, self._recvmmsg = library.sendmmsg, library.recvmmsg
+        self._sendmmsg.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int)
+        self._recvmmsg.argtypes = (*self._sendmmsg.argtypes, ctypes.c_void_p)
+        try:
+            receiving.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER)
+        except OSError:  # without CAP_NET_ADMIN as much as net.core.rmem_max allows
+            receiving.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+        receiving.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
+
+    @abstractmethod
+    def _encode(self, frames: Sequence[Frame]) -> None:
+        """Put at most BATCH frames into the outgoing batch."""
+
+    @abstractmethod
+    def _decode(self, count: int) -> list[Frame]:
+        """The frames in the first `count` datagrams, one each, their identifiers with FLAGS where any is due."""
+
+    def fileno(self) -> int:
+        """The socket, for select."""
+        return self._number
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Send one frame; a full transmit queue is tried again for some milliseconds, then BusFault."""
+        self.send_all(((can_id, data),))
+
+    def send_all(self, frames: Sequence[Frame]) -> None:
+        """Send the frames in this order, BATCH by one system call; raises BusFault as send."""
+        if len(frames) > BATCH:
+            for begin in range(0, len(frames), BATCH):
+                self.send_all(frames[begin : begin + BATCH])
+            return
+        self._encode(frames)
+        sent, tries, total = 0, 0, len(frames)
+        step = ctypes.sizeof(_Message)
+        while sent < total:
+            count = self._sendmmsg(self._out_number, self._out.address + sent * step, total - sent, _DONTWAIT)
+            if count > 0:
+                sent += count
+                continue
+            number = ctypes.get_errno()
+            if number not in _FULL:
+                raise BusFault(f"bus {self._name}: cannot send: {os.strerror(number)}")
+            tries += 1
+            if tries == _TRIES:
+                raise BusFault(f"bus {self._name}: transmit queue stays full: does any node acknowledge?")
+            select.select([], [], [], _RETRY)
+
+    def receive(self, timeout: float) -> Frame | None:
+        """The next data frame with an 11-bit identifier, or None after `timeout` seconds."""
+        waiting = self._waiting
+        if waiting:
+            return waiting.pop()
+        if timeout <= 0:
+            if self._dry:
+                self._dry = False
+                return None
+            return self._take_now()
+        end = time.monotonic() + timeout
+        while True:
+            if not select.select([self._number], [], [], timeout)[0]:
+                return None
+            self._fill()
+            if waiting:
+                return waiting.pop()
+            timeout = end - time.monotonic()
+            if timeout <= 0:
+                return None
+
+    def _take_now(self) -> Frame | None:
+        for _ in range(MOST_BATCHES):
+            more = self._fill()
+            if self._waiting:
+                return self._waiting.pop()
+            if not more:
+                break
+        return None
+
+    def _fill(self) -> bool:
+        """Take in a batch; False where there is no more."""
+        self._first.control_length = CONTROL
+        count = self._take_batch()
+        if not count:
+            return False
+        self._dry = count < BATCH
+        frames = self._decode(count)
+        for can_id, _ in frames:
+            if can_id & FLAGS:
+                self._take_others([each for each, _ in frames if each & FLAGS])
+                frames = [frame for frame in frames if not frame[0] & FLAGS]
+                break
+        frames.reverse()
+        self._waiting[:] = frames
+        return not self._dry
+
+    def _take_batch(self) -> int:
+        """How many datagrams are in the batch now, 0 where nothing was there."""
+        count: int = self._recvmmsg(self._number, self._in.address, BATCH, _DONTWAIT, None)
+        if count <= 0:
+            number = ctypes.get_errno()
+            if number == errno.EAGAIN:
+                return 0
+            fault = InterfaceDown if number == errno.ENETDOWN else BusFault
+            raise fault(f"bus {self._name}: cannot receive: {os.strerror(number)}")
+        length = self._first.control_length
+        if length not in (0, _STAMP_ALONE):
+            self._read_drops(length)
+        return count
+
+    def _take_others(self, others: list[int]) -> None:
+        """Frames that are no data frames with an 11-bit identifier: those that tell of errors count."""
+        errors = [can_id for can_id in others if can_id & ERROR]
+        self.errors += len(errors)
+        if any(can_id & BUS_OFF for can_id in errors) and not self._as_node:
+            raise BusFault(f"bus {self._name}: bus-off: check wiring, termination and bit rate")
+
+    def _read_drops(self, length: int) -> None:
+        """The kernel's count of lost frames, 32 bits; among control messages, each aligned to eight bytes."""
+        control, at = self._control.raw[:length], 0
+        while at + _CONTROL_HEADER.size <= length:
+            size, level, kind = _CONTROL_HEADER.unpack_from(control, at)
+            if level == socket.SOL_SOCKET and kind == _SO_RXQ_OVFL:
+                self.dropped = struct.unpack_from("=I", control, at + _CONTROL_HEADER.size)[0]
+            at += max(size + 7 & ~7, _CONTROL_HEADER.size)
+
+
+def _address(memory: bytearray) -> int:
+    return ctypes.addressof((ctypes.c_char * len(memory)).from_buffer(memory))

@@ -1,0 +1,146 @@
+"""CAN frames as python-can's udp_multicast carries them: a MessagePack map of a message's fields, one a datagram.
+
+python-can packs the fields in one order, so that all but identifier, length, data and flags is the same in every
+datagram. Datagrams are put together from prepared pieces, and recognised by them; a map of any other order or width is
+unpacked field by field. Identifiers carry SocketCAN's flags.
+"""
+
+from functools import lru_cache
+from typing import Any
+
+import msgpack
+
+from armlink.bus.port import ERROR
+
+EXTENDED, REMOTE = 0x80000000, 0x40000000
+LONGEST = 1024
+"""Bytes of the longest datagram that is taken for a frame; python-can makes at most 240 without a channel's name."""
+HEADS_KEPT = 4096
+_DEFAULTS: dict[str, Any] = {
+    "timestamp": 0.0,
+    "arbitration_id": 0,
+    "is_extended_id": True,
+    "is_remote_frame": False,
+    "is_error_frame": False,
+    "channel": None,
+    "dlc": None,
+    "data": None,
+    "is_fd": False,
+    "bitrate_switch": False,
+    "error_state_indicator": False,
+}
+"""Fields of python-can's Message in the order of its packer, with their values if a map leaves them out."""
+_FLAGS = tuple(name for name, value in _DEFAULTS.items() if isinstance(value, bool))
+_MOST_DATA = 64
+
+
+def _key(name: str) -> bytes:
+    return bytes([0xA0 | len(name)]) + name.encode()
+
+
+_BOOL = (b"\xc2", b"\xc3")
+_START = bytes([0x80 | len(_DEFAULTS)]) + _key("timestamp") + b"\xcb"
+_HEAD = len(_START) + 8
+"""Where what comes behind the time begins."""
+_NO_TIME = _START + bytes(8)
+"""A sender's time is 0, as of messages that a program has made; who receives it stamps it."""
+_IDENTIFIER = _HEAD + len(_key("arbitration_id"))
+_WIDTHS = {0xCC: 2, 0xCD: 3, 0xCE: 5}
+"""First byte of an identifier above 127 → bytes that it takes."""
+
+
+def _head(can_id: int, length: int) -> bytes:
+    """From the identifier to the length of the data, for a frame that is no remote frame."""
+    extended, error = bool(can_id & EXTENDED), bool(can_id & ERROR)
+    return b"".join(
+        (
+            _key("arbitration_id") + msgpack.packb(can_id & 0x1FFFFFFF),
+            _key("is_extended_id") + _BOOL[extended] + _key("is_remote_frame") + _BOOL[False],
+            _key("is_error_frame") + _BOOL[error] + _key("channel") + b"\xc0",
+            _key("dlc") + bytes([length]) + _key("data") + bytes([0xC4, length]),
+        )
+    )
+
+
+def _tail(fd: bool, switch: bool, indicator: bool) -> bytes:
+    """What comes behind the data."""
+    return b"".join(
+        _key(name) + _BOOL[value]
+        for name, value in (("is_fd", fd), ("bitrate_switch", switch), ("error_state_indicator", indicator))
+    )
+
+
+_BEHIND_IDENTIFIER = len(_head(0, 0)) - len(_key("arbitration_id")) - 1
+_TAILS = {
+    _tail(False, False, False): False,
+    **{_tail(True, switch, indicator): True for switch in (False, True) for indicator in (False, True)},
+}
+"""Ends of a datagram → whether the frame is CAN FD."""
+_SENT_TAILS = (_tail(False, False, False), _tail(True, True, False))
+
+
+@lru_cache(maxsize=HEADS_KEPT)
+def _start(can_id: int, length: int) -> bytes:
+    return _NO_TIME + _head(can_id, length)
+
+
+def encode(can_id: int, data: bytes, fd: bool) -> bytes:
+    """The datagram of a frame, with bit-rate switch where it is CAN FD; remote frames cannot be sent."""
+    return _start(can_id, len(data)) + data + _SENT_TAILS[fd]
+
+
+class Decoder:
+    """Datagrams in, frames out; knows again what it has seen."""
+
+    def __init__(self) -> None:
+        self._heads: dict[bytes, tuple[int, int]] = {}
+
+    def decode(self, datagram: bytes) -> tuple[int, bytes, bool] | None:
+        """Identifier with flags, data, and whether it is CAN FD; None where the datagram is no valid frame."""
+        if datagram.startswith(_START) and len(datagram) > _IDENTIFIER:
+            end = _IDENTIFIER + _WIDTHS.get(datagram[_IDENTIFIER], 1) + _BEHIND_IDENTIFIER
+            head = datagram[_HEAD:end]
+            known = self._heads.get(head)
+            if known is not None:
+                can_id, length = known
+                fd = _TAILS.get(datagram[end + length :])
+                if fd is not None and (length <= 8 or fd):
+                    return can_id, datagram[end : end + length], fd
+            found = _unpack(datagram)
+            if found is not None and head == _head(found[0], len(found[1])):
+                if len(self._heads) >= HEADS_KEPT:
+                    self._heads.clear()
+                self._heads[head] = found[0], len(found[1])
+            return found
+        return _unpack(datagram)
+
+
+def _unpack(datagram: bytes) -> tuple[int, bytes, bool] | None:
+    """Any map that python-can takes for a message; None for anything else."""
+    try:
+        fields = msgpack.unpackb(datagram, raw=False)
+    except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException):
+        return None
+    if not isinstance(fields, dict) or fields.keys() - _DEFAULTS.keys() - {"is_rx"}:
+        return None
+    fields = _DEFAULTS | fields
+    can_id, data, dlc = fields["arbitration_id"], fields["data"], fields["dlc"]
+    remote, fd = fields["is_remote_frame"], fields["is_fd"]
+    if data is None or remote:
+        data = b""
+    if not (type(can_id) is int and isinstance(data, bytes) and type(dlc) in (int, type(None))):
+        return None
+    if any(type(fields[name]) is not bool for name in _FLAGS):
+        return None
+    dlc = len(data) if dlc is None else dlc
+    extended, error = fields["is_extended_id"], fields["is_error_frame"]
+    sound = (
+        0 <= can_id < (0x20000000 if extended else 0x800)
+        and 0 <= dlc <= (_MOST_DATA if fd else 8)
+        and (remote or dlc == len(data))
+        and not (remote and (error or fd))
+        and (fd or not (fields["bitrate_switch"] or fields["error_state_indicator"]))
+    )
+    if not sound:
+        return None
+    return can_id | EXTENDED * extended | REMOTE * remote | ERROR * error, data, fd

@@ -1,0 +1,96 @@
+"""python-can's udp_multicast as a Port: datagrams made and read without message objects, its own echoes left out.
+
+Frames are received on the python-can bus's socket, which all members share the port of, and sent from a second one,
+whose address says which frames are our own. Multicast loops back to every socket of this machine, ours included.
+"""
+
+import contextlib
+import socket
+import struct
+import weakref
+from collections.abc import Sequence
+from typing import Any
+
+from armlink.bus.datagram_port import NAME, NOT_OURS, Batch, DatagramPort
+from armlink.bus.multicast_frames import LONGEST, Decoder, encode
+from armlink.bus.port import ERROR, Frame
+from armlink.errors import BusFault
+
+_IP_MULTICAST_ALL, _IPV6_MULTICAST_ALL = 49, 29
+_IGNORED: Frame = (NOT_OURS, b"")
+
+
+class MulticastPort(DatagramPort):
+    """A python-can UdpMulticastBus; with `fd` it sends CAN FD frames (bit-rate switch), else it ignores such frames."""
+
+    def __init__(self, bus: Any, fd: bool = True, as_node: bool = False) -> None:
+        """Open a socket to send from (`as_node` as in open_port); raises BusFault without a way to the group."""
+        self.ignored = 0
+        """Datagrams so far that were no frames."""
+        self._fd, self._takes_fd = fd, fd
+        inner = bus._multicast
+        name = f"udp_multicast:{inner.group}"
+        receiving: socket.socket = inner._socket
+        sending = _connect(name, receiving.family, inner.group, inner.port, inner.hop_limit)
+        weakref.finalize(self, sending.close)
+        self._own = _address(sending)
+        _hear_one_group(receiving)
+        self._decoder = Decoder()
+        super().__init__(name, receiving, sending, Batch(256), Batch(LONGEST, names=True), as_node)
+
+    def _encode(self, frames: Sequence[Frame]) -> None:
+        put, fd = self._out.put, self._fd
+        for i, (can_id, data) in enumerate(frames):
+            put(i, encode(can_id, data, fd and not can_id & ERROR))
+
+    def _decode(self, count: int) -> list[Frame]:
+        batch, own, decode = self._in, self._own, self._decoder.decode
+        content, names, size = batch.content, batch.names, len(own)
+        frames = []
+        for i, (length,) in enumerate(batch.lengths(count)):
+            if names[i * NAME : i * NAME + size] == own:
+                frames.append(_IGNORED)
+                continue
+            found = decode(bytes(content[i * LONGEST : i * LONGEST + length])) if length < LONGEST else None
+            if found is None:
+                self.ignored += 1
+                frames.append(_IGNORED)
+            elif found[2] and not self._takes_fd:
+                frames.append(_IGNORED)
+            else:
+                if self._as_node and not found[0] & ERROR:
+                    self._fd = found[2]
+                frames.append(found[:2])
+        return frames
+
+
+def _connect(name: str, family: int, group: str, port: int, hop_limit: int) -> socket.socket:
+    """A socket of our own to the group: connected, so that its address stays as it is."""
+    sending = socket.socket(family, socket.SOCK_DGRAM)
+    try:
+        if family == socket.AF_INET:
+            sending.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, hop_limit)
+        else:
+            sending.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_HOPS, hop_limit)
+        sending.connect((group, port))
+    except OSError as error:
+        sending.close()
+        raise BusFault(f"bus {name}: no way to the group: {error.strerror}") from None
+    return sending
+
+
+def _address(sending: socket.socket) -> bytes:
+    """The beginning of sockaddr_in or sockaddr_in6 as the kernel tells it of what this socket sent."""
+    address, port, *_ = sending.getsockname()
+    begin = struct.pack("=H", sending.family) + struct.pack("!H", port)
+    packed = socket.inet_pton(sending.family, address.partition("%")[0])
+    return begin + (packed if sending.family == socket.AF_INET else bytes(4) + packed)
+
+
+def _hear_one_group(receiving: socket.socket) -> None:
+    """Only the group joined, not every group that others on this machine have joined on the same port."""
+    with contextlib.suppress(OSError):
+        if receiving.family == socket.AF_INET:
+            receiving.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
+        else:
+            receiving.setsockopt(socket.IPPROTO_IPV6, _IPV6_MULTICAST_ALL, 0)

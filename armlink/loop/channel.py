@@ -1,0 +1,109 @@
+"""Messages between two processes over a socket pair; sending never blocks, receiving takes what is there."""
+
+import pickle
+import select
+import socket
+import struct
+from collections import deque
+from typing import Any
+
+_HEADER = struct.Struct("<I")
+CHUNK = 1 << 16
+MOST_SAMPLES = 15_000
+"""Samples that wait for a reader which is busy: a minute at 250 Hz; older ones are dropped."""
+
+
+class Closed(Exception):
+    """The process at the other end has gone."""
+
+
+class Channel:
+    """One end of a stream of pickled messages."""
+
+    def __init__(self, end: socket.socket) -> None:
+        """Take over a connected stream socket."""
+        end.setblocking(False)
+        self._socket = end
+        self._received = bytearray()
+        self._waiting: deque[tuple[bool, bytes]] = deque()
+        self._sent = 0
+        """Bytes of the first waiting message that have left."""
+        self._samples = 0
+        self.dropped = 0
+        """Samples that were dropped since nobody read them."""
+
+    def fileno(self) -> int:
+        """For select."""
+        return self._socket.fileno()
+
+    def put(self, message: Any, sample: bool = False) -> None:
+        """Queue a message; of samples that wait too long the oldest is dropped. Call `flush` to send."""
+        content = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
+        self._waiting.append((sample, _HEADER.pack(len(content)) + content))
+        self._samples += sample
+        if self._samples > MOST_SAMPLES:
+            self._drop_oldest()
+
+    def _drop_oldest(self) -> None:
+        for index, (sample, _) in enumerate(self._waiting):
+            if sample and (index or not self._sent):
+                del self._waiting[index]
+                self._samples -= 1
+                self.dropped += 1
+                return
+
+    def flush(self, timeout: float = 0.0) -> bool:
+        """Send what the socket takes, waiting at most `timeout` seconds for it; whether all has left. Raises Closed."""
+        while self._waiting:
+            sample, content = self._waiting[0]
+            try:
+                self._sent += self._socket.send(memoryview(content)[self._sent :])
+            except BlockingIOError:
+                if timeout <= 0 or not select.select([], [self._socket], [], timeout)[1]:
+                    return False
+                continue
+            except OSError:
+                raise Closed from None
+            if self._sent == len(content):
+                self._waiting.popleft()
+                self._sent = 0
+                self._samples -= sample
+        return True
+
+    def wait(self, timeout: float) -> None:
+        """Return when something has come, or after `timeout` seconds."""
+        select.select([self._socket], [], [], timeout)
+
+    def receive(self) -> list[Any]:
+        """All messages that have come, in order; raises Closed when the other end has gone and all were taken."""
+        gone = False
+        while True:
+            try:
+                content = self._socket.recv(CHUNK)
+            except BlockingIOError:
+                break
+            except OSError:
+                gone = True
+                break
+            if not content:
+                gone = True
+                break
+            self._received += content
+            if len(content) < CHUNK:
+                break
+        messages, start = [], 0
+        while len(self._received) - start >= _HEADER.size:
+            (size,) = _HEADER.unpack_from(self._received, start)
+            end = start + _HEADER.size + size
+            if len(self._received) < end:
+                break
+            messages.append(pickle.loads(memoryview(self._received)[start + _HEADER.size : end].tobytes()))
+            start = end
+        del self._received[:start]
+        if gone and not messages:
+            raise Closed
+        return messages
+
+    def close(self) -> None:
+        """Close this end."""
+        self._socket.close()

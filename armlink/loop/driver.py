@@ -1,0 +1,117 @@
+"""The interface between jobs and the process that makes the cycles: the same in one process and in two."""
+
+from collections.abc import Callable
+from typing import Any, Concatenate, ParamSpec, Protocol, Self, TypeVar
+
+from armlink.arm_file import ArmFile
+from armlink.arrays import Array
+from armlink.link.types import Calibration, Command, Controller, Identity, Sample, Samples, Setpoints, Stats
+
+R = TypeVar("R")
+P = ParamSpec("P")
+
+
+class ArmDriver(Protocol):
+    """Drives the joints of one arm.
+
+    Implemented by `armlink.link.link.Link`, which makes each cycle when it is asked for the next sample, and by
+    `armlink.loop.remote_link.RemoteLink`, whose process keeps the cycle whatever the job is doing: the last command
+    stays in force until the next one comes.
+    """
+
+    arm: ArmFile
+    names: tuple[str, ...]
+    n: int
+    rate: float
+    """Cycles a second [Hz]."""
+    period: float
+    """[s]."""
+
+    @property
+    def position_step(self) -> Array:
+        """Smallest change that each position reading can show (n,) [rad]; inf before start()."""
+        ...
+
+    @property
+    def position_sent(self) -> Array:
+        """Target position of the newest cycle (n,) [rad]."""
+        ...
+
+    @property
+    def torque_sent(self) -> Array:
+        """Target torque of the newest cycle (n,) [N·m]."""
+        ...
+
+    @property
+    def stats(self) -> Stats:
+        """Counters since the first cycle."""
+        ...
+
+    def __enter__(self) -> Self:
+        """The driver itself."""
+        ...
+
+    def __exit__(self, *error: Any) -> None:
+        """Stop the joints and close the bus."""
+        ...
+
+    def scan(self) -> list[Identity]:
+        """Identity and state of each joint's controller."""
+        ...
+
+    def start(self) -> None:
+        """Check and set up the controllers and start them; raises Refused, BusFault, BadInput."""
+        ...
+
+    def enable(self) -> Sample:
+        """Enable every joint under position control where it stands; raises BusFault."""
+        ...
+
+    def recover(self) -> Sample:
+        """Enable again after a Stall; raises BusFault."""
+        ...
+
+    def disable(self) -> None:
+        """Take the power from every joint; raises BusFault."""
+        ...
+
+    def stop(self) -> None:
+        """Quick stop of every joint."""
+        ...
+
+    def cycle(self, command: Command) -> Sample:
+        """The sample of a cycle in which this command was in force; raises Refused, Crossed, BusFault."""
+        ...
+
+    def play(self, setpoints: Setpoints) -> Samples:
+        """One row a cycle, sent ahead, and the sample of each; raises as cycle.
+
+        Closing the iterator early stops there.
+        """
+        ...
+
+    def run(self, controller: Controller) -> Samples:
+        """A controller in the process that makes the cycles, until the iterator is closed; raises as cycle."""
+        ...
+
+    def catch_up(self) -> None:
+        """Forget samples of cycles that were made while the job did something else."""
+        ...
+
+    def inside(self, function: "Callable[Concatenate[Any, P], R]", *args: P.args, **kwargs: P.kwargs) -> R:
+        """Call `function(link, ...)` in the process that makes the cycles; picklable both ways."""
+        ...
+
+    def read_calibration(self, joint: int) -> Calibration:
+        """The torque sensor record that joint 0 … n−1 works with; raises BusFault."""
+        ...
+
+    def read_temperatures(self) -> Array:
+        """Temperatures of the drives (n,) [°C]; NaN for a drive that does not report one. Raises BusFault."""
+        ...
+
+    def write_calibration(
+        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
+    ) -> Calibration:
+        """Make gain and offset [N·m] active in joint 0 … n−1; raises BadInput, BusFault."""
+        ...

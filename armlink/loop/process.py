@@ -1,0 +1,167 @@
+"""The process that owns an arm's bus and keeps its cycle: `python -m armlink.loop.process FD`, started by a RemoteLink.
+
+It makes every cycle on time whatever the job is doing: it plays what the job has sent ahead, and keeps the last command
+when there is nothing left. When the job ends or is killed the joints are stopped. When the job falls silent while
+joints are under torque control, they are held where they stand; under position control they keep their targets.
+"""
+
+import signal
+import socket
+import sys
+import time
+from collections import deque
+from collections.abc import Iterator
+
+import numpy as np
+
+from armlink.errors import ArmlinkError, Stall
+from armlink.link.gate import TORQUE_MODES
+from armlink.link.guard import Crossed
+from armlink.link.link import Link
+from armlink.link.types import Command, Sample, Setpoints
+from armlink.loop.channel import Channel, Closed
+from armlink.loop.messages import Alive, Answer, Call, Cut, Open, Play, Run, Stopped, pack
+from armlink.loop.realtime import prepare
+
+IDLE = 0.05
+"""Longest wait for the job while the joints are not enabled [s]."""
+SILENT = 3.0
+"""A job that says nothing for so long while joints are under torque control is gone [s]."""
+ENABLING = ("enable", "recover")
+
+
+class DriveLoop:
+    """The cycles of one link, and what the job asks for between them."""
+
+    def __init__(self, channel: Channel, link: Link) -> None:
+        """`link` is open and not started."""
+        self._channel, self._link = channel, link
+        self._chunks: deque[Setpoints] = deque()
+        self._source: Iterator[Sample] | None = None
+        self._last: Command | None = None
+        self._id, self._row = 0, -1
+        self._heard = time.monotonic()
+
+    def run(self) -> None:
+        """Until the job has gone."""
+        while True:
+            for message in self._channel.receive():
+                self._heard = time.monotonic()
+                self._handle(message)
+            if self._link.enabled:
+                self._cycle()
+            else:
+                self._channel.flush()
+                self._channel.wait(IDLE)
+
+    def _handle(self, message: object) -> None:
+        match message:
+            case Call():
+                self._call(message)
+            case Play(id, setpoints):
+                if id != self._id:
+                    self._begin(id)
+                self._chunks.append(setpoints)
+            case Run(id, controller):
+                self._begin(id)
+                self._source = self._link.run(controller)
+            case Cut():
+                self._chunks.clear()
+                self._source = None
+            case Alive():
+                pass
+
+    def _begin(self, id: int) -> None:
+        self._chunks.clear()
+        self._source, self._id, self._row = None, id, -1
+
+    def _call(self, call: Call) -> None:
+        link = self._link
+        try:
+            kwargs = dict(call.kwargs)
+            if callable(call.what):
+                answer = Answer(call.id, call.what(link, *call.args, **kwargs))
+            else:
+                found = getattr(link, call.what)
+                answer = Answer(call.id, found(*call.args, **kwargs) if callable(found) else found)
+        except ArmlinkError as error:
+            answer = Answer(call.id, error=error)
+        if call.what in ENABLING and answer.error is None:
+            self._begin(0)
+            self._last = Command.hold(link.position_sent)
+        self._channel.put(answer)
+        self._channel.flush()
+
+    def _cycle(self) -> None:
+        """One cycle: the next row, or the last command once more."""
+        try:
+            row, sample = self._next()
+        except Crossed as crossed:
+            self._hold_here()
+            self._channel.put(Stopped(crossed))
+        except ArmlinkError as error:
+            self._begin(self._id)
+            self._channel.put(Stopped(error))
+        else:
+            self._channel.put((self._id, row, pack(sample, self._link.torque_sent, self._link.position_sent)), True)
+            self._mind_silence()
+        self._channel.flush()
+
+    def _next(self) -> tuple[int, Sample]:
+        while True:
+            if self._source is None and self._chunks:
+                self._source = self._link.play(self._chunks.popleft())
+            if self._source is None:
+                assert self._last is not None
+                return -1, self._link.cycle(self._last)
+            sample = next(self._source, None)
+            if sample is not None:
+                self._last = self._link.last
+                self._row += 1
+                return self._row, sample
+            self._source = None
+
+    def _hold_here(self) -> None:
+        """Every joint under position control where it stands."""
+        self._chunks.clear()
+        self._source = None
+        self._last = Command.hold(self._link.latest_position)
+
+    def _mind_silence(self) -> None:
+        if self._last is None or time.monotonic() - self._heard < SILENT:
+            return
+        if np.isin(self._last.mode, TORQUE_MODES).any():
+            self._hold_here()
+            self._channel.put(Stopped(Stall(f"the job was silent for {SILENT:g} s: the joints hold where they stand")))
+
+
+def main(number: int) -> None:
+    """Serve the job at the other end of socket `number`; the joints are safe at the end, however that comes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the whole group: the job ends us
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    channel = Channel(socket.socket(fileno=number))
+    try:
+        (first,) = _first(channel)
+        try:
+            link = Link.open(first.arm, first.bus)
+        except ArmlinkError as error:
+            channel.put(Answer(0, error=error))
+            channel.flush(1.0)
+            return
+        with link:
+            channel.put(Answer(0, prepare()))
+            DriveLoop(channel, link).run()
+    except Closed:
+        return
+
+
+def _first(channel: Channel) -> list[Open]:
+    while True:
+        channel.wait(1.0)
+        messages = channel.receive()
+        if messages:
+            return messages
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]))

@@ -1,0 +1,290 @@
+"""A link whose cycles are made in a process of its own: the job sends commands ahead and gets the samples back."""
+
+import contextlib
+import itertools
+import socket
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Self
+
+import numpy as np
+
+from armlink.arm_file import ArmFile
+from armlink.arrays import Array
+from armlink.errors import BusFault
+from armlink.link.types import Calibration, Command, Controller, Identity, Sample, Samples, Setpoints, Stats
+from armlink.loop.channel import Channel, Closed
+from armlink.loop.messages import Alive, Answer, Call, Cut, Open, Play, Run, Stopped, unpack
+from armlink.loop.realtime import Realtime
+
+CHUNK = 50
+"""Rows of one message: unpickling more would hold up a cycle."""
+TOLD_EVERY = 0.2
+"""The loop hears from a job that reads samples at least so often [s]."""
+ANSWER = 60.0
+"""Longest wait for an answer of the loop [s]; starting an arm takes some seconds."""
+SAMPLE = 5.0
+"""Longest wait for a sample of an enabled arm [s]."""
+END = 3.0
+"""The process gets so long to leave the joints safe [s]."""
+
+
+class RemoteLink:
+    """An `ArmDriver`; context manager like `Link`. Not for several threads."""
+
+    def __init__(self, arm: ArmFile, bus: str | None = None) -> None:
+        """Start the process and open the bus; raises BadInput, BusFault."""
+        self.arm = arm
+        section = arm.require_link()
+        self.names = tuple(joint.name for joint in section.joints)
+        self.n, self.rate, self.period = len(self.names), section.rate, 1.0 / section.rate
+        self._numbers = itertools.count(1)
+        self._samples: deque[tuple[int, int, bytes]] = deque()
+        self._stopped: Stopped | None = None
+        self._answers: dict[int, Answer] = {}
+        self._in_force: Command | None = None
+        self._torque_sent = self._position_sent = np.full(self.n, np.nan)
+        self._step = np.full(self.n, np.inf)
+        self._told = time.monotonic()
+        ours, theirs = socket.socketpair()
+        command = [sys.executable, "-m", "armlink.loop.process", str(theirs.fileno())]
+        self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL)
+        theirs.close()
+        self._channel = Channel(ours)
+        try:
+            self._put(Open(arm, bus))
+            self.realtime: Realtime = self._answer(0)
+            """What the machine permitted the process that makes the cycles."""
+        except BaseException:
+            self._end()
+            raise
+
+    def __enter__(self) -> Self:
+        """The link itself."""
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Stop the joints, close the bus, end the process."""
+        with contextlib.suppress(BusFault):
+            self.stop()
+        self._end()
+
+    @property
+    def pid(self) -> int:
+        """Process id of the loop."""
+        return self._process.pid
+
+    @property
+    def position_step(self) -> Array:
+        """Smallest change that each position reading can show (n,) [rad]; inf before start()."""
+        return self._step
+
+    @property
+    def position_sent(self) -> Array:
+        """Target position of the newest sample taken (n,) [rad]."""
+        return self._position_sent
+
+    @property
+    def torque_sent(self) -> Array:
+        """Target torque of the newest sample taken (n,) [N·m]."""
+        return self._torque_sent
+
+    @property
+    def stats(self) -> Stats:
+        """Counters since the first cycle."""
+        found: Stats = self._call("stats")
+        return found
+
+    def scan(self) -> list[Identity]:
+        """Identity and state of each joint's controller."""
+        found: list[Identity] = self._call("scan")
+        return found
+
+    def start(self) -> None:
+        """As Link.start."""
+        self._call("start")
+        self._step = self._call("position_step")
+
+    def enable(self) -> Sample:
+        """As Link.enable."""
+        return self._enabled("enable")
+
+    def recover(self) -> Sample:
+        """As Link.recover."""
+        return self._enabled("recover")
+
+    def _enabled(self, how: str) -> Sample:
+        self._stopped = None
+        sample: Sample = self._call(how)
+        self._samples.clear()
+        self._position_sent, self._torque_sent = self._call("position_sent"), self._call("torque_sent")
+        self._in_force = Command.hold(self._position_sent)
+        return sample
+
+    def disable(self) -> None:
+        """As Link.disable."""
+        self._call("disable")
+
+    def stop(self) -> None:
+        """Quick stop of every joint."""
+        self._call("stop")
+
+    def read_calibration(self, joint: int) -> Calibration:
+        """As Link.read_calibration."""
+        found: Calibration = self._call("read_calibration", joint)
+        return found
+
+    def read_temperatures(self) -> Array:
+        """As Link.read_temperatures."""
+        found: Array = self._call("read_temperatures")
+        return found
+
+    def write_calibration(
+        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
+    ) -> Calibration:
+        """As Link.write_calibration."""
+        found: Calibration = self._call("write_calibration", joint, gain, offset, record_id, date, store)
+        return found
+
+    def inside(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        """Call `function(link, ...)` in the process that makes the cycles."""
+        return self._call(function, *args, **kwargs)
+
+    def cycle(self, command: Command) -> Sample:
+        """The next sample with this command in force; a command that is in force already is not sent again."""
+        if self._in_force is not None and _same(command, self._in_force):
+            return self._next()[2]
+        torque = command.torque[None, :].copy()
+        setpoints = Setpoints(command.mode.copy(), torque, command.position[None, :].copy(), command.guard)
+        (sample,) = self.play(setpoints)
+        return sample
+
+    def play(self, setpoints: Setpoints) -> Samples:
+        """As Link.play: every row is sent at once, and played whatever this process does meanwhile."""
+        if not len(setpoints):
+            return
+        number = next(self._numbers)
+        for begin in range(0, len(setpoints), CHUNK):
+            self._put(Play(number, setpoints[begin : begin + CHUNK]))
+        yield from self._take(number, len(setpoints))
+        self._in_force = _copy(setpoints.command(len(setpoints) - 1))
+
+    def run(self, controller: Controller) -> Samples:
+        """As Link.run, in the other process."""
+        number = next(self._numbers)
+        self._put(Run(number, controller))
+        yield from self._take(number, sys.maxsize)
+
+    def catch_up(self) -> None:
+        """Forget the samples that came while the job did something else; raises what stopped the arm."""
+        self._receive()
+        self._samples.clear()
+        self._raise_stopped()
+
+    def _take(self, number: int, rows: int) -> Samples:
+        """Samples of rows 0, 1, … of what was sent as `number`; what is left is cut when the iterator is closed."""
+        self._in_force = None
+        taken = 0
+        try:
+            while taken < rows:
+                id, row, sample = self._next()
+                if id == number and row >= 0:
+                    taken = row + 1
+                    yield sample
+        finally:
+            if taken < rows:
+                with contextlib.suppress(BusFault):
+                    self._put(Cut())
+
+    def _next(self) -> tuple[int, int, Sample]:
+        """The next cycle that was not taken yet; raises what stopped the arm, BusFault."""
+        end = time.monotonic() + SAMPLE
+        while not self._samples:
+            self._raise_stopped()
+            self._tell()
+            self._channel.wait(TOLD_EVERY)
+            self._receive()
+            if not self._samples and self._stopped is None and time.monotonic() > end:
+                raise BusFault(f"no cycle was made for {SAMPLE:g} s: the process that drives the arm hangs")
+        self._tell()
+        id, row, content = self._samples.popleft()
+        sample, self._torque_sent, self._position_sent = unpack(content)
+        return id, row, sample
+
+    def _raise_stopped(self) -> None:
+        if self._stopped is not None:
+            stopped, self._stopped = self._stopped, None
+            self._in_force = None
+            raise stopped.error
+
+    def _tell(self) -> None:
+        if time.monotonic() - self._told > TOLD_EVERY:
+            self._put(Alive())
+
+    def _put(self, message: object) -> None:
+        self._told = time.monotonic()
+        self._channel.put(message)
+        try:
+            while not self._channel.flush(0.1):
+                self._receive()
+        except Closed:
+            raise self._gone() from None
+
+    def _receive(self) -> None:
+        try:
+            messages = self._channel.receive()
+        except Closed:
+            raise self._gone() from None
+        for message in messages:
+            match message:
+                case Answer():
+                    self._answers[message.id] = message
+                case Stopped():
+                    self._stopped = message
+                case _:
+                    self._samples.append(message)
+
+    def _call(self, what: str | Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        number = next(self._numbers)
+        self._put(Call(number, what, args, tuple(kwargs.items())))
+        return self._answer(number)
+
+    def _answer(self, number: int) -> Any:
+        end = time.monotonic() + ANSWER
+        while number not in self._answers:
+            if time.monotonic() > end:
+                raise BusFault(f"the process that drives the arm has not answered for {ANSWER:g} s")
+            self._channel.wait(TOLD_EVERY)
+            self._receive()
+        answer = self._answers.pop(number)
+        if answer.error is not None:
+            raise answer.error
+        return answer.value
+
+    def _gone(self) -> BusFault:
+        status = self._process.poll()
+        return BusFault(
+            f"the process that drives the arm has ended (status {status}): the joints stop by their own deadline"
+        )
+
+    def _end(self) -> None:
+        self._channel.close()
+        try:
+            self._process.wait(END)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+def _copy(command: Command) -> Command:
+    return Command(command.mode.copy(), command.torque.copy(), command.position.copy(), guard=command.guard)
+
+
+def _same(one: Command, other: Command) -> bool:
+    fields = ("mode", "torque", "position")
+    return one.guard is other.guard and all(
+        np.array_equal(getattr(one, name), getattr(other, name), equal_nan=name != "mode") for name in fields
+    )

@@ -1,0 +1,34 @@
+"""What to do when the joints had to be stopped because the cycle stood still: ask, enable again, repeat the reading."""
+
+from collections.abc import Callable
+from typing import TypeVar
+
+from armlink.errors import HostLate, Stall
+from armlink.loop.driver import ArmDriver
+from calib.sweep.dataset import StallLine
+
+OnStall = Callable[[Stall], bool]
+"""Told why the joints were stopped; whether to enable them again and go on."""
+T = TypeVar("T")
+
+
+def give_up(stall: Stall) -> bool:
+    """An OnStall that does not go on."""
+    return False
+
+
+def bridged(link: ArmDriver, on_stall: OnStall, work: Callable[[], T]) -> T:
+    """What `work` returns; after each Stall that `on_stall` accepts it is done again from its beginning."""
+    while True:
+        try:
+            return work()
+        except Stall as stall:
+            if not on_stall(stall):
+                raise
+            link.recover()
+
+
+def stall_line(stall: Stall, t: float, reading: str) -> StallLine:
+    """How a stall at link time `t` [s] is noted in the data set."""
+    late = stall.late * 1e3 if isinstance(stall, HostLate) else None
+    return StallLine(t=t, late_ms=late, reading=reading, reason=str(stall))
