@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armlink.arm_file import ArmFile
+from armlink.bus.can_bus import CanBus
 from armlink.link.types import Sample, Stats
 
 Array = NDArray[np.float64]
@@ -25,7 +26,7 @@ class LoopOptions:
     pace: bool = True
     """In-process simulated arm: keep to the machine's time. Without, simulated time passes as fast as it can."""
     seed: int = 0
-    open_bus: Callable[[], Any] | None = field(default=None, repr=False)
+    open_bus: Callable[[], CanBus] | None = field(default=None, repr=False)
     """Gives the bus in tests; by default it is opened by name."""
 
 
