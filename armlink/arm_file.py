@@ -8,9 +8,11 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
+import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, ValidationError, model_validator
 
+from armlink.arrays import Array
 from armlink.errors import BadInput
 
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
@@ -124,6 +126,11 @@ class LinkSection(Section):
     deadline: Annotated[FiniteFloat, Field(ge=0.01, le=10)] = 0.1
     """A joint that hears no command for so long goes to quick stop; a reading this old is a fault [s]."""
     joints: tuple[LinkJoint, ...]
+
+    @property
+    def rated_torques(self) -> Array:
+        """Rated torque of every joint (n,) [N·m]."""
+        return np.array([joint.rated_torque for joint in self.joints])
 
     @model_validator(mode="after")
     def _nodes_are_unique(self) -> "LinkSection":

@@ -15,8 +15,8 @@ from side_by_side import Case, Figure, seconds
 
 from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.effects.registry import layout_of
 from sim_gap.model.load import load_model, read_spec
+from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import prepare
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.residuals.where import by_joint

@@ -1,4 +1,4 @@
-"""Chosen stops against random ones and against all joints at once: prints the table of docs/identification.md."""
+"""Chosen stops against random ones and all joints at once: prints the table of docs/appendix/identification.md."""
 
 import numpy as np
 from rich.console import Console
@@ -12,7 +12,7 @@ from gcomp.design.sweep_design import Sweep, choose_sweeps, readings_of, stop_co
 from gcomp.gravity.torque import torque_covariance
 from gcomp.identify.global_fit import Prediction, predict_covariance
 from gcomp.identify.parameters import Parameters
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 from sim_bus.sim_section import sim_section
 
 SIGMA = np.array([0.15, 0.15, 0.08, 0.06, 0.03, 0.03, 0.02])
@@ -50,7 +50,7 @@ def compare(
 
     def at_once(rows: int) -> np.ndarray:
         positions = np.tile(rng.uniform(arm.lower, arm.upper, (rows, arm.n)), (len(loads), 1))
-        readings = Readings.of(positions, np.zeros_like(positions), SIGMA, np.repeat(loads, rows))
+        readings = StaticReadings.of(positions, np.zeros_like(positions), SIGMA, np.repeat(loads, rows))
         return error(predict_covariance(arm, readings, guess, unknown=unknown))
 
     def at_random() -> np.ndarray:

@@ -1,1 +1,1 @@
-"""Gravity model of a serial revolute arm: pure math on arrays."""
+"""Gravity model of a serial arm of revolute joints: pure functions of arrays."""

@@ -1,4 +1,4 @@
-"""Array types and the checks that public functions make on what they are given."""
+"""Array types, and the checks that public functions make of their arguments."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ Mask = NDArray[np.bool_]
 
 
 def as_array(name: str, value: ArrayLike, shape: tuple[int | None, ...], finite: bool = True) -> Array:
-    """`value` as float64 of that shape (None stands for any length); raises BadArray naming `name` otherwise."""
+    """`value` as float64 of a given shape (None: any length); raises BadArray naming `name` if it is not."""
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -28,7 +28,7 @@ def as_array(name: str, value: ArrayLike, shape: tuple[int | None, ...], finite:
 
 
 def as_poses(name: str, value: ArrayLike, n: int) -> tuple[Array, tuple[int, ...]]:
-    """Joint positions (…, n) as (K, n) and the leading shape; raises BadArray where the last axis is not n."""
+    """Joint positions (…, n) as (K, n), and the leading shape; raises BadArray if the last axis is not n."""
     array = np.asarray(value, dtype=np.float64)
     if array.ndim == 0 or array.shape[-1] != n:
         raise BadArray(f"{name} has shape {array.shape}, expected (…, {n}): one position per joint")
@@ -36,7 +36,7 @@ def as_poses(name: str, value: ArrayLike, n: int) -> tuple[Array, tuple[int, ...
 
 
 def as_batch(array: Array, leading: tuple[int, ...]) -> Array:
-    """(K, …) with the leading shape that the poses came with."""
+    """An array (K, …) in the leading shape of the poses."""
     batch: Array = array.reshape(*leading, *array.shape[1:])
     return batch
 

@@ -2,13 +2,13 @@
 
 
 class GcompError(ValueError):
-    """Something a user can act on; `exit_status` is what a command line that meets it exits with."""
+    """An error that the user can correct; `exit_status` is the exit status of a command that it ends."""
 
     exit_status = 2
 
 
 class BadArray(GcompError):
-    """An array of the wrong shape or with values that cannot be used; says which, and what was expected."""
+    """An array of the wrong shape or with unusable values; names it and what was expected."""
 
 
 class BadModel(GcompError):

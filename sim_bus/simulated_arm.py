@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
-from sim_bus.effects.state import Entry, imperfections
+from sim_bus.effects.effect import EffectSetting
+from sim_bus.effects.registry import imperfections
 from sim_bus.node.cia402 import State
 from sim_bus.node.controller_settings import APPLIED, bring_into_force, power_on_values
 from sim_bus.node.drives import Drives
@@ -41,7 +42,7 @@ class SimulatedArm:
         self.time = 0.0
         self.outbox: deque[Frame] = deque()
         self.default_period = 1.0 / link.rate
-        self._entries: tuple[Entry, ...] = section.effects
+        self._entries: tuple[EffectSetting, ...] = section.effects
         with self._effects_checked():
             state = imperfections(self.names, self._entries)
             self.plant = Plant(arm, state)
@@ -144,7 +145,7 @@ class SimulatedArm:
         """Change a torque sensor from now on: its gain `gain` times as large, its offset `offset` [N·m] larger."""
         self.sensors.drift(self._place(joint), gain, offset)
 
-    def set_effects(self, entries: Iterable[Entry]) -> None:
+    def set_effects(self, entries: Iterable[EffectSetting]) -> None:
         """Replace the arm's imperfections while it runs. Raises BadInput."""
         wanted = tuple(entries)
         with self._effects_checked():
@@ -155,7 +156,7 @@ class SimulatedArm:
         self.drives.loops.reconfigure()
 
     @property
-    def effects(self) -> tuple[Entry, ...]:
+    def effects(self) -> tuple[EffectSetting, ...]:
         """The imperfections in force."""
         return self._entries
 

@@ -3,12 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from armlink.arm_file import ArmFile
+from armlink.arrays import Array
 from sim_bus.sim_section import sim_section
 
-Array = NDArray[np.float64]
 GAIN_RANGE = (0.9, 1.1)
 OFFSET_SHARE = 0.05
 """Largest torque offset as a share of rated torque."""
@@ -60,7 +59,7 @@ class Truth:
         The reference mass sits up to 0.15 m to the side of the flange. Raises BadInput.
         """
         random, stated = np.random.default_rng(seed), cls.of(arm)
-        rated = np.array([joint.rated_torque for joint in arm.require_link().joints])
+        rated = arm.require_link().rated_torques
         n = len(rated)
         lateral = random.uniform(-ATTACHMENT_RANGE, ATTACHMENT_RANGE, 2)
         return cls(

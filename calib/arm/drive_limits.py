@@ -3,12 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from calib.arm.kinematics import gcomp_arm
-
-Array = npt.NDArray[np.float64]
+from gcomp.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,11 +22,11 @@ class Limits:
     @classmethod
     def of(cls, arm: ArmFile) -> "Limits":
         """From the arm file's link section and joint range."""
-        described, joints = gcomp_arm(arm), arm.require_link().joints
+        described, link = gcomp_arm(arm), arm.require_link()
         return cls(
             described.lower,
             described.upper,
-            np.array([joint.rated_torque for joint in joints]),
-            np.array([joint.max_torque for joint in joints]),
-            np.array([joint.max_velocity for joint in joints]),
+            link.rated_torques,
+            np.array([joint.max_torque for joint in link.joints]),
+            np.array([joint.max_velocity for joint in link.joints]),
         )

@@ -4,11 +4,9 @@ import csv
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from armlink.errors import BadInput
-
-Array = npt.NDArray[np.float64]
+from gcomp.arrays import Array
 
 
 def load_poses(path: Path, n: int) -> Array:

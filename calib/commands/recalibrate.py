@@ -11,8 +11,8 @@ from calib.commands.options import Bus, Check, Flash, JsonFile, Replaced, Store
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
     from calib.field.field_fit import FieldFit
-    from calib.field.rows import FieldRows
     from calib.records.records import CalibrationRecord
+    from gcomp.identify.readings import StaticReadings
 
 
 def recalibrate(
@@ -71,7 +71,7 @@ def recalibrate(
 
 def _rows(
     arm_file: "ArmFile", data: list[Path], held: "CalibrationRecord | None"
-) -> "tuple[FieldRows, dict[str, str]]":
+) -> "tuple[StaticReadings, dict[str, str]]":
     """Rows of all recordings and sweeps, and the SHA-256 of each."""
     import hashlib
 
@@ -79,7 +79,7 @@ def _rows(
 
     from armlink.errors import BadInput
     from armlink.recording.recording import load_recording
-    from calib.field.rows import join, rows_of_recording, rows_of_sweeps
+    from calib.field.rows import rows_of_recording, rows_of_sweeps
     from calib.sweep.dataset import load_data
 
     n = len(arm_file.joint_names)
@@ -96,7 +96,7 @@ def _rows(
             raise BadInput(f"{path}: {recording.n} joints, but {arm_file.name} has {n}")
         parts.append(rows_of_recording(recording, gain, offset, number, str(path)))
         sources[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
-    return join(parts), sources
+    return parts[0].joined(*parts[1:]), sources
 
 
 def _answer(fit: "FieldFit", record: "CalibrationRecord", gravity: str, applied: bool) -> dict[str, Any]:

@@ -1,13 +1,16 @@
 """Single-joint sweeps of an arm, planned, checked and run; continues after an interruption."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
     from armlink.loop.driver import ArmDriver
+    from calib.commands.screen import SweepScreen
+    from calib.sweep.dataset import SweepData
+    from calib.sweep.preflight import Preflight
 
 
 def sweep(
@@ -50,40 +53,13 @@ def sweep(
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
     from armlink.loop.open import open_arm
-    from calib.arm.kinematics import model_arm
     from calib.arm.sweep_section import with_hold
-    from calib.commands.screen import (
-        SweepScreen,
-        confirm,
-        print_lines,
-        print_plan,
-        print_preflight,
-        stalls_said,
-        unsettled_said,
-    )
-    from calib.plan.collisions import check_plan
-    from calib.plan.drawing import draw_plan, seconds
-    from calib.plan.rough_gravity import guess_of_model
-    from calib.plan.sweep_plan import plan_sweep
+    from calib.commands.screen import SweepScreen, confirm, warn_late
     from calib.sweep.dataset import require_vacant
-    from calib.sweep.preflight import find_stops, listen
-    from calib.sweep.run import run_sweep
-    from calib.sweep.stalls import bridged
 
     arm_file = with_hold(load_arm(arm), hold)
     if plan:
-        model = None if arm_file.model_path is None else model_arm(arm_file)
-        planned = plan_sweep(arm_file, None if model is None else guess_of_model(model.arm, model.beta), seed=seed)
-        print_plan(arm_file, planned)
-        drawing = picture or (out or Path()) / f"{arm_file.name}-plan.html"
-        draw_plan(arm_file, planned, drawing)
-        took = seconds(arm_file, planned)
-        checked = check_plan(arm_file, planned)
-        print_lines([f"about {took / 60:.0f} min a pass; {checked}; drawn in {drawing}"])
-        write_json(
-            json_file,
-            {**planned.model_dump(mode="json"), "seconds": took, "collisions": checked, "picture": str(drawing)},
-        )
+        write_json(json_file, _plan(arm_file, seed, picture or (out or Path()) / f"{arm_file.name}-plan.html"))
         return
     if out is None:
         raise BadInput("sweep: give --out DIR for the data set, or --plan to print the plan alone")
@@ -93,44 +69,105 @@ def sweep(
     with _dry_link(arm_file, reference_mass) if dry_run else open_arm(arm_file, bus) as link:
         link.start()
         with SweepScreen(f"{arm_file.name}, {reference_mass:g} kg attached") as screen:
-            link.enable()
-            on_stall = screen.on_stall(keep_going)
-            found = bridged(link, on_stall, lambda: listen(link, arm_file))
-            if check_stops and not resume and not reference_mass:
-                heard = found
-                found = bridged(link, on_stall, lambda: find_stops(link, arm_file, heard, screen.count))
-            data = run_sweep(
+            found, data = _run(
                 link,
                 arm_file,
                 out,
-                reference_mass=reference_mass,
-                resume=resume,
-                progress=screen.update,
-                seed=seed,
-                on_stall=on_stall,
+                screen,
+                keep_going,
+                reference_mass,
+                resume,
+                seed,
+                check_stops and not resume and not reference_mass,
             )
-    print_preflight(found)
+        lateness = link.stats.lateness
+    _show(arm_file, found, data, screen)
+    warn_late(arm_file, lateness)
+    write_json(json_file, {**_answer(arm_file, data), "late_ms": lateness.in_ms()})
+
+
+def _plan(arm_file: "ArmFile", seed: int, picture: Path) -> dict[str, Any]:
+    """Print, check and draw the plan; the answer for machines."""
+    from calib.arm.kinematics import model_arm
+    from calib.commands.screen import print_lines, print_plan
+    from calib.plan.collisions import check_plan
+    from calib.plan.drawing import draw_plan, seconds
+    from calib.plan.rough_gravity import guess_of_model
+    from calib.plan.sweep_plan import plan_sweep
+
+    model = None if arm_file.model_path is None else model_arm(arm_file)
+    planned = plan_sweep(arm_file, None if model is None else guess_of_model(model.arm, model.beta), seed=seed)
+    print_plan(arm_file, planned)
+    draw_plan(arm_file, planned, picture)
+    took, checked = seconds(arm_file, planned), check_plan(arm_file, planned)
+    print_lines([f"about {took / 60:.0f} min a pass; {checked}; drawn in {picture}"])
+    return {**planned.model_dump(mode="json"), "seconds": took, "collisions": checked, "picture": str(picture)}
+
+
+def _run(
+    link: "ArmDriver",
+    arm_file: "ArmFile",
+    out: Path,
+    screen: "SweepScreen",
+    keep_going: int,
+    reference_mass: float,
+    resume: bool,
+    seed: int,
+    check_stops: bool,
+) -> "tuple[Preflight, SweepData]":
+    """Enable the arm, check it and sweep it."""
+    from calib.sweep.preflight import find_stops, listen
+    from calib.sweep.run import run_sweep
+    from calib.sweep.stalls import bridged
+
+    link.enable()
+    on_stall = screen.on_stall(keep_going)
+    heard = bridged(link, on_stall, lambda: listen(link, arm_file))
+    found = heard
+    if check_stops:
+        found = bridged(link, on_stall, lambda: find_stops(link, arm_file, heard, screen.count))
+    data = run_sweep(
+        link,
+        arm_file,
+        out,
+        reference_mass=reference_mass,
+        resume=resume,
+        progress=screen.update,
+        seed=seed,
+        on_stall=on_stall,
+    )
+    return found, data
+
+
+def _show(arm_file: "ArmFile", found: "Preflight", data: "SweepData", screen: "SweepScreen") -> None:
+    from calib.commands.screen import print_lines, print_plan, print_preflight, stalls_said, unsettled_said
+
     assert data.plan is not None
+    print_preflight(found)
     print_plan(arm_file, data.plan)
     print_lines([*unsettled_said(data), *stalls_said(data)], "yellow")
-    if not reference_mass:
+    if not data.manifest.reference_mass:
+        mass = data.plan.reference_mass
         screen.say(
-            f"{out} is complete. Now attach {data.plan.reference_mass:g} kg and sweep again with"
-            f" --reference-mass {data.plan.reference_mass:g} into another directory."
+            f"{data.path} is complete. Now attach {mass:g} kg and sweep again with --reference-mass {mass:g} into"
+            " another directory."
         )
-    answer = {
-        "out": str(out),
+
+
+def _answer(arm_file: "ArmFile", data: "SweepData") -> dict[str, Any]:
+    assert data.plan is not None
+    return {
+        "out": str(data.path),
         "arm": arm_file.name,
         "serial": arm_file.serial,
         "readings": len(data.readings),
         "unsettled": len(data.unsettled),
         "stalls": [stall.model_dump(include={"t", "late_ms", "reading"}) for stall in data.stalls],
         "seconds": data.readings[-1].t,
-        "reference_mass": reference_mass,
+        "reference_mass": data.manifest.reference_mass,
         "recommended_reference_mass": data.plan.reference_mass,
         "plan": data.plan.model_dump(mode="json"),
     }
-    write_json(json_file, answer)
 
 
 def _dry_link(arm_file: "ArmFile", reference_mass: float) -> "ArmDriver":

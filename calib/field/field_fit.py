@@ -13,10 +13,10 @@ import numpy.typing as npt
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
 from calib.field.linear_model import UNKNOWN_MOMENT, Belief, Solution, belief_of, field_columns, solve
-from calib.field.rows import FieldRows
 from calib.records.records import Array, CalibrationRecord, GravityRecord, Parameter
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.gravity.torque import gravity_regressor
+from gcomp.identify.readings import StaticReadings
 
 Flags = npt.NDArray[np.bool_]
 
@@ -66,7 +66,9 @@ class FieldFit:
         return np.stack([value - half, value + half], axis=1)
 
 
-def fit_field(arm: ArmFile, rows: FieldRows, gravity: GravityRecord, calibration: CalibrationRecord | None) -> FieldFit:
+def fit_field(
+    arm: ArmFile, rows: StaticReadings, gravity: GravityRecord, calibration: CalibrationRecord | None
+) -> FieldFit:
     """Gains and offsets from slow rows; `calibration` gives the position sensors and what was in force.
 
     Raises Refused where a payload explains the rows as well, or the records are of another arm; BadInput.
@@ -117,7 +119,7 @@ def _correlation(residual: Array, series: npt.NDArray[np.int64]) -> Array:
     return factor
 
 
-def _refuse_payload(belief: Belief, rows: FieldRows, q: Array, noise: Array, chi2: float) -> None:
+def _refuse_payload(belief: Belief, rows: StaticReadings, q: Array, noise: Array, chi2: float) -> None:
     """Raise Refused where the installed pairs do not fit, and a payload with them does as well as new pairs do."""
     n = belief.arm.n
     base = field_columns(belief, rows, q, belief.installed[0])
@@ -140,7 +142,7 @@ def _refuse_payload(belief: Belief, rows: FieldRows, q: Array, noise: Array, chi
         )
 
 
-def _report(belief: Belief, rows: FieldRows, columns: Array, solved: Solution, unseen: Flags) -> FieldFit:
+def _report(belief: Belief, rows: StaticReadings, columns: Array, solved: Solution, unseen: Flags) -> FieldFit:
     n, names = belief.arm.n, belief.arm.names
     counted = np.isfinite(rows.torque)
     model = columns[:, np.arange(n), np.arange(n)]

@@ -5,9 +5,9 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from calib.field.field_fit import FieldFit
-from calib.field.rows import FieldRows
 from calib.install.plausibility import FEWEST, worse_by
 from calib.records.records import Array, CalibrationRecord, JointCalibration, Parameter, matrix, provenance
+from gcomp.identify.readings import StaticReadings
 
 PAIR: tuple[Parameter, Parameter] = ("gain", "offset")
 BLOCK = 24
@@ -37,7 +37,7 @@ def field_record(
     )
 
 
-def check_field_heldout(rows: FieldRows, fit: FieldFit, before: CalibrationRecord) -> None:
+def check_field_heldout(rows: StaticReadings, fit: FieldFit, before: CalibrationRecord) -> None:
     """Raise Refused where rows left out of it are predicted worse than with the pairs in force.
 
     Every joint's line through the model torque is drawn on every second block of rows and tried on the others.

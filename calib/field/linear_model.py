@@ -7,10 +7,10 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
-from calib.field.rows import FieldRows
 from calib.records.records import PARAMETERS, Array, CalibrationRecord, GravityRecord
 from gcomp.arm.arm import Arm
 from gcomp.gravity.torque import gravity_regressor, gravity_stiffness
+from gcomp.identify.readings import StaticReadings
 
 HYSTERESIS = 0.01
 """Standard deviation of f_i believed beforehand, as a share of rated torque."""
@@ -111,7 +111,7 @@ def belief_of(arm: ArmFile, gravity: GravityRecord, calibration: CalibrationReco
     )
 
 
-def field_columns(belief: Belief, rows: FieldRows, q: Array, gain: Array) -> Array:
+def field_columns(belief: Belief, rows: StaticReadings, q: Array, gain: Array) -> Array:
     """(K, n, p): by gain, offset, hysteresis of each joint, by β in units of its root, by position offsets [std]."""
     n, each = belief.arm.n, np.eye(belief.arm.n)
     regressor = gravity_regressor(belief.arm, q)

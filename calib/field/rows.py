@@ -1,17 +1,15 @@
 """Rows for a calibration in the field: slow instants of a recording, or the readings of sweeps."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording
-from calib.fit.rows import fit_rows
+from calib.fit.sweep_readings import sweep_readings
 from calib.sweep.dataset import SweepData
-
-Array = npt.NDArray[np.float64]
+from gcomp.arrays import Array
+from gcomp.identify.readings import StaticReadings
 
 WINDOW = 0.25
 """Samples are averaged over so long: one row [s]."""
@@ -25,23 +23,7 @@ MOVED = 0.004
 FEWEST_ROWS = 12
 
 
-@dataclass(frozen=True, eq=False)
-class FieldRows:
-    """K static or slow rows of n joints, in time order; NaN torque where a sensor does not count."""
-
-    position: Array
-    """Position readings (K, n) [rad]."""
-    torque: Array
-    """Torque as the sensors themselves read it, no controller's calibration in it (K, n) [N·m]."""
-    sigma: Array
-    """Standard deviation of a torque row (K, n) [N·m]."""
-    direction: Array
-    """Sign of each joint's last motion (K, n); 0 where it has not moved yet."""
-    series: npt.NDArray[np.int64]
-    """Which recording or data set a row is of (K,)."""
-
-
-def rows_of_recording(recording: Recording, gain: Array, offset: Array, number: int, source: str) -> FieldRows:
+def rows_of_recording(recording: Recording, gain: Array, offset: Array, number: int, source: str) -> StaticReadings:
     """Windows of a recording in which all joints move slowly and steadily.
 
     `gain` and `offset` (n,) are the pairs that the controllers held: what they sent is turned back to the sensors' own
@@ -70,40 +52,24 @@ def rows_of_recording(recording: Recording, gain: Array, offset: Array, number: 
     chosen = [each for each, fine in zip(windows, slow, strict=True) if fine]
     sigma = np.array([_scatter(t[each], torque[each]) / np.sqrt(len(t[each])) for each in chosen])
     typical = np.sqrt(np.median(sigma**2, axis=0))
-    return FieldRows(
+    return StaticReadings(
         means[slow],
         np.array([torque[each].mean(axis=0) for each in chosen]),
-        np.broadcast_to(np.maximum(typical, 1e-6), (len(chosen), recording.n)).copy(),
-        _directions(means)[slow],
-        np.full(len(chosen), number),
+        np.maximum(typical, 1e-6),
+        direction=_directions(means)[slow],
+        series=np.full(len(chosen), number),
     )
 
 
-def rows_of_sweeps(data: SweepData, number: int) -> FieldRows:
+def rows_of_sweeps(data: SweepData, number: int) -> StaticReadings:
     """The unloaded readings of a sweep data set; raises BadInput where a reference mass was attached."""
     if data.manifest.reference_mass > 0:
         raise BadInput(
             f"{data.path}: swept with a reference mass of {data.manifest.reference_mass:g} kg: this takes the arm as"
             " its gravity record knows it, without a mass (armlink calibrate takes both)"
         )
-    rows = fit_rows([data])
-    direction = np.zeros(rows.readings.position.shape)
-    swept = np.flatnonzero(rows.swept >= 0)
-    direction[swept, rows.swept[swept]] = rows.direction[swept]
-    readings = rows.readings
-    return FieldRows(
-        np.array(readings.position),
-        np.array(readings.torque),
-        np.array(readings.sigma),
-        direction,
-        np.full(len(readings.load), number),
-    )
-
-
-def join(parts: Sequence[FieldRows]) -> FieldRows:
-    """All rows together."""
-    names = ("position", "torque", "sigma", "direction", "series")
-    return FieldRows(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    readings = sweep_readings([data]).readings
+    return replace(readings, series=np.full(len(readings), number))
 
 
 def _windows(t: Array) -> list[slice]:

@@ -8,15 +8,14 @@ import numpy.typing as npt
 
 from calib.fit.findings import Finding, effect_said, encoders_said, outliers_said, scattered
 from calib.fit.refinement import Extra, Refined, refine
-from calib.fit.rows import FitRows
+from calib.fit.sweep_readings import SweepReadings
 from calib.fit.unmodelled_effects import Effect, size_of, strongest
 from gcomp.arm.arm import Arm
+from gcomp.arrays import Array, Mask
 from gcomp.identify.global_fit import GlobalFit
 from gcomp.identify.parameters import Prior
 from gcomp.identify.sensor_model import predict
 
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 MOST_EFFECTS = 6
 """Effects that are looked for one after the other."""
 OUTLIER = 6.0
@@ -53,30 +52,32 @@ class Goodness:
 
     refined: Refined
     findings: tuple[Finding, ...]
-    outliers: Flags
+    outliers: Mask
     """Readings left out (K, n)."""
     left_out: tuple[LeftOut, ...]
 
 
-def examine(arm: Arm, rows: FitRows, fit: GlobalFit, priors: Mapping[str, Prior], rated: Array) -> Goodness:
+def examine(
+    kinematics: Arm, rows: SweepReadings, fit: GlobalFit, priors: Mapping[str, Prior], rated: Array
+) -> Goodness:
     """Refine a global fit, one effect after another that its residuals ask for, without outliers. rated (n,) [N·m]."""
-    rows, findings = _without_plateaus(arm.names, rows)
-    encoders = encoders_said(arm.names, rows)
+    rows, findings = _without_plateaus(kinematics.names, rows)
+    encoders = encoders_said(kinematics.names, rows)
     effects, sound = list[Effect](), rows.readings.sigma
     outliers = np.zeros(sound.shape, dtype=bool)
 
     def fitted() -> Refined:
         extras = tuple(extra for effect in effects for extra in effect.extras)
         kept = replace(rows.readings, torque=np.where(outliers, np.nan, rows.readings.torque))
-        return refine(arm, kept, fit, priors, rows.resolution, extras)
+        return refine(kinematics, kept, fit, priors, rows.resolution, extras)
 
     refined = fitted()
     for _ in range(MOST_EFFECTS):
-        strange = _outliers(arm, refined, rows, [extra for effect in effects for extra in effect.extras])
+        strange = _outliers(kinematics, refined, rows, [extra for effect in effects for extra in effect.extras])
         if (strange != outliers).any():
             outliers = strange
             refined = fitted()
-        found = strongest(arm, rows, ~outliers, refined, rated)
+        found = strongest(kinematics, rows, ~outliers, refined, rated)
         if found is None:
             break
         effects.append(found)
@@ -85,9 +86,9 @@ def examine(arm: Arm, rows: FitRows, fit: GlobalFit, priors: Mapping[str, Prior]
             rows = replace(rows, readings=replace(rows.readings, sigma=_doubted(sound, effects, refined)))
             refined = fitted()
     for effect, coefficient in _sized(effects, refined):
-        findings.append(effect_said(arm.names, effect, coefficient, refined, rated))
-    findings += outliers_said(arm.names, rows, outliers)
-    findings += scattered(arm.names, refined, rated, {finding.joint for finding in findings})
+        findings.append(effect_said(kinematics.names, effect, coefficient, refined, rated))
+    findings += outliers_said(kinematics.names, rows, outliers)
+    findings += scattered(kinematics.names, refined, rated, {finding.joint for finding in findings})
     said = encoders or findings  # what a wrong position does elsewhere is no finding of its own
     return Goodness(refined, tuple(said), outliers, leave_out(refined, rows))
 
@@ -109,7 +110,7 @@ def _doubted(sigma: Array, effects: list[Effect], refined: Refined) -> Array:
     return np.sqrt(square)
 
 
-def _without_plateaus(names: tuple[str, ...], rows: FitRows) -> tuple[FitRows, list[Finding]]:
+def _without_plateaus(names: tuple[str, ...], rows: SweepReadings) -> tuple[SweepReadings, list[Finding]]:
     """The rows without readings at a torque beyond which a sensor never went though the arm moved: it saturates."""
     torque, flat, found = rows.readings.torque, np.zeros(rows.readings.torque.shape, dtype=bool), []
     for joint, name in enumerate(names):
@@ -130,21 +131,21 @@ def _without_plateaus(names: tuple[str, ...], rows: FitRows) -> tuple[FitRows, l
     return (replace(rows, readings=readings) if found else rows), found
 
 
-def _sharp(rows: FitRows, joint: int) -> npt.NDArray[np.intp]:
+def _sharp(rows: SweepReadings, joint: int) -> npt.NDArray[np.intp]:
     """The rows in which a joint's reading counts and is exact enough to show a limit."""
     counted = np.flatnonzero(rows.readings.counted[:, joint])
     sigma = rows.readings.sigma[counted, joint]
     return counted[sigma <= BLURRED * np.median(sigma)] if len(counted) else counted
 
 
-def leave_out(refined: Refined, rows: FitRows) -> tuple[LeftOut, ...]:
+def leave_out(refined: Refined, rows: SweepReadings) -> tuple[LeftOut, ...]:
     """Each sweep's readings against a fit of all others, by the block form of the leave-one-out residual."""
     linear, found = refined.linear, []
     count = len(linear.row)
-    sweeps = np.array(rows.sweep)[linear.row]
+    series = rows.readings.series[linear.row]
     own = rows.swept[linear.row] == linear.joint
-    for name in dict.fromkeys(rows.sweep):
-        here = np.flatnonzero((sweeps == name) & own)
+    for sweep, name in enumerate(rows.sweeps):
+        here = np.flatnonzero((series == sweep) & own)
         if not len(here):
             continue
         part = linear.basis[:count][here]
@@ -159,13 +160,13 @@ def leave_out(refined: Refined, rows: FitRows) -> tuple[LeftOut, ...]:
     return tuple(found)
 
 
-def _outliers(arm: Arm, refined: Refined, rows: FitRows, extras: list[Extra]) -> Flags:
+def _outliers(kinematics: Arm, refined: Refined, rows: SweepReadings, extras: list[Extra]) -> Mask:
     """Readings (K, n) that no noise explains: deleted residuals, in robust standard deviations of their joint.
 
     Those left out before are judged again, for an effect found since may explain them.
     """
     linear, counted = refined.linear, rows.readings.counted
-    error = rows.readings.torque - predict(arm, refined.fit.complete, rows.readings)
+    error = rows.readings.torque - predict(kinematics, refined.fit.complete, rows.readings)
     error -= sum((value * extra.column for value, extra in zip(refined.coefficients, extras, strict=True)), 0.0 * error)
     deleted = error / (rows.readings.sigma * refined.factor)
     inside = np.zeros(counted.shape, dtype=bool)
@@ -173,7 +174,7 @@ def _outliers(arm: Arm, refined: Refined, rows: FitRows, extras: list[Extra]) ->
     count = len(linear.row)
     deleted[linear.row, linear.joint] = linear.residual[:count] / np.sqrt(np.maximum(1 - linear.leverage, 1e-3))
     flags = np.zeros(counted.shape, dtype=bool)
-    for joint in range(arm.n):
+    for joint in range(kinematics.n):
         used = np.abs(deleted[inside[:, joint], joint])
         if len(used) < FEWEST:
             continue

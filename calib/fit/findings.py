@@ -4,15 +4,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from calib.fit.refinement import Refined
-from calib.fit.rows import FitRows
+from calib.fit.sweep_readings import SweepReadings
 from calib.fit.unmodelled_effects import Effect, size_of
 from calib.motion.encoder_bits import stuck_bits
+from gcomp.arrays import Array, Mask
 
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 Kind = Literal[
     "spring",
     "direction",
@@ -53,28 +51,28 @@ def effect_said(names: tuple[str, ...], effect: Effect, coefficient: Array, refi
     """One effect in words."""
     name, gain = names[effect.joint], float(refined.fit.complete.gain[effect.joint]) or 1.0
     value = float(coefficient[0])
-    if effect.kind == "spring":
+    if effect.id == "transmission.spring":
         text = (
             f"{name}: torque linear in position that gravity does not explain, {value / gain:+.3g} N·m/rad: a cable or"
             " spring over the joint? It is taken out; its pull at 0 rad is part of the offset"
         )
         return Finding(name, "spring", value / gain, "N·m/rad", text)
-    if effect.kind == "direction":
+    if effect.each_sweep:
         size = size_of(coefficient)
         text = f"{name}: readings differ by {2 * size:.3g} N·m with the side of approach; taken out"
         return Finding(name, "direction", size, "N·m", text)
-    if effect.kind == "hysteresis":
+    if effect.id == "torque.hysteresis":
         text = (
             f"{name}: the torque sensor lags by {abs(value):.3g} N·m behind changes of torque (hysteresis); taken out"
         )
         return Finding(name, "hysteresis", abs(value), "N·m", text)
-    if effect.kind == "saturation":
+    if effect.id == "torque.saturation":
         text = f"{name}: the torque sensor flattens beyond {effect.knee:.3g} N·m: does it saturate?"
         return Finding(name, "saturation", effect.knee, "N·m", text)
-    if effect.kind == "drift":
+    if effect.id == "torque.drift":
         text = f"{name}: the torque reading drifts by {value * 3600:+.3g} N·m an hour: warm up, then sweep again"
         return Finding(name, "drift", value * 3600, "N·m/h", text)
-    if effect.kind == "eccentricity":
+    if effect.id == "position.eccentricity":
         size = float(np.hypot(*coefficient))
         text = f"{name}: the position reading is wrong by {size:.3g} rad once a turn: an eccentric encoder disc?"
         return Finding(name, "eccentricity", size, "rad", text)
@@ -82,7 +80,7 @@ def effect_said(names: tuple[str, ...], effect: Effect, coefficient: Array, refi
     return Finding(name, "nonlinear", value / gain, "1", text)
 
 
-def encoders_said(names: tuple[str, ...], rows: FitRows) -> list[Finding]:
+def encoders_said(names: tuple[str, ...], rows: SweepReadings) -> list[Finding]:
     """Position sensors with a bit that never changes."""
     found = []
     for joint, bit, step in stuck_bits(rows.readings.position, rows.resolution, rows.target):
@@ -94,14 +92,15 @@ def encoders_said(names: tuple[str, ...], rows: FitRows) -> list[Finding]:
     return found
 
 
-def outliers_said(names: tuple[str, ...], rows: FitRows, outliers: Flags) -> list[Finding]:
+def outliers_said(names: tuple[str, ...], rows: SweepReadings, outliers: Mask) -> list[Finding]:
     """Outliers by joint and sweep, with what a run of them looks like."""
     found = []
     for joint in np.flatnonzero(outliers.any(axis=0)):
         at = np.flatnonzero(outliers[:, joint])
-        where = ", ".join(f"{rows.sweep[row]} at {rows.readings.position[row, joint]:.3f} rad" for row in at[:4])
+        series, angle = rows.readings.series[at], rows.readings.position[at, joint]
+        where = ", ".join(f"{rows.sweeps[series[k]]} at {angle[k]:.3f} rad" for k in range(min(len(at), 4)))
         more = f" and {len(at) - 4} more" if len(at) > 4 else ""
-        run = len(at) >= 2 and len({rows.sweep[row] for row in at}) == 1
+        run = len(at) >= 2 and len(set(series.tolist())) == 1
         cause = "it touched something there, or a resting joint slipped" if run else "a knock or a bad contact"
         text = f"{names[joint]}: {len(at)} readings left out, {where}{more}: {cause}?"
         found.append(Finding(names[joint], "outliers", float(len(at)), "readings", text))

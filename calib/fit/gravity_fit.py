@@ -1,26 +1,24 @@
 """Gravity identification from sweeps: recursive from the tip to the base, then global, in calibrated torque."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from calib.arm.kinematics import gcomp_arm
-from calib.fit.rows import FitRows, fit_rows
 from calib.fit.sensor_fit import SensorFit
+from calib.fit.sweep_readings import SweepReadings, sweep_readings
 from calib.records.records import CalibrationRecord, GravityRecord, matrix, provenance
 from calib.sweep.dataset import SweepData
+from gcomp.arrays import Array, Mask
 from gcomp.errors import GcompError
 from gcomp.identify.global_fit import GlobalFit, identify_global
 from gcomp.identify.parameters import Parameters
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 from gcomp.identify.recursive import RecursiveFit, identify_recursive
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
+from gcomp.identify.sensor_model import joint_positions
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +30,7 @@ class GravityFit:
     """From the global fit (2n,) [kg·m]; 0 where gravity cannot determine it."""
     covariance: Array
     """(2n, 2n), the sensors' own uncertainty included; 0 where not determined."""
-    identifiable: Flags
+    identifiable: Mask
     """(2n,)"""
     recursive: RecursiveFit | None
     """The recursion from tip to base on the calibrated unloaded sweeps; None where there was no full unloaded pass."""
@@ -64,7 +62,7 @@ def identify_gravity(arm: ArmFile, data: Sequence[SweepData], sensors: SensorFit
     With a sensor fit the global result is its own: sensors and moments were estimated together. With a record its
     gains hold, and offsets are estimated anew. Raises Refused where no torque scale is known, BadInput on bad data.
     """
-    rows = fit_rows([each.require(arm) for each in data])
+    rows = sweep_readings([each.require(arm) for each in data])
     if isinstance(sensors, SensorFit):
         fit, calibration = sensors.fit, sensors.fit.complete
         _require_scale(sensors.names, np.isnan(sensors.value("gain")))
@@ -85,19 +83,22 @@ def identify_gravity(arm: ArmFile, data: Sequence[SweepData], sensors: SensorFit
     )
 
 
-def calibrated(rows: FitRows, calibration: Parameters, which: Flags) -> Readings:
+def calibrated(rows: SweepReadings, calibration: Parameters, which: Mask) -> StaticReadings:
     """Rows as true angles [rad] and torques [N·m] by the calibration, own sensors of swept joints alone."""
     readings = rows.readings
     own = rows.own
-    torque = np.where(own, (readings.torque - calibration.offset) / calibration.gain, np.nan)
-    position = readings.position * calibration.position_gain + calibration.position_offset
-    sigma = readings.sigma / np.abs(calibration.gain)
-    return Readings(position, torque, sigma, readings.load).rows(which & own.any(axis=1))
+    true = replace(
+        readings,
+        position=joint_positions(calibration, readings),
+        torque=np.where(own, (readings.torque - calibration.offset) / calibration.gain, np.nan),
+        sigma=readings.sigma / np.abs(calibration.gain),
+    )
+    return true.rows(which & own.any(axis=1))
 
 
-def _recursion(arm: ArmFile, rows: FitRows, calibration: Parameters) -> RecursiveFit | None:
+def _recursion(arm: ArmFile, rows: SweepReadings, calibration: Parameters) -> RecursiveFit | None:
     readings = calibrated(rows, calibration, rows.readings.load == 0)
-    if len(readings.load) == 0 or not readings.counted.any(axis=0).all():
+    if len(readings) == 0 or not readings.counted.any(axis=0).all():
         return None
     try:
         return identify_recursive(gcomp_arm(arm), readings)
@@ -105,7 +106,7 @@ def _recursion(arm: ArmFile, rows: FitRows, calibration: Parameters) -> Recursiv
         return None
 
 
-def _global(arm: ArmFile, rows: FitRows, calibration: Parameters) -> GlobalFit:
+def _global(arm: ArmFile, rows: SweepReadings, calibration: Parameters) -> GlobalFit:
     """Mass moments, offsets and, where there is a load, its point, with gains and position sensors known."""
     unknown = {"beta", "offset"} | ({"rho"} if any(rows.masses) else set())
     return identify_global(
@@ -125,7 +126,7 @@ def _parameters(record: CalibrationRecord) -> Parameters:
     )
 
 
-def _require_scale(names: tuple[str, ...], lost: Flags) -> None:
+def _require_scale(names: tuple[str, ...], lost: Mask) -> None:
     """Raise Refused where no joint's gain is known: then mass moments are known up to a factor only."""
     if lost.all():
         raise Refused(

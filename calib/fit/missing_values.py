@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from calib.fit.rows import FitRows
+from calib.fit.sweep_readings import SweepReadings
 from calib.records.records import PARAMETERS, Parameter
 from gcomp.identify.global_fit import GlobalFit
 
@@ -10,7 +10,7 @@ WORDY = 6
 """Parameters that a reason names one by one."""
 
 
-def reasons_of(fit: GlobalFit, rows: FitRows) -> dict[tuple[str, Parameter], str]:
+def reasons_of(fit: GlobalFit, rows: SweepReadings) -> dict[tuple[str, Parameter], str]:
     """Why each parameter without a value has none."""
     reasons: dict[tuple[str, Parameter], str] = {}
     lost = {name: found for name, found in zip(fit.names, fit.identifiable, strict=True) if not found}
@@ -22,7 +22,7 @@ def reasons_of(fit: GlobalFit, rows: FitRows) -> dict[tuple[str, Parameter], str
     return reasons
 
 
-def _reason(name: str, fit: GlobalFit, rows: FitRows) -> str:
+def _reason(name: str, fit: GlobalFit, rows: SweepReadings) -> str:
     if name in fit.hopeless:
         spread = float(np.sqrt(fit.covariance_of(name)[0, 0]))
         return f"these sweeps would give it to ± {2 * spread:.2g} only: gravity hardly acts on it in these poses"

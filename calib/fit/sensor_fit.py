@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy import stats
 
 from armlink.arm_file import ArmFile
@@ -13,14 +12,14 @@ from calib.arm.sweep_section import sweep_section
 from calib.fit.examination import Goodness, examine
 from calib.fit.findings import Finding
 from calib.fit.missing_values import reasons_of
-from calib.fit.rows import FitRows, fit_rows
+from calib.fit.sweep_readings import SweepReadings, sweep_readings
 from calib.records.records import PARAMETERS, CalibrationRecord, JointCalibration, Parameter, matrix, provenance
 from calib.sweep.dataset import SweepData
+from gcomp.arrays import Array
 from gcomp.identify.global_fit import GlobalFit, identify_global
 from gcomp.identify.parameters import Prior
 from gcomp.identify.sensor_model import predict
 
-Array = npt.NDArray[np.float64]
 WIDE = 0.005
 """Half width of a gain's 95 % interval, as a share of it, from which the user is told."""
 COMMON = (
@@ -36,7 +35,7 @@ class SensorFit:
 
     names: tuple[str, ...]
     fit: GlobalFit
-    rows: FitRows
+    rows: SweepReadings
     noise_factor: Array
     """Scatter of the readings over what their samples' noise explains (n,); at least 1."""
     hysteresis: Array
@@ -160,7 +159,7 @@ def fit_sensors(arm: ArmFile, data: Sequence[SweepData]) -> SensorFit:
     (`sweep.position_offset_std`), mass moments β and the load point ρ; theory.md section 7. Raises BadInput on data
     that cannot be fitted, Refused on data of another arm.
     """
-    rows = fit_rows([each.require(arm) for each in data])
+    rows = sweep_readings([each.require(arm) for each in data])
     good = _fit(arm, rows)
     fit = good.refined.fit
     loaded = any(rows.masses)
@@ -179,7 +178,7 @@ def fit_sensors(arm: ArmFile, data: Sequence[SweepData]) -> SensorFit:
     )
 
 
-def _fit(arm: ArmFile, rows: FitRows, **extra: Prior) -> Goodness:
+def _fit(arm: ArmFile, rows: SweepReadings, **extra: Prior) -> Goodness:
     """The global fit, then refined and examined."""
     described, section = gcomp_arm(arm), sweep_section(arm)
     unknown = {"gain", "offset", "position_gain", "beta"}
@@ -192,27 +191,25 @@ def _fit(arm: ArmFile, rows: FitRows, **extra: Prior) -> Goodness:
         if section.known_point is not None:
             priors["rho"] = section.known_point
     fit = identify_global(described, rows.readings, unknown=unknown, priors=priors, position_sigma=rows.position_sigma)
-    rated = np.array([joint.rated_torque for joint in arm.require_link().joints])
-    return examine(described, rows, fit, priors, rated)
+    return examine(described, rows, fit, priors, arm.require_link().rated_torques)
 
 
-def _modelled(arm: ArmFile, fit: GlobalFit, rows: FitRows) -> Array:
+def _modelled(arm: ArmFile, fit: GlobalFit, rows: SweepReadings) -> Array:
     """Torque readings (K, n) by the fitted sensors and moments alone [N·m]."""
     return predict(gcomp_arm(arm), fit.complete, rows.readings)
 
 
-def _friction(fit: GlobalFit, rows: FitRows) -> Array:
+def _friction(fit: GlobalFit, rows: SweepReadings) -> Array:
     """Half difference (n,) between the directions of motor torque less sensor torque [N·m]."""
     gain = np.where(np.abs(fit.complete.gain) > 1e-6, fit.complete.gain, 1.0)
     sensed = (rows.readings.torque - fit.complete.offset) / gain
     return _half_difference(rows.motor_torque - sensed, rows)
 
 
-def _half_difference(values: Array, rows: FitRows) -> Array:
+def _half_difference(values: Array, rows: SweepReadings) -> Array:
     """Half the mean difference (n,) between upward and downward approach of each swept joint's own values (K, n)."""
-    own = np.where(rows.own, values, np.nan)
-    up, down = own[rows.direction > 0], own[rows.direction < 0]
-    return np.array([_mean(up[:, j]) - _mean(down[:, j]) for j in range(own.shape[1])]) / 2
+    own, side = np.where(rows.own, values, np.nan), rows.readings.direction
+    return np.array([_mean(own[side[:, j] > 0, j]) - _mean(own[side[:, j] < 0, j]) for j in range(own.shape[1])]) / 2
 
 
 def _mean(values: Array) -> float:
@@ -220,7 +217,7 @@ def _mean(values: Array) -> float:
     return float(kept.mean()) if len(kept) else float("nan")
 
 
-def _gain_ratio(arm: ArmFile, rows: FitRows) -> Array:
+def _gain_ratio(arm: ArmFile, rows: SweepReadings) -> Array:
     """Gains as multiples of the last joint's (n,), from data without a reference mass."""
     n = len(arm.joint_names)
     std = np.full(n, np.inf)

@@ -1,20 +1,18 @@
-"""Effects that the sensor model does not have, as columns: which of them the residuals of a fit ask for."""
+"""Effects of the catalogue that the sensor model does not have: which of them the residuals of a fit show."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy import stats
 
 from calib.fit.refinement import Extra, Refined
-from calib.fit.rows import FitRows
+from calib.fit.sweep_readings import SweepReadings
 from gcomp.arm.arm import Arm
-from gcomp.identify.readings import Readings
+from gcomp.arrays import Array, Mask
+from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict, predict_and_jacobian
 
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 CHANCE = 1e-7
 """Probability of an F ratio at which an effect is held for real: some fifty are tried on each fit."""
 MATERIAL = 0.0005
@@ -33,16 +31,19 @@ PATH = 12
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """An effect found: its columns, in the kind's own units, and what it explains."""
+    """An effect found: its columns, in the effect's own units, and its significance."""
 
     joint: int
-    kind: str
+    id: str
+    """In `armlink.effect_catalogue`."""
     extras: tuple[Extra, ...]
     p_value: float
     knee: float = np.nan
     """Torque at which a sensor begins to saturate [N·m]."""
     doubt: Array | None = None
-    """What the columns leave open of each reading of the joint (K,), as a share of the effect's size."""
+    """Standard deviation that the columns leave at each reading of the joint (K,), as a share of the effect's size."""
+    each_sweep: bool = False
+    """Whether a hysteresis has its own size in each sweep (side of approach) instead of one width."""
 
 
 def size_of(coefficients: Array) -> float:
@@ -50,7 +51,7 @@ def size_of(coefficients: Array) -> float:
     return float(np.sqrt(np.mean(coefficients**2)))
 
 
-def strongest(arm: Arm, rows: FitRows, kept: Flags, refined: Refined, rated: Array) -> Effect | None:
+def strongest(kinematics: Arm, rows: SweepReadings, kept: Mask, refined: Refined, rated: Array) -> Effect | None:
     """The effect that explains most beyond chance of what `refined` left over, None where there is no material one.
 
     rated (n,) [N·m]; kept (K, n) are the readings that `refined` was made from, outliers left out.
@@ -58,8 +59,8 @@ def strongest(arm: Arm, rows: FitRows, kept: Flags, refined: Refined, rated: Arr
     counted = rows.readings.counted & kept
     linear, best, most = refined.linear, None, 0.0
     count = len(linear.row)
-    squares = np.bincount(linear.joint, linear.residual[:count] ** 2, minlength=arm.n)
-    for effect in _candidates(arm, rows, refined):
+    squares = np.bincount(linear.joint, linear.residual[:count] ** 2, minlength=kinematics.n)
+    for effect in _candidates(kinematics, rows, refined):
         columns = np.column_stack([extra.column[counted] for extra in effect.extras]) / linear.sigma[:, None]
         if not np.abs(columns).max(initial=0.0) > 0:
             continue
@@ -86,69 +87,78 @@ def strongest(arm: Arm, rows: FitRows, kept: Flags, refined: Refined, rated: Arr
     return best
 
 
-def _candidates(arm: Arm, rows: FitRows, refined: Refined) -> Iterator[Effect]:
+def _candidates(kinematics: Arm, rows: SweepReadings, refined: Refined) -> Iterator[Effect]:
     """Every effect that is tried, a joint at a time."""
     complete, readings = refined.fit.complete, rows.readings
     counted = readings.counted
-    _, _, flat = predict_and_jacobian(arm, complete, readings)
-    slope = np.zeros((*counted.shape, arm.n))
+    _, _, flat = predict_and_jacobian(kinematics, complete, readings)
+    slope = np.zeros((*counted.shape, kinematics.n))
     slope[counted] = flat
-    torque = predict(arm, complete, readings) - complete.offset
-    for joint in range(arm.n):
+    torque = predict(kinematics, complete, readings) - complete.offset
+    for joint in range(kinematics.n):
         here = counted[:, joint]
         if here.sum() < FEWEST:
             continue
         angle, own = readings.position[:, joint], torque[:, joint]
-        yield _one(arm.n, joint, "spring", here * angle)
+        yield _one(kinematics.n, joint, "transmission.spring", here * angle)
         doubt = _lag_doubt(rows, joint)
         sides = [here * side for side in _sides(rows, joint)]
         if sides:
-            columns = tuple(_one(arm.n, joint, "direction", side).extras[0] for side in sides)
-            yield Effect(joint, "direction", columns, 1.0, doubt=doubt)
-        yield replace(_one(arm.n, joint, "hysteresis", here * lag(arm, rows, refined, joint)), doubt=doubt)
+            columns = tuple(_one(kinematics.n, joint, "torque.hysteresis", side).extras[0] for side in sides)
+            yield Effect(joint, "torque.hysteresis", columns, 1.0, doubt=doubt, each_sweep=True)
+        yield replace(
+            _one(kinematics.n, joint, "torque.hysteresis", here * lag(kinematics, rows, refined, joint)), doubt=doubt
+        )
         largest = float(np.abs(own[here]).max())
-        yield _one(arm.n, joint, "nonlinear", here * own * np.abs(own) / max(largest, 1e-9))
+        yield _one(kinematics.n, joint, "torque.nonlinearity", here * own * np.abs(own) / max(largest, 1e-9))
         for share in KNEES:
             bent = np.where(here, np.sign(own) * np.maximum(np.abs(own) - share * largest, 0.0), 0.0)
             if np.count_nonzero(bent) >= FEWEST // 2:
-                yield _one(arm.n, joint, "saturation", bent, share * largest / max(abs(complete.gain[joint]), 1e-9))
-        yield _one(arm.n, joint, "drift", here * (rows.time - rows.time.mean()))
+                yield _one(
+                    kinematics.n,
+                    joint,
+                    "torque.saturation",
+                    bent,
+                    share * largest / max(abs(complete.gain[joint]), 1e-9),
+                )
+        yield _one(kinematics.n, joint, "torque.drift", here * (rows.time - rows.time.mean()))
         if float(np.ptp(angle[here])) > TURN:
             turn = (slope[..., joint] * np.sin(angle)[:, None], slope[..., joint] * np.cos(angle)[:, None])
-            yield Effect(joint, "eccentricity", tuple(Extra(joint, "eccentricity", each) for each in turn), 1.0)
+            extras = tuple(Extra(joint, "position.eccentricity", each) for each in turn)
+            yield Effect(joint, "position.eccentricity", extras, 1.0)
 
 
-def _one(n: int, joint: int, kind: str, values: Array, knee: float = np.nan) -> Effect:
+def _one(n: int, joint: int, effect_id: str, values: Array, knee: float = np.nan) -> Effect:
     """An effect that shows in one joint's sensor alone, `values` (K,)."""
     column = np.zeros((len(values), n))
     column[:, joint] = values
-    return Effect(joint, kind, (Extra(joint, kind, column),), 1.0, knee)
+    return Effect(joint, effect_id, (Extra(joint, effect_id, column),), 1.0, knee)
 
 
-def _sides(rows: FitRows, joint: int) -> Iterator[Array]:
+def _sides(rows: SweepReadings, joint: int) -> Iterator[Array]:
     """Side of approach (K,) in each sweep of a joint that has both, 0 elsewhere.
 
     How far a sensor lags depends on how far the torque swung on the way, braking included: each sweep has its own.
     """
-    names = np.array(rows.sweep)
-    for name in dict.fromkeys(names[rows.swept == joint]):
-        side = np.where((names == name) & (rows.swept == joint), rows.direction, 0)
-        if {-1, 1} <= set(side.tolist()):
-            yield side.astype(np.float64)
+    series, swept = rows.readings.series, rows.swept == joint
+    for sweep in dict.fromkeys(series[swept].tolist()):
+        side = np.where((series == sweep) & swept, rows.readings.direction[:, joint], 0.0)
+        if {-1.0, 1.0} <= set(side.tolist()):
+            yield side
 
 
-def _lag_doubt(rows: FitRows, joint: int) -> Array:
+def _lag_doubt(rows: SweepReadings, joint: int) -> Array:
     """How badly a lag is known (K,), as a share of its size.
 
     Along the joint's own sweep it hardly varies. Where the joint only holds it may stand anywhere between both ends,
     and stays there while another is swept, so that those readings together count as one.
     """
-    _, sweep, together = np.unique(rows.sweep, return_inverse=True, return_counts=True)
-    held: Array = HELD_DOUBT * np.sqrt(np.where(rows.swept < 0, 1, together[sweep]))
+    together = np.bincount(rows.readings.series)[rows.readings.series]
+    held: Array = HELD_DOUBT * np.sqrt(np.where(rows.swept < 0, 1, together))
     return np.where(rows.swept == joint, OWN_DOUBT, held)
 
 
-def lag(arm: Arm, rows: FitRows, refined: Refined, joint: int) -> Array:
+def lag(kinematics: Arm, rows: SweepReadings, refined: Refined, joint: int) -> Array:
     """Where in its play (K,), -1 to 1, a joint's torque sensor stands at each reading, the way to it being straight.
 
     The play is as wide as the residuals say (half their robust range), so that small changes of torque leave it where
@@ -158,8 +168,10 @@ def lag(arm: Arm, rows: FitRows, refined: Refined, joint: int) -> Array:
     shares = np.linspace(0, 1, PATH + 1)[1:]
     way = position[:-1, None] + shares[:, None] * (position[1:] - position[:-1])[:, None]
     way = np.concatenate([np.repeat(position[:1, None], PATH, axis=1), way])
-    flat = Readings.of(way.reshape(-1, arm.n), np.zeros((len(position) * PATH, arm.n)), 1.0, np.repeat(load, PATH))
-    torque = predict(arm, refined.fit.complete, flat)[:, joint].reshape(-1, PATH)
+    flat = StaticReadings.of(
+        way.reshape(-1, kinematics.n), np.zeros((len(position) * PATH, kinematics.n)), 1.0, np.repeat(load, PATH)
+    )
+    torque = predict(kinematics, refined.fit.complete, flat)[:, joint].reshape(-1, PATH)
     residual = refined.fit.residual[:, joint]
     width = max(float(np.nanmedian(np.abs(residual))) * 1.5, 1e-9)
     held, place = float(torque[0, 0]), np.zeros(len(position))

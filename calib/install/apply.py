@@ -10,7 +10,6 @@ from armlink.errors import BadInput, Refused
 from armlink.link.link import Link
 from calib.field.field_fit import FieldFit
 from calib.field.field_record import check_field_heldout
-from calib.field.rows import FieldRows
 from calib.fit.sensor_fit import SensorFit
 from calib.install.check_motion import CheckMotion
 from calib.install.journaled_write import install, mend
@@ -18,6 +17,7 @@ from calib.install.plausibility import check_bounds, check_change, check_gates, 
 from calib.records.records import Array, CalibrationRecord
 from calib.records.store import RecordStore
 from calib.sweep.dataset import SweepData
+from gcomp.identify.readings import StaticReadings
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def apply_field(
     record: CalibrationRecord,
     arm: ArmFile,
     store: RecordStore,
-    rows: FieldRows,
+    rows: StaticReadings,
     fit: FieldFit,
     beta: Array,
     how: Apply,

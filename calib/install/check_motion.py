@@ -5,8 +5,6 @@ where it was. Two things are judged: whether every controller now sends what its
 and, where there is a gravity model, whether readings fit it worse than before.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from armlink.arm_file import ArmFile
@@ -17,6 +15,7 @@ from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.motion.mover import Mover, Stalled
+from calib.motion.static_reading import StaticReading, stack
 from calib.records.records import Array, CalibrationRecord
 from gcomp.gravity.torque import gravity_torque
 
@@ -36,16 +35,6 @@ WORSE = 1.1
 """RMS against the model afterwards over before from which on it is worse, beside the floor."""
 
 
-@dataclass(frozen=True, eq=False)
-class CheckRows:
-    """Readings at P rests, as the controllers send them."""
-
-    position: Array
-    """(P, n) [rad]"""
-    torque: Array
-    """(P, n) [N·m]"""
-
-
 class CheckMotion:
     """The same small motion before and after a write; the link must have been enabled."""
 
@@ -54,7 +43,7 @@ class CheckMotion:
         self._link, self._arm, self._record, self._beta = link, arm, record, beta
         self._limits, self._names = Limits.of(arm), arm.joint_names
         self._installed: list[Calibration] = []
-        self._before: CheckRows | None = None
+        self._before: list[StaticReading] = []
         self._poses: Array = np.empty((0, link.n))
 
     def before(self) -> None:
@@ -66,11 +55,11 @@ class CheckMotion:
 
     def after(self) -> str | None:
         """Make it again: what is worse now, None where nothing is; raises Refused, BusFault."""
-        assert self._before is not None
+        assert self._before
         old = self._installed
         new = [self._link.read_calibration(joint) for joint in range(self._link.n)]
-        rows = self._run(self._mover())
-        return self._not_converted(rows, old, new) or self._fits_worse(rows)
+        readings = self._run(self._mover())
+        return self._not_converted(readings, old, new) or self._fits_worse(readings)
 
     def _mover(self) -> Mover:
         mover = Mover(self._link, sweep_section(self._arm), self._limits)
@@ -78,44 +67,43 @@ class CheckMotion:
         mover.speed = SPEED * self._limits.speed
         return mover
 
-    def _run(self, mover: Mover) -> CheckRows:
-        begin, positions, torques = mover.position.copy(), [], []
+    def _run(self, mover: Mover) -> list[StaticReading]:
+        begin, readings = mover.position.copy(), list[StaticReading]()
         try:
             for pose in self._poses:
                 mover.travel(pose, ACCELERATION)
-                rest = mover.rest(np.ones(self._link.n, dtype=bool))
-                positions.append(rest.position)
-                torques.append(rest.torque)
+                readings.append(mover.rest(np.ones(self._link.n, dtype=bool)))
             mover.travel(begin, ACCELERATION)
         except Stalled as error:
             raise Refused(f"check motion: {error}") from None
-        return CheckRows(np.array(positions), np.array(torques))
+        return readings
 
-    def _not_converted(self, rows: CheckRows, old: list[Calibration], new: list[Calibration]) -> str | None:
+    def _not_converted(
+        self, readings: list[StaticReading], old: list[Calibration], new: list[Calibration]
+    ) -> str | None:
         """Whether some controller does not send what its new pair makes of the old reading."""
-        assert self._before is not None
+        before, after = stack(self._before, "torque"), stack(readings, "torque")
         for j, name in enumerate(self._names):
-            expected = (self._before.torque[:, j] * old[j].gain + old[j].offset - new[j].offset) / new[j].gain
-            away = float(np.mean(rows.torque[:, j] - expected))
+            expected = (before[:, j] * old[j].gain + old[j].offset - new[j].offset) / new[j].gain
+            away = float(np.mean(after[:, j] - expected))
             if abs(away) > FLOOR * self._limits.rated[j]:
                 return f"{name}: sends {away:+.3f} N·m more than its new pair makes of the same readings"
         return None
 
-    def _fits_worse(self, rows: CheckRows) -> str | None:
+    def _fits_worse(self, readings: list[StaticReading]) -> str | None:
         if self._beta is None:
             return None
-        assert self._before is not None
-        before, after = self._rms(self._before, self._beta), self._rms(rows, self._beta)
+        before, after = self._rms(self._before, self._beta), self._rms(readings, self._beta)
         worse = (after > WORSE * before) & (after - before > FLOOR * self._limits.rated)
         if not worse.any():
             return None
         j = int(np.argmax(np.where(worse, after - before, -np.inf)))
         return f"{self._names[j]}: in the check motion {after[j]:.3f} N·m RMS against the model, {before[j]:.3f} before"
 
-    def _rms(self, rows: CheckRows, beta: Array) -> Array:
+    def _rms(self, readings: list[StaticReading], beta: Array) -> Array:
         record = self._record
-        q = rows.position * record.values("position_gain", 1.0) + record.values("position_offset", 0.0)
-        residual: Array = rows.torque - gravity_torque(gcomp_arm(self._arm), beta, q)
+        q = stack(readings, "position") * record.values("position_gain", 1.0) + record.values("position_offset", 0.0)
+        residual: Array = stack(readings, "torque") - gravity_torque(gcomp_arm(self._arm), beta, q)
         rms: Array = np.sqrt(np.mean(residual**2, axis=0))
         return rms
 

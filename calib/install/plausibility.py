@@ -10,14 +10,14 @@ from armlink.errors import Refused
 from armlink.link.torque_sensor_record import GAIN_RANGE
 from calib.arm.kinematics import gcomp_arm
 from calib.fit.findings import Finding
-from calib.fit.rows import FitRows, fit_rows
+from calib.fit.sweep_readings import SweepReadings, sweep_readings
 from calib.records.records import Array, CalibrationRecord, GravityRecord, Parameter
 from calib.records.store import RecordStore
 from calib.sweep.dataset import SweepData
 from gcomp.errors import GcompError
 from gcomp.identify.global_fit import identify_global
 from gcomp.identify.parameters import Parameters, Prior
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict
 
 LARGEST_OFFSET = 0.5
@@ -141,7 +141,7 @@ def check_heldout(
     are held, and the mass moments of `gravity` with them; without it those are estimated too. Both predict the steps
     left out; then the other half is left out.
     """
-    rows = fit_rows([each.require(arm) for each in data])
+    rows = sweep_readings([each.require(arm) for each in data])
     fresh = heldout_scores(new, arm, rows, refit=True)
     beta = None if gravity is None else np.array(gravity.require(arm).beta)
     stale = heldout_scores(old, arm, rows, refit=False, beta=beta)
@@ -166,7 +166,7 @@ def worse_by(new: Array, old: Array) -> float | None:
 
 
 def heldout_scores(
-    record: CalibrationRecord, arm: ArmFile, rows: FitRows, refit: bool, beta: Array | None = None
+    record: CalibrationRecord, arm: ArmFile, rows: SweepReadings, refit: bool, beta: Array | None = None
 ) -> Array:
     """Prediction errors (K, n) of steps that were left out, over their standard deviation; NaN where none counts.
 
@@ -194,16 +194,16 @@ def heldout_scores(
                 complete = identify_global(described, kept, unknown=unknown, start=start, priors=priors).complete
         except GcompError:
             continue
-        held: Readings = rows.readings.rows(fold == left_out)
+        held: StaticReadings = rows.readings.rows(fold == left_out)
         score[fold == left_out] = (held.torque - predict(described, complete, held)) / held.sigma
     return score
 
 
-def _folds(rows: FitRows) -> npt.NDArray[np.int64]:
+def _folds(rows: SweepReadings) -> npt.NDArray[np.int64]:
     """0 or 1 for every row: the steps of each sweep alternate, both directions of one step together."""
-    fold = np.zeros(len(rows.sweep), dtype=np.int64)
-    for name in set(rows.sweep):
-        here = np.array([each == name for each in rows.sweep])
+    fold = np.zeros(len(rows.readings), dtype=np.int64)
+    for sweep in range(len(rows.sweeps)):
+        here = rows.readings.series == sweep
         joint = int(rows.swept[here][0])
         if joint < 0:
             fold[here] = np.arange(here.sum()) % 2

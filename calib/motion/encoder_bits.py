@@ -4,9 +4,9 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from gcomp.arrays import Array
+
 FEWEST = 8
 """Distinct positions from which a bit can be judged."""
 CHANCE = 1e-4

@@ -14,7 +14,7 @@ from calib.arm.drive_limits import Limits
 from calib.arm.sweep_section import SweepSection
 from calib.motion.encoder_check import EncoderCheck
 from calib.motion.settle_rule import SettleRule
-from calib.motion.static_reading import Rest, average, stack
+from calib.motion.static_reading import StaticReading, average, stack
 from calib.motion.trajectory import trajectory
 
 Array = npt.NDArray[np.float64]
@@ -233,7 +233,7 @@ class Mover:
         limit = float(self.limits.upper[joint] if side > 0 else self.limits.lower[joint])
         return limit - side * (gap + 0.02 * abs(limit))
 
-    def rest(self, counts: Flags) -> Rest:
+    def rest(self, counts: Flags) -> StaticReading:
         """Wait until all has settled and the torque averages that `counts` (n,) are exact enough; raises Slipped."""
         rule, samples, resolution = self.rule, list[Sample](), self.known_resolution
         window, timeout = rule.window * self.link.period, rule.timeout * self.link.period

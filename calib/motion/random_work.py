@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.motion.trajectory import trajectory
-from calib.records.records import Array
+from gcomp.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -3,12 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from calib.arm.sweep_section import SweepSection
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
+from gcomp.arrays import Array, Mask
 
 DRIFT = 2.5
 """Standard errors by which the means of the window's halves may differ."""
@@ -44,7 +41,7 @@ class SettleRule:
             standard_error=standard_error,
         )
 
-    def settled(self, position: Array, torque: Array, counts: Flags, resolution: Array) -> bool:
+    def settled(self, position: Array, torque: Array, counts: Mask, resolution: Array) -> bool:
         """Whether nothing moves any more: position and torque (W, n) of the last window.
 
         A joint moves if its position covers more than twice `span` and more than one step of its sensor (an overshoot
@@ -63,7 +60,7 @@ class SettleRule:
         steady = drift**2 <= DRIFT**2 * np.maximum(step, self.standard_error**2) * 4 / len(torque)
         return bool(np.all((spread <= allowed) & steady | ~counts))
 
-    def exact(self, torque: Array, counts: Flags) -> bool:
+    def exact(self, torque: Array, counts: Mask) -> bool:
         """Whether the mean of the torque samples (K, n) is as exact as asked for, in every joint that `counts`."""
         error = np.nanstd(torque, axis=0, ddof=1) / np.sqrt(len(torque))
         return bool(np.all((error <= self.standard_error) | ~counts))

@@ -1,46 +1,127 @@
-"""Averages over the samples of a static reading."""
+"""One static reading: averages over samples taken while an arm stands still, and several of them as a batch."""
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
+from pydantic import ConfigDict, Field, GetCoreSchemaHandler
+from pydantic_core import CoreSchema, core_schema
 
 from armlink.link.types import Sample
+from gcomp.arrays import Array, Mask
+from gcomp.identify.readings import StaticReadings
 
-Array = npt.NDArray[np.float64]
+
+@dataclass(frozen=True)
+class _Json:
+    """How pydantic reads and writes an array: as JSON of type `kind`, made by `write`."""
+
+    kind: Any
+    write: Callable[[Any], Any] = np.ndarray.tolist
+
+    def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        schema = handler.generate_schema(self.kind)
+        writer = core_schema.plain_serializer_function_ser_schema(self.write, return_schema=schema)
+        return core_schema.no_info_after_validator_function(np.array, schema, serialization=writer)
 
 
-@dataclass(frozen=True, eq=False)
-class Rest:
-    """Averages over the samples of one static reading, (n,) each."""
+def _swept_side(direction: Array) -> int:
+    """Direction of the one joint that was swept; 0 if none was."""
+    return int(direction.sum())
 
+
+Vector = Annotated[Array, _Json(list[float])]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StaticReading:
+    """Averages of one static reading of n joints; also a line of a sweep data set, with the keys in this order."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+
+    kind: Literal["reading"] = "reading"
+    """Marks the line in a data set."""
+    sweep: str
+    """Name of the sweep, or "scout"; empty outside of sweeps."""
+    index: int
+    """Number of the reading within its sweep."""
+    joint: int | None
+    """Index of the swept joint; None if no joint was swept alone."""
+    direction: Annotated[Array, _Json(Literal[-1, 0, 1], _swept_side)]
+    """Sign of each joint's last motion (n,); 0 if unknown. A data set keeps the swept joint's alone, as one number."""
     t: float
+    """Time on the clock of its samples [s]: of the last one in a sweep, of the middle of the average elsewhere."""
     count: int
+    """Samples averaged."""
     settled: bool
-    position: Array
-    position_std: Array
-    torque: Array
-    torque_std: Array
-    motor_torque: Array
+    """False if the settle rule ran out of time."""
+    servo: Annotated[Mask, _Json(list[bool])]
+    """Joints held by their position loop (n,): their torque sensors read gravity, as the swept joint's does."""
+    position: Vector
+    """Mean position reading (n,) [rad]."""
+    position_std: Vector
+    torque: Vector
+    """Mean torque sensor reading (n,) [N·m]."""
+    torque_std: Vector
+    """Standard deviation of one sample (n,) [N·m]."""
+    motor_torque: Vector
+    """Mean of the drives' own torque estimate (n,) [N·m]; NaN if a drive reports none."""
+    torque_error: Annotated[Vector, Field(exclude=True)] = field(default_factory=lambda: np.array(np.nan))
+    """Standard error of the mean torque (n,) as the halves of the average show it [N·m]; NaN if not judged so."""
+
+    def __post_init__(self) -> None:
+        if np.ndim(self.direction) == 0:
+            moved = np.arange(len(self.position)) == (-1 if self.joint is None else self.joint)
+            object.__setattr__(self, "direction", np.where(moved, self.direction, 0.0))
+
+    @classmethod
+    def of(
+        cls, t: float, position: Array, torque: Array, direction: Array | None = None, **known: Any
+    ) -> "StaticReading":
+        """A reading outside of any sweep, every sensor counted; statistics that are not `known` are NaN."""
+        n = len(position)
+        nothing = {name: np.full(n, np.nan) for name in ("position_std", "torque_std", "motor_torque", "torque_error")}
+        held = {"sweep": "", "index": 0, "joint": None, "count": 1, "settled": True, "servo": np.ones(n, dtype=bool)}
+        sides = np.zeros(n) if direction is None else direction
+        return cls(**{**held, **nothing, **known}, t=t, position=position, torque=torque, direction=sides)
+
+    def within(self, sweep: str, index: int, servo: Mask, joint: int | None = None, direction: int = 0) -> Self:
+        """The same as reading `index` of a sweep of `joint`, approached in `direction`, `servo` (n,) joints held."""
+        return replace(self, sweep=sweep, index=index, servo=servo, joint=joint, direction=np.array(direction))
+
+    @property
+    def counted(self) -> Mask:
+        """Joints whose torque sensor reads gravity (n,)."""
+        swept = np.arange(len(self.position)) == (-1 if self.joint is None else self.joint)
+        return np.asarray(self.servo | swept, dtype=bool)
 
 
-def stack(samples: list[Sample], channel: str) -> Array:
-    """One channel of samples (K, n)."""
-    return np.array([getattr(sample, channel) for sample in samples])
+def stack(each: Sequence[Sample] | Sequence[StaticReading], channel: str) -> Array:
+    """One channel of samples or readings (K, n)."""
+    return np.array([getattr(one, channel) for one in each])
 
 
-def average(samples: list[Sample], settled: bool) -> Rest:
-    """Averages of samples; missing readings are left out."""
+def batch(readings: Sequence[StaticReading], sigma: ArrayLike) -> StaticReadings:
+    """Readings as a batch; `sigma` (K, n), (n,) or a number is the standard deviation of a torque [N·m]."""
+    torque = np.where(stack(readings, "counted"), stack(readings, "torque"), np.nan)
+    made = StaticReadings.of(stack(readings, "position"), torque, sigma)
+    return replace(made, direction=stack(readings, "direction"))
+
+
+def average(samples: Sequence[Sample], settled: bool) -> StaticReading:
+    """Averages of samples; missing values are left out."""
     position, torque, motor = (stack(samples, name) for name in ("position", "torque", "motor_torque"))
     reported = np.isfinite(motor).sum(axis=0)
     mean = np.nansum(motor, axis=0) / np.maximum(reported, 1)
-    return Rest(
-        t=samples[-1].t,
+    return StaticReading.of(
+        samples[-1].t,
+        np.nanmean(position, axis=0),
+        np.nanmean(torque, axis=0),
         count=int(np.isfinite(torque).all(axis=1).sum()),
         settled=settled,
-        position=np.nanmean(position, axis=0),
         position_std=np.nanstd(position, axis=0),
-        torque=np.nanmean(torque, axis=0),
         torque_std=np.nanstd(torque, axis=0, ddof=1),
         motor_torque=np.where(reported > 0, mean, np.nan),
     )

@@ -1,9 +1,8 @@
 """Trajectories between two poses: synchronous, within speed and acceleration limits, with rounded acceleration."""
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from gcomp.arrays import Array
 
 ROUNDING = 0.06
 """Time over which steps in acceleration are spread [s]."""

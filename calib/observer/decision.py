@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.motion.static_reading import StaticReading
 from calib.observer.cause_test import CauseTest, Verdict
 from calib.observer.config import ObserverConfig
-from calib.observer.rest_detector import Row
 from calib.records.records import Array
 
 
@@ -38,7 +38,7 @@ class Finding:
 class Agreeing:
     """Rows that agree on a drift of these joints."""
 
-    rows: list[Row]
+    rows: list[StaticReading]
     test: CauseTest
     joints: frozenset[int]
 

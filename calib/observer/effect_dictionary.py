@@ -1,16 +1,28 @@
-"""The dictionary of effects that the cause test fits: what each adds to the torque readings (theory.md section 6)."""
+"""The dictionary of effects that the cause test fits, as columns of the torque readings (docs/theory.md, section 6)."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.observer.rest_detector import Row
+from calib.motion.static_reading import StaticReading
 from calib.records.records import Array
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.gravity.torque import gravity_regressor, gravity_stiffness
 
+CAUSES = {
+    "gain": ("torque.gain",),
+    "offset": ("torque.offset",),
+    "drift": ("torque.gain", "torque.offset"),
+    "friction": ("friction.coulomb",),
+    "spring": ("transmission.spring", "torque.offset"),
+    "slip": ("position.offset",),
+    "payload": ("link.payload",),
+    "tilt": ("base.tilt",),
+    "scale": ("torque.gain",),
+}
+"""Effects (`armlink.effect_catalogue`) that a cause consists of; a spring's rest angle acts as an offset."""
 DRIFT = ("gain", "offset", "drift")
 
 
@@ -23,7 +35,7 @@ class Window:
     direction: Array
 
     @classmethod
-    def of(cls, rows: list[Row]) -> "Window":
+    def of(cls, rows: list[StaticReading]) -> "Window":
         """From K rows whose positions are true angles."""
         columns = ([getattr(row, name) for row in rows] for name in ("position", "torque", "direction"))
         return cls(*map(np.array, columns))
@@ -34,15 +46,17 @@ class Entry:
     """One effect of the dictionary."""
 
     cause: str
-    """gain, offset, drift (both), friction, spring, slip, payload, tilt or scale."""
+    """A key of CAUSES."""
     joint: int | None
     """Index of the joint, None where it concerns the arm."""
     columns: Array
-    """What a unit of each parameter adds to the torque readings, (K·n, p)."""
-    contains: tuple[str, ...] = ()
-    """Causes of the same joint that are special cases of this one."""
+    """Change of the torque readings per unit of each parameter, (K·n, p)."""
     price: int | None = None
     """Parameters that it is charged for in the BIC; by default those that it has."""
+
+    def contains(self, other: "Entry") -> bool:
+        """Whether the other is a special case of this one: fewer of its effects, at the same joint."""
+        return self.joint == other.joint and set(CAUSES[other.cause]) < set(CAUSES[self.cause])
 
 
 def dictionary(arm: Arm, beta: Array, window: Window) -> Iterator[Entry]:
@@ -61,9 +75,9 @@ def dictionary(arm: Arm, beta: Array, window: Window) -> Iterator[Entry]:
     for j in range(n):
         yield Entry("gain", j, row_of(j, torque[:, j]))
         yield Entry("offset", j, row_of(j, one))
-        yield Entry("drift", j, row_of(j, torque[:, j], one), contains=("gain", "offset"))
+        yield Entry("drift", j, row_of(j, torque[:, j], one))
         yield Entry("friction", j, row_of(j, window.direction[:, j]))
-        yield Entry("spring", j, row_of(j, q[:, j] - middle[j], one), contains=("offset",))
+        yield Entry("spring", j, row_of(j, q[:, j] - middle[j], one))
     stiffness = gravity_stiffness(arm, beta, q)
     for j in range(n):
         yield Entry("slip", j, stiffness[:, :, j].reshape(-1, 1))
@@ -77,11 +91,11 @@ def dictionary(arm: Arm, beta: Array, window: Window) -> Iterator[Entry]:
 
 
 def class_of(entry: Entry) -> str:
-    """What an entry counts as when verdicts compete: gain, offset and both of one joint are one class."""
+    """Class of an entry in the comparison of verdicts: gain, offset and both of one joint are one class."""
     cause = "drift" if entry.cause in DRIFT else entry.cause
     return cause if entry.joint is None else f"{cause}_{entry.joint + 1}"
 
 
 def kin(entry: Entry, winner: Entry) -> bool:
     """Whether an entry is no rival: same class, or the winner is a special case of it."""
-    return class_of(entry) == class_of(winner) or (entry.joint == winner.joint and winner.cause in entry.contains)
+    return class_of(entry) == class_of(winner) or entry.contains(winner)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.motion.static_reading import StaticReading
 from calib.observer.cause_test import CauseTest, Verdict
 from calib.observer.config import ObserverConfig
 from calib.observer.cusum import Cusum
@@ -17,7 +18,7 @@ from calib.observer.effect_dictionary import Window
 from calib.observer.events import Estimate, Event, verdict_evidence
 from calib.observer.gravity_belief import ModelBelief
 from calib.observer.pose_memory import Places
-from calib.observer.rest_detector import RestDetector, Row
+from calib.observer.rest_detector import RestDetector
 from calib.observer.sensor_filter import SensorFilter
 from calib.records.records import Array, CalibrationRecord, GravityRecord
 from gcomp.arm.arm import Arm
@@ -54,7 +55,7 @@ class Observer:
         self.filter = SensorFilter(arm.n, self.config)
         self.cusum = Cusum(arm.n, self.config)
         self.places = Places(arm.n, self.config.place_size, self.config.places, self.config.place_memory)
-        self.window: list[Row] = []
+        self.window: list[StaticReading] = []
         self.fresh = self.repeated = 0
         self.doubtful = False
         self.first: Agreeing | None = None
@@ -83,14 +84,14 @@ class Observer:
         row = self.rest.handle(t, position, torque)
         return [] if row is None else self.handle_row(row)
 
-    def handle_row(self, row: Row) -> list[Event]:
+    def handle_row(self, row: StaticReading) -> list[Event]:
         """Take one row: what `handle` makes of a stop."""
         self.rows += 1
         angle = self._position_gain * row.position + self._position_offset
         row = replace(row, position=angle)
-        if row.noise is not None:
+        if np.isfinite(row.torque_error).all():
             weight = 1 / min(self.rows + self.config.noise_rows, self.config.noise_memory)
-            self.sigma = np.sqrt((1 - weight) * self.sigma**2 + weight * row.noise**2)
+            self.sigma = np.sqrt((1 - weight) * self.sigma**2 + weight * row.torque_error**2)
         events = [] if self.held else self._watch(row)
         if events:
             self._start_test()
@@ -117,7 +118,7 @@ class Observer:
         self.places.forget()
         self._resume()
 
-    def _watch(self, row: Row) -> list[Event]:
+    def _watch(self, row: StaticReading) -> list[Event]:
         """Filter and change detection; returns alarms."""
         q, noise = row.position, self.sigma**2
         torque = self.belief.torque(q[None])[0]
@@ -182,7 +183,7 @@ class Observer:
         evidence = verdict_evidence(replace(verdict, cause="tool"), self.arm.names)
         return [self._event(t, "verdict", None, **evidence)]
 
-    def _confirm(self, t: float, window: list[Row], test: CauseTest, verdict: Verdict) -> list[Event]:
+    def _confirm(self, t: float, window: list[StaticReading], test: CauseTest, verdict: Verdict) -> list[Event]:
         """A window says drift: once another one before it agrees, decide on the rows of all that agree."""
         first, self.first = self.first, Agreeing(window, test, frozenset(verdict.joints))
         for joint in verdict.joints:
@@ -214,7 +215,7 @@ class Observer:
         evidence = {"gain": finding.gain, "offset": finding.offset, **std, "rows": finding.rows}
         return [replace(self._event(t, "proposal", joint, **evidence), finding=finding)]
 
-    def cause_test(self, rows: list[Row]) -> CauseTest:
+    def cause_test(self, rows: list[StaticReading]) -> CauseTest:
         """The cause test of these rows, by what is believed now."""
         return CauseTest(self.belief, Window.of(rows), self.sigma, self.config)
 
@@ -232,7 +233,7 @@ class Observer:
         self.window, self.fresh, self.repeated = [], 0, 0
         self.carrying = 0
 
-    def _is_new(self, row: Row) -> bool:
+    def _is_new(self, row: StaticReading) -> bool:
         """Whether the window has few enough rows of this place that one more would not only wind it up."""
         away = [np.abs(kept.position - row.position).max() for kept in self.window]
         return sum(bool(far < self.config.place_size) for far in away) < self.config.place_rows

@@ -1,27 +1,10 @@
 """Rest detection: turns samples into rows, one averaged row per stop of the arm."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from calib.motion.static_reading import StaticReading
 from calib.observer.config import ObserverConfig
 from calib.records.records import Array
-
-
-@dataclass(frozen=True)
-class Row:
-    """One stop of the arm."""
-
-    t: float
-    """Middle of the average [s]."""
-    position: Array
-    """Mean position reading (n,) [rad]."""
-    torque: Array
-    """Mean torque reading (n,) [N·m]."""
-    direction: Array
-    """Sign of each joint's last motion (n,): +1, -1, or 0 where it has not moved yet."""
-    noise: Array | None = None
-    """Half the difference of the average's two halves (n,) [N·m]: as large as the average's own error."""
 
 
 class RestDetector:
@@ -37,7 +20,7 @@ class RestDetector:
         self._samples: list[tuple[float, Array, Array]] = []
         self._done = False
 
-    def handle(self, t: float, position: Array, torque: Array) -> Row | None:
+    def handle(self, t: float, position: Array, torque: Array) -> StaticReading | None:
         """Take one sample (SI, (n,) each, NaN where missing); the row of this rest once it is complete, else None."""
         config = self._config
         if np.isnan(position).any() or np.isnan(torque).any():
@@ -62,11 +45,13 @@ class RestDetector:
         away = np.abs(position - self.left).max()
         self._done = self._done and bool(away < self._config.new_pose)
 
-    def _complete(self) -> Row:
+    def _complete(self) -> StaticReading:
         times, positions, torques = (np.array(column) for column in zip(*self._samples, strict=True))
         self._samples.clear()
         half = len(times) // 2
-        noise = (torques[:half].mean(axis=0) - torques[half:].mean(axis=0)) / 2
+        error = np.abs(torques[:half].mean(axis=0) - torques[half:].mean(axis=0)) / 2
         here: Array = positions.mean(axis=0)
         self.left, self._done = here, True
-        return Row(float(times.mean()), here, torques.mean(axis=0), self.direction, noise)
+        return StaticReading.of(
+            float(times.mean()), here, torques.mean(axis=0), self.direction, count=len(times), torque_error=error
+        )

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from calib.motion.static_reading import StaticReading
 from calib.observer.decision import Agreeing
 from calib.observer.observer import Observer
-from calib.observer.rest_detector import Row
 from calib.records.records import Array
 
 SCHEMA = 1
@@ -100,13 +100,13 @@ _SHAPES: dict[str, Callable[[int], tuple[int, ...]]] = {
 }
 
 
-def _row(row: Row) -> list[Any]:
+def _row(row: StaticReading) -> list[Any]:
     return [row.t, row.position.tolist(), row.torque.tolist(), row.direction.tolist()]
 
 
-def _unrow(row: list[Any]) -> Row:
+def _unrow(row: list[Any]) -> StaticReading:
     position, torque, direction = (_vector(values) for values in row[1:4])
-    return Row(float(row[0]), position, torque, direction)
+    return StaticReading.of(float(row[0]), position, torque, direction)
 
 
 def _vector(values: Any) -> Array:

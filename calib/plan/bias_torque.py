@@ -7,9 +7,8 @@ from calib.arm.drive_limits import Limits
 from calib.arm.sweep_section import SweepSection
 from calib.plan.rough_gravity import GravityGuess
 from calib.plan.stop_selection import Candidates
+from gcomp.arrays import Array, Mask
 
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 SLOWEST = 0.3
 """Acceleration that every planned sweep must allow [rad/s²]."""
 FASTEST = 2.0
@@ -37,12 +36,12 @@ def required_bias(
     return np.where(stops == 0, 0.0, needed)
 
 
-def pressable(guess: GravityGuess, section: SweepSection, limits: Limits, candidates: Candidates) -> Flags:
+def pressable(guess: GravityGuess, section: SweepSection, limits: Limits, candidates: Candidates) -> Mask:
     """Which resting joints (C, n) can be pressed on their stop within max_torque; True for the swept joint."""
     needed = required_bias(guess, section, limits, candidates.stops, candidates.poses)
     needed = needed + SLOWEST * reaction_bound(guess, candidates.joint)
     given = limits.max_torque if section.bias_torque is None else np.array(section.bias_torque)
-    flags: Flags = (needed <= np.minimum(given, limits.max_torque)) | (candidates.stops == 0)
+    flags: Mask = (needed <= np.minimum(given, limits.max_torque)) | (candidates.stops == 0)
     return flags
 
 
@@ -54,7 +53,7 @@ def reaction_bound(guess: GravityGuess, joint: int) -> Array:
 
 
 def bias_and_acceleration(
-    needed: Array, spare: Array, reaction: Array, pressed: Flags, section: SweepSection, limits: Limits, joint: int
+    needed: Array, spare: Array, reaction: Array, pressed: Mask, section: SweepSection, limits: Limits, joint: int
 ) -> tuple[Array, float]:
     """(Bias size (n,) [N·m], acceleration [rad/s²]): as fast as every joint's torque allows.
 
@@ -75,6 +74,6 @@ def travel_acceleration(limits: Limits, options: list[Candidates], guess: Gravit
     """Acceleration [rad/s²] that the drives can give beside gravity at the poses between which they travel."""
     if guess is None:
         return 1.0
-    poses = np.concatenate([each.poses.reshape(-1, guess.arm.n) for each in options])
+    poses = np.concatenate([each.poses.reshape(-1, guess.kinematics.n) for each in options])
     spare = limits.max_torque - np.abs(guess.torque(poses)).max(axis=0)
     return float(np.clip(np.min(spare / np.maximum(2 * guess.inertia(), 1e-9)), SLOWEST, FASTEST))

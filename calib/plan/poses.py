@@ -1,19 +1,22 @@
 """Where the arm goes: range of each sweep, poses of the scout, and the order of poses for short ways."""
 
-from collections.abc import Callable
-
 import numpy as np
-import numpy.typing as npt
 
 from armlink.errors import BadInput
 from calib.arm.drive_limits import Limits
 from calib.arm.sweep_section import SweepSection
+from calib.plan.collisions import Geometry
 from gcomp.arm.arm import Arm
+from gcomp.arrays import Array
+from gcomp.design.selection import select
 from gcomp.gravity.torque import gravity_regressor
 
-Array = npt.NDArray[np.float64]
 SCOUT_CANDIDATES = 300
 """Random poses among which the scout's are chosen."""
+UNKNOWN = 1e-6
+"""Information on each parameter beforehand: next to nothing, but the first poses' matrices can be inverted."""
+Poses = tuple[tuple[float, ...], ...]
+"""(P, n) [rad]"""
 
 
 def sweep_range(section: SweepSection, limits: Limits, joint: int) -> tuple[float, float]:
@@ -24,35 +27,29 @@ def sweep_range(section: SweepSection, limits: Limits, joint: int) -> tuple[floa
 
 
 def scout_poses(
-    described: Arm,
+    kinematics: Arm,
     section: SweepSection,
     limits: Limits,
     seed: int,
-    free: Callable[[Array], npt.NDArray[np.bool_]] | None = None,
-) -> tuple[tuple[float, ...], ...]:
-    """n + 3 poses (n,) that determine mass moments and sensor offsets well, ordered for short ways between them.
+    geometry: Geometry | None = None,
+) -> Poses:
+    """n + 3 poses that determine mass moments and sensor offsets well, ordered for short ways between them.
 
-    `free` tells which of poses (K, n) are without collision. Raises BadInput where too few are.
+    Poses in which bodies of `geometry` touch are left out; raises BadInput if too few remain.
     """
-    n = described.n
+    n = kinematics.n
     ends = np.array([sweep_range(section, limits, joint) for joint in range(n)])
     generator = np.random.default_rng(seed)
     poses = ends[:, 0] + generator.random((SCOUT_CANDIDATES, n)) * (ends[:, 1] - ends[:, 0])
-    if free is not None:
-        poses = poses[free(poses)]
+    if geometry is not None:
+        poses = poses[geometry.free(poses)]
         if len(poses) < 2 * (n + 3):
             raise BadInput("almost every pose within the joint range collides: narrow lower and upper in the arm file")
-    regressor = gravity_regressor(described, poses)
+    regressor = gravity_regressor(kinematics, poses)
     offsets = np.broadcast_to(np.eye(n), (len(poses), n, n))
     rows = np.concatenate([regressor, 10 * offsets], axis=2) / limits.rated[:, None]
     information = np.einsum("kip,kiq->kpq", rows, rows)
-    total = np.eye(3 * n) * 1e-6
-    chosen: list[int] = []
-    for _ in range(n + 3):
-        score = np.linalg.slogdet(total + information)[1]
-        score[chosen] = -np.inf
-        chosen.append(int(np.argmax(score)))
-        total = total + information[chosen[-1]]
+    (chosen,) = select([information[None]], UNKNOWN * np.eye(3 * n)[None], [n + 3], exchanges=0)
     return tuple(tuple(pose.tolist()) for pose in short_way(poses[chosen], ends.mean(axis=1)))
 
 
@@ -68,9 +65,9 @@ def short_way(poses: Array, begin: Array) -> Array:
     return poses[way]
 
 
-def require_range(section: SweepSection, limits: Limits, described: Arm) -> None:
+def require_range(section: SweepSection, limits: Limits, kinematics: Arm) -> None:
     """Raise BadInput, naming the joint, where a range leaves nothing to sweep."""
-    for joint, name in enumerate(described.names):
+    for joint, name in enumerate(kinematics.names):
         first, last = sweep_range(section, limits, joint)
         if not np.isfinite([first, last]).all() or last - first < 0.2:
             raise BadInput(

@@ -6,19 +6,19 @@ import numpy as np
 import numpy.typing as npt
 
 from gcomp.arm.arm import Arm
-from gcomp.arm.mass_moments import payload_columns
+from gcomp.arrays import Array, Mask
+from gcomp.design.selection import select, sweep_information, sweep_jacobian
 from gcomp.design.sweep_design import stop_combinations as limit_poses
 from gcomp.design.sweep_design import well_felt
-from gcomp.gravity.torque import gravity_levers, gravity_regressor, gravity_stiffness
-
-Array = npt.NDArray[np.float64]
+from gcomp.gravity.torque import gravity_levers
+from gcomp.identify.parameters import Parameters, free_mask
 
 SKETCH_STEPS = 5
 """Steps by which a candidate sweep is judged: enough for a sinusoid and an offset."""
-EXCHANGES = 2
-"""Rounds in which every chosen combination is compared once more with all others."""
 WAY = 0.6
 """Log determinant that a second of travel between two sweeps must be worth."""
+UNKNOWN = ("gain", "offset", "position_gain", "beta", "rho")
+"""Parameter families for which the stops are chosen."""
 PRIOR_GAIN, PRIOR_POSITION_GAIN, PRIOR_POINT = 0.15, 0.02, 0.2
 """What is known before any reading: standard deviations of torque gain, position gain, attachment point [m]."""
 
@@ -45,14 +45,14 @@ class Candidates:
         return Candidates(self.joint, self.stops[which], self.poses[which], self.lever[which])
 
 
-def stop_combinations(arm: Arm, joint: int, swept: tuple[float, float]) -> Candidates:
+def stop_combinations(kinematics: Arm, joint: int, swept: tuple[float, float]) -> Candidates:
     """The 2^(n-1) combinations in which the other joints stand at a limit, `joint` sweeping `swept`."""
-    rest = limit_poses(arm, joint)
-    stops = np.where(rest > (arm.lower + arm.upper) / 2, 1, -1).astype(np.int8)
+    rest = limit_poses(kinematics, joint)
+    stops = np.where(rest > (kinematics.lower + kinematics.upper) / 2, 1, -1).astype(np.int8)
     stops[:, joint] = 0
     poses = np.repeat(rest[:, None, :], SKETCH_STEPS, axis=1)
     poses[:, :, joint] = np.linspace(*swept, SKETCH_STEPS)
-    lever = gravity_levers(arm, poses[:, 0])[:, joint] / max(float(np.linalg.norm(arm.gravity)), 1e-9)
+    lever = gravity_levers(kinematics, poses[:, 0])[:, joint] / max(float(np.linalg.norm(kinematics.gravity)), 1e-9)
     return Candidates(joint, stops, poses, lever)
 
 
@@ -62,43 +62,39 @@ def reachable(candidates: Candidates) -> Candidates:
 
 
 def choose(
-    arm: Arm,
+    kinematics: Arm,
     candidates: list[Candidates],
-    count: list[int],
+    counts: list[int],
     moments: list[Array],
     sigma: Array,
     mass: float,
     speed: Array,
 ) -> list[list[int]]:
-    """For each joint's candidates, the indices of the `count` combinations that together are best.
+    """For each joint's candidates, the indices of the `counts` combinations that together are best.
 
     Best is D-optimal, less `WAY` for each second of travel from one sweep to the next at `speed` (n,) [rad/s].
     `moments` are the mass moments β (2n,) [kg·m] for which the design is made, as several guesses where they are
-    unknown; sigma (n,) [N·m] of one reading; mass [kg] of the second pass. Greedy, then exchanged.
+    unknown; sigma (n,) [N·m] of one reading; mass [kg] of the second pass.
     """
-    rows = [np.stack([_information(arm, each, beta, sigma, mass) for beta in moments]) for each in candidates]
-    total = np.stack([_prior(arm, beta, sigma) for beta in moments])
-    chosen: list[list[int]] = [[] for _ in candidates]
-    slots = [(place, slot) for place, each in enumerate(candidates) for slot in range(min(count[place], each.count))]
-    for turn in range(1 + EXCHANGES):
-        for place, slot in slots:
-            picks = chosen[place]
-            if turn:
-                total -= rows[place][:, picks[slot]]
-            score = np.linalg.slogdet(total[:, None] + rows[place])[1].mean(axis=0)
-            score -= WAY * _seconds(candidates, chosen, place, slot, speed)
-            score[[pick for other, pick in enumerate(picks) if other != slot]] = -np.inf
-            picks[slot : slot + 1] = [int(np.argmax(score))]
-            total += rows[place][:, picks[slot]]
-    return chosen
+    flange, free = [kinematics.a[-1], 0.0, kinematics.d[-1]], free_mask(kinematics.n, UNKNOWN)
+    guesses = [Parameters.nominal(kinematics.n, beta=beta, rho=flange) for beta in moments]
+    information = [
+        np.stack([_information(kinematics, guess, each, sigma, free, mass) for guess in guesses]) for each in candidates
+    ]
+    prior = np.stack([np.diag(_prior_std(guess, sigma)[free] ** -2.0) for guess in guesses])
+
+    def travel(chosen: list[list[int]], place: int, slot: int) -> Array:
+        return WAY * _seconds(candidates, chosen, place, slot, speed)
+
+    return select(information, prior, counts, cost=travel)
 
 
-def guessed_moments(arm: Arm, seed: int, draws: int = 3) -> list[Array]:
+def guessed_moments(kinematics: Arm, seed: int, draws: int = 3) -> list[Array]:
     """Mass moments (2n,) of plausible arms of these dimensions, for planning before anything was measured."""
     generator = np.random.default_rng(seed)
-    length = np.hypot(arm.a, arm.d)
+    length = np.hypot(kinematics.a, kinematics.d)
     beyond = np.cumsum((length + 0.1)[::-1])[::-1]
-    return [(generator.normal(size=(arm.n, 2)) * beyond[:, None]).ravel() for _ in range(draws)]
+    return [(generator.normal(size=(kinematics.n, 2)) * beyond[:, None]).ravel() for _ in range(draws)]
 
 
 def _seconds(candidates: list[Candidates], chosen: list[list[int]], place: int, slot: int, speed: Array) -> Array:
@@ -113,38 +109,23 @@ def _seconds(candidates: list[Candidates], chosen: list[list[int]], place: int, 
     return time
 
 
-def _information(arm: Arm, candidates: Candidates, beta: Array, sigma: Array, mass: float) -> Array:
-    """JᵀJ (C, P, P) of each candidate sweep, without and with the mass, for x = (k, o, c, β, ρ)."""
-    i, n = candidates.joint, arm.n
-    at_origin, by_point = payload_columns(arm)
-    tip = np.array([arm.a[-1], 0.0, arm.d[-1]])
-    regressor = gravity_regressor(arm, candidates.poses)[..., i, :]
-    count, steps = regressor.shape[:2]
-    parts = []
-    for load in (0.0, mass):
-        loaded = beta + load * (at_origin + by_point @ tip)
-        jacobian = np.zeros((count, steps, 5 * n + 3))
-        jacobian[..., i] = regressor @ loaded
-        jacobian[..., n + i] = 1.0
-        stiffness = gravity_stiffness(arm, loaded, candidates.poses)[..., i, :]
-        jacobian[..., 2 * n : 3 * n] = stiffness * candidates.poses
-        jacobian[..., 3 * n : 5 * n] = regressor
-        jacobian[..., 5 * n :] = load * regressor @ by_point
-        parts.append(jacobian / sigma[i])
-    both = np.concatenate(parts, axis=1)
-    information: Array = np.einsum("csp,csq->cpq", both, both, optimize=True)
-    return information
-
-
-def _prior(arm: Arm, beta: Array, sigma: Array) -> Array:
-    n = arm.n
-    std = np.concatenate(
-        [
-            np.full(n, PRIOR_GAIN),
-            100 * sigma,
-            np.full(n, PRIOR_POSITION_GAIN),
-            np.full(2 * n, 10 * max(float(np.abs(beta).max()), 1e-3)),
-            np.full(3, PRIOR_POINT),
-        ]
+def _information(
+    kinematics: Arm, guess: Parameters, candidates: Candidates, sigma: Array, free: Mask, mass: float
+) -> Array:
+    """JᵀJ (C, p, p) of each candidate sweep, made without and with the mass."""
+    return sweep_information(
+        sweep_jacobian(kinematics, guess, candidates.joint, candidates.poses, sigma, free, (0.0, mass))
     )
-    return np.diag(std**-2.0)
+
+
+def _prior_std(guess: Parameters, sigma: Array) -> Array:
+    """Standard deviations (6n + 3,) of the parameters before any reading."""
+    ones = np.ones(len(sigma))
+    return Parameters(
+        gain=PRIOR_GAIN * ones,
+        offset=100 * sigma,
+        position_gain=PRIOR_POSITION_GAIN * ones,
+        position_offset=ones,
+        beta=np.full(len(guess.beta), 10 * max(float(np.abs(guess.beta).max()), 1e-3)),
+        rho=np.full(3, PRIOR_POINT),
+    ).vector

@@ -2,11 +2,8 @@
 
 from typing import Annotated, Literal
 
-import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-Array = npt.NDArray[np.float64]
 Side = Literal[-1, 0, 1]
 
 

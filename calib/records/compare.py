@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from armlink.errors import BadInput, Refused
-from calib.records.records import PARAMETERS, Array, CalibrationRecord, GravityRecord
+from calib.records.records import PARAMETERS, CalibrationRecord, GravityRecord
+from gcomp.arrays import Array
 
 UNITS = {"gain": "1", "offset": "N·m", "position_gain": "1", "position_offset": "rad", "x": "kg·m", "y": "kg·m"}
 

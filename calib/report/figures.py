@@ -10,10 +10,10 @@ from plotly.subplots import make_subplots
 from calib.fit.sensor_fit import SensorFit
 from calib.sweep.verify import Verification
 from gcomp.arm.arm import Arm
-from gcomp.identify.readings import Readings
+from gcomp.arrays import Array
+from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict
 
-Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
 COLOURS = ("#1f5fa8", "#d9622b", "#3c8d5a", "#8a4fa3", "#b8912b", "#4f7f95", "#a83248", "#5b6b7a")
@@ -25,13 +25,13 @@ PANEL = 230
 
 def sweeps_of(fit: SensorFit, joint: int) -> list[str]:
     """Names of a joint's sweeps, as PASS/sweep, in the order they were taken."""
-    names = np.array(fit.rows.sweep)[fit.rows.swept == joint]
-    return list(dict.fromkeys(names.tolist()))
+    series = fit.rows.readings.series[fit.rows.swept == joint]
+    return [fit.rows.sweeps[sweep] for sweep in dict.fromkeys(series.tolist())]
 
 
 def sweep_rows(fit: SensorFit, joint: int, sweep: str) -> Indices:
     """Rows of one sweep, by position."""
-    at = np.flatnonzero((fit.rows.swept == joint) & (np.array(fit.rows.sweep) == sweep))
+    at = np.flatnonzero((fit.rows.swept == joint) & (fit.rows.readings.series == fit.rows.sweeps.index(sweep)))
     return at[np.argsort(fit.rows.readings.position[at, joint])]
 
 
@@ -53,7 +53,7 @@ def add_sweeps(figure: Any, arm: Arm, fit: SensorFit, joint: int, row: int, *, i
         x, y, left = readings.position[at, joint], readings.torque[at, joint], fit.fit.residual[at, joint]
         place = {"name": sweep, "legendgroup": sweep, "row": row}
         paint = COLOURS[colour % len(COLOURS)]
-        symbol = np.where(fit.rows.direction[at] > 0, "triangle-right", "triangle-left")
+        symbol = np.where(readings.direction[at, joint] > 0, "triangle-right", "triangle-left")
         marker = {"color": paint, "size": 7, "symbol": symbol}
         angle, reading = curve(arm, fit, at, joint)
         line = {"color": paint, "width": 1.5}
@@ -71,7 +71,7 @@ def curve(arm: Arm, fit: SensorFit, rows: Indices, joint: int) -> tuple[Array, A
     position[:, joint] = np.linspace(
         readings.position[rows[0], joint], readings.position[rows[-1], joint], CURVE_POINTS
     )
-    asked = Readings.of(position, np.zeros_like(position), 1.0, readings.load[rows[0]])
+    asked = StaticReadings.of(position, np.zeros_like(position), 1.0, readings.load[rows[0]])
     return position[:, joint], predict(arm, fit.fit.complete, asked)[:, joint]
 
 

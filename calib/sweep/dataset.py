@@ -12,15 +12,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from armlink.arm_file import ArmFile, describe, load_arm
 from armlink.errors import BadInput, Refused
+from calib.motion.static_reading import StaticReading, stack
 from calib.plan.types import SweepPlan
 from calib.records.atomic_file import part_of, write_whole
+from gcomp.arrays import Array
 
-Array = npt.NDArray[np.float64]
 MANIFEST, LINES = "manifest.json", "readings.jsonl"
 
 
@@ -60,43 +60,12 @@ class Manifest(_Model):
             arm_file=str(arm.path),
             names=arm.joint_names,
             reference_mass=reference_mass,
-            rated_torque=tuple(joint.rated_torque for joint in arm.require_link().joints),
+            rated_torque=tuple(arm.require_link().rated_torques.tolist()),
             installed_gain=tuple(gain for gain, _ in pairs),
             installed_offset=tuple(offset for _, offset in pairs),
             created=datetime.now(UTC).replace(microsecond=0),
             software=f"armlink {version('armlink')}",
         )
-
-
-class Reading(_Model):
-    """One static reading: averages over samples taken at rest, (n,) per joint."""
-
-    kind: Literal["reading"] = "reading"
-    sweep: str
-    """Name of the sweep, or "scout"."""
-    index: int
-    """Number of the reading within its sweep."""
-    joint: int | None
-    """Index of the swept joint; None where all joints were held."""
-    direction: Literal[-1, 0, 1]
-    """Side from which the swept joint came: 1 upwards, -1 downwards; 0 where none was swept."""
-    t: float
-    """Link time at its end [s]."""
-    count: int
-    """Samples averaged."""
-    settled: bool
-    """False where the settle rule's time was up."""
-    servo: tuple[bool, ...]
-    """Which joints were servo-held at rest: only their torque sensors read gravity."""
-    position: tuple[float, ...]
-    """Mean position reading [rad]."""
-    position_std: tuple[float, ...]
-    torque: tuple[float, ...]
-    """Mean torque reading of the sensor [N·m]."""
-    torque_std: tuple[float, ...]
-    """Standard deviation of one sample [N·m]."""
-    motor_torque: tuple[float, ...]
-    """Mean of the drive's own estimate [N·m]."""
 
 
 class PlanLine(_Model):
@@ -121,8 +90,15 @@ class StallLine(_Model):
     reason: str
 
 
-Line = Reading | PlanLine | StallLine
-_LINE: TypeAdapter[Line] = TypeAdapter(Annotated[Line, Field(discriminator="kind")])
+Line = StaticReading | PlanLine | StallLine
+_LINE: TypeAdapter[Line] = TypeAdapter(
+    Annotated[Line, Field(discriminator="kind")], config=ConfigDict(ser_json_inf_nan="constants")
+)
+
+
+def encoded(line: Line) -> bytes:
+    """A line of a data set as it stands in the file."""
+    return _LINE.dump_json(line) + b"\n"
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +107,7 @@ class SweepData:
 
     path: Path
     manifest: Manifest
-    readings: tuple[Reading, ...]
+    readings: tuple[StaticReading, ...]
     plan: SweepPlan | None
     """The plan as run; None where the scout had not been finished."""
     resolution: Array
@@ -147,7 +123,7 @@ class SweepData:
         return self.plan is not None and len(self.readings) >= self.plan.readings
 
     @property
-    def unsettled(self) -> tuple[Reading, ...]:
+    def unsettled(self) -> tuple[StaticReading, ...]:
         """Readings that were taken before the arm stood still."""
         return tuple(reading for reading in self.readings if not reading.settled)
 
@@ -173,7 +149,7 @@ class SweepData:
 
     def array(self, name: str) -> Array:
         """One field of all readings, (K,) or (K, n), as numbers."""
-        return np.array([getattr(reading, name) for reading in self.readings], dtype=float)
+        return stack(self.readings, name).astype(float)
 
 
 def load_data(path: Path) -> SweepData:
@@ -181,7 +157,7 @@ def load_data(path: Path) -> SweepData:
     manifest = _read_manifest(path)
     content = (path / LINES).read_bytes() if (path / LINES).is_file() else b""
     whole = content[: content.rfind(b"\n") + 1]
-    readings: list[Reading] = []
+    readings: list[StaticReading] = []
     stalls: list[StallLine] = []
     plan, resolution = None, np.zeros(len(manifest.names))
     for line in _parse(whole.splitlines(), path / LINES):
@@ -221,7 +197,7 @@ class DataWriter:
 
     def append(self, line: Line) -> None:
         """Write one line and wait until it is on disk; raises BadInput where the disk is full or fails."""
-        content = line.model_dump_json().encode() + b"\n"
+        content = encoded(line)
         try:
             if self._file.write(content) < len(content):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -274,7 +250,7 @@ def _parse(lines: Sequence[bytes], file: Path) -> Iterator[Line]:
             raise BadInput(f"{file}: line {number}: {describe(error)}") from None
 
 
-def _check_width(reading: Reading, n: int, path: Path) -> None:
+def _check_width(reading: StaticReading, n: int, path: Path) -> None:
     for key in ("servo", "position", "position_std", "torque", "torque_std", "motor_torque"):
         if len(getattr(reading, key)) != n:
             raise BadInput(f"{path}: sweep {reading.sweep}, reading {reading.index}: {key} is not one per joint ({n})")

@@ -13,12 +13,12 @@ from armlink.loop.driver import ArmDriver
 from calib.arm.drive_limits import Limits
 from calib.arm.sweep_section import SweepSection, sweep_section
 from calib.motion.mover import Mover, Slipped, Stalled
-from calib.motion.static_reading import Rest
+from calib.motion.static_reading import StaticReading
 from calib.plan.collisions import check_plan
 from calib.plan.sweep_plan import plan_sweep
 from calib.plan.types import Sweep, SweepPlan
-from calib.sweep.dataset import DataWriter, Manifest, PlanLine, Reading, SweepData, load_data
-from calib.sweep.scout import SCOUT, SLOWER, as_reading, rough_model, run_scout
+from calib.sweep.dataset import DataWriter, Manifest, PlanLine, SweepData, load_data
+from calib.sweep.scout import SCOUT, SLOWER, rough_model, run_scout
 from calib.sweep.stalls import OnStall, give_up, stall_line
 
 Array = npt.NDArray[np.float64]
@@ -81,7 +81,7 @@ def run_sweep(
 
 
 def _final_plan(
-    arm: ArmFile, first: SweepPlan, readings: list[Reading], mass: float, seed: int, resolution: Array
+    arm: ArmFile, first: SweepPlan, readings: list[StaticReading], mass: float, seed: int, resolution: Array
 ) -> SweepPlan:
     """The plan with bias torques, and the scout poses that were reached."""
     plan = plan_sweep(arm, rough_model(arm, readings), seed=seed, reference_mass=mass, resolution=resolution)
@@ -103,7 +103,7 @@ class _Pass:
         self,
         mover: Mover,
         writer: DataWriter,
-        readings: list[Reading],
+        readings: list[StaticReading],
         progress: Progress,
         clock: Callable[[], float],
         on_stall: OnStall = give_up,
@@ -116,7 +116,7 @@ class _Pass:
         self._progress, self._clock = progress, clock
         self._began, self._at_start = clock(), len(readings)
 
-    def save(self, reading: Reading) -> None:
+    def save(self, reading: StaticReading) -> None:
         """Put a reading on disk and report."""
         self.writer.append(reading)
         self.readings.append(reading)
@@ -124,7 +124,7 @@ class _Pass:
         left = (self._clock() - self._began) / made * max(self.total - len(self.readings), 0)
         self._progress(len(self.readings), self.total, left, self._text(reading))
 
-    def _text(self, reading: Reading) -> str:
+    def _text(self, reading: StaticReading) -> str:
         """What is being done, with a plot of the swept joint's torque in the sweep so far."""
         if reading.joint is None:
             return f"{reading.sweep} {reading.index + 1}"
@@ -177,8 +177,7 @@ class _Pass:
                 if retries > RETRIES:
                     raise
                 continue
-            counts = np.array(sweep.servo)
-            self.save(as_reading(rest, sweep.name, index, sweep.joint, sweep.target(index)[1], counts))
+            self.save(rest.within(sweep.name, index, np.array(sweep.servo), sweep.joint, sweep.target(index)[1]))
             open_readings.pop(0)
 
     def _rest_others(self, sweep: Sweep, bias: Array, target: float, direction: int, *, detour: bool = False) -> None:
@@ -197,7 +196,7 @@ class _Pass:
         if stops.any():
             mover.press(stops, bias)
 
-    def _step(self, sweep: Sweep, target: float, direction: int) -> Rest:
+    def _step(self, sweep: Sweep, target: float, direction: int) -> StaticReading:
         """Bring the swept joint to a step from its side and read."""
         mover, joint = self.mover, sweep.joint
         goal = mover.command.position.copy()

@@ -3,19 +3,16 @@
 from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.motion.mover import Mover, Stalled
-from calib.motion.static_reading import Rest
+from calib.motion.static_reading import StaticReading, stack
 from calib.plan.rough_gravity import GravityGuess, guess_gravity
 from calib.plan.types import SweepPlan
-from calib.sweep.dataset import Reading
 
-Array = npt.NDArray[np.float64]
 SCOUT = "scout"
 SCOUT_ACCELERATION = 1.0
 """Nothing is known of the arm's weight yet [rad/s²]."""
@@ -23,7 +20,7 @@ SLOWER, SLOWEST = 0.4, 0.15
 """Factor on the acceleration after a joint did not follow, and where that ends [rad/s²]."""
 
 
-def run_scout(mover: Mover, plan: SweepPlan, done: Collection[int], save: Callable[[Reading], None]) -> None:
+def run_scout(mover: Mover, plan: SweepPlan, done: Collection[int], save: Callable[[StaticReading], None]) -> None:
     """Read every scout pose that is not `done`, each passed to `save`; a pose that the drives cannot reach is left out.
 
     Raises Stalled where too few poses were reached to know the arm's weight.
@@ -46,41 +43,21 @@ def run_scout(mover: Mover, plan: SweepPlan, done: Collection[int], save: Callab
         if len(stalls) > 1:
             unreached.append(stalls[0])
             continue
-        rest = mover.rest(everything)
+        save(mover.rest(everything).within(SCOUT, index, everything))
         last = mover.position.copy()
-        save(as_reading(rest, SCOUT, index, None, 0, everything))
     if len(plan.scout) - len(unreached) < 4:
         raise unreached[0]
 
 
-def rough_model(arm: ArmFile, readings: Sequence[Reading]) -> GravityGuess:
+def rough_model(arm: ArmFile, readings: Sequence[StaticReading]) -> GravityGuess:
     """The rough gravity model from the scout's readings among `readings`."""
-    rows = [reading for reading in readings if reading.sweep == SCOUT]
+    scouted = [reading for reading in readings if reading.sweep == SCOUT]
     limits, section = Limits.of(arm), sweep_section(arm)
     return guess_gravity(
         gcomp_arm(arm),
-        np.array([row.position for row in rows]),
-        np.array([row.torque for row in rows]),
-        np.array([row.motor_torque for row in rows]),
+        stack(scouted, "position"),
+        stack(scouted, "torque"),
+        stack(scouted, "motor_torque"),
         limits.rated,
         section.friction,
-    )
-
-
-def as_reading(rest: Rest, sweep: str, index: int, joint: int | None, direction: int, servo: Array) -> Reading:
-    """One line of the data set from the averages at rest."""
-    return Reading(
-        sweep=sweep,
-        index=index,
-        joint=joint,
-        direction=1 if direction > 0 else -1 if direction < 0 else 0,
-        t=rest.t,
-        count=rest.count,
-        settled=rest.settled,
-        servo=tuple(bool(held) for held in servo),
-        position=tuple(rest.position.tolist()),
-        position_std=tuple(rest.position_std.tolist()),
-        torque=tuple(rest.torque.tolist()),
-        torque_std=tuple(rest.torque_std.tolist()),
-        motor_torque=tuple(rest.motor_torque.tolist()),
     )

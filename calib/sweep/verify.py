@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
@@ -15,9 +14,9 @@ from calib.arm.sweep_section import SweepSection, sweep_section
 from calib.motion.mover import Mover, Stalled
 from calib.plan.poses import short_way, sweep_range
 from calib.records.records import CalibrationRecord, GravityRecord
+from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque, torque_covariance
 
-Array = npt.NDArray[np.float64]
 ACCELERATION = 2.0
 TOLERANCE = 0.01
 """RMS that passes, as a share of the joint's largest model torque, beside the noise floor."""

@@ -10,7 +10,7 @@ from gcomp.errors import BadArray
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """A serial arm of n revolute joints in standard Denavit-Hartenberg form (theory note, section 1).
+    """A serial arm of n revolute joints in standard Denavit-Hartenberg form (docs/theory.md, section 1).
 
     Joint i turns about z_{i-1} by θ_i = q_i + theta_offset_i. Raises BadArray on wrong shapes or an empty range.
     """
@@ -27,9 +27,9 @@ class Arm:
     gravity: Array
     """Acceleration of gravity (3,) in the base frame [m/s²]."""
     lower: Array
-    """Lower joint limit (n,) [rad]; -inf where there is none."""
+    """Lower joint limit (n,) [rad]; -inf for none."""
     upper: Array
-    """Upper joint limit (n,) [rad]; +inf where there is none."""
+    """Upper joint limit (n,) [rad]; +inf for none."""
 
     def __post_init__(self) -> None:
         n = len(self.names)

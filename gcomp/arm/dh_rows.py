@@ -8,7 +8,8 @@ from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 
 PARALLEL = 1e-6
-"""Axes at less than this angle [rad] get the lengths a and d of parallel ones; their angle is kept as it is."""
+"""Axes at a smaller angle [rad] get the lengths a and d of parallel ones, since their common normal is ill-conditioned;
+their angle is kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +25,7 @@ class ArmGeometry:
     def base_parameters(self, mass: Array, first_moment: Array) -> Array:
         """Mass moments β (2n,) of links: masses (n,), first moments (n, 3) in bar frames from the joint points.
 
-        Equation (R) with any points of the axes in place of the Denavit-Hartenberg origins, which may lie far away.
+        Equation (R) of docs/theory.md, with any points of the axes in place of the Denavit-Hartenberg origins.
         """
         arm, along_axis, distal_mass = self.arm, 0.0, 0.0
         beta = np.empty((arm.n, 2))
@@ -85,7 +86,7 @@ def _feet(origin: Array, axis: Array, target: Array, following: Array, between: 
 
 
 def _perpendicular(axis: Array) -> Array:
-    """Unit vector perpendicular to `axis`, towards the world's x axis, or its y axis where x is along the axis."""
+    """Unit vector perpendicular to `axis`, towards the world's x axis, or its y axis if x is along the axis."""
     towards = np.eye(3)[0 if abs(axis[0]) < 0.9 else 1]
     across = towards - (towards @ axis) * axis
     perpendicular: Array = across / np.linalg.norm(across)

@@ -12,12 +12,12 @@ from gcomp.arrays import Array, as_array
 from gcomp.errors import BadModel
 
 LEAST_SHARE = 0.1
-"""No body keeps less than this share of its mass."""
+"""Smallest share of its mass that a body keeps, so that no mass comes near zero; a choice."""
 
 
 @dataclass(frozen=True, eq=False)
 class LinkChange:
-    """What writing back changed on one link; centres of mass in the body's own frame."""
+    """Change of one link by writing back; centres of mass in the body's own frame."""
 
     joint: str
     body: str
@@ -35,17 +35,17 @@ class LinkChange:
 def write_model(
     source: Path, target: Path, beta: Array, *, tip: str | None = None, bounds: Bounds | None = None
 ) -> tuple[LinkChange, ...]:
-    """Write `source` as `target` with inertials that have mass moments β (2n,) [kg·m], and say what changed.
+    """Write `source` to `target` with inertials that have mass moments β (2n,) [kg·m]; returns the change of each link.
 
-    Of each link the heaviest body changes, its inertia about the centre of mass in proportion to its mass. A NaN in β
-    is a moment that nothing is known of. Raises NotFeasible where no inertials within the bounds have β (by default
-    every body keeps a tenth of its mass), BadModel where the file cannot carry them.
+    The heaviest body of each link changes, its inertia about the centre of mass in proportion to its mass. NaN in β
+    marks an unknown moment. Raises NotFeasible if no inertials within the bounds have β (by default every body keeps
+    a tenth of its mass), BadModel if the file cannot hold them.
     """
     placed = place_chain(source, tip=tip)
     wanted = as_array("beta", beta, (2 * placed.arm.arm.n,), finite=False)
     for name, bodies in zip(placed.arm.arm.names, placed.bodies, strict=True):
         if not bodies or not placed.model.body_mass[list(bodies)].any():
-            raise BadModel(f"{source}: joint {name} moves no mass of its own: nothing there can carry its mass moments")
+            raise BadModel(f"{source}: joint {name} moves no mass of its own: no body can hold its mass moments")
     carriers = [max(bodies, key=lambda body: placed.model.body_mass[body]) for bodies in placed.bodies]
     nominal = Inertials(placed.arm.mass, placed.arm.first_moment)
     heaviest = placed.model.body_mass[carriers]
@@ -57,7 +57,7 @@ def write_model(
         change = _change(placed, link, body, found)
         if change.mass_after <= 0:
             raise BadModel(
-                f"{source}: body {change.body} would get a mass of {change.mass_after:.3g} kg: bound it higher"
+                f"{source}: body {change.body} would get a mass of {change.mass_after:.3g} kg: raise its lower bound"
             )
         element = _element(root, placed, body, source)
         (_write_urdf if root.tag == "robot" else _write_mjcf)(element, placed, body, change)
@@ -68,7 +68,7 @@ def write_model(
 
 
 def _change(placed: PlacedChain, link: int, body: int, found: Inertials) -> LinkChange:
-    """The body's new mass and centre of mass: it takes all that the link gained."""
+    """The body's new mass and centre of mass: it takes the whole change of its link."""
     model, data = placed.model, placed.data
     rotation = np.asarray(data.xmat[body]).reshape(3, 3)
     before, more = float(model.body_mass[body]), float(found.mass[link] - placed.arm.mass[link])
@@ -95,7 +95,7 @@ def _element(root: ET.Element, placed: PlacedChain, body: int, source: Path) -> 
         raise BadModel(f"{source}: inertiafromgeom is true: MuJoCo would ignore the inertials; set it to auto")
     bodies = [element for world in root.iter("worldbody") for element in world.iter("body")]
     if len(bodies) != placed.model.nbody - 1:
-        raise BadModel(f"{source}: it includes or replicates bodies: write it out as one file first")
+        raise BadModel(f"{source}: it includes or replicates bodies: save it as a single file first")
     return bodies[body - 1]
 
 
@@ -132,7 +132,7 @@ def _numbers(values: Array) -> str:
 
 
 def _check(target: Path, tip: str | None, wanted: Array, source: Path) -> None:
-    """Read the written file back: some compiler options change inertials after they are read."""
+    """Read the written file back: some compiler options change inertials after reading."""
     found = place_chain(target, tip=tip).arm.beta
     if np.nanmax(np.abs(found - wanted), initial=0.0) > 1e-9:
         target.unlink()

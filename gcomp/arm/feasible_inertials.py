@@ -17,7 +17,7 @@ from gcomp.arrays import Array, as_array, frozen
 from gcomp.errors import GcompError
 
 LENGTH = 0.1
-"""Shift of a centre of mass [m] that counts as much as a change of the mass by all of itself."""
+"""Shift of a centre of mass [m] that is weighted like a change of the mass by 100 %: a choice, the radius of a link."""
 
 MomentMap = Callable[[Array, Array], Array]
 """(mass (n,), first_moment (n, 3)) → mass moments β (2n,), linear."""
@@ -29,7 +29,7 @@ class NotFeasible(GcompError):
 
 @dataclass(frozen=True, eq=False)
 class Bounds:
-    """What inertials are allowed: masses from `mass` (n,) [kg], centres of mass in boxes (n, 3) [m] in bar frames."""
+    """Allowed inertials: masses from `mass` (n,) [kg], centres of mass in boxes (n, 3) [m] in bar frames."""
 
     mass: Array
     com_lower: Array
@@ -81,8 +81,8 @@ class Inertials:
 def nearest_inertials(beta: Array, nominal: Inertials, bounds: Bounds, moments: MomentMap) -> Inertials:
     """The inertials nearest to the nominal ones that have mass moments β (2n,) [kg·m] exactly and keep the bounds.
 
-    Nearest: least sum of squares of Δm_i/m_i and |Δ(m_i s_i)|/(m_i 0.1 m). A NaN in β is a moment that nothing is
-    known of: it stays free. Raises NotFeasible where the bounds leave none.
+    Nearest: least sum of squares of Δm_i/m_i and |Δ(m_i s_i)|/(m_i 0.1 m). A moment that is NaN in β stays free.
+    Raises NotFeasible if the bounds leave none.
     """
     n, start = len(nominal.mass), _pack(nominal)
     unit = np.repeat(nominal.mass, 4) * np.tile([1.0, LENGTH, LENGTH, LENGTH], n)
@@ -104,13 +104,13 @@ def nearest_inertials(beta: Array, nominal: Inertials, bounds: Bounds, moments: 
 def feasible_moments(arm: Arm, beta: Array, covariance: Array, bounds: Bounds) -> Array:
     """The mass moments (2n,) [kg·m] nearest to β in the metric of its covariance (2n, 2n) that the bounds allow.
 
-    This is constrained least squares on the readings that β was fitted to. Raises NotFeasible on empty bounds.
+    Equal to constrained least squares on the readings that β was fitted to. Raises NotFeasible on empty bounds.
     """
     n, known = arm.n, ~np.isnan(beta)
     linear = _matrix(n, lambda mass, moment: base_parameters(arm, mass, moment))
     spread, axes = np.linalg.eigh(covariance[np.ix_(known, known)])
     whiten = axes.T / np.sqrt(np.maximum(spread, 1e-12 * spread[-1]))[:, None]
-    keep_small = 1e-6 * np.linalg.norm(whiten @ linear[known])  # makes the solution unique; far below the readings' say
+    keep_small = 1e-6 * np.linalg.norm(whiten @ linear[known])  # makes the solution unique, with negligible weight
     system = np.vstack([whiten @ linear[known], keep_small * np.eye(4 * n)])
     target = np.concatenate([whiten @ beta[known], np.zeros(4 * n)])
     orthogonal, triangle = np.linalg.qr(system)
@@ -124,7 +124,7 @@ def feasible_moments(arm: Arm, beta: Array, covariance: Array, bounds: Bounds) -
 
 
 def least_distance(rows: Array, limits: Array) -> Array | None:
-    """The shortest u (p,) with rows (m, p) u ≥ limits (m,), or None where there is none."""
+    """The shortest u (p,) with rows (m, p) u ≥ limits (m,), None if there is none."""
     if np.all(limits <= 0):
         return np.zeros(rows.shape[1])
     scale = np.linalg.norm(np.column_stack([rows, limits]), axis=1)

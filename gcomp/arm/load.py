@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 URDF_COMPILER = {"fusestatic": "false", "discardvisual": "true", "balanceinertia": "true"}
 URDF_COMPILER |= {"boundmass": "1e-14", "boundinertia": "1e-14"}
-"""MuJoCo refuses massless moving bodies, which URDF files are full of: they get a mass that gravity does not notice."""
+"""MuJoCo refuses massless moving bodies, which are common in URDF files: they get a mass of no effect on gravity."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,15 +40,15 @@ def load_model(path: Path, *, tip: str | None = None, gravity: ArrayLike | None 
     """The serial arm of revolute joints in a URDF or MJCF file.
 
     The chain ends in body `tip`; by default in the last body that moves. Joints off the chain are refused unless `tip`
-    is given: then they stay where the file puts them. `gravity` (3,) [m/s²] in the model's world frame replaces the
-    model's own. Raises BadModel, naming the joint, where the chain is not a serial arm of revolute joints.
+    is given: then they keep the file's position. `gravity` (3,) [m/s²] in the model's world frame replaces the model's
+    own. Raises BadModel, naming the joint, if the chain is not a serial arm of revolute joints.
     """
     return place_chain(path, tip=tip, gravity=gravity).arm
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedChain:
-    """The chain in MuJoCo's reference configuration: what it takes to write inertials back into the file."""
+    """The chain in MuJoCo's reference configuration, with all that is needed to write inertials back into the file."""
 
     model: "mujoco.MjModel"
     data: "mujoco.MjData"
@@ -61,13 +61,13 @@ class PlacedChain:
 
 
 def place_chain(path: Path, *, tip: str | None = None, gravity: ArrayLike | None = None) -> PlacedChain:
-    """As load_model, with the bodies behind the links; raises BadModel likewise."""
+    """As load_model, with the bodies of each link; raises BadModel likewise."""
     model = compile_model(path)
     return _place(model, _chain(model, path, tip), gravity)
 
 
 def compile_model(path: Path) -> "mujoco.MjModel":
-    """The file compiled by MuJoCo: a URDF without its meshes, which gravity does not need. Raises BadModel."""
+    """The file compiled by MuJoCo, a URDF without its meshes, which gravity does not need. Raises BadModel."""
     import mujoco
 
     try:
@@ -122,7 +122,7 @@ def _chain(model: "mujoco.MjModel", path: Path, tip: str | None) -> list[int]:
             raise BadModel(f"{path}: joint {model.joint(joint).name} is {kind}: only revolute joints can be identified")
     if aside and tip is None:
         name = model.joint(aside[0]).name
-        raise BadModel(f"{path}: joint {name} branches off the chain: say with tip which body the chain ends in")
+        raise BadModel(f"{path}: joint {name} branches off the chain: name the body at the chain's end with tip")
     if not chain:
         raise BadModel(f"{path}: no joint between the base and tip {tip!r}")
     _refuse_couplings(model, chain, path)
@@ -170,7 +170,7 @@ def _place(model: "mujoco.MjModel", chain: list[int], gravity: ArrayLike | None)
 
 
 def _links(model: "mujoco.MjModel", chain: list[int]) -> dict[int, int]:
-    """Which link of the chain each body belongs to; bodies of the base are left out."""
+    """Index of the link that each body belongs to, by body id; bodies of the base are left out."""
     link_of: dict[int, int] = {}
     last_joint = {int(model.jnt_bodyid[joint]): link for link, joint in enumerate(chain)}
     for body in range(1, model.nbody):  # parents come before children

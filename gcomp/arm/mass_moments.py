@@ -1,4 +1,4 @@
-"""Mass moments of an arm: from its links' inertials, and what a payload adds (theory note, equations (R) and (P))."""
+"""Mass moments of an arm, from its links' inertials and of a payload (docs/theory.md, equations (R) and (P))."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -8,7 +8,7 @@ from gcomp.arrays import Array, as_array
 
 
 def base_parameters(arm: Arm, mass: ArrayLike, first_moment: ArrayLike) -> Array:
-    """Mass moments β = (n_1x, n_1y, …, n_nx, n_ny) (2n,) [kg·m] that gravity torque depends on; equation (R).
+    """Mass moments β = (n_1x, n_1y, …, n_nx, n_ny) (2n,) [kg·m], on which gravity torque depends; equation (R).
 
     mass (n,) [kg]; first_moment (n, 3) [kg·m], mass times centre of mass in each link's bar frame (origin on the
     joint axis at o_{i-1}, turning with the joint, z along the axis).
@@ -48,7 +48,7 @@ def payload_columns(arm: Arm) -> tuple[Array, Array]:
 
 
 def base_parameter_names(arm: Arm, tolerance: float = 1e-6) -> tuple[str, ...]:
-    """Names of the mass moments that gravity can show in some pose: 2(n − p) of them (theory note, section 2).
+    """Names of the 2(n − p) mass moments that act on a torque in some pose (docs/theory.md, section 2.4).
 
     p leading joints have their axis along gravity in every pose, to within `tolerance` [rad]; they carry no torque.
     """

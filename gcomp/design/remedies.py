@@ -1,4 +1,4 @@
-"""What would make a parameter identifiable: the sweeps to add, or why no sweep helps."""
+"""Remedies for parameters that are not identifiable: the sweeps to add, or why no sweep helps."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -7,23 +7,23 @@ import numpy as np
 
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
-from gcomp.design.sweep_design import SKETCH_STEPS, Sweep, candidate_sweeps, expected_readings, readings_of
+from gcomp.design.sweep_design import SKETCH_STEPS, Sweep, candidate_sweeps, readings_of
 from gcomp.identify.block_qr import fold
 from gcomp.identify.identifiability import NULL_STD, analyse, describe_null_space
 from gcomp.identify.natural_units import natural_units
 from gcomp.identify.parameters import Parameters, free_mask, parameter_names
-from gcomp.identify.readings import Readings
-from gcomp.identify.sensor_model import predict_and_jacobian
+from gcomp.identify.readings import StaticReadings
+from gcomp.identify.sensor_model import expected_readings, predict_and_jacobian
 
 
 def cures(
-    arm: Arm, readings: Readings, guess: Parameters, *, unknown: Collection[str], load: float = 1.0
+    arm: Arm, readings: StaticReadings, guess: Parameters, *, unknown: Collection[str], load: float = 1.0
 ) -> Mapping[str, str]:
-    """For each parameter that these readings do not determine, one sentence: which sweeps would, or why none does.
+    """One sentence for each parameter that these readings do not determine: which sweeps would, or why none does.
 
-    `guess` is the fit's `complete`, the readings those that were fitted. Sweeps of every joint at every stop
-    combination are tried, without load, then with `load` [kg] of reference mass as well; several where one is not
-    enough. Joints without limits cannot be held at stops: then nothing is tried.
+    `readings` are those fitted and `guess` is the fit's `complete`. Sweeps of every joint at every stop combination
+    are tried, without a load and then also with `load` [kg] of reference mass, several if one is not enough. An arm
+    with a joint without limits has no stops: then nothing is tried.
     """
     trial = _Trial.of(arm, readings, guess, free_mask(arm.n, unknown))
     candidates = _candidates(trial, load)
@@ -58,7 +58,7 @@ def describe_sweep(arm: Arm, sweep: Sweep) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """What has been read, and what has been added to it so far."""
+    """The readings, with the sweeps added until now, as a triangular factor."""
 
     arm: Arm
     guess: Parameters
@@ -69,7 +69,7 @@ class _Trial:
     triangle: Array
 
     @classmethod
-    def of(cls, arm: Arm, readings: Readings, guess: Parameters, free: Mask) -> "_Trial":
+    def of(cls, arm: Arm, readings: StaticReadings, guess: Parameters, free: Mask) -> "_Trial":
         unit = natural_units(arm, expected_readings(arm, guess, readings), guess)[free]
         names = tuple(name for name, is_free in zip(parameter_names(arm), free, strict=True) if is_free)
         empty = cls(arm, guess, free, np.median(readings.sigma, axis=0), unit, names, np.zeros((len(unit),) * 2))
@@ -77,13 +77,13 @@ class _Trial:
             empty = empty.with_rows(empty.weighted(block))
         return empty
 
-    def weighted(self, readings: Readings) -> Array:
+    def weighted(self, readings: StaticReadings) -> Array:
         """Weighted Jacobian (P, p) of the readings that count."""
         _, jacobian, _ = predict_and_jacobian(self.arm, self.guess, readings)
         return jacobian[:, self.free] / readings.sigma[readings.counted][:, None]
 
     def with_rows(self, rows: Array) -> "_Trial":
-        """The same with further rows (K, p)."""
+        """With further rows (K, p)."""
         triangle = fold(self.triangle, rows)
         return _Trial(self.arm, self.guess, self.free, self.sigma, self.unit, self.names, triangle)
 
@@ -95,7 +95,7 @@ class _Candidate:
     loaded: bool
 
     def gain(self, null: Array) -> tuple[int, bool, float]:
-        """(Null directions (p, m) that these rows see, whether that takes no load, how well)."""
+        """(Number of the null directions (p, m) that these rows determine, whether without a load, how well)."""
         seen = np.linalg.svd(self.rows @ null, compute_uv=False)
         return int(np.sum(seen > 1 / NULL_STD)), not self.loaded, float(np.sum(np.log1p(seen)))
 

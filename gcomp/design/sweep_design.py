@@ -1,40 +1,32 @@
-"""Which sweeps to make: stops for the resting joints to lean on and steps to take, chosen before anything moves.
-
-D-optimal designs make the volume of the parameters' confidence ellipsoid smallest, A-optimal ones the sum of their
-variances in natural units.
-"""
+"""Design of sweeps before anything moves: stops of the resting joints, steps (docs/theory.md, section 7.4)."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask, as_array
+from gcomp.design.selection import Criterion, select, sweep_information, sweep_jacobian
 from gcomp.errors import BadArray
 from gcomp.gravity.torque import gravity_levers
 from gcomp.identify.global_fit import Prediction, predict_covariance
 from gcomp.identify.natural_units import natural_units
 from gcomp.identify.parameters import Parameters, free_mask
-from gcomp.identify.readings import Readings
-from gcomp.identify.sensor_model import predict, predict_and_jacobian
+from gcomp.identify.readings import StaticReadings
+from gcomp.identify.sensor_model import expected_readings
 
 MINIMUM_LEVER = 0.3
-"""Γ/g of the swept joint below which a stop combination is taken only where there is no better one."""
+"""Γ/g of the swept joint below which a combination is used only if none is better (docs/theory.md, section 2.5)."""
 SKETCH_STEPS = 7
-"""Steps by which a candidate sweep is judged."""
-EXCHANGES = 2
-"""Rounds in which every chosen sweep is compared once more with all others."""
-
-Criterion = Literal["D", "A"]
+"""Steps by which a candidate sweep is judged: more than a sinusoid's three unknowns (docs/theory.md, section 5.3)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """Joint `joint` moves through `angles` (K,) [rad] while the others stand as in `pose` (n,) [rad]."""
+    """Joint `joint` moves through `angles` (K,) [rad] while the others rest as in `pose` (n,) [rad]."""
 
     joint: int
     pose: Array
@@ -53,7 +45,7 @@ class Sweep:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """Chosen sweeps, and what they would determine."""
+    """Chosen sweeps, and the precision that they would give."""
 
     sweeps: tuple[Sweep, ...]
     prediction: Prediction
@@ -62,11 +54,11 @@ class Design:
 def stop_combinations(arm: Arm, joint: int) -> Array:
     """The 2^(n-1) poses (C, n) [rad] with the other joints at a limit and `joint` in the middle.
 
-    Raises BadArray where a joint has no limits.
+    Raises BadArray if a joint has no limits.
     """
     for name, low, high in zip(arm.names, arm.lower, arm.upper, strict=True):
         if not (np.isfinite(low) and np.isfinite(high)):
-            raise BadArray(f"joint {name} has no limits ({low} to {high} rad): there is no stop to lean on")
+            raise BadArray(f"joint {name} has no limits ({low} to {high} rad): there is no stop to rest on")
     choices = [
         [(low + high) / 2] if i == joint else [low, high]
         for i, (low, high) in enumerate(zip(arm.lower, arm.upper, strict=True))
@@ -75,9 +67,9 @@ def stop_combinations(arm: Arm, joint: int) -> Array:
 
 
 def candidate_sweeps(arm: Arm, joint: int, steps: int, margin: float = 0.0) -> list[Sweep]:
-    """A sweep of `joint`, `margin` [rad] off its limits, for each stop combination in which it feels gravity well.
+    """A sweep of `joint`, `margin` [rad] off its limits, for each stop combination with a sufficient lever of gravity.
 
-    Well is Γ ≥ 0.3 g; where no combination has that, the better half is taken.
+    Sufficient is Γ ≥ 0.3 g; if no combination has that, the better half is taken.
     """
     poses = stop_combinations(arm, joint)
     good = well_felt(gravity_levers(arm, poses)[:, joint] / max(float(np.linalg.norm(arm.gravity)), 1e-9))
@@ -86,21 +78,21 @@ def candidate_sweeps(arm: Arm, joint: int, steps: int, margin: float = 0.0) -> l
 
 
 def well_felt(lever: Array) -> Mask:
-    """Which levers Γ/g (C,) are at least `MINIMUM_LEVER`; where none is, the better half."""
+    """Levers Γ/g (C,) of at least `MINIMUM_LEVER`; if there is none, the better half."""
     good: Mask = lever >= MINIMUM_LEVER
     return good if good.any() else lever >= np.median(lever)
 
 
-def readings_of(arm: Arm, sweeps: Sequence[Sweep], sigma: ArrayLike, loads: Sequence[float] = (0.0,)) -> Readings:
-    """Rows of these sweeps, made once with each load, in which only the swept joint's torque counts (torque 0)."""
+def readings_of(arm: Arm, sweeps: Sequence[Sweep], sigma: ArrayLike, loads: Sequence[float] = (0.0,)) -> StaticReadings:
+    """Readings of these sweeps, repeated with each load [kg]; only the swept joint's torque counts and is 0."""
     positions = np.concatenate([sweep.positions() for sweep in sweeps])
     torque = np.full(positions.shape, np.nan)
     swept = np.concatenate([np.full(len(sweep.angles), sweep.joint) for sweep in sweeps])
     torque[np.arange(len(torque)), swept] = 0.0
-    return Readings.of(
+    return StaticReadings.of(
         np.tile(positions, (len(loads), 1)),
         np.tile(torque, (len(loads), 1)),
-        as_array("sigma", np.broadcast_to(sigma, (arm.n,)), (arm.n,)),
+        _per_joint(arm, sigma),
         np.repeat(np.asarray(loads, dtype=np.float64), len(positions)),
     )
 
@@ -120,32 +112,15 @@ def choose_sweeps(
     """`poses` sweeps of every joint, stops chosen together so that the families `unknown` come out best.
 
     `guess` is the parameters expected, sigma () or (n,) [N·m] the noise of a reading, loads [kg] the reference masses
-    of the passes. Greedy choice, then exchanges. Raises BadArray on a joint without limits.
+    of the passes. Raises BadArray on a joint without limits.
     """
-    candidates = [candidate_sweeps(arm, joint, SKETCH_STEPS, margin) for joint in range(arm.n)]
-    information = [_information(arm, guess, each, sigma, unknown, loads, steps / SKETCH_STEPS) for each in candidates]
-    total = np.eye(information[0].shape[1])  # a prior of one natural unit keeps every stage regular
-    chosen: list[list[int]] = [[] for _ in candidates]
-    for _ in range(poses):
-        for joint, rows in enumerate(information):
-            if len(chosen[joint]) < len(rows):
-                best = _best(total, rows, chosen[joint], criterion)
-                chosen[joint].append(best)
-                total = total + rows[best]
-    for _ in range(EXCHANGES):
-        for joint, rows in enumerate(information):
-            for slot, old in enumerate(chosen[joint]):
-                total = total - rows[old]
-                others = [pick for pick in chosen[joint] if pick != old]
-                chosen[joint][slot] = _best(total, rows, others, criterion)
-                total = total + rows[chosen[joint][slot]]
-    sweeps = [
-        Sweep(joint, candidates[joint][pick].pose, candidates[joint][pick].stepped(steps))
-        for joint, picks in enumerate(chosen)
-        for pick in picks
-    ]
-    prediction = predict_covariance(arm, readings_of(arm, sweeps, sigma, loads), guess, unknown=unknown)
-    return Design(tuple(sweeps), prediction)
+    candidates = [candidate_sweeps(arm, joint, SKETCH_STEPS, margin) for joint in reversed(range(arm.n))]  # tip first
+    judge = _Judge.of(arm, guess, [sweep for each in candidates for sweep in each], sigma, unknown, loads)
+    information = [sweep_information(judge.jacobian(each)) * (steps / SKETCH_STEPS) for each in candidates]
+    picks = judge.select(information, [poses] * arm.n, criterion)
+    chosen = [each[pick] for each, of_joint in zip(candidates, picks, strict=True) for pick in of_joint]
+    sweeps = [Sweep(each.joint, each.pose, each.stepped(steps)) for each in chosen]
+    return judge.design(sorted(sweeps, key=lambda sweep: sweep.joint))
 
 
 def choose_steps(
@@ -161,71 +136,62 @@ def choose_steps(
 ) -> Design:
     """The same sweeps with `count` of their steps each, those that serve the families `unknown` best.
 
-    Give sweeps of many steps to choose from. Ends and turning points of the sinusoids win; keep 13 or more where
-    harmonics are to show in the residual.
+    Give sweeps of many steps to choose from: ends and turning points of the sinusoids win. Keep 13 or more if harmonics
+    are to show in the residual (docs/theory.md, section 5.3).
     """
-    rows = [np.concatenate(_scaled(arm, guess, [sweep], sigma, unknown, loads)) for sweep in sweeps]
-    total = np.eye(rows[0].shape[-1])
-    taken: list[list[int]] = [[] for _ in sweeps]
-    for _ in range(count):
-        for place, (sweep, jacobian) in enumerate(zip(sweeps, rows, strict=True)):
-            of_step = jacobian.reshape(len(loads), len(sweep.angles), -1)
-            information = np.einsum("lkp,lkq->kpq", of_step, of_step)
-            best = _best(total, information, taken[place], criterion)
-            taken[place].append(best)
-            total = total + information[best]
-    thinned = [
-        Sweep(each.joint, each.pose, each.angles[sorted(kept)]) for each, kept in zip(sweeps, taken, strict=True)
-    ]
-    prediction = predict_covariance(arm, readings_of(arm, thinned, sigma, loads), guess, unknown=unknown)
-    return Design(tuple(thinned), prediction)
+    judge = _Judge.of(arm, guess, sweeps, sigma, unknown, loads)
+    information = []
+    for sweep in sweeps:
+        by_step = judge.jacobian([sweep]).reshape(len(loads), len(sweep.angles), -1)
+        information.append(np.einsum("lkp,lkq->kpq", by_step, by_step))
+    kept = judge.select(information, [count] * len(sweeps), criterion)
+    return judge.design(
+        [Sweep(each.joint, each.pose, each.angles[sorted(steps)]) for each, steps in zip(sweeps, kept, strict=True)]
+    )
 
 
-def _information(
-    arm: Arm,
-    guess: Parameters,
-    sweeps: Sequence[Sweep],
-    sigma: ArrayLike,
-    unknown: Collection[str],
-    loads: Sequence[float],
-    repeat: float,
-) -> Array:
-    """JᵀJ (C, p, p) of each sweep in natural units, its rows standing for `repeat` each."""
-    per_load = _scaled(arm, guess, sweeps, sigma, unknown, loads)
-    jacobian = np.stack([rows.reshape(len(sweeps), -1, rows.shape[-1]) for rows in per_load], axis=1)
-    jacobian = jacobian.reshape(len(sweeps), -1, jacobian.shape[-1])
-    information: Array = np.swapaxes(jacobian, 1, 2) @ jacobian * repeat
-    return information
+@dataclass(frozen=True, eq=False)
+class _Judge:
+    """Comparison of sweeps: the parameters expected, which of them are unknown, and their natural units."""
+
+    arm: Arm
+    guess: Parameters
+    sigma: Array
+    unknown: Collection[str]
+    loads: Sequence[float]
+    free: Mask
+    unit: Array
+    """Of the free parameters (p,): with a prior of one unit each, every stage of the choice is regular."""
+
+    @classmethod
+    def of(
+        cls,
+        arm: Arm,
+        guess: Parameters,
+        sweeps: Sequence[Sweep],
+        sigma: ArrayLike,
+        unknown: Collection[str],
+        loads: Sequence[float],
+    ) -> "_Judge":
+        free = free_mask(arm.n, unknown)
+        unit = natural_units(arm, expected_readings(arm, guess, readings_of(arm, sweeps, sigma)), guess)[free]
+        return cls(arm, guess, _per_joint(arm, sigma), unknown, loads, free, unit)
+
+    def jacobian(self, sweeps: Sequence[Sweep]) -> Array:
+        """Weighted Jacobian (C, L·S, p) of sweeps of one joint with equally many steps."""
+        poses = np.stack([sweep.positions() for sweep in sweeps])
+        return sweep_jacobian(self.arm, self.guess, sweeps[0].joint, poses, self.sigma, self.free, self.loads)
+
+    def select(self, information: Sequence[Array], counts: Sequence[int], criterion: Criterion) -> list[list[int]]:
+        """The candidates of each group, given by their information (C, p, p), that together are best."""
+        prior = np.diag(self.unit**-2.0)[None]
+        return select([each[None] for each in information], prior, counts, criterion=criterion, unit=self.unit)
+
+    def design(self, sweeps: Sequence[Sweep]) -> Design:
+        """The sweeps with their predicted precision."""
+        readings = readings_of(self.arm, sweeps, self.sigma, self.loads)
+        return Design(tuple(sweeps), predict_covariance(self.arm, readings, self.guess, unknown=self.unknown))
 
 
-def _scaled(
-    arm: Arm,
-    guess: Parameters,
-    sweeps: Sequence[Sweep],
-    sigma: ArrayLike,
-    unknown: Collection[str],
-    loads: Sequence[float],
-) -> list[Array]:
-    """Weighted Jacobian in natural units of all sweeps' rows (K, p), one for each load."""
-    free = free_mask(arm.n, unknown)
-    unit = natural_units(arm, expected_readings(arm, guess, readings_of(arm, sweeps, sigma)), guess)[free]
-    scaled = []
-    for load in loads:
-        rows = readings_of(arm, sweeps, sigma, (load,))
-        _, jacobian, _ = predict_and_jacobian(arm, guess, rows)
-        scaled.append(jacobian[:, free] * unit / rows.sigma[rows.counted][:, None])
-    return scaled
-
-
-def expected_readings(arm: Arm, guess: Parameters, design: Readings) -> Readings:
-    """The design's rows with the torques that `guess` makes the sensors read."""
-    torque = np.where(design.counted, predict(arm, guess, design), np.nan)
-    return Readings(design.position, torque, design.sigma, design.load)
-
-
-def _best(total: Array, information: Array, taken: Collection[int], criterion: Criterion) -> int:
-    """The candidate whose information (C, p, p) improves the criterion most, those taken left out."""
-    summed = total + information
-    score = np.linalg.slogdet(summed)[1] if criterion == "D" else -np.trace(np.linalg.inv(summed), axis1=1, axis2=2)
-    score[list(taken)] = -np.inf
-    return int(np.argmax(score))
+def _per_joint(arm: Arm, sigma: ArrayLike) -> Array:
+    return as_array("sigma", np.broadcast_to(sigma, (arm.n,)), (arm.n,))

@@ -1,7 +1,7 @@
-"""Gravity torque computed fast: one pose in plain floats, many poses in blocks of arrays that stay in the cache.
+"""Fast gravity torque: one pose in plain floats, many poses in blocks of arrays that fit the cache.
 
 Two passes along the arm: composite mass moments inwards, gravity outwards into each bar frame, and at each joint
-τ_i = ḡ_ix N_iy − ḡ_iy N_ix, equation (E4) of the theory note. The components across a joint's axis are one complex
+τ_i = ḡ_ix N_iy − ḡ_iy N_ix, equation (E4) of docs/theory.md. The components across a joint's axis are one complex
 number, so that turning about the axis by θ is a product with e^{iθ}.
 """
 
@@ -18,8 +18,8 @@ from gcomp.gravity.half_angle import half_angles
 from gcomp.gravity.single_pose import compile_single_pose, without_rounding
 
 BLOCK = 5000
-"""Poses worked on at a time: about two megabytes of work space for seven joints. Not a power of two: rows that begin
-at the same place of a memory page push each other out of the cache."""
+"""Poses per block: about two megabytes of work space for seven joints, best in benchmarks/bench_gravity.py. Not a power
+of two: rows at the same offset of a memory page evict each other from the cache."""
 
 ComplexArray = NDArray[np.complex128]
 
@@ -36,11 +36,11 @@ class GravityModel:
 
     @cached_property
     def one(self) -> Callable[[Array], Array]:
-        """Holding torque (n,) [N·m] at one pose q (n,) [rad], in a few microseconds: its argument is not checked."""
+        """Holding torque (n,) [N·m] at one pose q (n,) [rad] in a few microseconds, as a function without checks."""
         return compile_single_pose(self.arm, self.beta)
 
     def many(self, q: ArrayLike) -> Array:
-        """Holding torque (…, n) [N·m] at poses q (…, n) [rad]; raises BadArray where the last axis is not n."""
+        """Holding torque (…, n) [N·m] at poses q (…, n) [rad]; raises BadArray if the last axis is not n."""
         poses, leading = as_poses("q", q, self.arm.n)
         torque = np.empty(poses.shape)
         for begin in range(0, len(poses), BLOCK):
@@ -90,7 +90,7 @@ _kept = threading.local()
 
 
 def _space_for(n: int, size: int) -> _Space:
-    """Work space for a block, kept by each thread for its next: new memory costs as much as the computation."""
+    """Work space for a block, reused by each thread: new memory costs as much as the computation."""
     space: _Space | None = getattr(_kept, "space", None)
     if space is None or space.turn.shape != (n, size):
         space = _kept.space = _Space(n, size)
@@ -105,7 +105,7 @@ def _turn(arm: Arm, q: Array, tangent: Array, double: Array, turn: ComplexArray)
 
 
 def _turn_about_x(ca: float, sa: float, y: Array, z: Array, to_y: Array, to_z: Array, spare: Array) -> None:
-    """(to_y, to_z) = (ca y − sa z, sa y + ca z), to_y possibly y itself; right angles take two operations of six."""
+    """(to_y, to_z) = (ca y − sa z, sa y + ca z), to_y possibly y itself; a right angle takes two of six operations."""
     if ca == 0.0:
         np.multiply(y, sa, out=to_z)
         np.multiply(z, -sa, out=to_y)

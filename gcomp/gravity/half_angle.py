@@ -1,4 +1,4 @@
-"""Cosines and sines of many joint angles through the tangent of the half: numpy's tan is vectorised, its sin is not."""
+"""Cosines and sines of many joint angles from tan(θ/2): numpy's tan is vectorised, its sin is not."""
 
 import numpy as np
 

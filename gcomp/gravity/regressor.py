@@ -1,8 +1,7 @@
 """The gravity regressor at many poses at once: each lever w_i = z_{i-1} × g followed outwards along the arm.
 
-One row of the arrays is one joint's lever, one column a component in one bar frame, each contiguous over the poses. A
-twist by a multiple of 90° costs nothing: it renames the components across it and changes their signs, and the turn
-that follows takes the sign along.
+A row of the arrays is a joint's lever, a column a component in a bar frame, each contiguous over the poses. A twist by
+a multiple of 90° costs nothing: it swaps components and changes their signs, which the next turn takes into account.
 """
 
 from typing import NamedTuple
@@ -15,7 +14,7 @@ from gcomp.gravity.half_angle import half_angles
 from gcomp.gravity.single_pose import without_rounding
 
 BLOCK = 10_000
-"""Poses worked on at a time: about four megabytes of work space for seven joints."""
+"""Poses per block: about four megabytes of work space for seven joints, best in benchmarks/bench_gravity.py."""
 
 
 class Signed(NamedTuple):
@@ -32,7 +31,7 @@ class Signed(NamedTuple):
 def regressor(arm: Arm, q: Array) -> Array:
     """Regressor Y (K, n, 2n) [m/s²] at poses q (K, n) [rad], equation (Y), each column Y[:, i, c] contiguous."""
     n, (size, _) = arm.n, q.shape
-    columns = np.empty((2 * n, n, size))  # np.zeros gets its memory in small pages: half a millisecond more
+    columns = np.empty((2 * n, n, size))  # np.zeros allocates small pages: half a millisecond more
     columns[:, 0] = 0.0
     for j in range(n - 1):
         columns[2 * j : 2 * j + 2, j + 1 :] = 0.0
@@ -47,9 +46,9 @@ def regressor(arm: Arm, q: Array) -> Array:
 
 
 def _levers_outwards(arm: Arm, columns: Array, space: "_Space") -> None:
-    """Levers w_i in bar frame j into columns[2j : 2j + 2, i], i ≤ j; gravity goes along until it becomes w_j.
+    """Levers w_i in bar frame j into columns[2j : 2j + 2, i], i ≤ j; gravity is turned along and gives w_j.
 
-    Rows from j + 1 on are zero throughout: so a lever enters without a component along its axis.
+    Rows from j + 1 on are zero, so that a new lever has no component along its axis.
     """
     first = int(not arm.gravity[:2].any())  # a first joint along gravity has no lever
     gx, gy, gz = (np.full(space.size, component) for component in arm.gravity)
@@ -73,7 +72,7 @@ def _levers_outwards(arm: Arm, columns: Array, space: "_Space") -> None:
 def _about_x(
     twist: tuple[float, float], y: Signed, z: Signed, space: tuple[Array, Array, Array]
 ) -> tuple[Signed, Signed]:
-    """(y cos α + z sin α, z cos α − y sin α): names and signs alone where α is a multiple of 90°."""
+    """(y cos α + z sin α, z cos α − y sin α): no arithmetic if α is a multiple of 90°."""
     ca, sa = twist
     if sa == 0.0:
         return Signed(y.array, ca * y.sign), Signed(z.array, ca * z.sign)
@@ -99,7 +98,7 @@ class _Space:
         self.g_y, self.g_z = np.zeros((2, size))
 
     def turn_by(self, arm: Arm, q: Array) -> None:
-        """Take the turns at poses q (K, n) [rad]."""
+        """Compute the turns at poses q (K, n) [rad]."""
         cos = self.cos
         half_angles(arm, q, self.tangent, cos)
         np.multiply(self.tangent, cos, out=self.sin)

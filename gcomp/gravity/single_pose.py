@@ -1,6 +1,6 @@
 """Gravity torque at a single pose: the two passes of the kernel unrolled into straight-line Python for one arm.
 
-A loop over joints spends most of its time on the loop; unrolled, and without the products by the zeros and ones of
+A loop over joints spends most of its time on the loop. Unrolled, and without products by the zeros and ones of
 right-angled twists, a seven-joint arm takes a few microseconds.
 """
 
@@ -14,11 +14,11 @@ from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 
 EXACT = 1e-15
-"""Cosine or sine of a twist below which it is taken for zero: right angles carry their rounding."""
+"""Cosine or sine of a twist below which it counts as zero: the rounding of a right angle is below 1e-16."""
 
 
 def without_rounding(alpha: float) -> tuple[float, float]:
-    """(cos α, sin α), exact where α is a multiple of 90° up to rounding."""
+    """(cos α, sin α), exact if α is a multiple of 90° up to rounding."""
     ca, sa = float(np.cos(alpha)), float(np.sin(alpha))
     if abs(ca) < EXACT:
         return 0.0, float(np.sign(sa))
@@ -81,7 +81,7 @@ def _number(value: float) -> str:
 
 
 def _sum(*products: tuple[str, str]) -> str:
-    """Source of a sum of products, without those by zero and the factors one."""
+    """Source text of a sum of products, without products by zero and factors of one."""
     terms = []
     for pair in products:
         if any(factor in ("0.0", "-0.0") for factor in pair):

@@ -1,6 +1,6 @@
-"""Gravity torque of an arm at many poses at once, its regressor and its stiffness (theory note, sections 1 and 2).
+"""Gravity torque of an arm at many poses at once, its regressor and its stiffness (docs/theory.md, sections 1 and 2).
 
-Torque is the holding torque τ = ∂V/∂q [N·m]: what a static joint transmits.
+Torque is the holding torque τ = ∂V/∂q [N·m], which a joint at rest transmits.
 """
 
 import numpy as np
@@ -23,7 +23,7 @@ def gravity_torque(arm: Arm, beta: ArrayLike, q: ArrayLike) -> Array:
 def gravity_regressor(arm: Arm, q: ArrayLike) -> Array:
     """Regressor Y (…, n, 2n) [m/s²] at poses q (…, n) [rad], with τ = Y β; equation (Y).
 
-    It is laid out column by column, as LAPACK has its matrices: Y[:, i, c] is contiguous, Y[k] is not.
+    The memory layout is column by column, as in LAPACK: Y[:, i, c] is contiguous, Y[k] is not.
     """
     poses, leading = as_poses("q", q, arm.n)
     return as_batch(regressor(arm, poses), leading)
@@ -48,7 +48,7 @@ def composite_moments(rotation: Array, moments: Array) -> Array:
 
 
 def gravity_levers(arm: Arm, q: ArrayLike) -> Array:
-    """Γ_i = |z_{i-1} × g| (…, n) [m/s²] at poses q (…, n): how much of gravity joint i can feel."""
+    """Levers of gravity Γ_i = |z_{i-1} × g| (…, n) [m/s²] at poses q (…, n) [rad]."""
     poses, leading = as_poses("q", q, arm.n)
     return as_batch(np.linalg.norm(bar_frames(arm, poses).lever, axis=-1), leading)
 

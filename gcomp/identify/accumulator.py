@@ -13,31 +13,31 @@ from gcomp.identify.identifiability import NULL_RATIO, analyse, describe_null_sp
 from gcomp.identify.parameters import free_mask, parameter_names
 
 BLOCK = 4096
-"""Samples worked on at a time."""
+"""Samples per block: a few megabytes of regressor for seven joints."""
 
 
 @dataclass(frozen=True, eq=False)
 class MomentFit:
-    """Offsets and mass moments from samples of all joints' sensors; NaN where not identifiable."""
+    """Offsets and mass moments from samples of all joints' sensors; NaN if not identifiable."""
 
     offset: Array
     """(n,) [N·m]"""
     beta: Array
     """(2n,) [kg·m]"""
     names: tuple[str, ...]
-    """What `covariance` is of: offsets, then mass moments."""
+    """Parameters of `covariance`: offsets, then mass moments."""
     covariance: Array
-    """(3n, 3n); NaN rows and columns where not identifiable."""
+    """(3n, 3n); NaN rows and columns for parameters that are not identifiable."""
     null_space: tuple[str, ...]
     residual_rms: Array
-    """Per joint (n,) [N·m]; NaN where no reading counted."""
+    """Per joint (n,) [N·m]; NaN if no reading counted."""
     samples: int
 
 
 class MomentAccumulator:
     """Weighted normal equations of τ_i = Y_i β + o_i, samples added block by block.
 
-    Kept is, for each joint, the Gram matrix of its rows [Y_i, 1, τ_i]: all that estimate, covariance and residual need.
+    For each joint the Gram matrix of its rows [Y_i, 1, τ_i] is kept: estimate, covariance and residual follow from it.
     """
 
     def __init__(self, arm: Arm, sigma: ArrayLike) -> None:
@@ -68,7 +68,7 @@ class MomentAccumulator:
             self._gram[i, felt, felt] += kept.T @ kept
 
     def solve(self) -> MomentFit:
-        """Estimate, covariance for the given sigma, and residual of everything added; raises BadArray on nothing."""
+        """Estimate, covariance for the given sigma, and residual of all samples; raises BadArray if there are none."""
         n, counts = self.arm.n, self._gram[:, -2, -2]
         if not counts.any():
             raise BadArray("no torque reading counts: nothing was added, or all are NaN")
@@ -100,7 +100,7 @@ class MomentAccumulator:
         )
 
     def _units(self, counts: Array) -> Array:
-        """Natural units of offsets and mass moments: the readings' size, and that over g."""
+        """Natural units of offsets and mass moments: the RMS of the readings, and that over g."""
         size = float(np.sqrt((self._gram[:, -1, -1] / np.maximum(counts, 1)).max())) or 1.0
         moment = size / (float(np.linalg.norm(self.arm.gravity)) or 1.0)
         return np.concatenate([np.full(self.arm.n, size), np.full(2 * self.arm.n, moment)])

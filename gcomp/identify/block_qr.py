@@ -1,4 +1,4 @@
-"""Least squares on many rows in little memory: the triangular factor, updated some rows at a time."""
+"""Least squares on many rows in little memory: a triangular factor that is updated block by block."""
 
 from collections.abc import Iterable
 
@@ -7,12 +7,12 @@ import numpy as np
 from gcomp.arrays import Array
 
 ROWS = 192
-"""Rows folded in at a time. So small a factorisation stays in the cache and on one thread: on a busy machine a
-threaded one is a hundred times slower than this."""
+"""Rows per update. A factorisation this small stays in the cache and on one thread; from 384 rows LAPACK uses threads,
+which on a busy machine is ten to a hundred times slower."""
 
 
 def fold(triangle: Array, rows: Array) -> Array:
-    """Triangular factor (p, p) of everything folded in so far and the rows (K, p)."""
+    """Triangular factor (p, p) of all rows folded in before and of the rows (K, p)."""
     for begin in range(0, len(rows), ROWS):
         stacked = np.vstack([triangle, rows[begin : begin + ROWS]])
         triangle = np.asarray(np.linalg.qr(stacked, mode="r"), dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Global identification: sensors, mass moments and load point from all data at once (theory note, section 7)."""
+"""Global identification: sensors, mass moments and load point from all data at once (docs/theory.md, section 7)."""
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -13,38 +13,38 @@ from gcomp.identify.least_squares import Outcome, Problem, solve
 from gcomp.identify.linear_start import linear_start
 from gcomp.identify.natural_units import natural_units
 from gcomp.identify.parameters import Parameters, Prior, family_slices, parameter_names, prior_vectors
-from gcomp.identify.readings import Readings
-from gcomp.identify.sensor_model import predict
+from gcomp.identify.readings import StaticReadings
+from gcomp.identify.sensor_model import expected_readings, predict
 
 MAX_STD = {"gain": 0.2, "offset": 0.5, "position_gain": 0.1, "position_offset": 0.35, "beta": 0.5, "rho": 0.2}
-"""Standard deviation beyond which a value is no answer, per family: shares of the gain; of the readings' size for
-offset and of that size over g for mass moments; rad; m."""
+"""Standard deviation beyond which a value is of no use, per family: as a share of the gain, of the readings' RMS for
+offsets, of that over g for mass moments; rad; m (docs/theory.md, section 7.3)."""
 DOUBT = 2.0
-"""Weighted squares per degree of freedom from which on another start is tried."""
+"""Weighted squares per degree of freedom above which another start is tried (docs/theory.md, section 7.2)."""
 
 
 @dataclass(frozen=True, eq=False)
 class GlobalFit:
-    """The result of the global identification. Known families keep the values they were given, with std 0."""
+    """Result of the global identification. Known families keep their given values, with std 0."""
 
     values: Parameters
-    """Estimates; NaN where not identifiable."""
+    """Estimates; NaN if not identifiable."""
     std: Parameters
-    """Standard deviations; inf where not identifiable, 0 where known."""
+    """Standard deviations; inf if not identifiable, 0 if known."""
     complete: Parameters
-    """Estimates with every number finite: what is not identifiable stands where the start left it."""
+    """Estimates, all finite: parameters that are not identifiable have the values of the start."""
     names: tuple[str, ...]
     """Names of the p estimated parameters."""
     covariance: Array
-    """Their covariance (p, p); NaN rows and columns where not identifiable."""
+    """Their covariance (p, p); NaN rows and columns for those that are not identifiable."""
     identifiable: Mask
-    """Which of them the rows (and priors) determine (p,)."""
+    """Those that the readings and priors determine (p,)."""
     null_space: tuple[str, ...]
-    """What the rows cannot tell apart, one sentence a direction."""
+    """Parameters that the readings cannot separate, one sentence per null direction."""
     hopeless: tuple[str, ...]
-    """Parameters that the rows touch, but with a standard deviation beyond `max_std`."""
+    """Parameters that are determined, but with a standard deviation beyond `max_std`."""
     residual: Array
-    """Reading minus model (K, n) [N·m]; NaN where a reading does not count."""
+    """Reading minus model (K, n) [N·m]; NaN for readings that do not count."""
     chi2: float
     """Sum of squared residuals over their variance."""
     dof: int
@@ -54,11 +54,11 @@ class GlobalFit:
 
     @property
     def not_identifiable(self) -> tuple[str, ...]:
-        """Names of the parameters that these rows do not determine."""
+        """Names of the parameters that the readings do not determine."""
         return tuple(name for name, found in zip(self.names, self.identifiable, strict=True) if not found)
 
     def covariance_of(self, *names: str) -> Array:
-        """Covariance of these parameters, in this order; raises KeyError where one was not estimated."""
+        """Covariance of these parameters, in this order; raises KeyError if one was not estimated."""
         missing = [name for name in names if name not in self.names]
         if missing:
             raise KeyError(f"{missing[0]} was not estimated; there are {', '.join(self.names)}")
@@ -67,7 +67,7 @@ class GlobalFit:
 
     @property
     def beta_covariance(self) -> Array:
-        """Covariance of all mass moments (2n, 2n); zero where β was known, NaN where not identifiable."""
+        """Covariance of all mass moments (2n, 2n); zero if β was known, NaN for moments that are not identifiable."""
         moments = [name for name in self.names if name.startswith("mass_moment")]
         size = len(self.values.beta)
         return self.covariance_of(*moments) if moments else np.zeros((size, size))
@@ -75,7 +75,7 @@ class GlobalFit:
 
 def identify_global(
     arm: Arm,
-    readings: Readings,
+    readings: StaticReadings,
     *,
     unknown: Collection[str],
     start: Parameters | None = None,
@@ -86,11 +86,11 @@ def identify_global(
 ) -> GlobalFit:
     """Estimate the families `unknown` by weighted least squares on the readings that count.
 
-    The scale comes from rows with a reference mass or from a prior on the gains. `start` holds the known families'
-    values and the first guess of the others (default Parameters.nominal). `position_sigma` () or (n,) [rad] is the
-    position readings' noise, carried into each row's variance. `loss` is linear, huber or cauchy. Parameters that the
-    rows do not determine are held where the start left them; everything else comes out as if they were known.
-    Raises BadArray on shapes and on names of families or losses that do not exist.
+    The scale comes from readings with a reference mass or from a prior on the gains. `start` holds the values of known
+    families and the first guess of the others (default Parameters.nominal). `position_sigma` () or (n,) [rad] is the
+    noise of position readings, which adds to each reading's variance. `loss` is linear, huber or cauchy. Parameters
+    that the readings do not determine keep the values of the start; all others come out as if those were known.
+    Raises BadArray on wrong shapes and on unknown families and losses.
     """
     readings.require_arm(arm)
     begin = start or _start_of(arm.n, priors or {})
@@ -108,10 +108,10 @@ def identify_global(
 
 
 def _starts(problem: Problem, begin: Parameters) -> Iterator[Parameters]:
-    """Starts in the order in which to try them.
+    """Starts in the order in which they are tried (docs/theory.md, section 7.2).
 
-    Position errors spoil the linear solution: so first everything but the scale from the rows without a reference mass,
-    then the scale from all rows; next the linear solution of all rows; then the values given.
+    Position errors bias the linear solution. Hence first everything but the scale from the readings without a reference
+    mass and the scale from all readings; then the linear solution of all readings; then the values given.
     """
     n, places, loaded = problem.arm.n, family_slices(problem.arm.n), problem.readings.load != 0
     positions = slice(places["position_gain"].start, places["position_offset"].stop)
@@ -127,10 +127,10 @@ def _starts(problem: Problem, begin: Parameters) -> Iterator[Parameters]:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What readings at given poses would determine, before anything moves."""
+    """Precision that readings at given poses would give, before anything moves."""
 
     std: Parameters
-    """Standard deviations; inf where not identifiable, 0 where known."""
+    """Standard deviations; inf if not identifiable, 0 if known."""
     names: tuple[str, ...]
     covariance: Array
     identifiable: Mask
@@ -139,7 +139,7 @@ class Prediction:
 
 def predict_covariance(
     arm: Arm,
-    design: Readings,
+    design: StaticReadings,
     guess: Parameters,
     *,
     unknown: Collection[str],
@@ -148,10 +148,11 @@ def predict_covariance(
 ) -> Prediction:
     """Covariance that identify_global would report for readings at the design's positions and loads.
 
-    Of the design's torques only NaN matters: that reading would not count. `guess` is the parameters expected.
+    NaN in the design's torques marks readings that would not count; other torques are not used. `guess` is the
+    parameters expected.
     """
     design.require_arm(arm)
-    expected = replace_torque(design, np.where(design.counted, predict(arm, guess, design), np.nan))
+    expected = expected_readings(arm, guess, design)
     problem = Problem.of(
         arm, expected, unknown, priors or {}, "linear", position_sigma, natural_units(arm, expected, guess)
     )
@@ -167,19 +168,14 @@ def predict_covariance(
     )
 
 
-def replace_torque(readings: Readings, torque: Array) -> Readings:
-    """The same rows with other torque readings (K, n)."""
-    return Readings(readings.position, torque, readings.sigma, readings.load)
-
-
 def _start_of(n: int, priors: Mapping[str, Prior]) -> Parameters:
-    """Nominal values, but the prior's mean where there is one."""
+    """Nominal values, or the mean of the prior for parameters that have one."""
     mean, std = prior_vectors(n, priors)
     return Parameters.from_vector(np.where(np.isfinite(std), mean, Parameters.nominal(n).vector), n)
 
 
 def _names_and_std(problem: Problem, information: Information) -> tuple[tuple[str, ...], Array]:
-    """(Names of the estimated parameters, standard deviation of the whole vector: 0 known, inf not determined)."""
+    """(Names of the estimated parameters, standard deviations (6n + 3,): 0 if known, inf if not determined)."""
     names = tuple(name for name, free in zip(parameter_names(problem.arm), problem.free, strict=True) if free)
     std = np.zeros(len(problem.free))
     spread = np.sqrt(np.diag(information.covariance))

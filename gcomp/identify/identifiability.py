@@ -1,4 +1,4 @@
-"""What a weighted Jacobian determines: covariance, parameters that cannot be identified, and why, in words."""
+"""Identifiability from a weighted Jacobian: covariance, parameters that are not identifiable, and why, in words."""
 
 from dataclasses import dataclass
 
@@ -7,24 +7,24 @@ import numpy as np
 from gcomp.arrays import Array, Mask
 
 NULL_RATIO = 1e-7
-"""Singular values below this share of the largest are zero. Structural zeros come out below 1e-8 (angles are written
-with eight digits), and the smallest true ones seen above 1e-4: the bound stands in the gap."""
+"""Share of the largest singular value below which one counts as zero. Structural zeros are below 1e-8, since angles are
+written with eight digits; the smallest true ones seen are above 1e-4 (docs/theory.md, section 7.3)."""
 NULL_STD = 1.0
-"""A direction known to no better than one natural unit is held fixed: its linearisation would mean nothing."""
+"""A direction with a larger standard deviation, in natural units, is held: a linearisation over it means nothing."""
 PARTICIPATION = 1e-4
-"""Share of a null direction from which on a parameter counts as taking part in it."""
+"""Smallest share in a null direction with which a parameter counts as taking part in it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """What the rows say about p parameters."""
+    """Information of the readings on p parameters."""
 
     covariance: Array
     """Covariance (p, p); NaN rows and columns for parameters that take part in a null direction."""
     determined: Mask
     """Parameters that take part in no null direction (p,)."""
     null_basis: Array
-    """Null directions (p, m) in natural units, each made as sparse as elimination makes it."""
+    """Null directions (p, m) in natural units, made sparse by elimination."""
     rank: int
     """Rank of the Jacobian."""
 
@@ -71,7 +71,7 @@ def _sparse_basis(null: Array) -> Array:
 
 
 def describe_null_space(basis: Array, names: tuple[str, ...]) -> tuple[str, ...]:
-    """One sentence per null direction (columns of `basis` (p, m)), naming the parameters that change together."""
+    """One sentence per null direction (columns of `basis` (p, m)), with the parameters that change together."""
     sentences = []
     for direction in basis.T:
         taking_part = [name for name, share in zip(names, direction, strict=True) if share]

@@ -12,52 +12,53 @@ from gcomp.errors import BadArray
 from gcomp.identify.block_qr import fold
 from gcomp.identify.identifiability import Information, Spectrum, analyse
 from gcomp.identify.parameters import Parameters, Prior, free_mask, prior_vectors
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict, predict_and_jacobian
 
 MAX_ITERATIONS = 60
+"""Fits of sweeps take 3 or 4, hardly determined ones some 20."""
 SETTLED, STALLED, EXACT = 1e-7, 1e-5, 1e-16
-"""The last step is the one that can lower the cost by less than this share (a hundredth of it where the weights are
-fixed and convergence is quadratic); that share where no step lowers it at all;
-cost per reading at which the residual is rounding."""
+"""Converged if a step can lower the cost by less than the first share of it (a hundredth of that with fixed weights, as
+convergence is then quadratic), or if no step lowers it and the gain expected is below the second share. The third is
+the cost per reading that is rounding alone. Choices: far below the cost's own scatter of √(2/dof)."""
 TUNING = {"huber": 1.345, "cauchy": 2.385}
-"""Where a robust loss starts to doubt a residual, in standard deviations: 95 % efficient on Gaussian noise."""
+"""Residual, in standard deviations, from which a robust loss gives less weight: 95 % efficient on Gaussian noise."""
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What is fitted to what; vectors are of the whole parameter vector (6n + 3,)."""
+    """A least-squares problem; vectors have the length of the whole parameter vector (6n + 3,)."""
 
     arm: Arm
-    readings: Readings
+    readings: StaticReadings
     free: Mask
     prior_mean: Array
     prior_std: Array
     loss: str
     position_sigma: Array
     unit: Array
-    """Natural units of the parameters: the size of a change that matters."""
+    """Natural units of the parameters (`natural_units`)."""
 
     @classmethod
     def of(
         cls,
         arm: Arm,
-        readings: Readings,
+        readings: StaticReadings,
         unknown: Collection[str],
         priors: Mapping[str, Prior],
         loss: str,
         position_sigma: ArrayLike,
         unit: Array,
     ) -> "Problem":
-        """Checked and in vector form; raises BadArray on a loss, family or shape that does not exist."""
+        """Check and convert to vectors; raises BadArray on an unknown loss or family and on wrong shapes."""
         if loss != "linear" and loss not in TUNING:
             raise BadArray(f"loss is {loss!r}, expected linear, {' or '.join(TUNING)}")
         noise = as_array("position_sigma", np.broadcast_to(position_sigma, (arm.n,)), (arm.n,))
         mean, std = prior_vectors(arm.n, priors)
         return cls(arm, readings, free_mask(arm.n, unknown), mean, std, loss, noise, unit)
 
-    def on(self, readings: Readings) -> "Problem":
-        """The same fitted to other readings."""
+    def on(self, readings: StaticReadings) -> "Problem":
+        """The same problem with other readings."""
         return replace(self, readings=readings)
 
     @property
@@ -117,7 +118,7 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Where the iteration ended."""
+    """End of the iteration."""
 
     vector: Array
     information: Information
@@ -129,7 +130,7 @@ class Outcome:
 
 
 def solve(problem: Problem, first: Parameters) -> Outcome:
-    """Minimise from `first`; directions that the rows do not determine are never moved along."""
+    """Minimise from `first`; no step goes along directions that the readings do not determine."""
     vector, damping, converged = first.vector, 0.0, False
     weight = problem.weights(vector)
     cost = problem.cost(vector, weight)
@@ -187,7 +188,7 @@ def _finish(problem: Problem, vector: Array, cost: float, iterations: int, conve
 
 
 def _robust_factor(problem: Problem, size: Array, rank: int) -> float:
-    """What a robust loss multiplies the covariance by: Huber's E[ψ²]/E[ψ']² at the residuals found."""
+    """Factor of a robust loss on the covariance: Huber's E[ψ²]/E[ψ']² at the residuals found."""
     influence = size * problem._loss_weight(size)
     bound = TUNING[problem.loss]
     if problem.loss == "huber":

@@ -1,4 +1,4 @@
-"""Start of the global fit: the model solved in the reciprocal gains, in which it is linear (theory note, (L))."""
+"""Start of the global fit: the model is linear in the reciprocal gains (docs/theory.md, equation (L))."""
 
 import numpy as np
 
@@ -10,28 +10,28 @@ from gcomp.identify.block_qr import least_squares
 from gcomp.identify.identifiability import NULL_RATIO
 from gcomp.identify.natural_units import natural_units
 from gcomp.identify.parameters import Parameters, family_slices
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import joint_positions
 
 SANE_GAIN_RATIO = 5.0
-"""A gain that comes out further than this factor from its start was not determined by its rows."""
+"""Factor to the start beyond which a gain counts as not determined by its readings (docs/theory.md, section 7.2)."""
 
 
 FACTORS = (1.0, 0.7, 1.4, 0.5, 2.0, -1.0, -0.7, -1.4, -0.5, -2.0)
-"""Common factors tried for such gains: position errors make (L) shrink κ towards zero, sign and ratios survive."""
+"""Common factors tried for such gains: position errors make (L) shrink κ towards zero but keep sign and ratios."""
 SMALLEST_RATIO = 1e-2
-"""Below this share of its start a κ does not even tell its sign."""
+"""Share of its start below which the sign of a κ is not determined either."""
 
 
 def linear_start(
-    arm: Arm, readings: Readings, start: Parameters, free: Mask, *, keep_ratios: bool = False
+    arm: Arm, readings: StaticReadings, start: Parameters, free: Mask, *, keep_ratios: bool = False
 ) -> Parameters:
     """Gains, offsets, mass moments and load point that solve (L) at the start's position gains and offsets.
 
-    κ_i v − ω_i − Y_i (β + μ E_ρ ρ) = μ Y_i E_0 with κ = 1/gain, ω = offset/gain; what `free` (6n + 3,) holds fixed
-    stays as in `start`. Without any reference mass and with β unknown the equation has no scale: then the gain of the
-    joint whose torque varies most stays. Gains that their rows do not determine get the sign that fits and the common
-    factor that fits best. `keep_ratios` leaves only a common factor of the gains free.
+    κ_i v − ω_i − Y_i (β + μ E_ρ ρ) = μ Y_i E_0 with κ = 1/gain, ω = offset/gain; parameters not in `free` (6n + 3,)
+    keep their start. Without a reference mass and with β unknown the equation has no scale: the gain of the joint whose
+    torque varies most keeps its start. Gains that their readings do not determine get the sign and the common factor
+    that fit best. `keep_ratios` leaves only a common factor of the gains free.
     """
     places = family_slices(arm.n)
     free_gain = free[places["gain"]].copy()
@@ -57,12 +57,12 @@ def linear_start(
 
 
 def _solve(
-    arm: Arm, readings: Readings, start: Parameters, free: Mask, free_gain: Mask, keep_ratios: bool
+    arm: Arm, readings: StaticReadings, start: Parameters, free: Mask, free_gain: Mask, keep_ratios: bool
 ) -> tuple[list[Array], float]:
-    """([κ (n,), ω (n,), β (2n,), ρ (3,)] of least norm, zero where not free; norm of the weighted residual)."""
+    """([κ (n,), ω (n,), β (2n,), ρ (3,)] of least norm, zero if not free; norm of the weighted residual)."""
     n = arm.n
 
-    def rows(block: Readings) -> Array:
+    def rows(block: StaticReadings) -> Array:
         row, joint = np.nonzero(block.counted)
         columns, target = _linear_rows(arm, block, start, free, free_gain)
         if keep_ratios:
@@ -80,13 +80,15 @@ def _solve(
 
 
 def _with_gain(parameters: Parameters, gain: Array) -> Parameters:
-    """The same with other gains (n,)."""
+    """The parameters with other gains (n,)."""
     vector = parameters.vector
     vector[family_slices(len(gain))["gain"]] = gain
     return Parameters.from_vector(vector, len(gain))
 
 
-def _linear_rows(arm: Arm, readings: Readings, start: Parameters, free: Mask, free_gain: Mask) -> tuple[Array, Array]:
+def _linear_rows(
+    arm: Arm, readings: StaticReadings, start: Parameters, free: Mask, free_gain: Mask
+) -> tuple[Array, Array]:
     """Columns (P, 4n + 3) of (κ, ω, β, ρ) and right-hand side (P,); columns that are not free are zero."""
     n, places = arm.n, family_slices(arm.n)
     row, joint = np.nonzero(readings.counted)
@@ -109,7 +111,7 @@ def _linear_rows(arm: Arm, readings: Readings, start: Parameters, free: Mask, fr
     return columns, target
 
 
-def _strongest(readings: Readings) -> int:
+def _strongest(readings: StaticReadings) -> int:
     """The joint whose counted torque varies most against its noise."""
     scaled = np.ma.masked_invalid(readings.torque / readings.sigma)
     return int(np.argmax(scaled.std(axis=0).filled(0.0)))

@@ -1,17 +1,18 @@
-"""Natural units: how large a change of each parameter matters."""
+"""Natural units: the size of a change that matters, for each parameter (docs/theory.md, section 7.3)."""
 
 import numpy as np
 
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 from gcomp.identify.parameters import Parameters
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 
 
-def natural_units(arm: Arm, readings: Readings, start: Parameters) -> Array:
-    """Natural units of the parameter vector (6n + 3,): changes that matter.
+def natural_units(arm: Arm, readings: StaticReadings, start: Parameters) -> Array:
+    """Natural units of the parameter vector (6n + 3,).
 
-    The gain as it starts, 1 rad, 1 m, the readings' size, that size over g.
+    The gain of the start, 1 rad and 1 m; the RMS reading of the most loaded joint for offsets, that over g for mass
+    moments.
     """
     with np.errstate(invalid="ignore"):
         per_joint = np.sqrt(np.nansum(readings.torque**2, axis=0) / np.maximum(readings.counted.sum(axis=0), 1))

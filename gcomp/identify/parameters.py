@@ -20,7 +20,7 @@ def family_size(family: str, n: int) -> int:
 
 
 def family_slices(n: int) -> dict[str, slice]:
-    """Where each family stands in the parameter vector (6n + 3,)."""
+    """Place of each family in the parameter vector (6n + 3,)."""
     slices, begin = {}, 0
     for family in FAMILIES:
         slices[family] = slice(begin, begin + family_size(family, n))
@@ -50,11 +50,11 @@ class Parameters:
     beta: Array
     """Mass moments (2n,) [kg·m]."""
     rho: Array
-    """Where the reference mass hangs, in bar frame n (3,) [m]."""
+    """Place of the reference mass in bar frame n (3,) [m]."""
 
     @classmethod
     def nominal(cls, n: int, **known: ArrayLike) -> "Parameters":
-        """Gains 1 and everything else 0, but for the families given; raises BadArray on an unknown family or shape."""
+        """Gains 1 and all else 0, except for the families given; raises BadArray on an unknown family or shape."""
         values = {family: np.full(family_size(family, n), float("gain" in family)) for family in FAMILIES}
         for family, value in known.items():
             if family not in FAMILIES:
@@ -78,16 +78,16 @@ class Parameters:
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Gaussian prior knowledge of one family: mean and standard deviation, an infinite one where nothing is known."""
+    """Gaussian prior of one family: mean and standard deviation, infinite for no knowledge."""
 
     mean: ArrayLike
     std: ArrayLike
 
 
 def free_mask(n: int, unknown: Collection[str]) -> Mask:
-    """Which entries of the parameter vector (6n + 3,) are estimated.
+    """Entries of the parameter vector (6n + 3,) that are estimated.
 
-    With β unknown, θ0_n stays fixed: turning link n's frame is the same as turning n_n and ρ (theory note, section 4).
+    With β unknown, θ0_n stays fixed: turning link n's frame is the same as turning n_n and ρ (docs/theory.md, 4.1).
     """
     strangers = sorted(set(unknown) - set(FAMILIES))
     if strangers or not unknown:
@@ -101,7 +101,7 @@ def free_mask(n: int, unknown: Collection[str]) -> Mask:
 
 
 def prior_vectors(n: int, priors: Mapping[str, Prior]) -> tuple[Array, Array]:
-    """Mean and standard deviation of the whole parameter vector (6n + 3,); infinite where there is no prior."""
+    """Mean and standard deviation of the whole parameter vector (6n + 3,); infinite without a prior."""
     mean, std = np.zeros(6 * n + 3), np.full(6 * n + 3, np.inf)
     slices = family_slices(n)
     for family, prior in priors.items():

@@ -1,28 +1,38 @@
-"""What an identification is given: positions, torques and loads, row by row."""
+"""Static readings, the input of every identification: one row per reading, one column per joint."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask, as_array, frozen
 from gcomp.errors import BadArray
 
 
+def _zero() -> Any:
+    """0 for every reading; `__post_init__` gives it its shape."""
+    return np.zeros(())
+
+
 @dataclass(frozen=True, eq=False)
-class Readings:
-    """K static readings of an arm of n joints. Raises BadArray on shapes, infinities, sigma ≤ 0."""
+class StaticReadings:
+    """K static readings of an arm of n joints. Raises BadArray on wrong shapes, infinite readings and sigma ≤ 0."""
 
     position: Array
     """Raw position readings φ (K, n) [rad]."""
     torque: Array
-    """Raw torque readings v (K, n) [N·m]; NaN where that joint's sensor does not count (pressed on a stop)."""
+    """Raw torque readings v (K, n) [N·m]; NaN if that joint's sensor does not count (pressed on a stop)."""
     sigma: Array
     """Standard deviation of a torque reading, (K, n) or (n,) [N·m]."""
-    load: Array
-    """Reference mass attached in that row (K,) [kg]; 0 where there is none."""
+    load: Array = field(default_factory=_zero)
+    """Reference mass attached (K,) [kg]; 0 for none."""
+    direction: Array = field(default_factory=_zero)
+    """Sign of each joint's last motion (K, n); 0 if it has not moved or that is not known."""
+    series: NDArray[np.int64] = field(default_factory=_zero)
+    """Number of the sweep or recording that a reading belongs to (K,)."""
 
     def __post_init__(self) -> None:
         position = as_array("position", self.position, (None, None))
@@ -33,45 +43,56 @@ class Readings:
         sigma = np.array(np.broadcast_to(as_array("sigma", np.atleast_2d(self.sigma), (None, n)), (count, n)))
         if np.any(sigma <= 0):
             raise BadArray(f"sigma is {sigma.min()}, expected every standard deviation above zero [N·m]")
-        load = as_array("load", self.load, (count,))
-        frozen(self, position=position, torque=torque, sigma=sigma, load=load)
+        load = as_array("load", _spread(self.load, (count,)), (count,))
+        direction = as_array("direction", _spread(self.direction, (count, n)), (count, n))
+        series = np.asarray(as_array("series", _spread(self.series, (count,)), (count,)), dtype=np.int64)
+        frozen(self, position=position, torque=torque, sigma=sigma, load=load, direction=direction, series=series)
 
     @classmethod
-    def of(cls, position: ArrayLike, torque: ArrayLike, sigma: ArrayLike, load: ArrayLike = 0.0) -> "Readings":
-        """Readings from arrays; `sigma` may be one number or one a joint, `load` one number."""
+    def of(cls, position: ArrayLike, torque: ArrayLike, sigma: ArrayLike, load: ArrayLike = 0.0) -> "StaticReadings":
+        """From arrays; `sigma` may be one number or one per joint, `load` one number."""
         positions = as_array("position", position, (None, None))
         return cls(
             positions,
             np.asarray(torque, dtype=np.float64),
             np.broadcast_to(np.asarray(sigma, dtype=np.float64), positions.shape),
-            np.broadcast_to(np.asarray(load, dtype=np.float64), positions.shape[:1]),
+            np.asarray(load, dtype=np.float64),
         )
 
     @property
     def counted(self) -> Mask:
-        """Which torque readings count (K, n)."""
+        """Torque readings that count (K, n)."""
         return ~np.isnan(self.torque)
 
-    def rows(self, which: Mask | slice) -> "Readings":
-        """These rows alone."""
-        return Readings(self.position[which], self.torque[which], self.sigma[which], self.load[which])
+    def __len__(self) -> int:
+        """Number of readings, K."""
+        return len(self.position)
 
-    def blocks(self, size: int = 2048) -> Iterator["Readings"]:
-        """The same rows, at most `size` at a time: memory for what is computed from them stays bounded."""
-        for begin in range(0, len(self.load), size):
+    def rows(self, which: Mask | slice) -> "StaticReadings":
+        """These readings alone."""
+        return StaticReadings(*(column[which] for column in self._columns()))
+
+    def blocks(self, size: int = 2048) -> Iterator["StaticReadings"]:
+        """The same readings, at most `size` at a time, so that the memory for what is computed from them is bounded."""
+        for begin in range(0, len(self), size):
             yield self.rows(slice(begin, begin + size))
 
-    def joined(self, other: "Readings") -> "Readings":
-        """These rows, then the other's."""
-        pairs = zip(self._arrays(), other._arrays(), strict=True)
-        return Readings(*(np.concatenate(pair) for pair in pairs))
+    def joined(self, *others: "StaticReadings") -> "StaticReadings":
+        """These readings, then the others'."""
+        columns = zip(*(each._columns() for each in (self, *others)), strict=True)
+        return StaticReadings(*(np.concatenate(column) for column in columns))
 
-    def _arrays(self) -> tuple[Array, Array, Array, Array]:
-        return self.position, self.torque, self.sigma, self.load
+    def _columns(self) -> list[Any]:
+        return [getattr(self, field.name) for field in fields(self)]
 
     def require_arm(self, arm: Arm) -> None:
-        """Raise BadArray unless these are readings of so many joints, with at least one that counts."""
+        """Raise BadArray unless these are readings of the arm's n joints, and at least one counts."""
         if self.position.shape[1] != arm.n:
             raise BadArray(f"readings of {self.position.shape[1]} joints, but the arm has {arm.n}")
         if not self.counted.any():
             raise BadArray("no torque reading counts: all are NaN")
+
+
+def _spread(value: ArrayLike, shape: tuple[int, ...]) -> ArrayLike:
+    """One number as an array of that shape; an array as it is."""
+    return np.broadcast_to(value, shape) if np.ndim(value) == 0 else value

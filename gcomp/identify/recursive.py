@@ -1,4 +1,4 @@
-"""Recursive identification of mass moments from single-joint sweeps, tip to base (theory note, section 2)."""
+"""Recursive identification of mass moments from single-joint sweeps, tip to base (docs/theory.md, section 2.3)."""
 
 from dataclasses import dataclass
 
@@ -8,10 +8,10 @@ from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
 from gcomp.errors import BadArray
 from gcomp.gravity.torque import gravity_regressor
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 
 DEAD_COLUMN = 1e-6
-"""A column whose norm is below this share of g·√K says nothing: the axis stood along gravity in every row."""
+"""Share of g·√K below which a column's norm counts as zero: the axis was along gravity in every row (section 2.3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,31 +19,33 @@ class RecursiveFit:
     """Mass moments and sensor offsets found joint by joint."""
 
     beta: Array
-    """Mass moments (2n,) [kg·m]; NaN where the sweeps do not determine them."""
+    """Mass moments (2n,) [kg·m]; NaN if the sweeps do not determine them."""
     offset: Array
-    """Sensor offsets (n,) [N·m]; 0 where they were declared known."""
+    """Sensor offsets (n,) [N·m]; 0 if declared known."""
     covariance: Array
-    """Covariance of (β, o) (3n, 3n); NaN rows and columns where β is."""
+    """Covariance of (β, o) (3n, 3n); NaN rows and columns where β is NaN."""
     identifiable: Mask
-    """Which mass moments were found (2n,)."""
+    """Mass moments that were found (2n,)."""
 
 
-def identify_recursive(arm: Arm, readings: Readings, *, fit_offset: bool = True) -> RecursiveFit:
+def identify_recursive(arm: Arm, readings: StaticReadings, *, fit_offset: bool = True) -> RecursiveFit:
     """Mass moments from each joint's own torque, from the last joint to the first; equations (8) to (18) of [MH97].
 
-    A joint's sweep is every row in which its torque counts: several sweeps of a joint are stacked. Rows carry no
-    reference mass; gains must have been applied. Raises BadArray where a joint has no row.
+    All readings in which a joint's torque counts are used together, from any number of its sweeps. They must be without
+    a reference mass and calibrated to true angles and torques. Raises BadArray if a joint has none.
     """
     readings.require_arm(arm)
     if np.any(readings.load != 0):
-        raise BadArray("the recursion takes unloaded rows only: leave out the rows with a reference mass")
+        raise BadArray("the recursion takes unloaded readings only: leave out those with a reference mass")
     n = arm.n
     beta, offset, covariance = np.zeros(2 * n), np.zeros(n), np.zeros((3 * n, 3 * n))
     found = np.ones(2 * n, dtype=bool)
     for i in reversed(range(n)):
         rows = readings.counted[:, i]
         if not rows.any():
-            raise BadArray(f"joint {arm.names[i]}: no row counts its torque: sweep it, or leave it out of the arm")
+            raise BadArray(
+                f"joint {arm.names[i]}: its torque counts in no reading: sweep it, or leave it out of the arm"
+            )
         weight = 1 / readings.sigma[rows, i]
         regressor = gravity_regressor(arm, readings.position[rows])[:, i] * weight[:, None]
         own = slice(2 * i, 2 * i + 2)
@@ -60,7 +62,7 @@ def identify_recursive(arm: Arm, readings: Readings, *, fit_offset: bool = True)
         solver, enough = _solver(columns)
         if not enough:
             raise BadArray(
-                f"joint {arm.names[i]}: {len(weight)} steps do not determine its moment: more steps, further"
+                f"joint {arm.names[i]}: {len(weight)} steps do not determine its moment: take more, over a wider range"
             )
         solution = solver @ target
         beta[own], offset[i] = (solution[:2] if found[2 * i] else 0.0), (solution[-1] if fit_offset else 0.0)
@@ -77,7 +79,7 @@ def identify_recursive(arm: Arm, readings: Readings, *, fit_offset: bool = True)
 
 
 def _felt(arm: Arm, weighted: Array, weight: Array) -> Mask:
-    """Which moments reach this joint's torque at all in these rows."""
+    """Moments that act on this joint's torque in these rows."""
     floor = DEAD_COLUMN * float(np.linalg.norm(arm.gravity)) * float(np.linalg.norm(weight))
     felt: Mask = np.linalg.norm(weighted, axis=0) > floor
     return felt

@@ -1,4 +1,6 @@
-"""What the sensors read at given parameters, and how each parameter changes that (theory note, section 7)."""
+"""Sensor readings at given parameters, and their Jacobian (docs/theory.md, section 7.1)."""
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -7,10 +9,10 @@ from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array
 from gcomp.gravity.torque import composite_moments
 from gcomp.identify.parameters import Parameters, family_slices
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 
 
-def joint_positions(parameters: Parameters, readings: Readings) -> Array:
+def joint_positions(parameters: Parameters, readings: StaticReadings) -> Array:
     """Joint positions q = c φ + θ0 (K, n) [rad]."""
     return readings.position * parameters.position_gain + parameters.position_offset
 
@@ -21,18 +23,23 @@ def row_moments(arm: Arm, parameters: Parameters, load: Array) -> Array:
     return (parameters.beta + load[:, None] * (fixed + by_point @ parameters.rho)).reshape(-1, arm.n, 2)
 
 
-def predict(arm: Arm, parameters: Parameters, readings: Readings) -> Array:
-    """Modelled torque readings (K, n) [N·m] of every joint, counted or not."""
+def predict(arm: Arm, parameters: Parameters, readings: StaticReadings) -> Array:
+    """Modelled torque readings (K, n) [N·m] of every joint, whether they count or not."""
     frames = bar_frames(arm, joint_positions(parameters, readings))
     composite = composite_moments(frames.rotation, row_moments(arm, parameters, readings.load))
     reading: Array = parameters.gain * np.einsum("kid,kid->ki", frames.lever, composite) + parameters.offset
     return reading
 
 
-def predict_and_jacobian(arm: Arm, parameters: Parameters, readings: Readings) -> tuple[Array, Array, Array]:
+def expected_readings(arm: Arm, parameters: Parameters, design: StaticReadings) -> StaticReadings:
+    """The design's readings with modelled torques in place of its own; what does not count stays NaN."""
+    return replace(design, torque=np.where(design.counted, predict(arm, parameters, design), np.nan))
+
+
+def predict_and_jacobian(arm: Arm, parameters: Parameters, readings: StaticReadings) -> tuple[Array, Array, Array]:
     """(Modelled counted readings (P,), their Jacobian (P, 6n + 3), their slope by position reading (P, n)).
 
-    The P counted readings stand in row order, then joint order.
+    The P counted readings are in row order, then joint order.
     """
     n, counted = arm.n, readings.counted
     row, joint = np.nonzero(counted)

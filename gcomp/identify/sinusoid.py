@@ -1,4 +1,4 @@
-"""The sinusoid that one joint's sweep traces, fitted with its covariance (theory note, section 5)."""
+"""Fit of the sinusoid that one joint's sweep traces, with covariance (docs/theory.md, section 5)."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from gcomp.arrays import Array, as_array
 from gcomp.errors import BadArray
 
 GAIN_SEARCH = np.linspace(0.7, 1.3, 61)
-"""Position gains tried before the refinement: a sweep of less than a turn has local minima."""
+"""Position gains tried before the refinement: a sweep of less than a turn has local minima (docs/theory.md, 5.2)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,18 +23,18 @@ class SinusoidFit:
     offset: float
     """o [N·m]."""
     position_gain: float
-    """c; 1 unless it was fitted."""
+    """c; 1 unless fitted."""
     friction: float
     """Half the difference between the two approach directions [N·m]; 0 unless directions were given."""
     names: tuple[str, ...]
-    """What `covariance` is of, in order."""
+    """Parameters of `covariance`, in order."""
     covariance: Array
     """Covariance for the given sigma, in units of the parameters."""
     residual: Array
     """v minus the fit (K,) [N·m]."""
 
     def std(self, name: str) -> float:
-        """Standard deviation of one fitted parameter; raises KeyError where it was not fitted."""
+        """Standard deviation of one fitted parameter; raises KeyError if it was not fitted."""
         if name not in self.names:
             raise KeyError(f"{name} was not fitted; there are {', '.join(self.names)}")
         return float(np.sqrt(self.covariance[self.names.index(name), self.names.index(name)]))
@@ -50,8 +50,8 @@ def fit_sinusoid(
 ) -> SinusoidFit:
     """Fit one joint's sweep: positions φ (K,) [rad], readings v (K,) [N·m], their standard deviation () or (K,).
 
-    `direction` (K,), ±1, is the side each stop was approached from: then a friction column is fitted as well.
-    Raises BadArray where the sweep cannot determine the parameters asked for.
+    `direction` (K,), ±1, is the side of approach of each step; with it a friction column is fitted as well.
+    Raises BadArray if the sweep does not determine the parameters asked for.
     """
     phi = as_array("position", position, (None,))
     v = as_array("torque", torque, (len(phi),))
@@ -70,7 +70,7 @@ def fit_sinusoid(
     scale = np.linalg.norm(jacobian, axis=0)
     if np.any(scale == 0) or len(phi) < len(names) or np.linalg.cond(jacobian / scale) > 1e9:
         raise BadArray(
-            f"{len(phi)} steps over {np.ptp(phi):.3f} rad do not determine {', '.join(names)}: sweep further"
+            f"{len(phi)} steps over {np.ptp(phi):.3f} rad do not determine {', '.join(names)}: sweep a wider range"
         )
     covariance = np.linalg.inv((jacobian / scale).T @ (jacobian / scale)) / np.outer(scale, scale)
     residual = (

@@ -1,38 +1,11 @@
-"""Errors of motor and drive: the torque made differs from the torque that the drive believes it makes (6077h)."""
+"""Errors of motor and drive: the motor torque differs from what the drive reports (6077h)."""
 
-from collections.abc import Mapping
-from typing import Any
-
-import numpy as np
-
-from sim_bus.effects.registry import Effect, Parameter
-from sim_bus.effects.state import Imperfections
-
-
-def _gain(state: Imperfections, joint: int, values: Mapping[str, Any]) -> None:
-    state.actuator_gain[joint] *= values["gain"]
-
-
-def _rotor_inertia(state: Imperfections, joint: int, values: Mapping[str, Any]) -> None:
-    state.rotor_inertia[joint] += values["inertia"]
-
-
-def _lag(state: Imperfections, joint: int, values: Mapping[str, Any]) -> None:
-    state.actuator_lag[joint] += values["time"]
-
-
-def _delay(state: Imperfections, joint: int, values: Mapping[str, Any]) -> None:
-    state.actuator_delay[joint] += values["time"]
-
-
-def _saturation(state: Imperfections, joint: int, values: Mapping[str, Any]) -> None:
-    state.actuator_saturation[joint] = np.minimum(state.actuator_saturation[joint], values["limit"])
-
+from sim_bus.effects.effect import NOT_NEGATIVE, POSITIVE, adds, effect, limits, scales
 
 EFFECTS = (
-    Effect("actuator.gain", (Parameter("gain", "1", above=0.0),), _gain),
-    Effect("actuator.rotor_inertia", (Parameter("inertia", "kg·m²", least=0.0),), _rotor_inertia),
-    Effect("actuator.lag", (Parameter("time", "s", least=0.0),), _lag),
-    Effect("actuator.delay", (Parameter("time", "s", least=0.0),), _delay),
-    Effect("actuator.saturation", (Parameter("limit", "N·m", least=0.0),), _saturation),
+    effect("actuator.gain", scales(lambda state: state.actuator_gain, "gain"), gain=POSITIVE),
+    effect("actuator.rotor_inertia", adds(lambda state: state.rotor_inertia, "inertia"), inertia=NOT_NEGATIVE),
+    effect("actuator.lag", adds(lambda state: state.actuator_lag, "time"), time=NOT_NEGATIVE),
+    effect("actuator.delay", adds(lambda state: state.actuator_delay, "time"), time=NOT_NEGATIVE),
+    effect("actuator.saturation", limits(lambda state: state.actuator_saturation, "limit"), limit=NOT_NEGATIVE),
 )

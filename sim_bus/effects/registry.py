@@ -1,72 +1,56 @@
-"""Which effects there are (contract 4), with their parameters and units; the forward form lies in the family's file."""
+"""All effects of the simulated arm: checks an arm file's settings and folds them into one state."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from sim_bus.effects.state import Imperfections
+from sim_bus.effects import actuator, base, friction, link, position, timing, torque, transmission
+from sim_bus.effects.effect import Effect, EffectSetting, Parameter
+from sim_bus.effects.state import Imperfections
 
-Apply = Callable[["Imperfections", int, Mapping[str, Any]], None]
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One parameter of an effect."""
-
-    name: str
-    unit: str
-    sizes: tuple[int, ...] = (0,)
-    """Allowed lengths; 0 is a plain number."""
-    default: float | None = None
-    joint: bool = False
-    """Whether the value is a joint's name."""
-    least: float | None = None
-    above: float | None = None
-    """The value must be at least `least`, and greater than `above`."""
-
-    @property
-    def bound(self) -> str:
-        """What the value must keep to, in words; empty where it is free."""
-        return f" of at least {self.least:g}" if self.least is not None else f" above {self.above:g}"
-
-    def holds(self, value: float) -> bool:
-        """Whether a number keeps to the bounds."""
-        return (self.least is None or value >= self.least) and (self.above is None or value > self.above)
-
-
-@dataclass(frozen=True)
-class Effect:
-    """One effect: its id, its parameters, whether it belongs to a joint, and what it does to the simulated arm."""
-
-    id: str
-    parameters: tuple[Parameter, ...]
-    apply: Apply
-    per_joint: bool = True
-
-
-FAMILIES = ("actuator", "base", "friction", "link", "position", "timing", "torque", "transmission")
-_effects: dict[str, Effect] = {}
+FAMILIES = (actuator, base, friction, link, position, timing, torque, transmission)
+"""Modules with an `EFFECTS`, one a family."""
+NOT_SIMULATED = {
+    "torque.nonlinearity": "the simulated sensor is linear apart from hysteresis, dead band and saturation"
+}
+"""Catalogue ids without a forward form, and why."""
+_EFFECTS = {each.id: each for each in sorted((e for family in FAMILIES for e in family.EFFECTS), key=lambda e: e.id)}
 
 
 def effects() -> dict[str, Effect]:
     """All effects by id, sorted."""
-    if not _effects:
-        for family in FAMILIES:
-            for effect in import_module(f"sim_bus.effects.{family}").EFFECTS:
-                _effects[effect.id] = effect
-    return dict(sorted(_effects.items()))
+    return dict(_EFFECTS)
+
+
+def imperfections(names: Sequence[str], settings: Iterable[EffectSetting]) -> Imperfections:
+    """Fold the settings, in order, into one state of the joints `names`. Raises ValueError."""
+    state = Imperfections(tuple(names))
+    for setting in settings:
+        check_entry(setting.effect, setting.joint, setting.parameters)
+        effect = _EFFECTS[setting.effect]
+        values: Mapping[str, Any] = {
+            p.name: _value(names, p, setting.parameters.get(p.name, p.domain.default)) for p in effect.parameters
+        }
+        effect.apply(state, _index(names, setting.joint) if effect.per_joint else -1, values)
+    return state
+
+
+def _value(names: Sequence[str], parameter: Parameter, value: Any) -> Any:
+    return _index(names, value) if parameter.joint else np.asarray(value, float)
+
+
+def _index(names: Sequence[str], joint: Any) -> int:
+    if joint not in names:
+        raise ValueError(f"no joint {joint!r}; there are {', '.join(names)}")
+    return list(names).index(joint)
 
 
 def check_entry(effect_id: str, joint: str | None, parameters: Mapping[str, Any]) -> None:
-    """Check one effect's id, joint and parameters. Raises ValueError that says what was expected."""
-    known = effects()
-    if effect_id not in known:
-        raise ValueError(f"no effect {effect_id!r}; there are {', '.join(known)}")
-    effect = known[effect_id]
+    """Check one effect's id, joint and parameters. Raises ValueError with what was expected."""
+    if effect_id not in _EFFECTS:
+        raise ValueError(f"no effect {effect_id!r}; there are {', '.join(_EFFECTS)}")
+    effect = _EFFECTS[effect_id]
     if effect.per_joint and joint is None:
         raise ValueError(f"{effect_id}: key joint is missing: name the joint it acts on")
     if not effect.per_joint and joint is not None:
@@ -77,7 +61,7 @@ def check_entry(effect_id: str, joint: str | None, parameters: Mapping[str, Any]
     for parameter in effect.parameters:
         if parameter.name in parameters:
             _check_value(effect, parameter, parameters[parameter.name])
-        elif parameter.default is None:
+        elif parameter.domain.default is None:
             raise ValueError(f"{effect_id}: parameter {parameter.name} is missing; it has {described(effect)}")
 
 
@@ -87,16 +71,16 @@ def described(effect: Effect) -> str:
 
 
 def _check_value(effect: Effect, parameter: Parameter, value: Any) -> None:
-    wanted = f"{effect.id}: parameter {parameter.name} [{parameter.unit}]: expected"
+    expected = f"{effect.id}: parameter {parameter.name} [{parameter.unit}]: expected"
     if parameter.joint:
         if not isinstance(value, str):
-            raise ValueError(f"{wanted} a joint's name, not {value!r}")
+            raise ValueError(f"{expected} a joint's name, not {value!r}")
         return
     numbers = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value]
     size = len(numbers) if isinstance(value, Sequence) else 0
     finite = all(isinstance(number, int | float) and np.isfinite(number) for number in numbers)
-    if finite and not all(parameter.holds(number) for number in numbers):
-        raise ValueError(f"{wanted} a number{parameter.bound}, not {value!r}")
+    if finite and not all(parameter.accepts(number) for number in numbers):
+        raise ValueError(f"{expected} a number{parameter.bound}, not {value!r}")
     if not finite or size not in parameter.sizes:
         sizes = " or ".join("one number" if size == 0 else f"{size} numbers" for size in parameter.sizes)
-        raise ValueError(f"{wanted} {sizes}, not {value!r}")
+        raise ValueError(f"{expected} {sizes}, not {value!r}")

@@ -1,31 +1,16 @@
-"""All imperfections of a simulated arm as arrays: effects fold into it, plant, drives and sensors read it."""
+"""All imperfections of a simulated arm as arrays: effects write them; plant, drives and sensors read them."""
 
-from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bus.effects.registry import check_entry, effects
-
 Array = NDArray[np.float64]
-
-
-class Entry(Protocol):
-    """One effect as the arm file gives it."""
-
-    @property
-    def effect(self) -> str: ...  # noqa: D102
-    @property
-    def joint(self) -> str | None: ...  # noqa: D102
-    @property
-    def parameters(self) -> dict[str, Any]: ...  # noqa: D102
 
 
 @dataclass
 class Imperfections:
-    """What is wrong with an arm, per joint (n,) unless said otherwise; as built, nothing is."""
+    """Imperfections of an arm, per joint (n,) unless noted otherwise; initially none."""
 
     names: tuple[str, ...]
     coulomb: Array = field(init=False)
@@ -33,45 +18,45 @@ class Imperfections:
     viscous: Array = field(init=False)
     """[N·m·s/rad]."""
     breakaway: Array = field(init=False)
-    """Static friction above Coulomb's [N·m]."""
+    """Static friction in excess of Coulomb friction [N·m]."""
     stribeck_velocity: Array = field(init=False)
     """[rad/s]."""
     asymmetry: Array = field(init=False)
     """Friction is (1 + a) times as large for positive motion and (1 − a) for negative."""
     load_friction: Array = field(init=False)
-    """Friction per transmitted torque."""
+    """Friction torque per transmitted torque [1]."""
     ripple: Array = field(init=False)
-    """Amplitude, cycles per rad, phase (n, 3)."""
+    """Amplitude [N·m], cycles [1/rad], phase [rad] (n, 3)."""
     spring: Array = field(init=False)
     """Stiffness [N·m/rad] and rest angle [rad] (n, 2)."""
     elasticity: Array = field(init=False)
-    """Stiffness between motor and link [N·m/rad]; infinite without."""
+    """Stiffness between motor and link [N·m/rad]; infinite if rigid."""
     backlash: Array = field(init=False)
-    """Full width of the play between motor and link [rad]."""
+    """Full width of the backlash between motor and link [rad]."""
     coupling: Array = field(init=False)
-    """Turn of motor i per turn of joint j, its own aside (n, n)."""
+    """Turn of motor i per turn of joint j ≠ i (n, n)."""
     rotor_inertia: Array = field(init=False)
-    """At the joint [kg·m²]."""
+    """Reflected to the joint [kg·m²]."""
     actuator_gain: Array = field(init=False)
     actuator_lag: Array = field(init=False)
     """[s]."""
     actuator_delay: Array = field(init=False)
     """[s]."""
     actuator_saturation: Array = field(init=False)
-    """[N·m]; infinite without."""
+    """[N·m]; infinite if there is no limit."""
     torque_gain: Array = field(init=False)
     torque_offset: Array = field(init=False)
     """[N·m]."""
     torque_drift: Array = field(init=False)
     """[N·m/s]."""
     crosstalk: Array = field(init=False)
-    """Torque reading of i per torque of j (n, n)."""
+    """Torque reading of joint i per torque of joint j (n, n)."""
     hysteresis: Array = field(init=False)
     """Half width [N·m]."""
     deadband: Array = field(init=False)
     """Half width [N·m]."""
     torque_saturation: Array = field(init=False)
-    """[N·m]; infinite without."""
+    """[N·m]; infinite if there is no limit."""
     position_gain: Array = field(init=False)
     position_offset: Array = field(init=False)
     """[rad]."""
@@ -89,7 +74,7 @@ class Imperfections:
     """Rotation of the base about its x and y axes [rad] (2,)."""
 
     def __post_init__(self) -> None:
-        """Start from a perfect arm."""
+        """Start with a perfect arm."""
         n = len(self.names)
         square, pair = (n, n), (n, 2)
         shapes: dict[str, tuple[int, ...]] = {"ripple": (n, 3), "spring": pair, "tilt": (2,)}
@@ -109,45 +94,22 @@ class Imperfections:
 
     @property
     def steady_friction(self) -> bool:
-        """Whether friction keeps one level whatever the velocity, direction and load."""
+        """Whether friction has one level, independent of velocity, direction and load."""
         return not (self.breakaway.any() or self.asymmetry.any() or self.load_friction.any())
 
     @property
     def soft(self) -> NDArray[np.bool_]:
-        """Joints whose motor can turn while the link stands, (n,)."""
+        """Joints whose motor can turn while the link is at rest, (n,)."""
         return np.isfinite(self.elasticity) | (self.backlash > 0)
 
     @property
     def gearing(self) -> bytes:
-        """What tells apart how motors turn with joints; empty where each turns rigidly with its own."""
+        """Key of how the motors are geared to the joints; empty if each turns rigidly with its own."""
         if not (self.soft.any() or self.coupling.any()):
             return b""
         return self.soft.tobytes() + self.coupling.tobytes()
 
     @property
     def prompt_motors(self) -> bool:
-        """Whether motors make at once, and pass on whole, the torque that is asked for."""
+        """Whether motors produce the commanded torque at once and transmit all of it."""
         return not (self.actuator_lag.any() or self.actuator_delay.any() or self.ripple[:, 0].any())
-
-
-def imperfections(names: Sequence[str], entries: Iterable[Entry]) -> Imperfections:
-    """Fold the entries, in order, into one state for the joints `names`. Raises ValueError."""
-    state, known = Imperfections(tuple(names)), effects()
-    for entry in entries:
-        check_entry(entry.effect, entry.joint, entry.parameters)
-        effect = known[entry.effect]
-        values: Mapping[str, Any] = {
-            p.name: _value(names, p.joint, entry.parameters.get(p.name, p.default)) for p in effect.parameters
-        }
-        effect.apply(state, _index(names, entry.joint) if effect.per_joint else -1, values)
-    return state
-
-
-def _value(names: Sequence[str], joint: bool, value: Any) -> Any:
-    return _index(names, value) if joint else np.asarray(value, float)
-
-
-def _index(names: Sequence[str], joint: Any) -> int:
-    if joint not in names:
-        raise ValueError(f"no joint {joint!r}; there are {', '.join(names)}")
-    return list(names).index(joint)

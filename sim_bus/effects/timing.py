@@ -1,14 +1,5 @@
-"""Signals that come late."""
+"""Signals that are delayed."""
 
-from collections.abc import Mapping
-from typing import Any
+from sim_bus.effects.effect import NOT_NEGATIVE, adds, effect
 
-from sim_bus.effects.registry import Effect, Parameter
-from sim_bus.effects.state import Imperfections
-
-
-def _delay(state: Imperfections, joint: int, values: Mapping[str, Any]) -> None:
-    state.torque_delay[joint] += values["delay"]
-
-
-EFFECTS = (Effect("timing.delay", (Parameter("delay", "s", least=0.0),), _delay),)
+EFFECTS = (effect("timing.delay", adds(lambda state: state.torque_delay, "delay"), delay=NOT_NEGATIVE),)

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from armlink.arm_file import ArmFile
 from sim_bus.node.cia402 import STATUS, State, command, next_state
@@ -23,7 +22,6 @@ from sim_bus.node.position_torque_loops import (
 from sim_bus.physics.plant import Plant
 from sim_bus.physics.sensors import Sensors
 
-Array = NDArray[np.float64]
 SUPPORTED_MODES = sum(1 << (mode - 1) for mode in (PROFILE_POSITION, PROFILE_TORQUE, CSP, CSV, CST))
 """6502h."""
 VELOCITY_FILTER = 0.008

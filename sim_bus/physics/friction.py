@@ -1,11 +1,10 @@
 """Dry friction of transmissions: its level from velocity, direction and load."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armlink.arrays import Array
 from sim_bus.effects.state import Imperfections
 
-Array = NDArray[np.float64]
 RESTING = 1e-4
 """Slower than this a joint rests, and its motor tells where it is heading [rad/s]."""
 

@@ -6,7 +6,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from armlink.arrays import Array
+
 Places = NDArray[np.intp] | slice
 
 

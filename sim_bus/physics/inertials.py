@@ -4,12 +4,10 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from armlink.arrays import Array
 from sim_bus.effects.state import Imperfections
 from sim_bus.physics.mjcf import TINY_INERTIA
-
-Array = NDArray[np.float64]
 
 
 class Inertials:

@@ -1,11 +1,9 @@
 """Motors that make their torque late: a pure delay, then a lag of first order."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armlink.arrays import Array
 from sim_bus.effects.state import Imperfections
-
-Array = NDArray[np.float64]
 
 
 class LateMotors:

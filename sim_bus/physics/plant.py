@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armlink.arm_file import ArmFile
+from armlink.arrays import Array
 from sim_bus.effects.state import Imperfections
 from sim_bus.physics import gravity as statics
 from sim_bus.physics.friction import dry_friction
@@ -22,7 +23,6 @@ from sim_bus.physics.motor_lag import LateMotors
 from sim_bus.physics.transmission import HARD_GEAR_STEP, Transmissions, rotor_inertia
 from sim_bus.sim_section import sim_section
 
-Array = NDArray[np.float64]
 FRICTION_AT_DOF = int(mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
 BRAKE_SHARE = 3.0
 """What the holding brake holds, in maximal torques."""

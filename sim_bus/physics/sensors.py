@@ -1,14 +1,13 @@
 """Torque and position sensors of all joints: gain, offset, imperfections, noise, quantisation."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from armlink.arm_file import ArmFile
+from armlink.arrays import Array
 from sim_bus.effects.state import Imperfections
 from sim_bus.sim_section import NOISE_SHARE, sim_section
 from sim_bus.truth import Truth
 
-Array = NDArray[np.float64]
 TORQUE_RANGE = 2.0
 """The torque sensors saturate at this many rated torques."""
 NOISE_BLOCK = 512
@@ -20,7 +19,7 @@ class Sensors:
     def __init__(self, arm: ArmFile, truth: Truth, imperfections: Imperfections, seed: int) -> None:
         """Sensors of `truth`; `seed` is the noise's."""
         section, link = sim_section(arm).sensors, arm.require_link()
-        rated = np.array([joint.rated_torque for joint in link.joints])
+        rated = link.rated_torques
         n = len(rated)
         bits = np.broadcast_to(np.array(section.bits), n)
         self.noise = NOISE_SHARE * rated if section.noise is None else np.array(section.noise)

@@ -11,11 +11,10 @@ rotor inertia follow its own angle, and load joint j by c_ij.
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armlink.arrays import Array
 from sim_bus.effects.state import Imperfections
 
-Array = NDArray[np.float64]
 ROTOR_SHARE = 0.1
 """A motor behind a spring has at least this share of its joint's inertia, where nothing says more."""
 DAMPING_RATIO = 0.04

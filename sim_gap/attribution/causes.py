@@ -1,4 +1,4 @@
-"""From fitted terms to causes: one entry an effect, ordered by what each brings on motion not fitted."""
+"""From fitted terms to causes: one cause per effect, ordered by how far each lowers the gap on held-out data."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -9,73 +9,51 @@ import numpy as np
 
 from sim_gap.attribution.confidence import confidence
 from sim_gap.attribution.diagnosis import Cause, Signs
-from sim_gap.attribution.law_test import Outside
+from sim_gap.attribution.law_test import LawTest
 from sim_gap.attribution.rivals import Rivals
 from sim_gap.attribution.steadiness import STEADY, steadiness
-from sim_gap.effects.registry import Layout, Row
+from sim_gap.effects.registry import effects
 from sim_gap.model.rigid_body import Array
-from sim_gap.residuals.residual_set import CARE_NM, ResidualSet
+from sim_gap.residuals.layout import Layout, Row
+from sim_gap.residuals.residual_set import RELEVANT_NM, ResidualSet
 from sim_gap.search.estimate import Estimate, Value
-from sim_gap.search.normal_equations import ColumnStore, Normal, Term
+from sim_gap.search.normal_equations import ColumnStore, NormalEquations, Term
 
 
 @dataclass(frozen=True)
 class Step:
-    """One effect added to those before it: RMS per joint before and after, (n,)."""
+    """One effect added to the earlier ones: RMS per joint before and after, (n,)."""
 
     effect: str
     terms: tuple[Term, ...]
     below: tuple[Term, ...]
-    """Those before it."""
+    """Terms of the earlier steps."""
     before: Array
     after: Array
 
     @property
     def fall(self) -> float:
-        """Largest fall on a joint [N·m]."""
+        """Largest decrease at a joint [N·m]."""
         return float(np.max(self.before - self.after))
 
 
-def ordered(estimate: Estimate, scorer: "_Scorer") -> list[Step]:
-    """Effects in the order in which each, added to those before it, lowers the held-out RMS of some joint most."""
-    groups: dict[str, list[Term]] = defaultdict(list)
-    for term in estimate.terms:
-        groups[_belongs(term, estimate.terms, scorer.heldout.layout.n - 1)].append(term)
-    chosen: list[Term] = []
-    before, steps = scorer.rms([]), []
-    while groups:
-        outcomes = {effect: scorer.rms([*chosen, *terms]) for effect, terms in groups.items()}
-        effect = max(outcomes, key=lambda name: float(np.max(before - outcomes[name])))
-        steps.append(Step(effect, tuple(groups.pop(effect)), tuple(chosen), before, outcomes[effect]))
-        chosen += steps[-1].terms
-        before = outcomes[effect]
-    return steps
-
-
-def _belongs(term: Term, terms: Sequence[Term], tip: int) -> str:
-    """The effect that a term counts to: where there is a payload, its inertia is the payload's."""
-    loaded = any(other.effect == "link.payload" for other in terms)
-    inertia_of_payload = loaded and term.effect == "link.inertia" and term.place == tip
-    return "link.payload" if inertia_of_payload else term.effect
-
-
 FLOOR_KNOWN = 1.05
-"""What is left counts as more than noise from this times the noise floor on: it is no better known."""
+"""A remaining residual counts as more than noise from this multiple of the noise floor, which is known no better."""
 
 
 class _Scorer:
     def __init__(self, estimate: Estimate, heldout: ResidualSet) -> None:
         self.estimate, self.heldout = estimate, heldout
-        self.normal = Normal(ColumnStore(heldout), estimate.terms)
+        self.normal = NormalEquations(ColumnStore(heldout), estimate.terms)
         self.joint = np.array([row[1] for row in self.normal.rows])
         self.counts = self.normal.count.sum(0) > 0
 
     def squares(self, terms: list[Term]) -> Array:
-        """Held-out mean square per row after fitting these terms on the training set, (R,)."""
+        """Held-out mean square per row after fitting these terms to the training set, (R,)."""
         return self.normal.mean_square(np.arange(self.normal.size), self.estimate.subset(terms))
 
     def signs(self, terms: tuple[Term, ...], evidence: float, outside: float) -> Signs:
-        """What speaks for and against a cause, on the row that rises most without its terms."""
+        """The evidence for and against a cause, on the row that increases most without its terms."""
         data, rows = self.heldout, self.normal.rows
         final = self.squares(list(self.estimate.terms))
         without = self.squares([term for term in self.estimate.terms if term not in terms])
@@ -85,22 +63,25 @@ class _Scorer:
         above = np.maximum(final - (FLOOR_KNOWN * floor) ** 2, 0.0)
         gaps = self.counts & (np.sqrt(raw) > np.array([data.margin[row] for row in rows]))
         elsewhere = float(np.mean(above[gaps] / raw[gaps])) if gaps.any() else 0.0
-        excess = float(np.sqrt(final[r])) / data.care[rows[r]]
+        excess = float(np.sqrt(final[r])) / data.relevance_floor[rows[r]]
         return Signs(evidence, float(above[r] / max(raw[r], 1e-12)), excess, elsewhere, outside)
 
     @cached_property
     def noise(self) -> Array:
-        """Mean square of the noise in each row: its floor's, but no more than what all terms leave, (R,)."""
+        """Mean square of the noise in each row: of its floor, but at most of the residual of all terms, (R,)."""
         floor = np.array([self.heldout.floor[row] for row in self.normal.rows])
         return np.asarray(np.minimum(floor**2, self.squares(list(self.estimate.terms))))
 
     def rms(self, terms: list[Term]) -> Array:
-        """Held-out RMS per joint after fitting these terms on the training set, (n,)."""
+        """Held-out RMS per joint after fitting these terms to the training set, (n,)."""
         return self._by_joint(self.squares(terms))
 
     def falls(self, terms: Sequence[Term], more: Sequence[Term], quiet: bool) -> Array:
-        """What `more` on top of `terms` lowers each joint's RMS by, (n,); where all is quiet, or at a joint some of
-        whose channels drown in noise, noise apart and in the row where it is most."""
+        """Decrease of each joint's RMS by `more` in addition to `terms`, (n,).
+
+        If all is quiet, and at a joint whose command passes over noisy channels: the largest decrease of one row, noise
+        subtracted.
+        """
         layout = self.heldout.layout
         before, after = (self.squares([*chosen]) for chosen in (terms, [*terms, *more]))
         whole = self._by_joint(before) - self._by_joint(after)
@@ -116,24 +97,46 @@ class _Scorer:
         return np.asarray(np.sqrt(out))
 
 
+def ordered(estimate: Estimate, scorer: _Scorer) -> list[Step]:
+    """Effects in the order in which each, added to the earlier ones, lowers the held-out RMS of some joint most."""
+    groups: dict[str, list[Term]] = defaultdict(list)
+    for term in estimate.terms:
+        groups[_belongs(term, estimate.terms, scorer.heldout.layout.n - 1)].append(term)
+    chosen: list[Term] = []
+    before, steps = scorer.rms([]), []
+    while groups:
+        outcomes = {effect: scorer.rms([*chosen, *terms]) for effect, terms in groups.items()}
+        effect = max(outcomes, key=lambda name: float(np.max(before - outcomes[name])))
+        steps.append(Step(effect, tuple(groups.pop(effect)), tuple(chosen), before, outcomes[effect]))
+        chosen += steps[-1].terms
+        before = outcomes[effect]
+    return steps
+
+
+def _belongs(term: Term, terms: Sequence[Term], tip: int) -> str:
+    """The effect that a term is attributed to: with a payload, the inertia of the last link is the payload's."""
+    loaded = any(other.effect == "link.payload" for other in terms)
+    inertia_of_payload = loaded and term.effect == "link.inertia" and term.place == tip
+    return "link.payload" if inertia_of_payload else term.effect
+
+
 MINOR, MINOR_INNER, MINOR_COMMAND = 0.009, 0.004, 0.001
-"""Share of a joint's torque (RMS) that a cause must lower some joint's RMS by, not to be minor; where the cause shows
-against the model, where only in motor against sensor, and where only in command against motor."""
-
-
+"""Share of a joint's torque (RMS) by which a cause must lower some joint's RMS not to be minor: if it shows against the
+model, only in motor against sensor, only in command against motor."""
 QUIET_NM = 0.08
-"""Least fall on a joint where all rows are within their margins, so that noise, and the little friction that every arm
-has, could be all there is [N·m]."""
+"""Least decrease at a joint [N·m] if all rows are within their margins, for noise and the small friction of every arm
+could explain them."""
 
 
-def materials(step: Step, estimate: Estimate, heldout: ResidualSet, scorer: "_Scorer", quiet: bool) -> tuple[Term, ...]:
-    """Those of a step's terms whose place matters: the rest can go together without a joint's RMS rising by what a
-    user would care about, all else that was found being there."""
-    hit = heldout.struck | estimate.store.data.struck
+def relevant_terms(
+    step: Step, estimate: Estimate, heldout: ResidualSet, scorer: _Scorer, quiet: bool
+) -> tuple[Term, ...]:
+    """Those of a step's terms that matter: without the others together, no joint's RMS rises by a relevant amount."""
+    hit = heldout.impacts | estimate.store.data.impacts
     if any(term.bound or (term.effect == "transmission.backlash" and term.place in hit) for term in step.terms):
         return step.terms
     shows = {row for term in step.terms for row in estimate.store.columns(term)}
-    least = np.maximum(_minor(shows, heldout.layout) * heldout.usual_torque, QUIET_NM if quiet else CARE_NM)
+    least = np.maximum(_minor(shows, heldout.layout) * heldout.usual_torque, QUIET_NM if quiet else RELEVANT_NM)
     if np.all(scorer.falls(step.below, step.terms, quiet) < least):
         return ()
     places = {term.place for term in step.terms}
@@ -152,7 +155,7 @@ def materials(step: Step, estimate: Estimate, heldout: ResidualSet, scorer: "_Sc
 
 
 def _minor(shows: set[Row], layout: Layout) -> Array:
-    """Share of each joint's torque that a cause which shows in these rows must matter by, (n,)."""
+    """Share of each joint's torque below which a cause that shows in these rows is minor, (n,)."""
     if any(channel == layout.against_model for channel, _ in shows):
         return np.full(layout.n, MINOR)
     inner = {channel for channel, _ in shows} == {layout.command}
@@ -165,39 +168,40 @@ def causes(
 ) -> tuple[list[Cause], list[Cause]]:
     """The causes, most important first, and the minor ones: whole effects, and joints at which an effect is small.
 
-    Where all is `quiet`, noise could be all there is: what does not show throughout the held-out motion is minor, too.
+    If all is `quiet`, noise could explain everything: a cause that does not show throughout the held-out data is minor,
+    too.
     """
     found: list[Cause] = []
     minor: list[Cause] = []
     scorer = _Scorer(estimate, heldout)
     fitted = _Scorer(estimate, estimate.store.data)
-    outside = Outside(estimate.store, estimate.terms)
+    law_test = LawTest(estimate.store, estimate.terms)
     for step in ordered(estimate, scorer):
-        main = materials(step, estimate, heldout, scorer, quiet)
+        main = relevant_terms(step, estimate, heldout, scorer, quiet)
         if quiet and main and steadiness(estimate, heldout, main) < STEADY:
             main = ()
         rest = tuple(term for term in step.terms if term not in main)
         for terms, out in ((main, found), (rest, minor)):
             if terms:
                 bound = any(term.bound for term in terms)
-                out.append(_cause(step, terms, fitted if bound else scorer, (rivals, outside), names))
+                out.append(_cause(step, terms, fitted if bound else scorer, (rivals, law_test), names))
     return found, minor
 
 
 def _cause(
     step: Step,
     terms: tuple[Term, ...],
-    scorer: "_Scorer",
-    against: tuple[Rivals, Outside],
+    scorer: _Scorer,
+    against: tuple[Rivals, LawTest],
     names: tuple[str, ...],
 ) -> Cause:
-    """One cause from the terms of a step that belong together, weighed against the library and what is outside it."""
-    rivals, outside = against
+    """One cause from terms of a step, compared with the rest of the library and with the general laws."""
+    rivals, law_test = against
     places = sorted({term.place for term in terms})
-    whole = rivals.whole_arm(step.effect)
+    whole = effects()[step.effect].signature.whole_arm
     touched = np.arange(len(names)) if whole else np.array(places)
     weighed = rivals.weigh(step.effect, terms)
-    stand_in = outside.weigh(terms)
+    stand_in = law_test.best_law(terms)
     signs = scorer.signs(terms, weighed.evidence, stand_in.worse)
     parameters: dict[str, dict[str, Value]] = {}
     for term in sorted(terms, key=lambda t: t.place):
@@ -218,5 +222,5 @@ def _cause(
 
 
 def left_over(data: ResidualSet, explained: dict[Row, Array]) -> dict[Row, Array]:
-    """Residual less what the terms explain, (K,) per row."""
+    """Residual less the sum of the terms, (K,) per row."""
     return {row: values - explained[row] for row, values in data.values.items()}

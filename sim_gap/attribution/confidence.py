@@ -1,7 +1,7 @@
-"""How often a cause with these signs is right: a logistic fit to blind cases, half of them with the effect withheld.
+"""Confidence of a cause: a logistic regression on its signs, fitted to blind cases, half with the effect withheld.
 
-The weights come from tests/campaigns/gap_confidence.py; docs/diagnosing-a-gap.md says which seeds of `armlink gap
-bench` they were fitted to, and how they did on another.
+The weights come from tests/campaigns/gap_confidence.py; docs/diagnosing-a-gap.md lists the seeds of `armlink gap bench`
+that they were fitted to and the calibration on another seed.
 """
 
 from dataclasses import replace
@@ -11,20 +11,21 @@ import numpy as np
 from sim_gap.attribution.diagnosis import Signs
 
 WEIGHTS = {"constant": -3.37, "evidence": 0.42, "left": -0.87, "elsewhere": -2.9, "outside": 1.3}
-"""Of 1 and of each feature."""
+"""Weights of the constant and of each feature."""
 MOST = 0.99
+"""Largest confidence."""
 FOUNDED = 0.3
-"""Where no cause reaches this, laws outside the library apart, what is there is unexplained."""
+"""If no cause reaches this confidence, general laws disregarded, the gap is unexplained."""
 BETTER, WORSE = 0.07, 0.9
-"""A law outside the library that does better or worse by more than this tells no more."""
+"""Bounds of the feature `outside`: a general law that fits better or worse than this carries no more information."""
 HINT = 0.5
-"""Confidence of a cause in an answer that leaves structure unexplained is no more than this."""
+"""Largest confidence of a cause in an answer that leaves structure unexplained."""
 
 
 def confidence(signs: Signs, rivals: int) -> float:
-    """Probability that a cause is right; shared with its rivals where this recording cannot tell them apart.
+    """Probability that a cause is right; shared with rivals that these recordings cannot separate.
 
-    With rivals there is no evidence for one of them: the other signs speak for all of them together.
+    With rivals the evidence is none for either: the other signs hold for all of them together.
     """
     x = features(replace(signs, evidence=np.inf) if rivals else signs)
     odds = WEIGHTS["constant"] + sum(WEIGHTS[name] * value for name, value in x.items())
@@ -33,12 +34,12 @@ def confidence(signs: Signs, rivals: int) -> float:
 
 
 def founded(signs: Signs) -> bool:
-    """Whether a cause accounts for what it is named for, whatever else might."""
+    """Whether a cause accounts for the gap on its row, even if a general law would too."""
     return confidence(replace(signs, outside=np.inf), 0) >= FOUNDED
 
 
 def features(signs: Signs) -> dict[str, float]:
-    """The signs as the logistic fit takes them."""
+    """The signs as features of the logistic regression."""
     return {
         "evidence": float(np.log(np.clip(signs.evidence, 0.003, 3.0))),
         "left": float(np.log(np.clip(signs.left, 1e-3, 1.0))),

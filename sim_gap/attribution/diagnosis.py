@@ -1,4 +1,4 @@
-"""The answer of a diagnosis, and its JSON form (contract 5)."""
+"""Result of a diagnosis (made by `sim_gap.attribution.diagnose`) and its JSON form (docs/formats.md)."""
 
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -6,7 +6,7 @@ from typing import Any, Literal
 import numpy as np
 
 from sim_gap.model.rigid_body import Array
-from sim_gap.residuals.where import Place
+from sim_gap.residuals.where import Location
 from sim_gap.search.estimate import Value
 
 SCHEMA = "armlink.gap/1"
@@ -15,23 +15,24 @@ Verdict = Literal["no_gap", "explained", "ambiguous", "unexplained"]
 
 @dataclass(frozen=True)
 class Signs:
-    """What speaks for a cause and against it, on the row where it brings most."""
+    """Evidence for and against a cause, on the row that it affects most."""
 
     evidence: float
-    """What is lost without it, whatever stands in its place: fall of ½ log(R² + floor²)."""
+    """Loss of score without it, the best replacement in its place: increase of ½ log(R² + floor²)."""
     left: float
-    """Share of that row's squared gap that is left in the end, above the noise, on motion not fitted."""
+    """Share of that row's squared gap that remains above the noise, on held-out data."""
     excess: float
-    """What is left there in the end [RMS], in units of what is not worth explaining."""
+    """RMS that remains there, in units of the relevance floor."""
     elsewhere: float
-    """Share of the whole squared gap that is left."""
+    """Share of the squared gap that remains over all rows."""
     outside: float = float("inf")
-    """How much worse the best general law does in its place, in units of `evidence`: the library may lack it."""
+    """How much worse the best general law scores in its place, in units of `evidence`; small if the library may lack
+    the true effect."""
 
 
 @dataclass(frozen=True)
 class Cause:
-    """One effect, the joints it sits on, its parameters, and what adding it to those before it does to the gap."""
+    """One effect with its joints and parameters, and the gap before and after adding it to the earlier causes."""
 
     effect: str
     joints: tuple[str, ...]
@@ -40,23 +41,23 @@ class Cause:
     gap_after: float
     confidence: float
     fall: float
-    """Largest fall of a joint's held-out RMS [N·m]."""
+    """Largest decrease of a joint's held-out RMS [N·m]."""
     signs: Signs
-    """What the confidence was made from."""
+    """The signs that the confidence follows from."""
     confounded_with: tuple[str, ...] = ()
     separate_by: str | None = None
     law: str = ""
-    """The general law that could best stand in for it."""
+    """The general law that could best replace it."""
 
     @property
     def shrink(self) -> float:
-        """Share of the gap that this cause takes away, on motion not fitted."""
+        """Relative decrease of the gap by this cause, on held-out data."""
         return 1.0 - self.gap_after / self.gap_before if self.gap_before > 0 else 0.0
 
 
 @dataclass(frozen=True)
 class Rollout:
-    """Position gap of the forward simulation against the recording [rad], (n,) before and after, and its horizon."""
+    """Position gap of the forward simulation against the recording [rad], (n,) before and after the correction."""
 
     horizon_s: float
     before: Array
@@ -65,14 +66,14 @@ class Rollout:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Where the gap lies, which effects cause it, how far adding them closes it."""
+    """Location of the gap, the effects that cause it, and the gap that remains after adding them."""
 
     verdict: Verdict
     names: tuple[str, ...]
-    where: tuple[Place, ...]
+    where: tuple[Location, ...]
     causes: tuple[Cause, ...]
     minor: tuple[Cause, ...]
-    """Small true imperfections that came out besides: none lowers any joint's gap by what a user would care about."""
+    """Further small imperfections: none lowers any joint's gap by a relevant amount."""
     noise_floor: Array
     train_before: Array
     train_after: Array
@@ -80,16 +81,16 @@ class Diagnosis:
     heldout_after: Array
     unexplained: float
     margin: Array
-    """What counts as a gap: RMS per joint above this [N·m]."""
+    """RMS per joint from which it is a gap [N·m], (n,)."""
     heldout_is: str
-    """Which motion `heldout` is."""
+    """Description of the held-out data."""
     rollout: Rollout | None = None
     notes: tuple[str, ...] = ()
     internals: Any = field(default=None, repr=False, compare=False)
-    """Fit and data behind the answer, for report and export."""
+    """Fit and data behind the result (`answer.Internals`), for report and export."""
 
     def to_json(self) -> dict[str, Any]:
-        """The contract's dictionary."""
+        """The dictionary of schema armlink.gap/1."""
         roll = self.rollout
         return {
             "schema": SCHEMA,

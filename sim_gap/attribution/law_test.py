@@ -1,4 +1,4 @@
-"""What the library lacks: how well a general law (effects/laws.py) could stand in for a cause."""
+"""Test of causes against general laws (effects/laws.py), which represent effects that the library lacks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,41 +6,40 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim_gap.effects.laws import LAWS
-from sim_gap.effects.registry import effects
 from sim_gap.model.rigid_body import Array
-from sim_gap.search.normal_equations import ColumnStore, Normal, Term
+from sim_gap.search.normal_equations import ColumnStore, NormalEquations, Term
 from sim_gap.search.stepwise import Search
 
 TRIED = 3
-"""Laws tried in full in the place of a term, the best by a first screening."""
+"""Number of laws tried in place of a term: the best of a first screening."""
 CONTAINED = 1e-6
-"""A cause is a case of a law where no more than this share of the power of its columns lies outside the law's."""
+"""A cause is a case of a law if at most this share of the power of its columns is outside the span of the law's."""
 
 
 @dataclass(frozen=True)
 class StandIn:
-    """The best law in the place of a cause."""
+    """The best law in place of a cause."""
 
     worse: float
-    """How much worse it does, in half a log of the mean square summed over the rows; negative is better, infinite where
-    there is no such law."""
+    """How much worse it scores: ½ log of the mean square summed over the rows; negative is better, infinite without a
+    law."""
     law: str
-    """Its id; empty where there is none."""
+    """Its id; empty without a law."""
 
 
-class Outside:
-    """Tries the general laws in the place of a cause."""
+class LawTest:
+    """Tries the general laws in place of a cause."""
 
     def __init__(self, store: ColumnStore, active: Sequence[Term]) -> None:
         layout = store.data.layout
-        offered = [Term(name, place) for name in LAWS for place in effects()[name].places(layout)]
-        self.search = Search(Normal(store, [*active, *offered]), list(active))
+        offered = [Term(name, place) for name, law in LAWS.items() for place in law.signature.places(layout)]
+        self.search = Search(NormalEquations(store, [*active, *offered]), list(active))
         self.laws = [law for law in offered if law in self.search.normal.at]
 
-    def weigh(self, terms: Sequence[Term]) -> StandIn:
-        """The law that could best stand in for these terms.
+    def best_law(self, terms: Sequence[Term]) -> StandIn:
+        """The law that could best replace these terms.
 
-        Either one law does for all of them, or each term has its own: then the term counts that is best founded.
+        Either one law replaces all of them, or each term has its own: then the term with the worst replacement counts.
         """
         own = [term for term in self.search.active if term in terms]
         apart = [self._instead([term]) for term in own]
@@ -48,20 +47,20 @@ class Outside:
         return min([*found, self._instead(own)] if len(own) > 1 else found, key=lambda each: each.worse)
 
     def _instead(self, own: Sequence[Term]) -> StandIn:
-        """The best law in the place of these terms, and of what else at its joint is then not missed."""
+        """The best law in place of these terms and of others at its joint that are then not missed."""
         search, best = self.search, StandIn(np.inf, "")
         rest = search.active
         for term in own:
             rest = search.without(term, rest)
         laws = [law for law in self.laws if not self._holds(law, own)]
         for _, law in search.weighted.screen(rest, laws)[:TRIED]:
-            beside = [term for term in rest if term.place == law.place and not effects()[term.effect].whole_arm]
+            beside = [term for term in rest if term.place == law.place and not term.form.signature.whole_arm]
             score, _ = search.pruned(search.possible([*rest, law]), beside)
             best = min(best, StandIn(score - search.score, law.effect), key=lambda each: each.worse)
         return best
 
     def _holds(self, law: Term, own: Sequence[Term]) -> bool:
-        """Whether these terms are of the law's own family and a case of it: then it says the same as they do."""
+        """Whether these terms are of the law's own family and a case of it: then both say the same."""
         normal, family = self.search.normal, LAWS[law.effect].family
         if any(term.effect.split(".")[0] != family for term in own):
             return False
@@ -78,7 +77,7 @@ class Outside:
 
 
 def _explained(gram: Array, across: Array) -> Array:
-    """Power of each of q columns that p others with this Gram matrix (p, p) account for, from `across` (p, q); (q,)."""
+    """Power of each of q columns in the span of p others with Gram matrix (p, p) and products `across` (p, q); (q,)."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
     inverse = np.linalg.pinv(gram * scale * scale[:, None], rcond=1e-12, hermitian=True) * scale * scale[:, None]
     return np.asarray(np.einsum("ij,ik,kj->j", across, inverse, across))

@@ -1,21 +1,21 @@
-"""What a diagnosis says besides its causes, a line each: what is odd, what else it may be, what is left."""
+"""Notes of a diagnosis, one line each: anomalies of the data, other possible causes, remaining residuals."""
 
 from collections.abc import Sequence
 
 from sim_gap.attribution.diagnosis import Cause
 from sim_gap.attribution.verdict import row_rms
 from sim_gap.effects.laws import LAWS
-from sim_gap.effects.registry import Row
 from sim_gap.model.rigid_body import Array
+from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.residuals.stuck_channels import Stuck
-from sim_gap.residuals.where import places
+from sim_gap.residuals.where import locate
 from sim_gap.search.estimate import Estimate
 
 ALIKE = 0.05
-"""A general law that does worse than a cause by less is told of."""
-TOLD = 3
-"""So many rows in which something is left are told of."""
+"""A general law that scores worse than a cause by less than this is noted."""
+MOST_ROWS = 3
+"""Number of rows with a remaining gap that are noted."""
 
 
 def notes(
@@ -26,16 +26,16 @@ def notes(
     judge: ResidualSet,
     left: dict[Row, Array],
 ) -> tuple[str, ...]:
-    """All lines; `fit` was fitted, `judge` was not, and of the latter this is `left`."""
-    known = (*_drowned(fit), *_stuck(stuck, fit), *_hits(fit), *_bound(estimate, fit), *_alike(found))
-    return (*known, *_left(judge, left), *_still(fit))
+    """All notes; `fit` is the training set, `judge` the held-out set with the remaining residual `left`."""
+    known = (*_noisy(fit), *_stuck(stuck, fit), *_impacts(fit), *_bound(estimate, fit), *_alike(found))
+    return (*known, *_remaining(judge, left), *_at_rest(fit))
 
 
-def _drowned(data: ResidualSet) -> tuple[str, ...]:
-    """A line for each joint whose command is compared beyond channels that are noisy."""
+def _noisy(data: ResidualSet) -> tuple[str, ...]:
+    """A note for each joint whose command passes over noisy channels."""
     layout, names = data.layout, data.signals[0].arm.names
     return tuple(
-        f"{names[j]}: {' and '.join(layout.chain[: layout.beyond(j)])} drown in noise: the command is compared with "
+        f"{names[j]}: too noisy: {' and '.join(layout.chain[: layout.beyond(j)])}; the command is compared with "
         f"{layout.reference((str(layout.command), j)) or 'the model'} instead"
         for j in range(layout.n)
         if layout.beyond(j)
@@ -44,59 +44,58 @@ def _drowned(data: ResidualSet) -> tuple[str, ...]:
 
 def _stuck(stuck: Sequence[Stuck], data: ResidualSet) -> tuple[str, ...]:
     names = data.signals[0].arm.names
-    told = (
-        f"{names[one.joint]}: {one.channel} repeats one number for {one.seconds:.3g} s while the arm moves: stuck "
-        "sensor or channel; this recording cannot tell what it should read, and those moments are left out"
+    lines = (
+        f"{names[one.joint]}: {one.channel} repeats one value for {one.seconds:.3g} s while the arm moves: stuck "
+        "sensor or channel; these samples are left out"
         for one in stuck
     )
-    return tuple(dict.fromkeys(told))
+    return tuple(dict.fromkeys(lines))
 
 
-def _hits(data: ResidualSet) -> tuple[str, ...]:
+def _impacts(data: ResidualSet) -> tuple[str, ...]:
     return tuple(
-        f"{data.signals[0].arm.names[joint]}: the torque jumps where it changes sign, as a gear with play does; "
-        f"these moments ({near.mean():.0%} of the time) are left out of the comparison"
-        for joint, near in data.struck.items()
+        f"{data.signals[0].arm.names[joint]}: the torque jumps when it changes sign, as in a gear with backlash; these "
+        f"samples ({near.mean():.0%} of the time) are left out of the comparison"
+        for joint, near in data.impacts.items()
     )
 
 
 def _bound(estimate: Estimate | None, data: ResidualSet) -> tuple[str, ...]:
-    """A line for what is in one recording alone, and for a payload that could be in part the links' own weight."""
+    """A note for effects in one recording alone, and for a payload that includes model errors of the links."""
     terms = () if estimate is None else estimate.terms
     labels = {s.number: s.label for s in data.signals}
-    lines = [f"{term.effect} is in {labels[term.bound]} alone" for term in terms if term.bound]
+    lines = [f"{term.effect} is present in {labels[term.bound]} alone" for term in terms if term.bound]
     if any(term.effect == "link.payload" and not term.bound for term in terms):
         lines.append(
-            "link.payload: what the links themselves weigh beyond the model counts to it; recordings of the arm "
-            "without the payload, given as well (--train), tell the two apart"
+            "link.payload: includes mass errors of the links themselves; to separate them, add recordings of the arm "
+            "without the payload (--train)"
         )
     return tuple(lines)
 
 
 def _alike(found: Sequence[Cause]) -> tuple[str, ...]:
-    """A line for each cause that a general law could stand in for."""
+    """A note for each cause that a general law could replace."""
     return tuple(
-        f"{cause.effect}: {LAWS[cause.law].told} would look the same in this motion; the true cause may be none that "
-        "is known here"
+        f"{cause.effect}: {LAWS[cause.law].description} would look the same in this motion; the true cause may not be "
+        "in the library"
         for cause in found
         if cause.signs.outside < ALIKE
     )
 
 
-def _left(data: ResidualSet, left: dict[Row, Array]) -> tuple[str, ...]:
-    """A line for the rows in which most is left, and what it goes with, where that is a gap still."""
+def _remaining(data: ResidualSet, left: dict[Row, Array]) -> tuple[str, ...]:
+    """A note for the rows with the largest remaining gaps, and the regime of motion of each."""
     above = [row for row, rms in row_rms(data, left).items() if rms > data.margin[row]]
     return tuple(
-        f"{place.joint}: {place.rms:.2g} N·m of {place.channel} are left (noise {place.noise:.2g}), which go with "
-        + ("nothing that is looked for here" if place.regime == "other" else f"{place.regime} ({place.share:.0%})")
-        for place in (places(data, left, above)[:TOLD] if above else [])
+        f"{at.joint}: {at.rms:.2g} N·m of {at.channel} remain (noise {at.noise:.2g}), "
+        + ("without a known regime" if at.regime == "other" else f"correlated with {at.regime} ({at.share:.0%})")
+        for at in (locate(data, left, above)[:MOST_ROWS] if above else [])
     )
 
 
-def _still(data: ResidualSet) -> tuple[str, ...]:
-    still = [
-        f"{data.signals[0].arm.names[joint]} hardly moves: its {channel} tells nothing of friction here"
+def _at_rest(data: ResidualSet) -> tuple[str, ...]:
+    return tuple(
+        f"{data.signals[0].arm.names[joint]} hardly moves: its {channel} contains no information on friction"
         for channel, joint in data.rows
         if channel == data.layout.motor and not any(s.moving[:, joint].mean() > 0.02 for s in data.signals)
-    ]
-    return tuple(still)
+    )

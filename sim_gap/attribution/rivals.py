@@ -1,24 +1,24 @@
-"""Which other effects would have explained the recording as well, and which motion would tell them apart."""
+"""Rivals of a cause: other effects that explain the recordings as well, and the motion that would separate them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sim_gap.effects.registry import effects
 from sim_gap.search.normal_equations import Term
 from sim_gap.search.stepwise import Search, shortlist
 
 AS_GOOD = 0.036
-"""A rival is as good where it scores no more than this below the chosen effect (half a log of the mean square): the
-price of three coefficients, for what every arm has besides may speak by so much for either."""
+"""A rival is as good if its score (½ log of the mean square) is worse by no more than this: the price of three
+coefficients, for the background of every arm can favour either by that much."""
 BARE = 0.012
-"""A cause that brings no more than the price of a coefficient has a rival in whatever brings anything in its place."""
+"""A cause that brings no more than the price of a coefficient has as a rival any effect that brings some of it."""
 TRIED = 4
-MOTION = {
+"""Number of rivals tried in place of a term: the best of a first screening."""
+SEPARATING_MOTION = {
     frozenset(
         {"friction.coulomb", "friction.load"}
-    ): "both ways at the same speed under clearly different loads (stretched out, folded, with a payload)",
-    frozenset({"friction.coulomb", "friction.stribeck"}): "constant speeds from creeping to fast, both ways",
-    frozenset({"friction.coulomb", "friction.viscous"}): "constant speeds from slow to fast, both ways",
+    ): "both directions at the same speed under clearly different loads (stretched out, folded, with a payload)",
+    frozenset({"friction.coulomb", "friction.stribeck"}): "constant speeds from creeping to fast, both directions",
+    frozenset({"friction.coulomb", "friction.viscous"}): "constant speeds from slow to fast, both directions",
     frozenset(
         {"friction.asymmetric", "torque.offset"}
     ): "a rest under a known load, and both directions at several loads",
@@ -37,12 +37,14 @@ MOTION = {
     ): "fast motion of the joint with the links beyond it stretched out and folded",
     frozenset({"torque.hysteresis", "friction.coulomb"}): "a slow change of load with the joint at rest",
 }
-GENERAL = "each joint alone through its whole range, slow and fast, both ways, with the other joints in two poses"
+GENERAL_MOTION = (
+    "each joint alone through its whole range, slow and fast, both directions, with the other joints in two poses"
+)
 
 
 @dataclass(frozen=True)
 class Weighed:
-    """What is lost without a cause, and what could stand in its place."""
+    """Score lost without a cause, and the effects that could replace it."""
 
     evidence: float
     confounded_with: tuple[str, ...]
@@ -50,18 +52,13 @@ class Weighed:
 
 
 class Rivals:
-    """Tries every effect of the library in the place of a cause."""
+    """Tries every effect of the library in place of a cause."""
 
     def __init__(self, search: Search) -> None:
         self.search = search
 
-    @staticmethod
-    def whole_arm(effect: str) -> bool:
-        """Whether an effect belongs to the arm rather than to a joint."""
-        return effects()[effect].whole_arm
-
     def weigh(self, effect: str, terms: Sequence[Term]) -> Weighed:
-        """What is lost without a cause at its best-founded place, whatever stands in; and what does as well."""
+        """Score lost without a cause at its best-founded place, if best replaced, and its equally good rivals."""
         search = self.search
         present = [term for term in search.active if term in terms and term.effect == effect]
         evidence = 0.0
@@ -79,7 +76,8 @@ class Rivals:
                 and not (term.effect == other.effect == "transmission.coupling")
             ]
             likely = [other for _, other in shortlist(search.weighted.screen(rest, others))[:TRIED]]
-            known = [o for o in others if o.place == term.place and frozenset({term.effect, o.effect}) in MOTION]
+            here = [other for other in others if other.place == term.place]
+            known = [other for other in here if frozenset({term.effect, other.effect}) in SEPARATING_MOTION]
             for other in dict.fromkeys([*likely, *known]):
                 worse = search.judge(search.with_beneath(other, rest)) - search.score
                 weakest = min(weakest, worse)
@@ -89,5 +87,7 @@ class Rivals:
             if weakest >= evidence or not rivals:
                 evidence, rivals = max(evidence, weakest), own
         confounded = tuple(dict.fromkeys(rivals))
-        motion = MOTION.get(frozenset({effect, confounded[0]}), GENERAL) if confounded else None
-        return Weighed(evidence, confounded, f"record {motion}" if motion else None)
+        if not confounded:
+            return Weighed(evidence, (), None)
+        motion = SEPARATING_MOTION.get(frozenset({effect, confounded[0]}), GENERAL_MOTION)
+        return Weighed(evidence, confounded, f"record {motion}")

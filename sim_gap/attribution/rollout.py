@@ -1,7 +1,7 @@
-"""Forward simulation from recorded states under recorded torque: how far the simulated joints stray from the real ones.
+"""Forward simulation from recorded states with recorded torque: deviation of the simulated from the real joints.
 
-What a MuJoCo model can hold of the effects is put into it; of the rest, the torque that they make on recorded motion
-is taken off the driving torque. Short windows, for an arm under open-loop torque drifts away whatever drives it.
+Effects that a MuJoCo model can hold are put into it; the torque of the others along the recorded motion is subtracted
+from the driving torque. The windows are short, for an arm with open-loop torque drifts away in any case.
 """
 
 from typing import Any
@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from sim_gap.attribution.diagnosis import Rollout
-from sim_gap.better_model.with_effects import Closed, with_effects
-from sim_gap.effects.registry import Layout, effects
+from sim_gap.better_model.with_effects import CorrectedModel, with_effects
 from sim_gap.model.load import SimModel
 from sim_gap.model.rigid_body import Array
+from sim_gap.residuals.layout import Layout
 from sim_gap.residuals.preprocess import Signals
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.estimate import Estimate
@@ -21,25 +21,25 @@ HORIZON_S = 0.5
 WINDOWS = 40
 STEP_S = 0.002
 LOST, WILD = np.pi, 50.0
-"""A joint counts as no farther astray than this [rad], and turns no faster than this [rad/s]: without friction and
-rotors a light joint would spin away and take the simulation with it."""
+"""Limits of a joint's deviation [rad] and speed [rad/s]: without friction and rotor inertia a light joint would diverge
+and the simulation with it."""
 LOCKED = 1e9
-"""Armature of joints of the model that the recording does not have: they stay where they are."""
+"""Armature of joints of the model that the recording does not have [kg·m²]: they stay at rest."""
 
 
 def roll_out(sim: SimModel, heldout: ResidualSet, estimate: Estimate | None) -> Rollout:
-    """Position gap [rad] per joint, RMS over the windows, of the nominal model and of the model with the effects."""
+    """Position gap per joint, RMS over the windows [rad], of the nominal model and of the model with the effects."""
     before = _gap(sim, with_effects(sim, None), heldout, None)
     after = before if estimate is None else _gap(sim, with_effects(sim, estimate), heldout, estimate)
     return Rollout(HORIZON_S, before, after)
 
 
-def _gap(sim: SimModel, closed: Closed, heldout: ResidualSet, estimate: Estimate | None) -> Array:
-    model = closed.model
+def _gap(sim: SimModel, corrected: CorrectedModel, heldout: ResidualSet, estimate: Estimate | None) -> Array:
+    model = corrected.model
     _prepare(model, sim)
     squares, count = np.zeros(sim.n), 0
     for signals in heldout.signals:
-        drive = signals.reading[heldout.layout.motor_side] - _not_held(signals, heldout.layout, closed, estimate)
+        drive = signals.reading[heldout.layout.motor_side] - _not_held(signals, heldout.layout, corrected, estimate)
         steps = round(HORIZON_S * signals.rate)
         last = len(signals.t) - steps - 1
         share = max(1, WINDOWS // len(heldout.signals))
@@ -60,12 +60,12 @@ def _prepare(model: Any, sim: SimModel) -> None:
     model.dof_armature[others] = LOCKED
 
 
-def _not_held(signals: Signals, layout: Layout, closed: Closed, estimate: Estimate | None) -> Array:
-    """Torque at the motor (or sensor, where there is none) that the model does not make by itself, (K, n)."""
+def _not_held(signals: Signals, layout: Layout, corrected: CorrectedModel, estimate: Estimate | None) -> Array:
+    """Torque at the motor (without one, at the sensor) of the effects that the model cannot hold, (K, n)."""
     out = np.zeros_like(signals.q)
-    for term in closed.not_held:
+    for term in corrected.not_held:
         assert estimate is not None
-        columns = effects()[term.effect].columns(signals, layout, term.place, term.shape)
+        columns = term.form.signature.columns(signals, layout, term.place, term.shape)
         for (channel, joint), x in columns.items():
             if channel != layout.command:
                 out[:, joint] += x @ estimate.of(term)

@@ -1,4 +1,4 @@
-"""Whether a cause shows steadily: in block after block of motion that was not fitted, not in a few moments."""
+"""Steadiness of a cause: whether it shows in most blocks of the held-out data and not in a few moments."""
 
 from collections.abc import Sequence
 
@@ -9,14 +9,14 @@ from sim_gap.search.estimate import Estimate
 from sim_gap.search.normal_equations import ColumnStore, Term
 
 STEADY = 2.0
-"""Standard errors by which a cause must lower a row's squares on average over the blocks."""
+"""Least mean decrease of a row's sum of squares over the blocks, in standard errors."""
 
 
 def steadiness(estimate: Estimate, heldout: ResidualSet, terms: Sequence[Term]) -> float:
-    """Standard errors by which these terms lower the squares of some held-out row, all others being fitted.
+    """Decrease of some held-out row's sum of squares by these terms, all others fitted, in standard errors.
 
-    The mean over blocks of time of what each block's sum of squares falls by, in standard errors of that mean; the
-    largest of the rows.
+    The mean over blocks of time of the decrease per block, divided by the standard error of that mean; the largest of
+    the rows.
     """
     store = ColumnStore(heldout)
     with_them = estimate.subset(list(estimate.terms))

@@ -1,4 +1,4 @@
-"""The verdict: is there a gap at all, is it explained, and by one effect only."""
+"""The verdict: whether there is a gap, whether it is explained, and whether by one effect only."""
 
 from collections.abc import Sequence
 
@@ -6,27 +6,27 @@ import numpy as np
 
 from sim_gap.attribution.confidence import founded
 from sim_gap.attribution.diagnosis import Cause, Verdict
-from sim_gap.effects.registry import Row
 from sim_gap.model.rigid_body import Array
+from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
 
 EXPLAINED = 0.15
-"""Share of the squared gap above the noise that may be left in an explained diagnosis."""
+"""Largest remaining share of the squared gap above the noise in an explained diagnosis."""
 
 
 def row_rms(data: ResidualSet, left: dict[Row, Array] | None = None) -> dict[Row, float]:
-    """RMS of each row that has valid samples [N·m]; of `left` instead of the raw residual."""
+    """RMS of each row with valid samples [N·m]; of `left` if given, else of the raw residual."""
     values = data.values if left is None else left
     return {row: root_mean_square(values[row][data.valid[row]]) for row in data.rows if data.valid[row].any()}
 
 
 def is_quiet(data: ResidualSet) -> bool:
-    """Whether no row exceeds what noise, and what nobody cares about, could be."""
-    return all(rms <= data.faint[row] for row, rms in row_rms(data).items())
+    """Whether noise alone could explain every row."""
+    return all(rms <= data.quiet_threshold[row] for row, rms in row_rms(data).items())
 
 
 def share_left(data: ResidualSet, left: dict[Row, Array]) -> float:
-    """Share of the squared gap above the noise that is left, over the rows that had a gap, each counted alike."""
+    """Remaining share of the squared gap above the noise, over the rows with a gap, each with the same weight."""
     before, after = row_rms(data), row_rms(data, left)
     shares, weights = [], []
     for row, rms in before.items():
@@ -39,7 +39,7 @@ def share_left(data: ResidualSet, left: dict[Row, Array]) -> float:
 
 
 def verdict(found: Sequence[Cause], data: ResidualSet, left: dict[Row, Array]) -> Verdict:
-    """`unexplained` where a gap is left or nothing is well founded, `ambiguous` where the first cause has a rival."""
+    """`unexplained` if a gap remains or no cause is well founded, `ambiguous` if the first cause has a rival."""
     after = row_rms(data, left)
     quiet = all(rms <= data.margin[row] for row, rms in after.items())
     if not found:

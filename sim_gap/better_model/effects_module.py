@@ -1,4 +1,4 @@
-"""Writes the module beside the exported MJCF: the source of `forward_effects` with one arm's effects in it."""
+"""The module written beside an exported MJCF: the source of `forward_effects` with one arm's effects filled in."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,16 +10,16 @@ from sim_gap.search.normal_equations import Term
 
 
 def module_path(model: Path) -> Path:
-    """Where the module of a written model lies: `closed.xml` → `closed_effects.py`."""
+    """Path of the module of a written model: `closed.xml` → `closed_effects.py`."""
     return model.with_name(f"{model.stem}_effects.py")
 
 
-def entries(sim: SimModel, estimate: Estimate, terms: Sequence[Term]) -> list[forward.Entry]:
-    """The terms as the module takes them; what is in one recording alone is left out.
+def joint_effects(sim: SimModel, estimate: Estimate, terms: Sequence[Term]) -> list[forward.JointEffect]:
+    """The terms in the module's form, without those present in one recording alone.
 
-    Where there is no torque sensor, an offset of the motor's torque is torque lost.
+    Without a torque sensor, an offset of the motor's torque is torque lost.
     """
-    out: list[forward.Entry] = []
+    out: list[forward.JointEffect] = []
     for term in terms:
         if term.bound:
             continue
@@ -31,13 +31,13 @@ def entries(sim: SimModel, estimate: Estimate, terms: Sequence[Term]) -> list[fo
 
 
 def module_text(sim: SimModel, estimate: Estimate, terms: Sequence[Term], model: str) -> str:
-    """The module's source for effects that the MJCF file `model` cannot hold."""
-    rows = "".join(f"    {entry!r},\n" for entry in entries(sim, estimate, terms))
+    """Source of the module with the effects that the MJCF file `model` cannot hold."""
+    rows = "".join(f"    {each!r},\n" for each in joint_effects(sim, estimate, terms))
     text = Path(forward.__file__).read_text(encoding="utf-8")
     for name, declared, value in (
         ("MODEL", 'MODEL = ""', f"{model!r}"),
         ("JOINTS", "JOINTS: tuple[str, ...] = ()", f"{sim.arm.names!r}"),
-        ("EFFECTS", "EFFECTS: tuple[Entry, ...] = ()", f"(\n{rows})"),
+        ("EFFECTS", "EFFECTS: tuple[JointEffect, ...] = ()", f"(\n{rows})"),
     ):
         text = text.replace(declared, f"{name} = {value}", 1)
     return text

@@ -1,4 +1,4 @@
-"""What `--out-model` writes: MJCF with the effects in it, and a module for those that MJCF cannot hold."""
+"""Export of the corrected model (`--out-model`): MJCF, and a module for the effects that MJCF cannot hold."""
 
 from pathlib import Path
 from typing import Any
@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from armlink.errors import BadInput
+from sim_gap.better_model.coupled_motors import add_to, coupled_motors
 from sim_gap.better_model.effects_module import module_path, module_text
-from sim_gap.better_model.with_effects import shared_motors, spec_of, with_effects
+from sim_gap.better_model.with_effects import spec_of, with_effects
 from sim_gap.model.load import SimModel
-from sim_gap.model.tendons import add_to
 from sim_gap.search.estimate import Estimate
 from sim_gap.search.normal_equations import Term
 
@@ -17,23 +17,23 @@ from sim_gap.search.normal_equations import Term
 def write_model(sim: SimModel, estimate: Estimate | None, path: Path) -> list[str]:
     """Write the model with the effects as MJCF, and beside it a module for those that MJCF cannot hold, if any.
 
-    Returns a line per effect that MJCF cannot hold; they also stand in a comment. Raises BadInput where the nominal
-    model did not come from a file, or a file cannot be written.
+    Returns a line per effect that MJCF cannot hold; the file lists them in a comment. Raises BadInput if the nominal
+    model did not come from a file or a file cannot be written.
     """
-    spec, closed = spec_of(sim), with_effects(sim, estimate)
+    spec, corrected = spec_of(sim), with_effects(sim, estimate)
     for body in list(spec.bodies)[1:]:
-        _set_inertial(body, closed.model)
+        _set_inertial(body, corrected.model)
     for joint in spec.joints:
-        _set_joint(joint, closed.model)
-    add_to(spec, shared_motors(sim, estimate))
+        _set_joint(joint, corrected.model)
+    add_to(spec, coupled_motors(sim, estimate))
     gains = _gains(sim, estimate)
     driven = {actuator.target for actuator in spec.actuators}
     for actuator in spec.actuators:
         actuator.gear = [gains.get(actuator.target, 1.0) * actuator.gear[0], *actuator.gear[1:]]
-    spec.option.gravity = closed.model.opt.gravity
+    spec.option.gravity = corrected.model.opt.gravity
     spec.compile()
     left = [
-        term for term in closed.not_held if term.effect != "actuator.gain" or sim.arm.names[term.place] not in driven
+        term for term in corrected.not_held if term.effect != "actuator.gain" or sim.arm.names[term.place] not in driven
     ]
     lines = [] if estimate is None else [_line(sim, estimate, term) for term in left]
     module = module_path(path)
@@ -49,7 +49,7 @@ def write_model(sim: SimModel, estimate: Estimate | None, path: Path) -> list[st
 
 
 def _gains(sim: SimModel, estimate: Estimate | None) -> dict[str, float]:
-    """Torque made per torque commanded, by joint name."""
+    """Motor torque per torque command, by joint name."""
     terms = [] if estimate is None else [term for term in estimate.terms if term.effect == "actuator.gain"]
     return {sim.arm.names[t.place]: estimate.parameters(t)["gain"].value for t in terms if estimate is not None}
 
@@ -57,8 +57,8 @@ def _gains(sim: SimModel, estimate: Estimate | None) -> dict[str, float]:
 def _line(sim: SimModel, estimate: Estimate, term: Term) -> str:
     values = estimate.parameters(term)
     where = f"in recording {term.bound}" if term.bound else sim.arm.names[term.place]
-    told = (f"{name} {v.value:.6g}" + (f" {v.unit}" if v.unit != "1" else "") for name, v in values.items())
-    return f"{term.effect} {where} " + ", ".join(told)
+    listed = (f"{name} {v.value:.6g}" + (f" {v.unit}" if v.unit != "1" else "") for name, v in values.items())
+    return f"{term.effect} {where} " + ", ".join(listed)
 
 
 def _set_inertial(body: Any, model: Any) -> None:

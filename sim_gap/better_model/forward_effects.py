@@ -1,13 +1,13 @@
-"""What MJCF cannot hold of an arm's imperfections, for a MuJoCo simulation of it. Needs numpy and mujoco alone.
+"""Imperfections of an arm that MJCF cannot hold, for a MuJoCo simulation of it. Needs only numpy and mujoco.
 
     model = mujoco.MjModel.from_xml_path(MODEL)
     effects = Effects(model)
-    mujoco.set_mjcb_passive(effects.passive)     # friction, ripple: part of the simulation from now on
+    mujoco.set_mjcb_passive(effects.passive)     # friction, ripple
     data = mujoco.MjData(model)
     while running:
-        data.qfrc_applied[effects.dofs] = effects.made(asked, data.time)   # drives: delay, lag, limit, gain
+        data.qfrc_applied[effects.dofs] = effects.made(command, data.time)   # drives: delay, lag, limit, gain
         mujoco.mj_step(model, data)
-        q, tau = effects.read(model, data)       # what position and torque sensors say
+        q, tau = effects.read(model, data)       # readings of position and torque sensors
 
 Torques in N·m, angles in rad, times in s; arrays (n,) in the order of JOINTS.
 """
@@ -20,38 +20,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Entry = tuple[str, str, dict[str, float]]
+JointEffect = tuple[str, str, dict[str, float]]
 """Effect, joint, parameters."""
 MODEL = ""
-"""The model that these effects belong to."""
+"""File of the model that these effects belong to."""
 JOINTS: tuple[str, ...] = ()
 """Base to tip."""
-EFFECTS: tuple[Entry, ...] = ()
+EFFECTS: tuple[JointEffect, ...] = ()
 RESTING = 1e-4
-"""Slower than this a joint rests [rad/s], and its motor tells where it is heading."""
+"""Speed below which a joint is at rest [rad/s], and its motor torque sets the direction of friction."""
 
 
 class Effects:
-    """The effects on one simulated arm; keeps what drives and sensors remember."""
+    """The effects on one simulated arm, with the state of drives and sensors."""
 
-    def __init__(self, model: Any, entries: Sequence[Entry] = EFFECTS, joints: Sequence[str] = JOINTS) -> None:
-        """For a compiled model whose joints bear these names; its friction loss is the Coulomb friction."""
-        self.joints, self._entries = tuple(joints), tuple(entries)
+    def __init__(self, model: Any, effects: Sequence[JointEffect] = EFFECTS, joints: Sequence[str] = JOINTS) -> None:
+        """For a compiled model with joints of these names; its friction loss is the Coulomb friction."""
+        self.joints, self._effects = tuple(joints), tuple(effects)
         ids = [model.joint(name).id for name in joints]
         self.dofs, self.places = model.jnt_dofadr[ids], model.jnt_qposadr[ids]
         self.coulomb: Array = model.dof_frictionloss[self.dofs].copy()
         self._known: dict[tuple[str, str], Array] = {}
-        self._asked: list[tuple[float, Array]] = []
+        self._commands: list[tuple[float, Array]] = []
         self._followed: Array | None = None
         self._passed: list[tuple[float, Array]] = []
         self._play: Array = np.zeros(len(self.joints))
         self._whole: Array = np.zeros(model.nv)
 
     def values(self, effect: str, parameter: str, otherwise: float = 0.0) -> Array:
-        """One parameter of an effect for every joint, (n,); `otherwise` where the joint does not have it."""
+        """One parameter of an effect for every joint, (n,); `otherwise` for joints without the effect."""
         if (effect, parameter) not in self._known:
             out = self._known[effect, parameter] = np.full(len(self.joints), otherwise)
-            for name, joint, parameters in self._entries:
+            for name, joint, parameters in self._effects:
                 if name == effect and parameter in parameters:
                     out[self.joints.index(joint)] = parameters[parameter]
         return self._known[effect, parameter]
@@ -59,7 +59,7 @@ class Effects:
     # ---- the transmission
 
     def passive(self, model: Any, data: Any) -> None:
-        """MuJoCo's passive-force callback: what ripple takes now, and the level of dry friction for the next step."""
+        """MuJoCo's passive-force callback: the ripple torque now, and the level of dry friction for the next step."""
         speed, carried = data.qvel[self.dofs], self.carried(model, data)
         fade = np.exp(-((speed / self.values("friction.stribeck", "velocity", 1.0)) ** 2))
         level = self.coulomb + self.values("friction.stribeck", "breakaway") * fade
@@ -74,17 +74,17 @@ class Effects:
         data.qfrc_passive[self.dofs] -= lost
 
     def carried(self, model: Any, data: Any) -> Array:
-        """Torque that moves and holds the links, M(q) a + C(q, v) v + gravity of the last step, (n,)."""
+        """Torque on the links, M(q) a + C(q, v) v + gravity of the last step, (n,)."""
         mujoco.mj_rne(model, data, 1, self._whole)
         return np.array(self._whole[self.dofs])
 
     # ---- the drives
 
-    def made(self, asked: Array, time: float) -> Array:
-        """Torque that the drives make when `asked` is asked for from now on: late, then lagging, clipped, scaled."""
-        self._asked.append((time, np.array(asked, float)))
-        due = _past(self._asked, time, self.values("actuator.delay", "time"), held=True)
-        before = self._asked[-2][0] if len(self._asked) > 1 else time
+    def made(self, command: Array, time: float) -> Array:
+        """Torque of the drives with `command` from now on: delayed, lagging, clipped, scaled."""
+        self._commands.append((time, np.array(command, float)))
+        due = _past(self._commands, time, self.values("actuator.delay", "time"), held=True)
+        before = self._commands[-2][0] if len(self._commands) > 1 else time
         lag = np.maximum(self.values("actuator.lag", "time"), 1e-12)
         share = 1.0 - np.exp(-(time - before) / lag)
         start = due if self._followed is None else self._followed
@@ -97,8 +97,8 @@ class Effects:
     def read(self, model: Any, data: Any) -> tuple[Array, Array]:
         """Readings of position [rad] and torque [N·m] sensors after a step, (n,) each.
 
-        A transmission that gives, or has play, shows in the position, whose sensor sits at the motor; that it swings is
-        left out.
+        An elastic transmission or one with backlash shows in the position, whose sensor is at the motor; its
+        oscillation is neglected.
         """
         torque = self.carried(model, data) - self._pushed(model, data)
         give = torque / self.values("transmission.elasticity", "stiffness", np.inf)
@@ -106,7 +106,7 @@ class Effects:
         return self._angle(data.qpos[self.places] + give), self._torque(torque, float(data.time))
 
     def _pushed(self, model: Any, data: Any) -> Array:
-        """What stops and contacts push the links by, (n,)."""
+        """Torque of stops and contacts on the links, (n,)."""
         rows = np.flatnonzero(data.efc_type[: data.nefc] == mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
         push = data.qfrc_constraint.copy()
         push[data.efc_id[rows]] -= data.efc_force[rows]
@@ -123,11 +123,11 @@ class Effects:
         return np.asarray(reading)
 
     def _torque(self, true: Array, time: float) -> Array:
-        """The reading of a torque [N·m]: late, crosstalk, play, dead band, limit, then gain, offset and drift."""
+        """The reading of a torque [N·m]: delay, crosstalk, play, dead band, limit, then gain, offset and drift."""
         self._passed.append((time, true))
         torque = _past(self._passed, time, self.values("timing.delay", "delay"), held=False)
         mixed = torque.copy()
-        for name, joint, parameters in self._entries:
+        for name, joint, parameters in self._effects:
             if name == "torque.crosstalk":
                 source = torque[int(parameters["source"]) - 1]
                 mixed[self.joints.index(joint)] += parameters["coefficient"] * source
@@ -141,7 +141,7 @@ class Effects:
 
 
 def _past(history: list[tuple[float, Array]], now: float, delay: Array, *, held: bool) -> Array:
-    """Each joint's value as it was `delay` ago, held or linear between entries; what is no longer needed is dropped."""
+    """Value of each joint `delay` ago, held or interpolated between entries; drops entries no longer needed."""
     while len(history) > 2 and history[1][0] <= now - delay.max() - 1e-12:
         del history[0]
     times, values = np.array([time for time, _ in history]), np.array([value for _, value in history])

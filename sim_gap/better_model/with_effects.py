@@ -1,4 +1,4 @@
-"""The simulation model with the fitted effects put in, as far as a MuJoCo model can hold them."""
+"""The simulation model corrected by the fitted effects, as far as a MuJoCo model can hold them."""
 
 import copy
 from dataclasses import dataclass
@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from armlink.errors import BadInput
+from sim_gap.better_model.coupled_motors import CoupledMotor, add_to, coupled_motors
 from sim_gap.effects.base import across
 from sim_gap.model.load import SimModel, read_spec
 from sim_gap.model.rigid_body import Array, inertial_of
-from sim_gap.model.tendons import SharedMotor, add_to
 from sim_gap.search.estimate import Estimate
 from sim_gap.search.normal_equations import Term
 
@@ -25,12 +25,12 @@ HELD = {
     "link.payload": "body inertial",
     "base.tilt": "option gravity",
 }
-"""Effects that a MuJoCo model holds, and where."""
+"""Effects that a MuJoCo model can hold, and the element that holds them."""
 SMALLEST_INERTIA = 1e-6
 
 
 @dataclass(frozen=True)
-class Closed:
+class CorrectedModel:
     """A model with effects added."""
 
     model: Any
@@ -40,11 +40,11 @@ class Closed:
     """Terms that MJCF cannot express."""
 
 
-def with_effects(sim: SimModel, estimate: Estimate | None) -> Closed:
+def with_effects(sim: SimModel, estimate: Estimate | None) -> CorrectedModel:
     """A copy of the compiled model with the estimate's effects in it."""
     if estimate is None:
-        return Closed(copy.copy(sim.mujoco_model), (), ())
-    model, coupled = _base(sim, shared_motors(sim, estimate))
+        return CorrectedModel(copy.copy(sim.mujoco_model), (), ())
+    model, coupled = _base(sim, coupled_motors(sim, estimate))
     held = tuple(
         term
         for term in estimate.terms
@@ -65,22 +65,11 @@ def with_effects(sim: SimModel, estimate: Estimate | None) -> Closed:
             model.opt.gravity[:] += np.stack(turns, axis=-1) @ c
         elif term.effect != "transmission.coupling":
             _joint(model, joint, term.effect, c)
-    return Closed(model, held, tuple(term for term in estimate.terms if term not in held))
+    return CorrectedModel(model, held, tuple(term for term in estimate.terms if term not in held))
 
 
-def shared_motors(sim: SimModel, estimate: Estimate | None) -> list[SharedMotor]:
-    """The motors that turn with two joints."""
-    terms = [] if estimate is None else [t for t in estimate.terms if t.effect == "transmission.coupling"]
-    names = sim.arm.names
-    return [
-        SharedMotor(names[t.place], names[int(t.shape[0]) - 1], t.shape[1], *estimate.of(t).tolist())
-        for t in terms
-        if estimate is not None
-    ]
-
-
-def _base(sim: SimModel, motors: list[SharedMotor]) -> tuple[Any, bool]:
-    """A copy of the nominal model with these motors in it, and whether it can hold them (it came from a file)."""
+def _base(sim: SimModel, motors: list[CoupledMotor]) -> tuple[Any, bool]:
+    """A copy of the nominal model with these motors, and whether it has them (only a model from a file can)."""
     if not motors or sim.path is None:
         return copy.copy(sim.mujoco_model), False
     spec = spec_of(sim)
@@ -91,7 +80,7 @@ def _base(sim: SimModel, motors: list[SharedMotor]) -> tuple[Any, bool]:
 def spec_of(sim: SimModel) -> Any:
     """The nominal model's file as a `mujoco.MjSpec`, its elements numbered and its joints named.
 
-    Raises BadInput where the model did not come from a file.
+    Raises BadInput if the model did not come from a file.
     """
     if sim.path is None:
         raise BadInput("--out-model: the model did not come from a file: give MJCF, URDF or an arm file with --sim")
@@ -103,7 +92,7 @@ def spec_of(sim: SimModel) -> Any:
 
 
 def _point(c: Array) -> Array:
-    """Ten parameters of a point mass from its mass and first moment."""
+    """Ten inertial parameters of a point mass from its mass and first moment."""
     return inertial_of(float(c[0]), c[1:] / float(c[0]), np.zeros((3, 3)))
 
 
@@ -123,7 +112,7 @@ def _joint(model: Any, joint: int, effect: str, c: Array) -> None:
 
 
 def _body(model: Any, joint: int, added: Array) -> None:
-    """Add inertial parameters, about the joint's anchor in the body's frame, to the body that the joint moves."""
+    """Add inertial parameters, about the joint's anchor and in the body's frame, to the body that the joint moves."""
     import mujoco
 
     body, anchor = model.jnt_bodyid[joint], model.jnt_pos[joint]
@@ -141,13 +130,13 @@ def _body(model: Any, joint: int, added: Array) -> None:
 
 
 def possible(principal: Array) -> Array:
-    """Principal moments of inertia that some distribution of mass has (none exceeds the other two together), (3,)."""
+    """The closest physical principal moments of inertia (none exceeds the sum of the other two), (3,)."""
     spread = np.maximum(0.5 * principal.sum() - principal, SMALLEST_INERTIA)
     return np.asarray(spread.sum() - spread)
 
 
 def split(inertial: Array) -> tuple[float, Array, Array]:
-    """Mass, centre of mass and inertia about it (3, 3) from ten parameters about the origin."""
+    """Mass, centre of mass and inertia about it (3, 3) from ten inertial parameters about the origin."""
     mass = max(float(inertial[0]), 1e-6)
     centre = inertial[1:4] / mass
     about = inertial[4:][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]

@@ -1,1 +1,1 @@
-"""The blind check (contract 6): sealed cases from a plant that the diagnosis does not fit with, and their score."""
+"""The blind check: sealed cases from an independent simulator, and the score of the diagnosis on them."""

@@ -1,4 +1,4 @@
-"""The blind check from end to end: cases made by a process of their own, answers sealed, labels opened, score."""
+"""The blind check from end to end: cases from a separate process, sealed answers, opened labels, score."""
 
 import subprocess
 import sys
@@ -15,7 +15,7 @@ from sim_gap.blind.cases.seal import open_labels, seal, write_answer
 from sim_gap.blind.judging.score import answer_name, score
 
 Diagnose = Callable[[Path, Sequence[Path], Sequence[Path], Sequence[str]], dict[str, Any]]
-"""Model, training and held-out recordings, effects withheld → the answer of contract 5."""
+"""Model, training and held-out recordings, effects withheld → the answer as in docs/formats.md."""
 
 
 def run_bench(
@@ -30,7 +30,7 @@ def run_bench(
     """Make `cases` sealed cases under `out`, have them diagnosed, seal the answers, open the labels and score.
 
     `lengths` are the seconds of training and held-out recordings. `progress` gets stage, done, total. `diagnose` must
-    be a module's function where `workers` exceeds 1. Raises BadInput where `out` holds an earlier check.
+    be a module-level function if `workers` exceeds 1. Raises BadInput if `out` holds an earlier check.
     """
     if cases < 1:
         raise BadInput(f"--cases {cases}: expected at least 1")
@@ -54,7 +54,7 @@ def run_bench(
 
 
 def make_apart(out: Path, seed: int, cases: int, workers: int, lengths: tuple[float, float]) -> Iterator[int]:
-    """Make the cases in a separate process; yields now and then how many there are. Raises Refused where it fails."""
+    """Make the cases in a separate process and yield their number from time to time. Raises Refused if it fails."""
     command = [sys.executable, "-m", "sim_gap.blind.cases.make", "--seed", str(seed), "--cases", str(cases)]
     command += ["--out", str(out / "cases"), "--labels", str(out / "labels"), "--workers", str(workers)]
     command += ["--train-s", str(lengths[0]), "--heldout-s", str(lengths[1])]
@@ -75,7 +75,7 @@ def make_apart(out: Path, seed: int, cases: int, workers: int, lengths: tuple[fl
 def tasks(out: Path) -> list[tuple[str, str]]:
     """(case, effect withheld or nothing) of every diagnosis to run.
 
-    Which effects to withhold the maker says (`labels/withhold.txt`); no label is opened for it.
+    The effects to withhold are listed in `labels/withhold.txt`; no label is opened for them.
     """
     names = sorted(path.name for path in (out / "cases").iterdir())
     lines = (out / "labels" / "withhold.txt").read_text(encoding="utf-8").splitlines()
@@ -84,7 +84,7 @@ def tasks(out: Path) -> list[tuple[str, str]]:
 
 
 def diagnose_files(sim: Path, train: Sequence[Path], heldout: Sequence[Path], exclude: Sequence[str]) -> dict[str, Any]:
-    """The diagnosis of this package on files, `exclude` taken out of its library."""
+    """The diagnosis of this package on files, with the effects `exclude` removed from its library."""
     from armlink.recording.recording import load_recording
     from sim_gap.attribution.diagnose import diagnose
 
@@ -95,7 +95,7 @@ def diagnose_files(sim: Path, train: Sequence[Path], heldout: Sequence[Path], ex
 
 
 def answer_case(diagnose: Diagnose, cases: Path, case: str, withheld: str) -> tuple[str, dict[str, Any]]:
-    """Name and answer of one diagnosis; one that refuses its input is an answer too, without causes."""
+    """Name and answer of one diagnosis; refused input is an answer without causes."""
     folder = cases / case
     started = time.monotonic()
     try:
@@ -123,5 +123,5 @@ def _answers(
         try:
             for job in as_completed(jobs):
                 yield job.result()
-        finally:  # what waits is not diagnosed in vain where one failed
+        finally:  # after a failure, pending cases are not diagnosed
             pool.shutdown(cancel_futures=True)

@@ -1,4 +1,4 @@
-"""Checks the diagnosis on sealed cases of simulated arms whose cause it cannot see."""
+"""Tests the diagnosis on sealed cases of simulated arms."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,29 +7,28 @@ import typer
 
 
 def bench(
-    seed: Annotated[int, typer.Option(help="Draws other arms, effects and motions.")] = 1,
-    cases: Annotated[int, typer.Option(help="How many cases.")] = 150,
-    json: Annotated[str | None, typer.Option(help="Write the score here; - is standard output.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of arms, effects and motions.")] = 1,
+    cases: Annotated[int, typer.Option(help="Number of cases.")] = 150,
+    json: Annotated[Path | None, typer.Option(help="Write the score here; - is standard output.")] = None,
     out: Annotated[Path | None, typer.Option(help="Keep cases, answers and labels in this new folder.")] = None,
-    workers: Annotated[int, typer.Option(help="Processes.")] = 2,
+    workers: Annotated[int, typer.Option(help="Number of processes.")] = 2,
 ) -> None:
-    """Make sealed cases, diagnose them, then open the labels and score (label withheld, and effect withheld).
+    """Make sealed cases, diagnose them, then open the labels and score (label withheld and effect withheld).
 
     Example: armlink gap bench --seed 3 --cases 60 --out bench-3 --json bench-3.json
     """
-    import json as json_format
-    import sys
     from tempfile import TemporaryDirectory
 
     from rich.console import Console
     from rich.progress import Progress, TaskID
 
+    from armlink.commands.output import write_json
     from armlink.errors import BadInput
     from sim_gap.blind.bench import diagnose_files, run_bench
     from sim_gap.blind.judging.tables import show
 
-    if json not in (None, "-") and not Path(str(json)).resolve().parent.is_dir():
-        raise BadInput(f"--json {json}: its folder does not exist: make it first")
+    if json is not None and str(json) != "-" and not json.resolve().parent.is_dir():
+        raise BadInput(f"--json {json}: its folder does not exist: create it first")
     console = Console(stderr=True)
     with TemporaryDirectory(prefix="armlink-bench-") as scratch, Progress(console=console) as bars:
         known: dict[str, TaskID] = {}
@@ -41,8 +40,4 @@ def bench(
 
         result = run_bench(diagnose_files, out or Path(scratch), seed, cases, workers, progress=progress)
     show(result, console)
-    text = json_format.dumps(result, indent=1, ensure_ascii=False) + "\n"
-    if json == "-":
-        sys.stdout.write(text)
-    elif json is not None:
-        Path(json).write_text(text, encoding="utf-8")
+    write_json(json, result)

@@ -1,4 +1,4 @@
-"""Runs a planned motion on the arm through the link, and records it for a diagnosis."""
+"""Runs a planned motion on the arm and records it for a diagnosis."""
 
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +15,7 @@ def collect(
         Path | None, typer.Option("--json", help="Write rows and seconds here; - is standard output.")
     ] = None,
 ) -> int:
-    """Move the arm along a planned motion under position control, every cycle recorded; Ctrl-C leaves it safe.
+    """Move the arm along a planned motion under position control and record every cycle; Ctrl-C stops it safely.
 
     Example: armlink gap collect sarcos --motion settle.csv --out settle.mcap --bus socketcan:can0
     """
@@ -30,7 +30,7 @@ def collect(
     from sim_gap.experiment.motion_file import load_motion
 
     if out.suffix != ".mcap" or not out.resolve().parent.is_dir():
-        raise BadInput(f"--out {out}: expected a .mcap file in a folder that is there")
+        raise BadInput(f"--out {out}: expected a .mcap file in an existing folder")
     arm_file = load_arm(arm)
     target = load_motion(motion, arm_file)
     console = Console(stderr=True)

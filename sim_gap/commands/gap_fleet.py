@@ -1,4 +1,4 @@
-"""Diagnoses every recording of a fleet on a cluster of workers, and gathers a table by arm and effect."""
+"""Diagnoses the recordings of a fleet on a cluster of workers, with a table by arm and effect."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,19 +9,19 @@ import typer
 def diagnose_fleet(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of cases, or of recordings with --sim.")],
     scheduler: Annotated[
-        str | None, typer.Option(help="Address of a dask scheduler; without it workers are started here.")
+        str | None, typer.Option(help="Address of a dask scheduler; default: workers on this machine.")
     ] = None,
-    sim: Annotated[Path | None, typer.Option(help="Nominal model of cases that have none of their own.")] = None,
-    workers: Annotated[int, typer.Option(min=1, help="Workers of the local cluster.")] = 2,
+    sim: Annotated[Path | None, typer.Option(help="Nominal model of cases without one of their own.")] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Number of workers of the local cluster.")] = 2,
     out: Annotated[
-        Path | None, typer.Option(help="Answers, one JSON line each; what it holds already is not done again.")
+        Path | None, typer.Option(help="Results, one JSON line each; cases already in it are not repeated.")
     ] = None,
     table: Annotated[Path | None, typer.Option(help="Also write the table by case and effect here (.parquet).")] = None,
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write all answers here; - is standard output.")
+        Path | None, typer.Option("--json", help="Write all results here; - is standard output.")
     ] = None,
 ) -> int:
-    """Map the diagnosis over thousands of recordings; exit status 1 where a case could not be diagnosed.
+    """Run the diagnosis on every case of a fleet; exit status 1 if a case could not be diagnosed.
 
     Example: armlink gap diagnose-fleet fleet/ --out answers.jsonl --table causes.parquet --scheduler tcp://127.0.0.1:8786
     """
@@ -38,7 +38,7 @@ def diagnose_fleet(
     left = [case for case in cases if case.name not in answers.found]
     console = Console(stderr=True)
     if len(left) < len(cases):
-        console.print(f"{answers.path}: {len(cases) - len(left)} of {len(cases)} are there already")
+        console.print(f"{answers.path}: {len(cases) - len(left)} of {len(cases)} cases are done already")
     columns = (*Progress.get_default_columns()[:2], MofNCompleteColumn(), TimeRemainingColumn())
     if left:
         with cluster(scheduler, min(workers, len(left))) as client, Progress(*columns, console=console) as bars:
@@ -56,7 +56,7 @@ def diagnose_fleet(
 
 
 def _show(rows: list[dict[str, Any]], console: Any) -> None:
-    """How often each effect was found, and on how many arms; then what could not be diagnosed."""
+    """Print how often each effect was found and on how many arms, then the cases that could not be diagnosed."""
     from rich.table import Table
 
     cases = {row["case"]: row["verdict"] for row in rows}

@@ -1,4 +1,4 @@
-"""Writes the motion that would settle what a diagnosis leaves open."""
+"""Plans the motion that would separate the candidate causes of a diagnosis."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,19 +7,19 @@ import typer
 
 
 def plan(
-    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file: ranges and speeds.")],
+    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
     out: Annotated[Path, typer.Option(help="Write the motion here (.csv with t and q_cmd_i).")],
     answer: Annotated[
-        Path | None, typer.Option(help="Answer of armlink gap diagnose --json: its open joints are moved.")
+        Path | None, typer.Option(help="Result of armlink gap diagnose --json: its undecided joints are moved.")
     ] = None,
-    joint: Annotated[list[str] | None, typer.Option(help="Joint to move alone; may repeat. Default: all.")] = None,
-    poses: Annotated[int, typer.Option(min=1, help="Poses of the other joints: loads to move under.")] = 2,
-    seed: Annotated[int, typer.Option(min=0, help="Draws other poses and sines, for held-out motion.")] = 0,
+    joint: Annotated[list[str] | None, typer.Option(help="Joint to move alone; may be repeated. Default: all.")] = None,
+    poses: Annotated[int, typer.Option(min=1, help="Number of poses of the other joints, for different loads.")] = 2,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of poses and sines; another one gives held-out motion.")] = 0,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write length and pieces here; - is standard output.")
     ] = None,
 ) -> int:
-    """Plan motion within the arm's limits that tells effects apart; nothing moves.
+    """Plan motion within the arm's limits that separates effects; nothing moves.
 
     Example: armlink gap plan sarcos --answer gap.json --out settle.csv
     """
@@ -35,7 +35,7 @@ def plan(
     save_motion(motion, out)
     console = Console(stderr=True)
     for sentence in sentences:
-        console.print(f"asked for: {sentence}", markup=False)
+        console.print(f"requested by the diagnosis: {sentence}", markup=False)
     for piece in motion.pieces:
         console.print(piece, markup=False)
     console.print(f"{out}: {motion.seconds:.0f} s; run it with armlink gap collect {arm} --motion {out}", markup=False)

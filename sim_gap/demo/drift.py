@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from armlink.link.types import Sample
 from calib.motion.random_work import work_targets
@@ -13,10 +12,9 @@ from calib.observer.watch_loop import WatchHistory, watch
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.records.store import RecordStore
 from calib.sweep.verify import Verification
+from gcomp.arrays import Array
 from sim_gap.demo.bench import Bench
 from sim_gap.demo.narrator import Report
-
-Array = npt.NDArray[np.float64]
 
 GAIN, OFFSET = 1.03, 0.3
 OFFSET_SHARE = 0.05
@@ -63,7 +61,7 @@ def run_drift(
     assert calibration is not None
     recalibrator = Recalibrator(bench.arm, link, store, "apply")
     limits = bench.arm.require_link().joints
-    rated = np.array([each.rated_torque for each in limits])
+    rated = bench.arm.require_link().rated_torques
     observer = Observer.of_records(described, calibration, gravity, rated)
     joint = drifting_joint(calibration, check, rated)
     offset = min(OFFSET, OFFSET_SHARE * limits[joint].rated_torque)

@@ -3,16 +3,14 @@
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
 from calib.fit.sensor_fit import SensorFit
 from calib.report.figures import COLOURS, GREY, PANEL, add_sweeps
 from gcomp.arm.arm import Arm
+from gcomp.arrays import Array
 from sim_gap.demo.drift import Drift
-
-Array = npt.NDArray[np.float64]
 
 RED = "#a83248"
 

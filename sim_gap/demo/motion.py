@@ -1,16 +1,14 @@
 """Motion for the gap's recordings: sums of sines within the joints' ranges and speeds, recorded through the link."""
 
 import numpy as np
-import numpy.typing as npt
 
 from armlink.link.types import Command
 from armlink.recording.recording import Recording
 from calib.motion.trajectory import trajectory
 from calib.records.records import CalibrationRecord
+from gcomp.arrays import Array
 from sim_gap.demo.bench import Bench
 from sim_gap.demo.narrator import Report
-
-Array = npt.NDArray[np.float64]
 
 TONES = 3
 BAND = (0.08, 0.3)

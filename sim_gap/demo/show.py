@@ -63,4 +63,4 @@ def drift_line(names: tuple[str, ...], drift: Drift) -> str:
 
 def gap_line(answer: Diagnosis) -> str:
     """The diagnosis in a sentence."""
-    return f"gap {answer.verdict}: {sentence(answer)}"
+    return sentence(answer)

@@ -1,105 +1,62 @@
-"""Drives that do not make the torque they are asked for: they show in the command against the drive's own estimate.
+"""Drives whose torque does not follow the command: they show in the command against the drive's own estimate.
 
-Where a recording has a command but no estimate, they show in the command against the sensor or the model.
+If a recording has a command but no estimate, they show in the command against the sensor or the model.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.signal import lfilter
 
-from sim_gap.effects.registry import Columns, Effect, Layout, Parameter, Shape
+from sim_gap.effects.effect import Effect, Plausibility, SearchHints, Shape, Signature, as_shape, between
+from sim_gap.effects.timing import late
 from sim_gap.model.rigid_body import Array
 from sim_gap.residuals.preprocess import Signals
 
-SHORTEST, LONGEST = 1e-3, 0.2
-"""Times that count as a lag or delay [s]."""
+LONGEST = 0.2
+"""Longest time that counts as a lag or delay [s]."""
 CLIPPED = 0.2
-"""What is clipped is, within this, all that is above the level."""
+"""Prior standard deviation of a clipped signal's coefficient about one: all above the level is cut off."""
+NEAR_ONE = between(0.6, 1.6)
 
 
-def commanding(layout: Layout) -> str | None:
-    """The channel whose residual a drive's shortcoming shows in."""
-    return layout.command or ("tau_cmd" if layout.motor == "tau_cmd" else None)
+def _missing(lost: Callable[[Array, float, float], Array]) -> Signature:
+    """Command less motor torque, `lost(command (K,), shape, rate)`."""
+    return Signature.at_command(lambda s, joint, shape: lost(s.reading["tau_cmd"][:, joint], shape[0], s.rate))
 
 
-class _Drive(Effect):
-    def places(self, layout: Layout) -> range:
-        return range(layout.n if commanding(layout) else 0)
-
-    def missing(self, command: Array, shape: float, rate: float) -> Array:
-        """Command less torque made, (K,), for the whole shape."""
-        raise NotImplementedError
-
-    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
-        channel = commanding(layout)
-        assert channel is not None
-        lost = self.missing(signals.reading["tau_cmd"][:, place], shape[0], signals.rate)
-        return {(channel, place): lost[:, None]}
-
-    def plausible(self, coefficients: Array, shape: Shape) -> bool:
-        return bool(0.6 < coefficients[0] < 1.6)
-
-    def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
-        return np.array([shape[0]])
+def _lag(command: Array, time: float, rate: float) -> Array:
+    """First-order lag by the trapezoidal rule, whose lag is exactly `time` even if it spans few samples."""
+    pole = (2.0 * rate * time - 1.0) / (2.0 * rate * time + 1.0)
+    gain = 0.5 * (1.0 - pole)
+    follow, _ = lfilter([gain, gain], [1.0, -pole], command, zi=[(1.0 - gain) * command[0]])
+    return np.asarray(command - follow)
 
 
-class _Late(_Drive):
-    parameters = (Parameter("time", "s"),)
-    shapes = ((0.01,),)
-    secant = True
-
-    def resized(self, coefficients: Array, shape: Shape) -> Shape:
-        return (float(np.clip(shape[0] * coefficients[0], SHORTEST, LONGEST)),)
-
-    def plausible(self, coefficients: Array, shape: Shape) -> bool:
-        return bool(SHORTEST < coefficients[0] * shape[0] < LONGEST)
-
-    def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
-        return coefficients * shape[0]
+def _delay(command: Array, time: float, rate: float) -> Array:
+    t = np.arange(len(command)) / rate
+    return np.asarray(command - np.interp(t - time, t, command))
 
 
-class Lag(_Late):
-    """A first-order lag behind the command."""
-
-    id = "actuator.lag"
-
-    def missing(self, command: Array, shape: float, rate: float) -> Array:
-        """By the trapezoidal rule, whose lag is exactly the shape however few samples it spans."""
-        pole = (2.0 * rate * shape - 1.0) / (2.0 * rate * shape + 1.0)
-        gain = 0.5 * (1.0 - pole)
-        follow, _ = lfilter([gain, gain], [1.0, -pole], command, zi=[(1.0 - gain) * command[0]])
-        return np.asarray(command - follow)
+def _clipped(command: Array, limit: float, _rate: float) -> Array:
+    return np.asarray(command - np.clip(command, -limit, limit))
 
 
-class Delay(_Late):
-    """The command carried out late."""
-
-    id = "actuator.delay"
-
-    def missing(self, command: Array, shape: float, rate: float) -> Array:
-        t = np.arange(len(command)) / rate
-        return np.asarray(command - np.interp(t - shape, t, command))
+def _levels(signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
+    """Levels that the command exceeds during some of the time [N·m]."""
+    commands = np.concatenate([np.abs(s.reading["tau_cmd"][:, place]) for s in signals])
+    shares = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995, 0.999)
+    return tuple((float(level),) for level in np.quantile(commands, shares))
 
 
-class Saturation(_Drive):
-    """Torque clipped at a limit."""
-
-    id = "actuator.saturation"
-    parameters = (Parameter("limit", "N·m"),)
-    usual = 1.0
-
-    def grid(self, signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
-        asked = np.concatenate([np.abs(s.reading["tau_cmd"][:, place]) for s in signals])
-        return tuple(
-            (float(level),) for level in np.quantile(asked, (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995, 0.999))
-        )
-
-    def spread(self, signals: Signals, place: int) -> Array:
-        return np.full(1, CLIPPED)
-
-    def missing(self, command: Array, shape: float, rate: float) -> Array:
-        return np.asarray(command - np.clip(command, -shape, shape))
-
-
-EFFECTS: tuple[Effect, ...] = (Lag(), Delay(), Saturation())
+EFFECTS = (
+    late("actuator.lag", _missing(_lag), 0.01, LONGEST),
+    late("actuator.delay", _missing(_delay), 0.01, LONGEST),
+    Effect(
+        "actuator.saturation",
+        _missing(_clipped),
+        Plausibility(prior_mean=1.0, prior_std=lambda _signals, _place: np.full(1, CLIPPED), allows=NEAR_ONE),
+        SearchHints(shapes_for=_levels),
+        parameters_of=as_shape,
+    ),
+)

@@ -1,126 +1,104 @@
-"""Friction between motor and torque sensor: it shows on the motor side, and where there is no motor channel, in `tau`.
+"""Friction between motor and torque sensor: it shows on the motor side, and without a motor channel, in `tau`.
 
 F(v) = (Fc + Fb·exp(−(v/vs)²) + μ·|τ|)·(1 ± ratio) + d·|v|, opposing v; τ is the transmitted torque.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from sim_gap.effects.registry import Columns, Effect, Layout, Parameter, Shape
+from sim_gap.effects.effect import (
+    Beneath,
+    Effect,
+    Key,
+    Plausibility,
+    SearchHints,
+    Shape,
+    Signature,
+    as_fitted_and_shape,
+    not_negative,
+)
 from sim_gap.model.rigid_body import Array
+from sim_gap.residuals.layout import Layout
 from sim_gap.residuals.preprocess import Signals
 
+COULOMB = ("friction.coulomb",)
+VELOCITIES = (0.03, 0.06, 0.12, 0.25, 0.5)
+"""Stribeck velocities that the search starts with [rad/s]."""
 WITHIN = 0.5
 """A Stribeck velocity is below this share of the fastest usual speed."""
 
 
-def dry(beneath: Mapping[str, Array]) -> float:
-    """Coulomb friction in all [N·m]: what was found and what the nominal model has."""
+def dry(beneath: Beneath) -> float:
+    """Total Coulomb friction [N·m]: the nominal model's and what was found in addition."""
     return float(beneath["friction.coulomb"][0] + beneath["nominal"][0])
 
 
-class _Friction(Effect):
-    def column(self, s: Signals, joint: int, shape: Shape) -> Array:
-        """The one column of this effect, (K,)."""
-        raise NotImplementedError
-
-    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
-        return {(layout.motor_side, place): self.column(signals, place, shape)[:, None]}
-
-    def plausible(self, coefficients: Array, shape: Shape) -> bool:
-        return bool(coefficients[0] >= 0.0)
+def _above_minus_nominal(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
+    """Less friction than the nominal model's is possible; 0.01 N·m below zero is noise."""
+    return bool(coefficients[0] > -float(beneath["nominal"][0]) - 0.01)
 
 
-class Coulomb(_Friction):
-    """A constant torque against the motion."""
-
-    id = "friction.coulomb"
-    parameters = (Parameter("torque", "N·m"),)
-    rare = 0
-    ordinary = 0.03
-
-    def plausible_on(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> bool:
-        """Less than the nominal model has is possible; a hundredth of a newton-metre below nothing is noise."""
-        return bool(coefficients[0] > -float(beneath["nominal"][0]) - 0.01)
-
-    def column(self, s: Signals, joint: int, shape: Shape) -> Array:
-        return s.direction[:, joint]
+def _above_minus_dry(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
+    """Real gears can have less friction at low speed than Coulomb's: breakaway is then negative."""
+    return bool(coefficients[0] > -dry(beneath))
 
 
-class Viscous(_Friction):
-    """A torque proportional to the velocity."""
-
-    id = "friction.viscous"
-    parameters = (Parameter("damping", "N·m·s/rad"),)
-    rare = 0
-    ordinary = 0.02
-
-    def column(self, s: Signals, joint: int, shape: Shape) -> Array:
-        return s.v[:, joint]
+def _below_dry(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
+    return bool(abs(coefficients[0]) < dry(beneath))
 
 
-class Stribeck(_Friction):
-    """Friction that changes at low speed: breakaway above Coulomb's, fading as exp(−(v/vs)²).
-
-    Real gears also have less friction at low speed than Coulomb and viscous friction say: breakaway is then negative.
-    """
-
-    id = "friction.stribeck"
-    parameters = (Parameter("breakaway", "N·m"), Parameter("velocity", "rad/s"))
-    needs = ("friction.coulomb",)
-    shapes = ((0.03,), (0.06,), (0.12,), (0.25,), (0.5,))
-
-    def column(self, s: Signals, joint: int, shape: Shape) -> Array:
-        return s.direction[:, joint] * np.exp(-((s.v[:, joint] / shape[0]) ** 2))
-
-    def grid(self, signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
-        """Velocities well within those that were seen: beyond, it is friction that varies with speed, no more."""
-        fastest = float(np.quantile(np.concatenate([np.abs(s.v[:, place]) for s in signals]), 0.95))
-        return tuple(shape for shape in self.shapes if shape[0] < WITHIN * fastest) or self.shapes[:1]
-
-    def made_of(self, layout: Layout, place: int, shape: Shape) -> tuple[tuple[str, int], ...]:
-        """Friction that grows with speed, or with load where speed goes with it."""
-        return ("friction.viscous", place), ("friction.load", place)
-
-    def plausible(self, coefficients: Array, shape: Shape) -> bool:
-        return True
-
-    def plausible_on(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> bool:
-        return bool(coefficients[0] > -dry(beneath))
-
-    def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
-        return np.array([coefficients[0], shape[0]])
+def _stribeck(s: Signals, joint: int, shape: Shape) -> Array:
+    """Breakaway in excess of Coulomb friction, decaying as exp(−(v/vs)²)."""
+    return np.asarray(s.direction[:, joint] * np.exp(-((s.v[:, joint] / shape[0]) ** 2)))
 
 
-class Asymmetric(_Friction):
-    """Friction that is (1 + ratio) times as large one way and (1 − ratio) the other; Coulomb's part of it."""
-
-    id = "friction.asymmetric"
-    parameters = (Parameter("ratio", "1"),)
-    needs = ("friction.coulomb",)
-
-    def column(self, s: Signals, joint: int, shape: Shape) -> Array:
-        return np.abs(s.direction[:, joint])
-
-    def plausible(self, coefficients: Array, shape: Shape) -> bool:
-        return True
-
-    def plausible_on(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> bool:
-        return bool(abs(coefficients[0]) < dry(beneath))
-
-    def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
-        return coefficients / max(abs(dry(beneath)), 1e-9)
+def _velocities(signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
+    """Velocities well within the recorded ones: beyond, the effect is friction that varies with speed."""
+    fastest = float(np.quantile(np.concatenate([np.abs(s.v[:, place]) for s in signals]), 0.95))
+    shapes = tuple((velocity,) for velocity in VELOCITIES)
+    return tuple(shape for shape in shapes if shape[0] < WITHIN * fastest) or shapes[:1]
 
 
-class Load(_Friction):
-    """Friction in proportion to the torque that the transmission carries."""
-
-    id = "friction.load"
-    parameters = (Parameter("coefficient", "N·m/(N·m)"),)
-
-    def column(self, s: Signals, joint: int, shape: Shape) -> Array:
-        return s.direction[:, joint] * np.abs(s.model[:, joint])
+def _viscous_or_load(_layout: Layout, place: int, _shape: Shape) -> tuple[Key, ...]:
+    """Friction that grows with speed, or with the load if that correlates with speed."""
+    return ("friction.viscous", place), ("friction.load", place)
 
 
-EFFECTS: tuple[Effect, ...] = (Coulomb(), Viscous(), Stribeck(), Asymmetric(), Load())
+def _ratio(coefficients: Array, _shape: Shape, beneath: Beneath) -> Array:
+    """Friction is (1 + ratio) times as large in one direction and (1 − ratio) in the other; of its Coulomb part."""
+    return coefficients / max(abs(dry(beneath)), 1e-9)
+
+
+EFFECTS = (
+    Effect(
+        "friction.coulomb",
+        Signature.at_motor(lambda s, joint, _: s.direction[:, joint]),
+        Plausibility(prior_penalty=0, background_std=0.03, allows=_above_minus_nominal),
+    ),
+    Effect(
+        "friction.viscous",
+        Signature.at_motor(lambda s, joint, _: s.v[:, joint]),
+        Plausibility(prior_penalty=0, background_std=0.02, allows=not_negative),
+    ),
+    Effect(
+        "friction.stribeck",
+        Signature.at_motor(_stribeck),
+        Plausibility(allows=_above_minus_dry),
+        SearchHints(shapes_for=_velocities, alternatives=_viscous_or_load),
+        needs=COULOMB,
+        parameters_of=as_fitted_and_shape,
+    ),
+    Effect(
+        "friction.asymmetric",
+        Signature.at_motor(lambda s, joint, _: np.abs(s.direction[:, joint])),
+        Plausibility(allows=_below_dry),
+        needs=COULOMB,
+        parameters_of=_ratio,
+    ),
+    Effect(
+        "friction.load",
+        Signature.at_motor(lambda s, joint, _: s.direction[:, joint] * np.abs(s.model[:, joint])),
+        Plausibility(allows=not_negative),
+    ),
+)

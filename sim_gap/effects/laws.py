@@ -1,173 +1,42 @@
-"""General laws: what a gap may be where its cause is none of the library's. They are never named, only compared with.
+"""General laws: what a gap may follow if its cause is not in the library. They are compared with, never reported.
 
-A law is a smooth function of one quantity (position, velocity, acceleration, load or time: the regimes in which a gap
-is looked for) in one channel of one joint, lateness to second order, any rigid body fixed to a link, or gravity that is
-other than the model says. A cause that such a law could stand in for is no certain one, for much that the library does
-not hold would look the same in this motion.
+A law is a smooth function of one quantity (position, velocity, acceleration, load or time: the regimes of a gap) in one
+channel of one joint, a delay to second order, any rigid body fixed to a link, or gravity of another direction or size.
+A cause that a law could replace is not certain, for unknown effects could look the same in this motion.
 """
 
-from typing import ClassVar
+from dataclasses import dataclass
 
 import numpy as np
 
-from sim_gap.effects.drive import commanding
-from sim_gap.effects.registry import Columns, Effect, Layout, Parameter, Shape
+from sim_gap.effects.effect import Effect, Plausibility, Shape, Signature
 from sim_gap.model.rigid_body import Array
+from sim_gap.residuals.layout import Columns, Layout
 from sim_gap.residuals.preprocess import Signals
 
 
-class _Law(Effect):
-    parameters: ClassVar[tuple[Parameter, ...]] = ()
-    general: ClassVar[bool] = True
-    rare: ClassVar[int] = 0
-    family: ClassVar[str]
-    """Effects of this family that are a case of the law say the same as it."""
-    told: ClassVar[str]
-    """The law in words."""
+@dataclass(frozen=True)
+class Law:
+    """One general law."""
+
+    id: str
+    family: str
+    """Effects of this family that are a case of the law say the same."""
+    description: str
+    signature: Signature
+
+    @property
+    def effect(self) -> Effect:
+        """The law as the search takes it: free of charge, without priors."""
+        return Effect(self.id, self.signature, Plausibility(prior_penalty=0))
 
 
-class _MotorLaw(_Law):
-    """Of the motor side, which only a recording with motor torque or command can tell from the link's."""
-
-    def places(self, layout: Layout) -> range:
-        return range(layout.n if layout.motor else 0)
-
-
-class OfPosition(_Law):
-    """A smooth function of a joint's own position, against the model."""
-
-    id = "law.position"
-    family = "transmission"
-    told = "any torque on the link that varies smoothly with the joint's position"
-
-    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
-        return {(layout.against_model, place): _of_position(signals, place)}
-
-
-class OfPositionAtMotor(_MotorLaw):
-    """A smooth function of a joint's own position on the motor side."""
-
-    id = "law.motor_position"
-    family = "transmission"
-    told = "anything in the drive train that varies smoothly with the joint's position"
-
-    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
-        return {(layout.motor_side, place): _of_position(signals, place)}
-
-
-class OfLoad(_Law):
-    """A sensor whose reading is a smooth function of its torque."""
-
-    id = "law.load"
-    family = "torque"
-    told = "any sensor that is wrong by a constant and in proportion to its torque"
-
-    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
-        return layout.sensor_columns(place, _of_load(signals.model[:, place]))
-
-
-class OfLoadAtMotor(_MotorLaw):
-    """A motor side that loses or gains a smooth function of its torque."""
-
-    id = "law.motor_load"
-    family = "actuator"
-    told = "any drive that is wrong by a constant and in proportion to its torque"
-
-    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
-        return {(layout.motor_side, place): _of_load(signals.motor_model[:, place])}
-
-
-class OfVelocityAtMotor(_Law):
-    """A motor side that loses a smooth function of its velocity."""
-
-    id = "law.motor_velocity"
-    family = "friction"
-    told = "anything in the drive train that varies smoothly with the joint's velocity"
-
-    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
-        v = signals.v[:, place]
-        return {(layout.motor_side, place): np.column_stack([v, v * np.abs(v)])}
-
-
-class OfAccelerationAtMotor(_MotorLaw):
-    """A motor side that carries something heavy."""
-
-    id = "law.motor_acceleration"
-    family = "actuator"
-    told = "anything in the drive train that goes with the joint's acceleration"
-
-    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
-        return {(layout.motor_side, place): signals.a[:, place, None]}
-
-
-class OfTime(_Law):
-    """A sensor whose reading wanders with time."""
-
-    id = "law.time"
-    family = "torque"
-    told = "any sensor whose reading wanders with time"
-
-    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
-        return layout.sensor_columns(place, np.column_stack([np.ones_like(signals.t), signals.t]))
-
-
-class LateReading(_Law):
-    """A sensor's reading that is late in whatever manner: two derivatives of its torque."""
-
-    id = "law.late_reading"
-    family = "timing"
-    told = "any way in which the sensor's reading comes late"
-
-    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
-        return layout.sensor_columns(place, _derivatives(signals.smooth_model[:, place], signals.rate))
-
-
-class LateDrive(_Law):
-    """A drive that is late in whatever manner: two derivatives of its command."""
-
-    id = "law.late_drive"
-    family = "actuator"
-    told = "any way in which the drive comes late"
-
-    def places(self, layout: Layout) -> range:
-        return range(layout.n if commanding(layout) else 0)
-
-    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
-        channel = commanding(layout)
-        assert channel is not None
-        return {(channel, place): _derivatives(signals.reading["tau_cmd"][:, place], signals.rate)}
-
-
-class Body(_Law):
-    """Any rigid body fixed to a link: its ten inertial parameters."""
-
-    id = "law.body"
-    family = "link"
-    told = "any rigid body fixed to a link"
-
-    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
-        carrying = np.flatnonzero(signals.arm.carries[:, place])
-        return {(layout.against_model, int(j)): signals.regressor[:, j, place] for j in carrying}
-
-
-class Gravity(_Law):
-    """Gravity of any size and direction."""
-
-    id = "law.gravity"
-    family = "base"
-    told = "gravity that comes from elsewhere than in the model"
-    whole_arm = True
-
-    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
-        return {(layout.against_model, j): signals.gravity_columns[:, j] for j in range(signals.n)}
-
-
-def _of_position(signals: Signals, joint: int) -> Array:
-    q = signals.q[:, joint]
+def _smooth_in_position(s: Signals, joint: int, _shape: Shape) -> Array:
+    q = s.q[:, joint]
     return np.column_stack([np.ones_like(q), q, np.sin(q), np.cos(q)])
 
 
-def _of_load(torque: Array) -> Array:
+def _linear(torque: Array) -> Array:
     return np.column_stack([np.ones_like(torque), torque])
 
 
@@ -176,21 +45,78 @@ def _derivatives(torque: Array, rate: float) -> Array:
     return np.column_stack([first, np.gradient(first, 1.0 / rate)])
 
 
-LAWS = {
-    law.id: law
-    for law in (
-        OfPosition(),
-        OfPositionAtMotor(),
-        OfLoad(),
-        OfLoadAtMotor(),
-        OfVelocityAtMotor(),
-        OfAccelerationAtMotor(),
-        OfTime(),
-        LateReading(),
-        LateDrive(),
-        Body(),
-        Gravity(),
-    )
-}
+def _smooth_in_velocity(s: Signals, joint: int, _shape: Shape) -> Array:
+    v = s.v[:, joint]
+    return np.column_stack([v, v * np.abs(v)])
+
+
+def _body(signals: Signals, layout: Layout, place: int, _shape: Shape) -> Columns:
+    """The ten inertial parameters of a body fixed to a link."""
+    carrying = np.flatnonzero(signals.arm.carries[:, place])
+    return {(layout.against_model, int(j)): signals.regressor[:, j, place] for j in carrying}
+
+
+def _gravity(signals: Signals, layout: Layout, _place: int, _shape: Shape) -> Columns:
+    return {(layout.against_model, j): signals.gravity_columns[:, j] for j in range(signals.n)}
+
+
+_LAWS = (
+    Law(
+        "law.position",
+        "transmission",
+        "any torque on the link that is a smooth function of the joint's position",
+        Signature.at_link(_smooth_in_position),
+    ),
+    Law(
+        "law.motor_position",
+        "transmission",
+        "any loss in the drive train that is a smooth function of the joint's position",
+        Signature.at_motor(_smooth_in_position, "motor"),
+    ),
+    Law(
+        "law.load",
+        "torque",
+        "any sensor error that is constant or proportional to the torque",
+        Signature.at_sensor(lambda s, joint, _: _linear(s.model[:, joint]), "any"),
+    ),
+    Law(
+        "law.motor_load",
+        "actuator",
+        "any drive error that is constant or proportional to the torque",
+        Signature.at_motor(lambda s, joint, _: _linear(s.motor_model[:, joint]), "motor"),
+    ),
+    Law(
+        "law.motor_velocity",
+        "friction",
+        "any loss in the drive train that is a smooth function of the joint's velocity",
+        Signature.at_motor(_smooth_in_velocity),
+    ),
+    Law(
+        "law.motor_acceleration",
+        "actuator",
+        "any torque in the drive train that is proportional to the joint's acceleration",
+        Signature.at_motor(lambda s, joint, _: s.a[:, joint], "motor"),
+    ),
+    Law(
+        "law.time",
+        "torque",
+        "any sensor error that drifts with time",
+        Signature.at_sensor(lambda s, _joint, _shape: _linear(s.t), "any"),
+    ),
+    Law(
+        "law.late_reading",
+        "timing",
+        "any delay or lag of the sensor's reading",
+        Signature.at_sensor(lambda s, joint, _: _derivatives(s.smooth_model[:, joint], s.rate), "any"),
+    ),
+    Law(
+        "law.late_drive",
+        "actuator",
+        "any delay or lag of the drive",
+        Signature.at_command(lambda s, joint, _: _derivatives(s.reading["tau_cmd"][:, joint], s.rate)),
+    ),
+    Law("law.body", "link", "any rigid body fixed to a link", Signature(_body)),
+    Law("law.gravity", "base", "gravity of another direction or size", Signature(_gravity, whole_arm=True)),
+)
+LAWS = {law.id: law for law in _LAWS}
 """All laws by id."""
-EFFECTS: tuple[Effect, ...] = tuple(LAWS.values())

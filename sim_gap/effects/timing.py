@@ -1,38 +1,36 @@
-"""Readings that come late against the position."""
-
-from collections.abc import Mapping
+"""Readings that are delayed against the position."""
 
 import numpy as np
 
-from sim_gap.effects.registry import Columns, Effect, Layout, Parameter, Shape
+from sim_gap.effects.effect import Beneath, Effect, Plausibility, SearchHints, Shape, Signature, as_share_of_shape
 from sim_gap.model.rigid_body import Array
 from sim_gap.residuals.preprocess import Signals
 
 SHORTEST, LONGEST = 1e-3, 0.1
-"""Times that count as a delay [s]."""
+"""Delays that count as such [s]."""
 
 
-class Delay(Effect):
-    """The torque sensor's reading late against the position."""
+def late(effect_id: str, signature: Signature, start: float, longest: float) -> Effect:
+    """An effect whose shape is a time: the search starts at `start` and goes up to `longest` [s]."""
 
-    id = "timing.delay"
-    parameters = (Parameter("delay", "s"),)
-    shapes = ((0.005,),)
-    secant = True
+    def allows(coefficients: Array, shape: Shape, _beneath: Beneath) -> bool:
+        return bool(SHORTEST < coefficients[0] * shape[0] < longest)
 
-    def columns(self, signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
-        torque = signals.model[:, place]
-        late = np.interp(signals.t - shape[0], signals.t, torque) - torque
-        return layout.sensor_columns(place, late[:, None])
+    def relinearise(coefficients: Array, shape: Shape) -> Shape:
+        return (float(np.clip(coefficients[0] * shape[0], SHORTEST, longest)),)
 
-    def resized(self, coefficients: Array, shape: Shape) -> Shape:
-        return (float(np.clip(coefficients[0] * shape[0], SHORTEST, LONGEST)),)
-
-    def plausible(self, coefficients: Array, shape: Shape) -> bool:
-        return bool(SHORTEST < coefficients[0] * shape[0] < LONGEST)
-
-    def values(self, coefficients: Array, shape: Shape, beneath: Mapping[str, Array]) -> Array:
-        return coefficients * shape[0]
+    return Effect(
+        effect_id,
+        signature,
+        Plausibility(allows=allows),
+        SearchHints(shapes=((start,),), linearised_at=0, relinearise=relinearise),
+        parameters_of=as_share_of_shape,
+    )
 
 
-EFFECTS: tuple[Effect, ...] = (Delay(),)
+def _delayed(signals: Signals, joint: int, shape: Shape) -> Array:
+    torque = signals.model[:, joint]
+    return np.asarray(np.interp(signals.t - shape[0], signals.t, torque) - torque)
+
+
+EFFECTS = (late("timing.delay", Signature.at_sensor(_delayed, "any"), 0.005, LONGEST),)

@@ -1,4 +1,4 @@
-"""Runs a planned motion on the arm through the link, and records what comes."""
+"""Runs a planned motion on the arm through the link and records it."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,10 +14,10 @@ from sim_gap.experiment.excitation import ACCELERATION, PACE
 
 
 def collect(link: ArmDriver, target: Array, out: Path, progress: Callable[[int, int], None] = lambda k, n: None) -> int:
-    """Bring the arm to the first target, follow them all under position control, record each cycle; returns rows.
+    """Move to the first target, follow all targets under position control, record each cycle; returns the row count.
 
-    The link is started and enabled by the caller, and leaves the joints safe however this ends. A kill loses at most
-    the recording's last second. Raises BusFault, Refused.
+    The caller starts and enables the link, which stops the joints safely in every case. A kill loses at most the last
+    second of the recording. Raises BusFault, Refused.
     """
     section = link.arm.require_link()
     speed = PACE * np.array([joint.max_velocity for joint in section.joints])

@@ -1,4 +1,4 @@
-"""Motion that tells effects apart: pieces for single joints and for all, within the arm file's ranges and speeds."""
+"""Excitation that separates effects: pieces for single joints and for all, within the arm file's ranges and speeds."""
 
 import json
 from collections.abc import Iterable
@@ -17,44 +17,44 @@ from calib.motion.trajectory import trajectory
 Array = npt.NDArray[np.float64]
 
 MARGIN = 0.12
-"""Kept from each stop, as a share of the range."""
+"""Distance from each stop, as a share of the range."""
 SPEEDS = (0.03, 0.1, 0.3, 0.6)
 """Constant speeds, as shares of a joint's max_velocity."""
 PACE = 0.5
 """Speed on the way to a pose, as a share of max_velocity."""
 ACCELERATION = 1.0
-"""At most [rad/s²], for drives that have little torque left over gravity."""
+"""Largest acceleration [rad/s²], for drives with little torque in excess of gravity."""
 LONGEST = 25.0
-"""One turn through the range takes no longer [s]: at creeping speed only a part of it is gone through."""
+"""Longest time for one pass through the range [s]: at creeping speed only a part of it is covered."""
 REST = 1.0
-"""Rest between pieces [s]."""
+"""Rest between moves [s]."""
 TONES, BAND = 4, (0.08, 0.6)
-"""Sines of the motion of all joints, and their frequencies [Hz]."""
+"""Number of sines per joint in the motion of all joints, and their frequency band [Hz]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Position targets of an arm, one a cycle."""
+    """Position targets of an arm, one per cycle."""
 
     names: tuple[str, ...]
     rate: float
     target: Array
     """(K, n) [rad]."""
     pieces: tuple[str, ...]
-    """What it consists of, for people."""
+    """Description of each part."""
 
     @property
     def seconds(self) -> float:
-        """How long it takes [s]."""
+        """Duration [s]."""
         return len(self.target) / self.rate
 
 
 def plan_motion(arm: ArmFile, joints: Iterable[str] = (), poses: int = 2, seed: int = 0) -> Motion:
-    """Each joint (or those named) alone, slow and fast, both ways, the others in `poses` poses; then all at once.
+    """Each joint (or those named) alone, slow and fast in both directions, with the others in `poses` poses; then all.
 
-    Constant speeds from creeping to fast part the frictions, reversals under two loads part friction from what depends
-    on load and play, and the sines of all joints part inertia, rotor and lag. Raises BadInput for a joint that the arm
-    does not have.
+    Constant speeds from creeping to fast separate the kinds of friction, reversals under two loads separate friction
+    from load-dependent effects and backlash, and the sines of all joints separate inertia, rotor and lag. Raises
+    BadInput for a joint that the arm does not have.
     """
     shape = _Shape(arm)
     names = list(shape.names)
@@ -72,7 +72,7 @@ def plan_motion(arm: ArmFile, joints: Iterable[str] = (), poses: int = 2, seed: 
 
 
 class _Shape:
-    """The motion as far as it is made; begins and goes on from the middle of all ranges."""
+    """The motion under construction; it starts in the middle of all ranges."""
 
     def __init__(self, arm: ArmFile) -> None:
         section, described = arm.require_link(), gcomp_arm(arm)
@@ -85,13 +85,13 @@ class _Shape:
         self.pieces: list[str] = []
 
     def go(self, goal: Array, speed: Array) -> None:
-        """To a pose (n,) [rad], all joints arriving together, and rest there."""
+        """Move to a pose (n,) [rad], all joints arriving together, and rest there."""
         way = trajectory(self.here, goal, speed, np.full(len(goal), ACCELERATION), 1 / self.rate)
         self.rows += [way, np.repeat(goal[None], round(REST * self.rate), axis=0)]
         self.here = goal
 
     def turn(self, joint: int, pose: Array) -> None:
-        """One joint through its range at each constant speed, both ways; the others stay at `pose` (n,) [rad]."""
+        """Move one joint through its range at each constant speed, both directions, the others at `pose` (n,) [rad]."""
         for share in SPEEDS:
             speed = share * self.fastest[joint]
             middle, half = (self.low[joint] + self.high[joint]) / 2, (self.high[joint] - self.low[joint]) / 2
@@ -101,10 +101,12 @@ class _Shape:
                 goal[joint] = end
                 there = np.allclose(np.delete(self.here, joint), np.delete(goal, joint))
                 self.go(goal, np.full(len(goal), speed) if there else PACE * self.fastest)
-        self.pieces.append(f"{self.names[joint]} alone, {len(SPEEDS)} speeds both ways, others at {np.round(pose, 2)}")
+        self.pieces.append(
+            f"{self.names[joint]} alone, {len(SPEEDS)} speeds in both directions, others at {np.round(pose, 2)}"
+        )
 
     def sines(self, joints: list[int], random: np.random.Generator, seconds: float = 60.0) -> None:
-        """The joints at once, each its own sum of sines about the middle of its range."""
+        """Move the joints together, each by its own sum of sines about the middle of its range."""
         self.go((self.low + self.high) / 2, PACE * self.fastest)
         t = np.arange(round(seconds * self.rate)) / self.rate
         fade = np.clip(np.minimum(t, seconds - t) / 2.0, 0.0, 1.0)
@@ -117,18 +119,18 @@ class _Shape:
             rows[:, joint] += fade * (size * np.sin(np.outer(t, omega) + random.uniform(0, 2 * np.pi, TONES))).sum(1)
         self.rows.append(rows)
         self.here = rows[-1]
-        self.pieces.append(f"all at once, {TONES} sines each, {seconds:g} s")
+        self.pieces.append(f"all joints together, {TONES} sines each, {seconds:g} s")
 
     def motion(self) -> Motion:
-        """All of it."""
+        """The whole motion."""
         return Motion(self.names, self.rate, np.concatenate(self.rows), tuple(self.pieces))
 
 
 def joints_in_doubt(answer: Path) -> tuple[list[str], list[str]]:
-    """(Joints that a diagnosis leaves open, its sentences on what to record) from its JSON; raises BadInput."""
+    """Undecided joints of a diagnosis, and the motions that it requests, from its JSON; raises BadInput."""
     try:
-        told: dict[str, Any] = json.loads(answer.read_text(encoding="utf-8"))
-        causes, where = told["causes"], told["where"]
+        result: dict[str, Any] = json.loads(answer.read_text(encoding="utf-8"))
+        causes, where = result["causes"], result["where"]
         open_causes = [cause for cause in causes if cause["confounded_with"]]
         joints = [joint for cause in open_causes or causes for joint in cause["joints"]]
         joints = joints or [place["joint"] for place in where]
@@ -136,4 +138,4 @@ def joints_in_doubt(answer: Path) -> tuple[list[str], list[str]]:
     except OSError as error:
         raise BadInput(f"{answer}: cannot be read: {error.strerror}") from None
     except (ValueError, KeyError, TypeError):
-        raise BadInput(f"{answer}: is no answer of armlink gap diagnose --json") from None
+        raise BadInput(f"{answer}: not a result of armlink gap diagnose --json") from None

@@ -1,4 +1,4 @@
-"""A planned motion as a file: CSV with columns t [s] and q_cmd_1 … q_cmd_n [rad], checked against the arm."""
+"""Files of planned motion: CSV with columns t [s] and q_cmd_1 … q_cmd_n [rad], checked against the arm."""
 
 from pathlib import Path
 
@@ -15,11 +15,11 @@ from sim_gap.experiment.excitation import Motion
 Array = npt.NDArray[np.float64]
 
 ROUNDING = 1.05
-"""Between two rows a motion may exceed a joint's max_velocity by this factor, for the rounding of a file."""
+"""Factor by which the speed between two rows may exceed max_velocity, for the rounding in a file."""
 
 
 def save_motion(motion: Motion, path: Path) -> None:
-    """Write `.csv`; raises BadInput where it cannot be written."""
+    """Write `.csv`; raises BadInput if it cannot be written."""
     if path.suffix != ".csv":
         raise BadInput(f"{path}: a motion is written as .csv")
     columns = {"t": np.arange(len(motion.target)) / motion.rate}
@@ -31,9 +31,9 @@ def save_motion(motion: Motion, path: Path) -> None:
 
 
 def load_motion(path: Path, arm: ArmFile) -> Array:
-    """Targets (K, n) [rad], one a cycle of the arm's rate, from a CSV with columns t and q_cmd_i (others are left out).
+    """Targets (K, n) [rad], one per cycle of the arm's rate, from a CSV with columns t and q_cmd_i (others ignored).
 
-    Raises BadInput where the motion does not fit the arm: columns, missing values, time, range, speed.
+    Raises BadInput if the motion does not fit the arm: columns, missing values, time, range, speed.
     """
     described, section = gcomp_arm(arm), arm.require_link()
     t, target = _columns(path, [f"q_cmd_{i + 1}" for i in range(described.n)])
@@ -57,7 +57,7 @@ def load_motion(path: Path, arm: ArmFile) -> Array:
 
 
 def _columns(path: Path, names: list[str]) -> tuple[Array, Array]:
-    """Times (K,) and columns (K, n), all finite, time rising."""
+    """Times (K,) and columns (K, n), all finite, times increasing."""
     try:
         table = pa_csv.read_csv(path)
     except (pa.ArrowInvalid, OSError) as error:
@@ -75,5 +75,5 @@ def _columns(path: Path, names: list[str]) -> tuple[Array, Array]:
         raise BadInput(f"{path}: row {bad[0][0] + 1}: no value of {('t', *names)[bad[0][1]]}")
     t = values[:, 0]
     if len(t) < 2 or not (np.diff(t) > 0).all():
-        raise BadInput(f"{path}: column t does not rise from row to row: expected seconds, at least two rows")
+        raise BadInput(f"{path}: column t does not increase from row to row: expected seconds, at least two rows")
     return t, values[:, 1:]

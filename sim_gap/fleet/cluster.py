@@ -1,4 +1,4 @@
-"""The workers that a fleet's diagnoses run on: a scheduler that is there, or processes of this machine."""
+"""The workers for the diagnoses of a fleet: an existing scheduler, or processes on this machine."""
 
 import logging
 from collections.abc import Iterator
@@ -9,14 +9,14 @@ from armlink.errors import BusFault
 
 CONNECT_SECONDS = 10.0
 KILLED = 3
-"""A case that this many workers died of is given up."""
+"""A case at which this number of workers died is given up."""
 
 
 @contextmanager
 def cluster(scheduler: str | None, workers: int) -> Iterator[Any]:
-    """A `distributed.Client` on a scheduler's address, else on `workers` processes of this machine, one thread each.
+    """A `distributed.Client` of a scheduler's address, or of `workers` processes on this machine, one thread each.
 
-    Raises BusFault (exit status 3) where nobody answers at the address.
+    Raises BusFault (exit status 3) if no scheduler answers at the address.
     """
     import dask
     from distributed import Client, LocalCluster
@@ -27,7 +27,7 @@ def cluster(scheduler: str | None, workers: int) -> Iterator[Any]:
         try:
             client = Client(scheduler, timeout=CONNECT_SECONDS)
         except (OSError, ValueError) as error:
-            raise BusFault(f"no dask scheduler at {scheduler}: {error}: start one, or leave --scheduler out") from None
+            raise BusFault(f"no dask scheduler at {scheduler}: {error}: start one, or omit --scheduler") from None
         with client:
             yield client
         return

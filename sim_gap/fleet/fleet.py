@@ -1,8 +1,8 @@
-"""The diagnosis mapped over a fleet's recordings on dask.distributed: one task a case, answers kept as they come.
+"""The diagnosis of a fleet's recordings on dask.distributed: one task per case, results stored as they arrive.
 
 A case is a folder with a model (`sim.xml`, `sim.urdf` or `sim.yaml`), `train*` and `heldout*` recordings; or, with one
-model for all, each recording that lies in the folder itself. A worker that dies takes no answer with it: dask runs its
-cases again elsewhere, and an answer that has been written is not made twice.
+model for all, each recording in the folder itself. No result is lost with a worker that dies: dask runs its cases again
+elsewhere, and a stored case is not repeated.
 """
 
 import json
@@ -19,7 +19,7 @@ SUFFIXES = (".csv", ".csv.gz", ".parquet", ".mcap")
 
 @dataclass(frozen=True)
 class Case:
-    """What one diagnosis is made from; `name` is its path within the folder."""
+    """Files of one diagnosis; `name` is the path within the folder."""
 
     name: str
     sim: Path
@@ -28,15 +28,15 @@ class Case:
 
 
 def find_cases(folder: Path, sim: Path | None = None) -> list[Case]:
-    """All cases under a folder, by name. Raises BadInput where there is none."""
+    """All cases under a folder, by name. Raises BadInput if there is none."""
     if not folder.is_dir():
-        raise BadInput(f"{folder}: no such folder: give one that holds cases or recordings")
+        raise BadInput(f"{folder}: no such folder: give one with cases or recordings")
     cases = [case for path in sorted(p for p in folder.rglob("*") if p.is_dir()) if (case := _case(path, folder, sim))]
     if sim is not None:
         cases += [Case(path.name, sim, (path,)) for path in _recordings(folder)]
     if not cases:
         raise BadInput(
-            f"{folder}: holds no case: expected folders with one of {', '.join(MODELS)}, train* and heldout* "
+            f"{folder}: contains no case: expected folders with one of {', '.join(MODELS)}, train* and heldout* "
             "recordings, or recordings and --sim MODEL for all of them"
         )
     return cases
@@ -57,7 +57,7 @@ def _recordings(path: Path) -> list[Path]:
 
 
 def diagnose_case(case: Case) -> dict[str, Any]:
-    """The answer of one case as the contract's dictionary, or `{"error": line}` where it cannot be diagnosed."""
+    """The JSON result of one case, or `{"error": line}` if it cannot be diagnosed."""
     from armlink.recording.recording import load_recording
     from sim_gap.attribution.diagnose import diagnose
 
@@ -72,7 +72,7 @@ def diagnose_case(case: Case) -> dict[str, Any]:
 
 
 def diagnose_fleet(cases: list[Case], client: Any) -> Iterator[tuple[str, dict[str, Any]]]:
-    """(Case name, answer) as they come in from the cluster of a `distributed.Client`; each case once."""
+    """(Case name, result) as they arrive from the cluster of a `distributed.Client`; each case once."""
     from distributed import as_completed
 
     names = {client.submit(diagnose_case, case, key=f"gap-{case.name}", pure=False): case.name for case in cases}
@@ -80,15 +80,15 @@ def diagnose_fleet(cases: list[Case], client: Any) -> Iterator[tuple[str, dict[s
         if future.status == "finished":
             yield names[future], future.result()
         else:
-            yield names[future], {"error": f"the workers failed at it: {future.exception()}"}
+            yield names[future], {"error": f"the workers failed: {future.exception()}"}
         future.release()
 
 
 class Answers:
-    """Answers by case in a file of JSON lines, only ever added to; a line that a kill cut off does not count."""
+    """Results by case in a file of JSON lines, append-only; a line truncated by a kill is ignored."""
 
     def __init__(self, path: Path) -> None:
-        """Read what is there. Raises BadInput where the file is of something else or cannot be written."""
+        """Read the existing lines. Raises BadInput if the file has other contents or cannot be written."""
         self.path = path
         self.found: dict[str, dict[str, Any]] = {}
         try:
@@ -106,10 +106,12 @@ class Answers:
             except ValueError:
                 continue
             except (KeyError, TypeError):
-                raise BadInput(f"{path}: line {number} is no answer of a fleet: give another file with --out") from None
+                raise BadInput(
+                    f"{path}: line {number} is not a result of a fleet: give another file with --out"
+                ) from None
 
     def add(self, case: str, answer: dict[str, Any]) -> None:
-        """Keep an answer; raises BadInput where the disk does not take it."""
+        """Append a result; raises BadInput if it cannot be written."""
         try:
             with self.path.open("a", encoding="utf-8") as stream:
                 stream.write(json.dumps({"case": case, "answer": answer}, ensure_ascii=False) + "\n")
@@ -119,7 +121,7 @@ class Answers:
 
 
 def table(answers: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
-    """One row a case and cause, for people and for Parquet; a case without a cause has one row."""
+    """One row per case and cause; a case without a cause has one row."""
     rows = []
     for case, answer in sorted(answers.items()):
         row: dict[str, Any] = {
@@ -131,12 +133,12 @@ def table(answers: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
         row |= {"effect": None, "joints": None, "shrink": None, "confidence": None, "confounded_with": None}
         causes = answer.get("causes") or [{}]
         for cause in causes:
-            told = {
+            columns = {
                 "effect": cause.get("effect"),
                 "joints": ", ".join(cause.get("joints", [])) or None,
                 "shrink": cause.get("shrink"),
                 "confidence": cause.get("confidence"),
                 "confounded_with": ", ".join(cause.get("confounded_with", [])) or None,
             }
-            rows.append(row | told)
+            rows.append(row | columns)
     return rows

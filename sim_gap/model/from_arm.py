@@ -7,10 +7,10 @@ from armlink.arm_file import load_arm
 from armlink.errors import BadInput
 
 
-def nominal_spec(path: Path) -> Any:
-    """The arm file at a path (or the bundled arm of that name) as a `mujoco.MjSpec`, effects left out.
+def nominal_model(path: Path) -> Any:
+    """Path of the model of an arm file (by path or bundled name), or the `mujoco.MjSpec` of its `sim` section.
 
-    Raises BadInput where the file carries no masses.
+    The section's effects are left out. Raises BadInput if the file has no masses.
     """
     arm = load_arm(str(path))
     if arm.sim is not None:
@@ -19,10 +19,8 @@ def nominal_spec(path: Path) -> Any:
 
         spec = build_model(arm, Imperfections(arm.joint_names)).spec
         for joint in spec.joints:
-            joint.frictionloss = 0.0  # the plant sets its friction as it runs
+            joint.frictionloss = 0.0  # the simulated arm sets its friction at run time
         return spec
     if arm.model_path is None:
-        raise BadInput(f"{path}: carries no masses: give kinematics.model (URDF or MJCF), a sim section, or --sim MJCF")
-    from sim_gap.model.load import read_spec
-
-    return read_spec(arm.model_path)
+        raise BadInput(f"{path}: has no masses: give kinematics.model (URDF or MJCF), a sim section, or --sim MJCF")
+    return arm.model_path

@@ -1,5 +1,6 @@
-"""The simulation model: MJCF, URDF or an arm file, compiled by MuJoCo, its joints matched to a recording's."""
+"""The simulation model (MJCF, URDF or arm file), compiled by MuJoCo, its joints matched to those of a recording."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -7,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from armlink.errors import BadInput
-from sim_gap.model.rigid_body import RigidArm, rigid_arm
+from sim_gap.model.rigid_body import RigidArm, Tendons, inertial_of
 
 
 @dataclass(frozen=True)
 class SimModel:
-    """A compiled MuJoCo model, the joints of it that the recordings hold, and the rigid arm read out of it."""
+    """A compiled MuJoCo model, those of its joints that the recordings have, and its rigid arm."""
 
     mujoco_model: Any
     joints: tuple[int, ...]
@@ -29,8 +30,8 @@ class SimModel:
 def load_model(source: Any, names: tuple[str, ...] = (), count: int | None = None) -> SimModel:
     """Compile a model from a path (.xml, .urdf, .yaml arm file), or take a compiled `mujoco.MjModel`.
 
-    `names` are the recording's joint names where it has any; `count` its number of joints. Joints are taken by name if
-    the model has them all, else in order. Raises BadInput where the model cannot be read or does not fit.
+    `names` are the recording's joint names if it has any; `count` is its number of joints. Joints are matched by name
+    if the model has all of them, else in order. Raises BadInput if the model cannot be read or does not fit.
     """
     import mujoco
 
@@ -45,14 +46,14 @@ def load_model(source: Any, names: tuple[str, ...] = (), count: int | None = Non
         if count is not None and count != len(hinges):
             raise BadInput(
                 f"{label}: has {len(hinges)} hinge joints ({', '.join(map(str, known))}), the recording {count}: "
-                "give the model of the recorded arm, or a recording whose joints bear the model's names"
+                "give the model of the recorded arm, or a recording with the model's joint names"
             )
         joints = hinges
     if not joints:
         raise BadInput(f"{label}: no hinge joint in the model: expected the arm as a chain of hinges")
     arm = rigid_arm(model, joints)
     if any(up >= j for j, up in enumerate(arm.parent)):
-        raise BadInput(f"{label}: joints {', '.join(arm.names)} do not run from base to tip: order them so")
+        raise BadInput(f"{label}: joints {', '.join(arm.names)} do not run from base to tip: reorder them")
     _check(model, joints, arm, label)
     return SimModel(model, tuple(joints), arm, path)
 
@@ -72,9 +73,12 @@ def read_spec(path: Path) -> Any:
     from armlink.arm_file import bundled_arms
 
     if path.suffix in (".yaml", ".yml") or str(path) in bundled_arms():
-        from sim_gap.model.from_arm import nominal_spec
+        from sim_gap.model.from_arm import nominal_model
 
-        return nominal_spec(path)
+        nominal = nominal_model(path)
+        if not isinstance(nominal, Path):
+            return nominal
+        path = nominal
     if not path.is_file():
         raise BadInput(f"no model file {path}: give an MJCF, URDF or arm file")
     try:
@@ -84,12 +88,86 @@ def read_spec(path: Path) -> Any:
 
 
 def _line(error: ValueError) -> str:
-    """MuJoCo's message, which runs over several lines, in one."""
+    """MuJoCo's message, which spans several lines, in one."""
     return " ".join(str(error).split())
 
 
+def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:
+    """The chain of the MuJoCo joints `joints` (hinges, base to tip) of a compiled model.
+
+    Other joints of the model are locked at qpos0; bodies on them belong to the link that carries them.
+    """
+    import mujoco
+
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    link_of_body = {int(model.jnt_bodyid[joint]): link for link, joint in enumerate(joints)}
+    frames = [(data.xmat[model.jnt_bodyid[j]].reshape(3, 3).copy(), data.xanchor[j].copy()) for j in joints]
+
+    def carrier(body: int) -> int:
+        while body and body not in link_of_body:
+            body = int(model.body_parentid[body])
+        return link_of_body.get(body, -1)
+
+    parent = tuple(carrier(int(model.body_parentid[model.jnt_bodyid[j]])) for j in joints)
+    inertial = np.zeros((len(joints), 10))
+    for body in range(1, model.nbody):
+        link = carrier(body)
+        if link >= 0:
+            turn, origin = frames[link]
+            spin = turn.T @ data.ximat[body].reshape(3, 3)
+            centre = turn.T @ (data.xipos[body] - origin)
+            inertia = spin @ np.diag(model.body_inertia[body]) @ spin.T
+            inertial[link] += inertial_of(float(model.body_mass[body]), centre, inertia)
+    ups = [frames[p] if p >= 0 else (np.eye(3), np.zeros(3)) for p in parent]
+    dof, adr = [int(model.jnt_dofadr[j]) for j in joints], [int(model.jnt_qposadr[j]) for j in joints]
+    return RigidArm(
+        names=tuple(
+            mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, j) or f"joint_{i + 1}" for i, j in enumerate(joints)
+        ),
+        parent=parent,
+        rotation=np.array([up[0].T @ own[0] for up, own in zip(ups, frames, strict=True)]),
+        offset=np.array([up[0].T @ (own[1] - up[1]) for up, own in zip(ups, frames, strict=True)]),
+        axis=np.array([model.jnt_axis[j] / np.linalg.norm(model.jnt_axis[j]) for j in joints]),
+        zero=model.qpos0[adr].copy(),
+        inertial=inertial,
+        gravity=model.opt.gravity.copy(),
+        armature=model.dof_armature[dof].copy(),
+        damping=np.reshape(model.dof_damping, (model.nv, -1))[dof, 0].copy(),
+        frictionloss=model.dof_frictionloss[dof].copy(),
+        stiffness=np.reshape(model.jnt_stiffness, (model.njnt, -1))[list(joints), 0].copy(),
+        rest=model.qpos_spring[adr].copy(),
+        tendons=tendons_of(model, joints),
+    )
+
+
+def tendons_of(model: Any, joints: Sequence[int]) -> Tendons:
+    """The fixed tendons of a compiled model over its joints `joints`; spatial tendons are left out."""
+    import mujoco
+
+    rows, which = [], []
+    for tendon in range(model.ntendon):
+        wraps = range(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
+        if any(model.wrap_type[w] != mujoco.mjtWrap.mjWRAP_JOINT for w in wraps):
+            continue
+        turns = np.zeros(len(joints))
+        for w in wraps:
+            if model.wrap_objid[w] in joints:
+                turns[list(joints).index(model.wrap_objid[w])] += model.wrap_prm[w]
+        rows.append(turns)
+        which.append(tendon)
+    damping = np.reshape(model.tendon_damping, (model.ntendon, -1))[which, 0] if which else np.zeros(0)
+    return Tendons(
+        turns=np.reshape(rows, (len(which), len(joints))),
+        armature=model.tendon_armature[which].copy(),
+        damping=damping.copy(),
+        frictionloss=model.tendon_frictionloss[which].copy(),
+    )
+
+
 def _check(model: Any, joints: list[int], arm: RigidArm, label: str) -> None:
-    """Compare with mj_inverse at random states: a model with parts that the chain leaves out is refused."""
+    """Compare with mj_inverse at random states. Raises BadInput for a model with parts that the chain leaves out."""
     import mujoco
 
     data, random = mujoco.MjData(model), np.random.default_rng(0)

@@ -1,28 +1,42 @@
 """Rigid-body torque of an open chain of hinges, and its exact regressor in every link's ten inertial parameters.
 
-Links, joint axes and inertials come from a compiled MuJoCo model; the arithmetic is the Newton-Euler recursion over
-whole recordings at once, so that 10⁵ rows cost less than a second. Checked against `mj_inverse` when a model is loaded.
+The Newton-Euler recursion runs over whole recordings at once, so that 10⁵ rows take less than a second. It is checked
+against MuJoCo's `mj_inverse` when a model is loaded (`sim_gap.model.load`).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_gap.model.tendons import Tendons, tendons_of
-
 Array = NDArray[np.float64]
 CREEP = 0.01
-"""Speed [rad/s] below which the sign of a velocity means nothing and friction may take any value."""
+"""Speed [rad/s] below which the sign of a velocity is not defined and friction may take any value."""
 INERTIAL = ("mass", "mx", "my", "mz", "ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 @dataclass(frozen=True)
+class Tendons:
+    """The m fixed tendons of a model, restricted to the n joints of an arm."""
+
+    turns: Array
+    """Turn of each tendon per turn of each joint, (m, n)."""
+    armature: Array
+    damping: Array
+    frictionloss: Array
+    """(m,) each: kg·m², N·m·s/rad, N·m."""
+
+    def torque(self, v: Array, a: Array) -> Array:
+        """Motor torque that they take [N·m], (…, n); the sign of friction is linear within the creeping speed."""
+        speed, push = v @ self.turns.T, a @ self.turns.T
+        along = np.clip(speed / CREEP, -1.0, 1.0)
+        return np.asarray((self.armature * push + self.damping * speed + self.frictionloss * along) @ self.turns)
+
+
+@dataclass(frozen=True)
 class RigidArm:
-    """An arm of n hinges: geometry, nominal inertial parameters, and what the model's joints carry besides."""
+    """An arm of n hinges: geometry, nominal inertial parameters, and the model's own joint terms."""
 
     names: tuple[str, ...]
     parent: tuple[int, ...]
@@ -34,7 +48,7 @@ class RigidArm:
     axis: Array
     """Joint axis in the link frame, (n, 3)."""
     zero: Array
-    """Joint position at which the angle is zero (MuJoCo's qpos0) [rad], (n,)."""
+    """Joint position at angle zero (MuJoCo's qpos0) [rad], (n,)."""
     inertial: Array
     """Mass [kg], first moment [kg·m], inertia about the origin [kg·m²] in the link frame, (n, 10) as in INERTIAL."""
     gravity: Array
@@ -44,9 +58,9 @@ class RigidArm:
     frictionloss: Array
     stiffness: Array
     rest: Array
-    """The nominal joints' own motor-side terms, (n,) each: kg·m², N·m·s/rad, N·m, N·m/rad, rad."""
+    """Motor-side terms of the nominal joints, (n,) each: kg·m², N·m·s/rad, N·m, N·m/rad, rad."""
     tendons: Tendons
-    """Motors that turn with several joints."""
+    """Motors coupled to several joints."""
 
     @property
     def n(self) -> int:
@@ -63,7 +77,7 @@ class RigidArm:
         return carries
 
     def with_inertial(self, inertial: Array) -> "RigidArm":
-        """The same arm with other inertial parameters (n, 10)."""
+        """The arm with other inertial parameters (n, 10)."""
         return replace(self, inertial=inertial)
 
     def torque(self, q: Array, v: Array, a: Array, gravity: Array | None = None) -> Array:
@@ -105,8 +119,8 @@ class RigidArm:
     def _forward(
         self, q: Array, v: Array, a: Array, gravity: Array | None
     ) -> tuple[list[Array], list[tuple[Array, Array, Array]]]:
-        """Each link's rotation to its parent (3, 3, K); its angular velocity and acceleration and the acceleration of
-        its origin less gravity, in its own frame, (3, K) each."""
+        """Each link's rotation to its parent (3, 3, K); its angular velocity, angular acceleration and the acceleration
+        of its origin less gravity, in its own frame, (3, K) each."""
         field = self.gravity if gravity is None else gravity
         still = np.zeros((3, len(q)))
         base = still, still, still - np.asarray(field, float)[:, None]
@@ -126,13 +140,13 @@ class RigidArm:
         return turns, moves
 
     def nominal_joint_torque(self, q: Array, v: Array, a: Array, direction: Array) -> Array:
-        """What the nominal joints add on the motor side: armature, damping, friction loss, spring, tendons (K, n).
+        """Torque of the nominal joints on the motor side: armature, damping, friction loss, spring, tendons (K, n).
 
-        `direction` is the sign of the velocity, however it is smoothed around rest.
+        `direction` is the sign of the velocity, smoothed around rest by the caller.
         """
         spring = self.stiffness * (q - self.rest)
         own = self.armature * a + self.damping * v + self.frictionloss * direction + spring
-        return np.asarray(own + self.tendons.torque(v, a, CREEP))
+        return np.asarray(own + self.tendons.torque(v, a))
 
 
 def _link_columns(axis: Array, lever: Array, omega: Array, alpha: Array, push: Array) -> Array:
@@ -153,12 +167,12 @@ def _cross(x: Array, y: Array) -> Array:
 
 
 def _in(turn: Array, vector: Array) -> Array:
-    """Into the turned frame: Rᵀ x for rotations (3, 3, K) and vectors (3, K)."""
+    """Into the rotated frame: Rᵀ x for rotations (3, 3, K) and vectors (3, K)."""
     return np.stack([turn[0, i] * vector[0] + turn[1, i] * vector[1] + turn[2, i] * vector[2] for i in range(3)])
 
 
 def _out(turn: Array, vector: Array) -> Array:
-    """Out of the turned frame: R x."""
+    """Out of the rotated frame: R x."""
     return np.stack([turn[i, 0] * vector[0] + turn[i, 1] * vector[1] + turn[i, 2] * vector[2] for i in range(3)])
 
 
@@ -174,56 +188,6 @@ def _turned(start: Array, axis: Array, angle: Array) -> Array:
 def _symmetric(six: Array) -> Array:
     """(…, 6) as xx, xy, xz, yy, yz, zz → (…, 3, 3)."""
     return np.asarray(six[..., [[0, 1, 2], [1, 3, 4], [2, 4, 5]]])
-
-
-def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:
-    """Read the chain of the MuJoCo joints `joints` (hinges, base to tip) out of a compiled model.
-
-    Other joints of the model stay locked at qpos0; bodies on them count to the link that carries them.
-    """
-    import mujoco
-
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    link_of_body = {int(model.jnt_bodyid[joint]): link for link, joint in enumerate(joints)}
-    frames = [(data.xmat[model.jnt_bodyid[j]].reshape(3, 3).copy(), data.xanchor[j].copy()) for j in joints]
-
-    def carrier(body: int) -> int:
-        while body and body not in link_of_body:
-            body = int(model.body_parentid[body])
-        return link_of_body.get(body, -1)
-
-    parent = tuple(carrier(int(model.body_parentid[model.jnt_bodyid[j]])) for j in joints)
-    inertial = np.zeros((len(joints), 10))
-    for body in range(1, model.nbody):
-        link = carrier(body)
-        if link >= 0:
-            turn, origin = frames[link]
-            spin = turn.T @ data.ximat[body].reshape(3, 3)
-            centre = turn.T @ (data.xipos[body] - origin)
-            inertia = spin @ np.diag(model.body_inertia[body]) @ spin.T
-            inertial[link] += inertial_of(float(model.body_mass[body]), centre, inertia)
-    ups = [frames[p] if p >= 0 else (np.eye(3), np.zeros(3)) for p in parent]
-    dof, adr = [int(model.jnt_dofadr[j]) for j in joints], [int(model.jnt_qposadr[j]) for j in joints]
-    return RigidArm(
-        names=tuple(
-            mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, j) or f"joint_{i + 1}" for i, j in enumerate(joints)
-        ),
-        parent=parent,
-        rotation=np.array([up[0].T @ own[0] for up, own in zip(ups, frames, strict=True)]),
-        offset=np.array([up[0].T @ (own[1] - up[1]) for up, own in zip(ups, frames, strict=True)]),
-        axis=np.array([model.jnt_axis[j] / np.linalg.norm(model.jnt_axis[j]) for j in joints]),
-        zero=model.qpos0[adr].copy(),
-        inertial=inertial,
-        gravity=model.opt.gravity.copy(),
-        armature=model.dof_armature[dof].copy(),
-        damping=np.reshape(model.dof_damping, (model.nv, -1))[dof, 0].copy(),
-        frictionloss=model.dof_frictionloss[dof].copy(),
-        stiffness=np.reshape(model.jnt_stiffness, (model.njnt, -1))[list(joints), 0].copy(),
-        rest=model.qpos_spring[adr].copy(),
-        tendons=tendons_of(model, joints),
-    )
 
 
 def inertial_of(mass: float, centre: Array, inertia: Array) -> Array:

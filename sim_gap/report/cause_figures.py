@@ -1,4 +1,4 @@
-"""A figure per finding: what a cause has to explain, against what it goes with, and what it does explain."""
+"""A figure per cause: the residual that it has to explain and its own share, over the quantity it correlates with."""
 
 from typing import Any
 
@@ -6,9 +6,9 @@ import numpy as np
 import plotly.graph_objects as go
 
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
-from sim_gap.effects.registry import Row
 from sim_gap.model.rigid_body import Array
-from sim_gap.report.figures import GREY, ORANGE, stacked, thinned
+from sim_gap.report.figures import BELOW_TITLE, GREY, ORANGE, stacked, thinned
+from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
 from sim_gap.search.estimate import Estimate
 from sim_gap.search.normal_equations import ColumnStore, Term
@@ -28,7 +28,7 @@ AGAINST = {
     "actuator.rotor_inertia": "acceleration",
     "link.inertia": "acceleration",
 }
-"""What an effect, or its family, goes with; the others go with the pose of the whole arm, and are shown over time."""
+"""Quantity that an effect or its family correlates with; the others follow the arm's pose and are shown over time."""
 LABELS = {
     "velocity": "velocity [rad/s]",
     "position": "position [rad]",
@@ -38,8 +38,8 @@ LABELS = {
 }
 
 
-def finding_figure(answer: Diagnosis, cause: Cause) -> Any:
-    """The row on which the cause explains most: residual less all other causes, and this cause's share; or None."""
+def cause_figure(answer: Diagnosis, cause: Cause) -> Any:
+    """Residual less all other causes, and this cause's share, on the row where it is largest; None without one."""
     data, estimate = answer.internals.heldout, answer.internals.estimate
     terms = tuple(term for term in estimate.terms if _is_of(term, cause, answer.names))
     store = ColumnStore(data)
@@ -48,9 +48,9 @@ def finding_figure(answer: Diagnosis, cause: Cause) -> Any:
     if not sizes or max(sizes.values()) == 0.0:
         return None
     row = max(sizes, key=lambda each: sizes[each])
-    what = AGAINST.get(cause.effect, AGAINST.get(cause.effect.split(".")[0], "time"))
+    quantity = AGAINST.get(cause.effect, AGAINST.get(cause.effect.split(".")[0], "time"))
     chosen = thinned(data.valid[row])
-    x = abscissa(data, row[1], what)[chosen]
+    x = abscissa(data, row[1], quantity)[chosen]
     left = (data.values[row] - all_of_them[row] + own[row])[chosen]
     figure = go.Figure()
     for values, colour, size, name in (
@@ -60,22 +60,22 @@ def finding_figure(answer: Diagnosis, cause: Cause) -> Any:
         marker = {"color": colour, "size": size, "opacity": 0.75}
         figure.add_scatter(x=x.round(4), y=values.round(4), mode="markers", marker=marker, name=name)
     joint, channel = answer.names[row[1]], row[0]
-    figure.update_xaxes(title=f"{LABELS[what]}" + ("" if what == "time" else f" of {joint}"))
+    figure.update_xaxes(title=f"{LABELS[quantity]}" + ("" if quantity == "time" else f" of {joint}"))
     figure.update_yaxes(title=f"{channel} of {joint} [N·m]")
     figure.update_layout(
-        title=f"{cause.effect}, at {joint} as an example" if len(cause.joints) > 1 else f"{cause.effect} of {joint}",
+        title=f"{cause.effect} at {joint}" + (" (example)" if len(cause.joints) > 1 else ""),
         height=340,
-        legend={"orientation": "h", "y": 1.02, "x": 1, "xanchor": "right", "yanchor": "bottom"},
+        legend=BELOW_TITLE,
     )
     return figure
 
 
-def abscissa(data: ResidualSet, joint: int, what: str) -> Array:
-    """What a residual may go with, (K,) of one joint at the rate of the comparison."""
-    if what == "time":
+def abscissa(data: ResidualSet, joint: int, quantity: str) -> Array:
+    """A quantity that a residual may correlate with, (K,) of one joint at the rate of the comparison."""
+    if quantity == "time":
         return data.time
     names = {"velocity": "v", "position": "q", "load": "model", "acceleration": "a"}
-    return stacked(data, names[what])[:, joint]
+    return stacked(data, names[quantity])[:, joint]
 
 
 def _is_of(term: Term, cause: Cause, names: tuple[str, ...]) -> bool:

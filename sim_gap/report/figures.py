@@ -1,4 +1,4 @@
-"""Figures of a diagnosis: gap before and after; residual over velocity, position, load, time, and what is explained."""
+"""Figures of a diagnosis: gap before and after; residual and fit over velocity, position, load and time."""
 
 from typing import Any
 
@@ -13,10 +13,12 @@ from sim_gap.residuals.residual_set import ResidualSet
 
 GREY, ORANGE, BLUE, LIGHT = "#9aa7b3", "#d9622b", "#1f5fa8", "#cfd8e0"
 POINTS = 600
+BELOW_TITLE = {"orientation": "h", "y": 1.02, "x": 1, "xanchor": "right", "yanchor": "bottom"}
+"""Place of a figure's legend."""
 
 
 def gap_bars(answer: Diagnosis) -> Any:
-    """Bars per joint: RMS before and after on held-out motion, noise floor as a line; logarithmic."""
+    """Bars per joint: RMS before and after on held-out data, noise floor as a line; logarithmic."""
     figure = go.Figure()
     names = list(answer.names)
     for label, values, colour in (("before", answer.heldout_before, LIGHT), ("after", answer.heldout_after, BLUE)):
@@ -30,10 +32,10 @@ def gap_bars(answer: Diagnosis) -> Any:
     low = float(max(np.nanmin(np.concatenate([answer.noise_floor, answer.heldout_after])) / 3.0, top * 1e-6))
     figure.update_yaxes(type="log", title="RMS [N·m]", range=[np.log10(low), np.log10(top)], dtick=1)
     figure.update_layout(
-        title="Torque gap on motion not fitted",
+        title="Torque gap on held-out data",
         barmode="group",
         height=380,
-        legend={"orientation": "h", "y": 1.02, "x": 1, "xanchor": "right", "yanchor": "bottom"},
+        legend=BELOW_TITLE,
     )
     return figure
 
@@ -56,13 +58,13 @@ def rollout_bars(names: tuple[str, ...], rollout: Rollout) -> Any:
         title=f"Position gap of the forward simulation over {rollout.horizon_s:.2g} s",
         height=340,
         barmode="group",
-        legend={"orientation": "h", "y": 1.02, "x": 1, "xanchor": "right", "yanchor": "bottom"},
+        legend=BELOW_TITLE,
     )
     return figure
 
 
 def residual_panels(answer: Diagnosis, channel: str) -> Any:
-    """One row a joint; residual of `channel` against velocity, position, load and time; None where there is nothing."""
+    """One row per joint: residual of `channel` over velocity, position, load and time; None without valid samples."""
     data, estimate = answer.internals.heldout, answer.internals.estimate
     explained = estimate.predict(data) if estimate is not None else None
     joints = [j for j in range(data.layout.n) if data.valid[channel, j].sum() > 10]
@@ -93,12 +95,12 @@ def residual_panels(answer: Diagnosis, channel: str) -> Any:
 
 
 def stacked(data: ResidualSet, name: str) -> Array:
-    """A quantity of the signals (`v`, `q`, `a`, `model`) at the rate of the comparison, recordings in a row, (K, n)."""
+    """A quantity of the signals (`v`, `q`, `a`, `model`) at the rate of the comparison, concatenated, (K, n)."""
     return np.concatenate([s.filtered(getattr(s, name)) for s in data.signals])
 
 
 def thinned(valid: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Places of the samples that are drawn: some hundreds of the valid ones."""
+    """Indices of the samples that are drawn: some hundreds of the valid ones."""
     rows = np.flatnonzero(valid)
     return rows[:: max(1, len(rows) // POINTS)]
 

@@ -1,21 +1,22 @@
-"""The diagnosis as sections of a report: verdict, causes, gap before and after, and the residuals in pictures."""
+"""The diagnosis as sections of a report: verdict, causes, gap before and after, figures of the residuals."""
 
 from html import escape
 from pathlib import Path
 from typing import Any
 
+from armlink.effect_catalogue import CATALOGUE
 from calib.report.page import ReportTable, Section, paragraph, render
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
-from sim_gap.report.cause_figures import finding_figure
-from sim_gap.report.effect_text import PLAIN, sentence
+from sim_gap.report.cause_figures import cause_figure
+from sim_gap.report.effect_text import sentence
 from sim_gap.report.figures import gap_bars, residual_panels, rollout_bars
 
 
 def sections(answer: Diagnosis) -> list[Section]:
-    """Sections for a page of its own or within another report."""
+    """Sections for a separate page or for a part of another report."""
     out = [_verdict(answer), _gap(answer)]
     if answer.internals is not None:
-        out += [*_findings(answer), *_residuals(answer)]
+        out += [*_causes(answer), *_residuals(answer)]
     return out
 
 
@@ -33,7 +34,7 @@ def _verdict(answer: Diagnosis) -> Section:
             ReportTable(
                 ("effect", "joints", "RMS before [N·m]", "after [N·m]", "shrink", "confidence"),
                 [_cause_row(cause) for cause in answer.causes],
-                "Causes in order, each added to those above it; RMS on motion not fitted, over the joints named.",
+                "Causes in order, each added to those above it; RMS on held-out data over the joints of the cause.",
                 texts=2,
             )
         )
@@ -45,13 +46,13 @@ def _verdict(answer: Diagnosis) -> Section:
                 texts=3,
             )
         )
-    return Section("What causes the gap", html, (), tables)
+    return Section("Causes of the gap", html, (), tables)
 
 
 def _cause_row(cause: Cause) -> list[str]:
     doubt = f"<br><small>or {escape(', '.join(cause.confounded_with))}: {escape(cause.separate_by or '')}</small>"
     return [
-        f"<b>{escape(cause.effect)}</b><br><small>{escape(PLAIN.get(cause.effect, ''))}</small>"
+        f"<b>{escape(cause.effect)}</b><br><small>{escape(CATALOGUE[cause.effect].description)}</small>"
         + (doubt if cause.confounded_with else ""),
         escape(", ".join(cause.joints)),
         f"{cause.gap_before:.3g}",
@@ -82,45 +83,47 @@ def _gap(answer: Diagnosis) -> Section:
             strict=True,
         )
     ]
-    header = ("joint", "noise floor", "fitted motion: before", "after", "other motion: before", "after")
+    header = ("joint", "noise floor", "training data: before", "after", "held-out data: before", "after")
     text = (
-        f"Torque gap of the simulation, RMS in N·m per joint, as the model stands and with the causes added. "
-        f"The other motion is {answer.heldout_is}; nothing was fitted or chosen on it."
+        f"Torque gap of the simulation, RMS in N·m per joint, of the nominal model and with the causes added. "
+        f"The held-out data, {answer.heldout_is}, were used neither for the fit nor for the selection of effects."
     )
     figures: list[Any] = [gap_bars(answer)]
     if answer.rollout is not None:
         figures.append(rollout_bars(answer.names, answer.rollout))
-    return Section("How far it closes", paragraph(text), figures, [ReportTable(header, rows)])
+    return Section("Gap before and after", paragraph(text), figures, [ReportTable(header, rows)])
 
 
-def _findings(answer: Diagnosis) -> list[Section]:
+def _causes(answer: Diagnosis) -> list[Section]:
     """A figure for every cause."""
-    figures = [finding_figure(answer, cause) for cause in answer.causes]
+    figures = [cause_figure(answer, cause) for cause in answer.causes]
     shown = [figure for figure in figures if figure is not None]
     if not shown:
         return []
     text = (
-        "Each cause where it explains most, on the other motion: grey is the residual less all other causes, orange "
-        "what this cause makes of it. Where it is right, orange lies in the middle of grey."
+        "Each cause on the row where it explains most, on held-out data: grey is the residual less all other causes, "
+        "orange the contribution of this cause. A correct cause follows the centre of the grey points."
     )
     return [Section("The causes one by one", paragraph(text), shown)]
 
 
 def _residuals(answer: Diagnosis) -> list[Section]:
-    places = {(p.channel, p.joint): p for p in answer.where}
+    locations = {(at.channel, at.joint): at for at in answer.where}
     data = answer.internals.heldout
     channels = [c for c in (data.layout.sensor, data.layout.motor) if c]
     out = []
     for channel in channels:
         against = "the model" if channel == data.layout.against_model else "the torque sensor"
         rows = [
-            [escape(name), p.regime, f"{p.share:.0%}", f"{p.rms:.3g}", f"{p.noise:.2g}"]
+            [escape(name), at.regime, f"{at.share:.0%}", f"{at.rms:.3g}", f"{at.noise:.2g}"]
             for name in answer.names
-            if (p := places.get((channel, name))) is not None
+            if (at := locations.get((channel, name))) is not None
         ]
-        header = ("joint", "goes with", "share", "RMS [N·m]", "noise [N·m]")
-        text = f"{channel} minus {against} on the other motion, grey as it is, orange what the causes explain of it."
-        table = ReportTable(header, rows, "The regime that accounts for most of each residual's square.", texts=2)
+        header = ("joint", "correlates with", "share", "RMS [N·m]", "noise [N·m]")
+        text = f"{channel} minus {against} on held-out data: grey as measured, orange the sum of the causes."
+        table = ReportTable(
+            header, rows, "The regime of motion with the largest share of each residual's mean square.", texts=2
+        )
         figure = residual_panels(answer, channel)
-        out.append(Section(f"Where: {channel}", paragraph(text), [figure] if figure is not None else [], [table]))
+        out.append(Section(f"Residuals: {channel}", paragraph(text), [figure] if figure is not None else [], [table]))
     return out

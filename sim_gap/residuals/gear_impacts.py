@@ -1,6 +1,6 @@
-"""Hits: where a gear with play changes sides, the residual jumps as no smooth effect does, in that joint and others.
+"""Gear impacts: when a gear with play changes sides, the residual jumps as no smooth effect does, in several joints.
 
-No inverse form follows a hit. Its moments are left out of the comparison, and that there are hits is a finding itself.
+No inverse form follows an impact. Its samples are left out of the comparison, and the impacts are reported.
 """
 
 import numpy as np
@@ -10,15 +10,15 @@ from sim_gap.model.rigid_body import Array
 from sim_gap.residuals.preprocess import Signals
 
 BEFORE_S, AFTER_S = 0.4, 0.6
-"""Left out before and after a change of sign of the torque."""
+"""Time left out before and after a change of sign of the torque [s]."""
 SHARP = 25.0
-"""So many times sharper (second difference, RMS) than elsewhere the residual must be near these changes."""
+"""Least ratio of the residual's second difference (RMS) near these changes to that elsewhere."""
 LEAST_LEFT = 0.2
-"""Share of a recording that must be left."""
+"""Share of a recording that must remain."""
 
 
-def hits(s: Signals, channel: str, residual: Array) -> dict[int, NDArray[np.bool_]]:
-    """Joints that hit at their torque reversals, and the samples near these, (k,) each.
+def near_impacts(s: Signals, channel: str, residual: Array) -> dict[int, NDArray[np.bool_]]:
+    """Joints whose gear hits at their torque reversals, and the samples near those, (k,) each.
 
     `residual` is that of the link-side sensor `channel`, (k, n), at the rate of the comparison.
     """

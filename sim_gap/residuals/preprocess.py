@@ -1,42 +1,41 @@
-"""A recording made ready: even sampling, smooth velocity and acceleration, model torque, and one filter for both sides.
+"""Prepares a recording: even sampling, smooth velocity and acceleration, model torque, one filter for data and model.
 
-Every column that is compared with a reading goes through the same zero-phase low pass and is decimated with it, so the
-filter changes neither side against the other. Signs, plays and clips are taken at the work rate, before that filter.
+Every column that is compared with a reading passes through the same zero-phase low pass and decimation as the reading,
+so that the filter does not change one against the other. Signs, plays and clips are evaluated at the work rate, before
+that filter.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.interpolate import CubicSpline, make_interp_spline
+from scipy.interpolate import make_interp_spline
 from scipy.signal import butter, sosfiltfilt, sosfreqz
 
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording
 from sim_gap.model.rigid_body import CREEP, Array, RigidArm
+from sim_gap.residuals.channel_noise import band_noise
+from sim_gap.residuals.resampling import SLOW_HZ, bridged, coverage, low_pass, thinner
+from sim_gap.residuals.stuck_channels import Stuck, stuck_intervals
 
 BAND_HZ = 6.0
-"""Pass band in which model and recording are compared."""
+"""Pass band in which model and recording are compared [Hz]."""
 SMOOTH_HZ = 20.0
-"""Pass band of position and velocity before anything nonlinear is taken of them."""
+"""Pass band of position and velocity before nonlinear functions are evaluated [Hz]."""
 CALM_HZ = 8.0
-"""Pass band of the model torque before a play or a clip is taken of it."""
+"""Pass band of the model torque before a play or a clip is evaluated [Hz]."""
 WORK_HZ = 125.0
-"""Highest rate at which columns are computed; faster recordings are low-passed and decimated to it."""
+"""Highest rate at which columns are computed [Hz]; faster recordings are low-passed and decimated to it."""
 TRIM_S = 0.3
-"""Cut at both ends after filtering."""
+"""Length cut off at both ends after filtering [s]."""
 SHORTEST_S = 3.0
-SLOW_HZ = 60.0
-"""Below this rate a recorded velocity is used; above, positions are differentiated, for drives report velocity late."""
-SPLINED = 3.5
-"""Steps between readings may differ so many times from the median for a channel to be interpolated by splines."""
 CHANNELS = {"tau": "torque", "tau_motor": "motor_torque", "tau_cmd": "torque_command"}
 
 
 @dataclass(frozen=True, eq=False)
 class Signals:
-    """One recording at an even work rate, with the nominal model's answer to its motion."""
+    """One recording at an even work rate, with the nominal model's torque along its motion."""
 
     label: str
     rate: float
@@ -49,15 +48,17 @@ class Signals:
     a: Array
     """(K,), then (K, n) each in rad, rad/s, rad/s²."""
     reading: dict[str, Array]
-    """Torque channels `tau`, `tau_motor`, `tau_cmd` that are there [N·m], (K, n)."""
+    """Torque channels present, of `tau`, `tau_motor`, `tau_cmd` [N·m], (K, n)."""
     known: dict[str, Array]
-    """1 where the channel was really read, 0 where a gap was bridged, (K, n)."""
+    """1 for readings, 0 for samples interpolated over a gap or stuck, (K, n)."""
     noise: dict[str, Array]
     """Standard deviation of each channel's noise within the pass band [N·m], (n,)."""
     arm: RigidArm
     temperature: Array | None = None
     number: int = 0
-    """Which of the training recordings this is (or the rest of), from 1; 0 is another."""
+    """Number from 1 of the training recording that this is (a part of); 0 for others."""
+    stuck: tuple[Stuck, ...] = ()
+    """Channels that are stuck for some time, in which they are not `known`."""
 
     @property
     def n(self) -> int:
@@ -66,7 +67,7 @@ class Signals:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Torque channels that are there."""
+        """Torque channels present."""
         return tuple(self.reading)
 
     @cached_property
@@ -76,8 +77,8 @@ class Signals:
 
     @cached_property
     def smooth_model(self) -> Array:
-        """Nominal torque without the noise of the accelerations, which would shake every play and clip (K, n)."""
-        return _low_pass(min(CALM_HZ, 0.4 * self.rate), self.rate)(self.model)
+        """Nominal torque without the noise of the accelerations, which would disturb plays and clips, (K, n)."""
+        return low_pass(min(CALM_HZ, 0.4 * self.rate), self.rate)(self.model)
 
     @cached_property
     def motor_model(self) -> Array:
@@ -96,7 +97,7 @@ class Signals:
         return self.arm.regressor(self.q, self.v, self.a)
 
     def sensitivity(self, joint: int) -> tuple[Array, Array, Array]:
-        """Derivatives of the model torque in one joint's position, velocity and acceleration, (K, n) each."""
+        """Derivatives of the model torque with respect to one joint's position, velocity, acceleration, (K, n) each."""
         if joint not in self._sensitivities:
             unit = np.eye(self.n)[joint]
             moved = [
@@ -118,21 +119,21 @@ class Signals:
 
     @cached_property
     def direction(self) -> Array:
-        """Sign of the velocity, passing through zero linearly within the creeping speed, (K, n)."""
+        """Sign of the velocity, linear through zero within the creeping speed, (K, n)."""
         return np.clip(self.v / CREEP, -1.0, 1.0)
 
     @cached_property
     def moving(self) -> Array:
-        """1 where a joint moves faster than it creeps, (K, n)."""
+        """1 if a joint moves faster than the creeping speed, (K, n)."""
         return (np.abs(self.v) > CREEP).astype(float)
 
     @property
     def step(self) -> int:
-        """Decimation from the work rate to that of the comparison."""
+        """Decimation from the work rate to the rate of the comparison."""
         return max(1, round(self.rate / (4.0 * self.band)))
 
     def filtered(self, x: Array) -> Array:
-        """Low-pass (4th-order Butterworth, forth and back), trimmed at the ends and decimated; (K, …) → (k, …)."""
+        """Low-pass (4th-order Butterworth, forward and backward), trimmed and decimated; (K, …) → (k, …)."""
         trim = max(1, round(TRIM_S * self.rate))
         return np.asarray(sosfiltfilt(self._sections, x, axis=0)[trim : len(x) - trim : self.step])
 
@@ -141,8 +142,8 @@ class Signals:
         return np.asarray(butter(4, self.band, fs=self.rate, output="sos"))
 
     def upper_half(self, x: Array) -> Array:
-        """RMS that white noise has within the pass band which has the same above half of it as `filtered` values x
-        (k, …), (…)."""
+        """RMS within the pass band of white noise with the same RMS in its upper half as `filtered` values x (k, …),
+        (…)."""
         rate = self.rate / self.step
         sections = butter(4, 0.5 * self.band, btype="high", fs=rate, output="sos")
         frequency = np.linspace(0.0, 0.5 * rate, 512)
@@ -152,23 +153,23 @@ class Signals:
         return np.asarray(np.sqrt(np.mean(sosfiltfilt(sections, x, axis=0) ** 2, axis=0) / share))
 
     def sampled(self, x: Array) -> Array:
-        """The rows of `x` at which `filtered` gives its values, unfiltered."""
+        """The rows of `x` at which `filtered` has its values, unfiltered."""
         trim = max(1, round(TRIM_S * self.rate))
         return x[trim : len(x) - trim : self.step]
 
 
 def require_length(recording: Recording, label: str) -> None:
-    """Raise BadInput where a recording is too short to tell anything."""
+    """Raise BadInput if a recording is too short for a diagnosis."""
     span = float(recording.t[-1] - recording.t[0]) if len(recording.t) else 0.0
     if len(recording.t) < 4 or span < SHORTEST_S:
         raise BadInput(
-            f"{label}: {len(recording.t)} rows over {span:.3g} s: too short to tell anything; "
+            f"{label}: {len(recording.t)} rows over {span:.3g} s: too short for a diagnosis; "
             f"record at least {SHORTEST_S:.0f} s"
         )
 
 
-def prepare(recording: Recording, arm: RigidArm, label: str = "recording") -> Signals:
-    """Make a recording ready for comparison with `arm`. Raises BadInput where it cannot be used, saying why."""
+def prepare(recording: Recording, arm: RigidArm, label: str = "recording", number: int = 0) -> Signals:
+    """Prepare a recording for the comparison with `arm`. Raises BadInput if it cannot be used, with the reason."""
     if recording.n != arm.n:
         raise BadInput(f"{label}: has {recording.n} joints, the model {arm.n}: give the model of the recorded arm")
     raw_step = float(np.median(np.diff(recording.t)))
@@ -178,99 +179,44 @@ def prepare(recording: Recording, arm: RigidArm, label: str = "recording") -> Si
     band = min(BAND_HZ, rate / 5.0)
     if band < 0.5:
         raise BadInput(f"{label}: {rate:.3g} rows a second are too few: record at 10 Hz or more")
-    thin = _thinner(1.0 / raw_step, stride)
-    q = thin(_bridged(recording.t, recording.position, even, label, "q"))
-    smooth = _low_pass(min(SMOOTH_HZ, 0.4 * rate), rate)
+    thin = thinner(1.0 / raw_step, stride)
+    q = thin(bridged(recording.t, recording.position, even, label, "q"))
+    smooth = low_pass(min(SMOOTH_HZ, 0.4 * rate), rate)
     times = even[::stride]
     spline = make_interp_spline(times, smooth(q), k=5)
     q, v, a = (np.asarray(spline(times, order)) for order in range(3))
     if rate < SLOW_HZ and recording.velocity is not None and np.isfinite(recording.velocity).all():
-        v = smooth(thin(_bridged(recording.t, recording.velocity, even, label, "dq")))
+        v = smooth(thin(bridged(recording.t, recording.velocity, even, label, "dq")))
         a = np.asarray(make_interp_spline(times, v, k=5)(times, 1))
     reading, known, noise = {}, {}, {}
     for channel, name in CHANNELS.items():
         values = getattr(recording, name)
         if values is None or not np.isfinite(values).any():
             continue
-        reading[channel] = thin(_bridged(recording.t, values, even, label, channel))
-        known[channel] = _coverage(recording.t, values, even)[::stride]
-        noise[channel] = np.array([_band_noise(recording.t, values[:, j], band) for j in range(arm.n)])
+        reading[channel] = thin(bridged(recording.t, values, even, label, channel))
+        known[channel] = coverage(recording.t, values, even)[::stride]
+        noise[channel] = np.array([band_noise(recording.t, values[:, j], band) for j in range(arm.n)])
     if not reading:
         raise BadInput(f"{label}: no torque channel holds a number: at least one of tau, tau_motor, tau_cmd is needed")
     clock = times - times[0]
-    return Signals(label, rate, band, clock, q, v, a, reading, known, noise, arm, recording.temperature)
+    signals = Signals(label, rate, band, clock, q, v, a, reading, known, noise, arm, recording.temperature, number)
+    return _without_stuck(signals, recording)
 
 
-def _bridged(t: Array, values: Array, even: Array, label: str, column: str) -> Array:
-    """Values on the even time base, by cubic splines where a channel is slow and even, else linearly.
-
-    Raises BadInput where a whole column is missing.
-    """
-    out = np.empty((len(even), values.shape[1]))
-    for j in range(values.shape[1]):
-        there = np.isfinite(values[:, j])
-        if there.sum() < 4 or (column == "q" and there.mean() < 0.2):
-            raise BadInput(
-                f"{label}: column {column}_{j + 1} holds {int(there.sum())} numbers in {len(t)} rows: "
-                "expected a reading in most rows; record that channel or leave it out"
-            )
-        own = t[there]
-        steps, usual = np.diff(own), float(np.median(np.diff(own)))
-        even_enough = steps.max() < SPLINED * usual and steps.min() > usual / SPLINED and usual > 1.0 / SLOW_HZ
-        curve = CubicSpline(own, values[there, j]) if even_enough else None
-        inside = np.clip(even, own[0], own[-1])
-        out[:, j] = np.interp(inside, own, values[there, j]) if curve is None else curve(inside)
-    return out
-
-
-def _coverage(t: Array, values: Array, even: Array) -> Array:
-    """1 where a reading is no further away than a few of the channel's own periods, (K, n)."""
-    out = np.zeros((len(even), values.shape[1]))
-    for j in range(values.shape[1]):
-        there = t[np.isfinite(values[:, j])]
-        after = np.clip(np.searchsorted(there, even), 1, len(there) - 1)
-        gap = there[after] - there[after - 1]
-        out[:, j] = gap <= max(6.0 * float(np.median(np.diff(there))), 0.05)
-    return out
-
-
-def _thinner(rate: float, stride: int) -> Callable[[Array], Array]:
-    if stride == 1:
-        return lambda x: x
-    low = _low_pass(0.4 * rate / stride, rate)
-    return lambda x: low(x)[::stride]
-
-
-def _low_pass(cut: float, rate: float) -> Callable[[Array], Array]:
-    sections = butter(4, cut, fs=rate, output="sos")
-    return lambda x: np.asarray(sosfiltfilt(sections, x, axis=0))
-
-
-def _band_noise(t: Array, values: Array, band: float) -> float:
-    """Noise within the pass band [N·m], from the channel's spectrum above twice that band or just above it (no lines).
-
-    Whichever is quieter: a controller's noise grows with frequency, and a fast motion ends somewhere.
-    """
-    there = np.isfinite(values)
-    x, own = values[there], t[there]
-    if len(x) < 64:
-        return 0.0
-    rate = 1.0 / float(np.median(np.diff(own)))
-    frequency, density = _spectrum(x - x.mean(), rate)
-    high = frequency > min(2.0 * band, 0.3 * rate)
-    near = (frequency > 1.5 * band) & (frequency < 3.0 * band)
-    levels = [float(np.median(density[part])) for part in (high, near) if part.any()]
-    return float(np.sqrt(min(levels) / 0.69 * band)) if levels else 0.0
-
-
-def _spectrum(x: Array, rate: float) -> tuple[Array, Array]:
-    """Power spectral density (Welch: Hann windows of 512 samples, half overlapping, straight lines taken off each)."""
-    size = min(len(x), 512)
-    pieces = np.lib.stride_tricks.sliding_window_view(x, size)[:: size // 2]
-    line = np.linspace(-1.0, 1.0, size)
-    pieces = pieces - pieces.mean(1, keepdims=True)
-    pieces = pieces - (pieces @ line / (line @ line))[:, None] * line
-    window = np.hanning(size)
-    power = np.abs(np.fft.rfft(pieces * window, axis=1)) ** 2
-    density = 2.0 * power.mean(0) / (rate * (window @ window))
-    return np.asarray(np.fft.rfftfreq(size, 1.0 / rate), float), np.asarray(density)
+def _without_stuck(s: Signals, recording: Recording) -> Signals:
+    """The signals with stuck readings marked as not known."""
+    known, found = dict(s.known), []
+    for channel in s.channels:
+        values = getattr(recording, CHANNELS[channel])
+        for joint in range(s.n):
+            there = np.isfinite(values[:, joint])
+            held = s.moving[:, joint] == 0.0 if channel != "tau" else np.zeros(len(s.t), bool)
+            own = recording.t[there] - recording.t[0]
+            still = stuck_intervals(s.t, s.model[:, joint], held, own, values[there, joint])
+            if still:
+                marked = known[channel].copy()
+                for start, end in still:
+                    marked[(s.t >= start) & (s.t <= end), joint] = 0.0
+                known[channel] = marked
+                found.append(Stuck(channel, joint, sum(end - start for start, end in still)))
+    return replace(s, known=known, stuck=tuple(found))

@@ -1,5 +1,6 @@
 """Residuals of a set of recordings: one row per channel and joint, with its noise floor, valid samples and folds."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -7,35 +8,35 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
-from sim_gap.effects.registry import Columns, Effect, Layout, Row, Shape
 from sim_gap.model.rigid_body import Array
-from sim_gap.residuals.gear_impacts import hits
+from sim_gap.residuals.gear_impacts import near_impacts
+from sim_gap.residuals.layout import Columns, Layout, Row, layout_of
 from sim_gap.residuals.preprocess import Signals
 
 MODEL_FLOOR = 1e-3
-"""Numerical and geometrical error that every model is granted, as a share of its torque."""
-SMALL, SMALL_INNER, SMALL_NM = 0.01, 0.003, 0.01
-"""Residual that is not worth a parameter: share of a joint's torque (RMS) against the model, of motor against sensor
-or command, and [N·m]."""
-CARE_NM = 0.05
-"""Smallest gap that a user would care about [N·m]: every arm has a few hundredths of friction and offset."""
-CARE, CARE_INNER, CARE_COMMAND = 0.016, 0.007, 0.001
-"""A gap that a user would care about, as a share of the joint's torque (RMS): against the model, motor against sensor,
-command against motor."""
-FAINT = 0.5
-"""Share of that below which there is nothing to search for."""
+"""Numerical and geometrical error granted to every model, as a share of its torque."""
+FLOOR, FLOOR_INNER, FLOOR_NM = 0.01, 0.003, 0.01
+"""Residual that is not worth a parameter: share of a joint's torque (RMS) against the model, and of motor against
+sensor or command; and in any case [N·m]."""
+RELEVANT_NM = 0.05
+"""Smallest gap that is relevant to a user [N·m]: every arm has a few hundredths of friction and offset."""
+RELEVANT, RELEVANT_INNER, RELEVANT_COMMAND = 0.016, 0.007, 0.001
+"""Smallest relevant gap as a share of the joint's torque (RMS): against the model, motor against sensor, command
+against motor."""
+QUIET = 0.5
+"""Share of the relevant gap below which there is nothing to search for."""
 FOLDS = 6
 MOVING_SHARE = 0.95
-"""A sample of the motor row counts where the joint moves during this share of the filter's window."""
+"""A sample of the motor row counts if the joint moves during this share of the filter's window."""
 SETTLE_S, SETTLED_LEAST = 0.08, 0.4
-"""Left out before and after rest and reversal, if at least this share of the motion is left."""
+"""Time left out before and after rest and reversal [s], if at least this share of the motion remains."""
 BLOCK_S = 2.0
 """Length of the blocks within which errors may be correlated, for confidence intervals [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualSet:
-    """Recordings with a common layout. All arrays are at the decimated rate, recordings one after the other."""
+    """Recordings with a common layout. Arrays are at the decimated rate, recordings concatenated."""
 
     signals: tuple[Signals, ...]
     layout: Layout
@@ -47,17 +48,17 @@ class ResidualSet:
 
     @cached_property
     def lengths(self) -> tuple[int, ...]:
-        """Samples of each recording."""
+        """Number of samples of each recording."""
         return tuple(len(s.filtered(s.t)) for s in self.signals)
 
     @cached_property
     def time(self) -> Array:
-        """Time since each recording's start [s], (K,)."""
+        """Time since the start of each recording [s], (K,)."""
         return np.concatenate([s.sampled(s.t) for s in self.signals])
 
     @cached_property
     def values(self) -> dict[Row, Array]:
-        """Reading minus what it is compared with [N·m], (K,) per row."""
+        """Reading minus its reference [N·m], (K,) per row."""
         return {row: np.concatenate([one[row] for one in self._stacked]) for row in self.rows}
 
     @cached_property
@@ -82,14 +83,14 @@ class ResidualSet:
         return layout.compared(out)
 
     @cached_property
-    def struck(self) -> dict[int, NDArray[np.bool_]]:
-        """Joints whose gear hits at torque reversals, and the samples near these, (K,) each."""
+    def impacts(self) -> dict[int, NDArray[np.bool_]]:
+        """Joints whose gear hits at torque reversals, and the samples near those, (K,) each."""
         sensor, out = self.layout.sensor, dict[int, NDArray[np.bool_]]()
         first = 0
         for s, length in zip(self.signals if sensor else (), self.lengths, strict=False):
             part = slice(first, first + length)
             rest = np.stack([self.values[str(sensor), j][part] for j in range(self.layout.n)], axis=1)
-            for joint, near in hits(s, str(sensor), rest).items():
+            for joint, near in near_impacts(s, str(sensor), rest).items():
                 row = (str(sensor), joint)
                 if root_mean_square(rest[near, joint]) < self.margin[row] - 2.0 * self.floor[row]:
                     continue
@@ -99,7 +100,7 @@ class ResidualSet:
 
     @cached_property
     def valid(self) -> dict[Row, NDArray[np.bool_]]:
-        """Samples that count: really read, no gear hitting, and for the motor row with the joint in motion."""
+        """Samples that count: read and not interpolated, away from gear impacts, and in motion for the motor row."""
         out: dict[Row, list[NDArray[np.bool_]]] = {row: [] for row in self.rows}
         for s in self.signals:
             moving = sliding(s)
@@ -111,38 +112,38 @@ class ResidualSet:
                 if channel == self.layout.motor or (channel == self.layout.command and self.layout.beyond(joint)):
                     there &= moving[:, joint]
                 out[channel, joint].append(there)
-        calm = ~np.any([np.zeros(sum(self.lengths), bool), *self.struck.values()], axis=0)
+        calm = ~np.any([np.zeros(sum(self.lengths), bool), *self.impacts.values()], axis=0)
         return {row: np.concatenate(parts) & calm for row, parts in out.items()}
 
     @cached_property
     def floor(self) -> dict[Row, float]:
-        """Noise floor of each row [N·m]: sensor noise, noise of the differentiated position, and model's own error."""
+        """Noise floor of each row [N·m]: sensor noise, noise of the differentiated position, model error."""
         both = list(zip(self.signals, self._stacked, strict=True))
         return {row: float(np.mean([self._floor(s, row, rest[row]) for s, rest in both])) for row in self.rows}
 
     @cached_property
-    def care(self) -> dict[Row, float]:
-        """What is not worth explaining in each row [N·m]: noise, and a small share of the largest torque."""
-        small = {row: SMALL if row[0] == self.layout.against_model else SMALL_INNER for row in self.rows}
-        parts = {row: (self.floor[row], small[row] * self.usual_torque[row[1]], SMALL_NM) for row in self.rows}
+    def relevance_floor(self) -> dict[Row, float]:
+        """Residual of each row below which no effect is searched for [N·m]: noise and a small share of the torque."""
+        small = {row: FLOOR if row[0] == self.layout.against_model else FLOOR_INNER for row in self.rows}
+        parts = {row: (self.floor[row], small[row] * self.usual_torque[row[1]], FLOOR_NM) for row in self.rows}
         return {row: float(np.linalg.norm(part)) for row, part in parts.items()}
 
     @cached_property
     def usual_torque(self) -> Array:
-        """RMS model torque of each joint, in the recording where it is largest [N·m], (n,)."""
+        """RMS model torque of each joint in the recording with the largest [N·m], (n,)."""
         return np.asarray(np.max([np.sqrt(np.mean(s.model**2, axis=0)) for s in self.signals], axis=0))
 
     def _floor(self, s: Signals, row: Row, rest: Array) -> float:
         channel, joint = row
         reference = self.layout.reference(row)
-        told = float(np.linalg.norm([s.noise[name][joint] for name in (channel, reference) if name]))
+        noise = float(np.linalg.norm([s.noise[name][joint] for name in (channel, reference) if name]))
         inner = channel == self.layout.command and not self.layout.beyond(joint)
         model = 0.0 if inner else MODEL_FLOOR * float(np.sqrt(np.mean(s.model[:, joint] ** 2)))
-        return float(np.hypot(min(told, float(s.upper_half(rest))), model)) + 1e-6
+        return float(np.hypot(min(noise, float(s.upper_half(rest))), model)) + 1e-6
 
     @cached_property
     def folds(self) -> NDArray[np.intp]:
-        """Fold of each sample: contiguous stretches of time, (K,)."""
+        """Cross-validation fold of each sample: contiguous stretches of time, (K,)."""
         total, out, first = sum(self.lengths), [], 0
         for length in self.lengths:
             count = max(1, round(FOLDS * length / total))
@@ -160,43 +161,48 @@ class ResidualSet:
             first += int(own[-1]) + 1
         return np.concatenate(out)
 
-    def columns(self, effect: Effect, place: int, shape: Shape) -> Columns:
-        """The effect's columns, filtered as the readings are, (K, p) per row that it touches."""
-        layout = self.layout
-        parts = [_filtered(s, layout.compared(effect.columns(s, layout, place, shape))) for s in self.signals]
+    def columns(self, of: Callable[[Signals, Layout], Columns]) -> Columns:
+        """A term's columns at the work rate, filtered like the readings, (K, p) per row that it touches."""
+        parts = [_filtered(s, self.layout.compared(of(s, self.layout))) for s in self.signals]
         return {row: np.concatenate([part[row] for part in parts]) for row in parts[0]}
 
     @cached_property
     def margin(self) -> dict[Row, float]:
-        """Below this a row's RMS is no gap [N·m]: twice its noise and what a user would care about.
+        """RMS of each row from which it is a gap [N·m]: twice the noise floor plus the smallest relevant gap.
 
-        The share is smaller where the motor is compared with the sensor, for no error of the links shows there.
+        That is smaller for the motor against the sensor, in which errors of the links do not show.
         """
         torque = self.usual_torque
-        return {row: 2.0 * self.floor[row] + max(self._care(row) * torque[row[1]], CARE_NM) for row in self.rows}
+        return {
+            row: 2.0 * self.floor[row] + max(self._relevant(row) * torque[row[1]], RELEVANT_NM) for row in self.rows
+        }
 
-    def _care(self, row: Row) -> float:
-        """Share of the joint's torque that a gap in this row must have for a user to care."""
+    def _relevant(self, row: Row) -> float:
+        """Smallest relevant gap in this row, as a share of the joint's torque."""
         reference = self.layout.reference(row)
         if reference is None:
-            return CARE
-        return CARE_COMMAND if (row[0], reference) == (self.layout.command, self.layout.motor) else CARE_INNER
+            return RELEVANT
+        command = (row[0], reference) == (self.layout.command, self.layout.motor)
+        return RELEVANT_COMMAND if command else RELEVANT_INNER
 
     @cached_property
-    def faint(self) -> dict[Row, float]:
-        """Below this a row's RMS may be noise and what nobody cares about: what is in it must show steadily [N·m]."""
+    def quiet_threshold(self) -> dict[Row, float]:
+        """RMS of each row below which it may be noise alone: an effect must then show steadily [N·m]."""
         noise = {row: 2.0 * floor for row, floor in self.floor.items()}
-        return {row: noise[row] + max(FAINT * (self.margin[row] - noise[row]), CARE_NM) for row in self.rows}
+        return {row: noise[row] + max(QUIET * (self.margin[row] - noise[row]), RELEVANT_NM) for row in self.rows}
 
-    def spread(self, effect: Effect, place: int) -> Array:
-        """Prior standard deviation of the effect's coefficients."""
-        return effect.spread(self.signals[0], place)
+
+def residual_sets(train: Sequence[Signals], heldout: Sequence[Signals]) -> tuple[ResidualSet, ResidualSet]:
+    """Residuals of the training and of the held-out recordings, in a common layout."""
+    layout = layout_of([*train, *heldout])
+    return ResidualSet(tuple(train), layout), ResidualSet(tuple(heldout), layout)
 
 
 def sliding(s: Signals) -> NDArray[np.bool_]:
-    """Samples at which each joint has been, and goes on, sliding: friction is that of the model, (k, n).
+    """Samples at which each joint slides before and after, so that its friction is fully developed, (k, n).
 
-    Around rest and reversals it builds up over some way first. Where a joint does hardly anything else they stay.
+    Around rest and reversals friction builds up over some distance. If a joint hardly does anything else, these samples
+    are kept.
     """
     moving = s.filtered(s.moving) > MOVING_SHARE
     width = 2 * round(SETTLE_S * s.rate / s.step) + 1
@@ -206,12 +212,12 @@ def sliding(s: Signals) -> NDArray[np.bool_]:
 
 
 def _filtered(s: Signals, columns: Columns) -> Columns:
-    """Columns of all rows through the filter at once."""
+    """Columns of all rows, filtered together."""
     ends = np.cumsum([x.shape[1] for x in columns.values()])[:-1]
     pieces = np.split(s.filtered(np.hstack(list(columns.values()))), ends, axis=1)
     return dict(zip(columns, pieces, strict=True))
 
 
 def root_mean_square(x: Array) -> float:
-    """Root of the mean square; NaN for nothing."""
+    """Root of the mean square; NaN for an empty array."""
     return float(np.sqrt(np.mean(x**2))) if len(x) else float("nan")

@@ -1,12 +1,12 @@
-"""Where the gap lies: joint, channel, and the regime of the motion that it goes with."""
+"""Location of the gap: joint, channel, and the regime of motion that it correlates with."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from sim_gap.effects.registry import Row
 from sim_gap.model.rigid_body import Array
+from sim_gap.residuals.layout import Row
 from sim_gap.residuals.preprocess import Signals
 from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
 
@@ -15,8 +15,8 @@ CLEAR = 0.25
 
 
 @dataclass(frozen=True)
-class Place:
-    """One row's gap: its RMS and noise [N·m], and the regime that accounts for the largest share of its square."""
+class Location:
+    """Gap of one row: RMS and noise [N·m], and the regime with the largest share of its mean square."""
 
     joint: str
     channel: str
@@ -26,10 +26,12 @@ class Place:
     share: float
 
 
-def places(data: ResidualSet, left: dict[Row, Array] | None = None, rows: Sequence[Row] | None = None) -> list[Place]:
-    """Every row (or those of `rows`) with its regime, the largest excess over its noise first.
+def locate(
+    data: ResidualSet, left: dict[Row, Array] | None = None, rows: Sequence[Row] | None = None
+) -> list[Location]:
+    """Every row (or those of `rows`) with its regime, by descending ratio of RMS to noise.
 
-    `left` is what is left of the residuals, instead of these, (K,) per row.
+    `left` replaces the residuals by what remains of them, (K,) per row.
     """
     values = data.values if left is None else left
     features = [_features(s) for s in data.signals]
@@ -44,12 +46,12 @@ def places(data: ResidualSet, left: dict[Row, Array] | None = None, rows: Sequen
             residual, {k: np.concatenate([f[k][:, joint] for f in features])[valid] for k in features[0]}
         )
         name = data.signals[0].arm.names[joint]
-        out.append(Place(name, channel, regime, root_mean_square(residual), data.floor[row], share))
-    return sorted(out, key=lambda place: -place.rms / max(place.noise, 1e-9))
+        out.append(Location(name, channel, regime, root_mean_square(residual), data.floor[row], share))
+    return sorted(out, key=lambda location: -location.rms / max(location.noise, 1e-9))
 
 
 def _features(s: Signals) -> dict[str, Array]:
-    """Columns per regime and joint, filtered, (K, n, p)."""
+    """Columns by regime, filtered, (K, n, p)."""
     t = np.broadcast_to((s.t / max(float(s.t[-1]), 1.0))[:, None], s.q.shape)
     near_reversal = np.exp(-((s.v / 0.05) ** 2))
     families = {
@@ -77,7 +79,7 @@ def _regime(residual: Array, features: dict[str, Array]) -> tuple[str, float]:
 
 
 def by_joint(data: ResidualSet, left: dict[Row, Array] | None = None) -> Array:
-    """RMS per joint [N·m]: root of the sum of squares over its channels, (n,); `left` instead of the raw residual."""
+    """RMS per joint [N·m]: root of the sum of mean squares over its channels, (n,); of `left` if given."""
     values = data.values if left is None else left
     squares = np.zeros(data.layout.n)
     for channel, joint in data.rows:
@@ -87,7 +89,7 @@ def by_joint(data: ResidualSet, left: dict[Row, Array] | None = None) -> Array:
 
 
 def combined(data: ResidualSet, levels: dict[Row, float]) -> Array:
-    """A level per row (noise floor, margin) combined per joint as in `by_joint`, (n,)."""
+    """A level per row (noise floor, margin), combined per joint as in `by_joint`, (n,)."""
     squares = np.zeros(data.layout.n)
     for channel, joint in data.rows:
         if data.valid[channel, joint].any():

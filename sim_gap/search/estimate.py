@@ -1,4 +1,4 @@
-"""The final fit of the chosen terms: coefficients, honest covariance, reported parameters, predictions."""
+"""The final fit of the selected terms: coefficients, covariance, reported parameters, predictions."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -7,21 +7,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from sim_gap.effects.registry import Row, effects
 from sim_gap.model.rigid_body import Array
+from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet
-from sim_gap.search.normal_equations import CORRELATED, ColumnStore, Normal, Term
+from sim_gap.search.normal_equations import CORRELATED, ColumnStore, NormalEquations, Term
 from sim_gap.search.stepwise import Search
 
 NOMINAL, WORSE, WORST = 0.01, 0.5, 0.2
-"""Error that the nominal mass moments of all links may have unfound, as a share; where some link's was found wrong, it
-is this share of the largest such error, up to the last."""
+"""Undetected error of the nominal mass moments of all links, relative: NOMINAL, or WORSE times the largest error found
+at a link, up to WORST."""
 SHAPE_STEP = 1e-2
 SHORT_M = 0.01
-"""A link's centre of mass counts as at least so far from its joint's axis where errors of its moment are judged [m]."""
+"""Least distance of a link's centre of mass from its joint's axis [m] for judging errors of its moment."""
 SYSTEMATIC = 0.3
-"""Share of a row's residual, and of what is not worth explaining, that may pass for any effect however long one
-records."""
+"""Share of a row's residual and of its relevance floor that can mimic an effect, independent of the recording's
+length."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Estimate:
 
     def __init__(self, store: ColumnStore, terms: list[Term]) -> None:
         self.store = store
-        self.normal = Normal(store, terms)
+        self.normal = NormalEquations(store, terms)
         self.terms = tuple(self.normal.terms)
         self.search = Search(self.normal, list(self.terms))
         self.index, self.coefficients = self.search.weighted.fit(self.terms)
@@ -49,7 +49,7 @@ class Estimate:
         return self.coefficients[self.normal.at[term]]
 
     def subset(self, terms: list[Term]) -> Array:
-        """Coefficients (P,) of a fit of these terms alone, zero elsewhere, under the final weights."""
+        """Coefficients (P,) of a fit of these terms alone with the final weights; zero for the others."""
         out = np.zeros(self.normal.size)
         index, values = self.search.weighted.fit(terms)
         out[index] = values
@@ -77,7 +77,7 @@ class Estimate:
 
     @cached_property
     def _shaped(self) -> list[Term]:
-        """Terms one of whose shape's entries was fitted."""
+        """Terms with a fitted entry of the shape."""
         return [term for term in self.terms if term.free is not None]
 
     def _shape_slope(self, term: Term, i: int, row: Row) -> Array:
@@ -90,9 +90,9 @@ class Estimate:
 
     @cached_property
     def covariance(self) -> Array:
-        """Of coefficients and smooth shapes, (P + S, P + S): sandwich over blocks of time, and what the rest of the arm
-        being a little wrong adds: an error of SYSTEMATIC times each row's residual that follows the column itself, mass
-        moments of links that are wrong unfound, and what every arm has of the effect."""
+        """Covariance of coefficients and fitted shapes, (P + S, P + S): a sandwich estimate over blocks of time, plus
+        systematic errors: SYSTEMATIC times each row's residual along the column itself, undetected errors of the links'
+        mass moments, and the effect's standard deviation over sound arms."""
         size = self._jacobian[0][1].shape[1]
         bread, scores = np.zeros((size, size)), np.zeros((int(self.store.data.blocks.max()) + 1, size))
         for weight, x, residual, block in self._jacobian:
@@ -105,16 +105,16 @@ class Estimate:
         seen = sum(len(residual) for _, _, residual, _ in self._jacobian) / max(len(self._jacobian), 1)
         systematic = SYSTEMATIC**2 * seen / CORRELATED * inverse
         statistical = inverse @ (scores.T @ scores) @ inverse * blocks / (blocks - 1)
-        ordinary = np.zeros(size)
+        background = np.zeros(size)
         for term in self.terms:
-            ordinary[self.normal.at[term]] = effects()[term.effect].ordinary
-        return np.asarray(statistical + systematic + self._unfound(inverse) + np.diag(ordinary**2))
+            background[self.normal.at[term]] = term.form.plausibility.background_std
+        return np.asarray(statistical + systematic + self._undetected(inverse) + np.diag(background**2))
 
-    def _unfound(self, inverse: Array) -> Array:
-        """What mass moments z of links that are wrong, but were not found so, add to the covariance, (P + S, P + S).
+    def _undetected(self, inverse: Array) -> Array:
+        """Contribution to the covariance of undetected errors z of the links' mass moments, (P + S, P + S).
 
-        They pull the coefficients by A⁻¹ XᵀW Z z, A⁻¹ being `inverse`; of z is known what is usual, and what the
-        residual says: its mean square about zero given both.
+        They shift the coefficients by A⁻¹ XᵀW Z z, A⁻¹ being `inverse`. The mean square of z about zero follows from
+        its usual size and the residual.
         """
         links, scale = self._other_links()
         size = len(scale)
@@ -136,7 +136,7 @@ class Estimate:
         return np.asarray(moved @ (spread + np.outer(mean, mean)) @ moved.T)
 
     def _other_links(self) -> tuple[list[int], Array]:
-        """Links whose mass moment is no term, and how wrong each component of it usually is [kg·m], (3 L,)."""
+        """Links whose mass moment is not a term, and the usual error of each of its components [kg·m], (3 L,)."""
         arm = self.store.data.signals[0].arm
         found = {term.place: self.of(term) for term in self.terms if term.effect == "link.mass_moment"}
         usual = np.maximum(np.linalg.norm(arm.inertial[:, 1:4], axis=1), SHORT_M * arm.inertial[:, 0])
@@ -147,7 +147,7 @@ class Estimate:
 
     def parameters(self, term: Term) -> dict[str, Value]:
         """Reported parameters with 95 % intervals."""
-        effect = effects()[term.effect]
+        effect = term.form
         beneath = {other.effect: other for other in self.terms if other.key in term.beneath}
         shaped, free = self._shaped, term.free
         chosen = [*self.normal.at[term], *(i for other in beneath.values() for i in self.normal.at[other])]
@@ -161,7 +161,7 @@ class Estimate:
             for name, other in beneath.items():
                 width = len(self.normal.at[other])
                 under[name], at = z[at : at + width], at + width
-            return np.asarray(effect.values(z[:own], shape, under), float)
+            return np.asarray(effect.parameters_of(z[:own], shape, under), float)
 
         size = () if free is None else (term.shape[free],)
         start = np.concatenate([self.of(term), *(self.of(other) for other in beneath.values()), size])
@@ -174,14 +174,14 @@ class Estimate:
         blocks = int(self.store.data.blocks.max()) + 1
         half = spread * student.ppf(0.975, max(blocks - 1, 1))
         return {
-            p.name: Value(float(c), float(c - h), float(c + h), p.unit)
-            for p, c, h in zip(effect.parameters, centre, half, strict=True)
+            name: Value(float(c), float(c - h), float(c + h), unit)
+            for (name, unit), c, h in zip(effect.reported, centre, half, strict=True)
         }
 
     def predict(
         self, data: ResidualSet, store: ColumnStore | None = None, terms: tuple[Term, ...] | None = None
     ) -> dict[Row, Array]:
-        """What the terms explain on another set, (K,) per row."""
+        """Sum of the terms on another set, (K,) per row."""
         store = store or ColumnStore(data)
         out = {row: np.zeros(sum(data.lengths)) for row in data.rows}
         for term in self.terms if terms is None else terms:

@@ -1,4 +1,4 @@
-"""The competition as a whole: search the library, search again where simpler effects may do, refine the shapes."""
+"""Model selection: search the library, search again if simpler effects may suffice, refine the shapes."""
 
 from collections.abc import Callable, Sequence
 
@@ -6,19 +6,19 @@ import numpy as np
 
 from sim_gap.effects.registry import effects
 from sim_gap.residuals.residual_set import ResidualSet
-from sim_gap.search.normal_equations import ColumnStore, Normal, Term, Weighted
+from sim_gap.search.normal_equations import ColumnStore, NormalEquations, Term, Weighted
 from sim_gap.search.stepwise import TRIES, Search, shortlist
 
 
-def compete(store: ColumnStore, library: Sequence[str]) -> Search:
-    """Search the library, refine the shapes of what was chosen, and drop what no longer earns its place."""
+def select_model(store: ColumnStore, library: Sequence[str]) -> Search:
+    """Search the library, refine the shapes of the selected terms, and drop those that no longer earn their place."""
     offered = candidates(store.data, library)
-    first = Search(Normal(store, offered))
+    first = Search(NormalEquations(store, offered))
     first.run()
-    chosen = refine(store, one_each([named(term) for term in without_doubtful(first).active]))
+    chosen = refine(store, one_each([canonical(term) for term in without_doubtful(first).active]))
     keys = {term.key for term in chosen}
-    rivals = in_place(store, chosen, [term for term in offered if term.key not in keys])
-    search = Search(Normal(store, [*chosen, *rivals]), chosen)
+    rivals = relinearised_in_place(store, chosen, [term for term in offered if term.key not in keys])
+    search = Search(NormalEquations(store, [*chosen, *rivals]), chosen)
     while search.backward():
         pass
     return search
@@ -30,35 +30,34 @@ def candidates(data: ResidualSet, library: Sequence[str]) -> list[Term]:
     return [
         Term(name, place, shape)
         for name in library
-        for place in effects()[name].places(layout)
-        for shape in effects()[name].grid(data.signals, place)
+        for place in effects()[name].signature.places(layout)
+        for shape in effects()[name].hints.grid(data.signals, place)
     ]
 
 
-def named(term: Term) -> Term:
-    """The term by which one is named that shows exactly alike."""
-    return Term(term.effect, *effects()[term.effect].settled(term.place, term.shape))
+def canonical(term: Term) -> Term:
+    """The term under which one is reported, of those that show exactly alike."""
+    return Term(term.effect, *term.form.hints.canonical(term.place, term.shape))
 
 
 def one_each(terms: Sequence[Term]) -> list[Term]:
-    """The terms, of one effect at one place the first: two shapes of it stand for one between them, to be refined."""
+    """The terms, only the first of each effect and place: two shapes approximate one between them."""
     return list({term.key: term for term in reversed(terms)}.values())[::-1]
 
 
 def without_doubtful(search: Search) -> Search:
-    """Search again from where terms that leave much on their rows have given way to the simpler ones they are made of.
+    """Search again with terms that leave a large residual on their rows replaced by their simpler alternatives.
 
-    One step at a time does not get there where these need company to do better.
+    Single steps do not get there if several alternatives are needed at once.
     """
-    layout, library = search.normal.layout, effects()
-    made = {t: library[t.effect].made_of(layout, t.place, t.shape) for t in search.active}
-    doubtful = [term for term, parts in made.items() if parts and search.leaves_much(term)]
+    parts = {term: term.alternatives(search.normal.layout) for term in search.active}
+    doubtful = [term for term, simpler in parts.items() if simpler and search.leaves_much(term)]
     if not doubtful:
         return search
     rest = search.active
     for term in doubtful:
         rest = search.without(term, rest)
-    wanted = {key for term in doubtful for key in made[term]} - {other.key for other in rest}
+    wanted = {key for term in doubtful for key in parts[term]} - {other.key for other in rest}
     again = Search(search.normal, [*rest, *(other for other in search.normal.terms if other.key in wanted)])
     again.added.update({term.key: TRIES - 1 for term in doubtful})
     again.run()
@@ -66,10 +65,10 @@ def without_doubtful(search: Search) -> Search:
 
 
 def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
-    """Move each shape between its neighbours of the starting grid to where the fit is best (golden section)."""
+    """Move each shape to the best fit between its neighbours on the starting grid (golden section)."""
     out = list(active)
     for _ in range(3):
-        out = secants(store, out)
+        out = relinearised(store, out)
     for term in list(out):
         found = _between(store.data, term)
         if found is None:
@@ -78,7 +77,7 @@ def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
 
         def fit(value: float, term: Term = term, free: int = free) -> float:
             trial = [term.reshaped(free, value) if other == term else other for other in out]
-            normal = Normal(store, trial)
+            normal = NormalEquations(store, trial)
             start = normal.square.sum(0) / np.maximum(normal.count.sum(0), 1.0)
             squares = normal.mean_square(*Weighted(normal, start).fit(normal.terms))
             return float(0.5 * np.log(squares + normal.floor**2)[normal.seen].sum())
@@ -90,53 +89,44 @@ def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
 
 
 def _between(data: ResidualSet, term: Term) -> tuple[int, float, float] | None:
-    """The free entry of a term's shape and its neighbours on the starting grid; None where there is none."""
+    """The free entry of a term's shape and its neighbours on the starting grid; None if it has none."""
     free = term.free
     if free is None:
         return None
-    grid = sorted({shape[free] for shape in effects()[term.effect].grid(data.signals, term.place)})
+    grid = sorted({shape[free] for shape in term.form.hints.grid(data.signals, term.place)})
     value = term.shape[free]
     lower, upper = [x for x in grid if x < value - 1e-9], [x for x in grid if x > value + 1e-9]
     beyond = sorted((0.5 * value, 1.5 * value))
     return free, (lower[-1] if lower else beyond[0]), (upper[0] if upper else beyond[1])
 
 
-def secants(store: ColumnStore, active: list[Term]) -> list[Term]:
-    """Take the secant of every curved effect at its fitted size."""
-    if not any(effects()[term.effect].secant for term in active):
+def relinearised(store: ColumnStore, active: list[Term]) -> list[Term]:
+    """The terms, nonlinear effects linearised at their fitted size."""
+    if all(term.form.hints.linearised_at is None for term in active):
         return active
-    normal = Normal(store, active)
+    normal = NormalEquations(store, active)
     search = Search(normal, list(normal.terms))
     _, values = search.weighted.fit(normal.terms)
-
-    def settled(term: Term) -> Term:
-        effect = effects()[term.effect]
-        shape = effect.resized(values[normal.at[term]], term.shape) if effect.secant else term.shape
-        return Term(term.effect, term.place, shape)
-
-    return [settled(term) for term in normal.terms]
+    return [term.relinearised(values[normal.at[term]]) for term in normal.terms]
 
 
-def in_place(store: ColumnStore, chosen: list[Term], offered: list[Term]) -> list[Term]:
-    """The terms offered, curved ones with their secants at the size that they take in the place of a chosen one."""
+def relinearised_in_place(store: ColumnStore, chosen: list[Term], offered: list[Term]) -> list[Term]:
+    """The terms offered, nonlinear effects linearised at the size that they have in place of a chosen term."""
     for _ in range(2):
-        curved = [term for term in offered if effects()[term.effect].secant]
-        if not curved or not chosen:
+        nonlinear = [term for term in offered if term.form.hints.linearised_at is not None]
+        if not nonlinear or not chosen:
             return offered
-        search = Search(Normal(store, [*chosen, *curved]), list(chosen))
+        search = Search(NormalEquations(store, [*chosen, *nonlinear]), list(chosen))
         best: dict[Term, tuple[float, Term]] = {}
         for term in search.active:
             rest = search.without(term, search.active)
-            for _, other in shortlist(search.weighted.screen(rest, curved))[:2]:
+            for _, other in shortlist(search.weighted.screen(rest, nonlinear))[:2]:
                 terms = search.with_beneath(other, rest)
                 score = search.judge(terms)
                 if score < best.get(other, (np.inf, other))[0]:
                     index, values = search.weighted.fit(terms)
                     own = values[np.isin(index, search.normal.at[other])]
-                    best[other] = (
-                        score,
-                        Term(other.effect, other.place, effects()[other.effect].resized(own, other.shape)),
-                    )
+                    best[other] = score, other.relinearised(own)
         offered = [best[term][1] if term in best else term for term in offered]
     return offered
 

@@ -1,4 +1,4 @@
-"""Normal equations of all candidate terms at once, per row and fold: trying a set of terms costs microseconds."""
+"""Normal equations of all candidate terms, by row and fold: any subset of terms is fitted in microseconds."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,14 +7,16 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_gap.effects.registry import Columns, Layout, Row, Shape, effects
+from sim_gap.effects.effect import Effect, Key, Shape
+from sim_gap.effects.registry import effects
 from sim_gap.model.rigid_body import Array
+from sim_gap.residuals.layout import Columns, Layout, Row
 from sim_gap.residuals.residual_set import ResidualSet
 
 PRICE = 0.012
-"""What a coefficient must at least lower Σ ½ log(R² + floor²) over all rows by: about 1 % of one row's RMS."""
+"""Least decrease of Σ ½ log(R² + floor²) over all rows per coefficient: about 1 % of one row's RMS."""
 CORRELATED = 8.0
-"""Samples of one effective observation: residuals of real arms are correlated over a third of a second or more."""
+"""Samples per effective observation: residuals of real arms are correlated over a third of a second or more."""
 
 
 @dataclass(frozen=True)
@@ -26,38 +28,53 @@ class Term:
     shape: Shape = ()
 
     @property
-    def key(self) -> tuple[str, int]:
-        """Effect and place, whatever the shape."""
+    def form(self) -> Effect:
+        """The inverse form of its effect."""
+        return effects()[self.effect]
+
+    @property
+    def key(self) -> Key:
+        """Effect and place, for every shape."""
         return self.effect, self.place
 
     def reshaped(self, entry: int, value: float) -> "Term":
-        """The same term with one entry of its shape changed."""
+        """The same term with one entry of its shape replaced."""
         return Term(self.effect, self.place, (*self.shape[:entry], value, *self.shape[entry + 1 :]))
 
     @property
     def free(self) -> int | None:
-        """The one entry of its shape that is fitted beside its coefficients; None where there is none."""
-        effect = effects()[self.effect]
-        entries = [i for i in range(len(self.shape)) if i not in effect.counted]
-        return entries[0] if len(entries) == 1 and not effect.secant else None
+        """The one entry of its shape that is fitted in addition to its coefficients; None if there is none."""
+        hints = self.form.hints
+        entries = [i for i in range(len(self.shape)) if i not in hints.discrete]
+        return entries[0] if len(entries) == 1 and hints.linearised_at is None else None
 
-    def covers(self, layout: Layout) -> tuple[tuple[str, int], ...]:
+    def covers(self, layout: Layout) -> tuple[Key, ...]:
         """Keys of the terms that it contains."""
-        return effects()[self.effect].covers(layout, self.place)
+        return self.form.hints.covers(layout, self.place)
+
+    def alternatives(self, layout: Layout) -> tuple[Key, ...]:
+        """Keys of the simpler terms that together could replace it."""
+        return self.form.hints.alternatives(layout, self.place, self.shape)
+
+    def relinearised(self, coefficients: Array) -> "Term":
+        """The same term, linearised at its fitted size; unchanged if it is linear."""
+        if self.form.hints.linearised_at is None:
+            return self
+        return Term(self.effect, self.place, self.form.hints.relinearise(coefficients, self.shape))
 
     @property
     def bound(self) -> int:
-        """The one training recording that it is in, from 1; 0 where it belongs to the arm."""
-        return effects()[self.effect].bound_to(self.shape)
+        """The one training recording that it is present in, from 1; 0 if it belongs to the arm."""
+        return self.form.signature.recording(self.shape)
 
     @property
-    def beneath(self) -> tuple[tuple[str, int], ...]:
-        """Keys of the terms that it stands upon."""
-        return tuple((name, self.place) for name in effects()[self.effect].needs)
+    def beneath(self) -> tuple[Key, ...]:
+        """Keys of the terms that it needs."""
+        return tuple((name, self.place) for name in self.form.needs)
 
 
 class ColumnStore:
-    """Filtered columns of terms on one residual set, computed once."""
+    """Filtered columns of terms on one residual set, each computed once."""
 
     def __init__(self, data: ResidualSet) -> None:
         self.data = data
@@ -66,11 +83,14 @@ class ColumnStore:
     def columns(self, term: Term) -> Columns:
         """Columns per row, (K, p) each; rows that the term does not touch are absent."""
         if term not in self._columns:
-            self._columns[term] = self.data.columns(effects()[term.effect], term.place, term.shape)
+            signature = term.form.signature
+            self._columns[term] = self.data.columns(
+                lambda signals, layout: signature.columns(signals, layout, term.place, term.shape)
+            )
         return self._columns[term]
 
 
-class Normal:
+class NormalEquations:
     """Gram matrices of the terms' columns with each other and with the residuals, per fold and row."""
 
     def __init__(self, store: ColumnStore, terms: Sequence[Term]) -> None:
@@ -87,23 +107,23 @@ class Normal:
         self.square, self.count = np.zeros(shape), np.zeros(shape)
         self.blocks: list[_Block] = []
         self._freedom: dict[Term, float] = {}
-        self.floor = np.array([data.care[row] for row in self.rows])
+        self.floor = np.array([data.relevance_floor[row] for row in self.rows])
         for r, row in enumerate(self.rows):
             self._accumulate(store, r, row)
         self.seen = self.count.sum(0) > 25
-        spreads = [data.spread(effects()[term.effect], term.place) for term in self.terms]
+        spreads = [term.form.plausibility.prior_std(data.signals[0], term.place) for term in self.terms]
         spread = np.concatenate([np.broadcast_to(s, w) for s, w in zip(spreads, widths, strict=True)] or [np.zeros(0)])
         mean_square = np.zeros(self.size)
         for block in self.blocks:
             mean_square[block.index] += np.diagonal(block.whole) / max(self.count.sum(), 1.0)
         self.prior = 1.0 / spread**2 + 1e-9 * mean_square
         self.prior[mean_square == 0.0] += 1.0
-        usual = [np.full(w, effects()[term.effect].usual) for term, w in zip(self.terms, widths, strict=True)]
-        self.pull = self.prior * np.concatenate([*usual, np.zeros(0)])
+        means = [np.full(w, term.form.plausibility.prior_mean) for term, w in zip(self.terms, widths, strict=True)]
+        self.pull = self.prior * np.concatenate([*means, np.zeros(0)])
 
     @property
     def price(self) -> float:
-        """What a coefficient must lower Σ ½ log(R² + floor²) over all rows by: more where there is little data.
+        """Decrease of Σ ½ log(R² + floor²) over all rows that a coefficient must bring: more if there is little data.
 
         ½ log(N)/N for N effective observations of a row (Schwarz), but at least PRICE.
         """
@@ -127,15 +147,15 @@ class Normal:
         self.blocks.append(_Block(index, position, gram, side))
 
     def weights(self, mean_square: Array) -> Array:
-        """Weight of one sample of each row: 1/(floor² + R²), less the correlation of neighbours."""
+        """Weight of one sample of each row: 1/(floor² + R²), divided by the correlation length in samples."""
         return np.asarray(np.where(self.seen, 1.0 / (self.floor**2 + mean_square) / CORRELATED, 0.0))
 
     def index(self, terms: Sequence[Term]) -> NDArray[np.intp]:
-        """Positions of the terms' coefficients."""
+        """Indices of the terms' coefficients."""
         return np.concatenate([self.at[term] for term in terms] or [np.zeros(0, np.intp)]).astype(np.intp)
 
     def solve(self, index: NDArray[np.intp], gram: Array, side: Array) -> Array:
-        """Coefficients at `index` from the weighted sums (p, p) and (p,) of these, with the prior."""
+        """Coefficients at `index` from their weighted sums (p, p) and (p,), with the prior."""
         matrix, right = gram + np.diag(self.prior[index]), side + self.pull[index]
         scale = 1.0 / np.sqrt(np.diag(matrix))
         return np.asarray(
@@ -143,12 +163,12 @@ class Normal:
         )
 
     def mean_square(self, index: NDArray[np.intp], coefficients: Array) -> Array:
-        """Residual's mean square per row after the terms, (R,)."""
+        """Mean square of the residual per row after subtracting the terms, (R,)."""
         errors = sum((self.errors(index, coefficients, fold) for fold in range(self.folds)), np.zeros(len(self.rows)))
         return np.asarray(errors / np.maximum(self.count.sum(0), 1.0))
 
     def freedom(self, term: Term) -> float:
-        """How many of a term's coefficients can show: those whose plausible size is worth a parameter."""
+        """Effective number of a term's coefficients: those whose plausible size would show in the data; at least 1."""
         if term not in self._freedom:
             at = self.at[term]
             gram = np.zeros((len(at), len(at)))
@@ -162,7 +182,7 @@ class Normal:
         return self._freedom[term]
 
     def size_of(self, term: Term, index: NDArray[np.intp], coefficients: Array) -> Array:
-        """RMS that a term contributes to each row with these coefficients of all terms (0 where it does not), (R,)."""
+        """RMS of a term in each row with these coefficients of all terms, (R,)."""
         values = dict(zip(index.tolist(), coefficients.tolist(), strict=True))
         c, out = np.array([values[i] for i in self.at[term].tolist()]), np.zeros(len(self.rows))
         for r, block in enumerate(self.blocks):
@@ -172,7 +192,7 @@ class Normal:
         return out
 
     def errors(self, index: NDArray[np.intp], coefficients: Array, fold: int) -> Array:
-        """Sum of squares per row after the terms over one fold, (R,)."""
+        """Sum of squares per row over one fold after subtracting the terms, (R,)."""
         out = self.square[fold].copy()
         for r, block in enumerate(self.blocks):
             at = block.position[index]
@@ -188,23 +208,23 @@ class _Block:
     """Sums of one row over the columns that touch it."""
 
     index: NDArray[np.intp]
-    """Those columns among all, (p,)."""
+    """Indices of those columns among all, (p,)."""
     position: NDArray[np.intp]
-    """Place of every column among those, −1 where it does not touch the row, (P,)."""
+    """Position of every column among those, −1 for a column that does not touch the row, (P,)."""
     gram: Array
     side: Array
     """(F, p, p) and (F, p)."""
 
     @cached_property
     def whole(self) -> Array:
-        """Gram over all folds, (p, p)."""
+        """Gram matrix over all folds, (p, p)."""
         return np.asarray(self.gram.sum(0))
 
 
 class Weighted:
-    """Normal equations under given row weights: fits, cross-validates, screens."""
+    """Normal equations with given row weights: fit, cross-validation, screening."""
 
-    def __init__(self, normal: Normal, mean_square: Array) -> None:
+    def __init__(self, normal: NormalEquations, mean_square: Array) -> None:
         self.normal = normal
         self.weights = normal.weights(mean_square)
         self.gram, self.side = np.zeros((normal.size, normal.size)), np.zeros(normal.size)
@@ -214,12 +234,12 @@ class Weighted:
                 self.side[block.index] += weight * block.side.sum(0)
 
     def fit(self, terms: Sequence[Term]) -> tuple[NDArray[np.intp], Array]:
-        """Indices and coefficients of the terms on all folds."""
+        """Indices and coefficients of the terms, fitted to all folds."""
         index = self.normal.index(terms)
         return index, self.normal.solve(index, self.gram[np.ix_(index, index)], self.side[index])
 
     def cross_validated(self, terms: Sequence[Term]) -> Array:
-        """Mean square per row, each fold predicted from the others, (R,)."""
+        """Mean square per row, each fold predicted from a fit to the others, (R,)."""
         normal, index = self.normal, self.normal.index(terms)
         gram, side = self._without_fold(index)
         errors = np.zeros(len(normal.rows))
@@ -228,7 +248,7 @@ class Weighted:
         return np.asarray(errors / np.maximum(normal.count.sum(0), 1.0))
 
     def _without_fold(self, index: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Weighted sums over all folds but each, of the columns `index`, (F, p, p) and (F, p)."""
+        """Weighted sums over all folds but one, for each fold, of the columns `index`, (F, p, p) and (F, p)."""
         folds, size = self.normal.folds, len(index)
         gram, side = np.zeros((folds, size, size)), np.zeros((folds, size))
         for weight, block in zip(self.weights, self.normal.blocks, strict=True):
@@ -241,7 +261,7 @@ class Weighted:
         return self.gram[np.ix_(index, index)] - gram, self.side[index] - side
 
     def screen(self, terms: Sequence[Term], candidates: Sequence[Term]) -> list[tuple[float, Term]]:
-        """Candidates by the fall of the weighted squares that each would bring on top of `terms`, best first."""
+        """Candidates by the decrease of the weighted squares that each brings in addition to `terms`, best first."""
         normal, index = self.normal, self.normal.index(terms)
         matrix, left = self.gram + np.diag(normal.prior), self.side
         if len(index):

@@ -1,40 +1,43 @@
-"""Which effects: every term of the library competes, judged on motion left out of its fit, at a price per parameter."""
+"""Stepwise selection of effects by their cross-validated score and a price per parameter."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from sim_gap.effects.registry import effects
-from sim_gap.search.normal_equations import Normal, Term, Weighted
+from sim_gap.effects.effect import Key
+from sim_gap.search.normal_equations import NormalEquations, Term, Weighted
+
+Scored = tuple[float, list[Term]]
+"""Score of a set of terms, lower is better, and the terms."""
 
 SHORTLIST = 10
 MOST_TERMS = 60
 TRIES = 3
-"""How often one effect at one place may come in during a search."""
+"""How often one effect at one place may be added during a search."""
 OWED = 0.06
-"""What an effect must do better by than the simpler ones it is made of, where it needs some of these besides."""
-MUCH = 3.0
-"""What a fit leaves, in units of what is not worth explaining, from which on another start of the search is tried."""
+"""Score by which an effect must be better than its simpler alternatives, if it needs some of them in addition."""
 BESIDE = 0.3
 """Size of these, as a share of its own, from which it needs them."""
+MUCH = 3.0
+"""Residual of a fit, in units of the relevance floor, from which the search is started again elsewhere."""
 
 
 @dataclass
 class Search:
     """Stepwise search over one set of normal equations."""
 
-    normal: Normal
+    normal: NormalEquations
     active: list[Term] = field(default_factory=list)
-    added: Counter[tuple[str, int]] = field(default_factory=Counter)
-    """How often each effect and place came in, so that nothing goes in and out for ever."""
+    added: Counter[Key] = field(default_factory=Counter)
+    """How often each effect and place was added, which bounds the search."""
 
     def __post_init__(self) -> None:
         self.reweigh()
 
     def reweigh(self) -> None:
-        """Weigh rows by what the active terms leave, twice, so that weights and fit agree."""
+        """Weigh the rows by the residual of the active terms, iterated until weights and fit agree."""
         mean_square = self.normal.square.sum(0) / np.maximum(self.normal.count.sum(0), 1.0)
         for _ in range(3):
             self.weighted = Weighted(self.normal, mean_square)
@@ -52,36 +55,38 @@ class Search:
         return float(fit + normal.price * sum(self.cost(term) for term in terms))
 
     def possible(self, terms: list[Term]) -> list[Term]:
-        """The terms less those whose coefficients no such effect can have, one after the other."""
+        """The terms less those with implausible coefficients, removed one after the other."""
         while wrong := self._implausible(terms):
             terms = self.without(wrong, terms)
         return terms
 
     def _implausible(self, terms: Sequence[Term]) -> Term | None:
-        """The first of the terms whose coefficients no such effect can have."""
+        """The first of the terms with implausible coefficients."""
         ends = np.cumsum([len(self.normal.at[term]) for term in terms])
         pieces = np.split(self.weighted.fit(terms)[1], ends[:-1]) if terms else []
         values = {term.key: piece for term, piece in zip(terms, pieces, strict=True)}
         for term in terms:
             beneath = {name: values[name, place] for name, place in term.beneath}
             beneath["nominal"] = self.normal.known_friction[term.place, None]
-            if not effects()[term.effect].plausible_on(values[term.key], term.shape, beneath):
+            if not term.form.plausibility.allows(values[term.key], term.shape, beneath):
                 return term
         return None
 
-    def accept(self, chosen: list[Term]) -> None:
-        """Go on with these terms."""
+    def accept(self, chosen: list[Term]) -> bool:
+        """Continue with these terms; true, for a step was taken."""
         self.added.update(term.key for term in chosen if term not in self.active)
         self.active = chosen
         self.reweigh()
+        return True
 
     def cost(self, term: Term) -> float:
-        """Coefficients that can show and shape parameters of a term, and what a rare effect must earn besides."""
-        effect = effects()[term.effect]
-        return self.normal.freedom(term) + len(term.shape) * (not effect.secant) + effect.rare
+        """Number of parameters that a term is charged for: effective coefficients, shape, and its prior penalty."""
+        form = term.form
+        shape = len(term.shape) * (form.hints.linearised_at is None)
+        return self.normal.freedom(term) + shape + form.plausibility.prior_penalty
 
     def with_beneath(self, term: Term, terms: Sequence[Term]) -> list[Term]:
-        """`terms` plus `term` plus what it stands upon; another shape of the same effect there gives way."""
+        """`terms` plus `term` plus what it needs; another shape of the same effect at that place is replaced."""
         gone = {term.key, *term.covers(self.normal.layout)}
         kept = [other for other in terms if other.key not in gone and term.key not in other.covers(self.normal.layout)]
         have = {other.key for other in kept}
@@ -89,39 +94,35 @@ class Search:
         return [*kept, *missing, term]
 
     def without(self, term: Term, terms: Sequence[Term]) -> list[Term]:
-        """`terms` less `term` and what stands upon it."""
+        """`terms` less `term` and what needs it."""
         return [other for other in terms if other != term and term.key not in other.beneath]
 
     def forward(self) -> bool:
         """Add the term that helps most, if any earns its place."""
         inactive = [term for term in self.normal.terms if term not in self.active and self.added[term.key] < TRIES]
-        best, chosen = self.score - 1e-4, None
-        for _, term in shortlist(self.weighted.screen(self.active, inactive)):
-            trial = self.with_beneath(term, self.active)
-            score = self.judge(trial)
-            if score < best:
-                best, chosen = score, trial
-        if chosen is None or len(chosen) > MOST_TERMS:
-            return False
-        self.accept(chosen)
-        return True
+        trials = (
+            self.with_beneath(term, self.active) for _, term in shortlist(self.weighted.screen(self.active, inactive))
+        )
+        chosen = self._best(self._judged(trials), self.score - 1e-4)
+        return chosen is not None and len(chosen) <= MOST_TERMS and self.accept(chosen)
 
     def backward(self) -> bool:
-        """Drop the term that is missed least, if the rest does better without it."""
-        best, chosen = self.score, None
-        for term in self.active:
-            trial = self.without(term, self.active)
-            score = self.judge(trial)
-            if score < best:
-                best, chosen = score, trial
-        if chosen is None:
-            return False
-        self.accept(chosen)
-        return True
+        """Drop the term that is missed least, if the rest scores better without it."""
+        trials = (self.without(term, self.active) for term in self.active)
+        chosen = self._best(self._judged(trials), self.score)
+        return chosen is not None and self.accept(chosen)
 
     def swap(self) -> bool:
-        """Exchange one term for another that does better in its stead."""
-        best, chosen = self.score - 1e-3, None
+        """Exchange one term for another that scores better in its place."""
+        chosen = self._best(self._judged(self._exchanges()), self.score - 1e-3)
+        return chosen is not None and self.accept(chosen)
+
+    def dissolve(self) -> bool:
+        """Exchange one term for its simpler alternatives, if they score as well."""
+        chosen = self._best(self._dissolved(), self.score - 1e-3)
+        return chosen is not None and self.accept(chosen)
+
+    def _exchanges(self) -> Iterator[list[Term]]:
         for term in list(self.active):
             rest = self.without(term, self.active)
             inactive = [
@@ -130,42 +131,41 @@ class Search:
                 if other not in rest and other != term and self.added[other.key] < TRIES
             ]
             for _, other in shortlist(self.weighted.screen(rest, inactive))[:4]:
-                trial = self.with_beneath(other, rest)
-                score = self.judge(trial)
-                if score < best:
-                    best, chosen = score, trial
-        if chosen is None:
-            return False
-        self.accept(chosen)
-        return True
+                yield self.with_beneath(other, rest)
 
-    def dissolve(self) -> bool:
-        """Exchange one term for the simpler effects that it could be made of, where those do as well."""
-        best, chosen = self.score - 1e-3, None
+    def _dissolved(self) -> Iterator[Scored]:
         for term in self.active:
-            parts = effects()[term.effect].made_of(self.normal.layout, term.place, term.shape)
+            parts = term.alternatives(self.normal.layout)
             if not parts:
                 continue
             rest = self.without(term, self.active)
             have = {other.key for other in rest}
             new = [other for other in self.normal.terms if other.key in parts and other.key not in have]
             score, trial = self.pruned([*rest, *new], new)
-            if score - self.owed(term) < best:
-                best, chosen = score - self.owed(term), trial
-        if chosen is None:
-            return False
-        self.accept(chosen)
-        return True
+            yield score - self.advantage_owed(term), trial
+
+    def _judged(self, trials: Iterable[list[Term]]) -> Iterator[Scored]:
+        for trial in trials:
+            yield self.judge(trial), trial
+
+    @staticmethod
+    def _best(scored: Iterable[Scored], bound: float) -> list[Term] | None:
+        """The trial with the lowest score below a bound; None if there is none."""
+        best, chosen = bound, None
+        for score, trial in scored:
+            if score < best:
+                best, chosen = score, trial
+        return chosen
 
     def leaves_much(self, term: Term) -> bool:
-        """Whether a row that the term touches is left with more than a few times what is not worth explaining."""
+        """Whether the residual of a row that the term touches exceeds MUCH times its relevance floor."""
         normal = self.normal
         left = np.sqrt(normal.mean_square(*self.weighted.fit(self.active)))
         touched = np.array([np.all(block.position[normal.at[term]] >= 0) for block in normal.blocks])
         return bool(np.any(left[touched & normal.seen] > MUCH * normal.floor[touched & normal.seen]))
 
     def pruned(self, terms: list[Term], doubtful: Sequence[Term]) -> tuple[float, list[Term]]:
-        """Score and terms after dropping of the doubtful ones those that do not earn their place."""
+        """Score and terms after dropping those of the doubtful ones that do not earn their place."""
         best, kept = self.judge(terms), terms
         while True:
             trials = [self.without(term, kept) for term in doubtful if term in kept]
@@ -174,18 +174,18 @@ class Search:
                 return best, kept
             best, kept = min(scored)[0], trials[min(scored)[1]]
 
-    def owed(self, term: Term) -> float:
-        """What a term must do better by than its parts, where some of these are needed beside it."""
-        parts = effects()[term.effect].made_of(self.normal.layout, term.place, term.shape)
+    def advantage_owed(self, term: Term) -> float:
+        """Score by which a term must be better than its alternatives, if some of them are needed beside it."""
+        parts = term.alternatives(self.normal.layout)
         beside = [other for other in self.active if other.key in parts]
-        if not beside or not effects()[term.effect].whole_arm:
+        if not beside or not term.form.signature.whole_arm:
             return 0.0
         own = self.normal.size_of(term, *self.weighted.fit(self.active))
         others = [self.normal.size_of(other, *self.weighted.fit(self.active)) for other in beside]
         return OWED if any(np.any(size > BESIDE * own) for size in others) else 0.0
 
     def run(self) -> list[Term]:
-        """Forward and backward until nothing helps, then exchanges, then again."""
+        """Forward and backward steps until none helps, then exchanges, then again."""
         for _ in range(4):
             while self.forward():
                 while self.backward():
@@ -199,8 +199,8 @@ class Search:
 
 
 def shortlist(screened: list[tuple[float, Term]]) -> list[tuple[float, Term]]:
-    """The first few, no effect at one place more than twice."""
-    seen: dict[tuple[str, int], int] = {}
+    """The first few terms, no effect at one place more than twice."""
+    seen: dict[Key, int] = {}
     out = []
     for fall, term in screened:
         seen[term.key] = seen.get(term.key, 0) + 1

@@ -101,7 +101,7 @@ def drawn_arm(seed: int, n: int | None = None, *, upright: bool | None = None, *
 def drawn_truth(arm: ArmFile, seed: int) -> Truth:
     """Gains 0.7 to 1.3, offsets ± 10 % of the sensors' range, position gains 0.98 to 1.02, mass up to 0.15 m aside."""
     random, n = np.random.default_rng([seed, 78]), len(arm.joint_names)
-    rated = np.array([joint.rated_torque for joint in arm.require_link().joints])
+    rated = arm.require_link().rated_torques
     return Truth(
         gain=random.uniform(0.7, 1.3, n),
         offset=random.uniform(-OFFSET_RANGE, OFFSET_RANGE, n) * rated,
@@ -140,7 +140,7 @@ def sweep(simulated: SimulatedArm, out: Path, *, loaded: bool = True) -> list[Sw
 def judge(arm: ArmFile, truth: Truth, data: list[SweepData], fit: SensorFit | None = None) -> Verdict:
     """Errors of the fit against the truth, and its unobservable parameters against the rank test."""
     fit = fit_sensors(arm, data) if fit is None else fit
-    rated = np.array([joint.rated_torque for joint in arm.require_link().joints])
+    rated = arm.require_link().rated_torques
     off = np.abs(fit.value("gain") / truth.gain - 1)
     gain = float(np.nanmax(off, initial=0.0))
     told = np.array([name in fit.imprecise for name in fit.names])  # known worse than asked, and said so

@@ -35,7 +35,7 @@ class FastArm:
         self.file = load_arm(arm) if isinstance(arm, str) else arm
         self.arm, self.random = gcomp_arm(self.file), np.random.default_rng([seed, 21])
         self.n, joints = self.arm.n, self.file.require_link().joints
-        self.rated = np.array([joint.rated_torque for joint in joints])
+        self.rated = self.file.require_link().rated_torques
         self.speed = np.array([joint.max_velocity for joint in joints])
         links = self.file.sim.links
         mass = np.array([link.mass for link in links])

@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 
 from armlink.arm_file import ArmFile, parse_arm
+from calib.motion.static_reading import StaticReading
 from calib.plan.types import SweepPlan
-from calib.sweep.dataset import Manifest, Reading, SweepData
+from calib.sweep.dataset import Manifest, SweepData
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
@@ -76,7 +77,7 @@ def synthetic_pass(arm: ArmFile, truth: Truth, plan: SweepPlan, mass: float, ran
     if mass:
         simulated.attach_mass(mass)
     n = len(arm.joint_names)
-    noise = 0.002 * np.array([joint.rated_torque for joint in arm.require_link().joints])
+    noise = 0.002 * arm.require_link().rated_torques
     rows: list[tuple[str, int, int | None, int, np.ndarray, tuple[bool, ...]]] = [
         ("scout", index, None, 0, np.array(pose), (True,) * n) for index, pose in enumerate(plan.scout)
     ]
@@ -93,21 +94,15 @@ def synthetic_pass(arm: ArmFile, truth: Truth, plan: SweepPlan, mass: float, ran
         torque = simulated.gravity_torque(angle)[0]
         reading = truth.gain * torque + truth.offset + random.normal(0, noise / np.sqrt(SAMPLES))
         readings.append(
-            Reading(
-                sweep=sweep_name,
-                index=index,
-                joint=joint,
-                direction=direction,
-                t=float(len(readings)),
+            StaticReading.of(
+                float(len(readings)),
+                shown,
+                reading,
                 count=SAMPLES,
-                settled=True,
-                servo=servo,
-                position=tuple(shown),
-                position_std=(0.0,) * n,
-                torque=tuple(reading),
-                torque_std=tuple(noise),
-                motor_torque=tuple(torque),
-            )
+                position_std=np.zeros(n),
+                torque_std=noise,
+                motor_torque=torque,
+            ).within(sweep_name, index, np.array(servo), joint, direction)
         )
     manifest = Manifest.of(arm, mass)
     return SweepData(Path(f"pass-{mass:g}"), manifest, tuple(readings), plan, np.full(n, RESOLUTION), "0" * 64)

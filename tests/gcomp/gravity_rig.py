@@ -9,7 +9,7 @@ from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import base_parameters
 from gcomp.arrays import Array
 from gcomp.identify.parameters import Parameters
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict
 
 DOWN, TILTED = (0.0, 0.0, -9.81), (9.81, 0.0, 0.0)
@@ -126,14 +126,14 @@ def make_readings(
     loads: tuple[float, ...] = (0.0,),
     sigma: Array | float = 0.05,
     rng: np.random.Generator | None = None,
-) -> Readings:
+) -> StaticReadings:
     """What the sensors read at these true positions with each load; with noise where a generator is given."""
     phi = (positions - true.position_offset) / true.position_gain
-    parts = [Readings.of(phi, marks, sigma, load) for load in loads]
+    parts = [StaticReadings.of(phi, marks, sigma, load) for load in loads]
     rows = parts[0]
     for part in parts[1:]:
         rows = rows.joined(part)
     torque = predict(arm, true, rows) + rows.torque
     if rng is not None:
         torque = torque + rows.sigma * rng.normal(size=torque.shape)
-    return Readings(rows.position, torque, rows.sigma, rows.load)
+    return StaticReadings(rows.position, torque, rows.sigma, rows.load)

@@ -43,7 +43,7 @@ class Rig:
         self.arm = SimulatedArm(described, truth or Truth.of(described), seed)
         self.bus = LockStepBus(arm=self.arm)
         self.nodes = [node.node_id for node in self.arm.nodes]
-        self.rated = np.array([joint.rated_torque for joint in described.require_link().joints])
+        self.rated = described.require_link().rated_torques
         self.position = np.zeros(len(self.nodes), int)
         self.torque = np.zeros(len(self.nodes))
         self.word = 0

@@ -66,7 +66,7 @@ def test_an_arm_from_a_model_file_takes_its_inertials_and_stops_from_there(tmp_p
 
 def test_truth_is_drawn_within_its_ranges_and_frozen() -> None:
     arm = load_arm("sarcos")
-    rated = np.array([joint.rated_torque for joint in arm.require_link().joints])
+    rated = arm.require_link().rated_torques
     drawn = [Truth.draw(arm, seed) for seed in range(200)]
     for truth in drawn:
         assert ((truth.gain >= 0.9) & (truth.gain <= 1.1)).all()

@@ -75,17 +75,21 @@ class Guard:
         """Let a request through to the application, or answer it here."""
         if scope["type"] != "http":
             return
+        headers = _headers(scope)
         try:
             self._check(scope, peer_of(scope))
-            body = await _read_body(_headers(scope), receive)
+            body = await _read_body(headers, receive)
         except Denied as denied:
+            if _has_body(headers):  # what has not come of it is discarded, within the bounds of `linger`
+                denied.headers["connection"] = "close"
             await _answer(denied, send)
             return
         await self.app(scope, _replay(body, receive), _with_headers(send))
 
     def _check(self, scope: Scope, peer: Peer) -> None:
         headers = _headers(scope)
-        if len(scope["query_string"]) + sum(len(name) + len(value) for name, value in scope["headers"]) > HEAD_LIMIT:
+        line = len(scope.get("raw_path", b"")) + len(scope["query_string"])
+        if line + sum(len(name) + len(value) for name, value in scope["headers"]) > HEAD_LIMIT:
             raise Denied(431, f"request line and headers may have {HEAD_LIMIT} bytes", {"connection": "close"})
         if peer.tcp and (wait := self._requests.take(peer.address, self.access.now())):
             raise Denied(429, f"too many requests: wait {math.ceil(wait)} s", {"retry-after": str(math.ceil(wait))})
@@ -148,13 +152,17 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
+def _has_body(headers: dict[str, str]) -> bool:
+    return headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
+
+
 async def _read_body(headers: dict[str, str], receive: Receive) -> bytes:
     """The whole body; raises Denied where it is too large or too slow."""
-    too_large = Denied(413, f"a request's body may have {BODY_LIMIT} bytes", {"connection": "close"})
+    too_large = Denied(413, f"a request's body may have {BODY_LIMIT} bytes")
     length = headers.get("content-length", "0")
     if not length.isdigit() or int(length[:20]) > BODY_LIMIT:
         raise too_large
-    if length == "0" and "transfer-encoding" not in headers:
+    if not _has_body(headers):
         return b""
     body = b""
     try:
@@ -162,14 +170,14 @@ async def _read_body(headers: dict[str, str], receive: Receive) -> bytes:
             while True:
                 message = await receive()
                 if message["type"] == "http.disconnect":
-                    raise Denied(400, "the connection ended within the body", {"connection": "close"})
+                    raise Denied(400, "the connection ended within the body")
                 body += bytes(message.get("body", b""))
                 if len(body) > BODY_LIMIT:
                     raise too_large
                 if not message.get("more_body", False):
                     return body
     except TimeoutError:
-        raise Denied(408, f"the body did not come within {BODY_SECONDS:.0f} s", {"connection": "close"}) from None
+        raise Denied(408, f"the body did not come within {BODY_SECONDS:.0f} s") from None
 
 
 def _replay(body: bytes, receive: Receive) -> Receive:

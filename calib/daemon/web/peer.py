@@ -8,10 +8,12 @@ import socket
 import struct
 from collections.abc import Awaitable, Callable, MutableMapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from calib.daemon.web.linger import LingeringTransport
 
 Scope = MutableMapping[str, Any]
 Message = MutableMapping[str, Any]
@@ -67,13 +69,13 @@ def describe_peer(transport: asyncio.Transport) -> Peer:
 
 
 class BoundedProtocol(H11Protocol):
-    """uvicorn's protocol, which tells the application its peer, keeps few bytes and does not wait for ever."""
+    """uvicorn's protocol, which names the peer, keeps few bytes, does not wait for ever and ends in stages."""
 
     _deadline: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Note who it is and start the clock for the first request."""
-        super().connection_made(transport)
+        super().connection_made(cast(asyncio.Transport, LingeringTransport(transport)))
         transport.set_write_buffer_limits(high=WRITE_BUFFER)
         peer, app = describe_peer(transport), self.app
 
@@ -94,6 +96,15 @@ class BoundedProtocol(H11Protocol):
         self._stop_the_clock()
         super().connection_lost(exc)
 
+    def shutdown(self) -> None:
+        """The server ends: an idle connection does at once, one that lingers in less time than the server takes."""
+        if self.transport.is_closing():
+            return
+        if self._awaits_head() and not self.transport.get_write_buffer_size():
+            self.transport.abort()
+        else:
+            super().shutdown()
+
     def send_400_response(self, msg: str) -> None:
         """What is not HTTP gets the API's form of error too."""
         body = json.dumps({"error": "this is not a valid HTTP request"}).encode()
@@ -104,6 +115,9 @@ class BoundedProtocol(H11Protocol):
         except h11.LocalProtocolError:  # it is in the middle of an answer already
             _log.debug("%s: malformed request during an answer", msg)
         self.transport.close()
+        if not self._awaits_head():  # the application has a request whose rest is not HTTP
+            self.cycle.disconnected = True
+            self.cycle.message_event.set()
 
     def _awaits_head(self) -> bool:
         cycle = getattr(self, "cycle", None)
@@ -122,7 +136,7 @@ class BoundedProtocol(H11Protocol):
 
     def _cut_if_waiting(self) -> None:
         self._deadline = None
-        if self._awaits_head():
+        if self._awaits_head() and not self.transport.is_closing():
             self.transport.abort()
 
 

@@ -1,6 +1,6 @@
 """Arms drawn at random: 3 to 7 hinges, plausible links, any mounting; written as MJCF.
 
-The nominal arm is what `sim.xml` says; `perturbed` is the arm that the plant moves, a little wrong everywhere.
+The nominal arm is that of `sim.xml`; `perturbed` is the arm that the plant simulates, with small errors everywhere.
 """
 
 from dataclasses import dataclass, replace
@@ -81,7 +81,7 @@ def draw_arm(random: np.random.Generator, joints: int | None = None) -> Arm:
     places = [np.array([0.0, 0.0, random.uniform(0.1, 0.4)]), *bone[:-1]]
     half = random.uniform(1.2, 2.6, n)
     centre = random.uniform(-0.3, 0.3, n)
-    lossy = random.random() < 0.4  # some models come with friction that their makers measured
+    lossy = random.random() < 0.4  # some models come with measured friction
     return Arm(
         offset=np.array([p.T @ place for p, place in zip(parent, places, strict=True)]),
         rotation=np.array([p.T @ turn @ own for p, turn, own in zip(parent, twist, frame, strict=True)]),
@@ -99,7 +99,7 @@ def draw_arm(random: np.random.Generator, joints: int | None = None) -> Arm:
 
 
 def perturbed(arm: Arm, random: np.random.Generator) -> Arm:
-    """The arm as it was really built: mass moments and rotors within about 1 %, inertias 2 %, masses 0.3 %."""
+    """The arm with manufacturing errors: mass moments and rotors about 1 %, inertias 2 %, masses 0.3 %."""
     n, small = arm.n, np.clip(random.normal(0.0, 0.5, (3, arm.n)), -1.0, 1.0)
     return replace(
         arm,
@@ -113,7 +113,7 @@ def perturbed(arm: Arm, random: np.random.Generator) -> Arm:
 def mjcf(arm: Arm, shared_rotors: tuple[tuple[int, int, float, float], ...] = ()) -> str:
     """The arm as MJCF text.
 
-    `shared_rotors` lists (i, j, coefficient, inertia): a rotor that turns with q_i + coefficient·q_j.
+    `shared_rotors` lists (i, j, coefficient, inertia): a rotor that turns by q_i + coefficient·q_j.
     """
     lines = [
         '<mujoco model="arm">',
@@ -154,7 +154,7 @@ def _text(values: Array | list[float]) -> str:
 
 
 def _bone(random: np.random.Generator) -> Array:
-    """Direction of a link: along its joint's axis or across it, a little off."""
+    """Direction of a link: along its joint's axis or across it, slightly perturbed."""
     direction = np.array([0.0, 0.0, 1.0]) if random.random() < 0.4 else np.array([random.choice([-1.0, 1.0]), 0.0, 0.0])
     return direction + random.normal(0.0, 0.15, 3)
 
@@ -167,14 +167,14 @@ def _twist(random: np.random.Generator) -> float:
 
 
 def _signed_axes(random: np.random.Generator) -> Array:
-    """A right-handed frame whose axes are some order of ±x, ±y, ±z."""
+    """A right-handed frame whose axes are a permutation of ±x, ±y, ±z."""
     frame = np.eye(3)[random.permutation(3)] * random.choice([-1.0, 1.0], 3)[:, None]
     frame[:, 0] *= np.linalg.det(frame)
     return np.asarray(frame)
 
 
 def _mounting(random: np.random.Generator) -> Array:
-    """Upright, hanging, on a wall or at some angle."""
+    """Rotation of the base: upright, hanging, on a wall or at another angle."""
     kind = random.random()
     angle = 0.0 if kind < 0.55 else np.pi if kind < 0.65 else np.pi / 2 if kind < 0.8 else random.uniform(0.2, 1.2)
     return _about_x(float(angle))
@@ -186,7 +186,7 @@ def _about_x(angle: float) -> Array:
 
 
 def _rod(mass: float, bone: Array, random: np.random.Generator) -> Array:
-    """Inertia of a thick rod along the bone [kg·m²], a little turned."""
+    """Inertia of a thick rod along the bone [kg·m²], slightly rotated."""
     length, radius = float(np.linalg.norm(bone)), random.uniform(0.03, 0.07)
     along = bone / length
     across, axial = mass * (length**2 / 12 + radius**2 / 4), mass * radius**2 / 2

@@ -1,4 +1,4 @@
-"""The held-out gap of a recording against the nominal model, by this package's own means (not the diagnosis's)."""
+"""The held-out gap of a recording against the nominal model, computed independently of the diagnosis."""
 
 from typing import Any
 
@@ -10,11 +10,11 @@ from sim_gap.blind.plant.rigid_body import compiled, inverse
 RATE = 250.0
 BAND_HZ = 6.0
 SMOOTH_SPEED = 0.02
-"""Nominal friction changes sign over this speed [rad/s]."""
+"""Speed over which nominal friction changes sign [rad/s]."""
 VISIBLE_RATIO, VISIBLE_LEAST = 3.0, 0.08
-"""An effect must multiply some held-out RMS by the one and raise it by the other [N·m]."""
+"""Least factor on some held-out RMS, and least increase of it [N·m], by a visible effect."""
 MOVING = 0.03
-"""Motor channels count only where a joint moves faster than this [rad/s]: at rest friction is anything."""
+"""Motor channels count only above this speed [rad/s]: at rest friction is undetermined."""
 
 
 def gap(arm: Arm, columns: dict[str, Array]) -> dict[str, list[float]]:
@@ -41,7 +41,7 @@ def gap(arm: Arm, columns: dict[str, Array]) -> dict[str, list[float]]:
 
 
 def largest_fall(before: dict[str, list[float]], after: dict[str, list[float]]) -> dict[str, Any]:
-    """Channel and joint where the effect's absence lowers the gap most, with both values and the shrink."""
+    """Channel and joint at which the effect's absence lowers the gap most, with both values and the shrink."""
     falls = [
         (b - a, channel, j, b, a)
         for channel in before
@@ -52,7 +52,7 @@ def largest_fall(before: dict[str, list[float]], after: dict[str, list[float]]) 
 
 
 def visible(fall: dict[str, Any]) -> bool:
-    """Whether the gap that an effect makes stands out of what every arm has."""
+    """Whether the gap caused by an effect exceeds that of every arm clearly."""
     return bool(fall["before"] > VISIBLE_RATIO * fall["after"] and fall["before"] - fall["after"] > VISIBLE_LEAST)
 
 

@@ -1,4 +1,4 @@
-"""Makes blind-check cases in its own process: `python -m sim_gap.blind.cases.make --out DIR --labels DIR`."""
+"""Makes blind-check cases in a process of its own: `python -m sim_gap.blind.cases.make --out DIR --labels DIR`."""
 
 import argparse
 import json
@@ -15,17 +15,18 @@ import numpy as np
 from sim_gap.blind.cases.arms import Array, mjcf
 from sim_gap.blind.cases.gap import gap, largest_fall, visible
 from sim_gap.blind.cases.recipe import Drawing, Recipe, draw, label, recipes
-from sim_gap.blind.plant.plant import Log, simulate
+from sim_gap.blind.plant.plant import simulate
+from sim_gap.blind.plant.runs import Log
 from sim_gap.blind.plant.sensors import record
 
 Values = TypeVar("Values")
 BATCH = 12
-"""Cases simulated side by side in one process."""
+"""Number of cases simulated together in one process."""
 TRAIN_S, HELDOUT_S, RATE = 120.0, 40.0, 250.0
 ROUNDS = 4
-"""How often a case that does not show its effects is drawn again."""
+"""Number of drawings of a case that does not show its effects."""
 FOLLOWED = 0.3
-"""Largest distance from the commanded trajectory [rad] of an arm under control."""
+"""Largest deviation from the commanded trajectory [rad] of an arm under control."""
 DECIMALS = {"t": 6, "q": 7, "dq": 6, "q_cmd": 7}
 
 
@@ -39,8 +40,8 @@ def make_cases(
 ) -> None:
     """Draw, simulate and write cases: `out/case_XXXX/{sim.xml,train.csv,heldout.csv}`, `labels/case_XXXX.json`.
 
-    A case whose effects do not stand out on the held-out motion, or whose arm was not under control, is drawn again;
-    one that no arm shows is left out.
+    A case is drawn again if its effects do not show in the held-out data or its arm was not under control, and left out
+    if no arm shows it.
     """
     labels.mkdir(parents=True, exist_ok=True)
     todo = dict.fromkeys(wanted, 0)
@@ -65,7 +66,7 @@ def make_cases(
 
 @dataclass(frozen=True)
 class Judged:
-    """A case's held-out recording, the gaps with and without its effects, and whether it will do."""
+    """A case's held-out recording, the gaps with and without its effects, and whether it can be used."""
 
     heldout: dict[str, Array]
     gaps: dict[str, Any]
@@ -80,7 +81,9 @@ def _judged(drawing: Drawing, logs: list[Log], rate: float) -> Judged:
         for run, log in zip(runs, logs, strict=True)
     ]
     gaps = [gap(drawing.nominal, recording) for recording in recordings]
-    recorded = [_chosen(each, drawing.columns) for each in gaps]  # what nobody records does not make a case clear
+    recorded = [
+        _chosen(each, drawing.columns) for each in gaps
+    ]  # channels that are not recorded do not make a case clear
     falls = [largest_fall(recorded[0], less) for less in recorded[1 : 1 + len(drawing.drawn)]]
     steady = all(_steady(run.command, log) for run, log in zip(runs, logs, strict=True))
     found = {"with": gaps[0], "without": gaps[-1], "falls": falls}
@@ -88,9 +91,9 @@ def _judged(drawing: Drawing, logs: list[Log], rate: float) -> Judged:
 
 
 def _steady(command: Array, log: Log) -> bool:
-    """Whether the controller followed its trajectory without shaking."""
-    shaken = np.abs(np.diff(log.motor, 2, axis=0)).mean(0) > 0.25 * log.motor.std(0) + 0.1
-    return bool(np.abs(log.position - command).max() < FOLLOWED and not shaken.any())
+    """Whether the controller followed its trajectory without oscillation."""
+    oscillating = np.abs(np.diff(log.motor, 2, axis=0)).mean(0) > 0.25 * log.motor.std(0) + 0.1
+    return bool(np.abs(log.position - command).max() < FOLLOWED and not oscillating.any())
 
 
 def _write(drawing: Drawing, judged: Judged, train: Log, folder: Path, labels: Path, rate: float) -> None:
@@ -109,13 +112,13 @@ def _random(drawing: Drawing, number: int) -> np.random.Generator:
 
 
 def _chosen(columns: dict[str, Values], wanted: dict[str, bool]) -> dict[str, Values]:
-    """Those that the recording has."""
+    """The columns that the recording has."""
     dropped = {name for name, key in (("q_cmd", "position_command"), ("tau_cmd", "torque_command")) if not wanted[key]}
     return {name: values for name, values in columns.items() if name not in dropped}
 
 
 def write_csv(path: Path, columns: dict[str, Array]) -> None:
-    """Columns of contract 2: `t`, then `name_1` … `name_n` of each channel."""
+    """Write columns as in docs/formats.md: `t`, then `name_1` … `name_n` of each channel."""
     import pyarrow as pa
     from pyarrow.csv import WriteOptions, write_csv
 
@@ -129,13 +132,13 @@ def write_csv(path: Path, columns: dict[str, Array]) -> None:
 
 
 def batches(wanted: Sequence[Recipe], size: int = BATCH) -> Iterator[Sequence[Recipe]]:
-    """Cases in groups."""
+    """Cases in groups of `size`."""
     for start in range(0, len(wanted), size):
         yield wanted[start : start + size]
 
 
 def main() -> None:
-    """Make a whole check's cases."""
+    """Make all cases of a check."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--cases", type=int, default=150)
@@ -159,7 +162,7 @@ def main() -> None:
 
 
 def withheld(labels: Path, each: int = 2) -> list[str]:
-    """Lines "case effect": the first `each` single-effect cases of every effect that the recording can tell."""
+    """Lines "case effect": the first `each` single-effect cases of every effect that the recording can separate."""
     chosen: dict[str, list[str]] = {}
     for path in sorted(labels.glob("*.json")):
         truth = json.loads(path.read_text(encoding="utf-8"))

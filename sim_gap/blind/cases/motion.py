@@ -1,4 +1,4 @@
-"""Motions that a user would record: sums of sines, point to point, sweeps back and forth, a chirp at the end."""
+"""Typical motions: sums of sines, point to point, back and forth at varying pace, a chirp at the end."""
 
 from dataclasses import dataclass
 
@@ -11,12 +11,12 @@ RATE = 500.0
 KINDS = ("sines", "points", "sweeps")
 CHIRP_S = 12.0
 SLOWEST, LONGEST_REST_S, NEAREST = 0.4, 0.9, 0.01
-"""Of moves from point to point: least share of the limits, longest rest between them [s], and nearest point [rad]."""
+"""Moves from point to point: least share of the limits, longest rest between them [s], least distance [rad]."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a trajectory may use, (n,) each: rad, rad, rad/s, rad/s²."""
+    """Limits of a trajectory, (n,) each: rad, rad, rad/s, rad/s²."""
 
     lower: Array
     upper: Array
@@ -30,7 +30,7 @@ class Limits:
 
     @property
     def reach(self) -> Array:
-        """Largest distance from the centre that is used [rad]."""
+        """Largest distance from the centre [rad]."""
         return 0.42 * (self.upper - self.lower)
 
 
@@ -74,9 +74,9 @@ def _points(t: Array, limits: Limits, random: np.random.Generator) -> Array:
             there = np.where(np.arange(n) == alone, there, here)
         share, left = random.uniform(SLOWEST, 1.0), t[-1] - now / RATE - LONGEST_REST_S
         while now == 0 and left < 2 * _seconds(there, limits, SLOWEST) and np.abs(there).max() > NEAREST:
-            there *= 0.8  # a short motion goes less far
+            there *= 0.8  # less distance in a short motion
         seconds = _seconds(there - here, limits, share)
-        if left < seconds + _seconds(there, limits, SLOWEST):  # no time to come back
+        if left < seconds + _seconds(there, limits, SLOWEST):  # no time to return
             there, seconds = np.zeros(n), _seconds(here, limits, random.uniform(SLOWEST, 1.0))
         rows = round(seconds * RATE)
         s = np.minimum(np.arange(rows) / max(rows - 1, 1), 1.0)[:, None]
@@ -94,14 +94,14 @@ def _points(t: Array, limits: Limits, random: np.random.Generator) -> Array:
 
 
 def _seconds(way: Array, limits: Limits, share: float) -> float:
-    """Time of a quintic move at a share of the limits; its peaks are 1.875 d/T and 5.7735 d/T²."""
+    """Duration of a quintic move at a share of the limits; its peaks are 1.875 d/T and 5.7735 d/T²."""
     distance = np.abs(way)
     fast = np.maximum(1.875 * distance / limits.velocity, np.sqrt(5.7735 * distance / limits.acceleration))
     return max(0.5, float(fast.max()) / share)
 
 
 def _sweeps(t: Array, limits: Limits, random: np.random.Generator) -> Array:
-    """Triangles with rounded corners, each joint at its own pace, which wanders."""
+    """Triangles with rounded corners, each joint at its own, slowly varying pace."""
     n = len(limits.lower)
     pace = random.uniform(0.04, 0.14, n) * (1.0 + 0.6 * np.sin(2 * np.pi * t[:, None] / random.uniform(15.0, 40.0, n)))
     phase = 2 * np.pi * np.cumsum(pace, axis=0) / RATE + random.uniform(0.0, 2 * np.pi, n)
@@ -127,7 +127,7 @@ def _window(t: Array) -> Array:
 
 
 def _scaled(x: Array, limits: Limits) -> Array:
-    """Each joint as large as its reach, velocity and acceleration allow."""
+    """Scaled per joint to the limits of reach, velocity and acceleration."""
     v, a = derivatives(x)
     use = [limits.reach / np.abs(x).max(0), limits.velocity / np.abs(v).max(0), limits.acceleration / np.abs(a).max(0)]
     return np.asarray(x * np.minimum.reduce(use))

@@ -1,4 +1,4 @@
-"""Which cases a blind check has, and how one is drawn: arm, effects, motions; all from one seed."""
+"""The cases of a blind check and how each is drawn: arm, effects, motions; all from one seed."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -8,21 +8,21 @@ import numpy as np
 from sim_gap.blind.cases.arms import Arm, Array, draw_arm
 from sim_gap.blind.cases.motion import KINDS, Limits, trajectory
 from sim_gap.blind.cases.scene import Scene
-from sim_gap.blind.cases.truth import ordinary
+from sim_gap.blind.cases.true_arm import sound
 from sim_gap.blind.effects.drawn import Drawn
 from sim_gap.blind.effects.library import DRAWS, EFFECTS
-from sim_gap.blind.plant.plant import Run
+from sim_gap.blind.plant.runs import Run
 
 ATTEMPTS = 600
-"""After so many arms that cannot show a case's effects it is left out; play, the rarest, takes some hundred."""
+"""Number of arms drawn for a case before it is left out; backlash, the rarest, takes some hundred."""
 OTHER_PAIR = 20
-"""After so many arms that cannot show two effects together, two others are drawn."""
+"""Number of arms drawn for two effects before two others are drawn."""
 NONE_SHARE, TWO_SHARE = 0.12, 0.18
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """One case before it is drawn: its effects by id; none and two are kinds of their own."""
+    """One case before it is drawn: its effects by id, none, one or two."""
 
     name: str
     effects: tuple[str, ...]
@@ -36,7 +36,7 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Drawing:
-    """One case drawn: the nominal arm, what is wrong with the true one, and three runs of it."""
+    """One case drawn: the nominal arm, its effects, and the runs of the true arm."""
 
     recipe: Recipe
     nominal: Arm
@@ -47,13 +47,13 @@ class Drawing:
     without: tuple[Run, ...]
     """The held-out motion of the same arm without each effect in turn, then without any; one run for one effect."""
     attempt: int
-    """Which of the recipe's drawings this is."""
+    """Number of this drawing of the recipe."""
     columns: dict[str, bool]
     """Optional columns: `velocity`, `position_command`, `torque_command`."""
 
 
 def recipes(seed: int, count: int) -> list[Recipe]:
-    """`count` cases: every effect in turn, and among them arms without an effect and with two."""
+    """`count` cases: every effect in turn, and among them arms without an effect and with two effects."""
     random = np.random.default_rng([seed, 0])
     none, two = round(NONE_SHARE * count), round(TWO_SHARE * count)
     order = [*random.permutation(EFFECTS).tolist()]
@@ -69,9 +69,9 @@ def _pair(random: np.random.Generator) -> tuple[str, ...]:
 
 
 def draw(recipe: Recipe, train_s: float, heldout_s: float, first: int = 0) -> Drawing | None:
-    """Draw one case; arms that cannot show its effects are drawn again, None where there is none in `ATTEMPTS`.
+    """Draw one case; arms that cannot show its effects are drawn again, None if there is none in `ATTEMPTS`.
 
-    `first` is the attempt to begin with.
+    `first` is the number of the first attempt.
     """
     for attempt in range(first, first + ATTEMPTS):
         random = np.random.default_rng([*recipe.seed, attempt])
@@ -108,16 +108,16 @@ def _assemble(
     seed = int(random.integers(2**31))
     feed = {number: scene.feed_forward(q) for number, q in enumerate((scene.command, command))}
 
-    whole = ordinary(nominal, scene.rated, np.random.default_rng(seed))
+    whole = sound(nominal, scene.rated, np.random.default_rng(seed))
     for effect in drawn:
         effect.apply(whole)
-    slowest = whole.bandwidth  # the same controller for all runs
+    bandwidth = whole.bandwidth  # the same controller for all runs
 
     def run(effects: tuple[Drawn, ...], number: int) -> Run:
-        truth = ordinary(nominal, scene.rated, np.random.default_rng(seed))
+        truth = sound(nominal, scene.rated, np.random.default_rng(seed))
         for effect in effects:
             effect.apply(truth)
-        truth.bandwidth = slowest
+        truth.bandwidth = bandwidth
         return Run(truth, (scene.command, command)[number], feed[number], scene.inertia, seed + number)
 
     columns = {name: bool(random.random() < share) for name, share in (("velocity", 0.5), ("position_command", 0.8))}
@@ -135,7 +135,7 @@ def _limits(arm: Arm, random: np.random.Generator) -> Limits:
 
 
 def _compatible(drawn: list[Drawn]) -> bool:
-    """Two effects may share a joint, but not where one rewrites what the other set."""
+    """Whether two effects can be combined: on a common joint, neither may overwrite the other."""
     if len(drawn) < 2:
         return True
     first, second = drawn
@@ -146,7 +146,7 @@ def _compatible(drawn: list[Drawn]) -> bool:
 
 
 def label(drawing: Drawing) -> dict[str, Any]:
-    """What the case truly is, for the score; gaps are added once it has run."""
+    """The true effects of the case, for the score; gaps are added once it has run."""
     chirp, nominal = "chirp" in drawing.motions["train"], drawing.nominal
     effects = [
         {

@@ -1,4 +1,4 @@
-"""What a nominal arm does along its commanded training motion: how large an effect must be to be seen."""
+"""A nominal arm along its commanded training motion, for choosing magnitudes of effects that show."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,7 +11,7 @@ from sim_gap.blind.cases.motion import RATE, derivatives
 from sim_gap.blind.plant.rigid_body import compiled, controlled_inertia, inverse
 
 THIN = 25
-"""Every 25th row of the trajectory is enough to judge magnitudes."""
+"""Magnitudes are judged on every 25th row of the trajectory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,13 +34,13 @@ class Scene:
 
     @cached_property
     def motion(self) -> tuple[Array, Array, Array]:
-        """q, v, a of every `THIN`th row."""
+        """q, v, a of every `THIN`-th row."""
         v, a = derivatives(self.command)
         return self.command[::THIN], v[::THIN], a[::THIN]
 
     @cached_property
     def rotor_torque(self) -> Array:
-        """Torque that the rotors take (K', n)."""
+        """Torque that accelerates the rotors (K', n) [N·m]."""
         return np.asarray(self.arm.armature * self.motion[2])
 
     @cached_property
@@ -56,7 +56,7 @@ class Scene:
 
     @cached_property
     def rated(self) -> Array:
-        """A drive's rated torque: what the motion needs and half as much again, at least 3 N·m; (n,)."""
+        """Rated torque of the drives: 1.5 times the peak torque of the motion, at least 3 N·m; (n,)."""
         return np.asarray(np.maximum(1.5 * np.abs(self.torque + self.rotor_torque).max(0), 3.0))
 
     @cached_property
@@ -75,7 +75,7 @@ class Scene:
         return out
 
     def change(self, other: Arm) -> Array:
-        """How the link-side torque changes with another arm in place of this one, (K', n)."""
+        """Change of the link-side torque with another arm in place of this one, (K', n)."""
         model = compiled(other)
         return inverse(model, *self.motion) - other.armature * self.motion[2] - self.torque
 

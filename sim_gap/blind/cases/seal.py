@@ -1,4 +1,4 @@
-"""Sealing: answers are written and hashed before a label is opened; labels are read only while the hashes hold."""
+"""Sealing: answers are hashed before a label is opened; labels are read only if the hashes match."""
 
 import hashlib
 import json
@@ -15,7 +15,7 @@ SCHEMA = "armlink.blind-seal/1"
 def write_answer(folder: Path, name: str, answer: Mapping[str, Any]) -> None:
     """Write one answer as `folder/NAME.json`. Raises Refused once the folder is sealed."""
     if (folder / MANIFEST).exists():
-        raise Refused(f"{folder}: answers are sealed: answer {name} comes too late; use another folder")
+        raise Refused(f"{folder}: answers are sealed, answer {name} is too late: use another folder")
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.json").write_text(json.dumps(answer, indent=1, ensure_ascii=False), encoding="utf-8")
 
@@ -35,11 +35,11 @@ def seal(folder: Path) -> str:
 def verify(folder: Path, digest: str | None = None) -> dict[str, dict[str, Any]]:
     """The sealed answers by name.
 
-    Raises Refused where an answer was changed, added or removed, or the manifest's own SHA-256 is not `digest`.
+    Raises Refused if an answer was changed, added or removed, or the manifest's own SHA-256 is not `digest`.
     """
     manifest = folder / MANIFEST
     if not manifest.is_file():
-        raise Refused(f"{folder}: answers are not sealed: labels stay shut until they are")
+        raise Refused(f"{folder}: answers are not sealed: seal them before opening the labels")
     content = manifest.read_bytes()
     if digest is not None and hashlib.sha256(content).hexdigest() != digest:
         raise Refused(f"{manifest}: not the manifest that was sealed")

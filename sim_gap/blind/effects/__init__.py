@@ -1,1 +1,1 @@
-"""Effects of contract 4 as the blind check draws them: forward form, and magnitudes that show in the recording."""
+"""The blind form of the effects: magnitudes that show in a recording, put into the true arm."""

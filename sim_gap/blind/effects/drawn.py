@@ -6,45 +6,90 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from armlink.effect_catalogue import CATALOGUE
 from sim_gap.blind.cases.arms import Arm, Array
 from sim_gap.blind.cases.scene import Scene, rms
-from sim_gap.blind.cases.truth import Truth
+from sim_gap.blind.cases.true_arm import TrueArm
 
 SENSOR_LEAST = 0.12
 MOTOR_LEAST = 0.3
-"""Least RMS that an effect causes in its channel [N·m], whatever the torque."""
+"""Least RMS that an effect causes in its channel [N·m], for every torque."""
 SHARES = (0.06, 0.14)
-"""RMS that an effect causes, as a share of the joint's RMS torque: several times what small errors cause."""
-
+"""RMS that an effect causes, as a share of the joint's RMS torque: several times that of small background errors."""
 OFTEN = 0.08
-"""Torque reversals a second that show what happens at a reversal."""
+"""Torque reversals per second from which effects at a reversal show."""
 
 Values = dict[str, float]
+Apply = Callable[[TrueArm], None]
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """An effect on one arm. `apply` puts it into the truth; `nominal` changes the nominal model, where need be."""
+    """An effect on one arm."""
 
     effect: str
     parameters: dict[str, Values]
-    """By joint name (`arm` for the whole arm)."""
-    apply: Callable[[Truth], None]
+    """By joint name (`arm` for the whole arm); named as a diagnosis reports them."""
+    apply: Apply
+    """Puts the effect into the true arm."""
     nominal: Callable[[Arm], Arm] | None = None
+    """Changes the nominal model, if need be."""
     implied: tuple[str, ...] = ()
-    """Simpler effects that are part of it and may rightly be named beside it."""
+    """Simpler effects that are part of it and may correctly be named as well."""
     undecided: str = ""
-    """Why slow motion may not tell it from another effect; empty where the recording can tell."""
+    """Why slow motion may not separate it from another effect; empty if the recording can."""
     confused_with: tuple[str, ...] = ()
-    """Effects that are as good an answer where it is undecided."""
+    """Effects that are an equally good answer if it is undecided."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a parameter that is not in the catalogue."""
+        known = {name for name, _ in CATALOGUE[self.effect].reported}
+        if unknown := {name for values in self.parameters.values() for name in values} - known:
+            raise ValueError(f"{self.effect}: {', '.join(sorted(unknown))} not in the catalogue")
+
+    @classmethod
+    def at(
+        cls,
+        scene: Scene,
+        joint: int,
+        effect: str,
+        values: Values,
+        apply: Apply,
+        nominal: Callable[[Arm], Arm] | None = None,
+        implied: tuple[str, ...] = (),
+        undecided: str = "",
+        confused_with: tuple[str, ...] = (),
+    ) -> "Drawn":
+        """An effect at one joint (or link)."""
+        name = scene.arm.names[joint]
+        return cls(effect, {name: values}, apply, nominal, implied, undecided, confused_with)
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """Names of the joints that it sits on; empty for the whole arm."""
+        """Names of its joints; empty for the whole arm."""
         return tuple(name for name in self.parameters if name != "arm")
 
 
 Draw = Callable[[Scene, np.random.Generator], Drawn | None]
+"""Draws an effect for the arm of a scene; None if the arm cannot show it."""
+
+
+def replaced(array: Callable[[TrueArm], Array], index: int, value: float) -> Apply:
+    """An effect that sets one entry of an array."""
+
+    def apply(true: TrueArm) -> None:
+        array(true)[index] = value
+
+    return apply
+
+
+def added(array: Callable[[TrueArm], Array], index: int, value: float) -> Apply:
+    """An effect that adds to one entry of an array."""
+
+    def apply(true: TrueArm) -> None:
+        array(true)[index] += value
+
+    return apply
 
 
 def sensor_level(scene: Scene, random: np.random.Generator) -> Array:
@@ -60,7 +105,7 @@ def motor_level(scene: Scene, random: np.random.Generator) -> Array:
 def pick(
     wanted: Array, cap: float | Array, random: np.random.Generator, allowed: NDArray[np.bool_] | None = None
 ) -> int | None:
-    """A joint whose wanted magnitude is finite and within the cap; None where there is none."""
+    """A joint with a wanted magnitude that is finite and within the cap; None if there is none."""
     fit = np.isfinite(wanted) & (wanted <= cap)
     if allowed is not None:
         fit &= allowed

@@ -1,4 +1,4 @@
-"""Friction of one joint beyond what the nominal model says."""
+"""Friction of one joint in excess of the nominal model's."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -7,11 +7,11 @@ import numpy as np
 
 from sim_gap.blind.cases.arms import Arm
 from sim_gap.blind.cases.scene import Scene, rms
-from sim_gap.blind.cases.truth import Truth
-from sim_gap.blind.effects.drawn import Draw, Drawn, motor_level, pick, sign
+from sim_gap.blind.cases.true_arm import TrueArm
+from sim_gap.blind.effects.drawn import Draw, Drawn, added, motor_level, pick, replaced, sign
 
 MOVING = 0.02
-"""Below this speed [rad/s] friction shows nothing that can be read."""
+"""Speed [rad/s] below which friction does not show in the readings."""
 
 
 def _known_coulomb(joint: int, torque: float, known: bool) -> tuple[Callable[[Arm], Arm] | None, tuple[str, ...]]:
@@ -29,26 +29,18 @@ def coulomb(scene: Scene, random: np.random.Generator) -> Drawn | None:
     """A constant torque against the motion."""
     j = int(random.integers(scene.arm.n))
     torque = float(motor_level(scene, random)[j] * random.uniform(1.0, 2.0))
-
-    def apply(truth: Truth) -> None:
-        truth.coulomb[j] += torque
-
-    return Drawn("friction.coulomb", {scene.arm.names[j]: {"torque": torque}}, apply)
+    return Drawn.at(scene, j, "friction.coulomb", {"torque": torque}, added(lambda true: true.coulomb, j, torque))
 
 
 def viscous(scene: Scene, random: np.random.Generator) -> Drawn | None:
     """A torque proportional to the velocity."""
     j = int(random.integers(scene.arm.n))
     damping = float(motor_level(scene, random)[j] * random.uniform(1.0, 2.0) / rms(scene.motion[1])[j])
-
-    def apply(truth: Truth) -> None:
-        truth.viscous[j] += damping
-
-    return Drawn("friction.viscous", {scene.arm.names[j]: {"damping": damping}}, apply)
+    return Drawn.at(scene, j, "friction.viscous", {"damping": damping}, added(lambda true: true.viscous, j, damping))
 
 
 def stribeck(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """More friction at low speed, on top of Coulomb friction."""
+    """More friction at low speed, in addition to Coulomb friction."""
     j = int(random.integers(scene.arm.n))
     level, speed = float(motor_level(scene, random)[j]), np.abs(scene.motion[1][:, j])
     moving = speed[speed > MOVING]
@@ -57,30 +49,29 @@ def stribeck(scene: Scene, random: np.random.Generator) -> Drawn | None:
     base = breakaway * random.uniform(0.8, 1.6)
     nominal, implied = _known_coulomb(j, base, bool(random.random() < 0.5))
 
-    def apply(truth: Truth) -> None:
-        truth.coulomb[j] = base + 0.02
-        truth.breakaway[j], truth.stribeck_velocity[j] = breakaway, velocity
+    def apply(true: TrueArm) -> None:
+        true.coulomb[j] = base + 0.02
+        true.breakaway[j], true.stribeck_velocity[j] = breakaway, velocity
 
     values = {"breakaway": breakaway, "velocity": velocity}
-    return Drawn("friction.stribeck", {scene.arm.names[j]: values}, apply, nominal, implied)
+    return Drawn.at(scene, j, "friction.stribeck", values, apply, nominal, implied)
 
 
 def asymmetric(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """Friction that differs by direction."""
+    """Friction that differs between directions."""
     j = int(random.integers(scene.arm.n))
     ratio = sign(random) * random.uniform(0.25, 0.6)
     base = float(1.5 * motor_level(scene, random)[j] / abs(ratio))
     nominal, implied = _known_coulomb(j, base, bool(random.random() < 0.5))
 
-    def apply(truth: Truth) -> None:
-        truth.coulomb[j], truth.asymmetry[j] = base, ratio
+    def apply(true: TrueArm) -> None:
+        true.coulomb[j], true.asymmetry[j] = base, ratio
 
-    values = {"ratio": ratio}
-    return Drawn("friction.asymmetric", {scene.arm.names[j]: values}, apply, nominal, implied)
+    return Drawn.at(scene, j, "friction.asymmetric", {"ratio": ratio}, apply, nominal, implied)
 
 
 def load(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """Friction in proportion to the torque carried; on a joint where that torque varies."""
+    """Friction proportional to the transmitted torque, on a joint whose torque varies."""
     size = np.abs(scene.torque)
     varies = size.std(0) > 0.4 * size.mean(0)
     wanted = 1.5 * motor_level(scene, random) / rms(size)
@@ -88,11 +79,8 @@ def load(scene: Scene, random: np.random.Generator) -> Drawn | None:
     if j is None:
         return None
     coefficient = float(wanted[j])
-
-    def apply(truth: Truth) -> None:
-        truth.load_friction[j] = coefficient
-
-    return Drawn("friction.load", {scene.arm.names[j]: {"coefficient": coefficient}}, apply)
+    put = replaced(lambda true: true.load_friction, j, coefficient)
+    return Drawn.at(scene, j, "friction.load", {"coefficient": coefficient}, put)
 
 
 DRAWS: dict[str, Draw] = {

@@ -11,4 +11,6 @@ DRAWS: dict[str, Draw] = {
     **transmission.DRAWS,
     **actuator.DRAWS,
 }
+NOT_DRAWN = {"torque.nonlinearity": "no diagnosis names it, so a case of it could not be scored"}
+"""Catalogue ids without a blind form, and why."""
 EFFECTS = tuple(sorted(DRAWS))

@@ -1,4 +1,4 @@
-"""Links, payload and base that are not as the nominal model says."""
+"""Links, payload and base that differ from the nominal model."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sim_gap.blind.cases.arms import Arm, Array
 from sim_gap.blind.cases.scene import Scene, rms
-from sim_gap.blind.cases.truth import Truth
+from sim_gap.blind.cases.true_arm import TrueArm
 from sim_gap.blind.effects.drawn import Draw, Drawn, sensor_level
 
 XYZ = ("x", "y", "z")
@@ -15,12 +15,12 @@ INERTIA = (("xx", 0, 0), ("xy", 0, 1), ("xz", 0, 2), ("yy", 1, 1), ("yz", 1, 2),
 
 
 def _scale(scene: Scene, other: Arm, joints: NDArray[np.intp], random: np.random.Generator) -> float:
-    """By how much to scale a change so that it shows on the best of `joints`."""
+    """Factor on a change at which it shows at the most sensitive of `joints`."""
     return float(1.0 / (rms(scene.change(other)) / sensor_level(scene, random))[joints].max())
 
 
 def mass_moment(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """A centre of mass elsewhere, across the link's own axis, so that its own joint feels it."""
+    """A shifted centre of mass, across the link's own axis, so that its own joint shows it."""
     arm, level = scene.arm, sensor_level(scene, random)
     shift = random.uniform(0.15, 0.3)
     for link in random.permutation(arm.n).tolist():
@@ -31,15 +31,15 @@ def mass_moment(scene: Scene, random: np.random.Generator) -> Drawn | None:
         if np.linalg.norm(moment) / arm.mass[link] > shift:
             continue
 
-        def apply(truth: Truth, link: int = link, moment: Array = moment) -> None:
-            truth.arm = truth.arm.with_moved(link, moment)
+        def apply(true: TrueArm, link: int = link, moment: Array = moment) -> None:
+            true.arm = true.arm.with_moved(link, moment)
 
-        return Drawn("link.mass_moment", {arm.names[link]: dict(zip(XYZ, moment.tolist(), strict=True))}, apply)
+        return Drawn.at(scene, link, "link.mass_moment", dict(zip(XYZ, moment.tolist(), strict=True)), apply)
     return None
 
 
 def inertia(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """More inertia, most of it about the joint's own axis, that no shift of mass explains."""
+    """Additional inertia, mostly about the joint's own axis, that no shift of mass explains."""
     arm, level = scene.arm, 1.3 * sensor_level(scene, random)
     for link in random.permutation(arm.n).tolist():
         axis = np.outer(arm.axis[link], arm.axis[link])
@@ -49,10 +49,10 @@ def inertia(scene: Scene, random: np.random.Generator) -> Drawn | None:
             continue
         added = unit * wanted
 
-        def apply(truth: Truth, link: int = link, added: Array = added) -> None:
-            truth.arm = _thicker(truth.arm, link, added)
+        def apply(true: TrueArm, link: int = link, added: Array = added) -> None:
+            true.arm = _thicker(true.arm, link, added)
 
-        return Drawn("link.inertia", {arm.names[link]: {name: float(added[r, c]) for name, r, c in INERTIA}}, apply)
+        return Drawn.at(scene, link, "link.inertia", {name: float(added[r, c]) for name, r, c in INERTIA}, apply)
     return None
 
 
@@ -71,8 +71,8 @@ def payload(scene: Scene, random: np.random.Generator) -> Drawn | None:
         np.clip(0.5 * 1.5 * _scale(scene, light, np.arange(arm.n), random), 0.3, 6.0) * random.uniform(1.0, 1.5)
     )
 
-    def apply(truth: Truth) -> None:
-        truth.arm = _loaded(truth.arm, mass, com)
+    def apply(true: TrueArm) -> None:
+        true.arm = _loaded(true.arm, mass, com)
 
     return Drawn("link.payload", {"arm": {"mass": mass, **dict(zip(XYZ, com.tolist(), strict=True))}}, apply)
 
@@ -83,7 +83,7 @@ def _loaded(arm: Arm, mass: float, com: Array) -> Arm:
 
 
 def tilt(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """The base turned by a small angle about an axis across gravity."""
+    """The base rotated by a small angle about an axis across gravity."""
     arm = scene.arm
     down = arm.gravity / np.linalg.norm(arm.gravity)
     axis = np.cross(down, random.standard_normal(3))
@@ -93,17 +93,19 @@ def tilt(scene: Scene, random: np.random.Generator) -> Drawn | None:
         return None
     turn = axis * max(wanted, 0.03)
 
-    def apply(truth: Truth) -> None:
-        truth.arm = _tilted(truth.arm, turn)
+    def apply(true: TrueArm) -> None:
+        true.arm = _tilted(true.arm, turn)
 
-    named = np.sort(np.argsort(np.abs(arm.gravity), kind="stable")[:2])  # the two base axes most nearly across gravity
+    named = np.sort(
+        np.argsort(np.abs(arm.gravity), kind="stable")[:2]
+    )  # the two base axes closest to perpendicular to gravity
     aligned = np.abs(down).max() > 0.999
     values = {f"angle_{k + 1}": float(turn[axis]) for k, axis in enumerate(named)} if aligned else {}
     return Drawn("base.tilt", {"arm": values}, apply)
 
 
 def _tilted(arm: Arm, turn: Array) -> Arm:
-    """The base turned by the rotation vector `turn` [rad]: gravity turns the other way in the base frame."""
+    """The base rotated by the rotation vector `turn` [rad]: gravity rotates the other way in the base frame."""
     angle = float(np.linalg.norm(turn))
     axis, g = turn / angle, arm.gravity
     gravity = g * np.cos(angle) - np.cross(axis, g) * np.sin(angle) + axis * (axis @ g) * (1.0 - np.cos(angle))

@@ -1,18 +1,18 @@
-"""Position sensors that mislead, and torque readings that come late."""
+"""Errors of the position sensors, and delays of the torque readings."""
 
 import numpy as np
 
 from sim_gap.blind.cases.arms import Array
 from sim_gap.blind.cases.scene import Scene, rms
-from sim_gap.blind.cases.truth import Truth
-from sim_gap.blind.effects.drawn import Draw, Drawn, pick, sensor_level, sign
+from sim_gap.blind.cases.true_arm import TrueArm
+from sim_gap.blind.effects.drawn import Draw, Drawn, added, pick, replaced, sensor_level, sign
 
 PERIOD_S = 0.004
-"""The recordings' sample interval: shorter delays are not in them."""
+"""Sample interval of the recordings [s]: shorter delays do not show."""
 
 
 def _felt(scene: Scene, random: np.random.Generator, error: Array) -> Array:
-    """Scale (n,) of a joint's position error (K', n) at which some joint's torque shows it."""
+    """Factor (n,) on a joint's position error (K', n) at which some joint's torque shows it."""
     shown = np.stack([rms(scene.slope[:, :, j] * error[:, j, None]) for j in range(scene.arm.n)], axis=1)
     return np.asarray(1.0 / np.maximum((shown / sensor_level(scene, random)[:, None]).max(0), 1e-9))
 
@@ -25,18 +25,16 @@ def offset(scene: Scene, random: np.random.Generator) -> Drawn | None:
         return None
     angle = sign(random) * max(float(wanted[j]), 0.015)
     twins = {0: ("base.tilt",), scene.arm.n - 1: ("link.mass_moment",)}
-
-    def apply(truth: Truth) -> None:
-        truth.position_offset[j] += angle
-
     why = {
         0: "of joint 1: base tilt does the same",
         scene.arm.n - 1: "of the last joint: its mass moment does the same",
     }
-    return Drawn(
+    return Drawn.at(
+        scene,
+        j,
         "position.offset",
-        {scene.arm.names[j]: {"offset": angle}},
-        apply,
+        {"offset": angle},
+        added(lambda true: true.position_offset, j, angle),
         undecided=why.get(j, ""),
         confused_with=twins.get(j, ()),
     )
@@ -49,15 +47,11 @@ def gain(scene: Scene, random: np.random.Generator) -> Drawn | None:
     if j is None:
         return None
     value = 1.0 + sign(random) * max(float(wanted[j]), 0.015)
-
-    def apply(truth: Truth) -> None:
-        truth.position_gain[j] = value
-
-    return Drawn("position.gain", {scene.arm.names[j]: {"gain": value}}, apply)
+    return Drawn.at(scene, j, "position.gain", {"gain": value}, replaced(lambda true: true.position_gain, j, value))
 
 
 def eccentricity(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """An error once a turn: true = read + amplitude·sin(read + phase)."""
+    """An error with a period of one turn: true = read + amplitude·sin(read + phase)."""
     phase = random.uniform(-np.pi, np.pi)
     wanted = 1.3 * _felt(scene, random, np.sin(scene.motion[0] + phase))
     far = np.ptp(scene.motion[0], axis=0) > 2.5  # a small part of a turn is an offset and a gain
@@ -66,14 +60,14 @@ def eccentricity(scene: Scene, random: np.random.Generator) -> Drawn | None:
         return None
     amplitude = max(float(wanted[j]), 0.02)
 
-    def apply(truth: Truth) -> None:
-        truth.eccentricity[j] = amplitude, phase
+    def apply(true: TrueArm) -> None:
+        true.eccentricity[j] = amplitude, phase
 
-    return Drawn("position.eccentricity", {scene.arm.names[j]: {"amplitude": amplitude, "phase": float(phase)}}, apply)
+    return Drawn.at(scene, j, "position.eccentricity", {"amplitude": amplitude, "phase": float(phase)}, apply)
 
 
 def delay(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """The torque sensor's reading late against the position, on one joint or on all."""
+    """The torque sensor's reading delayed against the position, on one joint or on all."""
     change = np.gradient(scene.torque, 0.05, axis=0)  # every 25th row at 500 Hz
     wanted = np.maximum(sensor_level(scene, random) / rms(change), 2.0 * PERIOD_S)
     j = pick(wanted, 0.04, random)
@@ -82,8 +76,8 @@ def delay(scene: Scene, random: np.random.Generator) -> Drawn | None:
     late = float(wanted[j])
     joints = list(range(scene.arm.n)) if random.random() < 0.25 else [j]
 
-    def apply(truth: Truth) -> None:
-        truth.torque_delay[joints] = late
+    def apply(true: TrueArm) -> None:
+        true.torque_delay[joints] = late
 
     return Drawn("timing.delay", {scene.arm.names[k]: {"delay": late} for k in joints}, apply)
 

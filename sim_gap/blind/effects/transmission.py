@@ -1,4 +1,4 @@
-"""Gears: ripple, a spring across the joint, two masses, play, a motor that turns with two joints."""
+"""Gears: ripple, a spring across the joint, elasticity, backlash, a motor coupled to two joints."""
 
 from dataclasses import replace
 
@@ -6,17 +6,17 @@ import numpy as np
 
 from sim_gap.blind.cases.arms import Arm, Array
 from sim_gap.blind.cases.scene import Scene, rms
-from sim_gap.blind.cases.truth import SharedMotor, Truth
-from sim_gap.blind.effects.drawn import OFTEN, Draw, Drawn, motor_level, pick, reversals, sensor_level, sign
+from sim_gap.blind.cases.true_arm import SharedMotor, TrueArm
+from sim_gap.blind.effects.drawn import OFTEN, Draw, Drawn, motor_level, pick, replaced, reversals, sensor_level, sign
 
 STEP_S = 5e-4
-"""The plant's step: springs must be slower than it."""
+"""Time step of the plant [s]: springs must be slower."""
 ELASTIC_LEAST = 0.25
-"""Least RMS torque that the deflection of an elastic joint must cause [N·m]."""
+"""Least RMS torque caused by the deflection of an elastic joint [N·m]."""
 
 
 def ripple(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """Torque lost to the gear's teeth: amplitude·sin(cycles·θ + phase), slow enough to pass a 6 Hz filter."""
+    """Torque lost to the meshing gear: amplitude·sin(cycles·θ + phase), slow enough to pass a 6 Hz filter."""
     fastest = np.quantile(np.abs(scene.motion[1]), 0.9, axis=0)
     j = int(random.integers(scene.arm.n))
     most = max(8.0, min(30.0, 2 * np.pi * 4.0 / max(float(fastest[j]), 0.1)))
@@ -26,10 +26,10 @@ def ripple(scene: Scene, random: np.random.Generator) -> Drawn | None:
         "phase": float(random.uniform(-np.pi, np.pi)),
     }
 
-    def apply(truth: Truth) -> None:
-        truth.ripple[j] = list(values.values())
+    def apply(true: TrueArm) -> None:
+        true.ripple[j] = list(values.values())
 
-    return Drawn("transmission.ripple", {scene.arm.names[j]: values}, apply)
+    return Drawn.at(scene, j, "transmission.ripple", values, apply)
 
 
 def spring(scene: Scene, random: np.random.Generator) -> Drawn | None:
@@ -40,19 +40,19 @@ def spring(scene: Scene, random: np.random.Generator) -> Drawn | None:
     rest = float(q[:, j].mean() + random.uniform(-0.5, 0.5) * q[:, j].std())
     stiffness = float(wanted[j])
 
-    def apply(truth: Truth) -> None:
-        truth.spring[j] = stiffness, rest
+    def apply(true: TrueArm) -> None:
+        true.spring[j] = stiffness, rest
 
-    return Drawn("transmission.spring", {scene.arm.names[j]: {"stiffness": stiffness, "rest": rest}}, apply)
+    return Drawn.at(scene, j, "transmission.spring", {"stiffness": stiffness, "rest": rest}, apply)
 
 
 def _turn_felt(scene: Scene, error: Array) -> Array:
-    """RMS torque over the worst joint that an angle error (K', n) of each joint causes, (n,)."""
+    """RMS torque at the most affected joint caused by an angle error (K', n) of each joint, (n,)."""
     return np.array([rms(scene.slope[:, :, j] * error[:, j, None]).max() for j in range(scene.arm.n)])
 
 
 def elasticity(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """Rotor and link with a spring between; the position sensor is at the rotor."""
+    """Rotor and link with a spring between them; the position sensor is at the rotor."""
     stiffness_of = rms(scene.torque) / random.uniform(0.015, 0.04)  # from the RMS deflection [rad]
     resonance, stiffest = (2 * np.pi * 4.0) ** 2 * scene.inertia, _stiffest(scene)
     shown = _turn_felt(scene, scene.torque / stiffness_of)
@@ -61,15 +61,12 @@ def elasticity(scene: Scene, random: np.random.Generator) -> Drawn | None:
         return None
     j = int(random.choice(np.flatnonzero(fit)))
     stiffness = float(stiffness_of[j])
-
-    def apply(truth: Truth) -> None:
-        truth.stiffness[j] = stiffness
-
-    return Drawn("transmission.elasticity", {scene.arm.names[j]: {"stiffness": stiffness}}, apply)
+    put = replaced(lambda true: true.stiffness, j, stiffness)
+    return Drawn.at(scene, j, "transmission.elasticity", {"stiffness": stiffness}, put)
 
 
 def backlash(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """Play between rotor and link, on a joint whose torque changes sign often."""
+    """Backlash between rotor and link, on a joint whose torque changes sign often."""
     level = np.maximum(sensor_level(scene, random), 0.2)
     wanted = 2.2 * level / np.maximum(_turn_felt(scene, np.ones_like(scene.torque)), 1e-9)
     often = reversals(scene.torque, 0.1 * rms(scene.torque)) >= OFTEN * scene.seconds
@@ -78,21 +75,21 @@ def backlash(scene: Scene, random: np.random.Generator) -> Drawn | None:
         return None
     play, stiffness = max(float(wanted[j]), 0.01), float(_stiffest(scene)[j])
 
-    def apply(truth: Truth) -> None:
-        truth.backlash[j], truth.stiffness[j] = play, stiffness
+    def apply(true: TrueArm) -> None:
+        true.backlash[j], true.stiffness[j] = play, stiffness
 
-    return Drawn("transmission.backlash", {scene.arm.names[j]: {"width": play}}, apply)
+    return Drawn.at(scene, j, "transmission.backlash", {"width": play}, apply)
 
 
 def _stiffest(scene: Scene) -> Array:
-    """Stiffness of a hard gear that the step still resolves, (n,)."""
+    """Stiffness of a stiff gear that the time step still resolves, (n,)."""
     link = np.maximum(scene.inertia - scene.arm.armature, 2e-3)
     reduced = link * scene.arm.armature / (link + scene.arm.armature)
     return np.asarray(np.minimum(0.04 * reduced / STEP_S**2, 4e4))
 
 
 def coupling(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """The motor of a joint turns with its neighbour too; the nominal model knows nothing of that motor."""
+    """The motor of a joint also turns with its neighbour; the nominal model does not have that motor."""
     n = scene.arm.n
     j = int(random.integers(1, n))
     k = j - 1 if j == n - 1 or random.random() < 0.7 else j + 1
@@ -109,20 +106,20 @@ def coupling(scene: Scene, random: np.random.Generator) -> Drawn | None:
         out.armature[j], out.damping[j], out.frictionloss[j] = 0.0, 0.0, 0.0
         return out
 
-    def apply(truth: Truth) -> None:
-        truth.shared.append(SharedMotor(j, k, coefficient, rotor))
-        truth.coulomb[j] += coulomb
-        truth.viscous[j] += viscous
+    def apply(true: TrueArm) -> None:
+        true.shared.append(SharedMotor(j, k, coefficient, rotor))
+        true.coulomb[j] += coulomb
+        true.viscous[j] += viscous
 
     values = {
         "coefficient": coefficient,
-        "other_joint": float(k - j),
+        "other_joint": float(k + 1),
         "inertia": rotor,
         "coulomb": coulomb,
         "viscous": viscous,
     }
     own = ("friction.coulomb", "friction.viscous", "actuator.rotor_inertia")
-    return Drawn("transmission.coupling", {scene.arm.names[j]: values}, apply, nominal, own)
+    return Drawn.at(scene, j, "transmission.coupling", values, apply, nominal, own)
 
 
 DRAWS: dict[str, Draw] = {

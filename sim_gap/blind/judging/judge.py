@@ -1,4 +1,4 @@
-"""One answer against one label: what was right, what was wrong, how near the parameters came. Pure functions."""
+"""Compares one answer with one label: right and wrong effects and joints, parameter errors. Pure functions."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,18 +7,18 @@ from typing import Any
 import numpy as np
 
 CONFIDENT = 0.8
-"""A cause claimed with more than this counts as blamed."""
+"""Confidence above which a cause counts as blamed."""
 MAIN_SHARE = 0.15
-"""A joint counts to a cause where its parameter is at least this share of the cause's largest."""
+"""Least parameter of a joint that counts to a cause, as a share of the cause's largest."""
 BESIDE_POINT = ("phase", "rest", "source", "other_joint")
-"""Parameters that are indices, or matter only together with another."""
+"""Parameters that are indices or depend on another one."""
 
 Json = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class ParameterError:
-    """One estimated parameter: its relative error, and whether the 95 % interval holds the truth (None if none)."""
+    """One estimated parameter: relative error, and whether the 95 % interval contains the true value (None without)."""
 
     effect: str
     name: str
@@ -34,31 +34,31 @@ class Judgement:
     kind: str
     truth: tuple[str, ...]
     withheld: str
-    """The effect taken out of the library, or nothing."""
+    """The effect removed from the library, or empty."""
     verdict: str
     first: str
-    """First effect named, steps beneath a true effect passed over; empty where none is named."""
+    """First effect named, effects implied by a true one skipped; empty if none is named."""
     confidence: float
     first_right: bool
     named: bool
-    """Whether a true effect stands first or among those it is confounded with."""
+    """Whether a true effect is the first or among those confounded with it."""
     tellable: bool
     found: tuple[str, ...]
-    """True effects among the causes, whatever their place."""
+    """True effects among the causes, at any position."""
     blamed: tuple[str, ...]
-    """Causes claimed with confidence that are not in this arm (small true imperfections listed last are forgiven)."""
+    """Confident causes that this arm does not have (small true imperfections listed last are excused)."""
     joints_right: int = 0
     joints_wrong: int = 0
     joints_missed: int = 0
     errors: tuple[ParameterError, ...] = ()
     shrink: float = float("nan")
-    """Held-out shrink claimed on the joint concerned."""
+    """Claimed relative decrease of the held-out gap at the joint concerned."""
     shrink_true: float = float("nan")
-    """Held-out shrink of adding the true effects."""
+    """Relative decrease of the held-out gap by the true effects."""
 
 
 def judge(answer: Json, label: Json, withheld: str = "") -> Judgement:
-    """Judge an answer (contract 5) against its label; `withheld` names the effect that was not in the library."""
+    """Judge an answer (docs/formats.md) against its label; `withheld` is the effect that was not in the library."""
     truths = [t for t in label["effects"] if t["effect"] != withheld]
     names = {t["effect"] for t in truths}
     implied = {name for t in label["effects"] for name in t["implied"]}
@@ -93,8 +93,8 @@ def judge(answer: Json, label: Json, withheld: str = "") -> Judgement:
 def _blamed(causes: Sequence[Json], label: Json, withheld: str) -> tuple[str, ...]:
     """Confident causes that are not true.
 
-    Forgiven: what a true effect implies, a rival of an effect that this motion cannot tell, and what comes after every
-    true effect and lowers the gap by no more than the small errors of this very arm make on the same joints.
+    Excused: effects implied by a true one, rivals of an effect that this motion cannot separate, and causes that follow
+    every true effect and lower the gap by no more than this arm's small errors do at the same joints.
     """
     present = [t for t in label["effects"] if t["effect"] != withheld]
     fine = {name for t in label["effects"] for name in t["implied"]} | {t["effect"] for t in present}
@@ -113,8 +113,8 @@ def _blamed(causes: Sequence[Json], label: Json, withheld: str) -> tuple[str, ..
 
 
 def _joints(causes: Sequence[Json], truths: Sequence[Json]) -> tuple[int, int, int]:
-    """Joints right, wrong and missed, over the true effects that sit on joints: of the cause that names the effect,
-    or names it as what it is confounded with; where none does, all are missed."""
+    """Joints right, wrong and missed, over the true effects of joints: of the cause that names the effect or is
+    confounded with it; without one, all are missed."""
     right = wrong = missed = 0
     for truth in truths:
         if not truth["joints"]:
@@ -128,7 +128,7 @@ def _joints(causes: Sequence[Json], truths: Sequence[Json]) -> tuple[int, int, i
 
 
 def _main_joints(cause: Json) -> list[str]:
-    """Joints of a cause whose first parameter (a gain's distance from 1) is not small beside the largest."""
+    """Joints of a cause whose largest parameter (a gain's distance from 1) is not small against the others'."""
     sizes = {}
     for joint in cause["joints"]:
         values = cause["parameters"].get(joint) or {}
@@ -146,10 +146,10 @@ def _deviation(name: str, value: float) -> float:
 
 def _parameter_errors(causes: Sequence[Json], truth: Json) -> list[ParameterError]:
     """Relative errors of a true effect's parameters: vectors by their norm, an inertia about the joint's axis."""
-    told = next((c for c in causes if c["effect"] == truth["effect"]), None)
+    claimed = next((c for c in causes if c["effect"] == truth["effect"]), None)
     out: list[ParameterError] = []
     for joint, true in truth["parameters"].items():
-        given = (told["parameters"].get(joint) if told else None) or {}
+        given = (claimed["parameters"].get(joint) if claimed else None) or {}
         values = {name: p["value"] for name, p in given.items() if name in true and p["value"] is not None}
         if not values:
             continue
@@ -182,7 +182,7 @@ def _vector_error(truth: Json, true: Json, values: Json) -> list[ParameterError]
 
 
 def _shrinks(answer: Json, label: Json) -> tuple[float, float]:
-    """Held-out shrink on the joint that the first true effect touches most: all causes together, and by the truth."""
+    """Relative decrease of the held-out gap at the joint that the first true effect affects most: claimed and true."""
     falls = label["gap"]["falls"]
     if not falls:
         return float("nan"), float("nan")

@@ -1,4 +1,4 @@
-"""The score of a blind check (contract 6), from judged answers: shares, tables, confusion matrix. Pure functions."""
+"""The score of a blind check (docs/formats.md) from judged answers: shares, confusion matrix. Pure functions."""
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from sim_gap.blind.judging.judge import Judgement, judge
 SCHEMA = "armlink.blind/1"
 BINS = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 1.0)
 WITHHELD = "--without--"
-"""Between a case's name and the effect taken out of the library, in an answer's name."""
+"""Separator of case and effect removed from the library, in an answer's name."""
 
 
 def score(answers: Mapping[str, Mapping[str, Any]], labels: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -21,18 +21,18 @@ def score(answers: Mapping[str, Mapping[str, Any]], labels: Mapping[str, Mapping
     for name, answer in answers.items():
         case, _, withheld = name.partition(WITHHELD)
         if not labels[case].get("clear", True):
-            continue  # no arm was found that shows its effects and stays under control
+            continue  # no arm shows its effects and stays under control
         judged.append(judge(answer, labels[case], withheld))
-    told = [j for j in judged if not j.withheld]
-    blind = [j for j in judged if j.withheld]
-    parts = {"label_withheld": label_withheld(told), "effect_withheld": effect_withheld(blind)}
+    whole = [j for j in judged if not j.withheld]
+    without = [j for j in judged if j.withheld]
+    parts = {"label_withheld": label_withheld(whole), "effect_withheld": effect_withheld(without)}
     return {
         "schema": SCHEMA,
         **parts,
         "meets": meets(parts),
-        "confusion": confusion(told),
-        "by_effect": by_effect(told),
-        "calibration": calibration(told),
+        "confusion": confusion(whole),
+        "by_effect": by_effect(whole),
+        "calibration": calibration(whole),
         "cases": [row(j) for j in judged],
     }
 
@@ -43,7 +43,7 @@ def answer_name(case: str, withheld: str = "") -> str:
 
 
 def label_withheld(judged: Sequence[Judgement]) -> dict[str, Any]:
-    """Shares over the cases whose label was hidden: of those with an effect, of those without, of those with two."""
+    """Shares over the cases with hidden labels: with one effect, with none, with two."""
     some = [j for j in judged if j.kind != "none"]
     single, two, none = ([j for j in judged if j.kind == kind] for kind in ("single", "two", "none"))
     errors = np.array([e.relative for j in some for e in j.errors])
@@ -76,7 +76,7 @@ def label_withheld(judged: Sequence[Judgement]) -> dict[str, Any]:
 
 
 def effect_withheld(judged: Sequence[Judgement]) -> dict[str, Any]:
-    """Shares over the cases whose effect was not in the library: wrong ones blamed with confidence, and verdicts."""
+    """Shares over the cases whose effect was removed from the library: false blames and verdicts."""
     return {
         "cases": len(judged),
         "false_blame": _share([bool(j.blamed) for j in judged]),
@@ -87,7 +87,7 @@ def effect_withheld(judged: Sequence[Judgement]) -> dict[str, Any]:
 
 
 def confusion(judged: Sequence[Judgement]) -> dict[str, dict[str, int]]:
-    """Of single-effect and no-effect cases: true effect (or `none`) by the effect named first (or the verdict)."""
+    """Counts of single-effect and no-effect cases: true effect (or `none`) by effect named first (or verdict)."""
     table: dict[str, Counter[str]] = defaultdict(Counter)
     for j in judged:
         if j.kind != "two":
@@ -96,7 +96,7 @@ def confusion(judged: Sequence[Judgement]) -> dict[str, dict[str, int]]:
 
 
 def by_effect(judged: Sequence[Judgement]) -> dict[str, dict[str, Any]]:
-    """Of single-effect cases: how many, right first, named, and the median parameter error, per effect."""
+    """Single-effect cases per effect: number, right first, named, and the median parameter error."""
     groups: dict[str, list[Judgement]] = defaultdict(list)
     for j in judged:
         if j.kind == "single":
@@ -114,11 +114,11 @@ def by_effect(judged: Sequence[Judgement]) -> dict[str, dict[str, Any]]:
 
 
 def calibration(judged: Sequence[Judgement]) -> list[dict[str, Any]]:
-    """First causes by their confidence: how many, their mean confidence, and the share that was right."""
-    told = [j for j in judged if j.first]
+    """First causes by confidence: number, mean confidence, and the share that was right."""
+    named = [j for j in judged if j.first]
     out = []
     for low, high in pairwise(BINS):
-        here = [j for j in told if low <= j.confidence < high or (high == 1.0 and j.confidence == 1.0)]
+        here = [j for j in named if low <= j.confidence < high or (high == 1.0 and j.confidence == 1.0)]
         if here:
             out.append(
                 {
@@ -133,7 +133,7 @@ def calibration(judged: Sequence[Judgement]) -> list[dict[str, Any]]:
 
 
 def row(j: Judgement) -> dict[str, Any]:
-    """One case for the table of all."""
+    """One case as a row of the table of all cases."""
     return {
         "case": j.case,
         "kind": j.kind,
@@ -153,19 +153,19 @@ def row(j: Judgement) -> dict[str, Any]:
 
 
 def meets(result: Mapping[str, Any]) -> dict[str, bool]:
-    """Which of the project's bounds (at least 150 cases) the score meets; a share over no case meets nothing."""
-    told, blind = result["label_withheld"], result["effect_withheld"]
+    """Whether the score meets each of the project's bounds (for at least 150 cases); a share over no case does not."""
+    known, blind = result["label_withheld"], result["effect_withheld"]
     least = {
-        "first_right_where_tellable": (told["first_right_where_tellable"], 0.93),
-        "first_or_confounded": (told["first_or_confounded"], 0.98),
-        "joints_f1": (told["joints"]["f1"], 0.95),
-        "two_both_found": (told["two"]["both_found"], 0.85),
-        "shrink_median_ratio": (told["shrink"]["median_ratio"], 0.95),
+        "first_right_where_tellable": (known["first_right_where_tellable"], 0.93),
+        "first_or_confounded": (known["first_or_confounded"], 0.98),
+        "joints_f1": (known["joints"]["f1"], 0.95),
+        "two_both_found": (known["two"]["both_found"], 0.85),
+        "shrink_median_ratio": (known["shrink"]["median_ratio"], 0.95),
     }
     most = {
-        "extra_confident": (told["extra_confident"], 0.03),
-        "no_effect_false_alarms": (told["no_effect"]["false_alarms"], 0.02),
-        "parameters_median_error": (told["parameters"]["median_error"], 0.03),
+        "extra_confident": (known["extra_confident"], 0.03),
+        "no_effect_false_alarms": (known["no_effect"]["false_alarms"], 0.02),
+        "parameters_median_error": (known["parameters"]["median_error"], 0.03),
         "false_blame": (blind["false_blame"], 0.10),
     }
     met = {name: value is not None and value >= bound for name, (value, bound) in least.items()}

@@ -1,4 +1,4 @@
-"""The score of a blind check as tables for people."""
+"""The score of a blind check as tables in the terminal."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -7,16 +7,16 @@ from rich.console import Console
 from rich.table import Table
 
 ROWS = (
-    ("right effect first, where the recording can tell", "label_withheld", "first_right_where_tellable"),
+    ("right effect first, if the recording can separate it", "label_withheld", "first_right_where_tellable"),
     ("right effect first", "label_withheld", "first_right"),
-    ("first, or named as confounded", "label_withheld", "first_or_confounded"),
+    ("right effect first or named as confounded", "label_withheld", "first_or_confounded"),
     ("an extra cause claimed with confidence", "label_withheld", "extra_confident"),
     ("joints: F1", "label_withheld", "joints", "f1"),
     ("no effect: false alarms", "label_withheld", "no_effect", "false_alarms"),
     ("two effects: both found", "label_withheld", "two", "both_found"),
     ("parameters: median error", "label_withheld", "parameters", "median_error"),
     ("parameters: within 10 %", "label_withheld", "parameters", "within_10_percent"),
-    ("shrink against the true effect's: median", "label_withheld", "shrink", "median_ratio"),
+    ("decrease of the gap relative to the true effect's: median", "label_withheld", "shrink", "median_ratio"),
     ("effect withheld: a wrong one blamed", "effect_withheld", "false_blame"),
 )
 

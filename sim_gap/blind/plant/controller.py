@@ -1,20 +1,17 @@
-"""The position controller of every joint: PID with feed-forward, on readings that are quantised and noisy."""
+"""The joints' position controllers: PID with feed-forward, on quantised and noisy readings."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sim_gap.blind.cases.arms import Array
 from sim_gap.blind.cases.motion import RATE
 from sim_gap.blind.plant.friction import padded
-
-if TYPE_CHECKING:
-    from sim_gap.blind.plant.plant import Run
+from sim_gap.blind.plant.runs import Run
 
 BLOCK = 256
 VELOCITY_HZ = 40.0
-"""Low pass of the controller's velocity."""
+"""Low pass of the controller's velocity [Hz]."""
 DAMPING_RATIO = 0.9
 INTEGRAL_S = 1.5
 
@@ -22,8 +19,8 @@ INTEGRAL_S = 1.5
 class Controller:
     """Torque commands for many arms at `motion.RATE`, (k, width)."""
 
-    def __init__(self, runs: Sequence["Run"], reading: Array, width: int) -> None:
-        """`reading` (B, width) at the start [rad]."""
+    def __init__(self, runs: Sequence[Run], reading: Array, width: int) -> None:
+        """`reading` (B, width): initial readings [rad]."""
         self.runs = runs
         inertia = padded([run.inertia for run in runs], width)
         omega = padded([run.truth.bandwidth for run in runs], width)
@@ -37,7 +34,7 @@ class Controller:
         self.position, self.speed, self.feed, self.noise = (np.zeros((BLOCK, len(runs), width)) for _ in range(4))
 
     def command(self, tick: int, reading: Array) -> Array:
-        """Torques [N·m] from the exact readings of the first k arms."""
+        """Torques [N·m] of the first k arms from their exact readings."""
         k, row = len(reading), tick % BLOCK
         if row == 0:
             self._load(tick, k)
@@ -52,7 +49,7 @@ class Controller:
         return np.asarray(torque + self.integral[:k] * self.error_sum[:k])
 
     def _load(self, tick: int, k: int) -> None:
-        """The next block of every trajectory, and of the sensors' noise (0.4 counts)."""
+        """Load the next block of every trajectory and of the sensors' noise (0.4 counts)."""
         for b, run in enumerate(self.runs[:k]):
             n, rows = run.truth.n, min(BLOCK, len(run.command) - tick)
             part = run.command[max(tick - 1, 0) : tick + rows]

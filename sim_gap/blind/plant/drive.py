@@ -1,4 +1,4 @@
-"""Motors, friction, gears and position sensors of many arms: from commanded torque to what moves the links."""
+"""Motors, friction, gears and position sensors of many arms: from commanded torque to the forces on the links."""
 
 from collections.abc import Sequence
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_gap.blind.cases.arms import Array
-from sim_gap.blind.cases.truth import Truth
+from sim_gap.blind.cases.true_arm import TrueArm
 from sim_gap.blind.plant.friction import Bristles, padded
 
 SPRING_DAMPING = 0.04
@@ -14,12 +14,12 @@ SPRING_DAMPING = 0.04
 
 
 class Drives:
-    """State of all drives, (B, width); every method works on the first k arms, k the length of what it is given."""
+    """State of all drives, (B, width); methods act on the first k arms, k being the length of their arguments."""
 
     def __init__(
-        self, truths: Sequence[Truth], inertia: Array, angle: Array, torque: Sequence[Array], step: float
+        self, truths: Sequence[TrueArm], inertia: Array, angle: Array, torque: Sequence[Array], step: float
     ) -> None:
-        """`inertia` (B, width) that each motor moves at least [kg·m²], `angle` and `torque` at rest, `step` [s]."""
+        """`inertia` (B, width): least inertia that each motor moves [kg·m²]; `angle`, `torque` at rest; `step` [s]."""
         width = angle.shape[1]
         self.step, self.count = step, 0
         self.current = padded(torque, width)
@@ -41,7 +41,7 @@ class Drives:
         self._sense(truths, width)
         self._two_masses(truths, angle)
 
-    def _sense(self, truths: Sequence[Truth], width: int) -> None:
+    def _sense(self, truths: Sequence[TrueArm], width: int) -> None:
         self.position_gain = padded([t.position_gain for t in truths], width, 1.0)
         self.position_offset = padded([t.position_offset for t in truths], width)
         self.bent = _Cells(padded([t.eccentricity[:, 0] for t in truths], width) != 0.0)
@@ -49,7 +49,7 @@ class Drives:
             padded([t.eccentricity[:, c] for t in truths], width)[self.bent.all] for c in range(2)
         )
 
-    def _two_masses(self, truths: Sequence[Truth], angle: Array) -> None:
+    def _two_masses(self, truths: Sequence[TrueArm], angle: Array) -> None:
         self.soft = _Cells(np.isfinite(padded([t.stiffness for t in truths], angle.shape[1], np.inf)))
         rows = list(zip(*(cells.tolist() for cells in self.soft.all), strict=True))
         self.stiffness = np.array([truths[b].stiffness[j] for b, j in rows])
@@ -61,7 +61,7 @@ class Drives:
         self.motor_half, self.motor_speed, self.motor_push = (np.zeros(len(rows)) for _ in range(3))
 
     def reading(self, angle: Array) -> Array:
-        """Exact reading φ of the position sensors, which sit at the motor.
+        """Exact reading φ of the position sensors, which are at the motor.
 
         θ = gain·φ + offset + amplitude·sin(φ + phase).
         """
@@ -80,7 +80,7 @@ class Drives:
         return np.asarray(reading)
 
     def forces(self, angle: Array, velocity: Array, command: Array) -> Array:
-        """Generalized forces on the links [N·m] now; `command` is what the controller asks for [N·m]."""
+        """Generalized forces on the links [N·m] for the controller's torque `command` [N·m]."""
         k = len(angle)
         self._follow(command)
         speed, turned = velocity, angle
@@ -105,7 +105,7 @@ class Drives:
         return np.asarray(passed - self.spring[:k] * (angle - self.rest[:k]))
 
     def move(self, k: int) -> None:
-        """Leapfrog of the motors behind springs, one step."""
+        """One leapfrog step of the motors behind springs."""
         self.count += 1
         _, few = self.soft.within(k)
         if few:
@@ -115,7 +115,7 @@ class Drives:
             self.motor_speed[:few] = self.motor_half[:few] + 0.5 * self.step * push
 
     def link_torque(self, acceleration: Array) -> Array:
-        """Torque at the link side of each transmission [N·m]: what was passed on less what the rotors took."""
+        """Torque at the link side of each transmission [N·m]: transmitted torque less that of the rotors."""
         k = len(acceleration)
         torque = self.passed[:k] - self.armature[:k] * acceleration
         for b, s in self.shared:
@@ -139,7 +139,7 @@ class Drives:
         np.clip(current, -self.limit[:k], self.limit[:k], out=current)
 
     def _gear(self, few: int, angle: Array, velocity: Array) -> Array:
-        """Torque through springs with play: none within the play, never pulling against the contact."""
+        """Torque through springs with backlash: zero within the play, never pulling on the contact."""
         twist = self.motor_angle[:few] - angle
         stretch = twist - np.clip(twist, -self.half_play[:few], self.half_play[:few])
         torque = self.stiffness[:few] * stretch + self.spring_damping[:few] * (self.motor_speed[:few] - velocity)
@@ -148,7 +148,7 @@ class Drives:
 
 
 class _Cells:
-    """Cells (arm, joint) of a mask in row order; `within(k)` gives those of the first k arms, and how many they are."""
+    """Cells (arm, joint) of a mask in row order; `within(k)` gives those of the first k arms and their number."""
 
     def __init__(self, mask: NDArray[np.bool_]) -> None:
         self.rows, self.columns = np.nonzero(mask)

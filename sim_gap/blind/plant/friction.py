@@ -1,7 +1,7 @@
-"""Elasto-plastic bristles (Dupont, Hayward, Armstrong, Altpeter 2002): LuGre friction that does not creep at rest.
+"""Elasto-plastic friction (Dupont, Hayward, Armstrong, Altpeter 2002): LuGre friction without drift at rest.
 
-f = σ₀ z + σ₁ ż + d v,  ż = v (1 − α(z, v) z/z_ss),  z_ss = g(v, τ)/σ₀ in the direction of v; α is 0 while the
-bristle bends elastically (|z| below 0.7 z_ss, or v and z apart), rises smoothly and is 1 where it slides.
+f = σ₀ z + σ₁ ż + d v,  ż = v (1 − α(z, v) z/z_ss),  z_ss = g(v, τ)/σ₀ in the direction of v; α is 0 in the elastic
+range (|z| below 0.7 z_ss, or v and z of opposite sign), rises smoothly and is 1 in sliding.
 g = (coulomb + breakaway·exp(−(v/v_s)²) + load·|τ|)·(1 ± asymmetry).
 """
 
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sim_gap.blind.cases.arms import Array
-from sim_gap.blind.cases.truth import Truth
+from sim_gap.blind.cases.true_arm import TrueArm
 
 ELASTIC_SHARE = 0.7
 STIFFEST = 0.05
@@ -20,7 +20,7 @@ STIFFEST = 0.05
 class Bristles:
     """Friction of many arms at once, (B, width); columns beyond an arm's joints are frictionless."""
 
-    def __init__(self, truths: Sequence[Truth], inertia: Array, step: float) -> None:
+    def __init__(self, truths: Sequence[TrueArm], inertia: Array, step: float) -> None:
         """`inertia` (B, width): least inertia that each motor moves [kg·m²]; `step` [s]."""
         width = inertia.shape[1]
         self.coulomb, self.viscous, self.breakaway, self.load = (
@@ -55,7 +55,7 @@ class Bristles:
 
 
 def padded(rows: Sequence[Array], width: int, fill: float = 0.0) -> Array:
-    """Rows of differing length as one array (B, width)."""
+    """Rows of different lengths as one array (B, width)."""
     out = np.full((len(rows), width), fill)
     for row, values in zip(out, rows, strict=True):
         row[: len(values)] = values

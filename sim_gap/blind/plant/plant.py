@@ -1,58 +1,31 @@
-"""Many arms moved at once: rigid links by MuJoCo's forward dynamics, all else by its own leapfrog at 0.5 ms.
+"""Simulates many arms at once: rigid links by MuJoCo's forward dynamics, the rest by leapfrog integration at 0.5 ms.
 
-Links get velocities at half steps from accelerations at full steps. Motors, bristles, gear play and the position
+Links get velocities at half steps from accelerations at full steps. Motors, bristles, backlash and the position
 controller (PID with feed-forward of the nominal model, 500 Hz, on a quantised and noisy reading) are arrays over all
-arms. An arm is simulated alike whoever its neighbours are.
+arms. The simulation of an arm does not depend on the others of its batch.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from sim_gap.blind.cases.arms import Array, mjcf
 from sim_gap.blind.cases.motion import RATE
-from sim_gap.blind.cases.truth import Truth
+from sim_gap.blind.cases.true_arm import TrueArm
 from sim_gap.blind.plant.controller import Controller
 from sim_gap.blind.plant.drive import Drives
 from sim_gap.blind.plant.rigid_body import quiet
+from sim_gap.blind.plant.runs import Log, Run
 
 SUBSTEPS = 4
 STEP = 1.0 / (RATE * SUBSTEPS)
 CHANNELS = ("position", "torque", "motor", "command", "angle")
 
 
-@dataclass(frozen=True)
-class Run:
-    """One arm asked to follow one trajectory."""
-
-    truth: Truth
-    command: Array
-    """Positions at `motion.RATE`, (K, n) [rad]."""
-    feed_forward: Array
-    """Nominal torque along the trajectory, (K, n) [N·m]."""
-    inertia: Array
-    """Of each joint, for the controller's gains (n,) [kg·m²]."""
-    seed: int
-
-
-@dataclass(frozen=True)
-class Log:
-    """What happened at `motion.RATE`, (K, n) each, before sensors: position is what the encoder's side turns by."""
-
-    position: Array
-    torque: Array
-    """Link side of the transmission [N·m]."""
-    motor: Array
-    """What the drive believes that it makes [N·m]."""
-    command: Array
-    angle: Array
-    """Of the links [rad]."""
-
-
 def simulate(runs: Sequence[Run]) -> list[Log]:
-    """Simulate all runs side by side and return their logs in order."""
+    """Simulate all runs together and return their logs in order."""
     order = sorted(range(len(runs)), key=lambda i: -len(runs[i].command))
     logs = _Batch([runs[i] for i in order]).run()
     out: list[Log] = [logs[0]] * len(runs)
@@ -62,7 +35,7 @@ def simulate(runs: Sequence[Run]) -> list[Log]:
 
 
 class _Batch:
-    """Arms sorted by length of their run, longest first, so that those still moving are always the first k."""
+    """Arms sorted by the length of their runs, longest first, so that those still moving are always the first k."""
 
     def __init__(self, runs: list[Run]) -> None:
         import mujoco
@@ -85,7 +58,7 @@ class _Batch:
         self.kept = {name: np.zeros((self.lengths[0], *shape)) for name in CHANNELS}
 
     def run(self) -> list[Log]:
-        """Move until the longest run is over."""
+        """Simulate until the longest run is over."""
         k = len(self.runs)
         for tick in range(self.lengths[0]):
             while self.lengths[k - 1] <= tick:
@@ -125,7 +98,7 @@ class _Batch:
             self.kept[name][tick, :k] = now[:k]
 
     def _least_inertia(self) -> Array:
-        """A lower bound of the inertia that each motor moves, (B, width)."""
+        """A lower bound of the inertia that each motor moves [kg·m²], (B, width)."""
         out = np.ones(self.angle.shape)
         for b, run in enumerate(self.runs):
             out[b, : run.truth.n] = np.maximum(run.truth.arm.armature, 0.01)
@@ -141,8 +114,8 @@ def _start(run: Run) -> Array:
     return np.asarray(truth.position_gain * reading + truth.position_offset + bent - stretch)
 
 
-def true_model(truth: Truth) -> Any:
-    """The arm's rigid mechanics as MuJoCo has them: true links, and the rotors that turn rigidly with them."""
+def true_model(truth: TrueArm) -> Any:
+    """The arm's rigid mechanics in MuJoCo: true links and the rotors that turn rigidly with them."""
     import mujoco
 
     rigid = replace(truth.arm, armature=np.where(truth.elastic, 0.0, truth.arm.armature))

@@ -15,7 +15,7 @@ def compiled(arm: Arm) -> Any:
 
 
 def quiet(model: Any) -> Any:
-    """Switch everything off in a model that is not the mechanics of its links and rotors."""
+    """Disable everything in a model except the mechanics of its links and rotors."""
     import mujoco
 
     off = mujoco.mjtDisableBit
@@ -31,7 +31,7 @@ def quiet(model: Any) -> Any:
 
 
 def inverse(model: Any, q: Array, v: Array, a: Array) -> Array:
-    """Torques M(q) a + C(q, v) v + ∂V/∂q [N·m] along a trajectory, (K, n) each; rotors count as the model has them."""
+    """Torques M(q) a + C(q, v) v + ∂V/∂q [N·m] along a trajectory, (K, n) each; rotors as in the model."""
     import mujoco
 
     data, out = mujoco.MjData(model), np.empty(q.shape)
@@ -44,12 +44,12 @@ def inverse(model: Any, q: Array, v: Array, a: Array) -> Array:
 
 
 def controlled_inertia(model: Any, q: Array) -> Array:
-    """Inertia of each joint for a controller's gains [kg·m²], (n,): the largest that it sees over the poses `q` (K, n),
-    but no more than twice the least that it feels while the other joints give way (1/(M⁻¹)_jj), for stability.
+    """Inertia of each joint for a controller's gains [kg·m²], (n,): the largest over the poses `q` (K, n), but at most
+    twice the least with the other joints free (1/(M⁻¹)_jj), for stability.
     """
     still, n = np.zeros_like(q), q.shape[1]
     weight = inverse(model, q, still, still)
     columns = [inverse(model, q, still, np.broadcast_to(push, q.shape)) - weight for push in np.eye(n)]
     mass = np.stack(columns, axis=2)
-    given_way = 1.0 / np.diagonal(np.linalg.inv(mass), axis1=1, axis2=2)
-    return np.asarray(np.minimum(np.diagonal(mass, axis1=1, axis2=2).max(0), 2.0 * given_way.min(0)))
+    free = 1.0 / np.diagonal(np.linalg.inv(mass), axis1=1, axis2=2)
+    return np.asarray(np.minimum(np.diagonal(mass, axis1=1, axis2=2).max(0), 2.0 * free.min(0)))

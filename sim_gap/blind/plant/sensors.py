@@ -1,4 +1,4 @@
-"""From what happened to what was recorded: torque sensors, resolution, noise, and rows at uneven times."""
+"""From the log of a run to its recording: torque sensors, resolution, noise, and rows at uneven times."""
 
 from collections.abc import Iterator
 
@@ -6,20 +6,20 @@ import numpy as np
 
 from sim_gap.blind.cases.arms import Array
 from sim_gap.blind.cases.motion import RATE
-from sim_gap.blind.cases.truth import Truth
-from sim_gap.blind.plant.plant import Log
+from sim_gap.blind.cases.true_arm import TrueArm
+from sim_gap.blind.plant.runs import Log
 
 JITTER_S = 4e-4
 LATE_SHARE = 0.003
-"""Share of rows that come a good part of a period late."""
+"""Share of rows that are late by a good part of a period."""
 LOST_SHARE = 0.001
 HALVES, SHARES = (0.4, 1.0, 1.8), (0.35, 0.4, 0.25)
-"""Half widths of the plays of a hysteresis, as shares of its width, and their weights before these are made to fit."""
+"""Half widths of the plays of a hysteresis, as shares of its width, and their weights before normalisation."""
 SENSOR_BITS = 16
 
 
 def record(
-    truth: Truth, log: Log, rate: float, velocity: bool, command: Array, random: np.random.Generator
+    truth: TrueArm, log: Log, rate: float, velocity: bool, command: Array, random: np.random.Generator
 ) -> dict[str, Array]:
     """Columns of a recording at about `rate` Hz: `t` (K,); q, tau, tau_motor, tau_cmd, q_cmd; dq if `velocity`."""
     clock = np.arange(len(log.position)) / RATE
@@ -61,7 +61,7 @@ def _at(t: Array, clock: Array, values: Array) -> Array:
 
 
 def _drive_velocity(position: Array, step: float, random: np.random.Generator) -> Array:
-    """What a drive reports: differences of its own reading through a first-order low pass (25 Hz), so a little late."""
+    """Velocity that a drive reports: differences of its own reading through a first-order low pass (25 Hz)."""
     from scipy.signal import lfilter
 
     seen = np.rint(position / step + 0.4 * random.standard_normal(position.shape)) * step
@@ -70,8 +70,8 @@ def _drive_velocity(position: Array, step: float, random: np.random.Generator) -
     return np.asarray(lfilter([1.0 - keep], [1.0, -keep], raw, axis=0))
 
 
-def _sensor(truth: Truth, torque: Array, clock: Array) -> Array:
-    """Readings without noise: late, crosstalk, then hysteresis, dead band, saturation, then gain, offset, drift."""
+def _sensor(truth: TrueArm, torque: Array, clock: Array) -> Array:
+    """Readings without noise: delay, crosstalk, then hysteresis, dead band, saturation, then gain, offset, drift."""
     late = np.column_stack(
         [np.interp(clock - d, clock, column) for d, column in zip(truth.torque_delay, torque.T, strict=True)]
     )
@@ -84,9 +84,9 @@ def _sensor(truth: Truth, torque: Array, clock: Array) -> Array:
 
 
 def _stays_behind(torque: Array, width: float) -> Array:
-    """Hysteresis of Prandtl and Ishlinskii: plays of several half widths side by side, which add up to `width`.
+    """Prandtl-Ishlinskii hysteresis: plays of several half widths in parallel, which add up to `width`.
 
-    It comes gradually, as in real gauges, and small vibration does not wear it off, as it would a Bouc-Wen model.
+    It builds up gradually, as in real strain gauges, and small vibration does not erase it, unlike a Bouc-Wen model.
     """
     shares = np.array(SHARES) / np.dot(SHARES, HALVES)
     read = torque * (1.0 - shares.sum())

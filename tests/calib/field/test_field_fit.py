@@ -1,6 +1,7 @@
 """Calibration in the field without a mass: intervals that hold, and no number where nothing can be separated."""
 
 import json
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -14,11 +15,12 @@ from armlink.errors import BadInput, Refused
 from armlink.recording.recording import Recording, save_recording
 from calib.arm.kinematics import gcomp_arm
 from calib.field.field_fit import fit_field
-from calib.field.rows import FieldRows, rows_of_recording
+from calib.field.rows import rows_of_recording
 from calib.records.records import CalibrationRecord, GravityRecord, JointCalibration, matrix, provenance
 from calib.records.store import RecordStore
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.gravity.torque import gravity_torque
+from gcomp.identify.readings import StaticReadings
 
 ARM = load_arm("sarcos")
 DESCRIBED = gcomp_arm(ARM)
@@ -63,13 +65,13 @@ def rows(
     beta: np.ndarray | None = None,
     zero: np.ndarray | float = 0.0,
     hysteresis: float = 0.0,
-) -> FieldRows:
+) -> StaticReadings:
     """Rests at random poses within the stops; `pose` (count, n) where they are given."""
     q = random.uniform(DESCRIBED.lower, DESCRIBED.upper, (count, N)) if pose is None else pose
     side = random.choice([-1.0, 1.0], q.shape)
     torque = gravity_torque(DESCRIBED, np.array(BETA) if beta is None else beta, q + zero)
     reading = gain * torque + offset + hysteresis * side + random.normal(0, SIGMA, q.shape)
-    return FieldRows(q, reading, np.full(q.shape, SIGMA), side, np.zeros(len(q), dtype=np.int64))
+    return StaticReadings(q, reading, np.full(q.shape, SIGMA), direction=side)
 
 
 def test_its_intervals_hold_the_truth_by_monte_carlo() -> None:
@@ -128,7 +130,7 @@ def test_an_axis_along_gravity_has_an_offset_and_no_gain() -> None:
     q = random.uniform(described.lower, described.upper, (60, N))
     side = random.choice([-1.0, 1.0], q.shape)
     reading = 1.04 * gravity_torque(described, np.array(BETA), q) + 0.3 + random.normal(0, SIGMA, q.shape)
-    drawn = FieldRows(q, reading, np.full(q.shape, SIGMA), side, np.zeros(60, dtype=np.int64))
+    drawn = StaticReadings(q, reading, np.full(q.shape, SIGMA), direction=side)
     fit = fit_field(upright, drawn, gravity(np.array(BETA), arm=upright), calibration(upright))
     assert np.isnan(fit.gain[0])
     assert "axis is vertical" in fit.reasons["joint_1", "gain"]
@@ -138,7 +140,9 @@ def test_an_axis_along_gravity_has_an_offset_and_no_gain() -> None:
 
 def test_a_joint_approached_from_one_side_has_no_offset() -> None:
     drawn = rows(np.random.default_rng(4), np.ones(N), np.zeros(N))
-    drawn.direction[:, 2] = 1.0
+    direction = drawn.direction.copy()
+    direction[:, 2] = 1.0
+    drawn = replace(drawn, direction=direction)
     fit = fit_field(ARM, drawn, gravity(np.array(BETA)), calibration())
     assert np.isnan(fit.offset[2])
     assert "one side only" in fit.reasons["joint_3", "offset"]

@@ -12,11 +12,12 @@ from armlink.arm_file import ArmFile, load_arm
 from calib.arm.kinematics import gcomp_arm
 from calib.fit.examination import _without_plateaus
 from calib.fit.gravity_fit import identify_gravity
-from calib.fit.rows import fit_rows
 from calib.fit.sensor_fit import SensorFit, fit_sensors
+from calib.fit.sweep_readings import sweep_readings
 from calib.motion.encoder_bits import missing_bit, stuck_bits
+from calib.motion.static_reading import StaticReading
 from calib.plan.sweep_plan import plan_sweep
-from calib.sweep.dataset import Reading, SweepData
+from calib.sweep.dataset import SweepData
 from calib.sweep.scout import rough_model
 from gcomp.gravity.torque import gravity_torque
 from sim_bus.simulated_arm import SimulatedArm
@@ -45,15 +46,15 @@ def sound() -> tuple[ArmFile, Truth, list[SweepData]]:
     return arm, truth, swept(arm, truth, 51)
 
 
-def bent(data: list[SweepData], change: Callable[[Reading, np.ndarray, np.ndarray], None]) -> list[SweepData]:
+def bent(data: list[SweepData], change: Callable[[StaticReading, np.ndarray, np.ndarray], None]) -> list[SweepData]:
     """The same data with position and torque of each reading changed in place."""
     passes = []
     for each in data:
         readings = []
         for reading in each.readings:
-            position, torque = np.array(reading.position), np.array(reading.torque)
+            position, torque = reading.position.copy(), reading.torque.copy()
             change(reading, position, torque)
-            readings.append(reading.model_copy(update={"position": tuple(position), "torque": tuple(torque)}))
+            readings.append(replace(reading, position=position, torque=torque))
         passes.append(replace(each, readings=tuple(readings)))
     return passes
 
@@ -81,7 +82,7 @@ def test_a_cable_spring_is_named_and_taken_out(sound) -> None:
     arm, truth, data = sound
     stiffness = 0.04 * rated(arm)
 
-    def pull(_: Reading, position: np.ndarray, torque: np.ndarray) -> None:
+    def pull(_: StaticReading, position: np.ndarray, torque: np.ndarray) -> None:
         torque[JOINT] += truth.gain[JOINT] * stiffness * position[JOINT]
 
     fit = fit_sensors(arm, bent(data, pull))
@@ -96,9 +97,9 @@ def test_hysteresis_is_measured_and_the_intervals_hold(sound) -> None:
     arm, truth, data = sound
     width = 0.03 * rated(arm)
 
-    def lag(reading: Reading, _: np.ndarray, torque: np.ndarray) -> None:
+    def lag(reading: StaticReading, _: np.ndarray, torque: np.ndarray) -> None:
         if reading.joint == JOINT:
-            torque[JOINT] -= reading.direction * width
+            torque[JOINT] -= reading.direction[JOINT] * width
 
     fit = fit_sensors(arm, bent(data, lag))
     assert fit.doubtful == ()
@@ -109,14 +110,14 @@ def test_hysteresis_is_measured_and_the_intervals_hold(sound) -> None:
     assert np.abs(z_scores(fit, truth, "offset")).max() < 4
 
 
-def drawn_lag(seed: int, width: float) -> Callable[[Reading, np.ndarray, np.ndarray], None]:
+def drawn_lag(seed: int, width: float) -> Callable[[StaticReading, np.ndarray, np.ndarray], None]:
     """A lag of the joint's sensor: nearly even along each of its sweeps, anywhere within the play where it holds."""
     random, by_sweep = np.random.default_rng(seed), dict[str, float]()
 
-    def lag(reading: Reading, _: np.ndarray, torque: np.ndarray) -> None:
+    def lag(reading: StaticReading, _: np.ndarray, torque: np.ndarray) -> None:
         if reading.joint == JOINT:
             size = by_sweep.setdefault(reading.sweep, random.uniform(0.6, 1.0))
-            torque[JOINT] -= reading.direction * size * width * random.uniform(0.9, 1.0)
+            torque[JOINT] -= reading.direction[JOINT] * size * width * random.uniform(0.9, 1.0)
         elif reading.joint is None:
             torque[JOINT] += random.uniform(-width, width)
         else:
@@ -143,7 +144,7 @@ def test_a_saturated_sensor_is_named(sound) -> None:
         abs(reading.torque[JOINT]) for each in data for reading in each.readings if reading.joint == JOINT
     )
 
-    def clip(_: Reading, __: np.ndarray, torque: np.ndarray) -> None:
+    def clip(_: StaticReading, __: np.ndarray, torque: np.ndarray) -> None:
         torque[JOINT] = np.clip(torque[JOINT], -limit, limit)
 
     fit = fit_sensors(arm, bent(data, clip))
@@ -155,7 +156,7 @@ def test_what_was_touched_is_left_out_and_named(sound) -> None:
     arm, truth, data = sound
     name = next(sweep.name for sweep in data[0].plan.sweeps if sweep.joint == JOINT)
 
-    def knock(reading: Reading, _: np.ndarray, torque: np.ndarray) -> None:
+    def knock(reading: StaticReading, _: np.ndarray, torque: np.ndarray) -> None:
         if reading.sweep == name and reading.index == 2:
             torque[JOINT] += 0.08 * rated(arm)
 
@@ -177,7 +178,7 @@ def upright() -> tuple[ArmFile, Truth, list[SweepData]]:
 def test_a_knock_does_not_make_a_joint_without_gravity_saturate(upright) -> None:
     arm, _, data = upright
 
-    def knock(reading: Reading, _: np.ndarray, torque: np.ndarray) -> None:
+    def knock(reading: StaticReading, _: np.ndarray, torque: np.ndarray) -> None:
         if reading.joint is None and reading.index == 0:
             torque[0] += 0.3 * rated(arm)
 
@@ -192,12 +193,11 @@ def test_an_arm_that_swung_while_it_was_read_counts_by_its_swing(upright) -> Non
     swung = []
     for each in bent(data, lambda *_: None):
         readings = [
-            reading.model_copy(
-                update={
-                    "settled": False,
-                    "torque": tuple(np.add(reading.torque, swing * random.standard_normal(len(reading.torque)))),
-                    "torque_std": tuple(np.hypot(reading.torque_std, swing)),
-                }
+            replace(
+                reading,
+                settled=False,
+                torque=reading.torque + swing * random.standard_normal(len(reading.torque)),
+                torque_std=np.hypot(reading.torque_std, swing),
             )
             if reading.joint is None and reading.index < 2
             else reading
@@ -212,9 +212,10 @@ def test_an_arm_that_swung_while_it_was_read_counts_by_its_swing(upright) -> Non
 
 def test_a_sensor_that_was_silent_while_the_arm_had_not_settled_tells_nothing_and_breaks_nothing(sound) -> None:
     arm, truth, data = sound
-    (first, *others), silent = data[0].readings, (float("nan"), *data[0].readings[0].torque[1:])
-    update = {"settled": False, "torque": silent, "torque_std": (float("nan"), *first.torque_std[1:])}
-    fit = fit_sensors(arm, [replace(data[0], readings=(first.model_copy(update=update), *others)), *data[1:]])
+    first, *others = data[0].readings
+    lost = np.where(np.arange(len(first.torque)) == 0, np.nan, 0.0)
+    silent = replace(first, settled=False, torque=first.torque + lost, torque_std=first.torque_std + lost)
+    fit = fit_sensors(arm, [replace(data[0], readings=(silent, *others)), *data[1:]])
     assert fit.findings == ()
     assert np.abs(z_scores(fit, truth, "gain")).max() < 4
 
@@ -222,7 +223,7 @@ def test_a_sensor_that_was_silent_while_the_arm_had_not_settled_tells_nothing_an
 @pytest.mark.filterwarnings("error")
 def test_a_joint_without_readings_shows_no_limit(sound) -> None:
     arm, _, data = sound
-    rows = fit_rows(data)
+    rows = sweep_readings(data)
     torque = rows.readings.torque.copy()
     torque[:, JOINT] = np.nan
     silent = replace(rows, readings=replace(rows.readings, torque=torque))
@@ -234,7 +235,7 @@ def test_a_stuck_encoder_bit_is_named(sound, bit: int, level: int) -> None:
     arm, _, data = sound
     step = data[0].resolution[JOINT]
 
-    def stick(_: Reading, position: np.ndarray, __: np.ndarray) -> None:
+    def stick(_: StaticReading, position: np.ndarray, __: np.ndarray) -> None:
         count = round(position[JOINT] / step)
         count = count | (1 << bit) if level else count & ~(1 << bit)
         position[JOINT] = count * step

@@ -1,5 +1,7 @@
 """The fit against MuJoCo's gravity: it finds what the sensors do, its intervals hold, and it invents nothing."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from sweep_arms import random_arm, synthetic_pass, with_section
@@ -27,7 +29,7 @@ def test_random_arms_are_calibrated_and_identified(seed: int, n: int) -> None:
     fit = fit_sensors(arm, data)
     assert fit.reasons == {}
     assert np.abs(fit.value("gain") / truth.gain - 1).max() < 0.005
-    rated = np.array([joint.rated_torque for joint in arm.require_link().joints])
+    rated = arm.require_link().rated_torques
     assert np.all(np.abs(fit.value("offset") - truth.offset) < 0.003 * rated)
     assert np.abs(fit.value("position_gain") - truth.position_gain).max() < 0.003
     gravity = identify_gravity(arm, data, fit)
@@ -123,9 +125,7 @@ def test_the_controllers_own_calibration_is_taken_out() -> None:
     applied = []
     for each in data:
         manifest = each.manifest.model_copy(update={"installed_gain": (1.25,) * 3, "installed_offset": (0.7,) * 3})
-        readings = tuple(
-            row.model_copy(update={"torque": tuple((v - 0.7) / 1.25 for v in row.torque)}) for row in each.readings
-        )
+        readings = tuple(replace(row, torque=(row.torque - 0.7) / 1.25) for row in each.readings)
         applied.append(SweepData(each.path, manifest, readings, each.plan, each.resolution, each.digest))
     plain, other = fit_sensors(arm, data), fit_sensors(arm, applied)
     np.testing.assert_allclose(other.value("gain"), plain.value("gain"), rtol=1e-3)

@@ -145,7 +145,7 @@ def made(config: FloatConfig) -> FloatControl:
     arm = load_arm("sarcos")
     described = gcomp_arm(arm)
     joints = arm.require_link().joints
-    rated, top = np.array([j.rated_torque for j in joints]), np.array([j.max_velocity for j in joints])
+    rated, top = arm.require_link().rated_torques, np.array([j.max_velocity for j in joints])
     beta = np.array(good_records(arm, Truth.of(arm))[1].beta)
     return FloatControl(described, beta, rated, top, 0.004, config)
 

@@ -6,10 +6,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from calib.motion.static_reading import StaticReading
 from calib.observer.config import ObserverConfig
 from calib.observer.events import Event
 from calib.observer.observer import Observer
-from calib.observer.rest_detector import Row
 from calib.observer.state import restore_observer, save_observer
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
@@ -49,7 +49,9 @@ class Bench:
             q = self.random.uniform(self.arm.lower, self.arm.upper)
             torque = gravity_torque(self.arm, self.beta, q) + self.extra(q)
             reading = self.gain * self.scale * torque + self.offset + SIGMA * self.random.normal(size=self.arm.n)
-            events = self.observer.handle_row(Row(self.t, q, reading, self.random.choice(self.directions, self.arm.n)))
+            events = self.observer.handle_row(
+                StaticReading.of(self.t, q, reading, self.random.choice(self.directions, self.arm.n))
+            )
             for event in events:
                 if event.finding and apply:
                     j = event.finding.joint
@@ -200,7 +202,7 @@ def test_a_long_rest_and_a_repeated_pose_do_not_wind_it_up(sarcos, sarcos_beta) 
     for k in range(1000):
         q = poses[k % 2]
         reading = gravity_torque(sarcos, sarcos_beta, q) + SIGMA * bench.random.normal(size=7)
-        assert bench.observer.handle_row(Row(2.0 * k, q, reading, np.ones(7))) == []
+        assert bench.observer.handle_row(StaticReading.of(2.0 * k, q, reading, np.ones(7))) == []
     assert bench.observer.estimate().accepted.max() <= 2 * ObserverConfig().place_rows
     assert bench.observer.estimate().offset_std.min() > 1e-3
 
@@ -252,7 +254,10 @@ def test_position_gain_and_offset_are_applied(sarcos, sarcos_beta) -> None:
     for k in range(60):
         q = random.uniform(sarcos.lower, sarcos.upper)
         reading = gravity_torque(sarcos, sarcos_beta, q) + SIGMA * random.normal(size=7)
-        assert observer.handle_row(Row(2.0 * k, (q - offset) / gain, reading, random.choice([-1.0, 1.0], 7))) == []
+        assert (
+            observer.handle_row(StaticReading.of(2.0 * k, (q - offset) / gain, reading, random.choice([-1.0, 1.0], 7)))
+            == []
+        )
 
 
 def test_a_payload_that_stays_becomes_a_tool_and_drift_is_seen_again(sarcos, sarcos_beta) -> None:

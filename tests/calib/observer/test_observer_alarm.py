@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from calib.motion.static_reading import StaticReading
 from calib.observer.config import ObserverConfig
 from calib.observer.cusum import Cusum
-from calib.observer.rest_detector import RestDetector, Row
+from calib.observer.rest_detector import RestDetector
 from calib.observer.sensor_filter import SensorFilter
 from gcomp.gravity.torque import gravity_torque
 
@@ -89,7 +90,7 @@ def test_an_outlier_is_not_taken_and_is_counted(sarcos) -> None:
     np.testing.assert_array_equal(tracked.rejected, 1)
 
 
-def run_detector(positions: np.ndarray, torques: np.ndarray, config: ObserverConfig = CONFIG) -> list[Row]:
+def run_detector(positions: np.ndarray, torques: np.ndarray, config: ObserverConfig = CONFIG) -> list[StaticReading]:
     """Rows of one joint's samples at 250 Hz."""
     detector, rows = RestDetector(1, config), []
     for k, (q, tau) in enumerate(zip(positions, torques, strict=True)):
@@ -138,5 +139,5 @@ def test_the_halves_of_an_average_tell_its_noise() -> None:
     q = np.concatenate([np.concatenate([rest(k % 2, 0.5), move(k % 2, 1 - k % 2, 1)]) for k in range(60)])
     rows = run_detector(q, 0.5 * random.normal(size=q.size))
     means = np.array([row.torque[0] for row in rows])
-    noise = np.array([row.noise[0] for row in rows if row.noise is not None])
+    noise = np.array([row.torque_error[0] for row in rows])
     assert np.sqrt(np.mean(noise**2)) == pytest.approx(np.std(means), rel=0.25)

@@ -1,5 +1,6 @@
 """The report to file, the held-out gate and recalibration from sweeps: on one made-up arm of three joints."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -115,10 +116,10 @@ def test_sweeps_that_disagree_with_one_another_do_not_replace_a_good_record(fit,
         steps = {r.sweep: sorted({round(o.position[1], 2) for o in mine if o.sweep == r.sweep}) for r in mine}
         readings = []
         for reading in data.readings:
-            torque = list(reading.torque)
+            torque = reading.torque.copy()
             if reading.joint == 1 and steps[reading.sweep].index(round(reading.position[1], 2)) % 2:
                 torque[1] *= 1.3
-            readings.append(reading.model_copy(update={"torque": tuple(torque)}))
+            readings.append(replace(reading, torque=torque))
         spoilt.append(type(data)(data.path, data.manifest, tuple(readings), data.plan, data.resolution, data.digest))
     gravity = identify_gravity(ARM, DATA, fit).record(ARM, record)
     check_heldout(record.model_copy(update={"note": "new"}), record, ARM, DATA, gravity)

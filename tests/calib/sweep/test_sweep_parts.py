@@ -2,6 +2,7 @@
 
 import json
 import resource
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,15 +16,21 @@ from armlink.errors import BadInput, Refused
 from calib.arm.sweep_section import SweepSection
 from calib.commands.screen import unsettled_said
 from calib.motion.settle_rule import SettleRule
+from calib.motion.static_reading import StaticReading
 from calib.motion.trajectory import trajectory
 from calib.plan.sweep_plan import plan_sweep
-from calib.sweep.dataset import DataWriter, Manifest, PlanLine, Reading, load_data
+from calib.sweep.dataset import DataWriter, Manifest, PlanLine, encoded, load_data
 from sim_bus.truth import Truth
 
 PERIOD = 0.004
 RULE = SettleRule.of(SweepSection(), np.array([0.05]), PERIOD)
 COUNTS = np.array([True])
 STEP = np.array([1e-4])
+
+
+def same(ours: Sequence[StaticReading], theirs: Sequence[StaticReading]) -> bool:
+    """Equal to the last digit, as the file has them."""
+    return list(map(encoded, ours)) == list(map(encoded, theirs))
 
 
 @given(
@@ -84,7 +91,7 @@ def test_a_data_set_reads_back_as_it_was_written(tmp_path: Path) -> None:
         for reading in data.readings:
             writer.append(reading)
     back = load_data(tmp_path / "set").require(arm)
-    assert back.readings == data.readings
+    assert same(back.readings, data.readings)
     assert back.plan == data.plan
     assert back.complete
 
@@ -99,10 +106,10 @@ def test_a_torn_last_line_is_left_out_and_overwritten_on_resume(tmp_path: Path, 
             writer.append(reading)
     lines = folder / "readings.jsonl"
     lines.write_bytes(lines.read_bytes()[:-torn])
-    assert load_data(folder).readings == readings[:2]
+    assert same(load_data(folder).readings, readings[:2])
     with DataWriter(folder, Manifest.of(arm, 0.0), resume=True) as writer:
         writer.append(readings[2])
-    assert load_data(folder).readings == readings
+    assert same(load_data(folder).readings, readings)
 
 
 def test_a_full_disk_is_said_in_one_line_and_loses_one_reading(tmp_path: Path) -> None:
@@ -120,10 +127,10 @@ def test_a_full_disk_is_said_in_one_line_and_loses_one_reading(tmp_path: Path) -
                 writer.append(readings[1])
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
-    assert load_data(folder).readings == readings[:1]
+    assert same(load_data(folder).readings, readings[:1])
     with DataWriter(folder, Manifest.of(arm, 0.0), resume=True) as writer:
         writer.append(readings[1])
-    assert load_data(folder).readings == readings[:2]
+    assert same(load_data(folder).readings, readings[:2])
 
 
 def test_a_data_set_whose_beginning_was_cut_off_can_be_begun_again(tmp_path: Path) -> None:
@@ -138,7 +145,7 @@ def test_unsettled_readings_are_told_with_their_sweeps() -> None:
     arm = random_arm(1, 3)
     data = synthetic_pass(arm, Truth.of(arm), plan_sweep(arm), 0.0, np.random.default_rng(0))
     assert unsettled_said(data) == []
-    swung = data.readings[0].model_copy(update={"settled": False})
+    swung = replace(data.readings[0], settled=False)
     (line,) = unsettled_said(replace(data, readings=(swung, *data.readings[1:])))
     assert line.startswith(f"1 of {len(data.readings)} readings had not settled")
     assert "in scout: they count less" in line
@@ -147,7 +154,7 @@ def test_unsettled_readings_are_told_with_their_sweeps() -> None:
 def test_a_missing_number_stays_missing(tmp_path: Path) -> None:
     arm = random_arm(1, 3)
     reading = synthetic_pass(arm, Truth.of(arm), plan_sweep(arm), 0.0, np.random.default_rng(0)).readings[0]
-    lacking = reading.model_copy(update={"motor_torque": (float("nan"),) * 3})
+    lacking = replace(reading, motor_torque=np.full(3, np.nan))
     with DataWriter(tmp_path / "set", Manifest.of(arm, 0.0)) as writer:
         writer.append(lacking)
     assert np.isnan(load_data(tmp_path / "set").array("motor_torque")).all()
@@ -174,9 +181,7 @@ def test_bad_data_sets_say_where(tmp_path: Path) -> None:
 
 def test_a_reading_of_the_wrong_width_is_refused(tmp_path: Path) -> None:
     small, large = random_arm(1, 3), random_arm(1, 4)
-    reading: Reading = synthetic_pass(
-        large, Truth.of(large), plan_sweep(large), 0.0, np.random.default_rng(0)
-    ).readings[0]
+    reading = synthetic_pass(large, Truth.of(large), plan_sweep(large), 0.0, np.random.default_rng(0)).readings[0]
     with DataWriter(tmp_path / "set", Manifest.of(small, 0.0)) as writer:
         writer.append(reading)
     with pytest.raises(BadInput, match="not one per joint"):

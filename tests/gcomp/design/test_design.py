@@ -6,11 +6,13 @@ from gravity_rig import DOWN, SARCOS_BETA, make_readings, make_sarcos, sweep_row
 
 from gcomp.arm.arm import Arm
 from gcomp.design.remedies import cures
+from gcomp.design.selection import sweep_jacobian
 from gcomp.design.sweep_design import Design, Sweep, choose_steps, choose_sweeps, readings_of, stop_combinations
 from gcomp.errors import BadArray
 from gcomp.gravity.torque import gravity_levers
 from gcomp.identify.global_fit import Prediction, identify_global, predict_covariance
 from gcomp.identify.parameters import Parameters
+from gcomp.identify.sensor_model import predict_and_jacobian
 
 SIGMA = np.array([0.15, 0.15, 0.08, 0.06, 0.03, 0.03, 0.02])
 GUESS = Parameters.nominal(7, beta=SARCOS_BETA, rho=[0.0, 0.0, 0.1])
@@ -141,3 +143,16 @@ def test_vertical_joint_is_beyond_cure_but_for_tilting_the_base() -> None:
         ("mass_moment_x[joint_1]", "mass_moment_y[joint_1]"),
         "no sweep: gravity does not act on it in any pose; tilt the base",
     )
+
+
+def test_the_jacobian_of_candidate_sweeps_is_the_sensor_model_s(rng, random_arm) -> None:
+    built = random_arm(rng, 5)
+    arm, n = built.arm, 5
+    guess = Parameters(*(rng.uniform(0.5, 1.5, size) for size in (n, n, n, n, 2 * n, 3)))
+    free, sigma, loads = rng.random(6 * n + 3) < 0.7, rng.uniform(0.1, 0.3, n), (0.0, 1.5)
+    sweeps = [Sweep(2, pose, np.linspace(-1.0, 1.0, 4)) for pose in rng.uniform(-1, 1, (3, n))]
+    ours = sweep_jacobian(arm, guess, 2, np.stack([sweep.positions() for sweep in sweeps]), sigma, free, loads)
+    for sweep, jacobian in zip(sweeps, ours, strict=True):
+        rows = readings_of(arm, [sweep], sigma, loads)
+        _, theirs, _ = predict_and_jacobian(arm, guess, rows)
+        np.testing.assert_allclose(jacobian, theirs[:, free] / sigma[2], rtol=1e-10, atol=1e-9)

@@ -9,7 +9,7 @@ from gcomp.errors import BadArray
 from gcomp.identify.global_fit import identify_global
 from gcomp.identify.linear_start import linear_start
 from gcomp.identify.parameters import FAMILIES, Parameters, Prior, free_mask
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict, predict_and_jacobian
 
 HALF = np.pi / 2
@@ -37,7 +37,7 @@ def test_jacobian_is_the_finite_difference(seed: int) -> None:
         built.beta, rng.normal(size=3) * 0.1,
     )  # fmt: skip
     torque = np.where(rng.random((6, n)) < 0.3, np.nan, 0.0)
-    rows = Readings.of(rng.uniform(-3, 3, (6, n)), torque, 0.1, np.array([0, 0, 1, 2, 0, 3.0]))
+    rows = StaticReadings.of(rng.uniform(-3, 3, (6, n)), torque, 0.1, np.array([0, 0, 1, 2, 0, 3.0]))
     modelled, jacobian, slope = predict_and_jacobian(built.arm, at, rows)
     assert modelled == pytest.approx(predict(built.arm, at, rows)[rows.counted])
     step = 1e-6
@@ -48,7 +48,7 @@ def test_jacobian_is_the_finite_difference(seed: int) -> None:
     row, _ = np.nonzero(rows.counted)
     for joint in range(n):
         nudge = step * np.eye(n)[joint]
-        moved = [Readings(rows.position + s * nudge, rows.torque, rows.sigma, rows.load) for s in (1, -1)]
+        moved = [StaticReadings(rows.position + s * nudge, rows.torque, rows.sigma, rows.load) for s in (1, -1)]
         ahead, behind = (predict(built.arm, at, each) for each in moved)
         assert slope[:, joint] == pytest.approx(((ahead - behind) / (2 * step))[rows.counted], rel=1e-6, abs=1e-6)
     assert len(row) == len(slope)
@@ -70,7 +70,7 @@ def test_everything_unknown_is_found_exactly_without_noise(sarcos, rng) -> None:
     assert not found.not_identifiable
 
 
-def random_case(seed: int) -> tuple[Parameters, Readings, Parameters, np.ndarray, list[str]]:
+def random_case(seed: int) -> tuple[Parameters, StaticReadings, Parameters, np.ndarray, list[str]]:
     """An arm of 3 to 7 joints, half of them upright, swept with noise, everything unknown."""
     rng = np.random.default_rng(seed)
     built = make_random_arm(rng, int(rng.integers(3, 8)))
@@ -90,9 +90,9 @@ def random_case(seed: int) -> tuple[Parameters, Readings, Parameters, np.ndarray
     return true, rows, found.values, found.std.vector, [*found.hopeless] if found.converged else ["not converged"]
 
 
-def some_poses(arm, rng) -> Readings:
+def some_poses(arm, rng) -> StaticReadings:
     q = rng.uniform(arm.lower, arm.upper, (200, arm.n))
-    return Readings.of(q, np.zeros_like(q), 1.0)
+    return StaticReadings.of(q, np.zeros_like(q), 1.0)
 
 
 def test_random_arms_with_noise_come_out_within_their_intervals() -> None:
@@ -118,7 +118,7 @@ def test_position_noise_widens_the_intervals_to_what_happens(sarcos) -> None:
     noise, scores, naive = 0.003, [], []
     for _ in range(40):
         exact = make_readings(sarcos, true, positions, marks, sigma=0.01, rng=rng)
-        rows = Readings(
+        rows = StaticReadings(
             exact.position + noise * rng.normal(size=positions.shape), exact.torque, exact.sigma, exact.load
         )
         for sigma, into in ((noise, scores), (0.0, naive)):
@@ -137,7 +137,7 @@ def test_robust_loss_survives_outliers_with_honest_intervals(loss: str, sarcos) 
     for _ in range(6):
         rows = make_readings(sarcos, true, positions, marks, loads=(0.0, 2.0), rng=rng)
         torque = rows.torque + np.where(rng.random(rows.torque.shape) < 0.03, 3.0, 0.0)
-        spoilt = Readings(rows.position, torque, rows.sigma, rows.load)
+        spoilt = StaticReadings(rows.position, torque, rows.sigma, rows.load)
         found = identify_global(sarcos, spoilt, unknown=("gain", "offset", "beta", "rho"), loss=loss)
         known = found.std.vector > 0
         scores.append((found.values.vector - true.vector)[known] / found.std.vector[known])

@@ -10,7 +10,7 @@ from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import base_parameter_names
 from gcomp.identify.global_fit import GlobalFit, identify_global, predict_covariance
 from gcomp.identify.parameters import FAMILIES, Parameters, family_slices
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict, predict_and_jacobian
 
 SENSORS = ("gain", "offset", "beta")
@@ -66,7 +66,7 @@ def test_an_unknown_direction_of_gravity_costs_one_more(gravity_unknown: bool, d
     true = Parameters.nominal(7, gain=rng.uniform(0.8, 1.2, 7), beta=SARCOS_BETA)
     positions, marks = sweep_rows(arm, 2, 13, rng)
     generic = positions + np.repeat(0.3 * rng.normal(size=(14, 7)), 13, axis=0)  # another pose for each sweep
-    rows = Readings.of(generic, marks, 1.0)
+    rows = StaticReadings.of(generic, marks, 1.0)
     jacobian = predict_and_jacobian(arm, true, rows)[1]
     families = family_slices(7)
     columns = [jacobian[:, families[name]] for name in (*SENSORS, *POSITIONS)]

@@ -12,7 +12,7 @@ from gcomp.gravity.torque import gravity_regressor, torque_covariance
 from gcomp.identify.global_fit import GlobalFit, identify_global
 from gcomp.identify.linear_start import linear_start
 from gcomp.identify.parameters import Parameters, Prior, family_slices, free_mask
-from gcomp.identify.readings import Readings
+from gcomp.identify.readings import StaticReadings
 from gcomp.identify.recursive import identify_recursive
 from gcomp.identify.sensor_model import predict_and_jacobian
 
@@ -54,7 +54,7 @@ def chosen(unknown: tuple[str, ...], poses: int) -> dict[int, str]:
     information: list[list[Array]] = [[] for _ in range(7)]
     for joint, stops in enumerate(candidates):
         for pose in stops:
-            rows = Readings.of(*sweep(joint, pose), SIGMA)
+            rows = StaticReadings.of(*sweep(joint, pose), SIGMA)
             jacobian = predict_and_jacobian(arm, GUESS, rows)[1][:, free] / SIGMA[joint]
             information[joint].append(jacobian.T @ jacobian)
     total: Array = np.diag(before[free])
@@ -102,8 +102,8 @@ def trials(stops: dict[int, str], poses: int, count: int, sensors: str = "own"):
         yield make_readings(arm, true, positions, marks, sigma=SIGMA, rng=rng)
 
 
-def unweighted(rows: Readings) -> Readings:
-    return Readings(rows.position, rows.torque, np.full_like(rows.sigma, 0.1), rows.load)
+def unweighted(rows: StaticReadings) -> StaticReadings:
+    return StaticReadings(rows.position, rows.torque, np.full_like(rows.sigma, 0.1), rows.load)
 
 
 def without_void(stops: dict[int, str]) -> dict[int, list[str]]:
@@ -133,7 +133,7 @@ def test_recursive_identification_with_gains_known(poses: int) -> None:
     assert torque_rms(found) == pytest.approx(RECURSIVE[poses], rel=0.2)
 
 
-def averaged_recursion(rows: Readings) -> Array:
+def averaged_recursion(rows: StaticReadings) -> Array:
     """β (14,) where each joint's two sweeps are fitted apart and averaged before the next joint's turn."""
     beta, regressor = np.zeros(14), gravity_regressor(make_sarcos(), rows.position)
     for joint in reversed(range(7)):
@@ -194,7 +194,7 @@ def test_recursion_that_takes_gains_and_positions_for_right() -> None:
     found = []
     for _, rows in calibrations(2, 200):
         bare = rows.load == 0
-        unloaded = Readings(rows.position[bare], rows.torque[bare], rows.sigma[bare], rows.load[bare])
+        unloaded = StaticReadings(rows.position[bare], rows.torque[bare], rows.sigma[bare], rows.load[bare])
         found.append(identify_recursive(make_sarcos(), unloaded).beta)
     assert torque_rms(found) == pytest.approx([0.85, 0.91, 0.31, 0.33, 0.086, 0.139, 0.023], rel=0.2)
 
@@ -262,7 +262,7 @@ def test_without_a_mass_a_gain_prior_leaves_only_the_common_scale_in_doubt() -> 
     readings, ratios, scales = [], [], []
     for true, rows in calibrations(4, 100):
         bare = rows.load == 0
-        rows = Readings(rows.position[bare], rows.torque[bare], rows.sigma[bare], rows.load[bare])
+        rows = StaticReadings(rows.position[bare], rows.torque[bare], rows.sigma[bare], rows.load[bare])
         found = identify_global(
             arm, rows, unknown=("gain", "offset", "position_offset", "beta"), priors={"gain": Prior(1.0, 0.03)}
         ).values

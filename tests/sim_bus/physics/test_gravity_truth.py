@@ -8,7 +8,7 @@ import pytest
 from rig import Rig, one_joint
 
 from armlink.arm_file import ArmFile, load_arm, parse_arm
-from sim_bus.effects.state import imperfections
+from sim_bus.effects.registry import imperfections
 from sim_bus.physics.plant import Plant
 from sim_bus.sim_section import EffectEntry, sim_section
 

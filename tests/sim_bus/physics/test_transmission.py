@@ -10,8 +10,7 @@ from rig import UNIT, Rig, one_joint
 
 from armlink.arm_file import ArmFile, load_arm, parse_arm
 from armlink.errors import BadInput
-from sim_bus.effects.registry import effects
-from sim_bus.effects.state import imperfections
+from sim_bus.effects.registry import effects, imperfections
 from sim_bus.physics.plant import Plant
 from sim_bus.sim_section import EffectEntry
 

@@ -10,12 +10,11 @@ from wrong_arms import Wrong, model, record
 from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.diagnosis import Diagnosis
-from sim_gap.effects.registry import layout_of
 from sim_gap.model.load import load_model
-from sim_gap.residuals.gear_impacts import hits
+from sim_gap.residuals.gear_impacts import near_impacts
+from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import prepare
 from sim_gap.residuals.residual_set import ResidualSet
-from sim_gap.residuals.stuck_channels import without_stuck
 
 Odd = Callable[[Recording], Recording]
 
@@ -53,7 +52,7 @@ def test_a_force_from_outside_is_blamed_on_nothing(force):
     answer = told(pushed(force))
     assert answer.verdict == "unexplained"
     assert not [cause for cause in answer.causes if cause.confidence > 0.5]
-    assert any(note.startswith("joint_2: ") and "are left (noise" in note for note in answer.notes)
+    assert any(note.startswith("joint_2: ") and "remain (noise" in note for note in answer.notes)
 
 
 def test_a_hum_below_the_pass_band_is_blamed_on_nothing():
@@ -85,7 +84,7 @@ def test_a_stuck_sensor_is_named_and_blames_no_effect(odd):
     answer = told(odd)
     assert answer.verdict == "unexplained"
     assert not answer.causes
-    assert "joint_2: tau repeats one number" in answer.notes[0]
+    assert "joint_2: tau repeats one value" in answer.notes[0]
 
 
 @pytest.mark.parametrize(("held", "channels"), [(True, ["tau"]), (False, ["tau", "tau_motor"])])
@@ -97,8 +96,8 @@ def test_the_motor_of_a_joint_that_is_held_may_repeat_one_number_its_sensor_may_
         position[:, 1] = 0.3
     torque[:, 1] = motor[:, 1] = 1.234
     recording = replace(moving, position=position, torque=torque, motor_torque=motor)
-    _, found = without_stuck(prepare(recording, load_model(model(), (), 3).arm), recording)
-    assert [(one.channel, one.joint) for one in found] == [(channel, 1) for channel in channels]
+    signals = prepare(recording, load_model(model(), (), 3).arm)
+    assert [(one.channel, one.joint) for one in signals.stuck] == [(channel, 1) for channel in channels]
 
 
 def test_beside_a_stuck_sensor_other_joints_are_still_read():
@@ -127,4 +126,4 @@ def test_a_gear_that_hits_is_seen_where_its_torque_changes_sign():
         signals = prepare(one, load_model(model()).arm)
         data = ResidualSet((signals,), layout_of([signals]))
         residual = np.stack([data.values["tau", j] for j in range(3)], axis=1)
-        assert set(hits(signals, "tau", residual)) == joints
+        assert set(near_impacts(signals, "tau", residual)) == joints

@@ -6,8 +6,9 @@ import numpy as np
 from scipy.signal import lfilter
 from wrong_arms import Wrong, model, record
 
-from sim_gap.effects.registry import effects, layout_of
+from sim_gap.effects.registry import effects
 from sim_gap.model.load import load_model
+from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import prepare
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.estimate import Estimate
@@ -21,7 +22,9 @@ def test_coverage(monkeypatch):
     for name in ("SYSTEMATIC", "NOMINAL"):
         monkeypatch.setattr(f"sim_gap.search.estimate.{name}", 0.0)
     for effect in ("friction.coulomb", "friction.viscous"):
-        monkeypatch.setattr(type(effects()[effect]), "ordinary", 0.0)
+        known = effects()[effect]
+        sound = replace(known, plausibility=replace(known.plausibility, background_std=0.0))
+        monkeypatch.setitem(effects(), effect, sound)
     wrong = Wrong(coulomb=np.full(3, 0.5), viscous=np.full(3, 0.8))
     nominal = load_model(model())
     clean = record(model(), wrong, seconds=60, rate=50, noise=0.0, channels=("tau_motor",))

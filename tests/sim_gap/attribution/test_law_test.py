@@ -1,22 +1,23 @@
-"""What the library may lack: general laws stand in for causes that this motion cannot tell from them."""
+"""General laws replace causes that cannot be told from them in this motion: the library may lack the true effect."""
 
 import numpy as np
 import pytest
 from wrong_arms import Wrong, model, record
 
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.attribution.law_test import Outside
+from sim_gap.attribution.law_test import LawTest
 from sim_gap.effects.laws import LAWS
-from sim_gap.effects.registry import effects, layout_of, library_without
+from sim_gap.effects.registry import effects, library_without
 from sim_gap.model.load import load_model
+from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import prepare
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.normal_equations import ColumnStore, Term
 
 
-def outside(wrong: Wrong, *active: Term) -> Outside:
+def law_test(wrong: Wrong, *active: Term) -> LawTest:
     signals = prepare(record(model(), wrong, seed=1, seconds=40, rate=50.0), load_model(model()).arm, "a recording")
-    return Outside(ColumnStore(ResidualSet((signals,), layout_of([signals]))), active)
+    return LawTest(ColumnStore(ResidualSet((signals,), layout_of([signals]))), active)
 
 
 def test_laws_are_in_no_library():
@@ -26,27 +27,27 @@ def test_laws_are_in_no_library():
 
 def test_mass_moments_of_two_links_that_are_one_payload_are_no_better_than_a_body():
     moments = Term("link.mass_moment", 1), Term("link.mass_moment", 2)
-    found = outside(Wrong(payload=1.0), *moments).weigh(moments)
+    found = law_test(Wrong(payload=1.0), *moments).best_law(moments)
     assert found.law == "law.body"
     assert found.worse < 0.1
 
 
 def test_a_payload_is_a_body_and_loses_nothing_by_it():
     payload = (Term("link.payload", 0),)
-    assert outside(Wrong(payload=1.0), *payload).weigh(payload).worse > 0.5
+    assert law_test(Wrong(payload=1.0), *payload).best_law(payload).worse > 0.5
 
 
 def test_friction_is_like_no_law():
     friction = (Term("friction.coulomb", 1),)
-    assert outside(Wrong(coulomb=np.array([0.0, 0.8, 0.0])), *friction).weigh(friction).worse > 0.5
+    assert law_test(Wrong(coulomb=np.array([0.0, 0.8, 0.0])), *friction).best_law(friction).worse > 0.5
 
 
 def test_where_a_law_does_for_a_crowd_of_small_causes_the_crowd_gives_way():
-    """A sensor's offset, told as a spring and asymmetric friction of the same joint."""
+    """A sensor's offset, fitted as a spring and asymmetric friction of the same joint."""
     spring = Term("transmission.spring", 1)
     crowd = spring, Term("friction.coulomb", 1), Term("friction.asymmetric", 1)
     wrong = Wrong(offset=np.array([0.0, 0.6, 0.0]), coulomb=np.array([0.0, 0.4, 0.0]))
-    found = outside(wrong, *crowd).weigh([spring])
+    found = law_test(wrong, *crowd).best_law([spring])
     assert found.law == "law.load"
     assert found.worse < 0.0
 
@@ -59,7 +60,7 @@ def test_what_a_law_says_as_well_is_not_said_with_confidence(withheld, wrong):
     recordings = [record(model(), wrong, seed=seed, seconds=40, rate=50.0) for seed in (1, 2)]
     answer = diagnose(model(), recordings[:1], recordings[1:], withhold=[withheld])
     assert not [cause for cause in answer.causes if cause.confidence > 0.8]
-    assert any("would look the same" in note or "are left" in note for note in answer.notes)
+    assert any("would look the same" in note or "remain (noise" in note for note in answer.notes)
     whole = diagnose(model(), recordings[:1], recordings[1:])
     assert whole.causes[0].effect == withheld
     assert whole.causes[0].confidence > 0.8

@@ -9,11 +9,12 @@ from wrong_arms import Wrong, model, record
 from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.diagnosis import Diagnosis
-from sim_gap.effects.elasticity_backlash import carried
-from sim_gap.effects.registry import layout_of
+from sim_gap.effects.elasticity_backlash import transmitted
 from sim_gap.model.load import load_model
+from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import prepare
 from sim_gap.residuals.residual_set import ResidualSet
+from sim_gap.search.normal_equations import ColumnStore, Term
 
 
 def commanded(seed: int, lag: float = 0.0, noise: tuple[float, float] = (0.0, 0.0), share: float = 0.0) -> Recording:
@@ -81,19 +82,17 @@ def test_the_command_is_compared_with_the_motors_estimate_unless_another_is_much
 
 def test_residuals_and_columns_of_a_command_are_compared_alike():
     """Friction shows in motor less sensor; in the command's row where that is compared beyond the motor."""
-    from sim_gap.effects.registry import effects
-
-    quiet, noisy = residuals(commanded(1)), residuals(commanded(1, noise=(9.0, 5.0)))
-    friction = effects()["friction.coulomb"]
-    assert ("tau_cmd", 1) not in quiet.columns(friction, 1, ())
-    columns = noisy.columns(friction, 1, ())
+    quiet, noisy = (ColumnStore(residuals(commanded(1, **options))) for options in ({}, {"noise": (9.0, 5.0)}))
+    friction = Term("friction.coulomb", 1)
+    assert ("tau_cmd", 1) not in quiet.columns(friction)
+    columns = noisy.columns(friction)
     np.testing.assert_allclose(columns["tau_cmd", 1], columns["tau_motor", 1])
-    assert ("tau_cmd", 0) not in noisy.columns(friction, 0, ())
+    assert ("tau_cmd", 0) not in noisy.columns(Term("friction.coulomb", 0))
 
 
 def test_a_noisy_reading_does_not_explain_itself_as_what_bends_a_gear():
     quiet, noisy = residuals(commanded(1)), residuals(commanded(1, noise=(9.0, 0.0)))
-    clear = [carried(data.signals[0], data.layout, 1) for data in (quiet, noisy)]
+    clear = [transmitted(data.signals[0], data.layout, 1) for data in (quiet, noisy)]
     inner = slice(50, -50)
     assert np.sqrt(np.mean((clear[1] - clear[0])[inner] ** 2)) < 0.2
 

@@ -41,7 +41,7 @@ def test_the_payload_of_one_recording_is_found_beside_what_is_wrong_with_the_arm
     assert mass.value == pytest.approx(2.6, rel=0.1)
     assert mass.low < 2.6 < mass.high
     assert payload.confidence > 0.8
-    assert any("is in recording 3 alone" in note for note in answer.notes)
+    assert any("is present in recording 3 alone" in note for note in answer.notes)
 
 
 def test_a_loaded_recording_alone_says_that_the_arm_itself_may_be_heavier(realdata):

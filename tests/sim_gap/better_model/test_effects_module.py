@@ -9,7 +9,8 @@ import pytest
 from wrong_arms import THREE, Wrong, record
 
 from armlink.arm_file import load_arm
-from sim_bus.effects.state import Imperfections, imperfections
+from sim_bus.effects.registry import imperfections
+from sim_bus.effects.state import Imperfections
 from sim_bus.physics.plant import Plant
 from sim_bus.physics.sensors import Sensors
 from sim_bus.truth import Truth

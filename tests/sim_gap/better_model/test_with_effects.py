@@ -8,10 +8,9 @@ import pytest
 from wrong_arms import THREE, Wrong, motion, record
 
 from sim_gap.attribution.diagnose import diagnose
+from sim_gap.better_model.coupled_motors import CoupledMotor, add_to, coupled_motors
 from sim_gap.better_model.export import write_model
-from sim_gap.better_model.with_effects import shared_motors
-from sim_gap.model.load import load_model
-from sim_gap.model.tendons import SharedMotor, add_to, tendons_of
+from sim_gap.model.load import load_model, tendons_of
 
 CASES = {
     "payload": Wrong(payload=0.8),
@@ -41,7 +40,7 @@ def test_the_written_model_has_no_gap_any_more(tmp_path, name):
 def test_a_shared_motor_becomes_a_fixed_tendon(tmp_path):
     """Its inertia and friction load both joints; the model with it can be diagnosed again."""
     (tmp_path / "arm.xml").write_text(THREE)
-    shared = SharedMotor("joint_3", "joint_2", 0.8, inertia=0.05, coulomb=0.8, viscous=0.3)
+    shared = CoupledMotor("joint_3", "joint_2", 0.8, inertia=0.05, coulomb=0.8, viscous=0.3)
     nominal = load_model(tmp_path / "arm.xml")
     recordings = []
     for seed in (1, 2):
@@ -54,7 +53,7 @@ def test_a_shared_motor_becomes_a_fixed_tendon(tmp_path):
     assert answer.causes[0].effect == "transmission.coupling"
     assert write_model(nominal, answer.internals.estimate, tmp_path / "closed.xml") == []
     assert answer.rollout.after.max() < 0.2 * answer.rollout.before.max()
-    (fitted,) = shared_motors(nominal, answer.internals.estimate)
+    (fitted,) = coupled_motors(nominal, answer.internals.estimate)
     assert (fitted.joint, fitted.other) == (shared.joint, shared.other)
     assert [fitted.lever, fitted.inertia, fitted.coulomb, fitted.viscous] == pytest.approx(
         [0.8, 0.05, 0.8, 0.3], rel=0.05
@@ -64,7 +63,7 @@ def test_a_shared_motor_becomes_a_fixed_tendon(tmp_path):
 
 def test_two_motors_may_turn_with_the_same_pair_of_joints():
     spec = mujoco.MjSpec.from_string(THREE)
-    pair = [SharedMotor("joint_3", "joint_2", lever, inertia=0.05, coulomb=0.8, viscous=0.3) for lever in (0.8, -0.6)]
+    pair = [CoupledMotor("joint_3", "joint_2", lever, inertia=0.05, coulomb=0.8, viscous=0.3) for lever in (0.8, -0.6)]
     add_to(spec, pair)
     model = spec.compile()
     assert tendons_of(model, range(3)).turns == pytest.approx(np.array([[0.0, 0.8, 1.0], [0.0, -0.6, 1.0]]))

@@ -15,10 +15,11 @@ from sim_gap.blind.cases.make import make_cases
 from sim_gap.blind.cases.motion import KINDS, RATE, Limits, derivatives, trajectory
 from sim_gap.blind.cases.recipe import Recipe
 from sim_gap.blind.cases.scene import Scene
-from sim_gap.blind.cases.truth import ordinary
+from sim_gap.blind.cases.true_arm import sound
 from sim_gap.blind.effects.library import DRAWS, EFFECTS
 from sim_gap.blind.plant.friction import Bristles
-from sim_gap.blind.plant.plant import Log, Run, simulate
+from sim_gap.blind.plant.plant import simulate
+from sim_gap.blind.plant.runs import Log, Run
 from sim_gap.blind.plant.sensors import _stays_behind, record
 
 CONTRACT = {
@@ -67,7 +68,7 @@ def no_effect() -> tuple[Run, Log]:
     random = np.random.default_rng(3)
     arm = draw_arm(random, 5)
     scene = Scene(arm, trajectory(("sines",), 8.0, limits(5), random))
-    run = Run(ordinary(arm, scene.rated, random), scene.command, scene.feed_forward(scene.command), scene.inertia, 7)
+    run = Run(sound(arm, scene.rated, random), scene.command, scene.feed_forward(scene.command), scene.inertia, 7)
     return run, simulate([run])[0]
 
 
@@ -119,7 +120,7 @@ def test_a_run_is_the_same_whoever_its_neighbours_are(no_effect: tuple[Run, Log]
     random = np.random.default_rng(11)
     arm = draw_arm(random, 7)
     scene = Scene(arm, trajectory(("points",), 2.0, limits(7), random))
-    other = Run(ordinary(arm, scene.rated, random), scene.command, scene.feed_forward(scene.command), scene.inertia, 1)
+    other = Run(sound(arm, scene.rated, random), scene.command, scene.feed_forward(scene.command), scene.inertia, 1)
     beside = simulate([short, other])[0]
     for name in ("position", "torque", "motor", "command"):
         np.testing.assert_allclose(getattr(beside, name), getattr(log, name)[:500], rtol=0, atol=1e-9)
@@ -174,7 +175,7 @@ def test_a_short_motion_from_point_to_point_moves_and_comes_back() -> None:
 def _bristles(coulomb: float) -> Bristles:
     random = np.random.default_rng(0)
     arm = draw_arm(random, 3)
-    truth = ordinary(arm, np.full(3, 10.0), random)
+    truth = sound(arm, np.full(3, 10.0), random)
     truth.coulomb[:], truth.viscous[:] = coulomb, 0.0
     return Bristles([truth], np.full((1, 3), 0.1), 5e-4)
 

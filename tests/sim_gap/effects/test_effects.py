@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 from wrong_arms import Wrong, model, record
 
-from sim_gap.effects.registry import effects, layout_of, library_without
+from sim_gap.effects.laws import LAWS
+from sim_gap.effects.registry import effects, library_without
 from sim_gap.model.load import load_model
+from sim_gap.residuals.layout import Columns, layout_of
 from sim_gap.residuals.preprocess import prepare
 from sim_gap.residuals.residual_set import ResidualSet
+from sim_gap.search.normal_equations import ColumnStore, Term
 
 CONTRACT = {
     "link.mass_moment", "link.inertia", "link.payload", "base.tilt", "position.offset", "position.gain",
@@ -25,6 +28,10 @@ def residuals(wrong: Wrong, channels=("tau", "tau_motor")) -> ResidualSet:
     nominal = load_model(model())
     signals = prepare(record(model(), wrong, noise=0.0, seconds=25, channels=channels), nominal.arm)
     return ResidualSet((signals,), layout_of([signals]))
+
+
+def columns_of(data: ResidualSet, effect: str, place: int, shape: tuple[float, ...] = ()) -> Columns:
+    return ColumnStore(data).columns(Term(effect, place, shape))
 
 
 def inner(data: ResidualSet) -> np.ndarray:
@@ -56,7 +63,7 @@ CASES = {
 def test_columns_times_the_true_parameters_are_the_residual(name: str):
     wrong, place, shape, coefficients = CASES[name]
     data = residuals(wrong)
-    columns = data.columns(effects()[name], place, shape)
+    columns = columns_of(data, name, place, shape)
     for row in data.rows:
         expected = columns[row] @ np.array(coefficients) if row in columns else np.zeros(len(data.values[row]))
         valid = data.valid[row] & inner(data)
@@ -70,23 +77,23 @@ def rms(x: np.ndarray) -> float:
 
 def test_a_sensor_effect_shows_in_both_rows_with_opposite_sign_and_a_motor_effect_in_one():
     data = residuals(Wrong())
-    sensor = data.columns(effects()["torque.offset"], 1, ())
+    sensor = columns_of(data, "torque.offset", 1)
     np.testing.assert_allclose(sensor["tau", 1], -sensor["tau_motor", 1])
-    assert set(data.columns(effects()["friction.coulomb"], 1, ())) == {("tau_motor", 1)}
-    assert set(data.columns(effects()["link.mass_moment"], 1, ())) == {("tau", 0), ("tau", 1)}
+    assert set(columns_of(data, "friction.coulomb", 1)) == {("tau_motor", 1)}
+    assert set(columns_of(data, "link.mass_moment", 1)) == {("tau", 0), ("tau", 1)}
 
 
 def test_the_library_holds_the_contracts_effects():
     assert set(effects()) >= CONTRACT
     for name in library_without([]):
         effect = effects()[name]
-        assert effect.parameters
+        assert effect.reported
         assert all(need in effects() for need in effect.needs)
 
 
 def test_what_stands_upon_an_effect_that_is_taken_out_goes_with_it() -> None:
     whole = set(library_without([]))
-    assert whole == {name for name, effect in effects().items() if not effect.general}
+    assert whole == {name for name in effects() if name not in LAWS}
     left = library_without(["friction.coulomb"])
     assert whole - set(left) == {"friction.coulomb", "friction.stribeck", "friction.asymmetric"}
     assert whole - set(library_without(["friction.stribeck"])) == {"friction.stribeck"}

@@ -42,7 +42,7 @@ def test_cases_are_folders_with_a_model_and_recordings(fleet: Path, tmp_path: Pa
     assert [case.name for case in cases] == ["arm_a/run_0", "arm_a/run_1", "arm_a/run_2", "arm_b/run_0"]
     assert cases[0].sim.name == "sim.xml"
     assert [path.name for path in (*cases[0].train, *cases[0].heldout)] == ["train.parquet", "heldout.csv"]
-    with pytest.raises(BadInput, match="holds no case"):
+    with pytest.raises(BadInput, match="contains no case"):
         find_cases(tmp_path)
     with pytest.raises(BadInput, match="no such folder"):
         find_cases(tmp_path / "absent")
@@ -83,12 +83,12 @@ def test_the_command_gathers_a_table_by_arm_and_effect_and_goes_on_where_it_stop
     whole = Path(out).read_bytes()
     Path(out).write_bytes(whole[:-40])  # as a kill leaves it
     again = CliRunner().invoke(app, arguments, standalone_mode=False)
-    assert "3 of 4 are there already" in " ".join(again.stderr.split())
+    assert "3 of 4 cases are done already" in " ".join(again.stderr.split())
     assert len(Answers(Path(out)).found) == 4
 
 
 def sleeper(case: Case) -> dict[str, object]:
-    """Dies with its worker the first time; a file tells."""
+    """Dies with its worker the first time, recorded by a file."""
     if not case.sim.exists():
         case.sim.touch()
         os.kill(os.getpid(), signal.SIGKILL)
@@ -113,6 +113,6 @@ def test_no_scheduler_at_an_address_is_one_line() -> None:
 def test_a_file_of_something_else_is_not_added_to(tmp_path: Path) -> None:
     other = tmp_path / "notes.json"
     other.write_text('{"mine": 1}\n', encoding="utf-8")
-    with pytest.raises(BadInput, match="line 1 is no answer of a fleet"):
+    with pytest.raises(BadInput, match="line 1 is not a result of a fleet"):
         Answers(other)
     assert other.read_text(encoding="utf-8") == '{"mine": 1}\n'

@@ -7,8 +7,8 @@ from wrong_arms import THREE
 
 from armlink.errors import BadInput
 from sim_gap.effects.link import moment_to_inertia
-from sim_gap.model.load import load_model
-from sim_gap.model.rigid_body import RigidArm, rigid_arm
+from sim_gap.model.load import load_model, rigid_arm
+from sim_gap.model.rigid_body import RigidArm
 
 
 def random_arm(n: int, seed: int) -> str:

@@ -5,7 +5,7 @@ import pytest
 from wrong_arms import Wrong, model, record
 
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.report.cause_figures import finding_figure
+from sim_gap.report.cause_figures import cause_figure
 from sim_gap.report.figures import residual_panels
 from sim_gap.report.page import sections
 
@@ -29,7 +29,7 @@ def test_a_residual_is_shown_over_velocity_position_load_and_time_for_every_join
 
 
 def test_every_cause_has_its_figure_and_lies_in_the_middle_of_what_it_explains(answer):
-    figures = {cause.effect: finding_figure(answer, cause) for cause in answer.causes}
+    figures = {cause.effect: cause_figure(answer, cause) for cause in answer.causes}
     assert figures.keys() == {"friction.coulomb", "transmission.spring"}
     for effect, axis in (("friction.coulomb", "velocity"), ("transmission.spring", "position")):
         left, explained = figures[effect].data

@@ -1,16 +1,17 @@
-"""All that is wrong with one arm of the blind check, as arrays; without effects, what is wrong with every arm."""
+"""The true arm of a blind case: all its imperfections as arrays; without effects, those of every arm."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_gap.blind.cases.arms import Arm, Array, perturbed
+from gcomp.arrays import Array
+from sim_gap.blind.cases.arms import Arm, perturbed
 
 
 @dataclass(frozen=True)
 class SharedMotor:
-    """A motor that turns with q_joint + coefficient·q_other: its inertia, and the friction of `joint`, load both."""
+    """A motor that turns by q_joint + coefficient·q_other: its inertia and the friction of `joint` load both."""
 
     joint: int
     other: int
@@ -20,11 +21,11 @@ class SharedMotor:
 
 
 @dataclass(eq=False)
-class Truth:
-    """One arm as it is. Arrays are (n,) unless said otherwise; SI units."""
+class TrueArm:
+    """One arm with its imperfections. Arrays are (n,) unless noted otherwise; SI units."""
 
     arm: Arm
-    """Links, rotors and gravity as they are; its damping and frictionloss are not used (see `coulomb`, `viscous`)."""
+    """True links, rotors and gravity; its damping and frictionloss are not used (see `coulomb`, `viscous`)."""
     coulomb: Array
     viscous: Array
     breakaway: Array
@@ -41,7 +42,7 @@ class Truth:
     backlash: Array
     """Full width of the play [rad]."""
     motor_gain: Array
-    """Torque made per torque that the drive reports."""
+    """Torque produced per torque that the drive reports."""
     motor_lag: Array
     motor_delay: Array
     motor_limit: Array
@@ -59,7 +60,7 @@ class Truth:
     eccentricity: Array
     """Amplitude and phase [rad], (n, 2)."""
     rated: Array
-    """Rated torque [N·m]: noise and resolution follow it."""
+    """Rated torque [N·m]: noise and resolution are proportional to it."""
     torque_noise: Array
     motor_noise: Array
     encoder_bits: int
@@ -83,11 +84,11 @@ class Truth:
         return float(2 * np.pi / 2**self.encoder_bits)
 
 
-def ordinary(nominal: Arm, rated: Array, random: np.random.Generator) -> Truth:
-    """The arm without effects: nominal parameters a little wrong everywhere, a little friction, noise of sensors."""
+def sound(nominal: Arm, rated: Array, random: np.random.Generator) -> TrueArm:
+    """The arm without effects: small errors of all nominal parameters, a little friction, sensor noise."""
     n = nominal.n
     zero, one, never = np.zeros(n), np.ones(n), np.full(n, np.inf)
-    return Truth(
+    return TrueArm(
         arm=perturbed(nominal, random),
         coulomb=nominal.frictionloss * random.uniform(0.98, 1.02, n) + random.uniform(0.01, 0.04, n),
         viscous=nominal.damping * random.uniform(0.98, 1.02, n) + random.uniform(0.0, 0.02, n),

@@ -1,0 +1,79 @@
+"""Ends a connection in stages (RFC 9112, section 9.6) and within bounds, so that its last answer is not lost."""
+
+import asyncio
+from typing import Any
+
+LINGER_BYTES = 1024 * 1024
+"""What a client may send after the last answer; one that sends more is cut."""
+LINGER_SECONDS = 1.5
+"""Time for that, counted from the end of the answer; shorter than the server's own end (`server.CLOSING_SECONDS`)."""
+FLUSH_SECONDS = 30.0
+"""An answer that the client has not taken by then, counted from `close`, is given up."""
+
+
+class LingeringTransport:
+    """A transport whose `close` sends what is unsent, half-closes, discards what comes, and ends when the client does.
+
+    A socket that is closed with bytes of the client unread makes the kernel reset the connection, and a client that is
+    still sending gets an error instead of the answer. `abort` cuts the connection at once. The rest is the plain
+    transport's.
+    """
+
+    def __init__(self, plain: asyncio.Transport) -> None:
+        self._plain = plain
+        self._lingers = False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._plain, name)
+
+    def is_closing(self) -> bool:
+        """Whether nothing more can be sent."""
+        return self._lingers or self._plain.is_closing()
+
+    def write(self, data: bytes) -> None:
+        """Send; dropped after `close`."""
+        if not self._lingers:
+            self._plain.write(data)
+
+    def close(self) -> None:
+        """End the connection; its protocol gets `connection_lost` at the end and nothing before."""
+        if not self.is_closing():
+            self._lingers = True
+            _Drain(self._plain).begin()
+
+
+class _Drain(asyncio.Protocol):
+    """Takes the place of a connection's protocol until the client has closed, or has used up its bytes or its time."""
+
+    def __init__(self, transport: asyncio.Transport) -> None:
+        self._transport, self._owner = transport, transport.get_protocol()
+        self._loop = asyncio.get_running_loop()
+        self._bytes_left = LINGER_BYTES
+        seconds = FLUSH_SECONDS if transport.get_write_buffer_size() else LINGER_SECONDS
+        self._end = self._loop.call_later(seconds, transport.abort)
+
+    def begin(self) -> None:
+        """Half-close, once all is sent, and read on even if reading was paused."""
+        self._transport.set_protocol(self)
+        self._transport.set_write_buffer_limits(high=0)  # resume_writing then says that all is sent
+        try:
+            self._transport.write_eof()
+        except OSError:  # the client has reset it already
+            self._transport.abort()
+        self._transport.resume_reading()
+
+    def resume_writing(self) -> None:
+        """All is sent: the time to close begins."""
+        self._end.cancel()
+        self._end = self._loop.call_later(LINGER_SECONDS, self._transport.abort)
+
+    def data_received(self, data: bytes) -> None:
+        """Discard it."""
+        self._bytes_left -= len(data)
+        if self._bytes_left < 0:
+            self._transport.abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Hand on to the connection's own protocol."""
+        self._end.cancel()
+        self._owner.connection_lost(exc)

@@ -1,0 +1,93 @@
+"""Stop combinations among which sweeps are chosen: held by the drives, felt by the sensor, free of collisions."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from armlink.arm_file import ArmFile
+from armlink.errors import BadInput
+from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import gcomp_arm
+from calib.arm.sweep_section import SweepSection, sweep_section
+from calib.plan.bias_torque import hold_torque, pressable
+from calib.plan.collisions import POINTS, Collided, Geometry
+from calib.plan.poses import require_range, sweep_range
+from calib.plan.rough_gravity import GravityGuess
+from calib.plan.stop_selection import Candidates, reachable, stop_combinations
+from gcomp.arm.arm import Arm
+from gcomp.arrays import Array
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedArm:
+    """The arm as planning sees it."""
+
+    kinematics: Arm
+    section: SweepSection
+    limits: Limits
+    guess: GravityGuess | None
+    """Rough gravity model; None if nothing is known of the masses."""
+    geometry: Geometry | None
+    """The model's bodies, for collisions; None if the arm file has no model."""
+
+    @classmethod
+    def of(cls, arm_file: ArmFile, guess: GravityGuess | None) -> Self:
+        """Raises BadInput if a joint's range is too short to sweep or the model cannot be used."""
+        kinematics, section, limits = gcomp_arm(arm_file), sweep_section(arm_file), Limits.of(arm_file)
+        require_range(section, limits, kinematics)
+        return cls(kinematics, section, limits, guess, None if arm_file.model_path is None else Geometry(arm_file))
+
+
+def sweep_options(planned: PlannedArm) -> tuple[list[Candidates], list[str]]:
+    """(Combinations of each joint, tip to base; notes on what had to be given up).
+
+    Raises BadInput if the drives can hold no combination, Collided if something touches in every one.
+    """
+    found = [_options(planned, joint) for joint in reversed(range(planned.kinematics.n))]
+    return [options for options, _ in found], [note for _, notes in found for note in notes]
+
+
+def _options(planned: PlannedArm, joint: int) -> tuple[Candidates, list[str]]:
+    section, limits, guess = planned.section, planned.limits, planned.guess
+    name = planned.kinematics.names[joint]
+    everything = stop_combinations(planned.kinematics, joint, sweep_range(section, limits, joint))
+    if planned.geometry is not None:
+        everything = _without_collision(everything, planned.geometry, name)
+    if guess is None:
+        return reachable(everything), []
+    least, largest, allowance = hold_torque(guess, section, limits, everything.poses)
+    strongest = np.maximum(np.abs(least), np.abs(largest))
+    drivable = strongest[:, joint] + allowance[:, joint] <= limits.max_torque[joint]
+    if not drivable.any():
+        drivable = strongest[:, joint] <= limits.max_torque[joint]
+    holdable = (strongest + section.friction * limits.rated <= limits.max_torque).all(axis=1) & drivable
+    pressed = pressable(guess, section, limits, everything).all(axis=1) & holdable  # it must leave its stop again
+    if pressed.sum() >= section.poses:
+        return reachable(everything.kept(pressed)), []
+    if not (pressed | holdable).any():
+        raise BadInput(
+            f"joint {name}: no combination of stops can be held within max_torque: gravity needs up to"
+            f" {_torques(strongest.min(axis=0))} N·m; sweep a lighter arm, or allow more torque"
+        )
+    note = f"{name}: too few stop combinations can be pressed within max_torque: some joints are servo-held instead"
+    return reachable(everything.kept(pressed | holdable)), [note]
+
+
+def _without_collision(candidates: Candidates, geometry: Geometry, name: str) -> Candidates:
+    """The combinations along which nothing touches, at the poses `check_plan` looks at; raises Collided if none."""
+    shares = np.linspace(0, 1, POINTS + 1)[:, None]
+    begin, end = candidates.poses[:, :1], candidates.poses[:, -1:]
+    flat = (begin + shares * (end - begin)).reshape(-1, candidates.poses.shape[-1])
+    free = np.all(geometry.free(flat).reshape(candidates.count, -1), axis=1)
+    if free.any():
+        return candidates.kept(free)
+    first, second = next(found for pose in flat for found in geometry.contacts(pose)).bodies
+    raise Collided(
+        f"joint {name}: in every combination of stops something touches, as {first} does {second}: narrow lower and"
+        " upper in the arm file"
+    )
+
+
+def _torques(values: Array) -> str:
+    return " ".join(f"{value:.1f}" for value in values)

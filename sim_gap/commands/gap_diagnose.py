@@ -1,0 +1,99 @@
+"""Explains the gap between a simulation model and recordings of the real arm."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from sim_gap.attribution.diagnosis import Diagnosis
+
+
+def diagnose(
+    sim: Annotated[str, typer.Option(help="Nominal model: MJCF, URDF or arm file.")],
+    train: Annotated[list[Path], typer.Option(help="Recording to fit; may be repeated.")],
+    heldout: Annotated[
+        list[Path] | None,
+        typer.Option(help="Held-out recording to judge on; may be repeated. Default: the end of each --train."),
+    ] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the result here; - is standard output.")] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a self-contained HTML report here.")] = None,
+    out_model: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write the corrected model here (MJCF), and beside it a module for effects MJCF cannot hold."
+        ),
+    ] = None,
+) -> None:
+    """Find where the gap is, which effects cause it, and how far they close it on held-out data.
+
+    Example: armlink gap diagnose --sim arm.xml --train slow.csv --train fast.csv --heldout other.csv --json -
+    """
+    from rich.console import Console
+
+    from armlink.commands.output import write_json
+    from armlink.errors import BadInput
+    from armlink.recording.recording import load_recording
+    from sim_gap.attribution import diagnose as diagnosis
+
+    console = Console(stderr=True)
+    paths = [*train, *(heldout or [])]
+    for target in (None if str(json) == "-" else json, report, out_model):
+        if target is not None and not target.resolve().parent.is_dir():
+            raise BadInput(f"{target}: its folder does not exist: create it first")
+    with console.status(f"reading {len(paths)} recordings"):
+        recordings = [load_recording(path) for path in paths]
+    count = len(train)
+    with console.status("fitting effects to the gap"):
+        answer = diagnosis.diagnose(sim, recordings[:count], recordings[count:], labels=[str(path) for path in paths])
+    for path, recording in zip(paths, recordings, strict=True):
+        if recording.warning:
+            console.print(f"{path}: {recording.warning}", style="yellow")
+    _show(answer, console)
+    if report is not None:
+        from sim_gap.report.page import write_report
+
+        write_report(answer, report, subtitle=f"{sim} against {', '.join(str(path) for path in paths)}")
+        console.print(f"report: {report}")
+    if out_model is not None:
+        _write_model(answer, out_model, console)
+    write_json(json, answer.to_json())
+
+
+def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
+    from sim_gap.better_model.effects_module import module_path
+    from sim_gap.better_model.export import write_model
+
+    missing = write_model(answer.internals.model, answer.internals.estimate, path)
+    console.print(f"corrected model: {path}")
+    for line in missing:
+        console.print(f"not in MJCF: {line}", style="yellow")
+    if missing:
+        console.print(f"{module_path(path)} applies these effects in a MuJoCo simulation")
+
+
+def _show(answer: "Diagnosis", console: "Console") -> None:
+    """Print verdict, causes and gap as tables."""
+    from rich.table import Column, Table
+
+    from sim_gap.report.effect_text import sentence
+
+    console.print(sentence(answer), style="bold")
+    if answer.causes:
+        effect = Column("effect", no_wrap=True)
+        headers = "joints", "RMS before", "after", "confidence", "confounded with"
+        table = Table(effect, *headers, title="causes, on held-out data")
+        for cause in answer.causes:
+            joints = f"all {len(answer.names)}" if cause.joints == answer.names else ", ".join(cause.joints)
+            numbers = f"{cause.gap_before:.3g}", f"{cause.gap_after:.3g}", f"{cause.confidence:.2f}"
+            table.add_row(cause.effect, joints, *numbers, ", ".join(cause.confounded_with))
+        console.print(table)
+    table = Table("joint", "noise floor", "before", "after", title=f"gap on {answer.heldout_is}, RMS in N·m")
+    for j, name in enumerate(answer.names):
+        numbers = answer.noise_floor[j], answer.heldout_before[j], answer.heldout_after[j]
+        table.add_row(name, *(f"{value:.3g}" for value in numbers))
+    console.print(table)
+    for note in answer.notes:
+        console.print(note, style="yellow")

@@ -1,0 +1,180 @@
+"""The inverse form of an effect, in three parts: how it shows, what is plausible, and hints to the search.
+
+The `Signature` gives the columns of an effect in the residuals, linear in its coefficients at a given shape. The
+`Plausibility` holds its priors and the values that can exist. The `SearchHints` say where to start and which simpler
+effects compete.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from armlink.effect_catalogue import CATALOGUE
+from sim_gap.model.rigid_body import Array
+from sim_gap.residuals.layout import Columns, Layout
+from sim_gap.residuals.preprocess import Signals
+
+Shape = tuple[float, ...]
+"""Nonlinear parameters of an effect, such as its Stribeck velocity."""
+Key = tuple[str, int]
+"""Id of an effect and the index of a joint or link (0 for the whole arm)."""
+Column = Callable[[Signals, int, Shape], Array]
+"""The columns of an effect at one place, (K,) or (K, p), from signals, place and shape."""
+Beneath = Mapping[str, Array]
+"""Coefficients of the effects that one needs, by id; `nominal` holds the model's own friction loss."""
+
+
+Channel = Literal["any", "sensor", "motor", "command"]
+"""The channel without which an effect cannot show."""
+
+
+@dataclass(frozen=True)
+class Signature:
+    """How an effect shows in a recording."""
+
+    columns: Callable[[Signals, Layout, int, Shape], Columns]
+    """Columns at the work rate, by row."""
+    channel: Channel = "any"
+    whole_arm: bool = False
+    """Whether it belongs to the arm as a whole instead of to one joint or link."""
+    recording: Callable[[Shape], int] = lambda _shape: 0
+    """The one training recording (from 1) that it is present in; 0 if it belongs to the arm for good."""
+
+    def places(self, layout: Layout) -> range:
+        """Joints or links at which it may be; empty if these channels cannot show it."""
+        channels = {"sensor": layout.sensor, "motor": layout.motor, "command": layout.commanded}
+        if self.channel != "any" and channels[self.channel] is None:
+            return range(0)
+        return range(1 if self.whole_arm else layout.n)
+
+    @classmethod
+    def at_motor(cls, column: Column, channel: Channel = "any") -> "Signature":
+        """An effect between motor and torque sensor, of one joint."""
+        return cls(lambda s, layout, j, shape: {(layout.motor_side, j): _2d(column(s, j, shape))}, channel)
+
+    @classmethod
+    def at_sensor(cls, column: Column, channel: Channel = "sensor") -> "Signature":
+        """An effect on the torque sensor's reading, of one joint."""
+        return cls(lambda s, layout, j, shape: layout.sensor_columns(j, _2d(column(s, j, shape))), channel)
+
+    @classmethod
+    def at_link(cls, column: Column) -> "Signature":
+        """An effect on the link side, of one joint: it shows against the model."""
+        return cls(lambda s, layout, j, shape: {(layout.against_model, j): _2d(column(s, j, shape))})
+
+    @classmethod
+    def at_command(cls, column: Column) -> "Signature":
+        """An effect between command and motor torque, of one joint."""
+        return cls(lambda s, layout, j, shape: {(str(layout.commanded), j): _2d(column(s, j, shape))}, "command")
+
+
+def _2d(columns: Array) -> Array:
+    return columns[:, None] if columns.ndim == 1 else columns
+
+
+def always(_coefficients: Array, _shape: Shape, _beneath: Beneath) -> bool:
+    """All coefficients are possible."""
+    return True
+
+
+def not_negative(coefficients: Array, _shape: Shape, _beneath: Beneath) -> bool:
+    """The first coefficient is not below zero: friction opposes motion, masses are positive."""
+    return bool(coefficients[0] >= 0.0)
+
+
+def positive(coefficients: Array, _shape: Shape, _beneath: Beneath) -> bool:
+    """The first coefficient is above zero."""
+    return bool(coefficients[0] > 0.0)
+
+
+def between(low: float, high: float) -> Callable[[Array, Shape, Beneath], bool]:
+    """The first coefficient lies strictly between two values."""
+    return lambda coefficients, _shape, _beneath: bool(low < coefficients[0] < high)
+
+
+@dataclass(frozen=True)
+class Plausibility:
+    """Priors of an effect, and the values that can exist."""
+
+    prior_penalty: int = 3
+    """Number of extra coefficients that the effect is charged for: 0 if every arm has it, more if few have."""
+    prior_mean: float = 0.0
+    """Prior mean of the coefficients: 1 if the shape alone determines the effect."""
+    prior_std: Callable[[Signals, int], Array] = lambda _signals, _place: np.full(1, np.inf)
+    """Prior standard deviation of each coefficient (p,), its largest plausible size; infinite for none."""
+    background_std: float = 0.0
+    """Standard deviation of each coefficient over sound arms; confidence intervals include it."""
+    allows: Callable[[Array, Shape, Beneath], bool] = always
+    """Whether such an effect can exist with these coefficients."""
+
+
+@dataclass(frozen=True)
+class SearchHints:
+    """Where the search starts, what it refines, and which simpler effects compete."""
+
+    shapes: tuple[Shape, ...] = ((),)
+    """Shapes to start with; the best one is then refined between its neighbours."""
+    shapes_for: Callable[[Sequence[Signals], int], tuple[Shape, ...]] | None = None
+    """The same for given recordings and place."""
+    discrete: frozenset[int] = frozenset()
+    """Entries of the shape that are the number of something (a joint, a recording): they are not refined."""
+    linearised_at: int | None = None
+    """Entry of the shape at which a nonlinear effect is linearised, by its secant; None if it is linear."""
+    relinearise: Callable[[Array, Shape], Shape] = lambda coefficients, _shape: (float(coefficients[0]),)
+    """The shape at which to linearise again, from the coefficients fitted at the last one."""
+    covers: Callable[[Layout, int], tuple[Key, ...]] = lambda _layout, _place: ()
+    """Effects whose columns this one contains: they are not fitted beside it."""
+    alternatives: Callable[[Layout, int, Shape], tuple[Key, ...]] = lambda _layout, _place, _shape: ()
+    """Simpler effects that together could replace this one; it must do better than they."""
+    canonical: Callable[[int, Shape], tuple[int, Shape]] = lambda place, shape: (place, shape)
+    """Place and shape under which it is reported, if two of them show alike."""
+
+    def grid(self, signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
+        """Shapes to start with on these recordings."""
+        return self.shapes if self.shapes_for is None else self.shapes_for(signals, place)
+
+
+def as_fitted(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:
+    """The coefficients are the reported parameters."""
+    return coefficients
+
+
+def as_gain(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:
+    """The coefficient is a gain's distance from one."""
+    return 1.0 + coefficients
+
+
+def as_shape(_coefficients: Array, shape: Shape, _beneath: Beneath) -> Array:
+    """The shape is the reported parameter."""
+    return np.array([shape[0]])
+
+
+def as_fitted_and_shape(coefficients: Array, shape: Shape, _beneath: Beneath) -> Array:
+    """The coefficient and the shape are the reported parameters."""
+    return np.array([coefficients[0], shape[0]])
+
+
+def as_share_of_shape(coefficients: Array, shape: Shape, _beneath: Beneath) -> Array:
+    """The coefficient is a factor on the shape."""
+    return coefficients * shape[0]
+
+
+@dataclass(frozen=True)
+class Effect:
+    """The inverse form of one effect."""
+
+    id: str
+    signature: Signature
+    plausibility: Plausibility = Plausibility()
+    hints: SearchHints = SearchHints()
+    needs: tuple[str, ...] = ()
+    """Effects at the same place that it builds on: the simpler model."""
+    parameters_of: Callable[[Array, Shape, Beneath], Array] = as_fitted
+    """Reported parameters from coefficients, shape and the coefficients of `needs`, in the catalogue's order."""
+
+    @property
+    def reported(self) -> tuple[tuple[str, str], ...]:
+        """Name and unit of each reported parameter."""
+        return CATALOGUE[self.id].reported
