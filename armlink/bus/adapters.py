@@ -8,10 +8,10 @@ import can
 from armlink.bus.can_bus import CanBus, MessageBus
 from armlink.bus.in_process import InProcessBus
 from armlink.bus.message_port import MessagePort
-from armlink.bus.multicast_port import MulticastPort
 from armlink.bus.port import Port
-from armlink.bus.socket_port import SocketPort
-from armlink.bus.stamped_port import StampedMulticastPort, StampedSocketPort
+from armlink.bus.sockets.multicast_port import MulticastPort
+from armlink.bus.sockets.socket_port import SocketPort
+from armlink.bus.sockets.stamped_port import StampedMulticastPort, StampedSocketPort
 from armlink.clock import Clock
 
 

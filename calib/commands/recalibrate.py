@@ -78,7 +78,7 @@ def _rows(
     import numpy as np
 
     from armlink.errors import BadInput
-    from armlink.recording.recording import load_recording
+    from armlink.recording.files import load_recording
     from calib.field.rows import rows_of_recording, rows_of_sweeps
     from calib.sweep.dataset import load_data
 

@@ -14,8 +14,8 @@ from armlink.bus.in_process import InProcessBus
 from armlink.bus.taps import TappedBus
 from armlink.cli import run
 from armlink.errors import BadInput
+from armlink.recording.files import load_recording
 from armlink.recording.recorder import Recorder
-from armlink.recording.recording import load_recording
 from armlink.recording.replay import frames_of_log, frames_of_recording, play_onto, recording_of_log
 
 SUFFIXES = (".asc", ".blf", ".log")

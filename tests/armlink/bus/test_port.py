@@ -8,12 +8,12 @@ import can
 import pytest
 
 from armlink.arm_file import Bus
-from armlink.bus import datagram_port
 from armlink.bus.bus_group import BusGroup, GroupPort
-from armlink.bus.datagram_port import BATCH
 from armlink.bus.message_port import MessagePort
 from armlink.bus.open import open_bus, open_link_bus
-from armlink.bus.socket_port import SocketPort
+from armlink.bus.sockets import datagram_port
+from armlink.bus.sockets.datagram_port import BATCH
+from armlink.bus.sockets.socket_port import SocketPort
 from armlink.errors import BadInput, BusFault
 
 

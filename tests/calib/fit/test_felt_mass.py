@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
-from sweep_arms import random_arm
+from sweep_arms import random_arm, synthetic_pass
 from synthetic_sweeps import passes, plans
 
 from calib.arm.kinematics import gcomp_arm
 from calib.fit.felt_mass import felt_mass
 from calib.fit.sweep_readings import sweep_readings
 from sim_bus.truth import Truth
-from sweep_arms import synthetic_pass
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3, 4])

@@ -9,9 +9,9 @@ import socket
 import struct
 from collections.abc import Sequence
 
-from armlink.bus.datagram_port import NAME, NOT_OURS, Batch, DatagramPort
-from armlink.bus.multicast_frames import LONGEST, Decoder, encode
 from armlink.bus.port import ERROR, Frame
+from armlink.bus.sockets.datagram_port import NAME, NOT_OURS, Batch, DatagramPort
+from armlink.bus.sockets.multicast_frames import LONGEST, Decoder, encode
 from armlink.errors import BusFault
 
 _IP_MULTICAST_ALL, _IPV6_MULTICAST_ALL = 49, 29

@@ -4,8 +4,8 @@ import socket
 import struct
 from collections.abc import Sequence
 
-from armlink.bus.datagram_port import FLAGS, Batch, DatagramPort
 from armlink.bus.port import Frame
+from armlink.bus.sockets.datagram_port import FLAGS, Batch, DatagramPort
 
 _CLASSIC, _FD = struct.Struct("=IBB2x8s"), struct.Struct("=IBB2x64s")
 _FD_FLAGS = 0x05  # CANFD_BRS | CANFD_FDF: a CAN FD frame with bit-rate switch

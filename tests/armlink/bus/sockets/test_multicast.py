@@ -13,11 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from armlink.arm_file import Bus
-from armlink.bus.datagram_port import BATCH
-from armlink.bus.multicast_frames import ERROR, EXTENDED, HEADS_KEPT, REMOTE, Decoder, encode
-from armlink.bus.multicast_port import MulticastPort
 from armlink.bus.open import open_bus
-from armlink.bus.stamped_port import StampedMulticastPort
+from armlink.bus.sockets.datagram_port import BATCH
+from armlink.bus.sockets.multicast_frames import ERROR, EXTENDED, HEADS_KEPT, REMOTE, Decoder, encode
+from armlink.bus.sockets.multicast_port import MulticastPort
+from armlink.bus.sockets.stamped_port import StampedMulticastPort
 
 GROUP = "239.74.163.47"
 PORT = 45200 + os.getpid() % 1000

@@ -6,10 +6,10 @@ import socket
 import struct
 import time
 
-from armlink.bus.datagram_port import BATCH, CONTROL, FLAGS, DatagramPort
-from armlink.bus.multicast_port import MulticastPort
 from armlink.bus.port import Stamped
-from armlink.bus.socket_port import SocketPort
+from armlink.bus.sockets.datagram_port import BATCH, CONTROL, FLAGS, DatagramPort
+from armlink.bus.sockets.multicast_port import MulticastPort
+from armlink.bus.sockets.socket_port import SocketPort
 
 MOST_BATCHES = 256
 """So many batches are taken at once: frames without end do not keep a listener for ever."""
