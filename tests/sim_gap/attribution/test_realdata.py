@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from armlink.recording.recording import load_recording, slice_rows
+from armlink.recording.files import load_recording
+from armlink.recording.recording import slice_rows
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.diagnosis import Diagnosis
 

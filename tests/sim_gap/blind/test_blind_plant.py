@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from armlink.recording.recording import load_recording
+from armlink.recording.files import load_recording
 from sim_gap.blind.cases.arms import Arm, draw_arm
 from sim_gap.blind.cases.make import make_cases
 from sim_gap.blind.cases.motion import KINDS, RATE, Limits, derivatives, trajectory
