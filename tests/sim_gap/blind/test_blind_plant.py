@@ -157,7 +157,7 @@ def test_trajectories_keep_their_limits_and_rest_at_both_ends(kind: str) -> None
 
 
 def test_point_to_point_motion_always_comes_back() -> None:
-    """Otherwise the command would jump at the start of the next kind of motion, and the drives be rated for that jump."""
+    """Otherwise the command would jump at the start of the next kind of motion, and drives be rated for that jump."""
     bounds = limits(4)
     for seed in range(60):
         q = trajectory(("points", "sweeps"), 30.0, bounds, np.random.default_rng(seed))
