@@ -1,4 +1,4 @@
-"""Real arms: the gap closes on motion that was not fitted, for the reasons that are known."""
+"""Real arms: the gap closes on held-out data, by the known causes."""
 
 import numpy as np
 import pytest
