@@ -96,8 +96,16 @@ def _check_host(console: "Console", arm: "ArmFile", seconds: float, json: Path |
     with console.status(f"{arm.name}: cycles at {arm.require_link().rate:g} Hz for {seconds:g} s, with a job beside"):
         report = measure_host(arm, seconds)
     late, section = report.lateness.in_ms(), arm.require_link()
-    answer = {"rate_hz": report.rate, "seconds": seconds, "late_ms": late, "holds_hz": report.holds_hz}
-    write_json(json, {"schema": HOST_SCHEMA, "arm": arm.name, **answer, "realtime": str(report.realtime)})
+    answer = {
+        "schema": HOST_SCHEMA,
+        "arm": arm.name,
+        "rate_hz": report.rate,
+        "seconds": seconds,
+        "late_ms": late,
+        "holds_hz": report.holds_hz,
+        "realtime": str(report.realtime),
+    }
+    write_json(json, answer)
     console.print(
         f"cycles began late by {late['p50']:.2f} ms (median), {late['p99']:.2f} (99 %), {late['p99_9']:.2f} (99.9 %),"
         f" {late['max']:.2f} (longest); {report.busy * 1e3:.2f} ms of processor time each; {report.realtime}",
