@@ -58,11 +58,9 @@ class Daemon:
         """See LoopControllers."""
         return self.host.controllers.read_calibration(joint)
 
-    def write_calibration(
-        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
-    ) -> Calibration:
+    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
         """See LoopControllers."""
-        return self.host.controllers.write_calibration(joint, gain, offset, record_id, date, store)
+        return self.host.controllers.write_calibration(joint, calibration, store)
 
     def sweep(self, poses: int, seed: int) -> Any:
         """See ChildHost."""

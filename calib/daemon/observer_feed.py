@@ -7,6 +7,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.canopen.cia402 import state_of
+from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, per_joint
 from calib.arm.kinematics import gcomp_arm
 from calib.daemon.loop.loop_messages import Array, Batch
 from calib.daemon.view.api_models import JointNow
@@ -32,18 +33,18 @@ class Watcher:
         section = arm.require_link()
         self.arm, self.gravity, self.calibration = gcomp_arm(arm), gravity.require(arm), calibration.require(arm)
         self.names = self.arm.names
-        rated = np.array([joint.rated_torque for joint in section.joints])
+        rated = arm.require_link().rated_torques
         self.observer = Observer.of_records(self.arm, self.calibration, self.gravity, rated, config)
         self._group = max(1, round(section.rate / OBSERVED_RATE))
         self._position_gain = self.calibration.values("position_gain", 1.0)
         self._position_offset = self.calibration.values("position_offset", 0.0)
-        self._gain, self._offset = np.ones(self.arm.n), np.zeros(self.arm.n)
+        self._change = per_joint([UNCALIBRATED] * self.arm.n)
         self._left: tuple[Array, Array, Array] | None = None
 
     def follow(self, calibration: CalibrationRecord) -> None:
         """Another record follows from the one in force, the controllers hold it: readings are by it from now on."""
         self.calibration = calibration
-        self._gain, self._offset = np.ones(self.arm.n), np.zeros(self.arm.n)
+        self._change = per_joint([UNCALIBRATED] * self.arm.n)
 
     def controllers_hold(self, held: tuple[tuple[float, float, int], ...] | None) -> list[str]:
         """What the controllers hold (gain, offset, record id); readings are brought to the record in force.
@@ -51,20 +52,19 @@ class Watcher:
         Returns the joints that hold another pair than the record's; none where it is not known (None).
         """
         if held is None:
-            self._gain, self._offset = np.ones(self.arm.n), np.zeros(self.arm.n)
+            self._change = per_joint([UNCALIBRATED] * self.arm.n)
             return []
-        gain, offset = np.array([each[0] for each in held]), np.array([each[1] for each in held])
-        wanted_gain, wanted_offset = self.calibration.values("gain"), self.calibration.values("offset")
-        wanted_gain = np.where(np.isnan(wanted_gain), gain, wanted_gain)
-        wanted_offset = np.where(np.isnan(wanted_offset), offset, wanted_offset)
-        differ = ~(np.isclose(gain, wanted_gain, rtol=1e-6, atol=0) & np.isclose(offset, wanted_offset, atol=1e-6))
-        self._gain = np.where(differ, gain / wanted_gain, 1.0)
-        self._offset = np.where(differ, (offset - wanted_offset) / wanted_gain, 0.0)
+        installed = per_joint(TorqueCalibration(gain, offset) for gain, offset, _ in held)
+        wanted = self.calibration.torque_calibration(installed)
+        same = np.isclose(installed.gain, wanted.gain, rtol=1e-6, atol=0)
+        differ = ~(same & np.isclose(installed.offset, wanted.offset, atol=1e-6))
+        change = installed.relative_to(wanted)
+        self._change = TorqueCalibration(np.where(differ, change.gain, 1.0), np.where(differ, change.offset, 0.0))
         return [name for name, other in zip(self.names, differ, strict=True) if other]
 
     def decimated(self, batch: Batch) -> tuple[Array, Array, Array]:
         """(t (K,), position (K, n), torque (K, n)) of the batch as the observer takes it, NaN where all is missing."""
-        torque = batch.channels["torque"] * self._gain + self._offset
+        torque = self._change.apply(batch.channels["torque"])
         columns = (batch.t, batch.channels["position"], torque)
         if self._left is not None:
             columns = tuple(np.concatenate(pair) for pair in zip(self._left, columns, strict=True))  # type: ignore[assignment]
@@ -106,7 +106,7 @@ class Watcher:
 
     def reading(self, torque: Array) -> Array:
         """A torque reading (n,) by the record in force [N·m]."""
-        return np.asarray(torque * self._gain + self._offset)
+        return self._change.apply(torque)
 
 
 def joints_now(

@@ -47,7 +47,7 @@ class Recalibrations:
         self.recalibrator = Recalibrator(arm, controllers, store, "propose")
         self.busy = False
         self._waiting: list[Finding] = []
-        self._checking: str | None = None
+        self._checking: tuple[str, ...] = ()
         self._unexplained: deque[tuple[Array, Array, Array]] = deque(maxlen=WAITING)
 
     # ---- what the observer found
@@ -140,7 +140,7 @@ class Recalibrations:
     def applied(self, row: ProposalRow, by: str, record: CalibrationRecord, install: bool = True) -> None:
         """A proposal is in force: keep and say it; with `install` the observer takes it over too."""
         finding = finding_of(row.finding)
-        self._checking = row.joint
+        self._checking = (row.joint,)
         joint = record.joints[finding.joint]
         gain = "as before" if joint.gain is None else f"{joint.gain:.5f}"
         text = f"{row.joint}: record {record.id} in force: gain {gain}, offset {joint.offset or 0.0:.3f} N·m"
@@ -161,12 +161,16 @@ class Recalibrations:
 
     # ---- after a write
 
+    def restored(self, joints: tuple[str, ...]) -> None:
+        """The current record was written to the controllers of these joints: `watch` checks it."""
+        self._checking = joints
+
     def watch(self, samples: tuple[Array, Array, Array], held: bool) -> None:
         """Give decimated samples to the check after a write; what is worse than before is taken back.
 
         While an alarm stands (`held`) they wait until its cause is `explained`: a payload says nothing of the sensor.
         """
-        if self._checking is None or self.busy:
+        if not self._checking or self.busy:
             return
         if held:
             self._unexplained.append(samples)
@@ -177,7 +181,7 @@ class Recalibrations:
     def explained(self, kind: str, joint: str | None) -> None:
         """An alarm's cause is known: samples that waited count where it is a drift of the joint just recalibrated."""
         waiting, self._unexplained = list(self._unexplained), deque(maxlen=WAITING)
-        if kind != "drift" or joint != self._checking:
+        if kind != "drift" or joint not in self._checking:
             return
         for samples in waiting:
             self._check(samples)
@@ -186,7 +190,7 @@ class Recalibrations:
         for t, position, torque in zip(*samples, strict=True):
             checked = self.recalibrator.sample(float(t), position, torque)
             if checked is not None:
-                self._checking = None
+                self._checking = ()
                 self._checked(checked)
                 return
 
@@ -205,8 +209,8 @@ class Recalibrations:
             else:
                 text = f"{joint}: rolled back to record {outcome.record.id}: {why}"
                 self._outside.say("roll-back", joint, text, {"record": outcome.record.id, "why": checked.why})
-                assert outcome.undo is not None
-                self._outside.installed(outcome.record, outcome.undo)
+                if outcome.undo is not None:  # else a whole record: the service sees that another one is current
+                    self._outside.installed(outcome.record, outcome.undo)
             self._next()
 
         self._start(lambda: self.recalibrator.undo(checked), done)

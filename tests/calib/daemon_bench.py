@@ -103,13 +103,15 @@ class DaemonBench:
 
     def install(self) -> None:
         """Write the current record to the controllers, as `armlink calibrate --apply` does."""
-        from calib.observer.recalibrator import write_record
+        from calib.install.journaled_write import install
+        from calib.install.plausibility import admit
 
         record = self.store.current(CalibrationRecord, self.arm)
         assert record is not None
         for message in self.host.pump():
             self.service.take(message)
-        write_record(record, self.host.controllers)
+        admitted = admit(record, self.arm, self.store)
+        install(admitted, self.store, self.host.controllers, by="ann", reason="sweep", check=None)
         self.service.in_force.held(None)
 
     def now(self) -> float:

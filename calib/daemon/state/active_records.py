@@ -7,9 +7,9 @@ from calib.daemon.observer_feed import Watcher
 from calib.daemon.proposal import finding_of
 from calib.daemon.recalibration_workflow import Recalibrations
 from calib.daemon.service_hooks import Outside
-from calib.install.journaled_write import mend
+from calib.install.journaled_write import recover
+from calib.install.plausibility import GateRefused
 from calib.observer.decision import Finding
-from calib.observer.recalibrator import write_record
 from calib.records.records import CalibrationRecord, GravityRecord
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ class InForce:
             return
 
         def work() -> tuple[bool, Held]:
-            undone = mend(service.arm, service.store, controllers) is not None
+            undone = recover(service.arm, service.store, controllers) is not None
             held = [controllers.read_calibration(joint) for joint in range(count)]
             return undone, tuple((each.gain, each.offset, each.record_id) for each in held)
 
@@ -190,14 +190,17 @@ class InForce:
             recalibrations.busy = False
             if isinstance(outcome, Exception):
                 _known(outcome)
-                service.say("refused", None, f"record {record.id} could not be written: {outcome}", {})
+                gate = {"gate": outcome.refusal.name} if isinstance(outcome, GateRefused) else {}
+                text = f"record {record.id} is not written: {outcome}"
+                service.say("refused", None, text, {"record": record.id, "joints": differ, **gate})
                 return
             watcher.controllers_hold(None)
+            recalibrations.restored(outcome)
             evidence = {"record": record.id, "joints": differ, "applied": True, "restored": True}
             service.say("recalibration", None, f"record {record.id} written anew to {', '.join(outcome)}", evidence)
 
         recalibrations.busy = True
-        service.around.run(lambda: write_record(record, service.around.port.controllers), done)
+        service.around.run(recalibrations.recalibrator.restore, done)
 
 
 def _known(error: Exception) -> None:
