@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.records.records import Array
 from gcomp.arm.arm import Arm
+from gcomp.arrays import Array
 from gcomp.gravity.batch import GravityModel
 
 

@@ -14,7 +14,8 @@ from armlink.loop.driver import ArmDriver
 from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm
 from calib.floating.controller import FloatConfig, FloatControl
-from calib.records.records import Array, CalibrationRecord
+from calib.records.records import CalibrationRecord
+from gcomp.arrays import Array
 
 LOOK_SECONDS = 0.5
 """Holding by position before and after; before, the sensors are compared with the model meanwhile."""
