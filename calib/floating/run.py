@@ -1,4 +1,4 @@
-"""Floats an arm on the bus: sensors compared with the model, torque control, back to holding by position at the end."""
+"""Floats an arm on the bus: sensors compared with the model, torque control, position control again at the end."""
 
 import contextlib
 from collections.abc import Callable
@@ -17,24 +17,26 @@ from calib.floating.controller import FloatConfig, FloatControl
 from calib.records.records import CalibrationRecord
 from gcomp.arrays import Array
 
-LOOK_SECONDS = 0.5
-"""Holding by position before and after; before, the sensors are compared with the model meanwhile."""
+HOLD_SECONDS = 0.5
+"""Position control before and after [s]; before, the sensors are averaged and compared with the model."""
 AGREEMENT = 0.1
-"""The sensors may differ from the model by this share of rated torque; beyond, the model is not of this arm."""
+"""Largest difference between sensor and model, as a share of rated torque; beyond it the model is not that of this arm
+as it is now. A calibration leaves well below a hundredth (`ObserverConfig.initial_gain_std`)."""
 
 
 @dataclass(frozen=True)
 class Floated:
-    """How it went."""
+    """Summary of one float."""
 
     seconds: float
+    """Of the link's clock [s]."""
     cycles: int
     largest_torque: Array
     """(n,) [N·m]"""
     largest_speed: Array
     """(n,) [rad/s]"""
     moved: Array
-    """Way between the furthest positions (n,) [rad]."""
+    """Range of positions (n,) [rad]."""
 
 
 def run_float(
@@ -48,10 +50,11 @@ def run_float(
     reflect: Callable[[Sample], Array] | None = None,
     on_sample: Callable[[Sample, Array], None] | None = None,
 ) -> Floated:
-    """Float for so long, or until KeyboardInterrupt; then the joints hold where they are, whatever happened.
+    """Float for `seconds` or until KeyboardInterrupt; in either case the joints then hold their positions.
 
-    The link must have been enabled; beta (2n,) [kg·m]. `reflect` gives torque (n,) [N·m] to be added, of a peer's arm
-    for example; `on_sample` sees every sample and the torque commanded. Raises Refused, BusFault.
+    The link must be enabled; beta (2n,) [kg·m]. `reflect` returns torque (n,) [N·m] to add, for example of a peer's
+    arm; `on_sample` sees every sample and the torque commanded (n,) [N·m]. Raises BusFault, and Refused if sensors and
+    model disagree.
     """
     described, limits = gcomp_arm(arm), Limits.of(arm)
     given = (
@@ -66,9 +69,7 @@ def run_float(
         while run.cycles * link.period < seconds:
             run.cycle()
     except KeyboardInterrupt:
-        with contextlib.suppress(
-            ArmlinkError
-        ):  # interrupted within a cycle, the link is in quick stop already: it holds
+        with contextlib.suppress(ArmlinkError):  # interrupted within a cycle, the link holds in quick stop already
             run.hold()
         raise
     run.hold()
@@ -93,9 +94,9 @@ class _Run:
         self._low, self._high = np.full(link.n, np.inf), np.full(link.n, -np.inf)
 
     def compare(self, rated: Array) -> None:
-        """Hold and compare; raises Refused where a sensor reads something else than the model, naming the joint."""
+        """Hold, and compare sensors with the model; raises Refused naming the joint that differs most."""
         readings = []
-        for _ in range(round(LOOK_SECONDS / self._link.period)):
+        for _ in range(round(HOLD_SECONDS / self._link.period)):
             self._sample = self._link.cycle(Command.hold(self._link.position_sent))
             np.copyto(self._position, self._sample.position, where=np.isfinite(self._sample.position))
             readings.append(self._sample.torque)
@@ -106,12 +107,12 @@ class _Run:
         if not away[worst] <= AGREEMENT * rated[worst]:
             raise Refused(
                 f"{self._link.names[worst]}: its sensor reads {sensor[worst]:.2f} N·m, the gravity model says"
-                f" {model[worst]:.2f}, at most {AGREEMENT * rated[worst]:.2f} apart is safe to float with: is a load"
+                f" {model[worst]:.2f}; at most {AGREEMENT * rated[worst]:.2f} apart is safe to float with: is a load"
                 " on the arm, a joint on its stop, or the calibration not written (armlink calibrate --apply)?"
             )
 
     def cycle(self) -> None:
-        """One cycle of float."""
+        """One cycle of torque control."""
         link = self._link
         np.copyto(self._position, self._sample.position, where=np.isfinite(self._sample.position))
         torque = self._control.torque(self._position)
@@ -127,12 +128,12 @@ class _Run:
             self._on_sample(self._sample, torque)
 
     def hold(self) -> None:
-        """Position control where the joints are."""
+        """Position control at the present positions."""
         link, here = self._link, self._position.copy()
-        for _ in range(round(LOOK_SECONDS / link.period)):
+        for _ in range(round(HOLD_SECONDS / link.period)):
             link.cycle(Command.hold(here))
 
     def result(self) -> Floated:
-        """How it went."""
+        """Summary."""
         seconds = self.cycles * self._link.period
         return Floated(seconds, self.cycles, self._largest, self._fastest, self._high - self._low)

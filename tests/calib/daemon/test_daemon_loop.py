@@ -18,7 +18,7 @@ from armlink.link.types import Calibration, Command
 from calib.arm.kinematics import gcomp_arm
 from calib.daemon.loop.arm_loop import ArmLoop
 from calib.daemon.loop.loop_messages import Batch, Down, LoopOptions, Up
-from calib.daemon.loop.loop_process import ChildHost
+from calib.daemon.loop.loop_process import LoopProcess
 from calib.daemon.settings import DaemonSection
 from calib.daemon.view.api_models import State
 from calib.motion.random_work import work_targets
@@ -125,7 +125,7 @@ def test_beside_another_controller_it_hears_all_and_sends_nothing(tmp_path: Path
             truth = link.cycle(Command.hold(next(targets)))
     loop = ArmLoop(LoopOptions(arm, listen_only=True, open_bus=lambda: Tap(bus.frames)))
     service = bench.service
-    service.listen_only = True
+    service.configuration.listen_only = True
     messages = [message for _ in range(120) for message in loop.run()]
     for message in messages:
         service.take(message)
@@ -172,7 +172,7 @@ def no_bus() -> None:
 
 
 def test_the_bus_process_ends_when_the_service_is_gone() -> None:
-    host = ChildHost(LoopOptions(load_arm("sarcos"), open_bus=no_bus), fork=True)
+    host = LoopProcess(LoopOptions(load_arm("sarcos"), open_bus=no_bus), fork=True)
     assert host._ours.poll(60.0)
     assert isinstance(host.pump()[0], Down)
     host._ours.close()  # as the kernel does where the service is killed
