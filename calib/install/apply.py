@@ -18,9 +18,10 @@ from calib.fit.sweep_readings import sweep_readings
 from calib.install.check_motion import CheckMotion
 from calib.install.journaled_write import install, recover
 from calib.install.plausibility import Admitted, GateRefused, Refusal, admit, admit_rollback
-from calib.records.records import Array, CalibrationRecord, GravityRecord
+from calib.records.records import CalibrationRecord, GravityRecord
 from calib.records.store import RecordStore
 from calib.sweep.dataset import SweepData
+from gcomp.arrays import Array
 from gcomp.identify.readings import StaticReadings
 
 
