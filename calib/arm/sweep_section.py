@@ -78,21 +78,21 @@ class SweepSection(Section):
         return Prior(np.array(self.reference_point), self.reference_point_std)
 
 
-def sweep_section(arm: ArmFile) -> SweepSection:
+def sweep_section(arm_file: ArmFile) -> SweepSection:
     """The arm file's `sweep` section, or the defaults where it has none; raises BadInput on a wrong length."""
-    section = arm.sweep if isinstance(arm.sweep, SweepSection) else SweepSection()
-    n = len(arm.require_link().joints)
+    section = arm_file.sweep if isinstance(arm_file.sweep, SweepSection) else SweepSection()
+    n = len(arm_file.require_link().joints)
     if section.bias_torque is not None and len(section.bias_torque) != n:
         raise BadInput(
-            f"{arm.path}: key sweep.bias_torque: {len(section.bias_torque)} values, expected {n}, one per joint"
+            f"{arm_file.path}: key sweep.bias_torque: {len(section.bias_torque)} values, expected {n}, one per joint"
         )
     return section
 
 
-def with_hold(arm: ArmFile, hold: str | None) -> ArmFile:
+def with_hold(arm_file: ArmFile, hold: str | None) -> ArmFile:
     """The arm with its resting joints held on `stops` or by `servo`; None leaves the arm file's. Raises BadInput."""
     if hold is None:
-        return arm
+        return arm_file
     if hold not in ("stops", "servo"):
         raise BadInput(f"--hold {hold}: expected stops or servo")
-    return arm.model_copy(update={"sweep": sweep_section(arm).model_copy(update={"hold": hold})})
+    return arm_file.model_copy(update={"sweep": sweep_section(arm_file).model_copy(update={"hold": hold})})

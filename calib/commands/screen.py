@@ -14,12 +14,15 @@ from rich.table import Table
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Stall
+from armlink.link.lateness import Lateness
 from calib.plan.types import SweepPlan
 
 if TYPE_CHECKING:
     from calib.sweep.dataset import SweepData
     from calib.sweep.preflight import Preflight
 
+LATE_SHARE = 0.5
+"""Share of link.deadline from which on a host is called late."""
 _CONSOLE = Console(stderr=True, markup=False)  # units stand in brackets
 
 
@@ -143,6 +146,19 @@ def stalls_said(data: "SweepData") -> list[str]:
         return []
     places = list(dict.fromkeys(stall.reading for stall in data.stalls))
     return [f"the joints were stopped {len(data.stalls)} times and the reading was repeated: {', '.join(places)}"]
+
+
+def warn_late(arm: ArmFile, lateness: Lateness) -> None:
+    """A line if this machine was late enough to come near the arm's deadline."""
+    late, deadline = lateness.percentile(0.999), arm.require_link().deadline
+    if late > LATE_SHARE * deadline:
+        print_lines(
+            [
+                f"this host was up to {late * 1e3:.0f} ms late in 99.9 % of the cycles, near link.deadline"
+                f" ({deadline * 1e3:.0f} ms): see armlink check {arm.name} --host"
+            ],
+            "yellow",
+        )
 
 
 def _short(names: tuple[str, ...]) -> list[str]:

@@ -54,7 +54,7 @@ def sweep(
     from armlink.errors import BadInput
     from armlink.loop.open import open_arm
     from calib.arm.sweep_section import with_hold
-    from calib.commands.screen import SweepScreen, confirm
+    from calib.commands.screen import SweepScreen, confirm, warn_late
     from calib.sweep.dataset import require_vacant
 
     arm_file = with_hold(load_arm(arm), hold)
@@ -80,8 +80,10 @@ def sweep(
                 seed,
                 check_stops and not resume and not reference_mass,
             )
+        lateness = link.stats.lateness
     _show(arm_file, found, data, screen)
-    write_json(json_file, _answer(arm_file, data))
+    warn_late(arm_file, lateness)
+    write_json(json_file, {**_answer(arm_file, data), "late_ms": lateness.in_ms()})
 
 
 def _plan(arm_file: "ArmFile", seed: int, picture: Path) -> dict[str, Any]:

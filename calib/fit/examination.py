@@ -57,25 +57,27 @@ class Goodness:
     left_out: tuple[LeftOut, ...]
 
 
-def examine(arm: Arm, rows: SweepReadings, fit: GlobalFit, priors: Mapping[str, Prior], rated: Array) -> Goodness:
+def examine(
+    kinematics: Arm, rows: SweepReadings, fit: GlobalFit, priors: Mapping[str, Prior], rated: Array
+) -> Goodness:
     """Refine a global fit, one effect after another that its residuals ask for, without outliers. rated (n,) [N·m]."""
-    rows, findings = _without_plateaus(arm.names, rows)
-    encoders = encoders_said(arm.names, rows)
+    rows, findings = _without_plateaus(kinematics.names, rows)
+    encoders = encoders_said(kinematics.names, rows)
     effects, sound = list[Effect](), rows.readings.sigma
     outliers = np.zeros(sound.shape, dtype=bool)
 
     def fitted() -> Refined:
         extras = tuple(extra for effect in effects for extra in effect.extras)
         kept = replace(rows.readings, torque=np.where(outliers, np.nan, rows.readings.torque))
-        return refine(arm, kept, fit, priors, rows.resolution, extras)
+        return refine(kinematics, kept, fit, priors, rows.resolution, extras)
 
     refined = fitted()
     for _ in range(MOST_EFFECTS):
-        strange = _outliers(arm, refined, rows, [extra for effect in effects for extra in effect.extras])
+        strange = _outliers(kinematics, refined, rows, [extra for effect in effects for extra in effect.extras])
         if (strange != outliers).any():
             outliers = strange
             refined = fitted()
-        found = strongest(arm, rows, ~outliers, refined, rated)
+        found = strongest(kinematics, rows, ~outliers, refined, rated)
         if found is None:
             break
         effects.append(found)
@@ -84,9 +86,9 @@ def examine(arm: Arm, rows: SweepReadings, fit: GlobalFit, priors: Mapping[str, 
             rows = replace(rows, readings=replace(rows.readings, sigma=_doubted(sound, effects, refined)))
             refined = fitted()
     for effect, coefficient in _sized(effects, refined):
-        findings.append(effect_said(arm.names, effect, coefficient, refined, rated))
-    findings += outliers_said(arm.names, rows, outliers)
-    findings += scattered(arm.names, refined, rated, {finding.joint for finding in findings})
+        findings.append(effect_said(kinematics.names, effect, coefficient, refined, rated))
+    findings += outliers_said(kinematics.names, rows, outliers)
+    findings += scattered(kinematics.names, refined, rated, {finding.joint for finding in findings})
     said = encoders or findings  # what a wrong position does elsewhere is no finding of its own
     return Goodness(refined, tuple(said), outliers, leave_out(refined, rows))
 
@@ -158,13 +160,13 @@ def leave_out(refined: Refined, rows: SweepReadings) -> tuple[LeftOut, ...]:
     return tuple(found)
 
 
-def _outliers(arm: Arm, refined: Refined, rows: SweepReadings, extras: list[Extra]) -> Mask:
+def _outliers(kinematics: Arm, refined: Refined, rows: SweepReadings, extras: list[Extra]) -> Mask:
     """Readings (K, n) that no noise explains: deleted residuals, in robust standard deviations of their joint.
 
     Those left out before are judged again, for an effect found since may explain them.
     """
     linear, counted = refined.linear, rows.readings.counted
-    error = rows.readings.torque - predict(arm, refined.fit.complete, rows.readings)
+    error = rows.readings.torque - predict(kinematics, refined.fit.complete, rows.readings)
     error -= sum((value * extra.column for value, extra in zip(refined.coefficients, extras, strict=True)), 0.0 * error)
     deleted = error / (rows.readings.sigma * refined.factor)
     inside = np.zeros(counted.shape, dtype=bool)
@@ -172,7 +174,7 @@ def _outliers(arm: Arm, refined: Refined, rows: SweepReadings, extras: list[Extr
     count = len(linear.row)
     deleted[linear.row, linear.joint] = linear.residual[:count] / np.sqrt(np.maximum(1 - linear.leverage, 1e-3))
     flags = np.zeros(counted.shape, dtype=bool)
-    for joint in range(arm.n):
+    for joint in range(kinematics.n):
         used = np.abs(deleted[inside[:, joint], joint])
         if len(used) < FEWEST:
             continue

@@ -86,7 +86,7 @@ class Refined:
 
 
 def refine(
-    arm: Arm,
+    kinematics: Arm,
     readings: StaticReadings,
     fit: GlobalFit,
     priors: Mapping[str, Prior],
@@ -94,12 +94,12 @@ def refine(
     extras: tuple[Extra, ...] = (),
 ) -> Refined:
     """From a global fit; `resolution` (n,) [rad] is the smallest step of the position readings, 0 where not known."""
-    problem = _Problem(arm, readings, fit, priors, resolution, extras)
-    vector, factor = fit.complete.vector.copy(), np.ones(arm.n)
+    problem = _Problem(kinematics, readings, fit, priors, resolution, extras)
+    vector, factor = fit.complete.vector.copy(), np.ones(kinematics.n)
     for _ in range(ROUNDS):
         step = problem.step(vector, factor)
         vector[problem.free] += step.solution[: step.parameters]
-        raw, freedom = _scatter(step.linear, arm.n)
+        raw, freedom = _scatter(step.linear, kinematics.n)
         used, factor = factor, np.maximum(factor * np.where(np.isnan(raw), 1.0, raw), 1.0)
     found = analyse(step.triangle, step.scale)
     inner, behind = slice(0, step.parameters), slice(step.parameters, None)
@@ -111,9 +111,9 @@ def refine(
     scaled = step.linear.residual[: len(step.linear.row)]
     refined = replace(
         fit,
-        values=Parameters.from_vector(np.where(np.isinf(deviation), np.nan, vector), arm.n),
-        std=Parameters.from_vector(deviation, arm.n),
-        complete=Parameters.from_vector(vector, arm.n),
+        values=Parameters.from_vector(np.where(np.isinf(deviation), np.nan, vector), kinematics.n),
+        std=Parameters.from_vector(deviation, kinematics.n),
+        complete=Parameters.from_vector(vector, kinematics.n),
         covariance=covariance,
         identifiable=determined,
         null_space=describe_null_space(found.null_basis[inner], fit.names),
@@ -142,22 +142,22 @@ class _Problem:
 
     def __init__(
         self,
-        arm: Arm,
+        kinematics: Arm,
         readings: StaticReadings,
         fit: GlobalFit,
         priors: Mapping[str, Prior],
         resolution: Array,
         extras: tuple[Extra, ...],
     ) -> None:
-        self.arm, self.readings = arm, readings
-        self.free = np.array([name in fit.names for name in parameter_names(arm)])
-        self.mean, self.std = (values[self.free] for values in prior_vectors(arm.n, priors))
+        self.arm, self.readings = kinematics, readings
+        self.free = np.array([name in fit.names for name in parameter_names(kinematics)])
+        self.mean, self.std = (values[self.free] for values in prior_vectors(kinematics.n, priors))
         self.row, self.joint = np.nonzero(readings.counted)
         count = len(self.row)
         self.columns = np.column_stack([np.zeros((count, 0)), *(extra.column[readings.counted] for extra in extras)])
         torque = float(np.abs(readings.torque[readings.counted]).max())
         sizes = torque / np.maximum(np.abs(self.columns).max(axis=0, initial=0.0), 1e-9)
-        self.scale = np.concatenate([natural_units(arm, readings, fit.complete)[self.free], sizes])
+        self.scale = np.concatenate([natural_units(kinematics, readings, fit.complete)[self.free], sizes])
         self.resolution = resolution
 
     def step(self, vector: Array, factor: Array) -> _Step:

@@ -51,7 +51,7 @@ def size_of(coefficients: Array) -> float:
     return float(np.sqrt(np.mean(coefficients**2)))
 
 
-def strongest(arm: Arm, rows: SweepReadings, kept: Mask, refined: Refined, rated: Array) -> Effect | None:
+def strongest(kinematics: Arm, rows: SweepReadings, kept: Mask, refined: Refined, rated: Array) -> Effect | None:
     """The effect that explains most beyond chance of what `refined` left over, None where there is no material one.
 
     rated (n,) [N·m]; kept (K, n) are the readings that `refined` was made from, outliers left out.
@@ -59,8 +59,8 @@ def strongest(arm: Arm, rows: SweepReadings, kept: Mask, refined: Refined, rated
     counted = rows.readings.counted & kept
     linear, best, most = refined.linear, None, 0.0
     count = len(linear.row)
-    squares = np.bincount(linear.joint, linear.residual[:count] ** 2, minlength=arm.n)
-    for effect in _candidates(arm, rows, refined):
+    squares = np.bincount(linear.joint, linear.residual[:count] ** 2, minlength=kinematics.n)
+    for effect in _candidates(kinematics, rows, refined):
         columns = np.column_stack([extra.column[counted] for extra in effect.extras]) / linear.sigma[:, None]
         if not np.abs(columns).max(initial=0.0) > 0:
             continue
@@ -87,35 +87,41 @@ def strongest(arm: Arm, rows: SweepReadings, kept: Mask, refined: Refined, rated
     return best
 
 
-def _candidates(arm: Arm, rows: SweepReadings, refined: Refined) -> Iterator[Effect]:
+def _candidates(kinematics: Arm, rows: SweepReadings, refined: Refined) -> Iterator[Effect]:
     """Every effect that is tried, a joint at a time."""
     complete, readings = refined.fit.complete, rows.readings
     counted = readings.counted
-    _, _, flat = predict_and_jacobian(arm, complete, readings)
-    slope = np.zeros((*counted.shape, arm.n))
+    _, _, flat = predict_and_jacobian(kinematics, complete, readings)
+    slope = np.zeros((*counted.shape, kinematics.n))
     slope[counted] = flat
-    torque = predict(arm, complete, readings) - complete.offset
-    for joint in range(arm.n):
+    torque = predict(kinematics, complete, readings) - complete.offset
+    for joint in range(kinematics.n):
         here = counted[:, joint]
         if here.sum() < FEWEST:
             continue
         angle, own = readings.position[:, joint], torque[:, joint]
-        yield _one(arm.n, joint, "transmission.spring", here * angle)
+        yield _one(kinematics.n, joint, "transmission.spring", here * angle)
         doubt = _lag_doubt(rows, joint)
         sides = [here * side for side in _sides(rows, joint)]
         if sides:
-            columns = tuple(_one(arm.n, joint, "torque.hysteresis", side).extras[0] for side in sides)
+            columns = tuple(_one(kinematics.n, joint, "torque.hysteresis", side).extras[0] for side in sides)
             yield Effect(joint, "torque.hysteresis", columns, 1.0, doubt=doubt, each_sweep=True)
-        yield replace(_one(arm.n, joint, "torque.hysteresis", here * lag(arm, rows, refined, joint)), doubt=doubt)
+        yield replace(
+            _one(kinematics.n, joint, "torque.hysteresis", here * lag(kinematics, rows, refined, joint)), doubt=doubt
+        )
         largest = float(np.abs(own[here]).max())
-        yield _one(arm.n, joint, "torque.nonlinearity", here * own * np.abs(own) / max(largest, 1e-9))
+        yield _one(kinematics.n, joint, "torque.nonlinearity", here * own * np.abs(own) / max(largest, 1e-9))
         for share in KNEES:
             bent = np.where(here, np.sign(own) * np.maximum(np.abs(own) - share * largest, 0.0), 0.0)
             if np.count_nonzero(bent) >= FEWEST // 2:
                 yield _one(
-                    arm.n, joint, "torque.saturation", bent, share * largest / max(abs(complete.gain[joint]), 1e-9)
+                    kinematics.n,
+                    joint,
+                    "torque.saturation",
+                    bent,
+                    share * largest / max(abs(complete.gain[joint]), 1e-9),
                 )
-        yield _one(arm.n, joint, "torque.drift", here * (rows.time - rows.time.mean()))
+        yield _one(kinematics.n, joint, "torque.drift", here * (rows.time - rows.time.mean()))
         if float(np.ptp(angle[here])) > TURN:
             turn = (slope[..., joint] * np.sin(angle)[:, None], slope[..., joint] * np.cos(angle)[:, None])
             extras = tuple(Extra(joint, "position.eccentricity", each) for each in turn)
@@ -152,7 +158,7 @@ def _lag_doubt(rows: SweepReadings, joint: int) -> Array:
     return np.where(rows.swept == joint, OWN_DOUBT, held)
 
 
-def lag(arm: Arm, rows: SweepReadings, refined: Refined, joint: int) -> Array:
+def lag(kinematics: Arm, rows: SweepReadings, refined: Refined, joint: int) -> Array:
     """Where in its play (K,), -1 to 1, a joint's torque sensor stands at each reading, the way to it being straight.
 
     The play is as wide as the residuals say (half their robust range), so that small changes of torque leave it where
@@ -163,9 +169,9 @@ def lag(arm: Arm, rows: SweepReadings, refined: Refined, joint: int) -> Array:
     way = position[:-1, None] + shares[:, None] * (position[1:] - position[:-1])[:, None]
     way = np.concatenate([np.repeat(position[:1, None], PATH, axis=1), way])
     flat = StaticReadings.of(
-        way.reshape(-1, arm.n), np.zeros((len(position) * PATH, arm.n)), 1.0, np.repeat(load, PATH)
+        way.reshape(-1, kinematics.n), np.zeros((len(position) * PATH, kinematics.n)), 1.0, np.repeat(load, PATH)
     )
-    torque = predict(arm, refined.fit.complete, flat)[:, joint].reshape(-1, PATH)
+    torque = predict(kinematics, refined.fit.complete, flat)[:, joint].reshape(-1, PATH)
     residual = refined.fit.residual[:, joint]
     width = max(float(np.nanmedian(np.abs(residual))) * 1.5, 1e-9)
     held, place = float(torque[0, 0]), np.zeros(len(position))

@@ -5,6 +5,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from armlink.torque_calibration import TorqueCalibration
 from calib.motion.static_reading import StaticReading
 from calib.observer.cause_test import CauseTest, Verdict
 from calib.observer.config import ObserverConfig
@@ -27,6 +28,11 @@ class Finding:
     rows: int
     confidence: float
     refused: tuple[str, ...] = ()
+
+    @property
+    def change(self) -> TorqueCalibration[float]:
+        """What the sensor as installed does to a torque: it reads gain · τ + offset instead of τ."""
+        return TorqueCalibration(self.gain, self.offset)
 
     @property
     def std(self) -> tuple[float, float]:

@@ -74,6 +74,6 @@ def travel_acceleration(limits: Limits, options: list[Candidates], guess: Gravit
     """Acceleration [rad/s²] that the drives can give beside gravity at the poses between which they travel."""
     if guess is None:
         return 1.0
-    poses = np.concatenate([each.poses.reshape(-1, guess.arm.n) for each in options])
+    poses = np.concatenate([each.poses.reshape(-1, guess.kinematics.n) for each in options])
     spare = limits.max_torque - np.abs(guess.torque(poses)).max(axis=0)
     return float(np.clip(np.min(spare / np.maximum(2 * guess.inertia(), 1e-9)), SLOWEST, FASTEST))

@@ -34,21 +34,21 @@ class Contact:
 class Geometry:
     """The bodies of the arm file's model. Overlaps that the model has at every pose are its own, and no collisions."""
 
-    def __init__(self, arm: ArmFile) -> None:
+    def __init__(self, arm_file: ArmFile) -> None:
         """Compile the model; raises BadInput where it cannot be used."""
         import mujoco
 
         from calib.arm.kinematics import gcomp_arm
         from gcomp.arm.load import compile_model
 
-        assert arm.model_path is not None
+        assert arm_file.model_path is not None
         self._mujoco = mujoco
-        described = gcomp_arm(arm)  # checks the chain and says in the arm file's words what is wrong
-        self.model = compile_model(arm.model_path)
+        kinematics = gcomp_arm(arm_file)  # checks the chain and says in the arm file's words what is wrong
+        self.model = compile_model(arm_file.model_path)
         self.data = mujoco.MjData(self.model)
-        self._places = [int(self.model.joint(name).qposadr[0]) for name in described.names]
+        self._places = [int(self.model.joint(name).qposadr[0]) for name in kinematics.names]
         generator = np.random.default_rng(0)
-        poses = generator.uniform(described.lower, described.upper, (12, described.n))
+        poses = generator.uniform(kinematics.lower, kinematics.upper, (12, kinematics.n))
         always = [{contact.bodies for contact in self._contacts(pose)} for pose in poses]
         self._own: set[Pair] = set.intersection(*always)
 
@@ -78,11 +78,11 @@ class Geometry:
         return "the surroundings" if body == 0 else str(self.model.body(body).name or f"body {body}")
 
 
-def check_plan(arm: ArmFile, plan: SweepPlan) -> str:
+def check_plan(arm_file: ArmFile, plan: SweepPlan) -> str:
     """Look at the whole way of a plan; raises Collided naming bodies, sweep and pose. Returns what was checked."""
-    if arm.model_path is None:
+    if arm_file.model_path is None:
         return "collisions not checked: the arm file has no kinematics.model with geometry"
-    geometry = Geometry(arm)
+    geometry = Geometry(arm_file)
     if geometry.model.ngeom == 0:
         return "collisions not checked: the model has no geometry"
     count = 0
@@ -92,7 +92,7 @@ def check_plan(arm: ArmFile, plan: SweepPlan) -> str:
         if touching:
             first, second = touching[0].bodies
             raise Collided(
-                f"{arm.name}: {first} would touch {second} {where}, {touching[0].depth * 1000:.1f} mm deep, at"
+                f"{arm_file.name}: {first} would touch {second} {where}, {touching[0].depth * 1000:.1f} mm deep, at"
                 f" {' '.join(f'{angle:.3f}' for angle in pose)} rad: narrow lower and upper of these joints in the arm"
                 " file, or clear the workspace"
             )

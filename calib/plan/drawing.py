@@ -24,19 +24,19 @@ GHOSTS = 4
 """Poses drawn of each sweep."""
 
 
-def joint_places(arm: Arm, q: Array) -> Array:
+def joint_places(kinematics: Arm, q: Array) -> Array:
     """Origins of all frames, base to tip (K, n + 1, 3) [m], at poses q (K, n) [rad]."""
-    rotation = bar_frames(arm, q).rotation
-    levers = np.column_stack([arm.a, np.zeros(arm.n), np.zeros(arm.n)])
-    along = np.einsum("knij,nj->kni", rotation, levers) + rotation[..., 2] * arm.d[:, None]
-    places = np.zeros((len(q), arm.n + 1, 3))
+    rotation = bar_frames(kinematics, q).rotation
+    levers = np.column_stack([kinematics.a, np.zeros(kinematics.n), np.zeros(kinematics.n)])
+    along = np.einsum("knij,nj->kni", rotation, levers) + rotation[..., 2] * kinematics.d[:, None]
+    places = np.zeros((len(q), kinematics.n + 1, 3))
     places[:, 1:] = np.cumsum(along, axis=1)
     return places
 
 
-def seconds(arm: ArmFile, plan: SweepPlan) -> float:
+def seconds(arm_file: ArmFile, plan: SweepPlan) -> float:
     """Time that one pass of a plan will take, roughly [s]."""
-    section, limits = sweep_section(arm), Limits.of(arm)
+    section, limits = sweep_section(arm_file), Limits.of(arm_file)
     period, speed = 0.02, section.travel_speed * limits.speed
 
     def travel(start: Array, goal: Array, acceleration: float) -> float:
@@ -57,16 +57,16 @@ def seconds(arm: ArmFile, plan: SweepPlan) -> float:
     return total
 
 
-def draw_plan(arm: ArmFile, plan: SweepPlan, path: Path) -> None:
+def draw_plan(arm_file: ArmFile, plan: SweepPlan, path: Path) -> None:
     """Write the picture: each sweep's poses as a stick figure that can be turned, shown and hidden. Raises OSError."""
     import plotly.graph_objects as graph
 
-    described, figure = gcomp_arm(arm), graph.Figure()
+    kinematics, figure = gcomp_arm(arm_file), graph.Figure()
     for sweep in plan.sweeps:
         begin, end = ends(sweep)
         poses = begin + np.linspace(0, 1, GHOSTS)[:, None] * (end - begin)
         points = np.concatenate(
-            [np.vstack([places, np.full((1, 3), np.nan)]) for places in joint_places(described, poses)]
+            [np.vstack([places, np.full((1, 3), np.nan)]) for places in joint_places(kinematics, poses)]
         )
         line = {"width": 5, "color": COLOURS[sweep.joint % len(COLOURS)]}
         figure.add_scatter3d(
@@ -78,7 +78,7 @@ def draw_plan(arm: ArmFile, plan: SweepPlan, path: Path) -> None:
             line=line,
             marker={"size": 3, "color": line["color"]},
         )
-    scouted = joint_places(described, np.array(plan.scout))[:, -1]
+    scouted = joint_places(kinematics, np.array(plan.scout))[:, -1]
     figure.add_scatter3d(
         x=scouted[:, 0],
         y=scouted[:, 1],
@@ -87,14 +87,14 @@ def draw_plan(arm: ArmFile, plan: SweepPlan, path: Path) -> None:
         name="scout (tip)",
         marker={"size": 4, "color": "black"},
     )
-    down = described.gravity / max(float(np.linalg.norm(described.gravity)), 1e-9)
-    length = 0.3 * max(float(np.abs(described.a).sum() + np.abs(described.d).sum()), 0.1)
+    down = kinematics.gravity / max(float(np.linalg.norm(kinematics.gravity)), 1e-9)
+    length = 0.3 * max(float(np.abs(kinematics.a).sum() + np.abs(kinematics.d).sum()), 0.1)
     arrow = np.vstack([np.zeros(3), length * down])
     figure.add_scatter3d(
         x=arrow[:, 0], y=arrow[:, 1], z=arrow[:, 2], mode="lines", name="gravity", line={"width": 8, "color": "grey"}
     )
     figure.update_layout(
-        title=f"{escape(arm.name)}: where the arm will be (base frame, m)",
+        title=f"{escape(arm_file.name)}: where the arm will be (base frame, m)",
         scene={"aspectmode": "data", "camera": _camera(down)},
         height=800,
         margin={"l": 0, "r": 0, "b": 0},

@@ -27,7 +27,7 @@ def sweep_range(section: SweepSection, limits: Limits, joint: int) -> tuple[floa
 
 
 def scout_poses(
-    described: Arm,
+    kinematics: Arm,
     section: SweepSection,
     limits: Limits,
     seed: int,
@@ -37,7 +37,7 @@ def scout_poses(
 
     Poses in which bodies of `geometry` touch are left out; raises BadInput if too few remain.
     """
-    n = described.n
+    n = kinematics.n
     ends = np.array([sweep_range(section, limits, joint) for joint in range(n)])
     generator = np.random.default_rng(seed)
     poses = ends[:, 0] + generator.random((SCOUT_CANDIDATES, n)) * (ends[:, 1] - ends[:, 0])
@@ -45,7 +45,7 @@ def scout_poses(
         poses = poses[geometry.free(poses)]
         if len(poses) < 2 * (n + 3):
             raise BadInput("almost every pose within the joint range collides: narrow lower and upper in the arm file")
-    regressor = gravity_regressor(described, poses)
+    regressor = gravity_regressor(kinematics, poses)
     offsets = np.broadcast_to(np.eye(n), (len(poses), n, n))
     rows = np.concatenate([regressor, 10 * offsets], axis=2) / limits.rated[:, None]
     information = np.einsum("kip,kiq->kpq", rows, rows)
@@ -65,9 +65,9 @@ def short_way(poses: Array, begin: Array) -> Array:
     return poses[way]
 
 
-def require_range(section: SweepSection, limits: Limits, described: Arm) -> None:
+def require_range(section: SweepSection, limits: Limits, kinematics: Arm) -> None:
     """Raise BadInput, naming the joint, where a range leaves nothing to sweep."""
-    for joint, name in enumerate(described.names):
+    for joint, name in enumerate(kinematics.names):
         first, last = sweep_range(section, limits, joint)
         if not np.isfinite([first, last]).all() or last - first < 0.2:
             raise BadInput(

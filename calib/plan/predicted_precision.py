@@ -34,7 +34,7 @@ def predicted_gain_std(
     scout (P, n) [rad] are poses at which all sensors count; sigma (n,) [N·m] is that of one reading, position_sigma
     (n,) [rad] that of its positions; `point` is what is known of where the mass hangs.
     """
-    arm = guess.arm
+    kinematics = guess.kinematics
     positions, counted = [scout], [np.ones(scout.shape, dtype=bool)]
     for sweep in sweeps:
         poses = np.tile(np.array(sweep.rest), (sweep.readings, 1))
@@ -57,12 +57,12 @@ def predicted_gain_std(
     if position_offset_std > 0:
         unknown.add("position_offset")
         priors["position_offset"] = Prior(0.0, position_offset_std)
-    tip = np.array([arm.a[-1] + SIDE, SIDE, arm.d[-1]])
+    tip = np.array([kinematics.a[-1] + SIDE, SIDE, kinematics.d[-1]])
     if point is not None:
         priors["rho"], tip = point, np.asarray(point.mean, dtype=np.float64)
-    start = Parameters.nominal(arm.n, beta=guess.beta, rho=tip)
+    start = Parameters.nominal(kinematics.n, beta=guess.beta, rho=tip)
     std: Array = predict_covariance(
-        arm, both, start, unknown=unknown, priors=priors, position_sigma=position_sigma
+        kinematics, both, start, unknown=unknown, priors=priors, position_sigma=position_sigma
     ).std.gain
     return std
 

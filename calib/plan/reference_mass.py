@@ -18,17 +18,17 @@ HAND = 0.15
 
 
 def reference_masses(
-    described: Arm, limits: Limits, options: list[Candidates], guess: GravityGuess | None
+    kinematics: Arm, limits: Limits, options: list[Candidates], guess: GravityGuess | None
 ) -> list[float]:
     """Masses [kg] that take `MASS_SHARES` of the torque left at the joint that they load most, to two digits."""
-    poses = np.concatenate([each.poses.reshape(-1, described.n) for each in options])
-    regressor = gravity_regressor(described, poses)
-    at_origin, by_point = payload_columns(described)
-    flange = np.array([described.a[-1], 0.0, described.d[-1]])
+    poses = np.concatenate([each.poses.reshape(-1, kinematics.n) for each in options])
+    regressor = gravity_regressor(kinematics, poses)
+    at_origin, by_point = payload_columns(kinematics)
+    flange = np.array([kinematics.a[-1], 0.0, kinematics.d[-1]])
     per_kg = np.abs(regressor @ (at_origin + by_point @ flange))
     per_kg += HAND * np.linalg.norm(regressor @ by_point, axis=-1)
     gravity = ASSUMED_GRAVITY * limits.max_torque if guess is None else np.abs(guess.torque(poses)).max(axis=0)
     room = np.maximum(limits.max_torque - gravity, 0.05 * limits.max_torque)
     most = float(np.min(room / np.maximum(per_kg.max(axis=0), 1e-9)))
-    most = min(most, 2 * float(limits.rated.max()) / (9.81 * float(reach(described)[0])))
+    most = min(most, 2 * float(limits.rated.max()) / (9.81 * float(reach(kinematics)[0])))
     return [float(f"{share * most:.2g}") for share in MASS_SHARES]

@@ -20,7 +20,7 @@ SIGMAS = 3.0
 class GravityGuess:
     """Mass moments in the scale of the drives' own torque, which is the scale of the commands."""
 
-    arm: Arm
+    kinematics: Arm
     beta: Array
     """(2n,) [kg·m]"""
     covariance: Array
@@ -28,12 +28,12 @@ class GravityGuess:
 
     def torque(self, q: Array) -> Array:
         """Holding torque (…, n) [N·m] at poses q (…, n) [rad]."""
-        torque: Array = gravity_regressor(self.arm, q) @ self.beta
+        torque: Array = gravity_regressor(self.kinematics, q) @ self.beta
         return torque
 
     def uncertainty(self, q: Array) -> Array:
         """Bound of the model's error (…, n) [N·m] at poses q (…, n) [rad]."""
-        regressor = gravity_regressor(self.arm, q)
+        regressor = gravity_regressor(self.kinematics, q)
         variance = np.einsum("...ip,pq,...iq->...i", regressor, self.covariance, regressor, optimize=True)
         bound: Array = SIGMAS * np.sqrt(np.maximum(variance, 0.0))
         return bound
@@ -41,23 +41,23 @@ class GravityGuess:
     def inertia(self) -> Array:
         """Rough upper size (n,) [kg·m²] of each joint's inertia: composite mass moment times reach."""
         moment = np.linalg.norm(self.beta.reshape(-1, 2), axis=1)[::-1].cumsum()[::-1]
-        size: Array = moment * reach(self.arm)
+        size: Array = moment * reach(self.kinematics)
         return size
 
 
-def guess_of_model(arm: Arm, beta: Array) -> GravityGuess:
+def guess_of_model(kinematics: Arm, beta: Array) -> GravityGuess:
     """What a model file's own inertials (2n,) [kg·m] are worth for planning: each mass moment to a tenth."""
     size = np.maximum(np.abs(beta), np.abs(beta).max(initial=0.0) / 20)
-    return GravityGuess(arm, beta, np.diag((MODEL_ERROR * size) ** 2))
+    return GravityGuess(kinematics, beta, np.diag((MODEL_ERROR * size) ** 2))
 
 
-def reach(arm: Arm, hand: float = 0.15) -> Array:
+def reach(kinematics: Arm, hand: float = 0.15) -> Array:
     """Longest distance (n,) [m] from each joint to the tip's far side."""
-    return np.hypot(arm.a, arm.d)[::-1].cumsum()[::-1] + hand
+    return np.hypot(kinematics.a, kinematics.d)[::-1].cumsum()[::-1] + hand
 
 
 def guess_gravity(
-    arm: Arm, position: Array, torque: Array, motor_torque: Array, rated: Array, friction: float
+    kinematics: Arm, position: Array, torque: Array, motor_torque: Array, rated: Array, friction: float
 ) -> GravityGuess:
     """Rough mass moments from servo-held poses: positions, sensor readings, drive torques, all (P, n).
 
@@ -65,7 +65,7 @@ def guess_gravity(
     torque (n,) [N·m], is how far the drive's torque may lie off. Where the fit is worse, the covariance says so.
     """
     poses, n = position.shape
-    regressor = gravity_regressor(arm, position)
+    regressor = gravity_regressor(kinematics, position)
     sensor_rows = np.zeros((poses, n, 4 * n))
     motor_rows = np.zeros((poses, n, 4 * n))
     joints = np.arange(n)
@@ -74,7 +74,7 @@ def guess_gravity(
     sensor_rows[:, :, 2 * n :] = -regressor
     motor_rows[:, :, 2 * n :] = regressor
     sensor_sigma, motor_sigma = 0.005 * rated, friction * rated
-    spread = np.concatenate([np.full(n, GAIN_STD), 0.3 * rated, np.full(2 * n, _largest_moment(arm, rated))])
+    spread = np.concatenate([np.full(n, GAIN_STD), 0.3 * rated, np.full(2 * n, _largest_moment(kinematics, rated))])
     expected = np.concatenate([np.ones(n), np.zeros(3 * n)])
     counted = np.isfinite(motor_torque)
     design = np.concatenate(
@@ -89,9 +89,9 @@ def guess_gravity(
     covariance = np.linalg.inv(design.T @ design)
     residual = design @ solution - target
     excess = max(float(residual @ residual) / max(len(target) - 4 * n, 1), 1.0)
-    return GravityGuess(arm, solution[2 * n :], covariance[2 * n :, 2 * n :] * excess)
+    return GravityGuess(kinematics, solution[2 * n :], covariance[2 * n :, 2 * n :] * excess)
 
 
-def _largest_moment(arm: Arm, rated: Array) -> float:
+def _largest_moment(kinematics: Arm, rated: Array) -> float:
     """A mass moment [kg·m] that no arm of these drives exceeds."""
-    return 2 * float(rated.max()) / max(float(np.linalg.norm(arm.gravity)), 1.0)
+    return 2 * float(rated.max()) / max(float(np.linalg.norm(kinematics.gravity)), 1.0)

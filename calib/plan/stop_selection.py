@@ -45,14 +45,14 @@ class Candidates:
         return Candidates(self.joint, self.stops[which], self.poses[which], self.lever[which])
 
 
-def stop_combinations(arm: Arm, joint: int, swept: tuple[float, float]) -> Candidates:
+def stop_combinations(kinematics: Arm, joint: int, swept: tuple[float, float]) -> Candidates:
     """The 2^(n-1) combinations in which the other joints stand at a limit, `joint` sweeping `swept`."""
-    rest = limit_poses(arm, joint)
-    stops = np.where(rest > (arm.lower + arm.upper) / 2, 1, -1).astype(np.int8)
+    rest = limit_poses(kinematics, joint)
+    stops = np.where(rest > (kinematics.lower + kinematics.upper) / 2, 1, -1).astype(np.int8)
     stops[:, joint] = 0
     poses = np.repeat(rest[:, None, :], SKETCH_STEPS, axis=1)
     poses[:, :, joint] = np.linspace(*swept, SKETCH_STEPS)
-    lever = gravity_levers(arm, poses[:, 0])[:, joint] / max(float(np.linalg.norm(arm.gravity)), 1e-9)
+    lever = gravity_levers(kinematics, poses[:, 0])[:, joint] / max(float(np.linalg.norm(kinematics.gravity)), 1e-9)
     return Candidates(joint, stops, poses, lever)
 
 
@@ -62,7 +62,7 @@ def reachable(candidates: Candidates) -> Candidates:
 
 
 def choose(
-    arm: Arm,
+    kinematics: Arm,
     candidates: list[Candidates],
     counts: list[int],
     moments: list[Array],
@@ -76,10 +76,10 @@ def choose(
     `moments` are the mass moments β (2n,) [kg·m] for which the design is made, as several guesses where they are
     unknown; sigma (n,) [N·m] of one reading; mass [kg] of the second pass.
     """
-    flange, free = [arm.a[-1], 0.0, arm.d[-1]], free_mask(arm.n, UNKNOWN)
-    guesses = [Parameters.nominal(arm.n, beta=beta, rho=flange) for beta in moments]
+    flange, free = [kinematics.a[-1], 0.0, kinematics.d[-1]], free_mask(kinematics.n, UNKNOWN)
+    guesses = [Parameters.nominal(kinematics.n, beta=beta, rho=flange) for beta in moments]
     information = [
-        np.stack([_information(arm, guess, each, sigma, free, mass) for guess in guesses]) for each in candidates
+        np.stack([_information(kinematics, guess, each, sigma, free, mass) for guess in guesses]) for each in candidates
     ]
     prior = np.stack([np.diag(_prior_std(guess, sigma)[free] ** -2.0) for guess in guesses])
 
@@ -89,12 +89,12 @@ def choose(
     return select(information, prior, counts, cost=travel)
 
 
-def guessed_moments(arm: Arm, seed: int, draws: int = 3) -> list[Array]:
+def guessed_moments(kinematics: Arm, seed: int, draws: int = 3) -> list[Array]:
     """Mass moments (2n,) of plausible arms of these dimensions, for planning before anything was measured."""
     generator = np.random.default_rng(seed)
-    length = np.hypot(arm.a, arm.d)
+    length = np.hypot(kinematics.a, kinematics.d)
     beyond = np.cumsum((length + 0.1)[::-1])[::-1]
-    return [(generator.normal(size=(arm.n, 2)) * beyond[:, None]).ravel() for _ in range(draws)]
+    return [(generator.normal(size=(kinematics.n, 2)) * beyond[:, None]).ravel() for _ in range(draws)]
 
 
 def _seconds(candidates: list[Candidates], chosen: list[list[int]], place: int, slot: int, speed: Array) -> Array:
@@ -109,9 +109,13 @@ def _seconds(candidates: list[Candidates], chosen: list[list[int]], place: int, 
     return time
 
 
-def _information(arm: Arm, guess: Parameters, candidates: Candidates, sigma: Array, free: Mask, mass: float) -> Array:
+def _information(
+    kinematics: Arm, guess: Parameters, candidates: Candidates, sigma: Array, free: Mask, mass: float
+) -> Array:
     """JᵀJ (C, p, p) of each candidate sweep, made without and with the mass."""
-    return sweep_information(sweep_jacobian(arm, guess, candidates.joint, candidates.poses, sigma, free, (0.0, mass)))
+    return sweep_information(
+        sweep_jacobian(kinematics, guess, candidates.joint, candidates.poses, sigma, free, (0.0, mass))
+    )
 
 
 def _prior_std(guess: Parameters, sigma: Array) -> Array:

@@ -23,7 +23,7 @@ from gcomp.arrays import Array
 class PlannedArm:
     """The arm as planning sees it."""
 
-    arm: Arm
+    kinematics: Arm
     section: SweepSection
     limits: Limits
     guess: GravityGuess | None
@@ -32,11 +32,11 @@ class PlannedArm:
     """The model's bodies, for collisions; None if the arm file has no model."""
 
     @classmethod
-    def of(cls, arm: ArmFile, guess: GravityGuess | None) -> Self:
+    def of(cls, arm_file: ArmFile, guess: GravityGuess | None) -> Self:
         """Raises BadInput if a joint's range is too short to sweep or the model cannot be used."""
-        described, section, limits = gcomp_arm(arm), sweep_section(arm), Limits.of(arm)
-        require_range(section, limits, described)
-        return cls(described, section, limits, guess, None if arm.model_path is None else Geometry(arm))
+        kinematics, section, limits = gcomp_arm(arm_file), sweep_section(arm_file), Limits.of(arm_file)
+        require_range(section, limits, kinematics)
+        return cls(kinematics, section, limits, guess, None if arm_file.model_path is None else Geometry(arm_file))
 
 
 def sweep_options(planned: PlannedArm) -> tuple[list[Candidates], list[str]]:
@@ -44,14 +44,14 @@ def sweep_options(planned: PlannedArm) -> tuple[list[Candidates], list[str]]:
 
     Raises BadInput if the drives can hold no combination, Collided if something touches in every one.
     """
-    found = [_options(planned, joint) for joint in reversed(range(planned.arm.n))]
+    found = [_options(planned, joint) for joint in reversed(range(planned.kinematics.n))]
     return [options for options, _ in found], [note for _, notes in found for note in notes]
 
 
 def _options(planned: PlannedArm, joint: int) -> tuple[Candidates, list[str]]:
     section, limits, guess = planned.section, planned.limits, planned.guess
-    name = planned.arm.names[joint]
-    everything = stop_combinations(planned.arm, joint, sweep_range(section, limits, joint))
+    name = planned.kinematics.names[joint]
+    everything = stop_combinations(planned.kinematics, joint, sweep_range(section, limits, joint))
     if planned.geometry is not None:
         everything = _without_collision(everything, planned.geometry, name)
     if guess is None:

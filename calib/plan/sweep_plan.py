@@ -35,7 +35,7 @@ ENOUGH = 1.2
 
 
 def plan_sweep(
-    arm: ArmFile,
+    arm_file: ArmFile,
     guess: GravityGuess | None = None,
     *,
     seed: int = 0,
@@ -50,14 +50,14 @@ def plan_sweep(
     and up to `MORE_POSES` more a joint are swept if the gains would not come out as exactly as asked. Raises BadInput
     if a joint's range is too short to sweep or no combination can be held.
     """
-    planned = PlannedArm.of(arm, guess)
+    planned = PlannedArm.of(arm_file, guess)
     section, goal = planned.section, planned.section.gain_std
     options, notes = sweep_options(planned)
-    moments = guessed_moments(planned.arm, seed) if guess is None else [guess.beta]
+    moments = guessed_moments(planned.kinematics, seed) if guess is None else [guess.beta]
     given = reference_mass or section.reference_mass
-    masses = [given] if given else reference_masses(planned.arm, planned.limits, options, guess)
+    masses = [given] if given else reference_masses(planned.kinematics, planned.limits, options, guess)
     poses = section.loaded_poses if reference_mass else section.poses
-    scout = scout_poses(planned.arm, section, planned.limits, seed, planned.geometry)
+    scout = scout_poses(planned.kinematics, section, planned.limits, seed, planned.geometry)
     for more in range(MORE_POSES + 1):
         sweeps = _choose(planned, options, poses + more, moments, masses[-1])
         mass, gain_std = _lightest(planned, sweeps, scout, masses, resolution)
@@ -87,9 +87,9 @@ def _choose(
     section, limits = planned.section, planned.limits
     counts = [1 if each.lever.max() < DEAD_LEVER else poses for each in options]
     sigma, speed = section.standard_error * limits.rated, section.travel_speed * limits.speed
-    picks = choose(planned.arm, options, counts, moments, sigma, mass, speed)
+    picks = choose(planned.kinematics, options, counts, moments, sigma, mass, speed)
     return tuple(
-        _sweep(planned, f"{planned.arm.names[each.joint]}.{number}", each, pick)
+        _sweep(planned, f"{planned.kinematics.names[each.joint]}.{number}", each, pick)
         for each, chosen in zip(options, picks, strict=True)
         for number, pick in enumerate(chosen, start=1)
     )
@@ -105,7 +105,7 @@ def _lightest(
     if planned.guess is None:
         return masses[-1], None
     section = planned.section
-    rounding = np.zeros(planned.arm.n) if resolution is None else resolution / np.sqrt(12.0)
+    rounding = np.zeros(planned.kinematics.n) if resolution is None else resolution / np.sqrt(12.0)
     for mass in masses:
         std = predicted_gain_std(
             planned.guess,

@@ -1,30 +1,24 @@
 """Entry point of the diagnosis in Python: a nominal model and recordings in, a `Diagnosis` out.
 
 In order: the model (`sim_gap.model`), prepared recordings and residuals (`sim_gap.residuals`), selection and fit of
-effects (`sim_gap.search`), causes and verdict (this package). `armlink gap diagnose` (`sim_gap.commands.gap_diagnose`)
-reads the files, calls `diagnose` and shows its result.
+effects (`sim_gap.search`), causes, and the answer with the verdict (this package). `armlink gap diagnose`
+(`sim_gap.commands.gap_diagnose`) reads the files, calls `diagnose` and shows its result.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording, default_names, slice_rows
-from sim_gap.attribution.causes import causes, left_over
-from sim_gap.attribution.confidence import HINT
-from sim_gap.attribution.diagnosis import Cause, Diagnosis, Verdict
-from sim_gap.attribution.notes import notes
+from sim_gap.attribution.answer import Internals, answer
+from sim_gap.attribution.causes import causes
+from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.attribution.rivals import Rivals
-from sim_gap.attribution.rollout import roll_out
-from sim_gap.attribution.verdict import is_quiet, share_left, verdict
+from sim_gap.attribution.verdict import is_quiet
 from sim_gap.effects.registry import library_without
-from sim_gap.model.load import SimModel, load_model
-from sim_gap.residuals.layout import layout_of
+from sim_gap.model.load import load_model
 from sim_gap.residuals.preprocess import prepare, require_length
-from sim_gap.residuals.residual_set import ResidualSet
-from sim_gap.residuals.stuck_channels import Stuck, without_stuck
-from sim_gap.residuals.where import by_joint, combined, locate
+from sim_gap.residuals.residual_set import ResidualSet, residual_sets
 from sim_gap.search.estimate import Estimate
 from sim_gap.search.model_selection import select_model
 from sim_gap.search.normal_equations import ColumnStore
@@ -33,17 +27,6 @@ OWN_HELDOUT = 0.3
 """Share at the end of each training recording that is held out if no held-out recording is given."""
 OWN_HELDOUT_S = 3.0
 """Least length of it [s], up to half of a short recording."""
-
-
-@dataclass(frozen=True, eq=False)
-class Internals:
-    """Model, data and fit behind a diagnosis, for report, roll-out and export."""
-
-    model: SimModel
-    train: ResidualSet
-    heldout: ResidualSet
-    estimate: Estimate | None
-    """None if there is no gap."""
 
 
 def diagnose(
@@ -75,14 +58,11 @@ def diagnose(
     numbers = [*range(1, len(train) + 1), *([0] * len(heldout))]
     if not heldout:
         train, heldout, labels, numbers = *_split(train), labels * 2, numbers * 2
-    prepared = [
-        without_stuck(replace(prepare(recording, sim.arm, label), number=number), recording)
+    ready = [
+        prepare(recording, sim.arm, label, number)
         for recording, label, number in zip([*train, *heldout], labels, numbers, strict=False)
     ]
-    ready = [signals for signals, _ in prepared]
-    stuck = tuple(each for _, found in prepared for each in found)
-    layout = layout_of(ready)
-    fit, judge = (ResidualSet(tuple(part), layout) for part in (ready[: len(train)], ready[len(train) :]))
+    fit, judge = residual_sets(ready[: len(train)], ready[len(train) :])
     _require_motion(fit)
     store = ColumnStore(fit)
     search = select_model(store, library_without(withhold))
@@ -90,43 +70,8 @@ def diagnose(
     quiet = not fit.impacts and is_quiet(judge) and is_quiet(fit)
     found, minor = causes(estimate, judge, Rivals(search), sim.arm.names, quiet=quiet)
     if quiet and not found:
-        return _answer(Internals(sim, fit, judge, None), [], [], heldout_is, stuck)
-    return _answer(Internals(sim, fit, judge, estimate), found, minor, heldout_is, stuck)
-
-
-def _answer(
-    made: Internals, found: list[Cause], minor: list[Cause], heldout_is: str, stuck: Sequence[Stuck]
-) -> Diagnosis:
-    fit, judge, estimate = made.train, made.heldout, made.estimate
-    left, left_fit = (
-        left_over(data, estimate.predict(data)) if estimate is not None else data.values for data in (judge, fit)
-    )
-    result: Verdict = "no_gap" if estimate is None else verdict(found, judge, left)
-    if stuck or (fit.impacts and not any(cause.effect == "transmission.backlash" for cause in found)):
-        result = "unexplained"
-    return Diagnosis(
-        verdict=result,
-        names=made.model.arm.names,
-        where=tuple(locate(judge)),
-        causes=tuple(_hints(found) if result == "unexplained" else found),
-        minor=tuple(minor),
-        noise_floor=combined(judge, judge.floor),
-        train_before=by_joint(fit),
-        train_after=by_joint(fit, left_fit),
-        heldout_before=by_joint(judge),
-        heldout_after=by_joint(judge, left),
-        unexplained=share_left(judge, left),
-        margin=combined(judge, judge.margin),
-        heldout_is=heldout_is,
-        rollout=roll_out(made.model, judge, estimate),
-        notes=notes(found, stuck, estimate, fit, judge, left),
-        internals=made,
-    )
-
-
-def _hints(found: list[Cause]) -> list[Cause]:
-    """The causes with their confidence capped, for a gap that remains unexplained."""
-    return [replace(cause, confidence=min(cause.confidence, HINT)) for cause in found]
+        return answer(Internals(sim, fit, judge, None), [], [], heldout_is)
+    return answer(Internals(sim, fit, judge, estimate), found, minor, heldout_is)
 
 
 def _names(recording: Recording) -> tuple[str, ...]:

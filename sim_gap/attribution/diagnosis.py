@@ -87,7 +87,7 @@ class Diagnosis:
     rollout: Rollout | None = None
     notes: tuple[str, ...] = ()
     internals: Any = field(default=None, repr=False, compare=False)
-    """Fit and data behind the result (`diagnose.Internals`), for report and export."""
+    """Fit and data behind the result (`answer.Internals`), for report and export."""
 
     def to_json(self) -> dict[str, Any]:
         """The dictionary of schema armlink.gap/1."""

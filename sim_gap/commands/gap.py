@@ -13,7 +13,10 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_
 
 @app.callback()
 def gap() -> None:
-    """Explain the gap between a simulation model and recordings of the real arm."""
+    """Explain the gap between a simulation model and recordings of the real arm.
+
+    Example: armlink gap diagnose --sim arm.xml --train slow.csv --heldout other.csv
+    """
 
 
 for command in (diagnose, plan, collect, diagnose_fleet, bench):

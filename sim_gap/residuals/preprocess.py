@@ -5,17 +5,19 @@ so that the filter does not change one against the other. Signs, plays and clips
 that filter.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.interpolate import CubicSpline, make_interp_spline
+from scipy.interpolate import make_interp_spline
 from scipy.signal import butter, sosfiltfilt, sosfreqz
 
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording
 from sim_gap.model.rigid_body import CREEP, Array, RigidArm
+from sim_gap.residuals.channel_noise import band_noise
+from sim_gap.residuals.resampling import SLOW_HZ, bridged, coverage, low_pass, thinner
+from sim_gap.residuals.stuck_channels import Stuck, stuck_intervals
 
 BAND_HZ = 6.0
 """Pass band in which model and recording are compared [Hz]."""
@@ -28,11 +30,6 @@ WORK_HZ = 125.0
 TRIM_S = 0.3
 """Length cut off at both ends after filtering [s]."""
 SHORTEST_S = 3.0
-SLOW_HZ = 60.0
-"""Below this rate [Hz] the recorded velocity is used; above, the position is differentiated, for drives report velocity
-late."""
-SPLINED = 3.5
-"""Largest ratio of a step between readings to the median step for interpolation by splines."""
 CHANNELS = {"tau": "torque", "tau_motor": "motor_torque", "tau_cmd": "torque_command"}
 
 
@@ -53,13 +50,15 @@ class Signals:
     reading: dict[str, Array]
     """Torque channels present, of `tau`, `tau_motor`, `tau_cmd` [N·m], (K, n)."""
     known: dict[str, Array]
-    """1 for readings, 0 for samples interpolated over a gap, (K, n)."""
+    """1 for readings, 0 for samples interpolated over a gap or stuck, (K, n)."""
     noise: dict[str, Array]
     """Standard deviation of each channel's noise within the pass band [N·m], (n,)."""
     arm: RigidArm
     temperature: Array | None = None
     number: int = 0
     """Number from 1 of the training recording that this is (a part of); 0 for others."""
+    stuck: tuple[Stuck, ...] = ()
+    """Channels that are stuck for some time, in which they are not `known`."""
 
     @property
     def n(self) -> int:
@@ -79,7 +78,7 @@ class Signals:
     @cached_property
     def smooth_model(self) -> Array:
         """Nominal torque without the noise of the accelerations, which would disturb plays and clips, (K, n)."""
-        return _low_pass(min(CALM_HZ, 0.4 * self.rate), self.rate)(self.model)
+        return low_pass(min(CALM_HZ, 0.4 * self.rate), self.rate)(self.model)
 
     @cached_property
     def motor_model(self) -> Array:
@@ -169,7 +168,7 @@ def require_length(recording: Recording, label: str) -> None:
         )
 
 
-def prepare(recording: Recording, arm: RigidArm, label: str = "recording") -> Signals:
+def prepare(recording: Recording, arm: RigidArm, label: str = "recording", number: int = 0) -> Signals:
     """Prepare a recording for the comparison with `arm`. Raises BadInput if it cannot be used, with the reason."""
     if recording.n != arm.n:
         raise BadInput(f"{label}: has {recording.n} joints, the model {arm.n}: give the model of the recorded arm")
@@ -180,99 +179,44 @@ def prepare(recording: Recording, arm: RigidArm, label: str = "recording") -> Si
     band = min(BAND_HZ, rate / 5.0)
     if band < 0.5:
         raise BadInput(f"{label}: {rate:.3g} rows a second are too few: record at 10 Hz or more")
-    thin = _thinner(1.0 / raw_step, stride)
-    q = thin(_bridged(recording.t, recording.position, even, label, "q"))
-    smooth = _low_pass(min(SMOOTH_HZ, 0.4 * rate), rate)
+    thin = thinner(1.0 / raw_step, stride)
+    q = thin(bridged(recording.t, recording.position, even, label, "q"))
+    smooth = low_pass(min(SMOOTH_HZ, 0.4 * rate), rate)
     times = even[::stride]
     spline = make_interp_spline(times, smooth(q), k=5)
     q, v, a = (np.asarray(spline(times, order)) for order in range(3))
     if rate < SLOW_HZ and recording.velocity is not None and np.isfinite(recording.velocity).all():
-        v = smooth(thin(_bridged(recording.t, recording.velocity, even, label, "dq")))
+        v = smooth(thin(bridged(recording.t, recording.velocity, even, label, "dq")))
         a = np.asarray(make_interp_spline(times, v, k=5)(times, 1))
     reading, known, noise = {}, {}, {}
     for channel, name in CHANNELS.items():
         values = getattr(recording, name)
         if values is None or not np.isfinite(values).any():
             continue
-        reading[channel] = thin(_bridged(recording.t, values, even, label, channel))
-        known[channel] = _coverage(recording.t, values, even)[::stride]
-        noise[channel] = np.array([_band_noise(recording.t, values[:, j], band) for j in range(arm.n)])
+        reading[channel] = thin(bridged(recording.t, values, even, label, channel))
+        known[channel] = coverage(recording.t, values, even)[::stride]
+        noise[channel] = np.array([band_noise(recording.t, values[:, j], band) for j in range(arm.n)])
     if not reading:
         raise BadInput(f"{label}: no torque channel holds a number: at least one of tau, tau_motor, tau_cmd is needed")
     clock = times - times[0]
-    return Signals(label, rate, band, clock, q, v, a, reading, known, noise, arm, recording.temperature)
+    signals = Signals(label, rate, band, clock, q, v, a, reading, known, noise, arm, recording.temperature, number)
+    return _without_stuck(signals, recording)
 
 
-def _bridged(t: Array, values: Array, even: Array, label: str, column: str) -> Array:
-    """Values on the even time base, by cubic splines for a channel that is slow and even, else linear.
-
-    Raises BadInput if a whole column is missing.
-    """
-    out = np.empty((len(even), values.shape[1]))
-    for j in range(values.shape[1]):
-        there = np.isfinite(values[:, j])
-        if there.sum() < 4 or (column == "q" and there.mean() < 0.2):
-            raise BadInput(
-                f"{label}: column {column}_{j + 1} holds {int(there.sum())} numbers in {len(t)} rows: "
-                "expected a reading in most rows; record that channel or leave it out"
-            )
-        own = t[there]
-        steps, usual = np.diff(own), float(np.median(np.diff(own)))
-        even_enough = steps.max() < SPLINED * usual and steps.min() > usual / SPLINED and usual > 1.0 / SLOW_HZ
-        curve = CubicSpline(own, values[there, j]) if even_enough else None
-        inside = np.clip(even, own[0], own[-1])
-        out[:, j] = np.interp(inside, own, values[there, j]) if curve is None else curve(inside)
-    return out
-
-
-def _coverage(t: Array, values: Array, even: Array) -> Array:
-    """1 if a reading is within a few of the channel's own periods, (K, n)."""
-    out = np.zeros((len(even), values.shape[1]))
-    for j in range(values.shape[1]):
-        there = t[np.isfinite(values[:, j])]
-        after = np.clip(np.searchsorted(there, even), 1, len(there) - 1)
-        gap = there[after] - there[after - 1]
-        out[:, j] = gap <= max(6.0 * float(np.median(np.diff(there))), 0.05)
-    return out
-
-
-def _thinner(rate: float, stride: int) -> Callable[[Array], Array]:
-    if stride == 1:
-        return lambda x: x
-    low = _low_pass(0.4 * rate / stride, rate)
-    return lambda x: low(x)[::stride]
-
-
-def _low_pass(cut: float, rate: float) -> Callable[[Array], Array]:
-    sections = butter(4, cut, fs=rate, output="sos")
-    return lambda x: np.asarray(sosfiltfilt(sections, x, axis=0))
-
-
-def _band_noise(t: Array, values: Array, band: float) -> float:
-    """Noise within the pass band [N·m], from the channel's median spectrum above twice that band or just above it.
-
-    The lower of the two: a controller's noise grows with frequency, and fast motion reaches beyond the band.
-    """
-    there = np.isfinite(values)
-    x, own = values[there], t[there]
-    if len(x) < 64:
-        return 0.0
-    rate = 1.0 / float(np.median(np.diff(own)))
-    frequency, density = _spectrum(x - x.mean(), rate)
-    high = frequency > min(2.0 * band, 0.3 * rate)
-    near = (frequency > 1.5 * band) & (frequency < 3.0 * band)
-    levels = [float(np.median(density[part])) for part in (high, near) if part.any()]
-    return float(np.sqrt(min(levels) / 0.69 * band)) if levels else 0.0
-
-
-def _spectrum(x: Array, rate: float) -> tuple[Array, Array]:
-    """Power spectral density (Welch: Hann windows of 512 samples, overlapping by half, each detrended)."""
-    size = min(len(x), 512)
-    pieces = np.lib.stride_tricks.sliding_window_view(x, size)[:: size // 2]
-    line = np.linspace(-1.0, 1.0, size)
-    pieces = pieces - pieces.mean(1, keepdims=True)
-    pieces = pieces - (pieces @ line / (line @ line))[:, None] * line
-    window = np.hanning(size)
-    power = np.abs(np.fft.rfft(pieces * window, axis=1)) ** 2
-    density = 2.0 * power.mean(0) / (rate * (window @ window))
-    return np.asarray(np.fft.rfftfreq(size, 1.0 / rate), float), np.asarray(density)
+def _without_stuck(s: Signals, recording: Recording) -> Signals:
+    """The signals with stuck readings marked as not known."""
+    known, found = dict(s.known), []
+    for channel in s.channels:
+        values = getattr(recording, CHANNELS[channel])
+        for joint in range(s.n):
+            there = np.isfinite(values[:, joint])
+            held = s.moving[:, joint] == 0.0 if channel != "tau" else np.zeros(len(s.t), bool)
+            own = recording.t[there] - recording.t[0]
+            still = stuck_intervals(s.t, s.model[:, joint], held, own, values[there, joint])
+            if still:
+                marked = known[channel].copy()
+                for start, end in still:
+                    marked[(s.t >= start) & (s.t <= end), joint] = 0.0
+                known[channel] = marked
+                found.append(Stuck(channel, joint, sum(end - start for start, end in still)))
+    return replace(s, known=known, stuck=tuple(found))

@@ -1,6 +1,6 @@
 """Residuals of a set of recordings: one row per channel and joint, with its noise floor, valid samples and folds."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,7 +10,7 @@ from scipy.ndimage import minimum_filter1d
 
 from sim_gap.model.rigid_body import Array
 from sim_gap.residuals.gear_impacts import near_impacts
-from sim_gap.residuals.layout import Columns, Layout, Row
+from sim_gap.residuals.layout import Columns, Layout, Row, layout_of
 from sim_gap.residuals.preprocess import Signals
 
 MODEL_FLOOR = 1e-3
@@ -190,6 +190,12 @@ class ResidualSet:
         """RMS of each row below which it may be noise alone: an effect must then show steadily [N·m]."""
         noise = {row: 2.0 * floor for row, floor in self.floor.items()}
         return {row: noise[row] + max(QUIET * (self.margin[row] - noise[row]), RELEVANT_NM) for row in self.rows}
+
+
+def residual_sets(train: Sequence[Signals], heldout: Sequence[Signals]) -> tuple[ResidualSet, ResidualSet]:
+    """Residuals of the training and of the held-out recordings, in a common layout."""
+    layout = layout_of([*train, *heldout])
+    return ResidualSet(tuple(train), layout), ResidualSet(tuple(heldout), layout)
 
 
 def sliding(s: Signals) -> NDArray[np.bool_]:

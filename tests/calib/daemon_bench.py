@@ -15,6 +15,8 @@ from calib.daemon.loop.loop_process import InlineLoop
 from calib.daemon.service import Service
 from calib.daemon.service_view import ServiceView
 from calib.daemon.settings import DaemonSection
+from calib.install.journaled_write import install
+from calib.install.plausibility import admit
 from calib.records.records import CalibrationRecord, GravityRecord, JointCalibration, matrix, provenance
 from calib.records.store import RecordStore
 from gcomp.arm.mass_moments import base_parameters
@@ -104,13 +106,12 @@ class DaemonBench:
 
     def install(self) -> None:
         """Write the current record to the controllers, as `armlink calibrate --apply` does."""
-        from calib.observer.recalibrator import write_record
-
         record = self.store.current(CalibrationRecord, self.arm)
         assert record is not None
         for message in self.host.pump():
             self.service.take(message)
-        write_record(record, self.host.controllers)
+        admitted = admit(record, self.arm, self.store)
+        install(admitted, self.store, self.host.controllers, by="ann", reason="sweep", check=None)
         self.service.records.held(None)
 
     def now(self) -> float:

@@ -48,7 +48,7 @@ class FastDaemon:
         self.wall_shift, self.clock_shift = timedelta(), 0.0
         self.store = RecordStore(str(directory / "records.db"))
         self.controllers, self.port = self, self
-        self.ids = [0] * self.fast.n
+        self.ids, self.dates = [0] * self.fast.n, [0] * self.fast.n
         self.sdo: list[str] = []
         self.run_aside = run_now
         self.on_write: Callable[[int], None] = lambda joint: None
@@ -94,17 +94,15 @@ class FastDaemon:
 
     def read_calibration(self, joint: int) -> Calibration:
         self.sdo.append(f"read {joint}")
-        return Calibration(
-            float(self.fast.held_gain[joint]), float(self.fast.held_offset[joint]), self.ids[joint], 0, 0
-        )
+        gain, offset = float(self.fast.held_gain[joint]), float(self.fast.held_offset[joint])
+        return Calibration(gain, offset, self.ids[joint], self.dates[joint])
 
-    def write_calibration(
-        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
-    ) -> Calibration:
+    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
         self.sdo.append(f"write {joint}")
         self.on_write(joint)
-        self.fast.held_gain[joint], self.fast.held_offset[joint] = np.float32(gain), np.float32(offset)
-        self.ids[joint] = record_id
+        self.fast.held_gain[joint] = np.float32(calibration.gain)
+        self.fast.held_offset[joint] = np.float32(calibration.offset)
+        self.ids[joint], self.dates[joint] = calibration.record_id, calibration.date
         return self.read_calibration(joint)
 
     def sweep(self, poses: int, seed: int) -> Reply | None:

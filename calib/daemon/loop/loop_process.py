@@ -35,12 +35,9 @@ class LoopControllers:
         """Active gain and offset [N·m] of joint j; raises BusFault."""
         return self._call("read", joint=joint)
 
-    def write_calibration(
-        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
-    ) -> Calibration:
+    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
         """Stage, read back and make active; raises BadInput, BusFault."""
-        given = {"joint": joint, "gain": gain, "offset": offset, "record_id": record_id, "date": date, "store": store}
-        return self._call("write", **given)
+        return self._call("write", joint=joint, calibration=calibration, store=store)
 
     def _call(self, what: Any, **arguments: Any) -> Calibration:
         reply = self._ask(Request(next(_numbers), what, arguments))

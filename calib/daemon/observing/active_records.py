@@ -9,8 +9,8 @@ from calib.daemon.settings import Configuration
 from calib.daemon.state.arm_state import ArmState
 from calib.daemon.state.bus_jobs import BusJobs
 from calib.daemon.state.event_log import EventLog
-from calib.install.journaled_write import mend
-from calib.observer.recalibrator import write_record
+from calib.install.journaled_write import recover
+from calib.install.plausibility import GateRefused
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.records.store import RecordStore
 
@@ -119,7 +119,7 @@ class ActiveRecords:
         arm, controllers = self._configuration.arm, self._environment.port.controllers
 
         def work() -> tuple[bool, Held]:
-            undone = mend(arm, self._store, controllers) is not None
+            undone = recover(arm, self._store, controllers) is not None
             held = [controllers.read_calibration(joint) for joint in range(len(arm.joint_names))]
             return undone, tuple((each.gain, each.offset, each.record_id) for each in held)
 
@@ -139,7 +139,11 @@ class ActiveRecords:
         if self.observation is None:
             return
         feed = self.observation.feed
-        differ, record = feed.controllers_hold(self._held), feed.calibration
+        differ, record, recalibrations = (
+            feed.controllers_hold(self._held),
+            feed.calibration,
+            self.observation.recalibrations,
+        )
         if not differ:
             return
         if self._configuration.settings.policy != "apply" or self._configuration.listen_only:
@@ -150,15 +154,14 @@ class ActiveRecords:
 
         def done(outcome: tuple[str, ...] | ArmlinkError) -> None:
             if isinstance(outcome, ArmlinkError):
-                self._events.say("refused", None, f"record {record.id} could not be written: {outcome}", {})
+                gate = {"gate": outcome.refusal.name} if isinstance(outcome, GateRefused) else {}
+                text = f"record {record.id} is not written: {outcome}"
+                self._events.say("refused", None, text, {"record": record.id, "joints": differ, **gate})
                 return
             feed.controllers_hold(None)
+            recalibrations.restored(outcome)
             evidence = {"record": record.id, "joints": differ, "applied": True, "restored": True}
             text = f"record {record.id} written again to {', '.join(outcome)}"
             self._events.say("recalibration", None, text, evidence)
 
-        self._jobs.start(lambda: self._write(record), done)
-
-    def _write(self, record: CalibrationRecord) -> tuple[str, ...]:
-        """Write the record in force to every controller; returns the joints written."""
-        return write_record(record, self._environment.port.controllers)
+        self._jobs.start(recalibrations.restore, done)

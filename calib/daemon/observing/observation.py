@@ -26,7 +26,7 @@ class Observation:
         more_poses: Callable[[str], None],
     ) -> None:
         """`more_poses` asks for a tour of poses, with the reason, if the observer cannot decide."""
-        self.feed, self._recalibrations = feed, recalibrations
+        self.feed, self.recalibrations = feed, recalibrations
         self._storage, self._events, self._jobs, self._more_poses = storage, events, jobs, more_poses
         self.last_accepted: dict[str, datetime] = {}
         """Time of the newest row that went into each joint's estimate."""
@@ -41,7 +41,7 @@ class Observation:
         self._note_accepted()
         if events:
             self._report(events)
-        self._recalibrations.watch(samples, self.feed.observer.held)
+        self.recalibrations.watch(samples, self.feed.observer.held)
 
     def _note_accepted(self) -> None:
         accepted = self.feed.observer.estimate().accepted
@@ -57,10 +57,10 @@ class Observation:
                 kind, text, evidence = describe(event)
                 self._events.say(kind, event.joint, text, evidence)
                 if event.kind == "verdict":
-                    self._recalibrations.explained(kind, event.joint)
+                    self.recalibrations.explained(kind, event.joint)
             self._storage.save(self.feed, history=True)
         for event in events:
             if event.finding is not None:
-                self._recalibrations.found(event.finding)
+                self.recalibrations.found(event.finding)
             elif event.kind == "undecided":
                 self._more_poses("watching alone cannot decide")

@@ -3,6 +3,7 @@
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, per_joint
 from calib.arm.kinematics import gcomp_arm
 from calib.daemon.loop.loop_messages import Batch
 from calib.observer.config import ObserverConfig
@@ -30,10 +31,10 @@ class ObserverFeed:
         section = arm.require_link()
         described, self.gravity, self.calibration = gcomp_arm(arm), gravity.require(arm), calibration.require(arm)
         self.names = described.names
-        rated = np.array([joint.rated_torque for joint in section.joints])
+        rated = section.rated_torques
         self.observer = Observer.of_records(described, self.calibration, self.gravity, rated, config)
         self._group = max(1, round(section.rate / OBSERVED_RATE))
-        self._gain, self._offset = np.ones(described.n), np.zeros(described.n)
+        self._change = per_joint([UNCALIBRATED] * described.n)
         self._left: Samples | None = None
 
     def measures_against(self, calibration: CalibrationRecord, gravity: GravityRecord) -> bool:
@@ -51,22 +52,20 @@ class ObserverFeed:
 
         Returns the joints that hold another pair than the record's; none if it is not known (None).
         """
-        n = len(self.names)
         if held is None:
-            self._gain, self._offset = np.ones(n), np.zeros(n)
+            self._change = per_joint([UNCALIBRATED] * len(self.names))
             return []
-        gain, offset = np.array([each[0] for each in held]), np.array([each[1] for each in held])
-        wanted_gain, wanted_offset = self.calibration.values("gain"), self.calibration.values("offset")
-        wanted_gain = np.where(np.isnan(wanted_gain), gain, wanted_gain)
-        wanted_offset = np.where(np.isnan(wanted_offset), offset, wanted_offset)
-        differ = ~(np.isclose(gain, wanted_gain, rtol=1e-6, atol=0) & np.isclose(offset, wanted_offset, atol=1e-6))
-        self._gain = np.where(differ, gain / wanted_gain, 1.0)
-        self._offset = np.where(differ, (offset - wanted_offset) / wanted_gain, 0.0)
+        installed = per_joint(TorqueCalibration(gain, offset) for gain, offset, _ in held)
+        wanted = self.calibration.torque_calibration(installed)
+        same = np.isclose(installed.gain, wanted.gain, rtol=1e-6, atol=0)
+        differ = ~(same & np.isclose(installed.offset, wanted.offset, atol=1e-6))
+        change = installed.relative_to(wanted)
+        self._change = TorqueCalibration(np.where(differ, change.gain, 1.0), np.where(differ, change.offset, 0.0))
         return [name for name, other in zip(self.names, differ, strict=True) if other]
 
     def reading(self, torque: Array) -> Array:
         """Torque (…, n) [N·m] as sent, converted to the record in force."""
-        return np.asarray(torque * self._gain + self._offset)
+        return self._change.apply(torque)
 
     def decimate(self, batch: Batch) -> Samples:
         """The samples of a batch at the observer's rate; NaN if all that go into one are missing."""

@@ -45,7 +45,7 @@ class RecalibrationWorkflow:
         self._recalibrator: Recalibrator | None = None
         self._installed: Installed = lambda record, finding: None
         self._waiting: list[Finding] = []
-        self._checking: str | None = None
+        self._checking: tuple[str, ...] = ()
         self._unexplained: deque[Samples] = deque(maxlen=WAITING)
 
     def begin(self, recalibrator: Recalibrator, installed: Installed) -> Finding | None:
@@ -55,7 +55,7 @@ class RecalibrationWorkflow:
         that led to the record now in force, if one did.
         """
         self._recalibrator, self._installed = recalibrator, installed
-        self._waiting, self._checking, self._unexplained = [], None, deque(maxlen=WAITING)
+        self._waiting, self._checking, self._unexplained = [], (), deque(maxlen=WAITING)
         current, last = recalibrator.record, None
         for row in self._journal.proposals():
             if row.record == current.id and row.state in ("applied", "approved"):
@@ -180,7 +180,7 @@ class RecalibrationWorkflow:
 
     def _applied(self, row: ProposalRow, by: str, record: CalibrationRecord) -> None:
         """Keep and report that a proposal's record is current."""
-        self._checking = row.joint
+        self._checking = (row.joint,)
         joint = record.joints[row.finding.joint]
         gain = "as before" if joint.gain is None else f"{joint.gain:.5f}"
         text = f"{row.joint}: record {record.id} in force: gain {gain}, offset {joint.offset or 0.0:.3f} N·m"
@@ -188,12 +188,20 @@ class RecalibrationWorkflow:
         self._journal.decide(row.id, self._events.now(), "applied", by)
         self._events.say("recalibration", row.joint, text, evidence)
 
+    def restore(self) -> tuple[str, ...]:
+        """Write the current record to controllers that hold another calibration; returns the joints written."""
+        return self._active().restore()
+
+    def restored(self, joints: tuple[str, ...]) -> None:
+        """The current record was written to the controllers of these joints: `watch` checks it."""
+        self._checking = joints
+
     def watch(self, samples: Samples, held: bool) -> None:
         """Give decimated samples to the check after a write; a write that made the readings worse is taken back.
 
         While an alarm is open (`held`) they wait until its cause is `explained`: a payload says nothing of the sensor.
         """
-        if self._checking is None or self._jobs.busy:
+        if not self._checking or self._jobs.busy:
             return
         if held:
             self._unexplained.append(samples)
@@ -204,7 +212,7 @@ class RecalibrationWorkflow:
     def explained(self, kind: str, joint: str | None) -> None:
         """An alarm's cause is known: samples that waited count if it is a drift of the joint just recalibrated."""
         waiting, self._unexplained = list(self._unexplained), deque(maxlen=WAITING)
-        if kind != "drift" or joint != self._checking:
+        if kind != "drift" or joint not in self._checking:
             return
         for samples in waiting:
             self._check(samples)
@@ -213,7 +221,7 @@ class RecalibrationWorkflow:
         for t, position, torque in zip(*samples, strict=True):
             checked = self._active().sample(float(t), position, torque)
             if checked is not None:
-                self._checking = None
+                self._checking = ()
                 self._checked(checked)
                 return
 
@@ -230,8 +238,8 @@ class RecalibrationWorkflow:
             else:
                 text = f"{joint}: rolled back to record {outcome.record.id}: {why}"
                 self._events.say("roll-back", joint, text, {"record": outcome.record.id, "why": checked.why})
-                assert outcome.undo is not None
-                self._installed(outcome.record, outcome.undo)
+                if outcome.undo is not None:  # else a whole record: the service sees that another one is current
+                    self._installed(outcome.record, outcome.undo)
             self._next()
 
         recalibrator = self._active()

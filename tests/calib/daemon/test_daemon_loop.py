@@ -14,7 +14,7 @@ from armlink.bus.open import open_link_bus
 from armlink.errors import BadInput, BusFault
 from armlink.link.link import Link
 from armlink.link.listener import Listener
-from armlink.link.types import Command
+from armlink.link.types import Calibration, Command
 from calib.arm.kinematics import gcomp_arm
 from calib.daemon.loop.arm_loop import ArmLoop
 from calib.daemon.loop.loop_messages import Batch, Down, LoopOptions, Up
@@ -62,7 +62,7 @@ def test_a_fault_of_a_joint_is_a_message_and_the_bus_is_opened_again(tmp_path: P
 def test_errors_of_the_bus_loop_come_back_as_what_they_are(tmp_path: Path) -> None:
     bench = DaemonBench(tmp_path, settings=settings("observe"), work=False)
     with pytest.raises(BadInput, match="gain 9"):
-        bench.host.controllers.write_calibration(0, 9.0, 0.0, 1)
+        bench.host.controllers.write_calibration(0, Calibration(9.0, 0.0, 1))
     bench.host.close()
     with pytest.raises(BusFault):
         bench.host.controllers.read_calibration(0)

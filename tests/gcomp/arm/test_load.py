@@ -113,7 +113,7 @@ def test_branches_unknown_tips_and_files_that_are_no_models_are_refused(tmp_path
         '<mujoco><worldbody><body name="a"><joint name="left"/><geom size="0.1"/></body>'
         '<body name="b"><joint name="right"/><geom size="0.1"/></body></worldbody></mujoco>'
     )
-    with pytest.raises(BadModel, match="joint left branches off the chain: say with tip"):
+    with pytest.raises(BadModel, match="joint left branches off the chain: name the body at the chain"):
         load_model(path)
     assert load_model(path, tip="a").arm.names == ("left",)
     with pytest.raises(BadModel, match="no body 'c' for tip; there are a, b"):

@@ -15,7 +15,6 @@ from sim_gap.residuals.gear_impacts import near_impacts
 from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import prepare
 from sim_gap.residuals.residual_set import ResidualSet
-from sim_gap.residuals.stuck_channels import without_stuck
 
 Odd = Callable[[Recording], Recording]
 
@@ -97,8 +96,8 @@ def test_the_motor_of_a_joint_that_is_held_may_repeat_one_number_its_sensor_may_
         position[:, 1] = 0.3
     torque[:, 1] = motor[:, 1] = 1.234
     recording = replace(moving, position=position, torque=torque, motor_torque=motor)
-    _, found = without_stuck(prepare(recording, load_model(model(), (), 3).arm), recording)
-    assert [(one.channel, one.joint) for one in found] == [(channel, 1) for channel in channels]
+    signals = prepare(recording, load_model(model(), (), 3).arm)
+    assert [(one.channel, one.joint) for one in signals.stuck] == [(channel, 1) for channel in channels]
 
 
 def test_beside_a_stuck_sensor_other_joints_are_still_read():

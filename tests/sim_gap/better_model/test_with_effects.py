@@ -21,9 +21,7 @@ CASES = {
 }
 
 
-pytest.mark.parametrize("name", CASES)
-
-
+@pytest.mark.parametrize("name", CASES)
 def test_the_written_model_has_no_gap_any_more(tmp_path, name):
     (tmp_path / "arm.xml").write_text(THREE)
     nominal = load_model(tmp_path / "arm.xml")

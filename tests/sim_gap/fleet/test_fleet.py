@@ -83,12 +83,12 @@ def test_the_command_gathers_a_table_by_arm_and_effect_and_goes_on_where_it_stop
     whole = Path(out).read_bytes()
     Path(out).write_bytes(whole[:-40])  # as a kill leaves it
     again = CliRunner().invoke(app, arguments, standalone_mode=False)
-    assert "3 of 4 are there already" in " ".join(again.stderr.split())
+    assert "3 of 4 cases are done already" in " ".join(again.stderr.split())
     assert len(Answers(Path(out)).found) == 4
 
 
 def sleeper(case: Case) -> dict[str, object]:
-    """Dies with its worker the first time; a file tells."""
+    """Dies with its worker the first time, recorded by a file."""
     if not case.sim.exists():
         case.sim.touch()
         os.kill(os.getpid(), signal.SIGKILL)

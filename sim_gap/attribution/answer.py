@@ -1,0 +1,60 @@
+"""The answer of a diagnosis around its causes: verdict, gap before and after, roll-out, notes."""
+
+from dataclasses import dataclass, replace
+
+from sim_gap.attribution.causes import left_over
+from sim_gap.attribution.confidence import HINT
+from sim_gap.attribution.diagnosis import Cause, Diagnosis, Verdict
+from sim_gap.attribution.notes import notes
+from sim_gap.attribution.rollout import roll_out
+from sim_gap.attribution.verdict import share_left, verdict
+from sim_gap.model.load import SimModel
+from sim_gap.residuals.residual_set import ResidualSet
+from sim_gap.residuals.where import by_joint, combined, locate
+from sim_gap.search.estimate import Estimate
+
+
+@dataclass(frozen=True, eq=False)
+class Internals:
+    """Model, data and fit behind a diagnosis, for report, roll-out and export."""
+
+    model: SimModel
+    train: ResidualSet
+    heldout: ResidualSet
+    estimate: Estimate | None
+    """None if there is no gap."""
+
+
+def answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: str) -> Diagnosis:
+    """The diagnosis from its causes, the minor ones, and a description of the held-out data."""
+    fit, judge, estimate = made.train, made.heldout, made.estimate
+    left, left_fit = (
+        left_over(data, estimate.predict(data)) if estimate is not None else data.values for data in (judge, fit)
+    )
+    stuck = [each for s in (*fit.signals, *judge.signals) for each in s.stuck]
+    result: Verdict = "no_gap" if estimate is None else verdict(found, judge, left)
+    if stuck or (fit.impacts and not any(cause.effect == "transmission.backlash" for cause in found)):
+        result = "unexplained"
+    return Diagnosis(
+        verdict=result,
+        names=made.model.arm.names,
+        where=tuple(locate(judge)),
+        causes=tuple(_hints(found) if result == "unexplained" else found),
+        minor=tuple(minor),
+        noise_floor=combined(judge, judge.floor),
+        train_before=by_joint(fit),
+        train_after=by_joint(fit, left_fit),
+        heldout_before=by_joint(judge),
+        heldout_after=by_joint(judge, left),
+        unexplained=share_left(judge, left),
+        margin=combined(judge, judge.margin),
+        heldout_is=heldout_is,
+        rollout=roll_out(made.model, judge, estimate),
+        notes=notes(found, stuck, estimate, fit, judge, left),
+        internals=made,
+    )
+
+
+def _hints(found: list[Cause]) -> list[Cause]:
+    """The causes with their confidence capped, for a gap that remains unexplained."""
+    return [replace(cause, confidence=min(cause.confidence, HINT)) for cause in found]
