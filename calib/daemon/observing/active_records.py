@@ -138,12 +138,8 @@ class ActiveRecords:
         """Compare the controllers with the record in force; under the policy apply, write it if they differ."""
         if self.observation is None:
             return
-        feed = self.observation.feed
-        differ, record, recalibrations = (
-            feed.controllers_hold(self._held),
-            feed.calibration,
-            self.observation.recalibrations,
-        )
+        feed, recalibrations = self.observation.feed, self.observation.recalibrations
+        differ, record = feed.controllers_hold(self._held), feed.calibration
         if not differ:
             return
         if self._configuration.settings.policy != "apply" or self._configuration.listen_only:
