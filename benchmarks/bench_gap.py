@@ -10,10 +10,10 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 from side_by_side import Case, Figure, seconds
 
 from armlink.recording.recording import Recording
+from gcomp.arrays import Array
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.model.load import load_model, read_spec
 from sim_gap.residuals.layout import layout_of
@@ -21,7 +21,6 @@ from sim_gap.residuals.preprocess import prepare
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.residuals.where import by_joint
 
-Array = NDArray[np.float64]
 ARM = "sarcos"
 SECONDS, RATE = 30.0, 250.0
 NOISE_NM = 0.02

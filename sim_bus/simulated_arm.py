@@ -5,10 +5,8 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
-import numpy as np
-from numpy.typing import NDArray
-
 from armlink.arm_file import ArmFile
+from armlink.arrays import Array
 from armlink.errors import BadInput
 from sim_bus.effects.effect import EffectSetting
 from sim_bus.effects.registry import imperfections
@@ -25,7 +23,6 @@ from sim_bus.physics.sensors import Sensors
 from sim_bus.sim_section import sim_section
 from sim_bus.truth import Truth
 
-Array = NDArray[np.float64]
 SYNC_ID = 0x80
 DRIVE_ERROR = 0x21
 """Error register: generic and device profile."""

@@ -12,7 +12,7 @@ from gcomp.errors import GcompError
 def gcomp_arm(arm_file: ArmFile) -> Arm:
     """The arm that gcomp computes with, joints in the arm file's order.
 
-    Raises BadInput where a model file cannot be used or its joints are not the ones that the link section drives.
+    Raises BadInput if a model file cannot be used or its joints are not those of the link section.
     """
     kinematics = arm_file.kinematics
     if arm_file.model_path is not None:
@@ -36,7 +36,7 @@ def gcomp_arm(arm_file: ArmFile) -> Arm:
 def model_arm(arm_file: ArmFile) -> ModelArm:
     """The arm of the arm file's model file, with the model's own mass moments; raises BadInput as gcomp_arm does.
 
-    The arm file's gravity is in the model's world frame; where the arm file gives none, the model's own holds.
+    The arm file's gravity is in the model's world frame; without it the model's own is used.
     """
     path, kinematics = arm_file.model_path, arm_file.kinematics
     if path is None:

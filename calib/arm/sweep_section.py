@@ -1,4 +1,4 @@
-"""The `sweep` section of the arm file: how sweeps are made. Every key has a default, so it may be left out."""
+"""The `sweep` section of the arm file. Every key has a default, so that the section may be left out."""
 
 from typing import Annotated, Literal
 
@@ -16,11 +16,11 @@ class SweepSection(Section):
     """Steps, poses, settle rule, averaging and how resting joints are held."""
 
     steps: Annotated[int, Field(ge=5, le=200)] = 6
-    """Positions per sweep; each is taken on the way up and again on the way down."""
+    """Positions per sweep; each is read on the way up and on the way down."""
     poses: Annotated[int, Field(ge=1, le=8)] = 2
     """Stop combinations of the resting joints per swept joint."""
     loaded_poses: Annotated[int, Field(ge=1, le=8)] = 1
-    """The same in the pass with the reference mass."""
+    """Stop combinations in the pass with the reference mass."""
     hold: Literal["stops", "servo"] = "stops"
     """Resting joints are pressed on their stops (only the swept joint's sensor counts) or servo-held (all count)."""
     range_margin: Annotated[FiniteFloat, Field(gt=0)] = 0.06
@@ -32,37 +32,36 @@ class SweepSection(Section):
     acceleration: PositiveFloat = 3.0
     """Peak acceleration of travel and of steps [rad/s²]."""
     bias_torque: tuple[PositiveFloat, ...] | None = None
-    """Torque that presses each joint against its stop [N·m]; by default what the scout finds necessary."""
+    """Torque that presses each joint against its stop [N·m]; by default from the scout's rough gravity model."""
     bias_margin: Share = 0.05
     """Margin of the bias torque over gravity, friction and model error, as a share of max_torque."""
     friction: Share = 0.06
     """Allowance for friction of the drives, as a share of rated torque."""
     gain_tolerance: Share = 0.15
-    """Allowance for error of the torque scale before anything is calibrated."""
+    """Allowance for the error of the torque scale before calibration."""
     settle_window: PositiveFloat = 0.15
     """Window over which velocity and torque scatter are judged [s]."""
     settle_velocity: PositiveFloat = 0.001
-    """A joint is at rest when it moves slower than this over the window [rad/s]."""
+    """Speed over the window below which a joint is at rest [rad/s]."""
     settle_scatter: PositiveFloat = 1.2
-    """Torque has settled when its scatter over the window is below this multiple of the sensor's own noise."""
+    """Torque has settled if its scatter over the window is below this multiple of the sensor's own noise."""
     settle_timeout: PositiveFloat = 4.0
-    """A step that has not settled by then is taken as it is, and marked [s]."""
+    """Time after which a step that has not settled is read all the same, and marked [s]."""
     standard_error: Share = 0.00035
-    """Standard error of the torque average asked for, as a share of rated torque; less where `gain_std` needs it."""
+    """Standard error of the torque averages, as a share of rated torque; smaller if `gain_std` requires it."""
     gain_std: Share = 0.001
-    """Standard deviation of the torque gains aimed at: where the plan predicts more, it averages longer."""
+    """Standard deviation of the torque gains to reach: if the plan predicts more, it averages longer."""
     max_samples: Annotated[int, Field(ge=10)] = 200
-    """Samples averaged at most."""
+    """Largest number of samples in an average."""
     reference_mass: PositiveFloat | None = None
     """Mass attached for the second pass [kg]; by default chosen from the torque limits."""
     reference_point: tuple[FiniteFloat, FiniteFloat, FiniteFloat] | None = None
-    """Where the mass's centre hangs, if measured: in the frame that turns with the last joint, origin on its axis, z
-    along it and x along `a` [m]; by default it is fitted. It gives the gains' common scale where all axes nearly meet.
-    """
+    """Centre of the mass, if measured: in the frame that turns with the last joint, origin on its axis, z along it and
+    x along `a` [m]; by default it is fitted. It determines the gains' common scale if all axes nearly meet."""
     reference_point_std: PositiveFloat = 0.001
-    """How well `reference_point` is known [m]."""
+    """Standard deviation of `reference_point` [m]."""
     position_offset_std: Annotated[FiniteFloat, Field(ge=0)] = 0.005
-    """How well the zero of the position sensors is known beforehand [rad]; 0 takes it as exact."""
+    """Standard deviation of the position sensors' zero beforehand [rad]; 0 for exact."""
 
     @model_validator(mode="after")
     def _one_bias_a_joint(self) -> "SweepSection":
@@ -72,14 +71,14 @@ class SweepSection(Section):
 
     @property
     def known_point(self) -> Prior | None:
-        """What is known beforehand of the place where the mass hangs, None where that is nothing."""
+        """Prior on the place of the reference mass, None without one."""
         if self.reference_point is None:
             return None
         return Prior(np.array(self.reference_point), self.reference_point_std)
 
 
 def sweep_section(arm_file: ArmFile) -> SweepSection:
-    """The arm file's `sweep` section, or the defaults where it has none; raises BadInput on a wrong length."""
+    """The arm file's `sweep` section, or the defaults without one; raises BadInput on a wrong length."""
     section = arm_file.sweep if isinstance(arm_file.sweep, SweepSection) else SweepSection()
     n = len(arm_file.require_link().joints)
     if section.bias_torque is not None and len(section.bias_torque) != n:

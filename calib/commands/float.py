@@ -7,7 +7,8 @@ import typer
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
-    from calib.records.records import Array, CalibrationRecord
+    from calib.records.records import CalibrationRecord
+    from gcomp.arrays import Array
 
 
 def hold_afloat(

@@ -91,7 +91,7 @@ def _plan(arm_file: "ArmFile", seed: int, picture: Path) -> dict[str, Any]:
     from calib.arm.kinematics import model_arm
     from calib.commands.screen import print_lines, print_plan
     from calib.plan.collisions import check_plan
-    from calib.plan.drawing import draw_plan, seconds
+    from calib.plan.drawing import draw_plan, pass_seconds
     from calib.plan.rough_gravity import guess_of_model
     from calib.plan.sweep_plan import plan_sweep
 
@@ -99,7 +99,7 @@ def _plan(arm_file: "ArmFile", seed: int, picture: Path) -> dict[str, Any]:
     planned = plan_sweep(arm_file, None if model is None else guess_of_model(model.arm, model.beta), seed=seed)
     print_plan(arm_file, planned)
     draw_plan(arm_file, planned, picture)
-    took, checked = seconds(arm_file, planned), check_plan(arm_file, planned)
+    took, checked = pass_seconds(arm_file, planned), check_plan(arm_file, planned)
     print_lines([f"about {took / 60:.0f} min a pass; {checked}; drawn in {picture}"])
     return {**planned.model_dump(mode="json"), "seconds": took, "collisions": checked, "picture": str(picture)}
 

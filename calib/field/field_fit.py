@@ -13,12 +13,11 @@ import numpy.typing as npt
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
 from calib.field.linear_model import UNKNOWN_MOMENT, Belief, Solution, belief_of, field_columns, solve
-from calib.records.records import Array, CalibrationRecord, GravityRecord, Parameter
+from calib.records.records import CalibrationRecord, GravityRecord, Parameter
 from gcomp.arm.mass_moments import payload_columns
+from gcomp.arrays import Array, Mask
 from gcomp.gravity.torque import gravity_regressor
 from gcomp.identify.readings import StaticReadings
-
-Flags = npt.NDArray[np.bool_]
 
 GAIN_STD = 0.02
 """Relative standard deviation above which a gain counts as not separable from the offset."""
@@ -142,7 +141,7 @@ def _refuse_payload(belief: Belief, rows: StaticReadings, q: Array, noise: Array
         )
 
 
-def _report(belief: Belief, rows: StaticReadings, columns: Array, solved: Solution, unseen: Flags) -> FieldFit:
+def _report(belief: Belief, rows: StaticReadings, columns: Array, solved: Solution, unseen: Mask) -> FieldFit:
     n, names = belief.arm.n, belief.arm.names
     counted = np.isfinite(rows.torque)
     model = columns[:, np.arange(n), np.arange(n)]

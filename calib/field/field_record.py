@@ -5,7 +5,8 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from calib.field.field_fit import FieldFit
-from calib.records.records import Array, CalibrationRecord, JointCalibration, Parameter, matrix, provenance
+from calib.records.records import CalibrationRecord, JointCalibration, Parameter, matrix, provenance
+from gcomp.arrays import Array
 
 PAIR: tuple[Parameter, Parameter] = ("gain", "offset")
 

@@ -4,7 +4,8 @@ import numpy as np
 
 from calib.field.field_fit import FieldFit
 from calib.fit.heldout import FEWEST
-from calib.records.records import Array, CalibrationRecord
+from calib.records.records import CalibrationRecord
+from gcomp.arrays import Array
 from gcomp.identify.readings import StaticReadings
 
 BLOCK = 24

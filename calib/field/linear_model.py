@@ -8,8 +8,9 @@ from armlink.arm_file import ArmFile
 from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, per_joint
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
-from calib.records.records import Array, CalibrationRecord, GravityRecord
+from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arm.arm import Arm
+from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_regressor, gravity_stiffness
 from gcomp.identify.readings import StaticReadings
 

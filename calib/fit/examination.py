@@ -1,4 +1,4 @@
-"""Does the sensor model hold? Where it does not, at which joint, and why: goodness of fit, outliers, left-out poses."""
+"""Whether the sensor model holds and, if not, at which joint and why: effects, outliers, leave-one-out residuals."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from calib.fit.findings import Finding, effect_said, encoders_said, outliers_said, scattered
+from calib.fit.findings import Finding, effect_finding, encoder_findings, outlier_findings, scatter_findings
 from calib.fit.refinement import Extra, Refined, refine
 from calib.fit.sweep_readings import SweepReadings
-from calib.fit.unmodelled_effects import Effect, size_of, strongest
+from calib.fit.unmodelled_effects import Effect, size_of, strongest_effect
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
 from gcomp.identify.global_fit import GlobalFit
@@ -17,52 +17,55 @@ from gcomp.identify.parameters import Prior
 from gcomp.identify.sensor_model import predict
 
 MOST_EFFECTS = 6
-"""Effects that are looked for one after the other."""
+"""Largest number of effects added one after the other; a choice."""
 OUTLIER = 6.0
-"""Robust standard deviations, its own pull on the fit taken out, from which a reading is an outlier."""
+"""Robust standard deviations of the deleted residual from which a reading is an outlier (docs/theory.md, 5.4)."""
 FEWEST = 8
-"""Readings of a joint from which outliers are told from noise."""
+"""Smallest number of a joint's readings for a robust standard deviation; a choice."""
 MOST_OUTLIERS = 0.15
-"""Share of a joint's readings that may be left out as outliers; where there are more, the model is at fault."""
+"""Largest share of a joint's readings that are left out as outliers; beyond it the model is at fault; a choice."""
 PLATEAU, PLATEAU_POSES = 4.0, 4
-"""Standard deviations within which readings count as equal; different poses at one extreme from which it is a limit."""
+"""Standard deviations within which readings count as equal; different poses at an extreme from which it is a limit."""
 SWING, BULK = 800.0, (10.0, 90.0)
-"""Standard deviations that a joint's torque must range over: else a sinusoid's own peak is as flat as a limit. Between
-these percentiles, for a knock makes no range."""
+"""Range of a joint's torque, in standard deviations, below which a sinusoid's peak is as flat as a limit; taken between
+these percentiles, so that a knock does not widen it. Chosen on the saturated sensors of test_examination.py."""
 BLURRED = 3.0
-"""A reading so many times less exact than most, as of an arm that swung, is near to every limit: it shows none."""
+"""Factor to the median standard deviation beyond which a reading, as of a swinging arm, cannot show a limit."""
 
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """How well one sweep is told by all others."""
+    """Cross-validation of one sweep: its readings against a fit of all others."""
 
     sweep: str
     joint: int
     """The swept joint."""
     rms: float
-    """Of its readings minus what a fit without it says [N·m]."""
+    """Of its readings minus their prediction [N·m]."""
     ratio: float
-    """That over what is to be expected."""
+    """Size over its expected value."""
 
 
 @dataclass(frozen=True, eq=False)
 class Goodness:
-    """The fit at its end, and what was found on the way."""
+    """The final fit, and whether the sensor model holds."""
 
     refined: Refined
     findings: tuple[Finding, ...]
     outliers: Mask
-    """Readings left out (K, n)."""
+    """Readings left out as outliers (K, n)."""
     left_out: tuple[LeftOut, ...]
 
 
 def examine(
     kinematics: Arm, rows: SweepReadings, fit: GlobalFit, priors: Mapping[str, Prior], rated: Array
 ) -> Goodness:
-    """Refine a global fit, one effect after another that its residuals ask for, without outliers. rated (n,) [N·m]."""
+    """Refine a global fit: add the effects that its residuals show, one by one, and leave outliers out.
+
+    rated (n,) [N·m] scales what is material.
+    """
     rows, findings = _without_plateaus(kinematics.names, rows)
-    encoders = encoders_said(kinematics.names, rows)
+    encoders = encoder_findings(kinematics.names, rows)
     effects, sound = list[Effect](), rows.readings.sigma
     outliers = np.zeros(sound.shape, dtype=bool)
 
@@ -77,7 +80,7 @@ def examine(
         if (strange != outliers).any():
             outliers = strange
             refined = fitted()
-        found = strongest(kinematics, rows, ~outliers, refined, rated)
+        found = strongest_effect(kinematics, rows, ~outliers, refined, rated)
         if found is None:
             break
         effects.append(found)
@@ -86,11 +89,11 @@ def examine(
             rows = replace(rows, readings=replace(rows.readings, sigma=_doubted(sound, effects, refined)))
             refined = fitted()
     for effect, coefficient in _sized(effects, refined):
-        findings.append(effect_said(kinematics.names, effect, coefficient, refined, rated))
-    findings += outliers_said(kinematics.names, rows, outliers)
-    findings += scattered(kinematics.names, refined, rated, {finding.joint for finding in findings})
-    said = encoders or findings  # what a wrong position does elsewhere is no finding of its own
-    return Goodness(refined, tuple(said), outliers, leave_out(refined, rows))
+        findings.append(effect_finding(kinematics.names, effect, coefficient, refined, rated))
+    findings += outlier_findings(kinematics.names, rows, outliers)
+    findings += scatter_findings(kinematics.names, refined, rated, {finding.joint for finding in findings})
+    final = encoders or findings  # a wrong position causes the others
+    return Goodness(refined, tuple(final), outliers, leave_out(refined, rows))
 
 
 def _sized(effects: list[Effect], refined: Refined) -> Iterator[tuple[Effect, Array]]:
@@ -102,7 +105,7 @@ def _sized(effects: list[Effect], refined: Refined) -> Iterator[tuple[Effect, Ar
 
 
 def _doubted(sigma: Array, effects: list[Effect], refined: Refined) -> Array:
-    """Standard deviations (K, n) [N·m] with what the effects leave open of each reading."""
+    """Standard deviations (K, n) [N·m] that include the uncertainty of the effects at each reading."""
     square = sigma**2
     for effect, coefficient in _sized(effects, refined):
         if effect.doubt is not None:
@@ -111,7 +114,7 @@ def _doubted(sigma: Array, effects: list[Effect], refined: Refined) -> Array:
 
 
 def _without_plateaus(names: tuple[str, ...], rows: SweepReadings) -> tuple[SweepReadings, list[Finding]]:
-    """The rows without readings at a torque beyond which a sensor never went though the arm moved: it saturates."""
+    """(Rows without readings at a sensor's limit, findings of sensors that saturate)."""
     torque, flat, found = rows.readings.torque, np.zeros(rows.readings.torque.shape, dtype=bool), []
     for joint, name in enumerate(names):
         counted = _sharp(rows, joint)
@@ -125,21 +128,21 @@ def _without_plateaus(names: tuple[str, ...], rows: SweepReadings) -> tuple[Swee
             if len(distinct) >= max(PLATEAU_POSES, 0.1 * len(counted)):
                 flat[near, joint] = True
                 limit = float(side * np.max(side * value))
-                text = f"{name}: {len(near)} readings at different poses stand at {limit:.4g} N·m: the sensor saturates"
+                text = f"{name}: {len(near)} readings at different poses are at {limit:.4g} N·m: the sensor saturates"
                 found.append(Finding(name, "saturation", limit, "N·m", text))
     readings = replace(rows.readings, torque=np.where(flat, np.nan, torque))
     return (replace(rows, readings=readings) if found else rows), found
 
 
 def _sharp(rows: SweepReadings, joint: int) -> npt.NDArray[np.intp]:
-    """The rows in which a joint's reading counts and is exact enough to show a limit."""
+    """Rows in which a joint's reading counts and is precise enough to show a limit."""
     counted = np.flatnonzero(rows.readings.counted[:, joint])
     sigma = rows.readings.sigma[counted, joint]
     return counted[sigma <= BLURRED * np.median(sigma)] if len(counted) else counted
 
 
 def leave_out(refined: Refined, rows: SweepReadings) -> tuple[LeftOut, ...]:
-    """Each sweep's readings against a fit of all others, by the block form of the leave-one-out residual."""
+    """Cross-validation of each sweep, by the block form of the leave-one-out residual (docs/theory.md, section 5.4)."""
     linear, found = refined.linear, []
     count = len(linear.row)
     series = rows.readings.series[linear.row]
@@ -161,9 +164,9 @@ def leave_out(refined: Refined, rows: SweepReadings) -> tuple[LeftOut, ...]:
 
 
 def _outliers(kinematics: Arm, refined: Refined, rows: SweepReadings, extras: list[Extra]) -> Mask:
-    """Readings (K, n) that no noise explains: deleted residuals, in robust standard deviations of their joint.
+    """Outliers (K, n) by deleted residuals, in robust standard deviations of their joint.
 
-    Those left out before are judged again, for an effect found since may explain them.
+    Readings left out before are judged again, since an effect added meanwhile may explain them.
     """
     linear, counted = refined.linear, rows.readings.counted
     error = rows.readings.torque - predict(kinematics, refined.fit.complete, rows.readings)

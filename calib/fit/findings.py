@@ -1,4 +1,4 @@
-"""What the readings of a sweep show that the sensor model does not have, in words."""
+"""Findings: effects in the readings that the sensor model does not have, in words."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -24,30 +24,33 @@ Kind = Literal[
     "scatter",
 ]
 SCATTER, MATERIAL_SCATTER = 3.0, 0.002
-"""Scatter that is no longer noise: this many times what the samples explain, and this share of rated torque."""
+"""Scatter that counts as a finding: this factor to the samples' noise, and this share of rated torque. Held by
+tests/campaigns/random_arms.py (none) and hard_cases.py (named)."""
 HOLDING: tuple[Kind, ...] = ("direction", "hysteresis", "outliers")
-"""What the fit takes out completely: the model holds without it."""
+"""Findings that the fit removes completely: with them removed the model holds."""
 
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """Something that the sensor model does not have and the readings show."""
+    """An effect in the readings that the sensor model does not have."""
 
     joint: str
     kind: Kind
     size: float
-    """In `unit`; NaN where there is no one number."""
+    """In `unit`; NaN if no single number describes it."""
     unit: str
     text: str
-    """One sentence for a person."""
+    """One sentence for the user."""
 
     @property
     def breaks_model(self) -> bool:
-        """Whether the joint's values must not be relied on as they are."""
+        """Whether the joint's values must not be used as they are."""
         return self.kind not in HOLDING
 
 
-def effect_said(names: tuple[str, ...], effect: Effect, coefficient: Array, refined: Refined, rated: Array) -> Finding:
+def effect_finding(
+    names: tuple[str, ...], effect: Effect, coefficient: Array, refined: Refined, rated: Array
+) -> Finding:
     """One effect in words."""
     name, gain = names[effect.joint], float(refined.fit.complete.gain[effect.joint]) or 1.0
     value = float(coefficient[0])
@@ -80,8 +83,8 @@ def effect_said(names: tuple[str, ...], effect: Effect, coefficient: Array, refi
     return Finding(name, "nonlinear", value / gain, "1", text)
 
 
-def encoders_said(names: tuple[str, ...], rows: SweepReadings) -> list[Finding]:
-    """Position sensors with a bit that never changes."""
+def encoder_findings(names: tuple[str, ...], rows: SweepReadings) -> list[Finding]:
+    """Findings of position sensors with a bit that never changes."""
     found = []
     for joint, bit, step in stuck_bits(rows.readings.position, rows.resolution, rows.target):
         text = (
@@ -92,23 +95,23 @@ def encoders_said(names: tuple[str, ...], rows: SweepReadings) -> list[Finding]:
     return found
 
 
-def outliers_said(names: tuple[str, ...], rows: SweepReadings, outliers: Mask) -> list[Finding]:
-    """Outliers by joint and sweep, with what a run of them looks like."""
+def outlier_findings(names: tuple[str, ...], rows: SweepReadings, outliers: Mask) -> list[Finding]:
+    """Findings of outliers, by joint, with a likely cause."""
     found = []
     for joint in np.flatnonzero(outliers.any(axis=0)):
         at = np.flatnonzero(outliers[:, joint])
         series, angle = rows.readings.series[at], rows.readings.position[at, joint]
-        where = ", ".join(f"{rows.sweeps[series[k]]} at {angle[k]:.3f} rad" for k in range(min(len(at), 4)))
+        places = ", ".join(f"{rows.sweeps[series[k]]} at {angle[k]:.3f} rad" for k in range(min(len(at), 4)))
         more = f" and {len(at) - 4} more" if len(at) > 4 else ""
         run = len(at) >= 2 and len(set(series.tolist())) == 1
         cause = "it touched something there, or a resting joint slipped" if run else "a knock or a bad contact"
-        text = f"{names[joint]}: {len(at)} readings left out, {where}{more}: {cause}?"
+        text = f"{names[joint]}: {len(at)} readings left out, {places}{more}: {cause}?"
         found.append(Finding(names[joint], "outliers", float(len(at)), "readings", text))
     return found
 
 
-def scattered(names: tuple[str, ...], refined: Refined, rated: Array, named: set[str]) -> list[Finding]:
-    """Joints whose readings scatter far more than their samples' noise, with nothing found that explains it."""
+def scatter_findings(names: tuple[str, ...], refined: Refined, rated: Array, named: set[str]) -> list[Finding]:
+    """Findings of joints whose readings scatter far more than their samples' noise, without a known cause."""
     linear, found = refined.linear, []
     count = len(linear.row)
     rest = linear.residual[:count] * linear.sigma

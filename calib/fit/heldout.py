@@ -6,7 +6,8 @@ import numpy.typing as npt
 from armlink.arm_file import ArmFile
 from calib.arm.kinematics import gcomp_arm
 from calib.fit.sweep_readings import SweepReadings
-from calib.records.records import Array, CalibrationRecord
+from calib.records.records import CalibrationRecord
+from gcomp.arrays import Array
 from gcomp.errors import GcompError
 from gcomp.identify.global_fit import identify_global
 from gcomp.identify.parameters import Parameters, Prior

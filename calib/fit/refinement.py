@@ -1,9 +1,8 @@
-"""The end of the sensor fit: what a global fit of the model alone cannot hold, as extra linear columns.
+"""Refinement of the sensor fit: effects beyond the sensor model, as extra linear columns (docs/theory.md, section 5.4).
 
-A position that was rounded once is wrong by the same amount in every reading taken there, so the rounding of each
-distinct position is an unknown of its own, with its prior. Whatever else bends the readings (hysteresis, a spring)
-enters the same way, without a prior. Gauss-Newton from the global fit; each joint's noise is brought to the scatter
-that is there.
+A rounded position has the same error in every reading taken there, so the rounding of each distinct position is an
+unknown of its own, with a prior. Other effects (hysteresis, a spring) enter in the same way, without a prior.
+Gauss-Newton from the global fit; each joint's noise is scaled to the scatter found.
 """
 
 from collections.abc import Mapping
@@ -22,19 +21,19 @@ from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict_and_jacobian
 
 ROUNDS = 4
-"""Gauss-Newton steps, with the noise brought up to date after each."""
+"""Gauss-Newton steps, each followed by an update of the noise; the start is the global fit's minimum; a choice."""
 NEGLIGIBLE = 0.1
-"""Rounding that changes no reading by more than this share of its noise is left out."""
+"""Share of a reading's noise below which rounding is neglected: it adds 0.5 % to the standard deviation."""
 FEWEST = 8.0
-"""Free readings of a joint from which its scatter is judged."""
+"""Free readings of a joint for an estimate of its scatter: known to 25 % then (1/√(2 · 8))."""
 
 
 @dataclass(frozen=True, eq=False)
 class Extra:
-    """One extra column: what a joint's torque reading would gain per unit of an effect."""
+    """An extra column: change of the torque readings per unit of an effect."""
 
     joint: int
-    """Index of the joint whose sensor shows it."""
+    """Index of the joint whose sensor shows the effect."""
     kind: str
     column: Array
     """By reading (K, n)."""
@@ -42,7 +41,7 @@ class Extra:
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """The fit linearised where it ended; P counted readings, p parameters, rounding and extra columns behind them."""
+    """The fit, linearised at its end: P counted readings; p parameters, rounding and extra columns."""
 
     row: npt.NDArray[np.int64]
     """Row of each counted reading (P,)."""
@@ -51,18 +50,18 @@ class Linear:
     sigma: Array
     """Its standard deviation, position rounding not counted (P,) [N·m]."""
     basis: Array
-    """Orthonormal columns (P + priors, r) that span what the parameters can do, in standard deviations."""
+    """Orthonormal basis (P + priors, r) of the parameters' columns, in standard deviations."""
     residual: Array
     """Residuals of readings, then of priors, in standard deviations (P + priors,)."""
 
     @property
     def leverage(self) -> Array:
-        """How much of each reading the fit takes for itself (P,), 0 to 1."""
+        """Leverage of each reading on its own prediction (P,), 0 to 1."""
         part: Array = np.einsum("pr,pr->p", self.basis, self.basis)[: len(self.row)]
         return part
 
     def left_over(self, columns: Array) -> Array:
-        """Columns (P, m), in standard deviations, without what the parameters can do (P + priors, m)."""
+        """Columns (P, m), in standard deviations, with the parameters projected out (P + priors, m)."""
         padded = np.vstack([columns, np.zeros((len(self.residual) - len(columns), columns.shape[1]))])
         rest: Array = padded - self.basis @ (self.basis.T @ padded)
         return rest
@@ -70,13 +69,13 @@ class Linear:
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """The global fit with rounding and extras taken into account."""
+    """The global fit with rounding and extra columns."""
 
     fit: GlobalFit
     factor: Array
-    """Scatter of each joint's readings over what its samples' noise explains (n,); at least 1."""
+    """Scatter of each joint's readings over their samples' noise (n,); at least 1."""
     raw_factor: Array
-    """The same where it may be below 1; NaN for a joint with too few readings."""
+    """The same without the lower bound; NaN for a joint with too few readings."""
     linear: Linear
     coefficients: Array
     """Of the extras, in their units (m,)."""
@@ -93,7 +92,7 @@ def refine(
     resolution: Array,
     extras: tuple[Extra, ...] = (),
 ) -> Refined:
-    """From a global fit; `resolution` (n,) [rad] is the smallest step of the position readings, 0 where not known."""
+    """Refine a global fit; `resolution` (n,) [rad] is the smallest step of the position readings, 0 if unknown."""
     problem = _Problem(kinematics, readings, fit, priors, resolution, extras)
     vector, factor = fit.complete.vector.copy(), np.ones(kinematics.n)
     for _ in range(ROUNDS):
@@ -138,7 +137,7 @@ class _Step:
 
 
 class _Problem:
-    """What is fitted, in matrices that do not change from step to step."""
+    """Parts of the problem that are the same in every step."""
 
     def __init__(
         self,
@@ -189,7 +188,7 @@ class _Problem:
 
 
 def _scatter(linear: Linear, n: int) -> tuple[Array, Array]:
-    """(Each joint's scatter over what was expected of it, NaN where too few readings are free; free readings) (n,)."""
+    """(Scatter over its expected value, NaN with too few free readings; free readings) of each joint (n,)."""
     count = len(linear.row)
     free: Array = np.bincount(linear.joint, 1 - linear.leverage, minlength=n).astype(np.float64)
     total = np.bincount(linear.joint, linear.residual[:count] ** 2, minlength=n)
@@ -198,10 +197,10 @@ def _scatter(linear: Linear, n: int) -> tuple[Array, Array]:
 
 
 def _rounding_columns(readings: StaticReadings, resolution: Array, slope: Array) -> Array:
-    """What one standard deviation of each distinct position's rounding does to the readings (P, m), in their own.
+    """Change of the readings (P, m) per standard deviation of each distinct position's rounding, in their own.
 
-    slope (P, n) is that of each reading by each position, in standard deviations per rad. Joints whose rounding does
-    not matter are left out.
+    slope (P, n) is the derivative of each reading by each position, in standard deviations per rad. Joints whose
+    rounding is negligible are left out.
     """
     row = np.nonzero(readings.counted)[0]
     columns = [np.zeros((len(row), 0))]

@@ -12,7 +12,7 @@ from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.fit.examination import Goodness, examine
 from calib.fit.findings import Finding
-from calib.fit.missing_values import reasons_of
+from calib.fit.missing_values import missing_values
 from calib.fit.sweep_readings import SweepReadings, sweep_readings
 from calib.records.records import PARAMETERS, CalibrationRecord, JointCalibration, Parameter, matrix, provenance
 from calib.sweep.dataset import SweepData
@@ -173,7 +173,7 @@ def fit_sensors(arm: ArmFile, data: Sequence[SweepData]) -> SensorFit:
         friction=_friction(fit, rows),
         goodness=good,
         quantile=float(stats.t.ppf(0.975, max(fit.dof, 1))),
-        reasons=reasons_of(fit, rows),
+        reasons=missing_values(fit, rows),
         gain_ratio=None if loaded else _gain_ratio(arm, rows),
         sources={each.path.name: each.digest for each in data},
     )

@@ -14,19 +14,21 @@ from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict, predict_and_jacobian
 
 CHANCE = 1e-7
-"""Probability of an F ratio at which an effect is held for real: some fifty are tried on each fit."""
+"""Probability of the F ratio by chance below which an effect is accepted; some fifty are tried on each fit
+(docs/theory.md, section 5.4)."""
 MATERIAL = 0.0005
-"""Root mean square of an effect, as a share of rated torque, below which nobody need know of it."""
+"""RMS of an effect, as a share of rated torque, below which it is not material (docs/theory.md, section 5.4)."""
 KNEES = (0.6, 0.7, 0.8, 0.9, 0.95)
-"""Shares of the largest torque at which a sensor is tried for beginning to saturate."""
+"""Shares of the largest torque tried as the onset of saturation."""
 FEWEST = 6
-"""Readings of a joint from which effects on it are looked for."""
+"""Smallest number of a joint's readings for a search of effects; a choice."""
 TURN = 2.0
-"""Range of a joint from which an error once a turn can be told from a gain [rad]."""
+"""Range of a joint from which an error once a turn can be separated from a gain [rad] (docs/theory.md, section 5.2)."""
 OWN_DOUBT, HELD_DOUBT = 0.1, 0.75
-"""Standard deviation of a sensor's lag, as a share of its size: along the joint's own sweep, and where it holds."""
+"""Standard deviation of a sensor's lag, as a share of its size: along the joint's own sweep; while it holds, with the
+lag anywhere between both ends (0.58 if uniform). Held by the hysteresis case of tests/campaigns/hard_cases.py."""
 PATH = 12
-"""Points of the way from one reading to the next at which the torque is computed for hysteresis."""
+"""Points between two readings at which the torque is computed for hysteresis: 0.1 rad apart over 1.2 rad."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,10 +53,10 @@ def size_of(coefficients: Array) -> float:
     return float(np.sqrt(np.mean(coefficients**2)))
 
 
-def strongest(kinematics: Arm, rows: SweepReadings, kept: Mask, refined: Refined, rated: Array) -> Effect | None:
-    """The effect that explains most beyond chance of what `refined` left over, None where there is no material one.
+def strongest_effect(kinematics: Arm, rows: SweepReadings, kept: Mask, refined: Refined, rated: Array) -> Effect | None:
+    """The effect that explains most of the residuals of `refined` beyond chance; None if none is material.
 
-    rated (n,) [N·m]; kept (K, n) are the readings that `refined` was made from, outliers left out.
+    rated (n,) [N·m]; kept (K, n) are the readings that `refined` used, without outliers.
     """
     counted = rows.readings.counted & kept
     linear, best, most = refined.linear, None, 0.0
@@ -136,9 +138,9 @@ def _one(n: int, joint: int, effect_id: str, values: Array, knee: float = np.nan
 
 
 def _sides(rows: SweepReadings, joint: int) -> Iterator[Array]:
-    """Side of approach (K,) in each sweep of a joint that has both, 0 elsewhere.
+    """Side of approach (K,) in each sweep of a joint that has both sides, 0 in other readings.
 
-    How far a sensor lags depends on how far the torque swung on the way, braking included: each sweep has its own.
+    A sensor's lag depends on the swing of torque on the way, braking included, so that each sweep has its own.
     """
     series, swept = rows.readings.series, rows.swept == joint
     for sweep in dict.fromkeys(series[swept].tolist()):
@@ -148,10 +150,10 @@ def _sides(rows: SweepReadings, joint: int) -> Iterator[Array]:
 
 
 def _lag_doubt(rows: SweepReadings, joint: int) -> Array:
-    """How badly a lag is known (K,), as a share of its size.
+    """Standard deviation of a lag (K,), as a share of its size.
 
-    Along the joint's own sweep it hardly varies. Where the joint only holds it may stand anywhere between both ends,
-    and stays there while another is swept, so that those readings together count as one.
+    Along the joint's own sweep the lag hardly varies. While the joint holds, it may be anywhere between both ends and
+    stays there as another joint is swept, so that those readings together count as one.
     """
     together = np.bincount(rows.readings.series)[rows.readings.series]
     held: Array = HELD_DOUBT * np.sqrt(np.where(rows.swept < 0, 1, together))
@@ -159,10 +161,10 @@ def _lag_doubt(rows: SweepReadings, joint: int) -> Array:
 
 
 def lag(kinematics: Arm, rows: SweepReadings, refined: Refined, joint: int) -> Array:
-    """Where in its play (K,), -1 to 1, a joint's torque sensor stands at each reading, the way to it being straight.
+    """Position of a joint's torque sensor in its play (K,), -1 to 1, at each reading, on straight ways between them.
 
-    The play is as wide as the residuals say (half their robust range), so that small changes of torque leave it where
-    it was. Rows where the joint was neither swept nor held stand at 0.
+    The width of the play comes from the residuals (1.5 times their median size), so that smaller changes of torque
+    leave the sensor in place.
     """
     position, load = rows.readings.position, rows.readings.load
     shares = np.linspace(0, 1, PATH + 1)[1:]

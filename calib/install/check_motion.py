@@ -16,7 +16,8 @@ from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.motion.mover import Mover, Stalled
 from calib.motion.static_reading import StaticReading, stack
-from calib.records.records import Array, CalibrationRecord
+from calib.records.records import CalibrationRecord
+from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque
 
 AMPLITUDE = 0.2

@@ -16,8 +16,9 @@ from armlink.errors import Refused
 from armlink.link.torque_sensor_record import GAIN_RANGE
 from armlink.link.types import Calibration
 from armlink.torque_calibration import UNKNOWN, TorqueCalibration
-from calib.records.records import Array, CalibrationRecord, Parameter
+from calib.records.records import CalibrationRecord, Parameter
 from calib.records.store import RecordStore
+from gcomp.arrays import Array
 
 LARGEST_OFFSET = 0.5
 """Largest offset of a working sensor, as a share of rated torque: beyond, half of its range is lost on one side."""

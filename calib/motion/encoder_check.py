@@ -1,14 +1,11 @@
 """Are a joint's position readings those of a sound encoder? Judged while it moves, before anything relies on them."""
 
 import numpy as np
-import numpy.typing as npt
 
 from armlink.errors import Refused
 from armlink.link.types import Sample
 from calib.motion.encoder_bits import bit_of, missing_bit
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
+from gcomp.arrays import Array, Mask
 
 MISSING = 0.02
 """Share of a motion's cycles without timely readings above which nothing is said of its encoders."""
@@ -59,7 +56,7 @@ class EncoderCheck:
         self._read_at[came] = sample.t
         self._unsure &= ~came | (False if sample.timely is None else ~sample.timely)
 
-    def judge(self, seen: Array, path: Array, movable: Flags, resolution: Array) -> None:
+    def judge(self, seen: Array, path: Array, movable: Mask, resolution: Array) -> None:
         """Raise EncoderFault where what a joint read on its way leaves out what one bit would have shown.
 
         seen (K, n) is what was read and path (K, n) where the `movable` joints were sent [rad]; `resolution` (n,) is

@@ -16,9 +16,7 @@ from calib.motion.encoder_check import EncoderCheck
 from calib.motion.settle_rule import SettleRule
 from calib.motion.static_reading import StaticReading, average, stack
 from calib.motion.trajectory import trajectory
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
+from gcomp.arrays import Array, Mask
 
 POSITION, TORQUE = 8, 10
 STALL = 0.2
@@ -84,7 +82,7 @@ class Mover:
         self.seen_at = first.t
         """Link time of the newest sample [s]."""
         self._encoders = EncoderCheck(link.names, link.position_step, limits.speed, first.t)
-        self.pressed: Flags = np.zeros(link.n, dtype=bool)
+        self.pressed: Mask = np.zeros(link.n, dtype=bool)
         self.side = np.zeros(link.n)
         self.resolution = np.full(link.n, np.inf)
         self._nothing = np.full(link.n, np.nan)
@@ -233,7 +231,7 @@ class Mover:
         limit = float(self.limits.upper[joint] if side > 0 else self.limits.lower[joint])
         return limit - side * (gap + 0.02 * abs(limit))
 
-    def rest(self, counts: Flags) -> StaticReading:
+    def rest(self, counts: Mask) -> StaticReading:
         """Wait until all has settled and the torque averages that `counts` (n,) are exact enough; raises Slipped."""
         rule, samples, resolution = self.rule, list[Sample](), self.known_resolution
         window, timeout = rule.window * self.link.period, rule.timeout * self.link.period
@@ -270,7 +268,7 @@ class Mover:
         begin = samples[-1].t - seconds + 0.5 * self.link.period
         return next(index for index, sample in enumerate(samples) if sample.t > begin)
 
-    def _stand(self, joints: Flags) -> None:
+    def _stand(self, joints: Mask) -> None:
         """Wait until pressed joints stand, `BOUNCE_SECONDS` at most; raises Slipped where one leaves its stop."""
         still = np.maximum(BOUNCE_STILL, 1.5 * self.known_resolution)
         look = max(int(BOUNCE_LOOK / self.link.period), 2)
@@ -282,7 +280,7 @@ class Mover:
             if np.all((high - low < still) | ~joints):
                 return
 
-    def _creep(self, stops: npt.NDArray[np.int64], joints: Flags) -> None:
+    def _creep(self, stops: npt.NDArray[np.int64], joints: Mask) -> None:
         """Move each joint towards its stop until it does not follow any more."""
         stride = np.minimum(self.section.approach_speed, self.limits.speed) * self.link.period * stops
         window = max(int(0.1 / self.link.period), 4)

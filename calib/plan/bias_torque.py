@@ -1,4 +1,4 @@
-"""How hard resting joints are pressed on their stops, and how fast the others may then move."""
+"""Torques that press resting joints on their stops, and the accelerations that these allow."""
 
 import numpy as np
 import numpy.typing as npt
@@ -10,9 +10,9 @@ from calib.plan.stop_selection import Candidates
 from gcomp.arrays import Array, Mask
 
 SLOWEST = 0.3
-"""Acceleration that every planned sweep must allow [rad/s²]."""
+"""Acceleration that every planned sweep must allow [rad/s²]: a step of 0.5 rad then takes 2.6 s; a choice."""
 FASTEST = 2.0
-"""Acceleration between sweeps where the drives allow it [rad/s²]."""
+"""Largest acceleration between sweeps [rad/s²]; a choice, swept in tests/campaigns/random_arms.py."""
 
 
 def hold_torque(guess: GravityGuess, section: SweepSection, limits: Limits, poses: Array) -> tuple[Array, Array, Array]:
@@ -37,7 +37,7 @@ def required_bias(
 
 
 def pressable(guess: GravityGuess, section: SweepSection, limits: Limits, candidates: Candidates) -> Mask:
-    """Which resting joints (C, n) can be pressed on their stop within max_torque; True for the swept joint."""
+    """Resting joints (C, n) that can be pressed on their stop within max_torque; True for the swept joint."""
     needed = required_bias(guess, section, limits, candidates.stops, candidates.poses)
     needed = needed + SLOWEST * reaction_bound(guess, candidates.joint)
     given = limits.max_torque if section.bias_torque is None else np.array(section.bias_torque)
@@ -46,7 +46,7 @@ def pressable(guess: GravityGuess, section: SweepSection, limits: Limits, candid
 
 
 def reaction_bound(guess: GravityGuess, joint: int) -> Array:
-    """Bound of the torque (n,) [N·m] that 1 rad/s² of the swept joint makes at every joint: √(M_ii M_jj)."""
+    """Bound of the torque (n,) [N·m] at every joint per rad/s² of the swept one: √(M_ii M_jj)."""
     inertia = guess.inertia()
     bound: Array = np.sqrt(inertia * inertia[joint])
     return bound
@@ -55,10 +55,10 @@ def reaction_bound(guess: GravityGuess, joint: int) -> Array:
 def bias_and_acceleration(
     needed: Array, spare: Array, reaction: Array, pressed: Mask, section: SweepSection, limits: Limits, joint: int
 ) -> tuple[Array, float]:
-    """(Bias size (n,) [N·m], acceleration [rad/s²]): as fast as every joint's torque allows.
+    """(Bias size (n,) [N·m], acceleration [rad/s²]), the largest acceleration that every joint's torque allows.
 
-    `spare` (n,) [N·m] is what the drives have beside gravity: a joint held by its servo bears the swept one's reaction
-    with it, and the swept joint moves by half of it.
+    `spare` (n,) [N·m] is the drives' torque beyond gravity: a servo-held joint resists the swept one's reaction with
+    it, and the swept joint accelerates with half of it.
     """
     given = limits.max_torque if section.bias_torque is None else np.array(section.bias_torque)
     left = np.where(pressed, given - needed, spare)
@@ -71,7 +71,7 @@ def bias_and_acceleration(
 
 
 def travel_acceleration(limits: Limits, options: list[Candidates], guess: GravityGuess | None) -> float:
-    """Acceleration [rad/s²] that the drives can give beside gravity at the poses between which they travel."""
+    """Acceleration [rad/s²] that the drives have beyond gravity at the poses between which they travel."""
     if guess is None:
         return 1.0
     poses = np.concatenate([each.poses.reshape(-1, guess.kinematics.n) for each in options])

@@ -1,4 +1,4 @@
-"""Does the arm touch itself or its surroundings on the way? By MuJoCo's contacts on the arm file's model, if any."""
+"""Collisions of the arm with itself or its surroundings, by MuJoCo's contacts on the arm file's model."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,14 +12,14 @@ from calib.plan.types import Sweep, SweepPlan
 from gcomp.arrays import Array
 
 POINTS = 15
-"""Poses looked at on each way from one place to the next."""
+"""Poses checked between two poses of a plan: 0.1 rad apart if a joint moves 1.5 rad; a choice."""
 DEPTH = 0.0005
-"""Overlap from which bodies count as touching [m]."""
+"""Overlap from which bodies count as touching [m]; a choice, below the accuracy of collision meshes."""
 Pair = tuple[str, str]
 
 
 class Collided(Refused):
-    """The plan leads through a contact."""
+    """A plan leads through a contact."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,10 +32,10 @@ class Contact:
 
 
 class Geometry:
-    """The bodies of the arm file's model. Overlaps that the model has at every pose are its own, and no collisions."""
+    """The bodies of the arm file's model. Overlaps that the model has at every pose do not count as collisions."""
 
     def __init__(self, arm_file: ArmFile) -> None:
-        """Compile the model; raises BadInput where it cannot be used."""
+        """Compile the model; raises BadInput if it cannot be used."""
         import mujoco
 
         from calib.arm.kinematics import gcomp_arm
@@ -43,7 +43,7 @@ class Geometry:
 
         assert arm_file.model_path is not None
         self._mujoco = mujoco
-        kinematics = gcomp_arm(arm_file)  # checks the chain and says in the arm file's words what is wrong
+        kinematics = gcomp_arm(arm_file)  # checks the chain, with errors in terms of the arm file
         self.model = compile_model(arm_file.model_path)
         self.data = mujoco.MjData(self.model)
         self._places = [int(self.model.joint(name).qposadr[0]) for name in kinematics.names]
@@ -57,7 +57,7 @@ class Geometry:
         return [contact for contact in self._contacts(pose) if contact.bodies not in self._own]
 
     def free(self, poses: Array) -> npt.NDArray[np.bool_]:
-        """Which of the poses (K, n) [rad] have no collision (K,)."""
+        """Poses (K, n) [rad] without collision, as a mask (K,)."""
         return np.array([not self.contacts(pose) for pose in poses], dtype=bool)
 
     def _contacts(self, pose: Array) -> list[Contact]:
@@ -79,41 +79,41 @@ class Geometry:
 
 
 def check_plan(arm_file: ArmFile, plan: SweepPlan) -> str:
-    """Look at the whole way of a plan; raises Collided naming bodies, sweep and pose. Returns what was checked."""
+    """Check all poses along a plan; raises Collided naming bodies, sweep and pose. Returns a sentence on the check."""
     if arm_file.model_path is None:
         return "collisions not checked: the arm file has no kinematics.model with geometry"
     geometry = Geometry(arm_file)
     if geometry.model.ngeom == 0:
         return "collisions not checked: the model has no geometry"
     count = 0
-    for where, pose in way(plan):
+    for place, pose in poses_along(plan):
         count += 1
         touching = geometry.contacts(pose)
         if touching:
             first, second = touching[0].bodies
             raise Collided(
-                f"{arm_file.name}: {first} would touch {second} {where}, {touching[0].depth * 1000:.1f} mm deep, at"
+                f"{arm_file.name}: {first} would touch {second} {place}, {touching[0].depth * 1000:.1f} mm deep, at"
                 f" {' '.join(f'{angle:.3f}' for angle in pose)} rad: narrow lower and upper of these joints in the arm"
                 " file, or clear the workspace"
             )
     return f"no collision at {count} poses along the way"
 
 
-def way(plan: SweepPlan) -> Iterator[tuple[str, Array]]:
-    """(Where, pose (n,) [rad]) along everything that the plan does, straight from one place to the next."""
+def poses_along(plan: SweepPlan) -> Iterator[tuple[str, Array]]:
+    """(Description, pose (n,) [rad]) of all motion of a plan, straight from one pose to the next."""
     here = None
     for number, scouted in enumerate(plan.scout, start=1):
         goal = np.array(scouted)
         yield from _between(here, goal, f"on the way to scout pose {number}")
         here = goal
     for sweep in plan.sweeps:
-        begin, end = ends(sweep)
+        begin, end = sweep_ends(sweep)
         yield from _between(here, begin, f"on the way to sweep {sweep.name}")
         yield from _between(begin, end, f"in sweep {sweep.name}")
         here = begin
 
 
-def ends(sweep: Sweep) -> tuple[Array, Array]:
+def sweep_ends(sweep: Sweep) -> tuple[Array, Array]:
     """First and last pose (n,) [rad] of a sweep."""
     begin = np.array(sweep.rest)
     end = begin.copy()
@@ -121,9 +121,9 @@ def ends(sweep: Sweep) -> tuple[Array, Array]:
     return begin, end
 
 
-def _between(start: Array | None, goal: Array, where: str) -> Iterator[tuple[str, Array]]:
+def _between(start: Array | None, goal: Array, place: str) -> Iterator[tuple[str, Array]]:
     if start is None:
-        yield where, goal
+        yield place, goal
         return
     for share in np.linspace(0, 1, POINTS + 1)[1:]:
-        yield where, start + share * (goal - start)
+        yield place, start + share * (goal - start)

@@ -1,4 +1,4 @@
-"""Where the arm will be, as a picture and as a time: one page that opens without a network."""
+"""A plan as a drawing and as a duration: one page that opens without a network."""
 
 from html import escape
 from pathlib import Path
@@ -11,20 +11,20 @@ from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.motion.trajectory import trajectory
-from calib.plan.collisions import ends
+from calib.plan.collisions import sweep_ends
 from calib.plan.types import SweepPlan
 from gcomp.arm.arm import Arm, bar_frames
 from gcomp.arrays import Array
 
 PRESS, READ = 1.0, 0.5
-"""Seconds that creeping onto stops and pressing take, and that one reading takes to settle and average."""
+"""Seconds for creeping onto stops and pressing, and for settling and averaging of one reading: estimates."""
 COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#e377c2", "#8c564b")
-"""One a joint."""
+"""One per joint."""
 GHOSTS = 4
-"""Poses drawn of each sweep."""
+"""Poses drawn per sweep."""
 
 
-def joint_places(kinematics: Arm, q: Array) -> Array:
+def frame_origins(kinematics: Arm, q: Array) -> Array:
     """Origins of all frames, base to tip (K, n + 1, 3) [m], at poses q (K, n) [rad]."""
     rotation = bar_frames(kinematics, q).rotation
     levers = np.column_stack([kinematics.a, np.zeros(kinematics.n), np.zeros(kinematics.n)])
@@ -34,8 +34,8 @@ def joint_places(kinematics: Arm, q: Array) -> Array:
     return places
 
 
-def seconds(arm_file: ArmFile, plan: SweepPlan) -> float:
-    """Time that one pass of a plan will take, roughly [s]."""
+def pass_seconds(arm_file: ArmFile, plan: SweepPlan) -> float:
+    """Rough duration of one pass of a plan [s]."""
     section, limits = sweep_section(arm_file), Limits.of(arm_file)
     period, speed = 0.02, section.travel_speed * limits.speed
 
@@ -48,7 +48,7 @@ def seconds(arm_file: ArmFile, plan: SweepPlan) -> float:
         total += travel(here, goal, 1.0) + READ
         here = goal
     for sweep in plan.sweeps:
-        begin, _ = ends(sweep)
+        begin, _ = sweep_ends(sweep)
         total += travel(here, begin, plan.travel_acceleration) + PRESS
         one = np.zeros(len(here))
         one[sweep.joint] = abs(sweep.steps[-1] - sweep.steps[0]) / (len(sweep.steps) - 1)
@@ -58,15 +58,15 @@ def seconds(arm_file: ArmFile, plan: SweepPlan) -> float:
 
 
 def draw_plan(arm_file: ArmFile, plan: SweepPlan, path: Path) -> None:
-    """Write the picture: each sweep's poses as a stick figure that can be turned, shown and hidden. Raises OSError."""
+    """Write the drawing: stick figures of each sweep that can be turned, shown and hidden. Raises OSError."""
     import plotly.graph_objects as graph
 
     kinematics, figure = gcomp_arm(arm_file), graph.Figure()
     for sweep in plan.sweeps:
-        begin, end = ends(sweep)
+        begin, end = sweep_ends(sweep)
         poses = begin + np.linspace(0, 1, GHOSTS)[:, None] * (end - begin)
         points = np.concatenate(
-            [np.vstack([places, np.full((1, 3), np.nan)]) for places in joint_places(kinematics, poses)]
+            [np.vstack([places, np.full((1, 3), np.nan)]) for places in frame_origins(kinematics, poses)]
         )
         line = {"width": 5, "color": COLOURS[sweep.joint % len(COLOURS)]}
         figure.add_scatter3d(
@@ -78,7 +78,7 @@ def draw_plan(arm_file: ArmFile, plan: SweepPlan, path: Path) -> None:
             line=line,
             marker={"size": 3, "color": line["color"]},
         )
-    scouted = joint_places(kinematics, np.array(plan.scout))[:, -1]
+    scouted = frame_origins(kinematics, np.array(plan.scout))[:, -1]
     figure.add_scatter3d(
         x=scouted[:, 0],
         y=scouted[:, 1],
@@ -94,7 +94,7 @@ def draw_plan(arm_file: ArmFile, plan: SweepPlan, path: Path) -> None:
         x=arrow[:, 0], y=arrow[:, 1], z=arrow[:, 2], mode="lines", name="gravity", line={"width": 8, "color": "grey"}
     )
     figure.update_layout(
-        title=f"{escape(arm_file.name)}: where the arm will be (base frame, m)",
+        title=f"{escape(arm_file.name)}: poses of the plan (base frame, m)",
         scene={"aspectmode": "data", "camera": _camera(down)},
         height=800,
         margin={"l": 0, "r": 0, "b": 0},
@@ -105,7 +105,7 @@ def draw_plan(arm_file: ArmFile, plan: SweepPlan, path: Path) -> None:
 
 
 def _camera(down: Array) -> dict[str, dict[str, float]]:
-    """A view in which gravity points down on the screen, from a little above."""
+    """A view from slightly above, with gravity pointing down on the screen."""
     up = -down if np.any(down) else np.array([0.0, 0.0, 1.0])
     side = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     eye = 1.8 * (side / np.linalg.norm(side) + 0.6 * np.cross(up, side) + 0.35 * up)
@@ -116,7 +116,7 @@ def _camera(down: Array) -> dict[str, dict[str, float]]:
 
 
 def _choices(plan: SweepPlan) -> list[dict[str, Any]]:
-    """Buttons: everything, or one sweep alone with the direction of gravity."""
+    """Buttons: all sweeps, or one of them, with the direction of gravity."""
     count = len(plan.sweeps)
     shown = {"all sweeps": [True] * (count + 2)}
     shown |= {one.name: [*(one is other for other in plan.sweeps), False, True] for one in plan.sweeps}

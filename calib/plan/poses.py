@@ -1,4 +1,4 @@
-"""Where the arm goes: range of each sweep, poses of the scout, and the order of poses for short ways."""
+"""Poses of a plan: range of each sweep, poses of the scout, and an order of poses with little travel."""
 
 import numpy as np
 
@@ -12,15 +12,15 @@ from gcomp.design.selection import select
 from gcomp.gravity.torque import gravity_regressor
 
 SCOUT_CANDIDATES = 300
-"""Random poses among which the scout's are chosen."""
+"""Random poses among which the scout's are chosen; a choice: n + 3 of them are needed."""
 UNKNOWN = 1e-6
-"""Information on each parameter beforehand: next to nothing, but the first poses' matrices can be inverted."""
+"""Prior information on each parameter: negligible, but it keeps the first poses' matrices regular."""
 Poses = tuple[tuple[float, ...], ...]
 """(P, n) [rad]"""
 
 
 def sweep_range(section: SweepSection, limits: Limits, joint: int) -> tuple[float, float]:
-    """First and last step [rad] of a joint: the margin grows with the angle, for the position gain is unknown."""
+    """First and last step [rad] of a joint; the margin grows with the angle, since the position gain is unknown."""
     low, high = float(limits.lower[joint]), float(limits.upper[joint])
     margin = section.range_margin
     return low + margin + 0.02 * abs(low), high - margin - 0.02 * abs(high)
@@ -33,7 +33,7 @@ def scout_poses(
     seed: int,
     geometry: Geometry | None = None,
 ) -> Poses:
-    """n + 3 poses that determine mass moments and sensor offsets well, ordered for short ways between them.
+    """n + 3 poses that determine mass moments and sensor offsets well, in an order with little travel.
 
     Poses in which bodies of `geometry` touch are left out; raises BadInput if too few remain.
     """
@@ -50,11 +50,11 @@ def scout_poses(
     rows = np.concatenate([regressor, 10 * offsets], axis=2) / limits.rated[:, None]
     information = np.einsum("kip,kiq->kpq", rows, rows)
     (chosen,) = select([information[None]], UNKNOWN * np.eye(3 * n)[None], [n + 3], exchanges=0)
-    return tuple(tuple(pose.tolist()) for pose in short_way(poses[chosen], ends.mean(axis=1)))
+    return tuple(tuple(pose.tolist()) for pose in nearest_first(poses[chosen], ends.mean(axis=1)))
 
 
-def short_way(poses: Array, begin: Array) -> Array:
-    """The same poses, each followed by the nearest that is left."""
+def nearest_first(poses: Array, begin: Array) -> Array:
+    """The same poses (K, n) [rad], each followed by the nearest of the remaining ones, from `begin` (n,) on."""
     left, way = list(range(len(poses))), []
     here = begin
     while left:
@@ -66,11 +66,11 @@ def short_way(poses: Array, begin: Array) -> Array:
 
 
 def require_range(section: SweepSection, limits: Limits, kinematics: Arm) -> None:
-    """Raise BadInput, naming the joint, where a range leaves nothing to sweep."""
+    """Raise BadInput, naming the joint, if a range leaves nothing to sweep."""
     for joint, name in enumerate(kinematics.names):
         first, last = sweep_range(section, limits, joint)
         if not np.isfinite([first, last]).all() or last - first < 0.2:
             raise BadInput(
                 f"joint {name}: its range {limits.lower[joint]} to {limits.upper[joint]} rad leaves nothing to sweep"
-                f" within range_margin {section.range_margin} rad: check lower and upper, or lessen the margin"
+                f" within range_margin {section.range_margin} rad: check lower and upper, or reduce the margin"
             )

@@ -1,4 +1,4 @@
-"""What a plan will tell about the sensors, before anything moves: the covariance that the fit would report."""
+"""Precision of a plan before anything moves: the covariance that the fit would report."""
 
 from collections.abc import Sequence
 
@@ -12,11 +12,12 @@ from gcomp.identify.parameters import Parameters, Prior
 from gcomp.identify.readings import StaticReadings
 
 SIDE = 0.05
-"""Lateral place at which the reference mass is assumed to hang [m]."""
+"""Lateral offset at which the reference mass is assumed to hang [m]; a choice."""
 SCATTER = 1.3
-"""By how much readings scatter more than their samples' noise, for the joints never stand quite still."""
+"""Scatter of readings over the noise of their samples, since joints never rest completely: as the fits of
+tests/campaigns/random_arms.py find it."""
 HOPELESS = 0.15
-"""A gain predicted worse than this is not one that more averaging could save."""
+"""Standard deviation beyond which more averaging cannot help a gain: that known beforehand (`PRIOR_GAIN`)."""
 
 
 def predicted_gain_std(
@@ -32,7 +33,7 @@ def predicted_gain_std(
     """Standard deviations (n,) of the torque gains after passes without and with `mass` [kg]; inf if not observable.
 
     scout (P, n) [rad] are poses at which all sensors count; sigma (n,) [N·m] is that of one reading, position_sigma
-    (n,) [rad] that of its positions; `point` is what is known of where the mass hangs.
+    (n,) [rad] that of its positions; `point` is the prior on the place of the mass.
     """
     kinematics = guess.kinematics
     positions, counted = [scout], [np.ones(scout.shape, dtype=bool)]
@@ -68,6 +69,6 @@ def predicted_gain_std(
 
 
 def worst_gain_std(std: Array) -> float:
-    """The largest standard deviation among the gains that averaging can improve; 0 where there is none."""
+    """Largest standard deviation among the gains that averaging can improve; 0 if there is none."""
     known = std[std < HOPELESS]
     return float(known.max()) if len(known) else 0.0

@@ -1,4 +1,4 @@
-"""Which reference masses suit an arm and its drives."""
+"""Reference masses that suit an arm and its drives."""
 
 import numpy as np
 
@@ -10,11 +10,12 @@ from gcomp.arm.mass_moments import payload_columns
 from gcomp.gravity.torque import gravity_regressor
 
 MASS_SHARES = (0.3, 0.5, 0.7)
-"""Shares of the torque left over gravity that the reference mass may take; the least that is precise enough."""
+"""Shares of the torque beyond gravity that the reference mass may take, tried from the smallest; a choice."""
 ASSUMED_GRAVITY = 0.6
-"""Share of max_torque that gravity is assumed to take while nothing has been measured."""
+"""Share of max_torque that gravity is assumed to take before any measurement: drives have 1.5 to 2.2 times gravity in
+tests/calib/drawn_arms.py."""
 HAND = 0.15
-"""How far from the flange the reference mass may hang [m]."""
+"""Largest distance of the reference mass from the flange [m], as in tests/calib/drawn_arms.py."""
 
 
 def reference_masses(

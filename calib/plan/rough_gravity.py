@@ -1,4 +1,4 @@
-"""The rough gravity model that the scout's static readings give: enough to choose bias torques that surely hold."""
+"""The rough gravity model from the scout's static readings: sufficient for bias torques that hold safely."""
 
 from dataclasses import dataclass
 
@@ -9,16 +9,16 @@ from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_regressor
 
 GAIN_STD = 0.3
-"""What is assumed of an uncalibrated torque gain: 1 ± 0.3."""
+"""Standard deviation of an uncalibrated torque gain; tests/calib/drawn_arms.py draws 0.7 to 1.3."""
 MODEL_ERROR = 0.1
-"""Share by which mass moments of a model file are assumed to be wrong."""
+"""Standard deviation of a model file's mass moments, as a share of each; a choice."""
 SIGMAS = 3.0
-"""Standard deviations of the rough model that bounds take in."""
+"""Standard deviations of the rough model that its bounds include: 99.7 %."""
 
 
 @dataclass(frozen=True, eq=False)
 class GravityGuess:
-    """Mass moments in the scale of the drives' own torque, which is the scale of the commands."""
+    """Rough mass moments, in the scale of the drives' torque, which is that of the commands."""
 
     kinematics: Arm
     beta: Array
@@ -46,13 +46,13 @@ class GravityGuess:
 
 
 def guess_of_model(kinematics: Arm, beta: Array) -> GravityGuess:
-    """What a model file's own inertials (2n,) [kg·m] are worth for planning: each mass moment to a tenth."""
+    """Mass moments β (2n,) [kg·m] of a model file, each taken as known to a tenth."""
     size = np.maximum(np.abs(beta), np.abs(beta).max(initial=0.0) / 20)
     return GravityGuess(kinematics, beta, np.diag((MODEL_ERROR * size) ** 2))
 
 
 def reach(kinematics: Arm, hand: float = 0.15) -> Array:
-    """Longest distance (n,) [m] from each joint to the tip's far side."""
+    """Largest distance (n,) [m] from each joint to the far side of a hand of size `hand` [m]."""
     return np.hypot(kinematics.a, kinematics.d)[::-1].cumsum()[::-1] + hand
 
 
@@ -62,7 +62,7 @@ def guess_gravity(
     """Rough mass moments from servo-held poses: positions, sensor readings, drive torques, all (P, n).
 
     Linear least squares on κ v − ω = Y β and τ_motor = Y β, with κ = 1/gain near 1; `friction`, a share of rated
-    torque (n,) [N·m], is how far the drive's torque may lie off. Where the fit is worse, the covariance says so.
+    torque (n,) [N·m], is the error allowed for the drives' torque. A worse fit enlarges the covariance.
     """
     poses, n = position.shape
     regressor = gravity_regressor(kinematics, position)
@@ -93,5 +93,5 @@ def guess_gravity(
 
 
 def _largest_moment(kinematics: Arm, rated: Array) -> float:
-    """A mass moment [kg·m] that no arm of these drives exceeds."""
+    """Upper bound of the mass moments [kg·m] that these drives can hold."""
     return 2 * float(rated.max()) / max(float(np.linalg.norm(kinematics.gravity)), 1.0)

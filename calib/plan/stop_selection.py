@@ -1,4 +1,4 @@
-"""Choice of stop combinations: the D-optimal design of the whole sensor and gravity fit (theory.md 2, 4, 7)."""
+"""Choice of stop combinations: a D-optimal design for the sensor and gravity fit (docs/theory.md, section 7.4)."""
 
 from dataclasses import dataclass
 
@@ -14,13 +14,14 @@ from gcomp.gravity.torque import gravity_levers
 from gcomp.identify.parameters import Parameters, free_mask
 
 SKETCH_STEPS = 5
-"""Steps by which a candidate sweep is judged: enough for a sinusoid and an offset."""
-WAY = 0.6
-"""Log determinant that a second of travel between two sweeps must be worth."""
+"""Steps by which a candidate sweep is judged: more than a sinusoid's three unknowns (docs/theory.md, section 5.3)."""
+TRAVEL_COST = 0.6
+"""Price of a second of travel between two sweeps, as log determinant (docs/theory.md, section 7.4)."""
 UNKNOWN = ("gain", "offset", "position_gain", "beta", "rho")
 """Parameter families for which the stops are chosen."""
 PRIOR_GAIN, PRIOR_POSITION_GAIN, PRIOR_POINT = 0.15, 0.02, 0.2
-"""What is known before any reading: standard deviations of torque gain, position gain, attachment point [m]."""
+"""Standard deviations before any reading of torque gain, position gain and place of the mass [m]
+(docs/theory.md, section 7.4)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +38,7 @@ class Candidates:
 
     @property
     def count(self) -> int:
-        """How many there are, C."""
+        """Number of combinations, C."""
         return len(self.stops)
 
     def kept(self, which: npt.NDArray[np.bool_]) -> "Candidates":
@@ -46,7 +47,7 @@ class Candidates:
 
 
 def stop_combinations(kinematics: Arm, joint: int, swept: tuple[float, float]) -> Candidates:
-    """The 2^(n-1) combinations in which the other joints stand at a limit, `joint` sweeping `swept`."""
+    """The 2^(n-1) combinations with the other joints at a limit, `joint` sweeping the range `swept` [rad]."""
     rest = limit_poses(kinematics, joint)
     stops = np.where(rest > (kinematics.lower + kinematics.upper) / 2, 1, -1).astype(np.int8)
     stops[:, joint] = 0
@@ -56,12 +57,12 @@ def stop_combinations(kinematics: Arm, joint: int, swept: tuple[float, float]) -
     return Candidates(joint, stops, poses, lever)
 
 
-def reachable(candidates: Candidates) -> Candidates:
-    """Those in which the swept joint feels gravity well; where there are none, the better half."""
+def with_lever(candidates: Candidates) -> Candidates:
+    """Those with a sufficient lever of gravity on the swept joint; if there are none, the better half."""
     return candidates.kept(well_felt(candidates.lever))
 
 
-def choose(
+def choose_stops(
     kinematics: Arm,
     candidates: list[Candidates],
     counts: list[int],
@@ -72,9 +73,9 @@ def choose(
 ) -> list[list[int]]:
     """For each joint's candidates, the indices of the `counts` combinations that together are best.
 
-    Best is D-optimal, less `WAY` for each second of travel from one sweep to the next at `speed` (n,) [rad/s].
-    `moments` are the mass moments β (2n,) [kg·m] for which the design is made, as several guesses where they are
-    unknown; sigma (n,) [N·m] of one reading; mass [kg] of the second pass.
+    Best is D-optimal, less `TRAVEL_COST` for each second of travel from one sweep to the next at `speed` (n,) [rad/s].
+    `moments` are the mass moments β (2n,) [kg·m] for which the design is made, several guesses if they are unknown;
+    sigma (n,) [N·m] of one reading; mass [kg] of the second pass.
     """
     flange, free = [kinematics.a[-1], 0.0, kinematics.d[-1]], free_mask(kinematics.n, UNKNOWN)
     guesses = [Parameters.nominal(kinematics.n, beta=beta, rho=flange) for beta in moments]
@@ -84,7 +85,7 @@ def choose(
     prior = np.stack([np.diag(_prior_std(guess, sigma)[free] ** -2.0) for guess in guesses])
 
     def travel(chosen: list[list[int]], place: int, slot: int) -> Array:
-        return WAY * _seconds(candidates, chosen, place, slot, speed)
+        return TRAVEL_COST * _seconds(candidates, chosen, place, slot, speed)
 
     return select(information, prior, counts, cost=travel)
 

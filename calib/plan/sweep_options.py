@@ -14,14 +14,14 @@ from calib.plan.bias_torque import hold_torque, pressable
 from calib.plan.collisions import POINTS, Collided, Geometry
 from calib.plan.poses import require_range, sweep_range
 from calib.plan.rough_gravity import GravityGuess
-from calib.plan.stop_selection import Candidates, reachable, stop_combinations
+from calib.plan.stop_selection import Candidates, stop_combinations, with_lever
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)
 class PlannedArm:
-    """The arm as planning sees it."""
+    """The arm, its limits and what is known of its masses, as planning needs them."""
 
     kinematics: Arm
     section: SweepSection
@@ -55,7 +55,7 @@ def _options(planned: PlannedArm, joint: int) -> tuple[Candidates, list[str]]:
     if planned.geometry is not None:
         everything = _without_collision(everything, planned.geometry, name)
     if guess is None:
-        return reachable(everything), []
+        return with_lever(everything), []
     least, largest, allowance = hold_torque(guess, section, limits, everything.poses)
     strongest = np.maximum(np.abs(least), np.abs(largest))
     drivable = strongest[:, joint] + allowance[:, joint] <= limits.max_torque[joint]
@@ -64,14 +64,14 @@ def _options(planned: PlannedArm, joint: int) -> tuple[Candidates, list[str]]:
     holdable = (strongest + section.friction * limits.rated <= limits.max_torque).all(axis=1) & drivable
     pressed = pressable(guess, section, limits, everything).all(axis=1) & holdable  # it must leave its stop again
     if pressed.sum() >= section.poses:
-        return reachable(everything.kept(pressed)), []
+        return with_lever(everything.kept(pressed)), []
     if not (pressed | holdable).any():
         raise BadInput(
             f"joint {name}: no combination of stops can be held within max_torque: gravity needs up to"
             f" {_torques(strongest.min(axis=0))} N·m; sweep a lighter arm, or allow more torque"
         )
     note = f"{name}: too few stop combinations can be pressed within max_torque: some joints are servo-held instead"
-    return reachable(everything.kept(pressed | holdable)), [note]
+    return with_lever(everything.kept(pressed | holdable)), [note]
 
 
 def _without_collision(candidates: Candidates, geometry: Geometry, name: str) -> Candidates:

@@ -17,21 +17,21 @@ from calib.plan.poses import Poses, scout_poses, sweep_range
 from calib.plan.predicted_precision import predicted_gain_std, worst_gain_std
 from calib.plan.reference_mass import reference_masses
 from calib.plan.rough_gravity import GravityGuess
-from calib.plan.stop_selection import Candidates, choose, guessed_moments
+from calib.plan.stop_selection import Candidates, choose_stops, guessed_moments
 from calib.plan.sweep_options import PlannedArm, sweep_options
 from calib.plan.types import Sweep, SweepPlan
 from gcomp.arrays import Array, Mask
 
 DEAD_LEVER = 0.005
-"""Γ/g below which a joint feels no gravity: its offset is still swept, at one combination."""
+"""Γ/g below which a joint is swept at one combination, for its offset alone (docs/theory.md, section 4.4)."""
 SERVO_GAP = 0.05
-"""Distance from the stop at which a servo-held joint rests [rad]."""
+"""Distance from the stop at which a servo-held joint rests [rad]; a choice."""
 MORE_POSES = 2
-"""Stop combinations per joint that may be added to those asked for, to reach the gains' precision."""
+"""Stop combinations per joint that may be added to reach the gains' precision; a choice: each takes minutes."""
 FINEST = 3.0
-"""How many times finer than asked readings may be averaged to reach the gains' precision."""
+"""Largest factor of precision by averaging longer: nine times the samples; a choice."""
 ENOUGH = 1.2
-"""How much worse than asked the gains' precision may be without a word."""
+"""Factor by which the gains may be less precise than asked without a note; a choice."""
 
 
 def plan_sweep(
@@ -87,7 +87,7 @@ def _choose(
     section, limits = planned.section, planned.limits
     counts = [1 if each.lever.max() < DEAD_LEVER else poses for each in options]
     sigma, speed = section.standard_error * limits.rated, section.travel_speed * limits.speed
-    picks = choose(planned.kinematics, options, counts, moments, sigma, mass, speed)
+    picks = choose_stops(planned.kinematics, options, counts, moments, sigma, mass, speed)
     return tuple(
         _sweep(planned, f"{planned.kinematics.names[each.joint]}.{number}", each, pick)
         for each, chosen in zip(options, picks, strict=True)

@@ -1,4 +1,4 @@
-"""What a sweep plan says: which joint turns when, where the others rest and what holds them there."""
+"""A sweep plan: which joint moves when, where the others rest and what holds them there."""
 
 from typing import Annotated, Literal
 
@@ -19,15 +19,15 @@ class Sweep(_Model):
     joint: int
     """Index of the swept joint, from 0 at the base."""
     stops: tuple[Side, ...]
-    """Where each resting joint stands: -1 at its lower stop, 1 at its upper; 0 for the swept joint."""
+    """Stop of each resting joint: -1 for the lower, 1 for the upper; 0 for the swept joint."""
     rest: tuple[FiniteFloat, ...]
     """Position (n,) of each resting joint, by the arm file [rad]; the swept joint's entry is its first step."""
     steps: tuple[FiniteFloat, ...]
     """Positions of the swept joint on the way up [rad]; the way down takes them backwards."""
     lever: FiniteFloat
-    """Γ/g: how much of gravity the swept joint can feel here, 0 to 1."""
+    """Γ/g, lever of gravity on the swept joint, 0 to 1."""
     servo: tuple[bool, ...]
-    """Which resting joints are held by their drive's position loop instead of a stop."""
+    """Resting joints that are held by their drive's position loop instead of a stop."""
     bias: tuple[FiniteFloat, ...] | None = None
     """Signed torque (n,) that presses each resting joint on its stop [N·m]; None until the scout has been made."""
     acceleration: FiniteFloat = 1.0
@@ -35,7 +35,7 @@ class Sweep(_Model):
 
     @property
     def readings(self) -> int:
-        """How many steps are read: the way up and the way down."""
+        """Number of readings: the steps on the way up and on the way down."""
         return 2 * len(self.steps)
 
     def target(self, reading: int) -> tuple[float, int]:
@@ -57,9 +57,9 @@ class SweepPlan(_Model):
     travel_acceleration: FiniteFloat = 1.0
     """Peak acceleration on the way from one sweep to the next [rad/s²]."""
     gain_std: FiniteFloat | None = None
-    """Standard deviation that the worst observable torque gain will have after both passes; None before the scout."""
+    """Predicted standard deviation of the worst observable torque gain after both passes; None before the scout."""
     notes: tuple[str, ...] = ()
-    """What the plan could not do as asked, one sentence each."""
+    """Requests that the plan could not meet, one sentence each."""
 
     @property
     def readings(self) -> int:

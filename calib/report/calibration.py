@@ -13,10 +13,11 @@ from calib.arm.kinematics import gcomp_arm
 from calib.fit.heldout import heldout_scores
 from calib.fit.sensor_fit import SensorFit
 from calib.records.compare import differences
-from calib.records.records import Array, CalibrationRecord, Parameter
+from calib.records.records import CalibrationRecord, Parameter
 from calib.report.figures import before_after_figure, joint_figure, left_out_figure, sweep_rows, sweeps_of
 from calib.report.page import ReportTable, Section, paragraph, render
 from calib.sweep.dataset import SweepData
+from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque
 
 PARAMETERS: tuple[tuple[Parameter, str, str], ...] = (

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
@@ -16,8 +15,8 @@ from armlink.loop.driver import ArmDriver
 from calib.arm.drive_limits import Limits
 from calib.arm.sweep_section import sweep_section
 from calib.motion.mover import Mover, Stalled
+from gcomp.arrays import Array
 
-Array = npt.NDArray[np.float64]
 LISTEN = 0.5
 """Seconds for which the sensors are listened to at rest, after as long again in which switching on dies down."""
 MISSING, LATE = 0.1, 0.5

@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused, Stall
@@ -20,8 +19,8 @@ from calib.plan.types import Sweep, SweepPlan
 from calib.sweep.dataset import DataWriter, Manifest, PlanLine, SweepData, load_data
 from calib.sweep.scout import SCOUT, SLOWER, rough_model, run_scout
 from calib.sweep.stalls import OnStall, give_up, stall_line
+from gcomp.arrays import Array
 
-Array = npt.NDArray[np.float64]
 Progress = Callable[[int, int, float, str], None]
 """Called after each reading with (readings done, readings in all, seconds left, what is being done)."""
 

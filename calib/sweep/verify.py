@@ -13,7 +13,7 @@ from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import SweepSection, sweep_section
 from calib.motion.mover import Mover, Stalled
-from calib.plan.poses import short_way, sweep_range
+from calib.plan.poses import nearest_first, sweep_range
 from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque, torque_covariance
@@ -110,7 +110,7 @@ def verify_poses(limits: Limits, section: SweepSection, count: int, seed: int, b
     """Random poses (count, n) [rad] within the joint range, ordered for short ways from `begin` (n,)."""
     ends = np.array([sweep_range(section, limits, joint) for joint in range(len(limits.lower))])
     generator = np.random.default_rng([seed, 6])
-    return short_way(ends[:, 0] + generator.random((count, len(ends))) * (ends[:, 1] - ends[:, 0]), begin)
+    return nearest_first(ends[:, 0] + generator.random((count, len(ends))) * (ends[:, 1] - ends[:, 0]), begin)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import expected_readings, predict_and_jacobian
 
 
-def cures(
+def remedies(
     arm: Arm, readings: StaticReadings, guess: Parameters, *, unknown: Collection[str], load: float = 1.0
 ) -> Mapping[str, str]:
     """One sentence for each parameter that these readings do not determine: which sweeps would, or why none does.

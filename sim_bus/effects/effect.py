@@ -5,12 +5,11 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from armlink import effect_catalogue as catalogue
+from armlink.arrays import Array
 from sim_bus.effects.state import Imperfections
 
-Array = NDArray[np.float64]
 Values = Mapping[str, Any]
 """Parameter values by name: numbers, arrays, or the index of a joint."""
 Apply = Callable[[Imperfections, int, Values], None]

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armlink.arm_file import ArmFile
+from armlink.arrays import Array
 from sim_bus.node.object_arrays import Signals
 from sim_bus.physics.plant import Plant
 from sim_bus.physics.sensors import Sensors
 from sim_bus.sim_section import sim_section
 
-Array = NDArray[np.float64]
 FEED = 1 << 20
 """User units a joint revolution (6092h)."""
 UNIT = 2 * np.pi / FEED
@@ -41,7 +41,7 @@ class Loops:
         """No joint powered."""
         section, self.n = sim_section(arm).servo, plant.n
         self._plant, self._sensors = plant, sensors
-        self.rated = np.array([joint.rated_torque for joint in arm.require_link().joints])
+        self.rated = arm.require_link().rated_torques
         self._per_mille = self.rated / 1000
         poses = np.random.default_rng(0).uniform(plant.lower, plant.upper, (TUNING_POSES, self.n))
         inertia = np.max([np.diag(plant.inertia(pose)) for pose in poses], axis=0) + self.rated / SPARE_ACCELERATION

@@ -7,13 +7,13 @@ from functools import cached_property
 
 import numpy as np
 
+from gcomp.arrays import Array
 from sim_gap.attribution.confidence import confidence
 from sim_gap.attribution.diagnosis import Cause, Signs
 from sim_gap.attribution.law_test import LawTest
 from sim_gap.attribution.rivals import Rivals
 from sim_gap.attribution.steadiness import STEADY, steadiness
 from sim_gap.effects.registry import effects
-from sim_gap.model.rigid_body import Array
 from sim_gap.residuals.layout import Layout, Row
 from sim_gap.residuals.residual_set import RELEVANT_NM, ResidualSet
 from sim_gap.search.estimate import Estimate, Value

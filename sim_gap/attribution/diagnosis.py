@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sim_gap.model.rigid_body import Array
+from gcomp.arrays import Array
 from sim_gap.residuals.where import Location
 from sim_gap.search.estimate import Value
 

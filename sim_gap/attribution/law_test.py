@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gcomp.arrays import Array
 from sim_gap.effects.laws import LAWS
-from sim_gap.model.rigid_body import Array
 from sim_gap.search.normal_equations import ColumnStore, NormalEquations, Term
 from sim_gap.search.stepwise import Search
 

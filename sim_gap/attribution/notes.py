@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 
+from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Cause
 from sim_gap.attribution.verdict import row_rms
 from sim_gap.effects.laws import LAWS
-from sim_gap.model.rigid_body import Array
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.residuals.stuck_channels import Stuck

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Rollout
 from sim_gap.better_model.with_effects import CorrectedModel, with_effects
 from sim_gap.model.load import SimModel
-from sim_gap.model.rigid_body import Array
 from sim_gap.residuals.layout import Layout
 from sim_gap.residuals.preprocess import Signals
 from sim_gap.residuals.residual_set import ResidualSet

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gcomp.arrays import Array
 from sim_gap.attribution.confidence import founded
 from sim_gap.attribution.diagnosis import Cause, Verdict
-from sim_gap.model.rigid_body import Array
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
 

@@ -17,9 +17,9 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from gcomp.arrays import Array
+
 JointEffect = tuple[str, str, dict[str, float]]
 """Effect, joint, parameters."""
 MODEL = ""

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 from armlink.errors import BadInput
+from gcomp.arrays import Array
 from sim_gap.better_model.coupled_motors import CoupledMotor, add_to, coupled_motors
 from sim_gap.effects.base import across
 from sim_gap.model.load import SimModel, read_spec
-from sim_gap.model.rigid_body import Array, inertial_of
+from sim_gap.model.rigid_body import inertial_of
 from sim_gap.search.estimate import Estimate
 from sim_gap.search.normal_equations import Term
 

@@ -3,19 +3,18 @@
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from armlink.link.link import Link
 from armlink.torque_calibration import TorqueCalibration
 from calib.records.records import CalibrationRecord
 from gcomp.arm.arm import Arm
+from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
-Array = npt.NDArray[np.float64]
 GRAVITY_POSES = 500
 
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from gcomp.arrays import Array
 from sim_gap.effects.effect import Beneath, Effect, Plausibility, Shape, Signature, between, not_negative
-from sim_gap.model.rigid_body import Array
 
 
 def _gain(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:

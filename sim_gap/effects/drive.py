@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.signal import lfilter
 
+from gcomp.arrays import Array
 from sim_gap.effects.effect import Effect, Plausibility, SearchHints, Shape, Signature, as_shape, between
 from sim_gap.effects.timing import late
-from sim_gap.model.rigid_body import Array
 from sim_gap.residuals.preprocess import Signals
 
 LONGEST = 0.2

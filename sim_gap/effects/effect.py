@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from armlink.effect_catalogue import CATALOGUE
-from sim_gap.model.rigid_body import Array
+from gcomp.arrays import Array
 from sim_gap.residuals.layout import Columns, Layout
 from sim_gap.residuals.preprocess import Signals
 

@@ -6,8 +6,8 @@ The link is at q − δ: δ = τ/K for elasticity; for backlash half the play, i
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
+from gcomp.arrays import Array
 from sim_gap.effects.effect import Beneath, Effect, Plausibility, Shape, Signature, between, positive
-from sim_gap.model.rigid_body import Array
 from sim_gap.residuals.layout import Columns, Layout
 from sim_gap.residuals.preprocess import Signals
 

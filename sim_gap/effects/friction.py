@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gcomp.arrays import Array
 from sim_gap.effects.effect import (
     Beneath,
     Effect,
@@ -18,7 +19,6 @@ from sim_gap.effects.effect import (
     as_fitted_and_shape,
     not_negative,
 )
-from sim_gap.model.rigid_body import Array
 from sim_gap.residuals.layout import Layout
 from sim_gap.residuals.preprocess import Signals
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gcomp.arrays import Array
 from sim_gap.effects.effect import Effect, Plausibility, Shape, Signature
-from sim_gap.model.rigid_body import Array
 from sim_gap.residuals.layout import Columns, Layout
 from sim_gap.residuals.preprocess import Signals
 

@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from gcomp.arrays import Array
 from sim_gap.effects.effect import Beneath, Effect, Plausibility, SearchHints, Shape, Signature, as_gain, between
-from sim_gap.model.rigid_body import Array
 from sim_gap.residuals.layout import Columns, Layout
 from sim_gap.residuals.preprocess import Signals
 

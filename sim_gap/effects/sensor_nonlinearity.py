@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from gcomp.arrays import Array
 from sim_gap.effects.drive import CLIPPED, NEAR_ONE
 from sim_gap.effects.effect import (
     Effect,
@@ -16,7 +17,6 @@ from sim_gap.effects.effect import (
     as_share_of_shape,
     between,
 )
-from sim_gap.model.rigid_body import Array
 from sim_gap.residuals.preprocess import Signals
 
 PLAY_HZ = 50.0

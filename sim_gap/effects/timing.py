@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from gcomp.arrays import Array
 from sim_gap.effects.effect import Beneath, Effect, Plausibility, SearchHints, Shape, Signature, as_share_of_shape
-from sim_gap.model.rigid_body import Array
 from sim_gap.residuals.preprocess import Signals
 
 SHORTEST, LONGEST = 1e-3, 0.1

@@ -7,14 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from calib.arm.kinematics import gcomp_arm
 from calib.motion.trajectory import trajectory
-
-Array = npt.NDArray[np.float64]
+from gcomp.arrays import Array
 
 MARGIN = 0.12
 """Distance from each stop, as a share of the range."""

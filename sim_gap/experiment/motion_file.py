@@ -3,16 +3,14 @@
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.csv as pa_csv
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from calib.arm.kinematics import gcomp_arm
+from gcomp.arrays import Array
 from sim_gap.experiment.excitation import Motion
-
-Array = npt.NDArray[np.float64]
 
 ROUNDING = 1.05
 """Factor by which the speed between two rows may exceed max_velocity, for the rounding in a file."""

@@ -10,7 +10,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from gcomp.arrays import Array
+
 CREEP = 0.01
 """Speed [rad/s] below which the sign of a velocity is not defined and friction may take any value."""
 INERTIAL = ("mass", "mx", "my", "mz", "ixx", "ixy", "ixz", "iyy", "iyz", "izz")

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 
+from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
-from sim_gap.model.rigid_body import Array
 from sim_gap.report.figures import BELOW_TITLE, GREY, ORANGE, stacked, thinned
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet, root_mean_square

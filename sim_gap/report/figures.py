@@ -7,8 +7,8 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
+from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Diagnosis, Rollout
-from sim_gap.model.rigid_body import Array
 from sim_gap.residuals.residual_set import ResidualSet
 
 GREY, ORANGE, BLUE, LIGHT = "#9aa7b3", "#d9622b", "#1f5fa8", "#cfd8e0"

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sim_gap.model.rigid_body import Array
+from gcomp.arrays import Array
 
 
 def band_noise(t: Array, values: Array, band: float) -> float:

@@ -6,7 +6,7 @@ No inverse form follows an impact. Its samples are left out of the comparison, a
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_gap.model.rigid_body import Array
+from gcomp.arrays import Array
 from sim_gap.residuals.preprocess import Signals
 
 BEFORE_S, AFTER_S = 0.4, 0.6

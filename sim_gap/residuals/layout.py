@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim_gap.model.rigid_body import Array
+from gcomp.arrays import Array
 from sim_gap.residuals.preprocess import Signals
 
 Row = tuple[str, int]

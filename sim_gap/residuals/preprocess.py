@@ -14,7 +14,8 @@ from scipy.signal import butter, sosfiltfilt, sosfreqz
 
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording
-from sim_gap.model.rigid_body import CREEP, Array, RigidArm
+from gcomp.arrays import Array
+from sim_gap.model.rigid_body import CREEP, RigidArm
 from sim_gap.residuals.channel_noise import band_noise
 from sim_gap.residuals.resampling import SLOW_HZ, bridged, coverage, low_pass, thinner
 from sim_gap.residuals.stuck_channels import Stuck, stuck_intervals

@@ -7,7 +7,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfiltfilt
 
 from armlink.errors import BadInput
-from sim_gap.model.rigid_body import Array
+from gcomp.arrays import Array
 
 SLOW_HZ = 60.0
 """Below this rate [Hz] the recorded velocity is used; above, the position is differentiated, for drives report velocity

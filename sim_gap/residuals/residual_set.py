@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
-from sim_gap.model.rigid_body import Array
+from gcomp.arrays import Array
 from sim_gap.residuals.gear_impacts import near_impacts
 from sim_gap.residuals.layout import Columns, Layout, Row, layout_of
 from sim_gap.residuals.preprocess import Signals

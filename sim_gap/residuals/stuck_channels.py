@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_gap.model.rigid_body import Array
+from gcomp.arrays import Array
 
 LONGEST_S = 2.0
 """Longest time for which a reading may repeat [s]."""

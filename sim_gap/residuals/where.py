@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim_gap.model.rigid_body import Array
+from gcomp.arrays import Array
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.preprocess import Signals
 from sim_gap.residuals.residual_set import ResidualSet, root_mean_square

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from sim_gap.model.rigid_body import Array
+from gcomp.arrays import Array
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.normal_equations import CORRELATED, ColumnStore, NormalEquations, Term

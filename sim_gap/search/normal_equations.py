@@ -7,9 +7,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from gcomp.arrays import Array
 from sim_gap.effects.effect import Effect, Key, Shape
 from sim_gap.effects.registry import effects
-from sim_gap.model.rigid_body import Array
 from sim_gap.residuals.layout import Columns, Layout, Row
 from sim_gap.residuals.residual_set import ResidualSet
 

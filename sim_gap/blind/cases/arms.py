@@ -6,9 +6,9 @@ The nominal arm is that of `sim.xml`; `perturbed` is the arm that the plant simu
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from gcomp.arrays import Array
+
 GRAVITY = 9.80665
 
 

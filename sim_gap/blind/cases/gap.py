@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from sim_gap.blind.cases.arms import Arm, Array
+from gcomp.arrays import Array
+from sim_gap.blind.cases.arms import Arm
 from sim_gap.blind.plant.rigid_body import compiled, inverse
 
 RATE = 250.0

@@ -12,7 +12,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from sim_gap.blind.cases.arms import Array, mjcf
+from gcomp.arrays import Array
+from sim_gap.blind.cases.arms import mjcf
 from sim_gap.blind.cases.gap import gap, largest_fall, visible
 from sim_gap.blind.cases.recipe import Drawing, Recipe, draw, label, recipes
 from sim_gap.blind.plant.plant import simulate

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim_gap.blind.cases.arms import Array
+from gcomp.arrays import Array
 
 RATE = 500.0
 """Rate of the commanded trajectories [Hz]."""

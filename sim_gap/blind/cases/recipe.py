@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from sim_gap.blind.cases.arms import Arm, Array, draw_arm
+from gcomp.arrays import Array
+from sim_gap.blind.cases.arms import Arm, draw_arm
 from sim_gap.blind.cases.motion import KINDS, Limits, trajectory
 from sim_gap.blind.cases.scene import Scene
 from sim_gap.blind.cases.true_arm import sound

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from sim_gap.blind.cases.arms import Arm, Array
+from gcomp.arrays import Array
+from sim_gap.blind.cases.arms import Arm
 from sim_gap.blind.cases.motion import RATE, derivatives
 from sim_gap.blind.plant.rigid_body import compiled, controlled_inertia, inverse
 

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armlink.effect_catalogue import CATALOGUE
-from sim_gap.blind.cases.arms import Arm, Array
+from gcomp.arrays import Array
+from sim_gap.blind.cases.arms import Arm
 from sim_gap.blind.cases.scene import Scene, rms
 from sim_gap.blind.cases.true_arm import TrueArm
 

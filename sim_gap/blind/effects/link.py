@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_gap.blind.cases.arms import Arm, Array
+from gcomp.arrays import Array
+from sim_gap.blind.cases.arms import Arm
 from sim_gap.blind.cases.scene import Scene, rms
 from sim_gap.blind.cases.true_arm import TrueArm
 from sim_gap.blind.effects.drawn import Draw, Drawn, sensor_level

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sim_gap.blind.cases.arms import Array
+from gcomp.arrays import Array
 from sim_gap.blind.cases.scene import Scene, rms
 from sim_gap.blind.cases.true_arm import TrueArm
 from sim_gap.blind.effects.drawn import Draw, Drawn, added, pick, replaced, sensor_level, sign

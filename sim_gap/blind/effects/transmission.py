@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim_gap.blind.cases.arms import Arm, Array
+from gcomp.arrays import Array
+from sim_gap.blind.cases.arms import Arm
 from sim_gap.blind.cases.scene import Scene, rms
 from sim_gap.blind.cases.true_arm import SharedMotor, TrueArm
 from sim_gap.blind.effects.drawn import OFTEN, Draw, Drawn, motor_level, pick, replaced, reversals, sensor_level, sign

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sim_gap.blind.cases.arms import Array
+from gcomp.arrays import Array
 from sim_gap.blind.cases.motion import RATE
 from sim_gap.blind.plant.friction import padded
 from sim_gap.blind.plant.runs import Run

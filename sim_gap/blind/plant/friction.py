@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sim_gap.blind.cases.arms import Array
+from gcomp.arrays import Array
 from sim_gap.blind.cases.true_arm import TrueArm
 
 ELASTIC_SHARE = 0.7

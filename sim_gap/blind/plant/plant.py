@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from sim_gap.blind.cases.arms import Array, mjcf
+from gcomp.arrays import Array
+from sim_gap.blind.cases.arms import mjcf
 from sim_gap.blind.cases.motion import RATE
 from sim_gap.blind.cases.true_arm import TrueArm
 from sim_gap.blind.plant.controller import Controller

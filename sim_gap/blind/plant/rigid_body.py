@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from sim_gap.blind.cases.arms import Arm, Array, mjcf
+from gcomp.arrays import Array
+from sim_gap.blind.cases.arms import Arm, mjcf
 
 
 def compiled(arm: Arm) -> Any:

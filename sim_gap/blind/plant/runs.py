@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from sim_gap.blind.cases.arms import Array
+from gcomp.arrays import Array
 from sim_gap.blind.cases.true_arm import TrueArm
 
 

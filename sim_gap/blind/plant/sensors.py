@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from sim_gap.blind.cases.arms import Array
+from gcomp.arrays import Array
 from sim_gap.blind.cases.motion import RATE
 from sim_gap.blind.cases.true_arm import TrueArm
 from sim_gap.blind.plant.runs import Log

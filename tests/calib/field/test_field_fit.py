@@ -12,7 +12,8 @@ from paper_arm import BETA
 from armlink.arm_file import ArmFile, load_arm
 from armlink.cli import run
 from armlink.errors import BadInput, Refused
-from armlink.recording.recording import Recording, save_recording
+from armlink.recording.files import save_recording
+from armlink.recording.recording import Recording
 from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, per_joint
 from calib.arm.kinematics import gcomp_arm
 from calib.field.field_fit import fit_field
@@ -27,7 +28,7 @@ ARM = load_arm("sarcos")
 DESCRIBED = gcomp_arm(ARM)
 N = DESCRIBED.n
 BLANK = per_joint([UNCALIBRATED] * N)
-RATED = np.array([joint.rated_torque for joint in ARM.require_link().joints])
+RATED = ARM.require_link().rated_torques
 MOMENT_STD = np.repeat([4.4e-3, 4.5e-3, 1.3e-3, 0.9e-3, 0.5e-3, 0.4e-3, 0.3e-3], 2)
 """Errors of β after a good calibration (theory.md section 6) [kg·m]."""
 ZERO_STD = 5e-4

@@ -8,7 +8,7 @@ import pytest
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.cli import run
-from calib.plan.collisions import Collided, Geometry, check_plan, way
+from calib.plan.collisions import Collided, Geometry, check_plan, poses_along
 from calib.plan.sweep_plan import plan_sweep
 
 MODEL = """
@@ -72,8 +72,8 @@ def test_a_body_in_the_middle_of_every_sweep_refuses_the_plan(tmp_path: Path, he
 def test_a_way_that_touches_is_refused_with_bodies_and_pose(tmp_path: Path) -> None:
     """No place of the plan touches the post, only the way from one to the next."""
     plan = plan_sweep(bench(tmp_path))
-    places = [np.array(pose) for pose in plan.scout] + [pose for where, pose in way(plan) if "sweep" in where]
-    for pose in (pose for where, pose in way(plan) if "scout" in where):
+    places = [np.array(pose) for pose in plan.scout] + [pose for where, pose in poses_along(plan) if "sweep" in where]
+    for pose in (pose for where, pose in poses_along(plan) if "scout" in where):
         arm = bench(tmp_path, post(*along(*pose, 0.8), half=0.02))
         if Geometry(arm).free(np.array(places)).all():
             with pytest.raises(

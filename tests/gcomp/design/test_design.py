@@ -5,7 +5,7 @@ import pytest
 from gravity_rig import DOWN, SARCOS_BETA, make_readings, make_sarcos, sweep_rows
 
 from gcomp.arm.arm import Arm
-from gcomp.design.remedies import cures
+from gcomp.design.remedies import remedies
 from gcomp.design.selection import sweep_jacobian
 from gcomp.design.sweep_design import Design, Sweep, choose_steps, choose_sweeps, readings_of, stop_combinations
 from gcomp.errors import BadArray
@@ -113,7 +113,7 @@ def test_cure_of_a_missing_sweep_names_it_and_works(sarcos) -> None:
     kept = np.isnan(marks[:, 3])
     rows = make_readings(sarcos, GUESS, positions[kept], marks[kept], sigma=SIGMA)
     found = identify_global(sarcos, rows, unknown=MOMENTS)
-    advice = cures(sarcos, rows, found.complete, unknown=MOMENTS)
+    advice = remedies(sarcos, rows, found.complete, unknown=MOMENTS)
     assert set(advice) == set(found.not_identifiable)
     assert "mass_moment_x[joint_4]" in advice
     assert advice["mass_moment_x[joint_4]"].startswith("sweep joint_4 with joint_1 at its ")
@@ -130,7 +130,7 @@ def test_cure_of_the_missing_scale_is_a_reference_mass(sarcos) -> None:
     rng = np.random.default_rng(1)
     rows = make_readings(sarcos, GUESS, *sweep_rows(sarcos, 2, 9, rng), sigma=SIGMA)
     found = identify_global(sarcos, rows, unknown=CALIBRATION)
-    advice = cures(sarcos, rows, found.complete, unknown=CALIBRATION)
+    advice = remedies(sarcos, rows, found.complete, unknown=CALIBRATION)
     assert "with a reference mass" in advice["gain[joint_1]"]
 
 
@@ -138,7 +138,7 @@ def test_vertical_joint_is_beyond_cure_but_for_tilting_the_base() -> None:
     arm, rng = make_sarcos(DOWN), np.random.default_rng(1)
     rows = make_readings(arm, GUESS, *sweep_rows(arm, 2, 9, rng), sigma=SIGMA)
     found = identify_global(arm, rows, unknown=MOMENTS)
-    advice = cures(arm, rows, found.complete, unknown=MOMENTS)
+    advice = remedies(arm, rows, found.complete, unknown=MOMENTS)
     assert advice == dict.fromkeys(
         ("mass_moment_x[joint_1]", "mass_moment_y[joint_1]"),
         "no sweep: gravity does not act on it in any pose; tilt the base",
