@@ -14,6 +14,7 @@ from armlink.arm_file import load_arm
 from armlink.cli import run
 from armlink.link.link import Link
 from calib.arm.drive_limits import Limits
+from calib.install import apply
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
 from calib.sweep.dataset import load_data
@@ -149,7 +150,7 @@ def test_recalibrate_writes_what_drifted_to_the_controllers(
         link.start()
         link.enable()
         again = run_sweep(link, arm, tmp_path / "again")
-    monkeypatch.setattr(Link, "open", lambda *_: Link(arm, LockStepBus(arm=simulated)))
+    monkeypatch.setattr(apply, "open_arm", lambda *_: Link(arm, LockStepBus(arm=simulated)))
     assert run(["recalibrate", str(arm_path), str(again.path), *store, "--apply"]) == 0
     record = RecordStore(str(tmp_path / "records.db")).current(CalibrationRecord, arm)
     assert record is not None
