@@ -97,7 +97,7 @@ class BoundedProtocol(H11Protocol):
         super().connection_lost(exc)
 
     def shutdown(self) -> None:
-        """The server ends: an idle connection does at once, one that lingers in less time than the server takes."""
+        """The server ends: close an idle connection at once; one that lingers ends by itself before the server does."""
         if self.transport.is_closing():
             return
         if self._awaits_head() and not self.transport.get_write_buffer_size():
