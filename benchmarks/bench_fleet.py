@@ -8,7 +8,8 @@ import mujoco
 import numpy as np
 from side_by_side import Case
 
-from armlink.recording.recording import Recording, save_recording
+from armlink.recording.files import save_recording
+from armlink.recording.recording import Recording
 from sim_gap.fleet.cluster import cluster
 from sim_gap.fleet.fleet import diagnose_fleet, find_cases
 

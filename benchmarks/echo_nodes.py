@@ -14,7 +14,7 @@ from typing import Any
 
 import can
 
-from armlink.bus.socket_port import SocketPort
+from armlink.bus.sockets.socket_port import SocketPort
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "armlink"))
 from fake_joints import FakeBus, make_arm
@@ -70,7 +70,7 @@ def start_nodes(channel: str) -> multiprocessing.Process:
 
 def _serve(channel: str, listens: Any) -> None:
     bus = can.Bus(interface="socketcan", channel=channel)
-    port, nodes = SocketPort(bus), FakeBus(NODES)
+    port, nodes = SocketPort(bus.socket, channel), FakeBus(NODES)
     listens.set()
     for node in NODES:
         nodes.nodes[node].position, nodes.nodes[node].torque = struct.unpack("<ii", readings(node))

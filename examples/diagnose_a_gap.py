@@ -7,7 +7,7 @@ import numpy as np
 
 from armlink.arm_file import load_arm
 from armlink.link.link import Link
-from armlink.recording.recording import load_recording
+from armlink.recording.files import load_recording
 from sim_bus.bus.lock_step import LockStepBus
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.experiment.collect import collect

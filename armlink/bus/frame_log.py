@@ -1,12 +1,12 @@
 """Raw CAN frames in the files of python-can's own loggers: Vector ASC and BLF, and candump's log.
 
-Times are kept to the microsecond, the finest that all three keep. Frames go from a bus into a log and from a log into
-whatever decodes a bus (`TappedBus`, `LogBus`), with the same times, so that both give the same samples bit for bit.
+Times are kept to the microsecond, the finest that all three keep. Frames go from a bus into a log (`taps.TappedBus`)
+and from a log into whatever decodes a bus (`LogBus`) with the same times: both give the same samples bit for bit.
 """
 
 import struct
 import zlib
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -14,7 +14,9 @@ from typing import Any, Self
 import can
 from can.io.blf import BLFParseError
 
-from armlink.clock import Clock, MonotonicClock
+from armlink.bus.in_process import InProcessBus
+from armlink.bus.message_port import is_data
+from armlink.bus.port import Frame
 from armlink.errors import BadInput, BusFault
 
 LOG_SUFFIXES = (".asc", ".blf", ".log")
@@ -63,60 +65,7 @@ class FrameLog:
             self._flushed = stamp
 
 
-class TappedBus:
-    """A bus whose messages all go to somebody else too, with the time at which they came."""
-
-    def __init__(self, bus: Any, tap: Callable[[can.Message, int], None], sends: bool = False) -> None:
-        """Take python-can's `bus`, closed with this one; `tap` gets each message and its time [µs].
-
-        That is the interface's own time stamp, or, where we send too, `clock`, so that what was sent has a time too.
-        """
-        self.bus, self._tap, self._sends = bus, tap, sends
-        self.clock: Clock = getattr(bus, "clock", None) or MonotonicClock()
-        self.channel_info = bus.channel_info
-        self._first: int | None = None
-        self._newest = 0
-
-    def stamp(self) -> float:
-        """When the newest frame came, since the first [s], as the interface stamped it."""
-        return self._newest / 1e6
-
-    def take(self, timeout: float = 0.0) -> tuple[int, bytes] | None:
-        """The next data frame with an 11-bit identifier, or None after `timeout` seconds; raises BusFault."""
-        while True:
-            try:
-                message = self.bus.recv(timeout=timeout)
-            except (can.CanError, OSError) as error:
-                raise BusFault(f"bus {self.channel_info}: cannot receive: {error}") from None
-            if message is None:
-                return None
-            self._hand_on(message, 0.0 if self._sends else message.timestamp)
-            if is_ours(message):
-                return message.arbitration_id, bytes(message.data)
-
-    def put(self, can_id: int, data: bytes) -> None:
-        """Send a frame; raises BusFault where it cannot be sent, or where this bus only listens."""
-        if not self._sends:
-            raise BusFault(f"bus {self.channel_info}: only listened to")
-        message = can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
-        self._hand_on(message, 0.0)
-        try:
-            self.bus.send(message)
-        except (can.CanError, OSError) as error:
-            raise BusFault(f"bus {self.channel_info}: cannot send: {error}") from None
-
-    def shutdown(self) -> None:
-        """Close the bus."""
-        self.bus.shutdown()
-
-    def _hand_on(self, message: can.Message, time: float) -> None:
-        stamp = round((time or self.clock.now()) * 1e6)
-        self._first = stamp if self._first is None else self._first
-        self._newest = stamp - self._first
-        self._tap(message, stamp)
-
-
-class LogBus:
+class LogBus(InProcessBus):
     """A log as a bus that somebody listens to: each frame at its time, then silence; its clock is the log's."""
 
     def __init__(self, path: Path) -> None:
@@ -137,13 +86,15 @@ class LogBus:
         """When the newest frame came, since the first [s]."""
         return self._time
 
-    stamp = now
+    def stamp(self) -> float:
+        """When the newest frame came, since the first [s]."""
+        return self._time
 
     def sleep_until(self, instant: float) -> None:
         """Let time go on, to `instant` [s]."""
         self._time = max(self._time, instant)
 
-    def take(self, timeout: float = 0.0) -> tuple[int, bytes] | None:
+    def take(self, timeout: float = 0.0) -> Frame | None:
         """The next frame, whenever it comes, or None where there is none."""
         if self._next is None:
             self._time += max(0.0, timeout)
@@ -158,7 +109,7 @@ class LogBus:
         raise BusFault(f"{self.channel_info}: a log takes no frames")
 
     def shutdown(self) -> None:
-        """Nothing to close."""
+        """Nothing to close: its file is read to the end, or given up with this object."""
 
 
 class LogReader:
@@ -182,7 +133,7 @@ class LogReader:
         for message in self._messages():
             stamp = round(message.timestamp * 1e6)
             first = stamp if first is None else first
-            if is_ours(message):
+            if is_data(message):
                 self.count += 1
                 yield stamp - first, message.arbitration_id, bytes(message.data)
 
@@ -245,8 +196,3 @@ class _WholeLines:
     def close(self) -> None:
         """Close the file."""
         self._stream.close()
-
-
-def is_ours(message: can.Message) -> bool:
-    """Whether a message is a data frame with an 11-bit identifier."""
-    return not (message.is_error_frame or message.is_extended_id or message.is_remote_frame)

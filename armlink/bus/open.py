@@ -1,18 +1,12 @@
 """Buses by name: `INTERFACE:CHANNEL[@BITRATE]`, any interface that python-can knows."""
 
-import math
-import time
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from armlink.arm_file import Bus, LinkSection
+from armlink.bus.bus_group import BusGroup
+from armlink.bus.can_bus import MessageBus
 from armlink.errors import BadInput, BusFault
 
-if TYPE_CHECKING:
-    import can
-
-SLICE = 0.001
-"""Longest wait for one of several buses at a time [s]."""
 FORM = "INTERFACE:CHANNEL[@BITRATE], for example socketcan:can0 or socketcan:can0@1000000"
 
 
@@ -36,7 +30,7 @@ def resolve_bus(spec: str | None, section: Bus) -> Bus:
     return bus.model_copy(update=same)
 
 
-def open_bus(spec: str | None, section: Bus) -> "can.BusABC":
+def open_bus(spec: str | None, section: Bus) -> MessageBus:
     """Open the bus that `spec` names, or else the arm file's section.
 
     Raises BadInput for a malformed specification or an interface that python-can does not know, and BusFault where
@@ -45,13 +39,15 @@ def open_bus(spec: str | None, section: Bus) -> "can.BusABC":
     import can
     from can.exceptions import CanInterfaceNotImplementedError
 
+    from armlink.bus.adapters import adapt
+
     bus = resolve_bus(spec, section)
     name = f"{bus.interface}:{bus.channel}"
     options: dict[str, Any] = {} if bus.interface == "socketcan" else {"bitrate": bus.bitrate}
     if bus.fd:
         options |= {"protocol": can.CanProtocol.CAN_FD} if bus.interface == "virtual" else {"fd": True}
     try:
-        return can.Bus(interface=bus.interface, channel=bus.channel, **options, **bus.options)
+        return adapt(can.Bus(interface=bus.interface, channel=bus.channel, **options, **bus.options), name)
     except CanInterfaceNotImplementedError as error:
         raise BadInput(f"bus {name}: {error}: python-can has no such interface here") from None
     except TypeError as error:
@@ -61,7 +57,7 @@ def open_bus(spec: str | None, section: Bus) -> "can.BusABC":
         raise BusFault(f"bus {name}: cannot open it: {reason}") from None
 
 
-def open_link_bus(spec: str | None, section: LinkSection) -> Any:
+def open_link_bus(spec: str | None, section: LinkSection) -> MessageBus:
     """Open the bus of an arm's link, or all of its buses as one (BusGroup); `spec` puts every joint on one bus.
 
     Raises as open_bus.
@@ -69,7 +65,7 @@ def open_link_bus(spec: str | None, section: LinkSection) -> Any:
     names = list(dict.fromkeys(joint.bus for joint in section.joints))
     if spec is not None or names == [""]:
         return open_bus(spec, section.bus)
-    members: list[Any] = []
+    members: list[MessageBus] = []
     try:
         for name in names:
             member = open_bus(None, section.buses[name] if name else section.bus)
@@ -81,36 +77,3 @@ def open_link_bus(spec: str | None, section: LinkSection) -> Any:
     if len(members) == 1:
         return members[0]
     return BusGroup(members, {joint.node: names.index(joint.bus) for joint in section.joints})
-
-
-class BusGroup:
-    """Several python-can buses as one: a message goes to the bus of its node, or to every bus where it is for all."""
-
-    def __init__(self, members: Sequence[Any], route: Mapping[int, int]) -> None:
-        """`route` is node id → index of its bus among `members`."""
-        self.members, self.route = tuple(members), dict(route)
-        self.channel_info = " and ".join(str(member.channel_info) for member in self.members)
-
-    def send(self, msg: "can.Message", timeout: float | None = None) -> None:
-        """Send one message, as python-can's buses do."""
-        index = self.route.get(msg.arbitration_id & 0x7F)
-        for member in self.members if index is None else (self.members[index],):
-            member.send(msg, timeout)
-
-    def recv(self, timeout: float | None = None) -> "can.Message | None":
-        """The next message of any bus, or None after `timeout` seconds (None: wait for ever)."""
-        end = math.inf if timeout is None else time.monotonic() + timeout
-        wait = 0.0
-        while True:
-            for member in self.members:
-                message = member.recv(wait)
-                if message is not None:
-                    return message
-            if time.monotonic() >= end:
-                return None
-            wait = min(SLICE, max(0.0, end - time.monotonic()))
-
-    def shutdown(self) -> None:
-        """Close every bus."""
-        for member in self.members:
-            member.shutdown()

@@ -3,8 +3,12 @@
 import math
 from dataclasses import dataclass
 
+from armlink.arm_file import ArmFile
+
 TORQUE_PER_MICRO = 1e-6
 """2100h:01 is in µN·m."""
+USER_UNITS = 1 << 20
+"""User units of a joint turn, if the controllers are not asked for 6092h."""
 
 
 @dataclass(frozen=True)
@@ -38,3 +42,9 @@ def units_from(
         position=2 * math.pi * feed[1] / feed[0],
         encoder_step=2 * math.pi / increments_a_turn,
     )
+
+
+def assumed_units(arm: ArmFile) -> tuple[Units, ...]:
+    """Scales by the arm file's rated torques and USER_UNITS a turn, for listeners, who do not ask the controllers."""
+    joints = arm.require_link().joints
+    return tuple(units_from(round(joint.rated_torque * 1e3), (1, 1), (1, 1), (USER_UNITS, 1)) for joint in joints)

@@ -58,7 +58,7 @@ def check(
     if host:
         return _check_host(console, described, seconds, json)
     with Link.open(described, bus) as link:
-        simulated = hasattr(link.bus, "clock")
+        simulated = link.bus.clock is not None
         if not (passive or yes or simulated):
             protection = link.protection
             times = {"deadline": protection.deadline_ms, "heartbeat": protection.heartbeat_ms}

@@ -19,7 +19,7 @@ def convert(
 
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
-    from armlink.recording.recording import load_recording, save_recording
+    from armlink.recording.files import load_recording, save_recording
 
     recording = load_recording(source)
     try:

@@ -34,8 +34,9 @@ def record(
     from rich.console import Console
 
     from armlink.arm_file import load_arm
-    from armlink.bus.frame_log import FrameLog, TappedBus
+    from armlink.bus.frame_log import FrameLog
     from armlink.bus.open import open_link_bus
+    from armlink.bus.taps import TappedBus
     from armlink.commands.output import write_json
     from armlink.errors import BadInput, BusFault
     from armlink.recording.mcap import RecordingWriter

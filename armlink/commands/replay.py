@@ -35,7 +35,7 @@ def replay(
     from armlink.bus.frame_log import is_log
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
-    from armlink.recording.recording import load_recording, save_recording
+    from armlink.recording.files import load_recording, save_recording
     from armlink.recording.replay import play_onto, recording_of_log, show
 
     arm_file = load_arm(arm)

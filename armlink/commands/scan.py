@@ -23,7 +23,6 @@ def scan(
 
     from armlink.arm_file import Bus, load_arm
     from armlink.bus.open import open_bus, open_link_bus
-    from armlink.bus.port import open_port
     from armlink.canopen.eds_file import expected_identity, of_joints
     from armlink.clock import MonotonicClock
     from armlink.commands.output import write_json
@@ -43,8 +42,8 @@ def scan(
         stated = {each.node: expected_identity(each, sheet) for each, sheet in zip(link.joints, sheets, strict=True)}
         opened = open_link_bus(bus, link)
     try:
-        clock = getattr(opened, "clock", None) or MonotonicClock()
-        found = scan_bus(open_port(opened), clock, joints)
+        clock = opened.clock or MonotonicClock()
+        found = scan_bus(opened.open_port(), clock, joints)
         channel = str(opened.channel_info)
     finally:
         opened.shutdown()

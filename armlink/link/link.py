@@ -4,13 +4,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 from types import TracebackType
-from typing import Any, Concatenate, ParamSpec, Self, TypeVar
+from typing import TYPE_CHECKING, Concatenate, ParamSpec, Self, TypeVar
 
 import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
-from armlink.bus.port import open_port
+from armlink.bus.adapters import as_bus
+from armlink.bus.can_bus import CanBus
 from armlink.canopen import object_dictionary as objects
 from armlink.canopen.cia402 import State
 from armlink.canopen.sdo import NodeServices, PumpedNetwork, joint_services
@@ -25,6 +26,9 @@ from armlink.link.gate_limits import gate_limits, joint_ranges, target_window
 from armlink.link.guard import Crossed
 from armlink.link.torque_sensor_record import TorqueSensorRecords
 from armlink.link.types import Command, Controller, Identity, Sample, Samples, Setpoints, Stats
+
+if TYPE_CHECKING:
+    import can
 
 PATIENCE = 2.5
 """Readings may be so many periods old while a motion goes on; a reply that comes a period late is within it."""
@@ -43,19 +47,19 @@ class Link(TorqueSensorRecords):
     Leaving it, however, leaves the joints in quick stop, where they hold, unless `disable` was called.
     """
 
-    def __init__(self, arm: ArmFile, bus: Any, clock: Clock | None = None) -> None:
-        """Take `bus` (python-can's, closed on leaving) and a clock: by default the bus's own or the machine's."""
-        self.arm, self.bus = arm, bus
+    def __init__(self, arm: ArmFile, bus: "CanBus | can.BusABC", clock: Clock | None = None) -> None:
+        """Take `bus` (python-can's too, closed on leaving) and a clock: by default the bus's own or the machine's."""
+        self.arm, self.bus = arm, as_bus(bus)
         self.section = section = arm.require_link()
         self.names = tuple(joint.name for joint in section.joints)
         self.nodes = tuple(joint.node for joint in section.joints)
         self.n, self.rate, self.period = len(self.names), section.rate, 1.0 / section.rate
-        own_clock: Clock | None = getattr(bus, "clock", None)
-        self._lock_step = own_clock is not None
-        self.clock: Clock = clock or own_clock or MonotonicClock()
+        self._lock_step = self.bus.clock is not None
+        self.clock: Clock = clock or self.bus.clock or MonotonicClock()
         self.windows = [target_window(*limits) for limits in joint_ranges(arm)]
         self.protection = device.protection_of(section)
-        self._loop = Loop(open_port(bus), self.clock, self.nodes, self.protection.host, self.period, self._lock_step)
+        port, host = self.bus.open_port(), self.protection.host
+        self._loop = Loop(port, self.clock, self.nodes, host, self.period, self._lock_step)
         self._loop.heartbeat_cycles = max(1, int(section.deadline / 2 * self.rate))
         self.commander = Commander(self._loop, self.clock, self.names, self.period, section.deadline, self._lock_step)
         self._cycling = self._enabled = False

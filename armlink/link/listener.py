@@ -11,21 +11,26 @@ from collections import deque
 from collections.abc import Callable
 from functools import cached_property
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
-from armlink.bus.stamped_port import StampedGroup, Stamping, open_listening_port
+from armlink.bus.adapters import as_bus
+from armlink.bus.can_bus import CanBus
+from armlink.bus.port import StampedPort
 from armlink.canopen import object_dictionary as objects
 from armlink.canopen.pdo import RPDO1
 from armlink.canopen.sdo import NodeServices, PumpedNetwork, joint_services
+from armlink.canopen.units import assumed_units
 from armlink.clock import Clock, MonotonicClock
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.torque_sensor_record import TorqueSensorRecords
 from armlink.link.types import Sample, Stats
-from armlink.monitor.monitor import assumed_units
+
+if TYPE_CHECKING:
+    import can
 
 SLEEP = 0.04
 """Frames that bear their time may wait for so long [s]: ten cycles at 250 Hz, half of what a small receive queue holds
@@ -39,17 +44,16 @@ NO_COMMAND = bytes(8)
 class Listener(TorqueSensorRecords):
     """Context manager: `with Listener(arm, bus) as listener: sample = listener.next(0.1)`."""
 
-    def __init__(self, arm: ArmFile, bus: Any) -> None:
-        """Take `bus` (python-can's, closed on leaving); its own clock counts where it has one, else the machine's."""
-        self.arm, self.bus = arm, bus
+    def __init__(self, arm: ArmFile, bus: "CanBus | can.BusABC") -> None:
+        """Take `bus` (python-can's too, closed on leaving); its own clock counts if it has one, else the machine's."""
+        self.arm, self.bus = arm, as_bus(bus)
         self.section = section = arm.require_link()
         self.names = tuple(joint.name for joint in section.joints)
         self.nodes = tuple(joint.node for joint in section.joints)
         self.n, self.period = len(self.names), 1.0 / section.rate
-        own_clock: Clock | None = getattr(bus, "clock", None)
-        self.clock: Clock = own_clock or MonotonicClock()
-        self._port = open_listening_port(bus)
-        self._loop = Loop(self._port, self.clock, self.nodes, 0, self.period, own_clock is not None)
+        self.clock: Clock = self.bus.clock or MonotonicClock()
+        self._port = self.bus.open_listening_port()
+        self._loop = Loop(self._port, self.clock, self.nodes, 0, self.period, self.bus.clock is not None)
         units = assumed_units(arm)
         self._loop.set_units(units)
         self._loop.on_other = self._take_other
@@ -124,7 +128,7 @@ class Listener(TorqueSensorRecords):
     def _hear(self, seconds: float, at_once: bool = False) -> None:
         """Take in what comes, for at most so long; `at_once`: somebody waits for the very next frame."""
         port = self._port
-        if isinstance(port, Stamping | StampedGroup):
+        if isinstance(port, StampedPort):
             if at_once:
                 port.wait(seconds)
             else:

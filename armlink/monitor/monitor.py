@@ -7,19 +7,18 @@ from typing import Any
 import can
 
 from armlink.arm_file import ArmFile
-from armlink.bus.frame_log import TappedBus, is_ours
-from armlink.bus.port import open_port
+from armlink.bus.can_bus import MessageBus
+from armlink.bus.message_port import is_data
+from armlink.bus.port import Port
+from armlink.bus.taps import TappedBus, TappedPort
 from armlink.canopen import emcy
 from armlink.canopen import object_dictionary as objects
 from armlink.canopen.cia402 import state_of
-from armlink.canopen.units import Units, units_from
+from armlink.canopen.units import assumed_units
 from armlink.clock import Clock, MonotonicClock
 from armlink.link.cyclic_exchange import NO_STATUS, Loop
 from armlink.link.types import Sample
 from armlink.monitor.cycle_stats import CycleStats
-
-USER_UNITS = 1 << 20
-"""User units of a joint turn; a monitor does not ask the controllers, since another host may be doing so."""
 
 
 @dataclass(eq=False)
@@ -36,25 +35,31 @@ class View:
 class Monitor:
     """Listens to an arm's joints. With `sync` it is the bus's host: starts the nodes (NMT) and sends SYNC itself."""
 
-    def __init__(self, arm: ArmFile, bus: Any, sync: bool = False, stats: bool = False) -> None:
+    def __init__(self, arm: ArmFile, bus: MessageBus, sync: bool = False, stats: bool = False) -> None:
         """`stats`: measure the cycle too, from every frame's time stamp, which costs more than listening alone."""
         self.section = section = arm.require_link()
         self.names = tuple(joint.name for joint in section.joints)
         self.nodes = tuple(joint.node for joint in section.joints)
-        own_clock: Clock | None = getattr(bus, "clock", None)
-        self.clock: Clock = own_clock or MonotonicClock()
+        self.clock: Clock = bus.clock or MonotonicClock()
         self._sync, self._period = sync, 1.0 / section.rate
         self.cycle_stats: CycleStats | None = None
         """Figures of the cycle so far, None where they were not asked for."""
         if stats:
             self.cycle_stats = CycleStats(self.nodes, self._period, section.bus.bitrate)
-            bus = TappedBus(bus, self._count_cycle, sends=sync)
-        self._loop = Loop(open_port(bus), self.clock, self.nodes, 0, self._period, own_clock is not None)
+        self._loop = Loop(self._open_port(bus), self.clock, self.nodes, 0, self._period, bus.clock is not None)
         self._loop.set_units(assumed_units(arm))
         self._loop.on_other = self._count
         self._syncs = 0
         if sync:
             self._loop.send(objects.NMT_ID, bytes([objects.NMT_START, 0]))
+
+    def _open_port(self, bus: MessageBus) -> Port:
+        """The bus's port; for statistics one that shows every frame, with the interface's times if we only listen."""
+        if self.cycle_stats is None:
+            return bus.open_port()
+        if self._sync:
+            return TappedPort(bus.open_port(), self.clock, self.cycle_stats.take)
+        return TappedBus(bus, self._count_cycle).open_port()
 
     @property
     def frames(self) -> int:
@@ -119,14 +124,8 @@ class Monitor:
         return self._loop.sample(self.clock.now())
 
     def _count_cycle(self, message: can.Message, stamp: int) -> None:
-        if self.cycle_stats and is_ours(message):
+        if self.cycle_stats and is_data(message):
             self.cycle_stats.take(stamp / 1e6, message.arbitration_id, bytes(message.data))
 
     def _count(self, can_id: int, data: bytes) -> None:
         self._syncs += can_id == objects.SYNC_ID
-
-
-def assumed_units(arm: ArmFile) -> tuple[Units, ...]:
-    """Scales by the arm file's rated torques and 2^20 user units a turn."""
-    joints = arm.require_link().joints
-    return tuple(units_from(round(joint.rated_torque * 1e3), (1, 1), (1, 1), (USER_UNITS, 1)) for joint in joints)

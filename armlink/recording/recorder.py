@@ -3,18 +3,17 @@
 import math
 import struct
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
-from armlink.bus.port import open_port
+from armlink.bus.can_bus import CanBus, TimedBus
 from armlink.canopen import object_dictionary as objects
 from armlink.canopen.pdo import RPDO1
+from armlink.canopen.units import assumed_units
 from armlink.clock import Clock, MonotonicClock
 from armlink.link.cyclic_exchange import Loop
-from armlink.monitor.monitor import assumed_units
 
 WAIT_SECONDS = 0.1
 Row = tuple[float, dict[str, Array]]
@@ -23,15 +22,15 @@ Row = tuple[float, dict[str, Array]]
 class Recorder:
     """Iterates over rows: time from the first SYNC [s], and channels of Recording, NaN where nothing came."""
 
-    def __init__(self, arm: ArmFile, bus: Any) -> None:
+    def __init__(self, arm: ArmFile, bus: CanBus) -> None:
+        """Listen to `bus`; times are the frames' own if they have any, else when they were read."""
         section = arm.require_link()
         self.names = tuple(joint.name for joint in section.joints)
         nodes = tuple(joint.node for joint in section.joints)
-        own_clock: Clock | None = getattr(bus, "clock", None)
-        self.clock: Clock = own_clock or MonotonicClock()
-        self._stamp: Callable[[], float] = getattr(bus, "stamp", self.clock.now)
-        self._bus = bus
-        self._loop = Loop(open_port(bus), self.clock, nodes, 0, 1.0 / section.rate, own_clock is not None)
+        self.clock: Clock = bus.clock or MonotonicClock()
+        self._timed = bus if isinstance(bus, TimedBus) else None
+        self._stamp: Callable[[], float] = self._timed.stamp if self._timed else self.clock.now
+        self._loop = Loop(bus.open_port(), self.clock, nodes, 0, 1.0 / section.rate, bus.clock is not None)
         units = assumed_units(arm)
         self._loop.set_units(units)
         self._loop.on_other = self._take
@@ -49,7 +48,7 @@ class Recorder:
     def rows(self, seconds: float) -> Iterator[Row]:
         """Rows that are complete within `seconds`, or in a whole log (LogBus); raises BusFault where the bus fails."""
         end = self.clock.now() + seconds
-        while (remaining := end - self.clock.now()) > 0 and not getattr(self._bus, "ended", False):
+        while (remaining := end - self.clock.now()) > 0 and not (self._timed and self._timed.ended):
             self._loop.receive(min(remaining, WAIT_SECONDS))
             yield from self._rows
             self._rows.clear()

@@ -1,8 +1,7 @@
-"""Recordings: what the arm's channels read over time, loaded and saved by suffix (contract 2)."""
+"""Recordings: readings of an arm's channels over time, and the columns that stand for them in tables."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +21,6 @@ COLUMNS = {
 }
 """Channel name -> column prefix; joint i of 1..n has the column `PREFIX_i`."""
 TORQUE_CHANNELS = ("torque", "motor_torque", "torque_command")
-SUFFIXES = (".csv", ".csv.gz", ".parquet", ".mcap")
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,36 +122,6 @@ def is_channel(column: str) -> bool:
     return column == "t" or _joint_index(column) is not None
 
 
-def load_recording(path: str | Path) -> Recording:
-    """Load `.csv`, `.csv.gz`, `.parquet` or `.mcap`; raises BadInput with one line that names row or column."""
-    path = Path(path)
-    suffix = _suffix(path)
-    if not path.is_file():
-        raise BadInput(f"no recording {path}: give a {', '.join(SUFFIXES)} file")
-    if suffix == ".mcap":
-        from armlink.recording.mcap import load_mcap
-
-        return load_mcap(path).check(str(path))
-    from armlink.recording.tables import load_csv, load_parquet
-
-    return (load_parquet if suffix == ".parquet" else load_csv)(path).check(str(path))
-
-
-def save_recording(recording: Recording, path: str | Path) -> None:
-    """Save by suffix (see load_recording); raises BadInput where the recording is not sound."""
-    path = Path(path)
-    suffix = _suffix(path)
-    recording.check(str(path))
-    if suffix == ".mcap":
-        from armlink.recording.mcap import save_mcap
-
-        save_mcap(recording, path)
-        return
-    from armlink.recording.tables import save_csv, save_parquet
-
-    (save_parquet if suffix == ".parquet" else save_csv)(recording, path)
-
-
 def slice_rows(recording: Recording, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Recording:
     """The recording at some of its rows (times unchanged)."""
     values = {field.name: getattr(recording, field.name) for field in fields(recording)}
@@ -161,13 +129,6 @@ def slice_rows(recording: Recording, rows: slice | NDArray[np.bool_] | NDArray[n
         if isinstance(value, np.ndarray):
             values[name] = value[rows]
     return Recording(**values)
-
-
-def _suffix(path: Path) -> str:
-    for suffix in sorted(SUFFIXES, key=len, reverse=True):
-        if path.name.lower().endswith(suffix):
-            return suffix
-    raise BadInput(f"{path}: not a recording by its suffix, expected {', '.join(SUFFIXES)}")
 
 
 def _joint_index(column: str) -> int | None:

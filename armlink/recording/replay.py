@@ -10,12 +10,12 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.bus.frame_log import LogBus, LogReader, is_log
 from armlink.bus.open import open_bus, parse_bus
+from armlink.bus.port import Port, Stamped
 from armlink.canopen import object_dictionary as objects
 from armlink.canopen.pdo import TPDO1, TPDO2, TPDO3
-from armlink.canopen.units import TORQUE_PER_MICRO
+from armlink.canopen.units import TORQUE_PER_MICRO, assumed_units
 from armlink.clock import Clock, MonotonicClock
 from armlink.errors import BadInput
-from armlink.monitor.monitor import assumed_units
 from armlink.recording.recorder import Recorder
 from armlink.recording.recording import Array, Recording
 
@@ -27,7 +27,6 @@ _JOINTS_SEND = (0x080, 0x180, 0x280, 0x380, 0x480, 0x580, 0x700)
 _ENABLED = 0x27
 _REFRESH = 0.2  # [s]
 _I16, _I32 = (-(1 << 15), (1 << 15) - 1), (-(1 << 31), (1 << 31) - 1)
-Stamped = tuple[float, int, bytes]
 
 
 def recording_of_log(arm: ArmFile, path: Path) -> Recording:
@@ -53,8 +52,6 @@ def play_onto(arm: ArmFile, source: Path, recording: Recording, spec: str, speed
 
     Raises BadInput for a bus that is not virtual, BusFault where it cannot be opened or takes no frames.
     """
-    from armlink.bus.port import open_port
-
     described = parse_bus(spec)
     virtual = described.interface == "socketcan" and described.channel.startswith("vcan")
     if not virtual and described.interface not in VIRTUAL_INTERFACES:
@@ -64,7 +61,7 @@ def play_onto(arm: ArmFile, source: Path, recording: Recording, spec: str, speed
     bus = open_bus(spec, arm.require_link().bus)
     try:
         frames = frames_of_log(source) if is_log(source) else frames_of_recording(arm, recording)
-        return _play(frames, open_port(bus), MonotonicClock(), speed)
+        return _play(frames, bus.open_port(), MonotonicClock(), speed)
     finally:
         bus.shutdown()
 
@@ -117,7 +114,7 @@ def show(recording: Recording, console: "Console", speed: float, clock: Clock | 
     console.print(_table(recording, times.size - 1))
 
 
-def _play(frames: Iterator[Stamped], port: Any, clock: Clock, speed: float) -> int:
+def _play(frames: Iterator[Stamped], port: Port, clock: Clock, speed: float) -> int:
     start, count = clock.now(), 0
     for t, can_id, data in frames:
         if speed > 0:

@@ -76,7 +76,7 @@ def _rows(
     import hashlib
 
     from armlink.errors import BadInput
-    from armlink.recording.recording import load_recording
+    from armlink.recording.files import load_recording
     from armlink.torque_calibration import UNCALIBRATED, per_joint
     from calib.field.rows import rows_of_recording, rows_of_sweeps
     from calib.sweep.dataset import load_data

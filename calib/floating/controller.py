@@ -63,16 +63,20 @@ class FloatControl:
         self._speed: Array = np.zeros(arm.n)
         self._detent: Array = np.zeros(arm.n)
 
-    def torque(self, position: Array) -> Array:
-        """Target torque (n,) [N·m] at position readings (n,) [rad]; the last reading replaces a missing one (NaN)."""
+    def torque(self, position: Array, elapsed: float | None = None) -> Array:
+        """Target torque (n,) [N·m] at position readings (n,) [rad], `elapsed` seconds after those before.
+
+        The last reading replaces a missing one (NaN); without a time a period has passed.
+        """
         angle = self._gain * position + self._offset
         if self._last is None:
             if np.isnan(angle).any():
                 return np.full(angle.size, np.nan)
             self._last, self._detent = angle.copy(), angle.copy()
         angle = np.where(np.isnan(angle), self._last, angle)
-        share = min(self._period / self.config.speed_time, 1.0)
-        self._speed += share * ((angle - self._last) / self._period - self._speed)
+        period = self._period if elapsed is None else max(elapsed, self._period / 2)
+        share = min(period / self.config.speed_time, 1.0)
+        self._speed += share * ((angle - self._last) / period - self._speed)
         self._last = angle
         gravity: Array = np.asarray(self._model.one(angle))
         return gravity + self._damping() + self._soft_ends(angle) + self._hold(angle)

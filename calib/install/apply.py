@@ -7,7 +7,8 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
-from armlink.link.link import Link
+from armlink.loop.driver import ArmDriver
+from armlink.loop.open import open_arm
 from calib.field.field_fit import FieldFit
 from calib.field.heldout import heldout_errors
 from calib.fit.findings import Finding
@@ -88,7 +89,7 @@ def apply_rollback(
     gravity = store.current(GravityRecord, arm)
     beta = None if gravity is None else np.array(gravity.beta)
 
-    def gate(link: Link) -> Admitted:
+    def gate(link: ArmDriver) -> Admitted:
         held = {joint: link.read_calibration(joint) for joint in range(link.n)}
         return admit_rollback(record, arm, store, held, how.replaced)
 
@@ -159,7 +160,7 @@ def _check_names(arm: ArmFile, how: Apply) -> None:
 
 
 def _write(
-    gate: Callable[[Link], Admitted],
+    gate: Callable[[ArmDriver], Admitted],
     record: CalibrationRecord,
     arm: ArmFile,
     store: RecordStore,
@@ -168,7 +169,7 @@ def _write(
     reason: str,
 ) -> tuple[str, ...]:
     exchanged = f"; sensor exchanged: {', '.join(how.replaced)}" if how.replaced else ""
-    with Link.open(arm, how.bus) as link:
+    with open_arm(arm, how.bus) as link:
         link.start()
         recover(arm, store, link)
         admitted = gate(link)

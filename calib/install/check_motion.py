@@ -9,8 +9,8 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
-from armlink.link.link import Link
 from armlink.link.types import Calibration
+from armlink.loop.driver import ArmDriver
 from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
@@ -40,7 +40,7 @@ WORSE = 1.1
 class CheckMotion:
     """The same small motion before and after a write; the link must have been enabled."""
 
-    def __init__(self, link: Link, arm: ArmFile, record: CalibrationRecord, beta: Array | None) -> None:
+    def __init__(self, link: ArmDriver, arm: ArmFile, record: CalibrationRecord, beta: Array | None) -> None:
         """The motion is around the arm's present pose; `beta` (2n,) [kg·m] is None if no gravity model is known."""
         self._link, self._arm, self._record, self._beta = link, arm, record, beta
         self._limits, self._names = Limits.of(arm), arm.joint_names

@@ -6,6 +6,8 @@ from typing import Any
 import can
 
 from armlink.arm_file import load_arm
+from armlink.bus.in_process import InProcessBus
+from armlink.bus.port import Frame
 from armlink.errors import BusFault
 from sim_bus.bus.fault_injector import BUS_OFF, ERROR_FLAG, HOST_REFUSES, Injector
 from sim_bus.bus.fault_kinds import Fault, parse_fault
@@ -34,7 +36,7 @@ class SimulatedClock:
                 self._bus.line.advance(instant - self._arm.time)
 
 
-class LockStepBus(can.BusABC):  # type: ignore[misc]
+class LockStepBus(can.BusABC, InProcessBus):  # type: ignore[misc]
     """One endpoint of a CAN bus whose other end is the arm. As a python-can interface: `armlink_sim:ARM`.
 
     `recv` pops what the nodes sent; where there is nothing and `timeout` is positive, simulated time passes instead,
@@ -63,7 +65,7 @@ class LockStepBus(can.BusABC):  # type: ignore[misc]
         """Error frames so far."""
         self._injector: Injector | None = None
         self._lock = RLock()
-        self.clock = SimulatedClock(self, self._lock)
+        self.clock: SimulatedClock = SimulatedClock(self, self._lock)
         self.channel_info = f"simulated arm {arm.arm.name}"
         bitrate = options.pop("bitrate", arm.arm.require_link().bus.bitrate)
         if options.pop("timing", False):
@@ -112,7 +114,7 @@ class LockStepBus(can.BusABC):  # type: ignore[misc]
             if can_id == SYNC_ID:
                 line.advance(self.arm.period)
 
-    def take(self, timeout: float = 0.0) -> tuple[int, bytes] | None:
+    def take(self, timeout: float = 0.0) -> Frame | None:
         """As recv, without a message object; error frames are counted. Raises BusFault where one says bus-off."""
         while True:
             frame = self._next(timeout)

@@ -5,10 +5,9 @@ import time
 from collections.abc import Callable, Sequence
 from types import FrameType
 
-import can
-
-from armlink.bus.open import BusGroup
-from armlink.bus.port import Frame, GroupPort, InterfaceDown, Port, open_port
+from armlink.bus.bus_group import BusGroup, GroupPort
+from armlink.bus.can_bus import CanBus
+from armlink.bus.port import Frame, InterfaceDown, Port
 from armlink.canopen.object_dictionary import NMT_ID
 from armlink.errors import BusFault
 from sim_bus.bus.control_pipe import ControlPipe
@@ -37,7 +36,7 @@ class Server:
     def __init__(
         self,
         arm: SimulatedArm,
-        bus: can.BusABC | BusGroup,
+        bus: CanBus,
         drifts: Sequence[Drift] = (),
         lockstep: bool = False,
         now: Callable[[], float] = time.monotonic,
@@ -45,8 +44,8 @@ class Server:
         control: ControlPipe | None = None,
     ) -> None:
         """`now` is the clock that the physics follows unless `lockstep`; `control` gives orders while it runs."""
-        self._arm, self._bus, self._lockstep, self._now = arm, bus, lockstep, now
-        self._port = open_port(bus, as_node=True)
+        self._arm, self._lockstep, self._now = arm, lockstep, now
+        self._port = bus.open_port(as_node=True)
         ports = self._port.members if isinstance(self._port, GroupPort) else (self._port,)
         *self._others, self._leading = ports
         """Of several buses the last gives SYNC: a host fills them in their order."""

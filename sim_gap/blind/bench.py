@@ -85,7 +85,7 @@ def tasks(out: Path) -> list[tuple[str, str]]:
 
 def diagnose_files(sim: Path, train: Sequence[Path], heldout: Sequence[Path], exclude: Sequence[str]) -> dict[str, Any]:
     """The diagnosis of this package on files, with the effects `exclude` removed from its library."""
-    from armlink.recording.recording import load_recording
+    from armlink.recording.files import load_recording
     from sim_gap.attribution.diagnose import diagnose
 
     answer = diagnose(

@@ -35,7 +35,7 @@ def diagnose(
 
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
-    from armlink.recording.recording import load_recording
+    from armlink.recording.files import load_recording
     from sim_gap.attribution import diagnose as diagnosis
 
     console = Console(stderr=True)

@@ -12,7 +12,8 @@ from rich.console import Console
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import BadInput
-from armlink.recording.recording import Recording, save_recording
+from armlink.recording.files import save_recording
+from armlink.recording.recording import Recording
 from calib.arm.kinematics import gcomp_arm
 from calib.fit.gravity_fit import identify_gravity
 from calib.fit.sensor_fit import fit_sensors

@@ -5,16 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.effects.effect import (
-    Beneath,
-    Effect,
-    Key,
-    Plausibility,
-    SearchHints,
-    Shape,
-    Signature,
-    positive,
-)
+from sim_gap.effects.effect import Beneath, Effect, Key, Plausibility, SearchHints, Shape, Signature, positive
 from sim_gap.model.rigid_body import CREEP
 from sim_gap.residuals.layout import Columns, Layout
 from sim_gap.residuals.preprocess import Signals

@@ -58,7 +58,7 @@ def _recordings(path: Path) -> list[Path]:
 
 def diagnose_case(case: Case) -> dict[str, Any]:
     """The JSON result of one case, or `{"error": line}` if it cannot be diagnosed."""
-    from armlink.recording.recording import load_recording
+    from armlink.recording.files import load_recording
     from sim_gap.attribution.diagnose import diagnose
 
     paths = [*case.train, *case.heldout]

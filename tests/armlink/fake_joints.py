@@ -6,6 +6,7 @@ from collections import deque
 from pathlib import Path
 
 from armlink.arm_file import parse_arm
+from armlink.bus.in_process import InProcessBus
 from armlink.canopen import object_dictionary as objects
 
 SWITCH_ON_DISABLED, READY, SWITCHED_ON, ENABLED, QUICK_STOP, FAULT = 0x40, 0x21, 0x23, 0x27, 0x07, 0x08
@@ -111,8 +112,8 @@ class FakeNode:
         return self.status != before
 
 
-class FakeBus:
-    """Duck-typed lock-step bus: `put`, `take`, `clock`."""
+class FakeBus(InProcessBus):
+    """Lock-step bus."""
 
     channel_info = "fake"
 

@@ -3,8 +3,10 @@
 import struct
 from collections import deque
 
+from armlink.bus.in_process import InProcessBus
 
-class Tap:
+
+class Tap(InProcessBus):
     """Frames that a host and its joints exchange, each at its time; anything sent is a failure."""
 
     channel_info = "tap"

@@ -14,7 +14,8 @@ import numpy as np
 from fast_arm import FastArm
 
 from armlink.arm_file import load_arm
-from armlink.recording.recording import Recording, load_recording, save_recording
+from armlink.recording.files import load_recording, save_recording
+from armlink.recording.recording import Recording
 from calib.observer.observer import Observer
 
 FOLDER = Path(__file__).parent / "replays"

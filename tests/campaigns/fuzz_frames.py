@@ -15,7 +15,6 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 sys.path.insert(0, str(Path(__file__).parents[1] / "armlink"))
-from armlink.bus.port import open_port
 from armlink.errors import ArmlinkError
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.link import Link
@@ -60,7 +59,7 @@ def mutated_frame(rng: random.Random) -> tuple[int, bytes]:
 def fuzz_decoder(rng: random.Random, frames: int) -> int:
     """Random frames into the loop alone; frames taken in."""
     bus = Observed(range(1, N + 1))
-    loop = Loop(open_port(bus), bus.clock, tuple(bus.nodes), 127, bus.period, True)
+    loop = Loop(bus.open_port(), bus.clock, tuple(bus.nodes), 127, bus.period, True)
     done = 0
     while done < frames:
         bus.out.extend(random_frame(rng) for _ in range(BATCH))

@@ -12,8 +12,9 @@ import pytest
 from pydantic import TypeAdapter
 
 from armlink.arm_file import ArmFile
+from armlink.recording.files import SUFFIXES
 from armlink.recording.mcap import TOPICS
-from armlink.recording.recording import COLUMNS, SUFFIXES, Recording
+from armlink.recording.recording import COLUMNS, Recording
 from calib.motion.static_reading import StaticReading
 from calib.records.records import CalibrationRecord, GravityRecord, Record
 from calib.sweep.dataset import Manifest, PlanLine, StallLine

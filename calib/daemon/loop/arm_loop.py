@@ -207,7 +207,7 @@ class ArmLoop:
 
     def _keep_pace(self, link: Link) -> None:
         """Run an in-process simulated arm in real time: wait for the machine's clock."""
-        if not self.options.pace or getattr(link.bus, "clock", None) is None:
+        if not self.options.pace or link.bus.clock is None:
             return
         now, real = link.clock.now(), time.monotonic()
         if self._real_start is None or real - self._real_start[1] - (now - self._real_start[0]) > 1.0:

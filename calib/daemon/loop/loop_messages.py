@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armlink.arm_file import ArmFile
+from armlink.bus.can_bus import CanBus
 from armlink.link.types import Sample, Stats
 from gcomp.arrays import Array
 
@@ -25,7 +26,7 @@ class LoopOptions:
     pace: bool = True
     """In-process simulated arm: run in real time; without, simulated time passes as fast as it can."""
     seed: int = 0
-    open_bus: Callable[[], Any] | None = field(default=None, repr=False)
+    open_bus: Callable[[], CanBus] | None = field(default=None, repr=False)
     """Returns the bus, in tests; by default it is opened by name."""
 
 

@@ -9,11 +9,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from armlink.bus.frame_log import FrameLog, LogReader, TappedBus
+from armlink.bus.frame_log import FrameLog, LogReader
+from armlink.bus.in_process import InProcessBus
+from armlink.bus.taps import TappedBus
 from armlink.cli import run
 from armlink.errors import BadInput
+from armlink.recording.files import load_recording
 from armlink.recording.recorder import Recorder
-from armlink.recording.recording import load_recording
 from armlink.recording.replay import frames_of_log, frames_of_recording, play_onto, recording_of_log
 
 SUFFIXES = (".asc", ".blf", ".log")
@@ -130,7 +132,7 @@ def test_only_what_joints_send_is_played_onto_a_bus_and_only_a_virtual_one(arm_o
 
 
 def test_a_recording_goes_onto_a_bus_as_the_frames_that_joints_would_have_sent(arm_of, tmp_path):
-    class Played:
+    class Played(InProcessBus):
         channel_info, time = "played", 0.0
 
         def __init__(self, frames):
@@ -138,6 +140,11 @@ def test_a_recording_goes_onto_a_bus_as_the_frames_that_joints_would_have_sent(a
 
         def now(self):
             return self.time
+
+        stamp = now
+
+        def shutdown(self):
+            pass
 
         def take(self, timeout=0.0):
             self.time, can_id, data = self.frames.pop(0)

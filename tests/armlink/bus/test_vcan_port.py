@@ -7,7 +7,6 @@ import pytest
 
 from armlink.arm_file import Bus
 from armlink.bus.open import open_bus, open_link_bus
-from armlink.bus.port import open_port
 
 pytestmark = pytest.mark.vcan
 
@@ -23,7 +22,7 @@ def _a_vcan0():
 
 def test_a_slow_reader_knows_how_many_frames_it_lost():
     with open_bus(None, VCAN0) as sender, open_bus(None, VCAN0) as reader:
-        sending, reading = open_port(sender), open_port(reader)
+        sending, reading = sender.open_port(), reader.open_port()
         sent = 0
         while sent < 400 * len(CYCLE):
             sending.send_all(CYCLE)
@@ -48,7 +47,7 @@ def test_two_buses_one_of_them_can_fd_are_one(arm_of):
         can.Bus(interface="socketcan", channel="vcan0") as base,
         can.Bus(interface="socketcan", channel="vcan1", fd=True) as hand,
     ):
-        port = open_port(group)
+        port = group.open_port()
         port.send_all([(0x201, b"one"), (0x202, b"two"), (0x80, b"")])
         heard = {bus: [bus.recv(1.0), bus.recv(1.0)] for bus in (base, hand)}
         assert [m.arbitration_id for m in heard[base]] == [0x201, 0x80]

@@ -11,7 +11,6 @@ from fake_joints import FakeBus
 
 from armlink.arm_file import Bus
 from armlink.bus.open import open_bus, open_link_bus
-from armlink.bus.port import open_port
 from armlink.link.listener import Listener
 from armlink.link.types import Calibration
 
@@ -36,7 +35,7 @@ def taken(listener):
 
 def test_cycles_that_waited_together_are_apart_as_they_were_sent(arm_of):
     with open_bus(None, VCAN0) as other, Listener(arm_of(2), open_bus(None, VCAN0)) as listener:
-        controller, syncs = open_port(other), []
+        controller, syncs = other.open_port(), []
         for cycle in range(30):
             began = time.monotonic()
             controller.send(0x80, b"")
@@ -64,7 +63,7 @@ def test_two_buses_are_taken_in_the_order_of_their_frames(arm_of):
     arm = arm.model_copy(update={"link": section})
     group = open_link_bus(None, section)
     with Listener(arm, open_link_bus(None, section)) as listener:
-        controller = open_port(group)
+        controller = group.open_port()
         for cycle in range(30):
             controller.send(0x80, b"")  # on each bus
             for node in (1, 2):
@@ -81,7 +80,7 @@ def test_a_calibration_is_read_and_written_between_the_cycles(arm_of):
 
     def serve():
         with open_bus(None, VCAN0) as bus:
-            port = open_port(bus)
+            port = bus.open_port()
             while not done.is_set():
                 frame = port.receive(0.05)
                 if frame is not None:
@@ -92,7 +91,7 @@ def test_a_calibration_is_read_and_written_between_the_cycles(arm_of):
     thread = threading.Thread(target=serve)
     thread.start()
     with open_bus(None, VCAN0) as other, Listener(arm_of(2), open_bus(None, VCAN0)) as listener:
-        controller = open_port(other)
+        controller = other.open_port()
         for cycle in range(10):
             controller.send(0x80, b"")
             controller.send(0x181, READING.pack(0, 1_000_000 * cycle))

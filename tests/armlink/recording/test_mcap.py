@@ -7,8 +7,9 @@ from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer as RosWriter
 
 from armlink.errors import BadInput
+from armlink.recording.files import load_recording, save_recording
 from armlink.recording.mcap import RecordingWriter
-from armlink.recording.recording import Recording, load_recording, save_recording
+from armlink.recording.recording import Recording
 from armlink.recording.ros_joint_state import (
     SCHEMA,
     SCHEMA_NAME,

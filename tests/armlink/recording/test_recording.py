@@ -9,7 +9,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from armlink.errors import BadInput
-from armlink.recording.recording import Recording, load_recording, save_recording, slice_rows
+from armlink.recording.files import load_recording, save_recording
+from armlink.recording.recording import Recording, slice_rows
 
 
 @pytest.fixture

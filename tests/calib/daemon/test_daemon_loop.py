@@ -10,6 +10,7 @@ from daemon_bench import DaemonBench
 from fast_daemon import QUIET
 
 from armlink.arm_file import load_arm
+from armlink.bus.in_process import InProcessBus
 from armlink.bus.open import open_link_bus
 from armlink.errors import BadInput, BusFault
 from armlink.link.link import Link
@@ -86,7 +87,7 @@ class Recorded(LockStepBus):
         return frame
 
 
-class Tap:
+class Tap(InProcessBus):
     """Another place on that bus, later: hears every frame at its time; sending is a failure."""
 
     channel_info = "tap"

@@ -16,7 +16,7 @@ from fast_daemon import QUIET, FastDaemon
 
 from armlink.arm_file import load_arm
 from armlink.errors import BadInput
-from armlink.recording.recording import load_recording
+from armlink.recording.files import load_recording
 from calib.daemon.logs import JsonFormatter
 from calib.daemon.loop.loop_messages import Down, Up
 from calib.daemon.notify import Notifier, watchdog_seconds

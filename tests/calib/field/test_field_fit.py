@@ -12,7 +12,8 @@ from paper_arm import BETA
 from armlink.arm_file import ArmFile, load_arm
 from armlink.cli import run
 from armlink.errors import BadInput, Refused
-from armlink.recording.recording import Recording, save_recording
+from armlink.recording.files import save_recording
+from armlink.recording.recording import Recording
 from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, per_joint
 from calib.arm.kinematics import gcomp_arm
 from calib.field.field_fit import fit_field

@@ -8,7 +8,9 @@ import pytest
 import yaml
 
 from armlink.arm_file import load_arm
-from armlink.bus.open import BusGroup, open_link_bus
+from armlink.bus.bus_group import BusGroup
+from armlink.bus.in_process import InProcessBus
+from armlink.bus.open import open_link_bus
 from armlink.cli import run
 from armlink.link.link import Link
 from armlink.link.types import Command
@@ -67,20 +69,24 @@ def served(path):
     group.shutdown()
 
 
-class Pumped:
+class Pumped(InProcessBus):
     """A bus on which the simulated arm gets its turn whenever the host finds nothing there; no thread, no waiting."""
 
-    channel_info = "pumped"
-
     def __init__(self, bus, turn):
-        self.bus, self.turn, self.send, self.shutdown = bus, turn, bus.send, bus.shutdown
+        self.bus, self.port, self.turn = bus, bus.open_port(), turn
 
-    def recv(self, timeout=None):
-        message = self.bus.recv(0)
-        if message is None:
+    def put(self, can_id, data):
+        self.port.send(can_id, data)
+
+    def take(self, timeout=0.0):
+        frame = self.port.receive(0.0)
+        if frame is None:
             self.turn()
-            message = self.bus.recv(0)
-        return message
+            frame = self.port.receive(0.0)
+        return frame
+
+    def shutdown(self):
+        self.bus.shutdown()
 
 
 class ArmTime:

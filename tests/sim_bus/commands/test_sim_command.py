@@ -12,6 +12,7 @@ import can
 import pytest
 from rig import one_joint
 
+from armlink.bus.adapters import as_bus
 from armlink.cli import run
 from armlink.errors import BadInput
 from sim_bus.bus.control_pipe import ControlPipe
@@ -67,7 +68,7 @@ def test_physics_follows_the_clock_and_a_drift_comes_at_its_time(ends: tuple[can
     arm_end, host_end = ends
     described, hand = one_joint(), Hand()
     arm = SimulatedArm(described, Truth.of(described))
-    server = Server(arm, arm_end, [Drift("hinge", 1.5, 0.0, 0.15)], now=hand.now)
+    server = Server(arm, as_bus(arm_end), [Drift("hinge", 1.5, 0.0, 0.15)], now=hand.now)
     hand.time = 0.1
     server.turn()
     assert receive(host_end) == [(0x705, b"\0")]
@@ -85,7 +86,7 @@ def test_in_lock_step_a_sync_is_a_period(ends: tuple[can.BusABC, can.BusABC]) ->
     arm_end, host_end = ends
     described, hand = one_joint(), Hand()
     arm = SimulatedArm(described, Truth.of(described))
-    server = Server(arm, arm_end, lockstep=True, now=hand.now)
+    server = Server(arm, as_bus(arm_end), lockstep=True, now=hand.now)
     for can_id, data in ((0, b"\1\0"), (0x80, b""), (0x80, b"")):
         host_end.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
         hand.time += 0.05
@@ -120,7 +121,7 @@ def test_in_lock_step_a_host_that_died_is_noticed(ends: tuple[can.BusABC, can.Bu
     arm_end, host_end = ends
     described, hand = one_joint(), Hand()
     arm = SimulatedArm(described, Truth.of(described))
-    server = Server(arm, arm_end, lockstep=True, now=hand.now)
+    server = Server(arm, as_bus(arm_end), lockstep=True, now=hand.now)
 
     def send(can_id: int, data: bytes) -> None:
         host_end.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
@@ -148,7 +149,7 @@ def test_orders_through_a_pipe_change_the_running_arm(ends: tuple[can.BusABC, ca
     described, hand, wrong = one_joint(), Hand(), []
     arm = SimulatedArm(described, Truth.of(described))
     pipe = ControlPipe(tmp_path / "arm.pipe")
-    server = Server(arm, ends[0], now=hand.now, control=pipe)
+    server = Server(arm, as_bus(ends[0]), now=hand.now, control=pipe)
     server.on_wrong = wrong.append
 
     def order(*lines: str) -> None:

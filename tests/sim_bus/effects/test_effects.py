@@ -37,7 +37,7 @@ def torque_reading(rig: Rig) -> float:
     return float(rig.reading_torque[0] * 1e-6)
 
 
-def test_the_ids_are_those_of_the_contract() -> None:
+def test_the_ids_are_of_the_known_families() -> None:
     families = {effect.split(".")[0] for effect in effects()}
     assert families == {"actuator", "base", "friction", "link", "position", "timing", "torque", "transmission"}
     assert all(parameter.unit for effect in effects().values() for parameter in effect.parameters)

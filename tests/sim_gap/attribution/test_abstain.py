@@ -19,7 +19,7 @@ from sim_gap.residuals.residual_set import ResidualSet
 Odd = Callable[[Recording], Recording]
 
 
-def told(odd: Odd, wrong: Wrong | None = None) -> Diagnosis:
+def diagnosed(odd: Odd, wrong: Wrong | None = None) -> Diagnosis:
     recordings = [odd(record(model(), wrong or Wrong(), seed=seed, seconds=40, rate=50.0)) for seed in (1, 2)]
     return diagnose(model(), recordings[:1], recordings[1:])
 
@@ -49,7 +49,7 @@ def machine_beside(t: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("force", [knock, leaning, machine_beside])
 def test_a_force_from_outside_is_blamed_on_nothing(force):
-    answer = told(pushed(force))
+    answer = diagnosed(pushed(force))
     assert answer.verdict == "unexplained"
     assert not [cause for cause in answer.causes if cause.confidence > 0.5]
     assert any(note.startswith("joint_2: ") and "remain (noise" in note for note in answer.notes)
@@ -57,14 +57,14 @@ def test_a_force_from_outside_is_blamed_on_nothing(force):
 
 def test_a_hum_below_the_pass_band_is_blamed_on_nothing():
     hum = lambda r: replace(r, torque=r.torque + np.sin(2 * np.pi * 2.1 * r.t)[:, None] * [0, 1, 0])  # noqa: E731
-    answer = told(hum)
+    answer = diagnosed(hum)
     assert answer.verdict == "unexplained"
     assert not answer.causes
 
 
 def test_mains_hum_above_the_pass_band_is_no_gap():
     hum = lambda r: replace(r, torque=r.torque + np.sin(2 * np.pi * 18.7 * r.t)[:, None] * [0, 1, 0])  # noqa: E731
-    assert told(hum).verdict == "no_gap"
+    assert diagnosed(hum).verdict == "no_gap"
 
 
 def stuck(recording: Recording) -> Recording:
@@ -81,7 +81,7 @@ def dead(recording: Recording) -> Recording:
 
 @pytest.mark.parametrize("odd", [stuck, dead])
 def test_a_stuck_sensor_is_named_and_blames_no_effect(odd):
-    answer = told(odd)
+    answer = diagnosed(odd)
     assert answer.verdict == "unexplained"
     assert not answer.causes
     assert "joint_2: tau repeats one value" in answer.notes[0]
@@ -89,7 +89,7 @@ def test_a_stuck_sensor_is_named_and_blames_no_effect(odd):
 
 @pytest.mark.parametrize(("held", "channels"), [(True, ["tau"]), (False, ["tau", "tau_motor"])])
 def test_the_motor_of_a_joint_that_is_held_may_repeat_one_number_its_sensor_may_not(held, channels):
-    """While other joints move, what a held joint carries changes; friction takes it up, and the motor need not."""
+    """While other joints move, the load of a held joint changes; friction takes it up instead of the motor."""
     moving = record(model(), Wrong(), seed=1, seconds=40, rate=50.0)
     position, torque, motor = (x.copy() for x in (moving.position, moving.torque, moving.motor_torque))
     if held:
@@ -101,7 +101,7 @@ def test_the_motor_of_a_joint_that_is_held_may_repeat_one_number_its_sensor_may_
 
 
 def test_beside_a_stuck_sensor_other_joints_are_still_read():
-    answer = told(dead, Wrong(coulomb=np.array([0.8, 0.0, 0.0])))
+    answer = diagnosed(dead, Wrong(coulomb=np.array([0.8, 0.0, 0.0])))
     assert answer.causes[0].effect == "friction.coulomb"
     assert answer.causes[0].joints == ("joint_1",)
     assert answer.causes[0].confidence <= 0.5
@@ -112,7 +112,7 @@ def test_friction_that_the_library_has_not_is_no_viscous_friction_for_sure():
         v = np.gradient(recording.position, recording.t, axis=0)
         return replace(recording, motor_torque=recording.motor_torque + np.abs(v) * v * [0, 6, 0])
 
-    assert not [cause for cause in told(drag).causes if cause.confidence > 0.8]
+    assert not [cause for cause in diagnosed(drag).causes if cause.confidence > 0.8]
 
 
 def test_a_gear_that_hits_is_seen_where_its_torque_changes_sign():

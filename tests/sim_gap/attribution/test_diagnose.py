@@ -1,4 +1,4 @@
-"""The diagnosis on arms that are wrong in a known way: right effect, joint, parameter; and none where there is none."""
+"""The diagnosis of arms with known imperfections: correct effect, joint and parameter; no cause for a sound arm."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ def at(joint: int, value: float, other: float = 0.0) -> np.ndarray:
     return np.array([value if j == joint else other for j in range(3)])
 
 
-def told(wrong: Wrong, channels=BOTH, **options) -> Diagnosis:
+def diagnosed(wrong: Wrong, channels=BOTH, **options) -> Diagnosis:
     train = record(model(), wrong, seed=1, seconds=40, channels=channels)
     return diagnose(model(), [train], [record(model(), wrong, seed=2, seconds=25, channels=channels)], **options)
 
@@ -47,7 +47,7 @@ SINGLE = [
 
 @pytest.mark.parametrize(("effect", "place", "name", "truth", "wrong", "channels"), SINGLE)
 def test_one_effect_is_named_first_with_its_joint_and_size(effect, place, name, truth, wrong, channels):
-    answer = told(wrong, channels)
+    answer = diagnosed(wrong, channels)
     assert answer.verdict == "explained"
     assert answer.causes[0].effect == effect
     assert place in (*answer.causes[0].joints, "arm")
@@ -57,19 +57,19 @@ def test_one_effect_is_named_first_with_its_joint_and_size(effect, place, name, 
 
 
 def test_the_same_effect_on_several_joints_is_one_cause():
-    answer = told(Wrong(coulomb=np.array([0.5, 0.6, 0.7])))
+    answer = diagnosed(Wrong(coulomb=np.array([0.5, 0.6, 0.7])))
     assert [cause.effect for cause in answer.causes] == ["friction.coulomb"]
     assert answer.causes[0].joints == ("joint_1", "joint_2", "joint_3")
 
 
 def test_two_effects_on_different_sides_are_both_found():
-    answer = told(Wrong(coulomb=at(1, 0.8), gain=at(0, 1.08, 1.0)))
+    answer = diagnosed(Wrong(coulomb=at(1, 0.8), gain=at(0, 1.08, 1.0)))
     assert {cause.effect for cause in answer.causes if cause.confidence > 0.8} == {"friction.coulomb", "torque.gain"}
 
 
 def test_ripple_of_many_teeth_is_found_where_the_joint_turns_slowly_enough():
     """A harmonic drive of ratio 100: two waves a turn of the motor, 32 a radian of the joint."""
-    answer = told(Wrong(ripple=at(1, 0.6), cycles=100 / np.pi))
+    answer = diagnosed(Wrong(ripple=at(1, 0.6), cycles=100 / np.pi))
     assert answer.causes[0].effect == "transmission.ripple"
     assert value(answer, "joint_2", "cycles") == pytest.approx(100 / np.pi, rel=0.01)
     assert value(answer, "joint_2", "amplitude") == pytest.approx(0.6, rel=0.1)
@@ -77,12 +77,12 @@ def test_ripple_of_many_teeth_is_found_where_the_joint_turns_slowly_enough():
 
 @pytest.mark.parametrize("channels", [BOTH, MOTOR])
 def test_a_true_model_has_no_gap(channels):
-    answer = told(Wrong(), channels)
+    answer = diagnosed(Wrong(), channels)
     assert (answer.verdict, answer.causes) == ("no_gap", ())
 
 
 def test_an_effect_that_was_withheld_is_not_blamed_on_another_with_confidence():
-    answer = told(Wrong(ripple=at(1, 0.6)), withhold=["transmission.ripple"])
+    answer = diagnosed(Wrong(ripple=at(1, 0.6)), withhold=["transmission.ripple"])
     assert answer.verdict == "unexplained" or not [c for c in answer.causes if c.confidence > 0.8]
 
 
@@ -115,8 +115,8 @@ def test_without_other_motion_the_end_of_the_recording_is_kept_for_judging():
     assert "last 30%" in answer.heldout_is
 
 
-def test_the_json_has_the_contracts_keys():
-    answer = told(Wrong(coulomb=at(1, 0.8))).to_json()
+def test_the_json_has_the_documented_keys():
+    answer = diagnosed(Wrong(coulomb=at(1, 0.8))).to_json()
     assert answer["schema"] == "armlink.gap/1"
     assert set(answer) >= {"verdict", "where", "causes", "gap", "rollout", "unexplained"}
     assert set(answer["where"][0]) == {"joint", "channel", "regime", "rms", "noise", "share"}

@@ -18,7 +18,7 @@ TRIALS = 60
 
 
 def test_coverage(monkeypatch):
-    """Of the part that is noise; what an arm that is a little wrong adds is left out here."""
+    """Coverage of the statistical part alone, without systematic errors of the arm."""
     for name in ("SYSTEMATIC", "NOMINAL"):
         monkeypatch.setattr(f"sim_gap.search.estimate.{name}", 0.0)
     for effect in ("friction.coulomb", "friction.viscous"):

@@ -1,4 +1,4 @@
-"""General laws replace causes that cannot be told from them in this motion: the library may lack the true effect."""
+"""General laws replace causes that look the same in this motion, for the library may lack the true effect."""
 
 import numpy as np
 import pytest

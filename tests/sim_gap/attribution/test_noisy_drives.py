@@ -1,4 +1,4 @@
-"""Drives that fall short where sensors are noisy: told from what is quietest; noise alone is still no gap."""
+"""Drive errors with noisy sensors: the quietest reference is used, and noise alone is not a gap."""
 
 from dataclasses import replace
 
@@ -36,7 +36,7 @@ def commanded(seed: int, lag: float = 0.0, noise: tuple[float, float] = (0.0, 0.
     )
 
 
-def told(**wrong) -> Diagnosis:
+def diagnosed(**wrong) -> Diagnosis:
     return diagnose(model(), [commanded(1, **wrong)], [commanded(2, **wrong)])
 
 
@@ -46,7 +46,7 @@ def residuals(recording: Recording) -> ResidualSet:
 
 
 def test_a_lag_far_below_the_noise_of_sensor_and_estimate_is_told_from_the_command_against_the_model():
-    answer = told(lag=0.06, noise=(9.0, 5.0))
+    answer = diagnosed(lag=0.06, noise=(9.0, 5.0))
     first = answer.causes[0]
     assert "actuator.lag" in {first.effect, *first.confounded_with}
     assert first.joints == ("joint_2",)
@@ -55,14 +55,14 @@ def test_a_lag_far_below_the_noise_of_sensor_and_estimate_is_told_from_the_comma
 
 
 def test_a_lag_within_the_margin_of_its_channel_is_told_where_it_shows_throughout():
-    answer = told(lag=0.03, noise=(0.0, 0.4))
+    answer = diagnosed(lag=0.03, noise=(0.0, 0.4))
     first = answer.causes[0]
     assert "actuator.lag" in {first.effect, *first.confounded_with}
 
 
 def test_the_same_noise_without_a_lag_is_no_gap():
-    assert told(noise=(9.0, 5.0)).verdict == "no_gap"
-    assert told(noise=(0.0, 0.4)).verdict == "no_gap"
+    assert diagnosed(noise=(9.0, 5.0)).verdict == "no_gap"
+    assert diagnosed(noise=(0.0, 0.4)).verdict == "no_gap"
 
 
 def test_noise_that_command_and_estimate_have_in_common_is_no_noise_of_their_difference():
@@ -81,7 +81,7 @@ def test_the_command_is_compared_with_the_motors_estimate_unless_another_is_much
 
 
 def test_residuals_and_columns_of_a_command_are_compared_alike():
-    """Friction shows in motor less sensor; in the command's row where that is compared beyond the motor."""
+    """Friction shows in motor less sensor, and in the command's row if that passes over the motor."""
     quiet, noisy = (ColumnStore(residuals(commanded(1, **options))) for options in ({}, {"noise": (9.0, 5.0)}))
     friction = Term("friction.coulomb", 1)
     assert ("tau_cmd", 1) not in quiet.columns(friction)
@@ -98,7 +98,7 @@ def test_a_noisy_reading_does_not_explain_itself_as_what_bends_a_gear():
 
 
 def test_a_limit_reached_in_one_stretch_of_the_training_alone_is_told():
-    """Left out of the fit, that stretch is still foretold: above its limit a drive makes nothing, which is known."""
+    """Without that interval in the fit it is still predicted: above its limit a drive adds no torque."""
     train, heldout = commanded(7), commanded(1)
     high = np.abs(train.motor_torque[:, 1])
     near = np.abs(train.t - train.t[np.argmax(high)]) < 2.0

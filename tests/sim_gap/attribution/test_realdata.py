@@ -1,9 +1,10 @@
-"""Real arms: the gap closes on motion that was not fitted, for the reasons that are known."""
+"""Real arms: the gap closes on held-out data, by the known causes."""
 
 import numpy as np
 import pytest
 
-from armlink.recording.recording import load_recording, slice_rows
+from armlink.recording.files import load_recording
+from armlink.recording.recording import slice_rows
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.diagnosis import Diagnosis
 

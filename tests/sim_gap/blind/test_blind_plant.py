@@ -1,4 +1,4 @@
-"""The blind check's plant: it moves as the true mechanics say; an effect shows in the channels where it belongs."""
+"""The blind check's plant: it moves by the true mechanics, and an effect shows in the right channels."""
 
 import json
 from pathlib import Path
@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from armlink.recording.recording import load_recording
+from armlink.recording.files import load_recording
 from sim_gap.blind.cases.arms import Arm, draw_arm
 from sim_gap.blind.cases.make import make_cases
 from sim_gap.blind.cases.motion import KINDS, RATE, Limits, derivatives, trajectory
@@ -22,7 +22,7 @@ from sim_gap.blind.plant.plant import simulate
 from sim_gap.blind.plant.runs import Log, Run
 from sim_gap.blind.plant.sensors import _stays_behind, record
 
-CONTRACT = {
+ALL = {
     "link.mass_moment",
     "link.inertia",
     "link.payload",
@@ -157,7 +157,7 @@ def test_trajectories_keep_their_limits_and_rest_at_both_ends(kind: str) -> None
 
 
 def test_point_to_point_motion_always_comes_back() -> None:
-    """Else the command would jump where the next kind of motion begins, and every drive be rated for that jump."""
+    """Otherwise the command would jump at the start of the next kind of motion, and drives be rated for that jump."""
     bounds = limits(4)
     for seed in range(60):
         q = trajectory(("points", "sweeps"), 30.0, bounds, np.random.default_rng(seed))
@@ -212,8 +212,8 @@ def test_hysteresis_stays_behind_by_its_width() -> None:
     np.testing.assert_allclose(late[middle & ~rising], -0.5, atol=0.02)
 
 
-def test_every_effect_of_the_contract_is_drawn() -> None:
-    assert set(EFFECTS) == set(DRAWS) == CONTRACT
+def test_every_effect_is_drawn() -> None:
+    assert set(EFFECTS) == set(DRAWS) == ALL
 
 
 SHOWN = (

@@ -62,22 +62,24 @@ def answer(*causes: dict[str, Any], verdict: str = "explained", after: float = 0
 
 
 def test_right_cause_first() -> None:
-    told = judge(answer(cause("friction.coulomb")), label(truth("friction.coulomb")))
-    assert told.first_right
-    assert told.named
-    assert not told.blamed
-    assert (told.joints_right, told.joints_wrong, told.joints_missed) == (1, 0, 0)
-    assert [e.relative for e in told.errors] == [0.0]
-    assert told.errors[0].inside
-    assert told.shrink == pytest.approx(0.9)
-    assert told.shrink_true == pytest.approx(0.9)
+    judged = judge(answer(cause("friction.coulomb")), label(truth("friction.coulomb")))
+    assert judged.first_right
+    assert judged.named
+    assert not judged.blamed
+    assert (judged.joints_right, judged.joints_wrong, judged.joints_missed) == (1, 0, 0)
+    assert [e.relative for e in judged.errors] == [0.0]
+    assert judged.errors[0].inside
+    assert judged.shrink == pytest.approx(0.9)
+    assert judged.shrink_true == pytest.approx(0.9)
 
 
 def test_true_cause_as_rival_is_named_but_not_first() -> None:
-    told = judge(answer(cause("friction.viscous", 0.6, rivals=("friction.coulomb",))), label(truth("friction.coulomb")))
-    assert told.named
-    assert not told.first_right
-    assert not told.blamed
+    judged = judge(
+        answer(cause("friction.viscous", 0.6, rivals=("friction.coulomb",))), label(truth("friction.coulomb"))
+    )
+    assert judged.named
+    assert not judged.first_right
+    assert not judged.blamed
 
 
 def test_extra_cause_is_blamed_only_when_confident_and_large() -> None:
@@ -92,25 +94,25 @@ def test_extra_cause_is_blamed_only_when_confident_and_large() -> None:
 
 def test_implied_effect_may_stand_first() -> None:
     case = label({**truth("friction.stribeck", breakaway=1.0, velocity=0.1), "implied": ["friction.coulomb"]})
-    told = judge(
+    judged = judge(
         answer(cause("friction.coulomb"), cause("friction.stribeck", joint_2={"breakaway": 1.1, "velocity": 0.1})), case
     )
-    assert told.first_right
-    assert not told.blamed
-    assert [e.relative for e in told.errors] == pytest.approx([0.1, 0.0])
+    assert judged.first_right
+    assert not judged.blamed
+    assert [e.relative for e in judged.errors] == pytest.approx([0.1, 0.0])
 
 
 def test_joint_that_is_small_beside_the_largest_does_not_count() -> None:
     two = cause("friction.coulomb", joint_1={"torque": 0.02}, joint_2={"torque": 1.9})
     assert judge(answer(two), label(truth("friction.coulomb"))).joints_wrong == 0
     two = cause("friction.coulomb", joint_1={"torque": 1.0}, joint_2={"torque": 1.9})
-    told = judge(answer(two), label(truth("friction.coulomb")))
-    assert (told.joints_right, told.joints_wrong, told.joints_missed) == (1, 1, 0)
+    judged = judge(answer(two), label(truth("friction.coulomb")))
+    assert (judged.joints_right, judged.joints_wrong, judged.joints_missed) == (1, 1, 0)
 
 
 def test_gain_errs_by_its_distance_from_one() -> None:
-    told = judge(answer(cause("torque.gain", joint_2={"gain": 1.09})), label(truth("torque.gain", gain=1.10)))
-    assert [e.relative for e in told.errors] == pytest.approx([0.1])
+    judged = judge(answer(cause("torque.gain", joint_2={"gain": 1.09})), label(truth("torque.gain", gain=1.10)))
+    assert [e.relative for e in judged.errors] == pytest.approx([0.1])
 
 
 def test_joints_of_an_effect_that_is_not_found_are_missed_and_of_one_named_as_rival_are_not() -> None:
@@ -122,8 +124,8 @@ def test_joints_of_an_effect_that_is_not_found_are_missed_and_of_one_named_as_ri
 
 def test_inertia_errs_about_the_joints_axis() -> None:
     true = truth("link.inertia", xx=0.5, xy=0.0, xz=0.0, yy=0.5, yz=0.0, zz=1.0)
-    told = judge(answer(cause("link.inertia", joint_2={"xx": 9.0, "zz": 0.9, "yz": 3.0})), label(true))
-    assert [e.relative for e in told.errors] == pytest.approx([0.1])
+    judged = judge(answer(cause("link.inertia", joint_2={"xx": 9.0, "zz": 0.9, "yz": 3.0})), label(true))
+    assert [e.relative for e in judged.errors] == pytest.approx([0.1])
 
 
 def test_withheld_effect_must_not_be_replaced() -> None:
@@ -146,15 +148,18 @@ def test_score_counts_shares() -> None:
         answer_name("a", "friction.coulomb"): answer(cause("friction.viscous")),
     }
     result = score(answers, labels)
-    told = result["label_withheld"]
-    assert told["cases"] == 4
-    assert told["first_right_where_tellable"] == 1.0
-    assert told["first_right"] == 0.5
-    assert told["first_or_confounded"] == 1.0
-    assert told["no_effect"] == {"cases": 1, "false_alarms": 0.0}
-    assert told["two"] == {"cases": 1, "both_found": 0.0}
-    assert (told["joints"]["precision"], told["joints"]["recall"]) == (1.0, 0.75)  # of c the offset's joint is missed
-    assert told["joints"]["f1"] == pytest.approx(6 / 7)
+    judged = result["label_withheld"]
+    assert judged["cases"] == 4
+    assert judged["first_right_where_tellable"] == 1.0
+    assert judged["first_right"] == 0.5
+    assert judged["first_or_confounded"] == 1.0
+    assert judged["no_effect"] == {"cases": 1, "false_alarms": 0.0}
+    assert judged["two"] == {"cases": 1, "both_found": 0.0}
+    assert (judged["joints"]["precision"], judged["joints"]["recall"]) == (
+        1.0,
+        0.75,
+    )  # of c the offset's joint is missed
+    assert judged["joints"]["f1"] == pytest.approx(6 / 7)
     assert result["effect_withheld"]["false_blame"] == 1.0
     assert result["confusion"] == {
         "actuator.lag": {"actuator.delay": 1},

@@ -8,7 +8,8 @@ from wrong_arms import THREE, Wrong, model, record
 
 from armlink.cli import run
 from armlink.errors import BadInput
-from armlink.recording.recording import Recording, save_recording
+from armlink.recording.files import save_recording
+from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
 
 

@@ -9,7 +9,7 @@ import pytest
 from armlink.arm_file import load_arm
 from armlink.errors import BadInput
 from armlink.link.link import Link
-from armlink.recording.recording import load_recording
+from armlink.recording.files import load_recording
 from calib.arm.kinematics import gcomp_arm
 from sim_gap.experiment.collect import collect
 from sim_gap.experiment.excitation import SPEEDS, joints_in_doubt, plan_motion

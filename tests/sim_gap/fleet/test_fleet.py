@@ -12,7 +12,7 @@ import wrong_arms
 from typer.testing import CliRunner
 
 from armlink.errors import BadInput
-from armlink.recording.recording import save_recording
+from armlink.recording.files import save_recording
 from sim_gap.commands.gap import app
 from sim_gap.fleet.cluster import cluster
 from sim_gap.fleet.fleet import Answers, Case, diagnose_case, diagnose_fleet, find_cases

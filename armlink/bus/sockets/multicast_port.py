@@ -7,13 +7,11 @@ whose address says which frames are our own. Multicast loops back to every socke
 import contextlib
 import socket
 import struct
-import weakref
 from collections.abc import Sequence
-from typing import Any
 
-from armlink.bus.datagram_port import NAME, NOT_OURS, Batch, DatagramPort
-from armlink.bus.multicast_frames import LONGEST, Decoder, encode
 from armlink.bus.port import ERROR, Frame
+from armlink.bus.sockets.datagram_port import NAME, NOT_OURS, Batch, DatagramPort
+from armlink.bus.sockets.multicast_frames import LONGEST, Decoder, encode
 from armlink.errors import BusFault
 
 _IP_MULTICAST_ALL, _IPV6_MULTICAST_ALL = 49, 29
@@ -21,22 +19,33 @@ _IGNORED: Frame = (NOT_OURS, b"")
 
 
 class MulticastPort(DatagramPort):
-    """A python-can UdpMulticastBus; with `fd` it sends CAN FD frames (bit-rate switch), else it ignores such frames."""
+    """CAN over UDP multicast; with `fd` it sends CAN FD frames (bit-rate switch), without it ignores such frames."""
 
-    def __init__(self, bus: Any, fd: bool = True, as_node: bool = False) -> None:
-        """Open a socket to send from (`as_node` as in open_port); raises BusFault without a way to the group."""
+    def __init__(
+        self,
+        receiving: socket.socket,
+        group: tuple[str, int],
+        hop_limit: int,
+        name: str,
+        fd: bool = True,
+        as_node: bool = False,
+    ) -> None:
+        """Open a socket to send to `group` (address and port) from; `receiving` has joined it.
+
+        `name` of the bus for messages, `as_node` as in CanBus.open_port. Raises BusFault without a route to the group.
+        """
         self.ignored = 0
         """Datagrams so far that were no frames."""
         self._fd, self._takes_fd = fd, fd
-        inner = bus._multicast
-        name = f"udp_multicast:{inner.group}"
-        receiving: socket.socket = inner._socket
-        sending = _connect(name, receiving.family, inner.group, inner.port, inner.hop_limit)
-        weakref.finalize(self, sending.close)
+        self._sending = sending = _connect(name, receiving.family, group, hop_limit)
         self._own = _address(sending)
         _hear_one_group(receiving)
         self._decoder = Decoder()
         super().__init__(name, receiving, sending, Batch(256), Batch(LONGEST, names=True), as_node)
+
+    def close(self) -> None:
+        """Close the socket that was opened to send from."""
+        self._sending.close()
 
     def _encode(self, frames: Sequence[Frame]) -> None:
         put, fd = self._out.put, self._fd
@@ -64,7 +73,7 @@ class MulticastPort(DatagramPort):
         return frames
 
 
-def _connect(name: str, family: int, group: str, port: int, hop_limit: int) -> socket.socket:
+def _connect(name: str, family: int, group: tuple[str, int], hop_limit: int) -> socket.socket:
     """A socket of our own to the group: connected, so that its address stays as it is."""
     sending = socket.socket(family, socket.SOCK_DGRAM)
     try:
@@ -72,10 +81,10 @@ def _connect(name: str, family: int, group: str, port: int, hop_limit: int) -> s
             sending.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, hop_limit)
         else:
             sending.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_HOPS, hop_limit)
-        sending.connect((group, port))
+        sending.connect(group)
     except OSError as error:
         sending.close()
-        raise BusFault(f"bus {name}: no way to the group: {error.strerror}") from None
+        raise BusFault(f"bus {name}: no route to the group: {error.strerror}") from None
     return sending
 
 

@@ -1,24 +1,27 @@
 """SocketCAN's raw socket as a Port: classical frames, or CAN FD frames with bit-rate switch."""
 
+import socket
 import struct
 from collections.abc import Sequence
-from typing import Any
 
-from armlink.bus.datagram_port import FLAGS, Batch, DatagramPort
 from armlink.bus.port import Frame
+from armlink.bus.sockets.datagram_port import FLAGS, Batch, DatagramPort
 
 _CLASSIC, _FD = struct.Struct("=IBB2x8s"), struct.Struct("=IBB2x64s")
 _FD_FLAGS = 0x05  # CANFD_BRS | CANFD_FDF: a CAN FD frame with bit-rate switch
 
 
 class SocketPort(DatagramPort):
-    """The raw socket of a python-can SocketCAN bus."""
+    """A raw CAN socket."""
 
-    def __init__(self, bus: Any, fd: bool = False, as_node: bool = False) -> None:
-        """`fd`: the socket takes CAN FD frames, and such are sent; `as_node` as in open_port."""
+    def __init__(self, raw: socket.socket, name: str, fd: bool = False, as_node: bool = False) -> None:
+        """`name` of the bus for messages; `fd`: the socket takes CAN FD frames, and such are sent.
+
+        `as_node` as in CanBus.open_port.
+        """
         self._layout = _FD if fd else _CLASSIC
         size = self._layout.size
-        super().__init__(bus.channel_info, bus.socket, bus.socket, Batch(size), Batch(size), as_node)
+        super().__init__(name, raw, raw, Batch(size), Batch(size), as_node)
         self._received = memoryview(self._in.content)
         self._fd = fd
 

@@ -13,12 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from armlink.arm_file import Bus
-from armlink.bus.datagram_port import BATCH
-from armlink.bus.multicast_frames import ERROR, EXTENDED, HEADS_KEPT, REMOTE, Decoder, encode
-from armlink.bus.multicast_port import MulticastPort
 from armlink.bus.open import open_bus
-from armlink.bus.port import open_port
-from armlink.bus.stamped_port import StampedMulticastPort, open_listening_port
+from armlink.bus.sockets.datagram_port import BATCH
+from armlink.bus.sockets.multicast_frames import ERROR, EXTENDED, HEADS_KEPT, REMOTE, Decoder, encode
+from armlink.bus.sockets.multicast_port import MulticastPort
+from armlink.bus.sockets.stamped_port import StampedMulticastPort
 
 GROUP = "239.74.163.47"
 PORT = 45200 + os.getpid() % 1000
@@ -43,7 +42,7 @@ def member():
 
 @pytest.fixture
 def port(member):
-    return open_port(member)
+    return member.open_port()
 
 
 def message(can_id=0x181, data=b"", fd=False, **fields):
@@ -199,7 +198,7 @@ def test_python_can_hears_what_a_port_sends(port, stock, length):
 
 def test_a_classical_bus_sends_classical_frames_and_does_not_hear_fd(stock):
     with open_member(fd=False) as bus:
-        port = open_port(bus)
+        port = bus.open_port()
         port.send(0x201, b"abc")
         heard = stock.recv(1.0)
         assert (heard.is_fd, heard.bitrate_switch, bytes(heard.data)) == (False, False, b"abc")
@@ -239,7 +238,7 @@ def test_own_frames_are_left_out_and_equal_ones_of_others_are_not(port, stock):
 
 def test_two_ports_hear_each_other_but_not_themselves(port):
     with open_member() as bus:
-        other = open_port(bus)
+        other = bus.open_port()
         port.send_all([(0x80, b""), (0x201, b"a")])
         other.send(0x181, b"b")
         assert drain(other) == [(0x80, b""), (0x201, b"a")]
@@ -255,7 +254,7 @@ def test_a_wait_lasts_its_time_whatever_echoes_come_meanwhile(port):
 
 def test_more_frames_than_a_batch_pass(port):
     with open_member() as bus:
-        other = open_port(bus)
+        other = bus.open_port()
         frames = [(can_id, bytes([can_id & 0xFF])) for can_id in range(3 * BATCH + 5)]
         port.send_all(frames)
         assert drain(other) == frames
@@ -268,7 +267,7 @@ def test_other_groups_on_the_same_port_are_not_heard(port):
 
 
 def test_a_node_answers_in_frames_as_it_hears(member, stock):
-    port = open_port(member, as_node=True)
+    port = member.open_port(as_node=True)
     stock.send(message(0x601, b"classic"))
     assert port.receive(1.0) == (0x601, b"classic")
     port.send_all([(0x581, b"1"), (0x20000008, bytes(8))])
@@ -309,8 +308,8 @@ def test_datagrams_that_are_no_frames_are_ignored_and_counted(port, stock):
 
 def test_a_full_queue_counts_what_it_lost(port):
     with open_member() as bus, open_member() as small:
-        other, port = open_port(bus), open_port(small)
-        small._multicast._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        other, port = bus.open_port(), small.open_port()
+        small.bus._multicast._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         other.send_all([(0x181, bytes(8))] * 2000)
         taken = len(drain(port))
         other.send(0x182, b"")
@@ -321,7 +320,7 @@ def test_a_full_queue_counts_what_it_lost(port):
 
 def test_a_listener_gets_the_kernel_s_times(stock):
     with open_member() as bus:
-        port = open_listening_port(bus)
+        port = bus.open_listening_port()
         assert isinstance(port, StampedMulticastPort)
         before = time.monotonic()
         for can_id in range(200):
@@ -341,7 +340,7 @@ def test_ipv6(monkeypatch):
     channel = "ff15:7079:7468:6f6e:6465:6d6f:6d63:6173"
     try:
         with open_member(channel=channel) as bus, can.Bus(channel, interface="udp_multicast", port=PORT) as stock:
-            port = open_port(bus)
+            port = bus.open_port()
             assert isinstance(port, MulticastPort)
             port.send(0x181, b"six")
             stock.send(message(0x182, b"back"))

@@ -5,16 +5,11 @@ import select
 import socket
 import struct
 import time
-from typing import Any
 
-from armlink.bus.datagram_port import BATCH, CONTROL, FLAGS, DatagramPort
-from armlink.bus.multicast_port import MulticastPort
-from armlink.bus.port import GroupPort, Port, is_fd, is_multicast, is_socketcan, open_port
-from armlink.bus.socket_port import SocketPort
-from armlink.canopen.object_dictionary import SYNC_ID
-
-Stamped = tuple[float, int, bytes]
-"""When a frame came, by the machine's monotonic clock [s], its identifier and its data."""
+from armlink.bus.port import Stamped
+from armlink.bus.sockets.datagram_port import BATCH, CONTROL, FLAGS, DatagramPort
+from armlink.bus.sockets.multicast_port import MulticastPort
+from armlink.bus.sockets.socket_port import SocketPort
 
 MOST_BATCHES = 256
 """So many batches are taken at once: frames without end do not keep a listener for ever."""
@@ -71,61 +66,29 @@ class Stamping(DatagramPort):
 
 
 class StampedSocketPort(Stamping, SocketPort):
-    """SocketCAN with times."""
+    """SocketCAN with timestamps."""
 
-    def __init__(self, bus: Any, fd: bool = False) -> None:
-        """The raw socket of a python-can SocketCAN bus."""
-        super().__init__(bus, fd)
-        self.stamp(bus.socket)
+    def __init__(self, raw: socket.socket, name: str, fd: bool = False) -> None:
+        """As SocketPort."""
+        super().__init__(raw, name, fd)
+        self.stamp(raw)
 
 
 class StampedMulticastPort(Stamping, MulticastPort):
-    """udp_multicast with times."""
+    """udp_multicast with timestamps."""
 
-    def __init__(self, bus: Any, fd: bool = True) -> None:
-        """The socket of a python-can UdpMulticastBus."""
-        super().__init__(bus, fd)
-        self.stamp(bus._multicast._socket)
-
-
-class StampedGroup(GroupPort):
-    """Several buses as one, their frames in the order of their times; the SYNC of the first bus stands for all."""
-
-    def __init__(self, group: Any) -> None:
-        """Take `group.members` (buses that can be stamped) and `group.route` (node id → index of its bus)."""
-        self._stamping = tuple(_stamped(bus) for bus in group.members)
-        super().__init__(group, self._stamping)
-        self._early: list[Stamped] = []
-
-    def wait(self, timeout: float) -> None:
-        """Return when a frame is there, or after `timeout` seconds."""
-        select.select(self._numbers, [], [], timeout)
-
-    def take_all(self) -> list[Stamped]:
-        """All frames that came before this call, as Stamping.take_all; later ones wait for those of every bus."""
-        end = time.monotonic()
-        frames, self._early = self._early, []
-        for index, member in enumerate(self._stamping):
-            for frame in member.take_all():
-                if not (index and frame[1] == SYNC_ID):
-                    (frames if frame[0] <= end else self._early).append(frame)
-        return sorted(frames, key=lambda frame: frame[0])
-
-
-def open_listening_port(bus: Any) -> Port:
-    """A Stamping port or StampedGroup where every bus can be stamped, else as open_port; a group counts SYNC once."""
-    members = getattr(bus, "members", (bus,))
-    if all(is_socketcan(member) or is_multicast(member) for member in members):
-        return StampedGroup(bus) if hasattr(bus, "members") else _stamped(bus)
-    port = open_port(bus)
-    if isinstance(port, GroupPort):
-        port.one_sync = True
-    return port
-
-
-def _stamped(bus: Any) -> Stamping:
-    kind = StampedSocketPort if is_socketcan(bus) else StampedMulticastPort
-    return kind(bus, is_fd(bus))
+    def __init__(
+        self,
+        receiving: socket.socket,
+        group: tuple[str, int],
+        hop_limit: int,
+        name: str,
+        fd: bool = True,
+        as_node: bool = False,
+    ) -> None:
+        """As MulticastPort."""
+        super().__init__(receiving, group, hop_limit, name, fd, as_node)
+        self.stamp(receiving)
 
 
 def _clocks() -> tuple[float, float]:

@@ -1,0 +1,112 @@
+"""python-can's buses as CanBus: SocketCAN and udp_multicast by their sockets, any other interface by its messages."""
+
+from types import TracebackType
+from typing import Self, cast
+
+import can
+
+from armlink.bus.can_bus import CanBus, MessageBus
+from armlink.bus.in_process import InProcessBus
+from armlink.bus.message_port import MessagePort
+from armlink.bus.port import Port
+from armlink.bus.sockets.multicast_port import MulticastPort
+from armlink.bus.sockets.socket_port import SocketPort
+from armlink.bus.sockets.stamped_port import StampedMulticastPort, StampedSocketPort
+from armlink.clock import Clock
+
+
+class PythonCanBus:
+    """Any interface of python-can; a context manager that closes it."""
+
+    clock: Clock | None = None
+
+    def __init__(self, bus: can.BusABC, name: str = "") -> None:
+        """Take a bus of python-can's, closed with this one; `name` for messages, by default python-can's own."""
+        self.bus = bus
+        self.channel_info = name or str(bus.channel_info)
+
+    def __enter__(self) -> Self:
+        """The bus itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        """Close the bus."""
+        self.shutdown()
+
+    @property
+    def fd(self) -> bool:
+        """Whether the bus takes CAN FD frames."""
+        return str(self.bus.protocol).startswith("CanProtocol.CAN_FD")
+
+    def open_port(self, as_node: bool = False) -> Port:
+        """As CanBus has it."""
+        return MessagePort(self.bus, self.channel_info, self.fd, as_node)
+
+    def open_listening_port(self) -> Port:
+        """As CanBus has it."""
+        return self.open_port()
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """As MessageSource has it; raises python-can's errors."""
+        return self.bus.recv(timeout)
+
+    def shutdown(self) -> None:
+        """Close the bus."""
+        self.bus.shutdown()
+
+
+class SocketCanBus(PythonCanBus):
+    """Linux's SocketCAN."""
+
+    def open_port(self, as_node: bool = False) -> Port:
+        """As CanBus has it."""
+        return SocketPort(self.bus.socket, self.channel_info, self.fd, as_node)
+
+    def open_listening_port(self) -> Port:
+        """As CanBus has it."""
+        return StampedSocketPort(self.bus.socket, self.channel_info, self.fd)
+
+
+class MulticastBus(PythonCanBus):
+    """CAN over UDP multicast, in python-can's format."""
+
+    def __init__(self, bus: can.BusABC, name: str = "") -> None:
+        """Take a UdpMulticastBus of python-can's, closed with this one."""
+        super().__init__(bus, name)
+        self._ports: list[MulticastPort] = []
+
+    def open_port(self, as_node: bool = False) -> Port:
+        """As CanBus has it; raises BusFault if the machine has no route to the group."""
+        return self._open(MulticastPort, as_node)
+
+    def open_listening_port(self) -> Port:
+        """As CanBus has it; raises BusFault if the machine has no route to the group."""
+        return self._open(StampedMulticastPort)
+
+    def _open(self, kind: type[MulticastPort], as_node: bool = False) -> Port:
+        inner = self.bus._multicast  # python-can does not show its socket otherwise
+        port = kind(inner._socket, (inner.group, inner.port), inner.hop_limit, self.channel_info, self.fd, as_node)
+        self._ports.append(port)
+        return port
+
+    def shutdown(self) -> None:
+        """Close the bus and its ports."""
+        for port in self._ports:
+            port.close()
+        super().shutdown()
+
+
+_ADAPTERS = {"SocketcanBus": SocketCanBus, "UdpMulticastBus": MulticastBus}
+"""By python-can's classes, whose modules are not imported for the sake of a comparison."""
+
+
+def adapt(bus: can.BusABC, name: str = "") -> MessageBus:
+    """A bus of python-can's as MessageBus; `name` for messages. The simulation in lock-step is one already."""
+    if isinstance(bus, InProcessBus):
+        return cast(MessageBus, bus)
+    return _ADAPTERS.get(type(bus).__name__, PythonCanBus)(bus, name)
+
+
+def as_bus(bus: CanBus | can.BusABC) -> CanBus:
+    """The bus itself, adapted if it is python-can's."""
+    return adapt(bus) if isinstance(bus, can.BusABC) else bus

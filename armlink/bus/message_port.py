@@ -1,0 +1,68 @@
+"""Any python-can interface as a Port, by its message objects."""
+
+import errno
+from collections.abc import Sequence
+
+import can
+
+from armlink.bus.port import ERROR, Frame, InterfaceDown
+from armlink.errors import BusFault
+
+
+class MessagePort:
+    """Messages of a python-can bus; CAN FD frames with bit-rate switch if `fd`."""
+
+    def __init__(self, bus: can.BusABC, name: str, fd: bool = False, as_node: bool = False) -> None:
+        """`name` of the bus for messages; `as_node` as in CanBus.open_port."""
+        self.errors = self.dropped = 0
+        self._bus, self._name, self._fd, self._as_node = bus, name, fd, as_node
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Send one frame; raises BusFault if python-can cannot."""
+        is_error = bool(can_id & ERROR)
+        fd = self._fd and not is_error
+        message = can.Message(
+            arbitration_id=can_id & ~ERROR,
+            data=data,
+            is_extended_id=False,
+            is_error_frame=is_error,
+            is_fd=fd,
+            bitrate_switch=fd,
+        )
+        try:
+            self._bus.send(message)
+        except (can.CanError, OSError) as error:
+            raise BusFault(f"bus {self._name}: cannot send: {error}") from None
+
+    def send_all(self, frames: Sequence[Frame]) -> None:
+        """Send the frames in this order; raises BusFault as send."""
+        for can_id, data in frames:
+            self.send(can_id, data)
+
+    def receive(self, timeout: float) -> Frame | None:
+        """The next data frame with an 11-bit identifier, or None after `timeout` seconds."""
+        while True:
+            message = receive_message(self._bus, self._name, timeout)
+            if message is None:
+                return None
+            if message.is_error_frame:
+                self.errors += 1
+            elif is_data(message):
+                if self._as_node:
+                    self._fd = message.is_fd
+                return message.arbitration_id, bytes(message.data)
+
+
+def is_data(message: can.Message) -> bool:
+    """Whether a message is a data frame with an 11-bit identifier."""
+    return not (message.is_error_frame or message.is_extended_id or message.is_remote_frame)
+
+
+def receive_message(bus: can.BusABC, name: str, timeout: float) -> can.Message | None:
+    """The next message of a python-can bus, or None after `timeout` seconds; raises BusFault, InterfaceDown."""
+    try:
+        return bus.recv(timeout=timeout)
+    except (can.CanError, OSError) as error:
+        down = errno.ENETDOWN in (getattr(error, "error_code", None), getattr(error, "errno", None))
+        fault = InterfaceDown if down else BusFault
+        raise fault(f"bus {name}: cannot receive: {error}") from None

@@ -1,0 +1,87 @@
+"""Buses and ports that hand on what passes: to a frame log, to statistics of the cycle."""
+
+from collections.abc import Callable, Sequence
+
+import can
+
+from armlink.bus.can_bus import MessageSource
+from armlink.bus.in_process import InProcessBus
+from armlink.bus.message_port import is_data, receive_message
+from armlink.bus.port import Frame, Port
+from armlink.clock import Clock, MonotonicClock
+from armlink.errors import BusFault
+
+
+class TappedBus(InProcessBus):
+    """A bus that is only listened to, and whose every message goes to somebody else too, with its time."""
+
+    ended = False
+
+    def __init__(self, source: MessageSource, tap: Callable[[can.Message, int], None]) -> None:
+        """Take `source`, closed with this one; `tap` gets each message and the interface's time of it [µs]."""
+        self._source, self._tap = source, tap
+        self.clock, self.channel_info = source.clock, source.channel_info
+        self._now = (source.clock or MonotonicClock()).now
+        self._first: int | None = None
+        self._newest = 0
+
+    def stamp(self) -> float:
+        """When the newest frame came, since the first [s], as the interface stamped it."""
+        return self._newest / 1e6
+
+    def take(self, timeout: float = 0.0) -> Frame | None:
+        """The next data frame with an 11-bit identifier, or None after `timeout` seconds; raises BusFault."""
+        while True:
+            message = receive_message(self._source, self.channel_info, timeout)
+            if message is None:
+                return None
+            stamp = round((message.timestamp or self._now()) * 1e6)
+            self._first = stamp if self._first is None else self._first
+            self._newest = stamp - self._first
+            self._tap(message, stamp)
+            if is_data(message):
+                return message.arbitration_id, bytes(message.data)
+
+    def put(self, can_id: int, data: bytes) -> None:
+        """Refuse: this bus is only listened to."""
+        raise BusFault(f"bus {self.channel_info}: only listened to")
+
+    def shutdown(self) -> None:
+        """Close the source."""
+        self._source.shutdown()
+
+
+class TappedPort:
+    """A port whose frames, out and in, go to somebody else too, each with the time at which it passed."""
+
+    def __init__(self, port: Port, clock: Clock, tap: Callable[[float, int, bytes], None]) -> None:
+        """`tap` gets time by `clock` [s], identifier and data."""
+        self._port, self._now, self._tap = port, clock.now, tap
+
+    @property
+    def errors(self) -> int:
+        """Error frames so far."""
+        return self._port.errors
+
+    @property
+    def dropped(self) -> int:
+        """Frames lost so far because they were not read in time."""
+        return self._port.dropped
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Send one frame; raises BusFault."""
+        self.send_all(((can_id, data),))
+
+    def send_all(self, frames: Sequence[Frame]) -> None:
+        """Send the frames in this order; raises BusFault."""
+        now = self._now()
+        for frame in frames:
+            self._tap(now, *frame)
+        self._port.send_all(frames)
+
+    def receive(self, timeout: float) -> Frame | None:
+        """The next frame, or None after `timeout` seconds."""
+        frame = self._port.receive(timeout)
+        if frame is not None:
+            self._tap(self._now(), *frame)
+        return frame

@@ -1,0 +1,38 @@
+"""A reference mass that was forgotten, or stated wrong, is noticed whatever the gains are; one that is there is not."""
+
+import numpy as np
+import pytest
+from sweep_arms import random_arm, synthetic_pass
+from synthetic_sweeps import passes, plans
+
+from calib.arm.kinematics import gcomp_arm
+from calib.fit.felt_mass import felt_mass
+from calib.fit.sweep_readings import sweep_readings
+from sim_bus.truth import Truth
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_a_mass_that_is_there_is_felt(seed: int) -> None:
+    arm = random_arm(seed, 3 + seed % 3)
+    _, data = passes(arm, seed)
+    felt = felt_mass(gcomp_arm(arm), sweep_readings(data).readings)
+    assert felt is not None
+    assert felt.felt == pytest.approx(felt.stated, rel=0.3)
+    assert not felt.contradicts
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 4.0])
+def test_a_mass_that_is_forgotten_or_another_is_named(share: float) -> None:
+    arm = random_arm(5, 4)
+    truth, random = Truth.draw(arm, 5), np.random.default_rng(5)
+    bare, loaded = plans(arm, truth, 5)
+    mass = bare.reference_mass
+    data = [synthetic_pass(arm, truth, bare, 0.0, random), synthetic_pass(arm, truth, loaded, share * mass, random)]
+    stated = data[1].manifest.model_copy(update={"reference_mass": mass})
+    from dataclasses import replace
+
+    felt = felt_mass(gcomp_arm(arm), sweep_readings([data[0], replace(data[1], manifest=stated)]).readings)
+    assert felt is not None
+    assert felt.contradicts
+    assert felt.felt == pytest.approx(share * mass, rel=0.3, abs=0.1 * mass)
+    assert f"{mass:g} kg were stated" in str(felt)
