@@ -8,7 +8,7 @@ import numpy as np
 from calib.observer.config import ObserverConfig
 from calib.observer.effect_dictionary import DRIFT, Entry, class_of, dictionary, kin
 from calib.observer.gravity_belief import GravityBelief
-from calib.records.records import Array
+from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_levers
 from gcomp.identify.readings import StaticReadings
 
