@@ -16,7 +16,6 @@ import pyarrow.parquet as pa_parquet
 from armlink.arrays import Array
 from armlink.errors import BadInput
 from armlink.recording.recording import (
-    Array,
     Recording,
     channels_of,
     columns_of,
