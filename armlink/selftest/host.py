@@ -96,7 +96,8 @@ class EchoPort:
 def measure_host(arm: ArmFile, seconds: float) -> HostReport:
     """Make cycles in a process of its own, with a job beside it that computes and writes as a sweep does."""
     ours, theirs = socket.socketpair()
-    command = [sys.executable, "-m", "armlink.selftest.host", str(theirs.fileno())]
+    program = "import sys; from armlink.selftest.host import main; main(int(sys.argv[1]))"
+    command = [sys.executable, "-c", program, str(theirs.fileno())]
     process = subprocess.Popen(command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL)
     theirs.close()
     channel = Channel(ours)
@@ -170,9 +171,3 @@ def main(number: int) -> None:
         while not channel.flush(1.0):
             channel.receive()
         channel.wait(5.0)  # for the job to read it
-
-
-if __name__ == "__main__":
-    from armlink.selftest import host  # under its own name, so that what it sends can be unpickled
-
-    host.main(int(sys.argv[1]))

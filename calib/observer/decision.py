@@ -31,7 +31,7 @@ class Finding:
 
     @property
     def change(self) -> TorqueCalibration[float]:
-        """What the sensor as installed does to a torque: it reads gain · τ + offset instead of τ."""
+        """Calibration of the drifted sensor: it reads gain · τ + offset instead of τ [N·m]."""
         return TorqueCalibration(self.gain, self.offset)
 
     @property

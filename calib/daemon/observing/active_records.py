@@ -139,11 +139,8 @@ class ActiveRecords:
         if self.observation is None:
             return
         feed = self.observation.feed
-        differ, record, recalibrations = (
-            feed.controllers_hold(self._held),
-            feed.calibration,
-            self.observation.recalibrations,
-        )
+        differ, record = feed.controllers_hold(self._held), feed.calibration
+        recalibrations = self.observation.recalibrations
         if not differ:
             return
         if self._configuration.settings.policy != "apply" or self._configuration.listen_only:

@@ -20,7 +20,7 @@ class LingeringTransport:
     """
 
     def __init__(self, plain: asyncio.Transport) -> None:
-        self._plain = plain
+        self._plain, self._loop = plain, asyncio.get_running_loop()
         self._lingers = False
 
     def __getattr__(self, name: str) -> Any:
@@ -39,18 +39,17 @@ class LingeringTransport:
         """End the connection; its protocol gets `connection_lost` at the end and nothing before it."""
         if not self.is_closing():
             self._lingers = True
-            _Drain(self._plain).begin()
+            _Drain(self._plain, self._loop).begin()
 
 
 class _Drain(asyncio.Protocol):
     """Replaces a connection's protocol until the client closes or has used up its bytes or its time."""
 
-    def __init__(self, transport: asyncio.Transport) -> None:
-        self._transport, self._owner = transport, transport.get_protocol()
-        self._loop = asyncio.get_running_loop()
+    def __init__(self, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop) -> None:
+        self._transport, self._owner, self._loop = transport, transport.get_protocol(), loop
         self._bytes_left = LINGER_BYTES
         seconds = FLUSH_SECONDS if transport.get_write_buffer_size() else LINGER_SECONDS
-        self._end = self._loop.call_later(seconds, transport.abort)
+        self._end = loop.call_later(seconds, transport.abort)
 
     def begin(self) -> None:
         """Half-close once everything is sent, and keep reading even if reading was paused."""

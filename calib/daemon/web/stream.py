@@ -29,6 +29,7 @@ class Streams:
         self._tasks: set[asyncio.Task[None]] = set()
         self._item: JointsItem | None = None
         self._bytes = b""
+        self._closed = False
         self.cut_off = 0
         """Number of clients cut off because they did not read."""
 
@@ -43,7 +44,8 @@ class Streams:
         return self.clients >= MOST_CLIENTS
 
     def close(self) -> None:
-        """End every stream."""
+        """End every stream, and each that is asked for later as soon as it has begun."""
+        self._closed = True
         for task in self._tasks:
             task.cancel()
 
@@ -57,6 +59,8 @@ class Streams:
         """Serve one client until it leaves: all events after id `after` (None: only new ones), then new items."""
         client = asyncio.create_task(self._send_all(send, after))
         self._tasks.add(client)
+        if self._closed:
+            client.cancel()
         gone = asyncio.create_task(_until_gone(receive))
         try:
             await asyncio.wait({client, gone}, return_when=asyncio.FIRST_COMPLETED)

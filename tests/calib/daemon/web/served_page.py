@@ -75,7 +75,8 @@ def served(
             await asyncio.gather(*work)
         finally:
             for task in work:
-                task.cancel()
+                if not task.cancelling():  # a second time would break off the server's end
+                    task.cancel()
             await asyncio.gather(*work, return_exceptions=True)
 
     running = loop.create_task(main())

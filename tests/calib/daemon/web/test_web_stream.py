@@ -191,3 +191,22 @@ def test_there_is_an_end_to_the_number_of_clients(server: Served, view: MadeUpVi
         first(found, "joints")
         refused = server.client().get("/api/stream")
         assert (refused.status_code, refused.json()["error"]) == (429, "1 clients are on the stream already")
+
+
+def test_a_stream_that_is_asked_for_while_the_server_ends_ends_at_once() -> None:
+    """The page comes back as soon as its stream has ended, and may find the server still listening."""
+    sent = []
+
+    async def note(message: Any) -> None:
+        sent.append(message)
+
+    async def run() -> int:
+        streams = Streams(MadeUpView())
+        streams.close()
+        client_stays = asyncio.Event().wait
+        async with asyncio.timeout(30):
+            await streams.run({}, client_stays, note, None)
+        return streams.clients
+
+    assert asyncio.run(run()) == 0
+    assert sent == [{"type": "http.response.body", "body": b"", "more_body": False}]
