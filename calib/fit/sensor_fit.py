@@ -26,7 +26,7 @@ WIDE = 0.005
 tests/campaigns/random_arms.py allows a gain."""
 COMMON = (
     "the common scale of the gains comes from the levers between the axes before the last, which are too short here;"
-    " measure the place of the mass (sweep.reference_point), or use a heavier one"
+    " measure where it hangs (sweep.reference_point), or use a heavier one"
 )
 """Reason for a low precision of all gains together."""
 
