@@ -34,8 +34,11 @@ def calibrate(
     Example: armlink calibrate unloaded loaded --json calibration.json
     """
     from armlink.commands.output import write_json
+    from armlink.errors import Refused
+    from calib.arm.kinematics import gcomp_arm
     from calib.commands.screen import print_lines
     from calib.commands.sweep_data import load_sweeps
+    from calib.fit.felt_mass import felt_mass
     from calib.fit.sensor_fit import fit_sensors
     from calib.install.apply import Apply, apply_calibration
     from calib.records.records import CalibrationRecord
@@ -46,6 +49,11 @@ def calibrate(
     records = RecordStore(store)
     current = records.current(CalibrationRecord, arm_file)
     record = fit.record(arm_file).model_copy(update={"parent": None if current is None else current.id})
+    felt = felt_mass(gcomp_arm(arm_file), fit.rows.readings)
+    if felt is not None and felt.contradicts:
+        records.add(record)
+        write_json(json_file, _answer(fit, record, False))
+        raise Refused(f"{felt} Record {record.id} is kept, and not made current")
     _show(fit)
     if apply:
         user = getpass.getuser()

@@ -42,7 +42,8 @@ def rollback(
     line = [each for each in records.activations(arm_file) if each.record == to][-1]
     typer.echo(f"{line.kind} record {to} is current on {arm_file.name} {arm_file.serial} since {line.at}", err=True)
     if line.kind == "calibration" and not apply:
-        typer.echo("the joint controllers keep what they hold; --apply writes it to them", err=True)
+        keep = "the joint controllers keep what they hold: --apply writes it to them now;"
+        typer.echo(f"{keep} a daemon with policy apply writes it by itself within seconds", err=True)
 
 
 def _apply(arm_file: "ArmFile", to: str, records: "RecordStore", how: "Apply", reason: str) -> None:

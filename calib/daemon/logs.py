@@ -32,4 +32,5 @@ def log_as_json(level: int = logging.INFO) -> None:
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(level)
-    logging.getLogger("can").setLevel(max(level, logging.WARNING))  # it logs every socket that it opens
+    for chatty in ("can", "canopen"):  # they log every socket that they open, and every SDO
+        logging.getLogger(chatty).setLevel(max(level, logging.WARNING))

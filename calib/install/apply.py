@@ -18,7 +18,7 @@ from calib.fit.sweep_readings import sweep_readings
 from calib.install.check_motion import CheckMotion
 from calib.install.journaled_write import install, recover
 from calib.install.plausibility import Admitted, GateRefused, Refusal, admit, admit_rollback
-from calib.records.records import CalibrationRecord, GravityRecord
+from calib.records.records import CalibrationRecord, GravityRecord, Record
 from calib.records.store import RecordStore
 from calib.sweep.dataset import SweepData
 from gcomp.arrays import Array
@@ -131,12 +131,21 @@ def check_heldout(
     """Raise GateRefused if held-out readings of a joint are predicted worse than by the old record.
 
     New gains, offsets and mass moments are estimated from the other steps; the old record's gains and offsets are
-    fixed, and so are the mass moments of `gravity`; without it those are estimated too.
+    fixed, and so are the mass moments of `gravity`; without it those are estimated too. A record that was fitted to
+    some of these readings is not judged by them: for it they are not held out.
     """
+    if fitted_to(old, data):
+        return
     rows = sweep_readings([each.require(arm) for each in data])
-    beta = None if gravity is None else np.array(gravity.require(arm).beta)
+    independent = gravity is not None and not fitted_to(gravity, data)
+    beta = np.array(gravity.require(arm).beta) if gravity is not None and independent else None
     fresh = heldout_scores(new, arm, rows, refit=True)
     _refuse_worse(arm, old, fresh, heldout_scores(old, arm, rows, refit=False, beta=beta))
+
+
+def fitted_to(record: Record, data: Sequence[SweepData]) -> bool:
+    """Whether a record comes from some of these data sets."""
+    return not {each.digest for each in data}.isdisjoint(record.sources.values())
 
 
 def _refuse_worse(arm: ArmFile, old: CalibrationRecord, new_errors: Array, old_errors: Array) -> None:

@@ -1,5 +1,6 @@
 """The records in force: read from the store, compared with what the controllers hold, observed against."""
 
+import logging
 from collections.abc import Callable
 
 from armlink.errors import ArmlinkError
@@ -14,6 +15,7 @@ from calib.install.plausibility import GateRefused
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.records.store import RecordStore
 
+_LOG = logging.getLogger("armlink.daemon")
 RECORDS_SECONDS = 5.0
 """Time between two looks at the record store, where other commands may have made another record current [s]."""
 
@@ -69,7 +71,10 @@ class ActiveRecords:
                 found = {"calibration": calibration, "gravity": gravity}
                 missing = " and ".join(name for name, record in found.items() if record is None)
                 of_arm = f"of {arm.name} {arm.serial}"
-                self.detail = f"waits for a {missing} record {of_arm}: armlink sweep, calibrate, identify"
+                waits = f"waits for a {missing} record {of_arm}: armlink sweep, calibrate, identify"
+                if waits != self.detail:
+                    _LOG.warning(waits)
+                self.detail = waits
                 return
             before = self.observation
             if before is not None and before.feed.measures_against(calibration, gravity):
