@@ -20,8 +20,9 @@ from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
 from mcap.writer import Writer
 from zstandard import ZstdError
 
+from armlink.arrays import Array
 from armlink.errors import BadInput
-from armlink.recording.recording import Array, Recording
+from armlink.recording.recording import Recording
 from armlink.recording.ros_joint_state import SCHEMA, SCHEMA_NAME, JointState, JointStateDecoder, joint_state_encoder
 
 TOPICS: dict[str, tuple[str | None, str | None, str | None]] = {

@@ -6,9 +6,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from armlink.arrays import Array
 from armlink.errors import BadInput
-
-Array = NDArray[np.float64]
 
 COLUMNS = {
     "position": "q",

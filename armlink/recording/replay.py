@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.arrays import Array
 from armlink.bus.frame_log import LogBus, LogReader, is_log
 from armlink.bus.open import open_bus, parse_bus
 from armlink.bus.port import Port, Stamped
@@ -17,7 +18,7 @@ from armlink.canopen.units import TORQUE_PER_MICRO, assumed_units
 from armlink.clock import Clock, MonotonicClock
 from armlink.errors import BadInput
 from armlink.recording.recorder import Recorder
-from armlink.recording.recording import Array, Recording
+from armlink.recording.recording import Recording
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -13,9 +13,9 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pa_parquet
 
+from armlink.arrays import Array
 from armlink.errors import BadInput
 from armlink.recording.recording import (
-    Array,
     Recording,
     channels_of,
     columns_of,

@@ -25,12 +25,12 @@ class Limits:
     """[rad/s]"""
 
     @classmethod
-    def of(cls, arm: ArmFile) -> "Limits":
+    def of(cls, arm_file: ArmFile) -> "Limits":
         """From the arm file's link section and joint range."""
-        described, link = gcomp_arm(arm), arm.require_link()
+        kinematics, link = gcomp_arm(arm_file), arm_file.require_link()
         return cls(
-            described.lower,
-            described.upper,
+            kinematics.lower,
+            kinematics.upper,
             link.rated_torques,
             np.array([joint.max_torque for joint in link.joints]),
             np.array([joint.max_velocity for joint in link.joints]),

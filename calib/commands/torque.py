@@ -8,12 +8,8 @@ import typer
 from calib.commands.options import JsonFile, Store
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
     from gcomp.arm.arm import Arm
-
-    Array = npt.NDArray[np.float64]
+    from gcomp.arrays import Array
 
 MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
 

@@ -18,7 +18,7 @@ SURE = 0.15
 
 @dataclass(frozen=True)
 class FeltMass:
-    """What the torque sensors feel of the reference mass, if their gains are 1."""
+    """The reference mass as the torque sensors feel it, if their gains are 1."""
 
     stated: float
     """[kg]."""

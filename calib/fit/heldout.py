@@ -5,12 +5,13 @@ import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from calib.arm.kinematics import gcomp_arm
+from calib.fit.gravity_fit import sensor_parameters
 from calib.fit.sweep_readings import SweepReadings
 from calib.records.records import CalibrationRecord
 from gcomp.arrays import Array
 from gcomp.errors import GcompError
 from gcomp.identify.global_fit import identify_global
-from gcomp.identify.parameters import Parameters, Prior
+from gcomp.identify.parameters import Prior
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict
 
@@ -42,23 +43,15 @@ def worse_by(new: Array, old: Array) -> float | None:
 
 
 def heldout_scores(
-    record: CalibrationRecord, arm: ArmFile, rows: SweepReadings, refit: bool, beta: Array | None = None
+    record: CalibrationRecord, arm_file: ArmFile, rows: SweepReadings, refit: bool, beta: Array | None = None
 ) -> Array:
     """Prediction errors (K, n) of held-out steps over their standard deviation; NaN if they do not count.
 
     Every second step of each sweep is held out, then the other half. With `refit` gains and offsets are estimated from
     the remaining steps, else they are the record's; likewise mass moments unless `beta` (2n,) [kg·m] is given.
     """
-    described, score = gcomp_arm(arm), np.full(rows.readings.torque.shape, np.nan)
-    known = {} if beta is None else {"beta": beta}
-    start = Parameters.nominal(
-        described.n,
-        gain=record.values("gain", 1.0),
-        offset=record.values("offset", 0.0),
-        position_gain=record.values("position_gain", 1.0),
-        position_offset=record.values("position_offset", 0.0),
-        **known,
-    )
+    kinematics, score = gcomp_arm(arm_file), np.full(rows.readings.torque.shape, np.nan)
+    start = sensor_parameters(record, **({} if beta is None else {"beta": beta}))
     priors = {"gain": Prior(start.gain, LOOSE)} if refit else {}
     fold = _folds(rows)
     unknown = {"rho"} if any(rows.masses) else set[str]()
@@ -67,11 +60,11 @@ def heldout_scores(
         kept, complete = rows.readings.rows(fold != left_out), start
         try:
             if unknown:
-                complete = identify_global(described, kept, unknown=unknown, start=start, priors=priors).complete
+                complete = identify_global(kinematics, kept, unknown=unknown, start=start, priors=priors).complete
         except GcompError:
             continue
         held: StaticReadings = rows.readings.rows(fold == left_out)
-        score[fold == left_out] = (held.torque - predict(described, complete, held)) / held.sigma
+        score[fold == left_out] = (held.torque - predict(kinematics, complete, held)) / held.sigma
     return score
 
 

@@ -22,40 +22,41 @@ from gcomp.identify.parameters import Prior
 from gcomp.identify.sensor_model import predict
 
 WIDE = 0.005
-"""Half width of a gain's 95 % interval, as a share of it, from which the user is told."""
+"""Half width of a gain's 95 % interval, as a share of it, from which it is listed as imprecise: the error that
+tests/campaigns/random_arms.py allows a gain."""
 COMMON = (
-    "the mass tells the gains' common scale by the levers between the axes before the last, which are too short here;"
+    "the common scale of the gains comes from the levers between the axes before the last, which are too short here;"
     " measure where it hangs (sweep.reference_point), or use a heavier one"
 )
-"""Why all gains may be known badly together."""
+"""Reason for a low precision of all gains together."""
 
 
 @dataclass(frozen=True, eq=False)
 class SensorFit:
-    """What the sweeps say about every sensor; NaN where they say nothing, and then `reasons` says why."""
+    """Every sensor's gains and offsets from sweeps; NaN if not identifiable, with the cause in `reasons`."""
 
     names: tuple[str, ...]
     fit: GlobalFit
     rows: SweepReadings
     noise_factor: Array
-    """Scatter of the readings over what their samples' noise explains (n,); at least 1."""
+    """Scatter of the readings over their samples' noise (n,); at least 1."""
     hysteresis: Array
     """Half the mean difference between readings approached upwards and downwards (n,) [N·m]."""
     friction: Array
     """Friction still locked at rest: half the mean difference of the drives' own torque between the directions, less
-    that of the sensors (n,) [N·m]; NaN where the drives report none."""
+    that of the sensors (n,) [N·m]; NaN if the drives report none."""
     goodness: Goodness
-    """Whether the model holds, and what speaks against it."""
+    """Whether the sensor model holds, with findings."""
     quantile: float
     """Student quantile of a 95 % interval."""
     reasons: dict[tuple[str, Parameter], str]
-    """(joint, parameter) → why there is no value."""
+    """(joint, parameter) → why it has no value."""
     gain_ratio: Array | None
-    """Without a reference mass: gains as multiples of the last joint's (n,); NaN where not known."""
+    """Without a reference mass: gains as multiples of the last joint's (n,); NaN if unknown."""
     sources: dict[str, str]
 
     def value(self, parameter: Parameter) -> Array:
-        """Estimates of one parameter (n,), NaN where not identifiable."""
+        """Estimates of one parameter (n,), NaN if not identifiable."""
         found: Array = getattr(self.fit.values, parameter).copy()
         for joint, name in enumerate(self.names):
             if (name, parameter) in self.reasons:
@@ -63,29 +64,29 @@ class SensorFit:
         return found
 
     def std(self, parameter: Parameter) -> Array:
-        """Standard deviations (n,), NaN where not identifiable."""
+        """Standard deviations (n,), NaN if not identifiable."""
         spread: Array = getattr(self.fit.std, parameter)
         return np.where(np.isnan(self.value(parameter)), np.nan, spread)
 
     def ci95(self, parameter: Parameter) -> Array:
-        """95 % intervals (n, 2), NaN where not identifiable."""
+        """95 % intervals (n, 2), NaN if not identifiable."""
         half = self.quantile * self.std(parameter)
         return np.stack([self.value(parameter) - half, self.value(parameter) + half], axis=1)
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What the readings show that the model does not have, in words."""
+        """Effects in the readings that the sensor model does not have."""
         return self.goodness.findings
 
     @property
     def doubtful(self) -> tuple[str, ...]:
-        """Joints at which the model does not hold, so that their values must not be relied on."""
+        """Joints at which the model does not hold, so that their values must not be used."""
         broken = {finding.joint for finding in self.findings if finding.breaks_model}
         return tuple(name for name in self.names if name in broken)
 
     @property
     def attachment(self) -> tuple[Array, Array] | None:
-        """Where the reference mass hung, and half of its 95 % interval, (3,) each [m]; NaN where not determined.
+        """Place of the reference mass and half of its 95 % interval, (3,) each [m]; NaN if not determined.
 
         In the frame that turns with the last joint, origin on its axis. None without a reference mass.
         """
@@ -110,7 +111,7 @@ class SensorFit:
 
     @property
     def imprecise(self) -> dict[str, str]:
-        """Joint → why its gain, though determined, is known worse than `WIDE`."""
+        """Joint → why its gain, though determined, is less precise than `WIDE`."""
         half = self.quantile * self.std("gain") / np.abs(self.value("gain"))
         common = bool(np.all(half[np.isfinite(half)] > WIDE))
         why = COMMON if common else "give its sweeps more poses, or the arm a heavier reference mass"
@@ -126,7 +127,7 @@ class SensorFit:
         rms: Array = np.sqrt(np.nanmean(self.fit.residual**2, axis=0))
         return rms
 
-    def record(self, arm: ArmFile) -> CalibrationRecord:
+    def record(self, arm_file: ArmFile) -> CalibrationRecord:
         """The calibration record of this fit."""
         residual = self.residual_rms
         joints = tuple(
@@ -146,42 +147,42 @@ class SensorFit:
         ]
         covariance = self.fit.covariance_of(*(inner for _, inner in wanted)) if wanted else np.zeros((0, 0))
         return CalibrationRecord(
-            **provenance(arm, self.sources),
+            **provenance(arm_file, self.sources),
             joints=joints,
             covariance_of=tuple(outer for outer, _ in wanted),
             covariance=matrix(covariance) if wanted else (),
         )
 
 
-def fit_sensors(arm: ArmFile, data: Sequence[SweepData]) -> SensorFit:
+def fit_sensors(arm_file: ArmFile, data: Sequence[SweepData]) -> SensorFit:
     """Fit every sensor of the arm to its sweep data sets (unloaded, with a reference mass, or several of each).
 
-    Unknown are torque gains k and offsets o, position gains c, position offsets within the arm file's trust
-    (`sweep.position_offset_std`), mass moments β and the load point ρ; theory.md section 7. Raises BadInput on data
-    that cannot be fitted, Refused on data of another arm.
+    Unknown are torque gains k and offsets o, position gains c, position offsets with the prior of the arm file
+    (`sweep.position_offset_std`), mass moments β and the load point ρ; docs/theory.md, section 7. Raises BadInput on
+    data that cannot be fitted, Refused on data of another arm.
     """
-    rows = sweep_readings([each.require(arm) for each in data])
-    good = _fit(arm, rows)
+    rows = sweep_readings([each.require(arm_file) for each in data])
+    good = _fit(arm_file, rows)
     fit = good.refined.fit
     loaded = any(rows.masses)
     return SensorFit(
-        names=arm.joint_names,
+        names=arm_file.joint_names,
         fit=fit,
         rows=rows,
         noise_factor=good.refined.factor,
-        hysteresis=_half_difference(rows.readings.torque - _modelled(arm, fit, rows), rows),
+        hysteresis=_half_difference(rows.readings.torque - _modelled(arm_file, fit, rows), rows),
         friction=_friction(fit, rows),
         goodness=good,
         quantile=float(stats.t.ppf(0.975, max(fit.dof, 1))),
         reasons=missing_values(fit, rows),
-        gain_ratio=None if loaded else _gain_ratio(arm, rows),
+        gain_ratio=None if loaded else _gain_ratio(arm_file, rows),
         sources={each.path.name: each.digest for each in data},
     )
 
 
-def _fit(arm: ArmFile, rows: SweepReadings, **extra: Prior) -> Goodness:
+def _fit(arm_file: ArmFile, rows: SweepReadings, **extra: Prior) -> Goodness:
     """The global fit, then refined and examined."""
-    described, section = gcomp_arm(arm), sweep_section(arm)
+    kinematics, section = gcomp_arm(arm_file), sweep_section(arm_file)
     unknown = {"gain", "offset", "position_gain", "beta"}
     priors = dict(extra)
     if section.position_offset_std > 0:
@@ -191,13 +192,13 @@ def _fit(arm: ArmFile, rows: SweepReadings, **extra: Prior) -> Goodness:
         unknown.add("rho")
         if section.known_point is not None:
             priors["rho"] = section.known_point
-    fit = identify_global(described, rows.readings, unknown=unknown, priors=priors, position_sigma=rows.position_sigma)
-    return examine(described, rows, fit, priors, arm.require_link().rated_torques)
+    fit = identify_global(kinematics, rows.readings, unknown=unknown, priors=priors, position_sigma=rows.position_sigma)
+    return examine(kinematics, rows, fit, priors, arm_file.require_link().rated_torques)
 
 
-def _modelled(arm: ArmFile, fit: GlobalFit, rows: SweepReadings) -> Array:
+def _modelled(arm_file: ArmFile, fit: GlobalFit, rows: SweepReadings) -> Array:
     """Torque readings (K, n) by the fitted sensors and moments alone [N·m]."""
-    return predict(gcomp_arm(arm), fit.complete, rows.readings)
+    return predict(gcomp_arm(arm_file), fit.complete, rows.readings)
 
 
 def _friction(fit: GlobalFit, rows: SweepReadings) -> Array:
@@ -218,12 +219,12 @@ def _mean(values: Array) -> float:
     return float(kept.mean()) if len(kept) else float("nan")
 
 
-def _gain_ratio(arm: ArmFile, rows: SweepReadings) -> Array:
+def _gain_ratio(arm_file: ArmFile, rows: SweepReadings) -> Array:
     """Gains as multiples of the last joint's (n,), from data without a reference mass."""
-    n = len(arm.joint_names)
+    n = len(arm_file.joint_names)
     std = np.full(n, np.inf)
     std[-1] = 1e-4
-    fit = _fit(arm, rows, gain=Prior(1.0, std)).refined.fit
+    fit = _fit(arm_file, rows, gain=Prior(1.0, std)).refined.fit
     ratio: Array = fit.values.gain
     return np.where(fit.std.gain < 0.2, ratio, np.nan)
 

@@ -1,4 +1,4 @@
-"""One static reading: averages over samples taken while an arm stands still, and several of them as a batch."""
+"""One static reading: averages over samples of an arm at rest, and several of them as a batch."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace

@@ -6,10 +6,11 @@ from itertools import combinations, pairwise, product
 import numpy as np
 
 from calib.observer.config import ObserverConfig
-from calib.observer.effect_dictionary import DRIFT, Entry, Window, class_of, dictionary, kin
+from calib.observer.effect_dictionary import DRIFT, Entry, class_of, dictionary, kin
 from calib.observer.gravity_belief import GravityBelief
-from calib.records.records import Array
+from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_levers
+from gcomp.identify.readings import StaticReadings
 
 
 @dataclass(frozen=True)
@@ -58,13 +59,12 @@ class _Fit:
 class CauseTest:
     """The dictionary fitted to one window, with model error marginalised: covariance σ²I + Y Cov(β) Yᵀ + H Σ_q Hᵀ."""
 
-    def __init__(self, belief: GravityBelief, window: Window, sigma: Array, config: ObserverConfig) -> None:
-        """sigma (n,) [N·m]: standard deviation of one row's torque."""
+    def __init__(self, belief: GravityBelief, window: StaticReadings, config: ObserverConfig) -> None:
+        """Of K rows with true angles, torques as installed and their standard deviations."""
         self.belief, self.window, self._config = belief, window, config
         residual, nuisance = belief.residual(window.position, window.torque, config.position_std)
-        noise = np.tile(sigma, len(window.position))
         covariance = nuisance @ nuisance.T
-        covariance[np.diag_indices_from(covariance)] += noise**2
+        covariance[np.diag_indices_from(covariance)] += window.sigma.ravel() ** 2
         self.entries = list(dictionary(belief.arm, belief.beta, window))
         stacked = np.column_stack([residual.ravel(), *(entry.columns for entry in self.entries)])
         white: Array = np.linalg.solve(np.linalg.cholesky(covariance), stacked)  # scipy takes longer to load

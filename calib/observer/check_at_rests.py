@@ -11,7 +11,8 @@ from armlink.link.types import Calibration
 from calib.arm.kinematics import gcomp_arm
 from calib.observer.config import ObserverConfig
 from calib.observer.rest_detector import RestDetector
-from calib.records.records import Array, CalibrationRecord, GravityRecord
+from calib.records.records import CalibrationRecord, GravityRecord
+from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque
 
 ROWS = 12

@@ -9,7 +9,7 @@ from armlink.torque_calibration import TorqueCalibration
 from calib.motion.static_reading import StaticReading
 from calib.observer.cause_test import CauseTest, Verdict
 from calib.observer.config import ObserverConfig
-from calib.records.records import Array
+from gcomp.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.motion.static_reading import StaticReading
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_regressor, gravity_stiffness
+from gcomp.identify.readings import StaticReadings
 
 CAUSES = {
     "gain": ("torque.gain",),
@@ -24,21 +24,6 @@ CAUSES = {
 }
 """Effects (`armlink.effect_catalogue`) that a cause consists of; a spring's rest angle acts as an offset."""
 DRIFT = ("gain", "offset", "drift")
-
-
-@dataclass(frozen=True)
-class Window:
-    """K rows: true angles (K, n) [rad], torque readings as installed (K, n) [N·m], directions of approach (K, n)."""
-
-    position: Array
-    torque: Array
-    direction: Array
-
-    @classmethod
-    def of(cls, rows: list[StaticReading]) -> "Window":
-        """From K rows whose positions are true angles."""
-        columns = ([getattr(row, name) for row in rows] for name in ("position", "torque", "direction"))
-        return cls(*map(np.array, columns))
 
 
 @dataclass(frozen=True)
@@ -59,8 +44,8 @@ class Entry:
         return self.joint == other.joint and set(CAUSES[other.cause]) < set(CAUSES[self.cause])
 
 
-def dictionary(arm: Arm, beta: Array, window: Window) -> Iterator[Entry]:
-    """Every entry of the dictionary for the poses of a window; beta (2n,) [kg·m] is the present gravity model."""
+def dictionary(arm: Arm, beta: Array, window: StaticReadings) -> Iterator[Entry]:
+    """Every entry of the dictionary for the true angles of a window; beta (2n,) [kg·m] is the present gravity model."""
     q, n = window.position, arm.n
     regressor = gravity_regressor(arm, q)
     torque = regressor @ beta

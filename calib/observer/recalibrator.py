@@ -14,8 +14,9 @@ from calib.install.journaled_write import Controllers, install, recover
 from calib.install.plausibility import Admitted, admit, admit_drift, admit_rollback
 from calib.observer.check_at_rests import AfterWrite, Checked
 from calib.observer.decision import Finding
-from calib.records.records import Array, CalibrationRecord, GravityRecord, matrix, provenance
+from calib.records.records import CalibrationRecord, GravityRecord, matrix, provenance
 from calib.records.store import RecordStore
+from gcomp.arrays import Array
 
 Policy = Literal["observe", "propose", "apply"]
 APPLIED_BY = "observer, policy apply"

@@ -9,7 +9,7 @@ from armlink.link.types import Command, Sample
 from calib.observer.events import Event
 from calib.observer.observer import Observer
 from calib.observer.recalibrator import Recalibration, Recalibrator
-from calib.records.records import Array
+from gcomp.arrays import Array
 
 
 class Cycling(Protocol):

@@ -14,8 +14,8 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, FiniteFloat, V
 from armlink.arm_file import ArmFile, describe
 from armlink.errors import BadInput, Refused
 from armlink.torque_calibration import UNKNOWN, TorqueCalibration
+from gcomp.arrays import Array
 
-Array = npt.NDArray[np.float64]
 Matrix = tuple[tuple[FiniteFloat, ...], ...]
 Parameter = Literal["gain", "offset", "position_gain", "position_offset"]
 PARAMETERS: tuple[Parameter, ...] = ("gain", "offset", "position_gain", "position_offset")

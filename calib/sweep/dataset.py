@@ -30,14 +30,14 @@ class _Model(BaseModel):
 
 
 class Manifest(_Model):
-    """Whose data this is, and with what load it was taken."""
+    """Arm, load and controllers' calibration of a data set."""
 
     schema_: Literal["armlink.sweep/1"] = Field(default="armlink.sweep/1", alias="schema")
     arm: str
     serial: str
     description_hash: str
     arm_file: str
-    """Path of the arm file that it was made with."""
+    """Path of the arm file that it was taken with."""
     names: tuple[str, ...]
     reference_mass: float
     """Reference mass attached during this pass [kg]; 0 for none."""
@@ -52,18 +52,18 @@ class Manifest(_Model):
 
     @classmethod
     def of(
-        cls, arm: ArmFile, reference_mass: float, installed: Sequence[TorqueCalibration[float]] | None = None
+        cls, arm_file: ArmFile, reference_mass: float, installed: Sequence[TorqueCalibration[float]] | None = None
     ) -> Self:
         """The manifest of a new data set of this arm; `installed` is what the controllers hold, by default nothing."""
-        pairs = installed or [UNCALIBRATED] * len(arm.joint_names)
+        pairs = installed or [UNCALIBRATED] * len(arm_file.joint_names)
         return cls(
-            arm=arm.name,
-            serial=arm.serial,
-            description_hash=arm.description_hash,
-            arm_file=str(arm.path),
-            names=arm.joint_names,
+            arm=arm_file.name,
+            serial=arm_file.serial,
+            description_hash=arm_file.description_hash,
+            arm_file=str(arm_file.path),
+            names=arm_file.joint_names,
             reference_mass=reference_mass,
-            rated_torque=tuple(arm.require_link().rated_torques.tolist()),
+            rated_torque=tuple(arm_file.require_link().rated_torques.tolist()),
             installed_gain=tuple(each.gain for each in pairs),
             installed_offset=tuple(each.offset for each in pairs),
             created=datetime.now(UTC).replace(microsecond=0),
@@ -72,12 +72,12 @@ class Manifest(_Model):
 
     @property
     def installed(self) -> TorqueCalibration[Array]:
-        """What the controllers held while the data was taken (n,)."""
+        """Calibration that the controllers held while the data was taken (n,)."""
         return TorqueCalibration(np.array(self.installed_gain), np.array(self.installed_offset))
 
 
 class PlanLine(_Model):
-    """The plan as it is run: written once the scout has found the bias torques."""
+    """The plan as run, written as soon as the scout has determined the bias torques."""
 
     kind: Literal["plan"] = "plan"
     plan: SweepPlan
@@ -105,7 +105,7 @@ _LINE: TypeAdapter[Line] = TypeAdapter(
 
 
 def encoded(line: Line) -> bytes:
-    """A line of a data set as it stands in the file."""
+    """A line of a data set as in the file."""
     return _LINE.dump_json(line) + b"\n"
 
 
@@ -117,9 +117,9 @@ class SweepData:
     manifest: Manifest
     readings: tuple[StaticReading, ...]
     plan: SweepPlan | None
-    """The plan as run; None where the scout had not been finished."""
+    """The plan as run; None if the scout was not finished."""
     resolution: Array
-    """Smallest step seen in each joint's position reading (n,) [rad]; 0 where it is not known."""
+    """Smallest step seen in each joint's position reading (n,) [rad]; 0 if unknown."""
     digest: str = field(repr=False)
     """SHA-256 (hex) of the lines read."""
     stalls: tuple[StallLine, ...] = ()
@@ -127,20 +127,20 @@ class SweepData:
 
     @property
     def complete(self) -> bool:
-        """Whether every reading of the plan is there."""
+        """Whether it has every reading of the plan."""
         return self.plan is not None and len(self.readings) >= self.plan.readings
 
     @property
     def unsettled(self) -> tuple[StaticReading, ...]:
-        """Readings that were taken before the arm stood still."""
+        """Readings that were taken before the arm was at rest."""
         return tuple(reading for reading in self.readings if not reading.settled)
 
-    def require(self, arm: ArmFile) -> Self:
-        """This data set, if it is of this arm; else raises Refused with one line that names what differs."""
+    def require(self, arm_file: ArmFile) -> Self:
+        """This data set; raises Refused, naming the difference, if it is of another arm."""
         differing = {
-            "arm": (self.manifest.arm, arm.name),
-            "serial": (self.manifest.serial, arm.serial),
-            "description": (self.manifest.description_hash[:12], arm.description_hash[:12]),
+            "arm": (self.manifest.arm, arm_file.name),
+            "serial": (self.manifest.serial, arm_file.serial),
+            "description": (self.manifest.description_hash[:12], arm_file.description_hash[:12]),
         }
         for what, (ours, wanted) in differing.items():
             if ours != wanted:
@@ -148,12 +148,12 @@ class SweepData:
         return self
 
     def load_arm(self, override: str | None = None) -> ArmFile:
-        """The arm file that it was made with, or the one given instead; raises BadInput, Refused on another arm."""
+        """The arm file that it was taken with, or `override`; raises BadInput, Refused on another arm."""
         path = Path(self.manifest.arm_file)
         found = override or (str(path) if path.is_file() else self.manifest.arm)
-        arm = load_arm(found)
-        self.require(arm)
-        return arm
+        arm_file = load_arm(found)
+        self.require(arm_file)
+        return arm_file
 
     def array(self, name: str) -> Array:
         """One field of all readings, (K,) or (K, n), as numbers."""
@@ -161,7 +161,7 @@ class SweepData:
 
 
 def load_data(path: Path) -> SweepData:
-    """Read a data set; a torn last line is left out. Raises BadInput naming the file and line."""
+    """Read a data set; an incomplete last line is left out. Raises BadInput naming the file and line."""
     manifest = _read_manifest(path)
     content = (path / LINES).read_bytes() if (path / LINES).is_file() else b""
     whole = content[: content.rfind(b"\n") + 1]
@@ -181,7 +181,7 @@ def load_data(path: Path) -> SweepData:
 
 
 def require_vacant(path: Path, resume: bool = False) -> None:
-    """Raise BadInput unless a new data set can begin at `path`, or with `resume` one is there to go on with."""
+    """Raise BadInput unless a new data set can begin at `path` or, with `resume`, one there can be continued."""
     if resume:
         _read_manifest(path)
     elif path.exists() and (not path.is_dir() or any(each != part_of(path / MANIFEST) for each in path.iterdir())):
@@ -192,7 +192,7 @@ class DataWriter:
     """Appends to a data set; each line is on disk when `append` returns. A context manager."""
 
     def __init__(self, path: Path, manifest: Manifest, resume: bool = False) -> None:
-        """Make the directory, or with `resume` go on with the one there; raises BadInput where that cannot be."""
+        """Make the directory or, with `resume`, continue the one there; raises BadInput if that is impossible."""
         require_vacant(path, resume)
         if resume:
             _require_same(_read_manifest(path), manifest, path)
@@ -204,7 +204,7 @@ class DataWriter:
         _keep_names(path)
 
     def append(self, line: Line) -> None:
-        """Write one line and wait until it is on disk; raises BadInput where the disk is full or fails."""
+        """Write one line and wait until it is on disk; raises BadInput if the disk is full or fails."""
         content = encoded(line)
         try:
             if self._file.write(content) < len(content):
@@ -213,7 +213,7 @@ class DataWriter:
         except OSError as error:
             raise BadInput(
                 f"{self._file.name}: {error.strerror}: the last reading is not kept, those before it are;"
-                " mend the disk, then go on with --resume"
+                " free or repair the disk, then continue with --resume"
             ) from None
 
     def __enter__(self) -> Self:
@@ -231,7 +231,7 @@ class DataWriter:
 
 
 def _keep_names(path: Path) -> None:
-    """Wait until a directory's new names and its own are on disk: a power cut must not take them."""
+    """Wait until a directory's entries and its own name are on disk, so that a power cut cannot lose them."""
     for folder in (path, path.parent):
         opened = os.open(folder, os.O_RDONLY)
         os.fsync(opened)

@@ -1,4 +1,4 @@
-"""Verification: drives to poses that no fit has seen and compares model torque with sensor torque (Figure 6)."""
+"""Verification: model against sensor torque at held-out poses, as Figure 6 of [MH97] (docs/theory.md, section 3)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,10 +19,12 @@ from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque, torque_covariance
 
 ACCELERATION = 2.0
+"""Of travel between poses [rad/s²]; a choice."""
 TOLERANCE = 0.01
-"""RMS that passes, as a share of the joint's largest model torque, beside the noise floor."""
+"""RMS that passes, as a share of the joint's largest model torque: twice the error of gravity torque that
+tests/calib/drawn_arms.py allows."""
 NOISE_FLOOR = 0.003
-"""RMS that passes anyway, as a share of rated torque."""
+"""RMS that always passes, as a share of rated torque: the error of an offset that tests/calib/drawn_arms.py allows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +65,7 @@ class Verification:
 
 def run_verify(
     link: ArmDriver,
-    arm: ArmFile,
+    arm_file: ArmFile,
     gravity: GravityRecord,
     calibration: CalibrationRecord | None = None,
     *,
@@ -73,13 +75,13 @@ def run_verify(
 ) -> Verification:
     """Drive, servo-held, to random poses within the joint range and read every torque sensor there.
 
-    The link must have been enabled. Without a calibration record the controllers' own calibration stands. Raises
-    Refused on records of another arm, or where no pose can be reached; BusFault.
+    The link must have been enabled. Without a calibration record the controllers' own calibration is used. Raises
+    Refused on records of another arm, or if no pose can be reached; BusFault.
     """
-    n, section, limits = link.n, sweep_section(arm), Limits.of(arm)
-    described = gcomp_arm(arm)
-    sensors = _Sensors.of(link, None if calibration is None else calibration.require(arm))
-    beta = np.array(gravity.require(arm).beta)
+    n, section, limits = link.n, sweep_section(arm_file), Limits.of(arm_file)
+    kinematics = gcomp_arm(arm_file)
+    sensors = _Sensors.of(link, None if calibration is None else calibration.require(arm_file))
+    beta = np.array(gravity.require(arm_file).beta)
     mover = Mover(link, section, limits)
     mover.hold_all()
     everything, angles, torques, skipped = np.ones(n, dtype=bool), [], [], 0
@@ -100,14 +102,14 @@ def run_verify(
     if not angles:
         raise Refused("no pose was reached: the drives stalled at every one; is the arm free to move?")
     q = np.array(angles)
-    model = gravity_torque(described, beta, q)
-    variance = np.diagonal(torque_covariance(described, np.array(gravity.covariance), q), axis1=-2, axis2=-1)
+    model = gravity_torque(kinematics, beta, q)
+    variance = np.diagonal(torque_covariance(kinematics, np.array(gravity.covariance), q), axis1=-2, axis2=-1)
     tolerance = np.maximum(TOLERANCE * np.abs(model).max(axis=0), NOISE_FLOOR * limits.rated)
     return Verification(link.names, q, np.array(torques), model, np.sqrt(np.maximum(variance, 0.0)), skipped, tolerance)
 
 
 def verify_poses(limits: Limits, section: SweepSection, count: int, seed: int, begin: Array) -> Array:
-    """Random poses (count, n) [rad] within the joint range, ordered for short ways from `begin` (n,)."""
+    """Random poses (count, n) [rad] within the joint range, in an order with little travel from `begin` (n,)."""
     ends = np.array([sweep_range(section, limits, joint) for joint in range(len(limits.lower))])
     generator = np.random.default_rng([seed, 6])
     return nearest_first(ends[:, 0] + generator.random((count, len(ends))) * (ends[:, 1] - ends[:, 0]), begin)
@@ -115,7 +117,7 @@ def verify_poses(limits: Limits, section: SweepSection, count: int, seed: int, b
 
 @dataclass(frozen=True, eq=False)
 class _Sensors:
-    """From what the controllers send to angles and torques."""
+    """Conversion of what the controllers send to angles and torques."""
 
     installed: TorqueCalibration[Array]
     calibrated: TorqueCalibration[Array]

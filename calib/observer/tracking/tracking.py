@@ -5,11 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from calib.motion.static_reading import StaticReading
+from calib.motion.static_reading import StaticReading, batch, stack
 from calib.observer.cause_test import CauseTest
 from calib.observer.config import ObserverConfig
 from calib.observer.decision import Finding
-from calib.observer.effect_dictionary import Window
 from calib.observer.gravity_belief import GravityBelief
 from calib.observer.saved_values import UNREADABLE
 from calib.observer.tracking.cusum import Cusum
@@ -58,12 +57,11 @@ class Tracking:
 
     def cause_test(self, rows: list[StaticReading]) -> CauseTest:
         """The cause test of these rows, by the present belief."""
-        return CauseTest(self.belief, Window.of(rows), self.sigma, self._config)
+        return CauseTest(self.belief, batch(rows, self.sigma), self._config)
 
     def learn(self, rows: list[StaticReading]) -> None:
         """Adapt the model to rows that are free of drift."""
-        window = Window.of(rows)
-        self.belief.learn(window.position, window.torque, self.sigma)
+        self.belief.learn(stack(rows, "position"), stack(rows, "torque"), self.sigma)
         self._poses.forget()
 
     def carry(self, values: Array, covariance: Array) -> None:

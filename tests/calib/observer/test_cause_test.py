@@ -9,17 +9,22 @@ import pytest
 from effects_on_readings import CONFIG, SIGMA, payload
 
 from calib.observer.cause_test import CauseTest, Verdict
-from calib.observer.effect_dictionary import Window, dictionary
+from calib.observer.effect_dictionary import dictionary
 from calib.observer.gravity_belief import GravityBelief
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.gravity.torque import gravity_regressor, gravity_stiffness, gravity_torque
+from gcomp.identify.readings import StaticReadings
 
 MODEL_STD = np.repeat([4.4, 4.5, 1.3, 0.9, 0.5, 0.4, 0.3], 2) * 1e-3
 """Errors of a good calibration, kg·m (docs/theory.md, section 6)."""
 
 Effect = Callable[[Arm, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.random.Generator], str]
 """(arm, beta, q, direction, readings to change, random) -> the right answer."""
+
+
+def window(q: np.ndarray, v: np.ndarray, direction: np.ndarray) -> StaticReadings:
+    return StaticReadings(q, v, np.full(q.shape[1], SIGMA), direction=direction)
 
 
 def nothing(arm, beta, q, direction, v, random):
@@ -125,7 +130,7 @@ def verdict(arm, beta, effect, rows, random, model_std=None) -> tuple[str, Verdi
     v += SIGMA * random.normal(size=v.shape)
     std = np.zeros(beta.size) if model_std is None else model_std
     belief = GravityBelief(arm, beta + std * random.normal(size=beta.size), np.diag(std**2))
-    return truth, CauseTest(belief, Window(q, v, direction), np.full(arm.n, SIGMA), CONFIG).verdict()
+    return truth, CauseTest(belief, window(q, v, direction), CONFIG).verdict()
 
 
 def answer(truth: str, said: Verdict) -> str:
@@ -208,7 +213,7 @@ def test_the_estimate_holds_the_truth_as_often_as_its_covariance_says(sarcos, sa
         v[:, 2] = 1.03 * v[:, 2] + 0.3
         v += SIGMA * random.normal(size=v.shape)
         belief = GravityBelief(sarcos, sarcos_beta + MODEL_STD * random.normal(size=14), np.diag(MODEL_STD**2))
-        test = CauseTest(belief, Window(q, v, np.ones_like(q)), np.full(7, SIGMA), CONFIG)
+        test = CauseTest(belief, window(q, v, np.ones_like(q)), CONFIG)
         change, covariance = test.drift(2, "drift")
         error = change - (0.03, 0.3)
         scores.append(float(error @ np.linalg.solve(covariance, error)))
@@ -219,8 +224,8 @@ def test_the_dictionary_is_the_derivative_of_the_torque(sarcos, sarcos_beta) -> 
     """Slip, tilt and payload columns against finite differences of the gravity torque."""
     random = np.random.default_rng(5)
     q = random.uniform(sarcos.lower, sarcos.upper, (4, 7))
-    window = Window(q, np.zeros_like(q), np.ones_like(q))
-    entries = {(entry.cause, entry.joint): entry.columns for entry in dictionary(sarcos, sarcos_beta, window)}
+    poses = window(q, np.zeros_like(q), np.ones_like(q))
+    entries = {(entry.cause, entry.joint): entry.columns for entry in dictionary(sarcos, sarcos_beta, poses)}
     step = 1e-6
     for joint in range(7):
         turn = step * np.eye(7)[joint]
@@ -243,9 +248,7 @@ def test_one_pose_cannot_blame_a_payload(sarcos, sarcos_beta) -> None:
     q = np.tile(random.uniform(sarcos.lower, sarcos.upper), (20, 1))
     v = gravity_torque(sarcos, sarcos_beta, q)
     payload(0.5)(sarcos, sarcos_beta, q, np.ones_like(q), v, random)
-    test = CauseTest(
-        GravityBelief(sarcos, sarcos_beta, np.zeros((14, 14))), Window(q, v, q * 0), np.full(7, SIGMA), CONFIG
-    )
+    test = CauseTest(GravityBelief(sarcos, sarcos_beta, np.zeros((14, 14))), window(q, v, q * 0), CONFIG)
     assert test.verdict().cause != "payload"
 
 
@@ -257,5 +260,5 @@ def test_a_vertical_joint_that_gravity_does_not_load_has_only_an_offset(sarcos, 
     v[:, 0] += 0.2
     v += SIGMA * random.normal(size=v.shape)
     belief = GravityBelief(upright, sarcos_beta, np.zeros((14, 14)))
-    said = CauseTest(belief, Window(q, v, random.choice([-1.0, 1.0], q.shape)), np.full(7, SIGMA), CONFIG).verdict()
+    said = CauseTest(belief, window(q, v, random.choice([-1.0, 1.0], q.shape)), CONFIG).verdict()
     assert (said.cause, said.joint) == ("offset", 0)

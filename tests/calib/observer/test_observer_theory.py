@@ -7,11 +7,11 @@ import pytest
 from effects_on_readings import CONFIG, SIGMA, payload
 
 from calib.observer.cause_test import CauseTest
-from calib.observer.effect_dictionary import Window
 from calib.observer.gravity_belief import GravityBelief
 from calib.observer.tracking.cusum import Cusum
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.gravity.torque import gravity_regressor, gravity_torque
+from gcomp.identify.readings import StaticReadings
 
 PICKUPS, WATCHED, FRESH = 700, 100, 20
 LOAD_BOX = 0.15
@@ -32,9 +32,10 @@ def cause_of_pickup(arm, beta, mass, random) -> str:
     else:
         return "no alarm"
     fresh = slice(row + 1, row + 1 + FRESH)
-    window = Window(q[fresh], reading[fresh], random.choice([-1.0, 1.0], (FRESH, arm.n)))
+    side = random.choice([-1.0, 1.0], (FRESH, arm.n))
+    window = StaticReadings(q[fresh], reading[fresh], np.full(arm.n, SIGMA), direction=side)
     exact = GravityBelief(arm, beta, np.zeros((beta.size, beta.size)))
-    verdict = CauseTest(exact, window, np.full(arm.n, SIGMA), CONFIG).verdict()
+    verdict = CauseTest(exact, window, CONFIG).verdict()
     return "drift" if verdict.is_drift else verdict.cause
 
 
