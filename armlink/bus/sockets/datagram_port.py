@@ -115,6 +115,10 @@ class DatagramPort(ABC):
         self._sendmmsg, self._recvmmsg = library.sendmmsg, library.recvmmsg
         self._sendmmsg.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int)
         self._recvmmsg.argtypes = (*self._sendmmsg.argtypes, ctypes.c_void_p)
+        self._prepare(receiving)
+
+    def _prepare(self, receiving: socket.socket) -> None:
+        """Give the socket a large receive queue that counts what it loses."""
         try:
             receiving.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER)
         except OSError:  # without CAP_NET_ADMIN as much as net.core.rmem_max allows

@@ -21,8 +21,9 @@ _CLOCK_TRIES, _CLOCK_SECONDS = 5, 1e-4  # two clocks are read so close together,
 class Stamping(DatagramPort):
     """A port whose frames are taken in batches, with their times: by `wait` and `take_all`, not by `receive`."""
 
-    def stamp(self, receiving: socket.socket) -> None:
+    def _prepare(self, receiving: socket.socket) -> None:
         """Let the kernel stamp what comes; every datagram has room for its control messages."""
+        super()._prepare(receiving)
         receiving.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         self._control = ctypes.create_string_buffer(BATCH * CONTROL)
         base = ctypes.addressof(self._control)
@@ -68,27 +69,9 @@ class Stamping(DatagramPort):
 class StampedSocketPort(Stamping, SocketPort):
     """SocketCAN with timestamps."""
 
-    def __init__(self, raw: socket.socket, name: str, fd: bool = False) -> None:
-        """As SocketPort."""
-        super().__init__(raw, name, fd)
-        self.stamp(raw)
-
 
 class StampedMulticastPort(Stamping, MulticastPort):
     """udp_multicast with timestamps."""
-
-    def __init__(
-        self,
-        receiving: socket.socket,
-        group: tuple[str, int],
-        hop_limit: int,
-        name: str,
-        fd: bool = True,
-        as_node: bool = False,
-    ) -> None:
-        """As MulticastPort."""
-        super().__init__(receiving, group, hop_limit, name, fd, as_node)
-        self.stamp(receiving)
 
 
 def _clocks() -> tuple[float, float]:
