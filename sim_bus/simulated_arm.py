@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armlink.arm_file import ArmFile
+from armlink.canopen.object_dictionary import SYNC_ID
 from armlink.errors import BadInput
 from sim_bus.effects.effect import EffectSetting
 from sim_bus.effects.registry import imperfections
@@ -26,7 +27,6 @@ from sim_bus.sim_section import sim_section
 from sim_bus.truth import Truth
 
 Array = NDArray[np.float64]
-SYNC_ID = 0x80
 DRIVE_ERROR = 0x21
 """Error register: generic and device profile."""
 TARGETS = {(0x6071, 0), (0x607A, 0), (0x60FF, 0)}

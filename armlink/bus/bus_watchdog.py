@@ -1,6 +1,6 @@
 """What a bus shows that is not as it should be: a second host, a duplicated node id, a babbling node, a restart."""
 
-from armlink.canopen import object_dictionary as objects
+from armlink.canopen.object_dictionary import HEARTBEAT_ID, NMT_ID, SYNC_ID
 from armlink.canopen.pdo import RPDO1, RPDO2
 
 MOST_FRAMES = 1000
@@ -22,9 +22,9 @@ class BusWatch:
     def __init__(self, nodes: tuple[int, ...], host: int) -> None:
         """`nodes` are the joints' node ids, `host` is our own: nobody else sends its heartbeat."""
         self._ours = {
-            objects.NMT_ID: "NMT command",
-            objects.SYNC_ID: "SYNC",
-            objects.HEARTBEAT_ID + host: "heartbeat of the host",
+            NMT_ID: "NMT command",
+            SYNC_ID: "SYNC",
+            HEARTBEAT_ID + host: "heartbeat of the host",
             **{RPDO1.cob_base + node: f"RPDO1 of node {node}" for node in nodes},
             **{RPDO2.cob_base + node: f"RPDO2 of node {node}" for node in nodes},
         }

@@ -8,25 +8,25 @@ from typing import Any
 import canopen
 
 from armlink.arm_file import ArmFile, DeviceIdentity, LinkJoint
-from armlink.canopen import object_dictionary as objects
+from armlink.canopen import object_dictionary
 from armlink.canopen.object_dictionary import Entry
 from armlink.canopen.pdo import LINK_PDOS
 from armlink.errors import BadInput
 
 SUFFIXES = (".eds", ".dcf")
 OPTIONAL = {
-    objects.TORQUE_OFFSET: "torque offset: nothing latched to clear",
-    objects.PROFILE_VELOCITY: "profile velocity: no profile position mode",
-    objects.TORQUE_SLOPE: "torque slope: no profile torque mode",
-    objects.STORE_MANUFACTURER: "store: a calibration is lost at power-off",
-    objects.HEARTBEAT_PRODUCER: "",
+    object_dictionary.TORQUE_OFFSET: "torque offset: nothing latched to clear",
+    object_dictionary.PROFILE_VELOCITY: "profile velocity: no profile position mode",
+    object_dictionary.TORQUE_SLOPE: "torque slope: no profile torque mode",
+    object_dictionary.STORE_MANUFACTURER: "store: a calibration is lost at power-off",
+    object_dictionary.HEARTBEAT_PRODUCER: "",
 }
 """Objects that a controller may lack, and what it then does not do."""
 
 
 def used_objects() -> Iterable[Entry]:
     """The objects of a controller that the link uses."""
-    return [value for value in vars(objects).values() if isinstance(value, Entry)]
+    return [value for value in vars(object_dictionary).values() if isinstance(value, Entry)]
 
 
 def bundled_path() -> str:

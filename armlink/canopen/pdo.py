@@ -4,8 +4,19 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from armlink.canopen import object_dictionary as objects
-from armlink.canopen.object_dictionary import Entry
+from armlink.canopen.object_dictionary import (
+    CONTROL_WORD,
+    MODE,
+    MODE_DISPLAY,
+    MOTOR_TORQUE,
+    POSITION,
+    STATUS_WORD,
+    TARGET_POSITION,
+    TARGET_TORQUE,
+    TORQUE_READING,
+    VELOCITY,
+    Entry,
+)
 
 SYNC_TYPE = 1
 """Transmission type: RPDO applied at, TPDO sent after every SYNC (CiA 301, 1800h:02)."""
@@ -47,20 +58,20 @@ RPDO1 = Pdo(
     0x200,
     0x1400,
     0x1600,
-    (objects.CONTROL_WORD, objects.TARGET_TORQUE, objects.TARGET_POSITION),
+    (CONTROL_WORD, TARGET_TORQUE, TARGET_POSITION),
     SYNC_TYPE,
 )
-RPDO2 = Pdo("RPDO2", 0x300, 0x1401, 0x1601, (objects.MODE,), EVENT_TYPE)
-TPDO1 = Pdo("TPDO1", 0x180, 0x1800, 0x1A00, (objects.POSITION, objects.TORQUE_READING), SYNC_TYPE)
+RPDO2 = Pdo("RPDO2", 0x300, 0x1401, 0x1601, (MODE,), EVENT_TYPE)
+TPDO1 = Pdo("TPDO1", 0x180, 0x1800, 0x1A00, (POSITION, TORQUE_READING), SYNC_TYPE)
 TPDO2 = Pdo(
     "TPDO2",
     0x280,
     0x1801,
     0x1A01,
-    (objects.STATUS_WORD, objects.MOTOR_TORQUE, objects.VELOCITY),
+    (STATUS_WORD, MOTOR_TORQUE, VELOCITY),
     STATUS_DECIMATION,
 )
-TPDO3 = Pdo("TPDO3", 0x380, 0x1802, 0x1A02, (objects.STATUS_WORD, objects.MODE_DISPLAY), EVENT_TYPE)
+TPDO3 = Pdo("TPDO3", 0x380, 0x1802, 0x1A02, (STATUS_WORD, MODE_DISPLAY), EVENT_TYPE)
 LINK_PDOS = (RPDO1, RPDO2, TPDO1, TPDO2, TPDO3)
 
 Write = Callable[[Entry, int], None]

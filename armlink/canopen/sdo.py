@@ -11,9 +11,8 @@ import canopen
 from canopen.sdo.exceptions import SdoAbortedError, SdoError
 
 from armlink.arm_file import ArmFile
-from armlink.canopen import eds_file as data_sheet
-from armlink.canopen import object_dictionary as objects
-from armlink.canopen.object_dictionary import Entry
+from armlink.canopen import eds_file
+from armlink.canopen.object_dictionary import DEVICE_TYPE, Entry
 from armlink.errors import BusFault
 
 logging.getLogger("canopen").addHandler(logging.NullHandler())
@@ -93,7 +92,7 @@ class NodeServices:
         client = self.remote.sdo
         client.MAX_RETRIES = 1
         try:
-            client.upload(objects.DEVICE_TYPE.index, 0)
+            client.upload(DEVICE_TYPE.index, 0)
         except SdoAbortedError:
             return True
         except (SdoError, *MALFORMED):
@@ -169,7 +168,7 @@ class NodeServices:
 
 def joint_services(network: PumpedNetwork, arm: ArmFile, pump: Pump) -> tuple[NodeServices, ...]:
     """SDO access to every joint's controller, in joint order; raises BadInput for a wrong data sheet."""
-    pairs = zip(arm.require_link().joints, data_sheet.of_joints(arm), strict=True)
+    pairs = zip(arm.require_link().joints, eds_file.of_joints(arm), strict=True)
     return tuple(NodeServices(network, joint.name, joint.node, sheet, pump) for joint, sheet in pairs)
 
 

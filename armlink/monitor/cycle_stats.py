@@ -8,7 +8,7 @@ import numpy as np
 
 from armlink.arrays import Array
 from armlink.bus.frame_bits import frame_bits
-from armlink.canopen import object_dictionary as objects
+from armlink.canopen.object_dictionary import SYNC_ID
 from armlink.canopen.pdo import TPDO1
 
 KEPT = 1_000_000
@@ -58,7 +58,7 @@ class CycleStats:
         """Count a frame that came at `stamp` [s]."""
         if self._first == self._first:  # what came before the first SYNC is no whole cycle
             self._bits += frame_bits(can_id, data)
-        if can_id == objects.SYNC_ID:
+        if can_id == SYNC_ID:
             self._begin(stamp)
         elif can_id in self._waiting:
             self._waiting.discard(can_id)

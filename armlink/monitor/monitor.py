@@ -12,8 +12,8 @@ from armlink.bus.message_port import is_data
 from armlink.bus.port import Port
 from armlink.bus.taps import TappedBus, TappedPort
 from armlink.canopen import emcy
-from armlink.canopen import object_dictionary as objects
 from armlink.canopen.cia402 import state_of
+from armlink.canopen.object_dictionary import NMT_ID, NMT_START, NMT_STATES, OPERATIONAL, SYNC_ID
 from armlink.canopen.units import assumed_units
 from armlink.clock import Clock, MonotonicClock
 from armlink.link.cyclic_exchange import NO_STATUS, Loop
@@ -51,7 +51,7 @@ class Monitor:
         self._loop.on_other = self._count
         self._syncs = 0
         if sync:
-            self._loop.send(objects.NMT_ID, bytes([objects.NMT_START, 0]))
+            self._loop.send(NMT_ID, bytes([NMT_START, 0]))
 
     def _open_port(self, bus: MessageBus) -> Port:
         """The bus's port; for statistics one that shows every frame, with the interface's times if we only listen."""
@@ -95,7 +95,7 @@ class Monitor:
 
     def _joint(self, sample: Sample, joint: int) -> dict[str, Any]:
         sends = math.isfinite(sample.position[joint])  # which only an operational node does
-        nmt = objects.OPERATIONAL if sends else self._loop.node_states.get(joint)
+        nmt = OPERATIONAL if sends else self._loop.node_states.get(joint)
         status = int(sample.status[joint])
         return {
             "joint": self.names[joint],
@@ -105,7 +105,7 @@ class Monitor:
             "torque": float(sample.torque[joint]),
             "motor_torque": float(sample.motor_torque[joint]),
             "state": None if status == NO_STATUS else state_of(status).value,
-            "nmt": None if nmt is None else objects.NMT_STATES.get(nmt, str(nmt)),
+            "nmt": None if nmt is None else NMT_STATES.get(nmt, str(nmt)),
             "age": float(sample.age[joint]),
         }
 
@@ -114,7 +114,7 @@ class Monitor:
         count = max(1, round(seconds / self._period))
         start = self.clock.now()
         for cycle in range(count):
-            self._loop.send(objects.SYNC_ID, b"")
+            self._loop.send(SYNC_ID, b"")
             self._syncs += 1
             end = start + (cycle + 1) * self._period
             while (remaining := end - self.clock.now()) > 0:
@@ -128,4 +128,4 @@ class Monitor:
             self.cycle_stats.take(stamp / 1e6, message.arbitration_id, bytes(message.data))
 
     def _count(self, can_id: int, data: bytes) -> None:
-        self._syncs += can_id == objects.SYNC_ID
+        self._syncs += can_id == SYNC_ID

@@ -4,10 +4,10 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 
 from armlink.bus.port import Port
-from armlink.canopen import eds_file as data_sheet
+from armlink.canopen.eds_file import bundled
 from armlink.canopen.sdo import NodeServices, PumpedNetwork
 from armlink.clock import Clock
-from armlink.link import controller_setup as device
+from armlink.link.controller_setup import identify
 from armlink.link.types import Identity
 
 SEARCH_SECONDS = 0.3
@@ -32,14 +32,14 @@ def scan_bus(port: Port, clock: Clock, joints: Mapping[int, str]) -> list[Identi
         return True
 
     found = _search(port, pump, network)
-    dictionary = data_sheet.bundled()
+    dictionary = bundled()
     identities = []
     for node in sorted({*+found, *joints}):
         name = joints.get(node, "")
         if found[node] > 1:  # whatever one of them is asked, the other answers too
             identities.append(Identity(name, node, present=True, answers=found[node]))
         elif found[node]:
-            identities.append(device.identify(NodeServices(network, name, node, dictionary, pump)))
+            identities.append(identify(NodeServices(network, name, node, dictionary, pump)))
         else:
             identities.append(Identity(name, node, present=False))
     return identities

@@ -9,7 +9,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.bus.can_bus import CanBus, TimedBus
-from armlink.canopen import object_dictionary as objects
+from armlink.canopen.object_dictionary import SYNC_ID
 from armlink.canopen.pdo import RPDO1
 from armlink.canopen.units import assumed_units
 from armlink.clock import Clock, MonotonicClock
@@ -55,7 +55,7 @@ class Recorder:
 
     def _take(self, can_id: int, data: bytes) -> None:
         joint = self._joint_of.get(can_id)
-        if can_id == objects.SYNC_ID:
+        if can_id == SYNC_ID:
             self._complete(self._stamp())
         elif joint is not None and len(data) == RPDO1.layout.size:
             _, self._next_torque[joint], self._next_position[joint] = struct.unpack("<Hhi", data)

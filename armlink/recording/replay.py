@@ -11,7 +11,7 @@ from armlink.arm_file import ArmFile
 from armlink.bus.frame_log import LogBus, LogReader, is_log
 from armlink.bus.open import open_bus, parse_bus
 from armlink.bus.port import Port, Stamped
-from armlink.canopen import object_dictionary as objects
+from armlink.canopen.object_dictionary import SYNC_ID
 from armlink.canopen.pdo import TPDO1, TPDO2, TPDO3
 from armlink.canopen.units import TORQUE_PER_MICRO, assumed_units
 from armlink.clock import Clock, MonotonicClock
@@ -87,7 +87,7 @@ def frames_of_recording(arm: ArmFile, recording: Recording) -> Iterator[Stamped]
     motor = nothing if recording.motor_torque is None else recording.motor_torque
     velocity = nothing if recording.velocity is None else recording.velocity
     for row, t in enumerate((recording.t - recording.t[0]).tolist()):
-        yield t, objects.SYNC_ID, b""
+        yield t, SYNC_ID, b""
         for j, (joint, unit) in enumerate(zip(joints, units, strict=True)):
             position, reading = recording.position[row, j], torque[row, j]
             if math.isfinite(position) and math.isfinite(reading):
