@@ -5,7 +5,7 @@ export PYTHON
 CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host daemon_days daemon_kills fuzz_frames web
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint format bench soak blind mutants docs constraints clean
+.PHONY: help venv demo test lint format bench soak realtime blind mutants docs constraints clean
 
 help: ## Say what can be done
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
@@ -42,6 +42,9 @@ soak: .venv/.dev ## Long campaigns outside make test: kills, faults, simulated d
 	@status=0; for name in $(CAMPAIGNS); do \
 	  echo "soak: $$name" >&2; $(BIN)/python tests/campaigns/$$name.py $(ARGS) || { status=1; echo "soak: $$name failed" >&2; }; \
 	done; exit $$status
+
+realtime: .venv/.dev ## Long campaign outside make test: the whole job between processes, in real time (ARGS="--seeds 1 --busy")
+	$(BIN)/python tests/campaigns/real_time.py $(ARGS)
 
 blind: .venv/.dev ## Long campaign outside make test: the diagnosis against sealed cases (ARGS="--cases 20")
 	$(BIN)/armlink gap bench $(ARGS)

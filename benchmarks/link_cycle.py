@@ -16,7 +16,7 @@ import canopen
 from echo_nodes import NODES, answer_in_kernel, make_arm, remove_gateway, start_nodes
 
 from armlink.bus.open import open_bus
-from armlink.canopen import eds_file as data_sheet
+from armlink.canopen.eds_file import bundled
 from armlink.clock import MonotonicClock
 from armlink.link.link import Link
 from armlink.link.types import Command
@@ -56,7 +56,7 @@ class PeerHost:
     def __init__(self, channel: str) -> None:
         self.network = canopen.Network()
         self.network.connect(interface="socketcan", channel=channel)
-        dictionary = data_sheet.bundled()
+        dictionary = bundled()
         self.came, self.missing = threading.Event(), 0
         self.commands, self.readings = [], []
         for number in NODES:

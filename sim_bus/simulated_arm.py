@@ -7,6 +7,7 @@ from contextlib import contextmanager
 
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
+from armlink.canopen.object_dictionary import SYNC_ID
 from armlink.errors import BadInput
 from sim_bus.effects.effect import EffectSetting
 from sim_bus.effects.registry import imperfections
@@ -23,7 +24,6 @@ from sim_bus.physics.sensors import Sensors
 from sim_bus.sim_section import sim_section
 from sim_bus.truth import Truth
 
-SYNC_ID = 0x80
 DRIVE_ERROR = 0x21
 """Error register: generic and device profile."""
 TARGETS = {(0x6071, 0), (0x607A, 0), (0x60FF, 0)}

@@ -1,4 +1,4 @@
-"""python-can's buses as CanBus: SocketCAN and udp_multicast by their sockets, any other interface by its messages."""
+"""Adapters of python-can's buses: SocketCAN and udp_multicast through their sockets, others through messages."""
 
 from types import TracebackType
 from typing import Self, cast
@@ -16,12 +16,12 @@ from armlink.clock import Clock
 
 
 class PythonCanBus:
-    """Any interface of python-can; a context manager that closes it."""
+    """Any interface of python-can; a context manager that closes the bus."""
 
     clock: Clock | None = None
 
     def __init__(self, bus: can.BusABC, name: str = "") -> None:
-        """Take a bus of python-can's, closed with this one; `name` for messages, by default python-can's own."""
+        """Take ownership of a python-can bus; `name` for messages, by default python-can's own."""
         self.bus = bus
         self.channel_info = name or str(bus.channel_info)
 
@@ -39,15 +39,15 @@ class PythonCanBus:
         return str(self.bus.protocol).startswith("CanProtocol.CAN_FD")
 
     def open_port(self, as_node: bool = False) -> Port:
-        """As CanBus has it."""
+        """See CanBus."""
         return MessagePort(self.bus, self.channel_info, self.fd, as_node)
 
     def open_listening_port(self) -> Port:
-        """As CanBus has it."""
+        """See CanBus."""
         return self.open_port()
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """As MessageSource has it; raises python-can's errors."""
+        """See MessageSource; raises python-can's errors."""
         return self.bus.recv(timeout)
 
     def shutdown(self) -> None:
@@ -59,11 +59,11 @@ class SocketCanBus(PythonCanBus):
     """Linux's SocketCAN."""
 
     def open_port(self, as_node: bool = False) -> Port:
-        """As CanBus has it."""
+        """See CanBus."""
         return SocketPort(self.bus.socket, self.channel_info, self.fd, as_node)
 
     def open_listening_port(self) -> Port:
-        """As CanBus has it."""
+        """See CanBus."""
         return StampedSocketPort(self.bus.socket, self.channel_info, self.fd)
 
 
@@ -71,20 +71,20 @@ class MulticastBus(PythonCanBus):
     """CAN over UDP multicast, in python-can's format."""
 
     def __init__(self, bus: can.BusABC, name: str = "") -> None:
-        """Take a UdpMulticastBus of python-can's, closed with this one."""
+        """Take ownership of a UdpMulticastBus of python-can."""
         super().__init__(bus, name)
         self._ports: list[MulticastPort] = []
 
     def open_port(self, as_node: bool = False) -> Port:
-        """As CanBus has it; raises BusFault if the machine has no route to the group."""
+        """See CanBus; raises BusFault if there is no route to the group."""
         return self._open(MulticastPort, as_node)
 
     def open_listening_port(self) -> Port:
-        """As CanBus has it; raises BusFault if the machine has no route to the group."""
+        """See CanBus; raises BusFault if there is no route to the group."""
         return self._open(StampedMulticastPort)
 
     def _open(self, kind: type[MulticastPort], as_node: bool = False) -> Port:
-        inner = self.bus._multicast  # python-can does not show its socket otherwise
+        inner = self.bus._multicast  # python-can has no public access to the group
         port = kind(inner._socket, (inner.group, inner.port), inner.hop_limit, self.channel_info, self.fd, as_node)
         self._ports.append(port)
         return port
@@ -97,16 +97,16 @@ class MulticastBus(PythonCanBus):
 
 
 _ADAPTERS = {"SocketcanBus": SocketCanBus, "UdpMulticastBus": MulticastBus}
-"""By python-can's classes, whose modules are not imported for the sake of a comparison."""
+"""By name of python-can's class, so that the interface's module need not be imported."""
 
 
 def adapt(bus: can.BusABC, name: str = "") -> MessageBus:
-    """A bus of python-can's as MessageBus; `name` for messages. The simulation in lock-step is one already."""
+    """Adapter of a python-can bus; `name` for messages. A bus in lock-step needs none."""
     if isinstance(bus, InProcessBus):
         return cast(MessageBus, bus)
     return _ADAPTERS.get(type(bus).__name__, PythonCanBus)(bus, name)
 
 
 def as_bus(bus: CanBus | can.BusABC) -> CanBus:
-    """The bus itself, adapted if it is python-can's."""
+    """The bus itself, or the adapter of a python-can bus."""
     return adapt(bus) if isinstance(bus, can.BusABC) else bus

@@ -1,4 +1,4 @@
-"""Several buses as one: a frame goes to the bus of its node, or to every bus if it is for all nodes."""
+"""Several buses as one: a frame goes to the bus of its node, or to every bus if it addresses all nodes."""
 
 import math
 import select
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import can
 
 _SLICE = 0.001
-"""Longest wait for one of several buses at a time, if the operating system cannot wait for all at once [s]."""
+"""Longest wait for one bus at a time if the operating system cannot wait for all of them [s]."""
 
 
 class BusGroup:
@@ -29,11 +29,11 @@ class BusGroup:
         self.channel_info = " and ".join(member.channel_info for member in self.members)
 
     def open_port(self, as_node: bool = False) -> "GroupPort":
-        """As CanBus has it."""
+        """See CanBus."""
         return GroupPort([member.open_port(as_node) for member in self.members], self.route)
 
     def open_listening_port(self) -> "GroupPort":
-        """As CanBus has it; SYNC counts once, on the first bus."""
+        """See CanBus; SYNC is taken from the first bus only."""
         ports = [member.open_listening_port() for member in self.members]
         if all(isinstance(port, StampedPort) for port in ports):
             return StampedGroup(ports, self.route)
@@ -62,7 +62,7 @@ class GroupPort:
     """The ports of several buses as one."""
 
     def __init__(self, members: Sequence[Port], route: Mapping[int, int], one_sync: bool = False) -> None:
-        """`route` is node id → index of its port; `one_sync`: the SYNC of the first bus stands for all."""
+        """`route` is node id → index of its port; `one_sync`: take SYNC from the first bus only."""
         self.members = tuple(members)
         self._of_node: dict[int, Port] = {node: self.members[index] for node, index in route.items()}
         self._numbers = [port.fileno() for port in self.members if isinstance(port, Selectable)]
@@ -70,12 +70,12 @@ class GroupPort:
 
     @property
     def errors(self) -> int:
-        """Error frames so far, of all buses."""
+        """Error frames received on all buses."""
         return sum(port.errors for port in self.members)
 
     @property
     def dropped(self) -> int:
-        """Frames lost so far, of all buses."""
+        """Frames lost on all buses."""
         return sum(port.dropped for port in self.members)
 
     def send(self, can_id: int, data: bytes) -> None:
@@ -117,7 +117,7 @@ class GroupPort:
 
 
 class StampedGroup(GroupPort):
-    """Stamped ports as one, their frames in the order of their timestamps; SYNC counts once, on the first bus."""
+    """Stamped ports as one, frames in the order of their timestamps; SYNC is taken from the first bus only."""
 
     def __init__(self, members: Sequence[Port], route: Mapping[int, int]) -> None:
         """`members` are stamped ports."""
@@ -130,7 +130,7 @@ class StampedGroup(GroupPort):
         select.select(self._numbers, [], [], timeout)
 
     def take_all(self) -> list[Stamped]:
-        """All frames that came before this call, as StampedPort.take_all; later ones wait for those of every bus."""
+        """All frames received before this call, in the order of time; later ones are kept for the next call."""
         end = time.monotonic()
         frames, self._early = self._early, []
         for index, member in enumerate(self._stamped):

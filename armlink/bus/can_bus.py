@@ -1,4 +1,4 @@
-"""A CAN bus that is open: what the link and its listeners need of it, whatever it is made of.
+"""Protocols of an open CAN bus, as the link and its listeners use it.
 
 Adapters: python-can's interfaces (adapters.py), several buses as one (bus_group.py), buses inside this process
 (in_process.py: lock-step simulation, logs).
@@ -23,19 +23,19 @@ class CanBus(Protocol):
 
     @property
     def clock(self) -> Clock | None:
-        """The bus's own time if it has one (simulation in lock-step, a log), None if it is the machine's."""
+        """The bus's own time (simulation in lock-step, log); None if it runs in the machine's time."""
         ...
 
     def open_port(self, as_node: bool = False) -> Port:
-        """A port to send and receive by; one bus has one owner.
+        """A port to send and receive; a bus has one owner.
 
-        `as_node` is for a node's end of the bus: it answers in the kind of frames that it hears (classical, CAN FD)
-        and takes no notice of error frames.
+        `as_node` is for a node's end of the bus: it answers in the kind of frames it receives (classical or CAN FD)
+        and ignores error frames.
         """
         ...
 
     def open_listening_port(self) -> Port:
-        """A port for one who only listens: a StampedPort if the interface stamps frames."""
+        """A port for a listener: a StampedPort if the interface timestamps frames."""
         ...
 
     def shutdown(self) -> None:
@@ -44,7 +44,7 @@ class CanBus(Protocol):
 
 
 class MessageSource(Protocol):
-    """A bus whose messages can be had as they are: extended, remote and error frames, with the interface's times."""
+    """A bus that gives access to all messages, extended, remote and error frames too, with their timestamps."""
 
     @property
     def channel_info(self) -> str:
@@ -66,18 +66,18 @@ class MessageSource(Protocol):
 
 
 class MessageBus(CanBus, MessageSource, Protocol):
-    """A bus of python-can's."""
+    """A bus of python-can."""
 
 
 @runtime_checkable
 class TimedBus(Protocol):
-    """A bus whose frames bear times of their own, such as a log's."""
+    """A bus whose frames have their own timestamps, such as a log."""
 
     @property
     def ended(self) -> bool:
-        """Whether no frame will come any more."""
+        """Whether no more frames will come."""
         ...
 
     def stamp(self) -> float:
-        """When the newest frame came, since the first [s]."""
+        """Time of the newest frame since the first [s]."""
         ...

@@ -1,4 +1,4 @@
-"""How long frames occupy a CAN bus: bits on the wire, stuff bits computed from what the frame carries (ISO 11898-1).
+"""Length of CAN frames on the wire [bits], with stuff bits computed from their content (ISO 11898-1).
 
 A classical data frame with an 11-bit identifier and n data bytes has 34 + 8n bits from start of frame to the end of the
 checksum, in which a bit of the other value is stuffed behind five equal ones, and 13 behind them without stuffing:
@@ -8,14 +8,14 @@ checksum delimiter, acknowledge slot and delimiter, end of frame (7), intermissi
 from functools import lru_cache
 
 FIXED_BITS = 47
-"""Bits of a frame without data and without stuff bits, intermission included; 8 more a byte."""
+"""Bits of a frame without data and stuff bits, intermission included; each data byte adds 8."""
 _STUFFED = 34
 _CRC15 = 0x4599
-_IDLE = 5  # the idle bus is recessive, so that start of frame begins a run of its own
+_IDLE = 5  # the idle bus is recessive, so start of frame begins a new run
 
 
 def frame_bits(can_id: int, data: bytes) -> int:
-    """Bits that a classical data frame with an 11-bit identifier takes on the wire, its own stuff bits included."""
+    """Bits that a classical data frame with an 11-bit identifier takes on the wire, stuff bits included."""
     state, crc, stuffed = _head(can_id, len(data))
     for byte in data:
         crc = (crc << 8 ^ _CRC_OF_BYTE[crc >> 7 ^ byte]) & 0x7FFF
@@ -26,13 +26,13 @@ def frame_bits(can_id: int, data: bytes) -> int:
 
 
 def longest_frame_bits(length: int) -> int:
-    """Most bits that a frame with `length` data bytes can take: a stuff bit behind each four of the stuffed part."""
+    """Upper bound of the bits of a frame with `length` data bytes: one stuff bit per four bits of the stuffed part."""
     return FIXED_BITS + 8 * length + (_STUFFED + 8 * length - 1) // 4
 
 
 @lru_cache(maxsize=4096)
 def _head(can_id: int, length: int) -> tuple[int, int, int]:
-    """Stuffing state, checksum and stuff bits behind start of frame, identifier, three dominant bits and length."""
+    """Stuffing state, checksum and stuff bits after start of frame, identifier, three dominant bits and length."""
     bits = can_id << 7 | length
     crc = 0
     for at in reversed(range(19)):
@@ -53,7 +53,7 @@ def _crc_of_byte(byte: int) -> int:
 
 
 def _stuff(state: int, bits: int, count: int) -> tuple[int, int]:
-    """State behind `count` bits and the stuff bits among them; a state is 5 × last value + equal bits so far − 1."""
+    """State after `count` bits and the number of stuff bits; a state is 5 × last value + run of equal bits − 1."""
     stuffed = 0
     for at in reversed(range(count)):
         bit = bits >> at & 1

@@ -1,7 +1,7 @@
-"""Raw CAN frames in the files of python-can's own loggers: Vector ASC and BLF, and candump's log.
+"""Logs of raw CAN frames in the formats of python-can's loggers: Vector ASC and BLF, and candump's log.
 
-Times are kept to the microsecond, the finest that all three keep. Frames go from a bus into a log (`taps.TappedBus`)
-and from a log into whatever decodes a bus (`LogBus`) with the same times: both give the same samples bit for bit.
+Times have the microsecond resolution that all three formats keep. Frames recorded from a bus (`taps.TappedBus`) and
+replayed from a log (`LogBus`) carry the same times, so that both decode to the same samples bit for bit.
 """
 
 import struct
@@ -21,25 +21,25 @@ from armlink.errors import BadInput, BusFault
 
 LOG_SUFFIXES = (".asc", ".blf", ".log")
 FLUSH_MICROSECONDS = 500_000
-"""A killed recorder loses at most this and what the operating system had not written."""
-_CONTAINER = 8192  # bytes that BLF keeps back until it writes them
+"""Interval of flushes: a killed recorder loses at most this and what the operating system had not written."""
+_CONTAINER = 8192  # bytes that the BLF writer buffers
 _ASC_END = "end triggerblock"
-_BLF_SIZE = struct.Struct("<16xQ")  # file size as the header states it
+_BLF_SIZE = struct.Struct("<16xQ")  # file size as stated in the header
 _BAD_CONTENT = (BLFParseError, ValueError, IndexError, TypeError, OverflowError, struct.error, zlib.error)
 
 
 def is_log(path: Path) -> bool:
-    """Whether a file is a raw frame log by its suffix."""
+    """Whether a file has the suffix of a raw frame log."""
     return path.suffix.lower() in LOG_SUFFIXES
 
 
 class FrameLog:
-    """Writes every message of a bus to a log; a context manager that ends the file properly."""
+    """Writes every message of a bus to a log; a context manager that completes the file."""
 
     def __init__(self, path: Path) -> None:
-        """Create the file; raises BadInput for a suffix that is no log's, or a file that cannot be written."""
+        """Create the file; raises BadInput for another suffix or a file that cannot be written."""
         if not is_log(path):
-            raise BadInput(f"{path}: not a frame log by its suffix, expected {', '.join(LOG_SUFFIXES)}")
+            raise BadInput(f"{path}: not the suffix of a frame log, expected {', '.join(LOG_SUFFIXES)}")
         try:
             self._writer = can.Logger(str(path))
         except OSError as error:
@@ -53,11 +53,11 @@ class FrameLog:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        """End the file."""
+        """Complete the file."""
         self._writer.stop()
 
     def write(self, message: can.Message, stamp: int) -> None:
-        """Add a message that came at `stamp` [µs]."""
+        """Add a message received at `stamp` [µs]."""
         message.timestamp = stamp / 1e6
         self._writer.on_message_received(message)
         if stamp - self._flushed > FLUSH_MICROSECONDS:
@@ -66,10 +66,10 @@ class FrameLog:
 
 
 class LogBus(InProcessBus):
-    """A log as a bus that somebody listens to: each frame at its time, then silence; its clock is the log's."""
+    """A log as a bus to listen to: each frame at its time, then silence; its clock is the log's time."""
 
     def __init__(self, path: Path) -> None:
-        """Open the log; raises BadInput where it is none."""
+        """Open the log; raises BadInput if it is none."""
         self.reader = LogReader(path)
         self.clock = self
         self.channel_info = str(path)
@@ -79,23 +79,23 @@ class LogBus(InProcessBus):
 
     @property
     def ended(self) -> bool:
-        """Whether every frame was taken."""
+        """Whether every frame has been taken."""
         return self._next is None
 
     def now(self) -> float:
-        """When the newest frame came, since the first [s]."""
+        """Time of the newest frame since the first [s]."""
         return self._time
 
     def stamp(self) -> float:
-        """When the newest frame came, since the first [s]."""
+        """Time of the newest frame since the first [s]."""
         return self._time
 
     def sleep_until(self, instant: float) -> None:
-        """Let time go on, to `instant` [s]."""
+        """Advance the log's time to `instant` [s]."""
         self._time = max(self._time, instant)
 
     def take(self, timeout: float = 0.0) -> Frame | None:
-        """The next frame, whenever it comes, or None where there is none."""
+        """The next frame, however late, or None at the end of the log."""
         if self._next is None:
             self._time += max(0.0, timeout)
             return None
@@ -105,27 +105,27 @@ class LogBus(InProcessBus):
         return can_id, data
 
     def put(self, can_id: int, data: bytes) -> None:
-        """Refuse: nobody hears it."""
-        raise BusFault(f"{self.channel_info}: a log takes no frames")
+        """Raise BusFault: a log cannot be sent to."""
+        raise BusFault(f"{self.channel_info}: a log cannot be sent to")
 
     def shutdown(self) -> None:
-        """Nothing to close: its file is read to the end, or given up with this object."""
+        """Nothing to do: the file closes with its reader."""
 
 
 class LogReader:
-    """Reads a log as far as it is sound; `warning` says afterwards where it was not."""
+    """Reads a log as far as it is intact; `warning` then says where it is truncated or unreadable."""
 
     def __init__(self, path: Path) -> None:
-        """Raises BadInput where there is no such file, or not by its suffix."""
+        """Raises BadInput if the file does not exist or has another suffix."""
         if not is_log(path):
-            raise BadInput(f"{path}: not a frame log by its suffix, expected {', '.join(LOG_SUFFIXES)}")
+            raise BadInput(f"{path}: not the suffix of a frame log, expected {', '.join(LOG_SUFFIXES)}")
         if not path.is_file():
             raise BadInput(f"no frame log {path}: give a {', '.join(LOG_SUFFIXES)} file")
         self._path = path
         self.count = 0
-        """Frames read so far."""
+        """Frames read."""
         self.warning = ""
-        """What was cut or could not be read; empty while all is sound."""
+        """Where the log is truncated or unreadable; empty if it is intact."""
 
     def frames(self) -> Iterator[tuple[int, int, bytes]]:
         """Time since the first message [µs], identifier and data of each data frame with an 11-bit identifier."""
@@ -171,7 +171,7 @@ class LogReader:
 
 
 class _WholeLines:
-    """Lines of a text file up to the first that is not ended, in the form that python-can's readers take."""
+    """Lines of a text file up to the first one without newline, as python-can's readers expect them."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
@@ -190,7 +190,7 @@ class _WholeLines:
         return str(line)
 
     def read(self, size: int = -1) -> str:
-        """Only so that python-can takes it for a file."""
+        """Not used; python-can requires the attribute of a file."""
         raise NotImplementedError
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Buses inside this process: frames go in by `put` and come out by `take`, and nothing blocks."""
+"""Buses inside this process: frames go in by `put` and out by `take`, without blocking."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -8,32 +8,32 @@ from armlink.clock import Clock
 
 
 class InProcessBus(ABC):
-    """A CanBus by two methods; its clock goes on as its frames do."""
+    """A CanBus made from `put` and `take`; waiting advances its clock."""
 
     channel_info: str = "in process"
     clock: Clock | None = None
     errors: int = 0
-    """Error frames so far."""
+    """Error frames received."""
 
     @property
     def dropped(self) -> int:
-        """Frames lost so far because they were not taken in time."""
+        """Frames lost because they were not taken in time."""
         return 0
 
     @abstractmethod
     def put(self, can_id: int, data: bytes) -> None:
-        """Send one frame; raises BusFault if the bus does not take it."""
+        """Send one frame; raises BusFault if the bus does not accept it."""
 
     @abstractmethod
     def take(self, timeout: float = 0.0) -> Frame | None:
         """The next frame, or None after `timeout` seconds of the bus's time."""
 
     def open_port(self, as_node: bool = False) -> Port:
-        """A port; a node's end needs nothing else."""
+        """A port; the same for a node's end."""
         return InProcessPort(self)
 
     def open_listening_port(self) -> Port:
-        """The same as any port."""
+        """A port without timestamps."""
         return InProcessPort(self)
 
     @abstractmethod
@@ -42,7 +42,7 @@ class InProcessBus(ABC):
 
 
 class InProcessPort:
-    """An InProcessBus as a Port; waiting lets its time go on."""
+    """Port of an InProcessBus."""
 
     def __init__(self, bus: InProcessBus) -> None:
         self._bus = bus
@@ -51,12 +51,12 @@ class InProcessPort:
 
     @property
     def errors(self) -> int:
-        """Error frames so far."""
+        """Error frames received."""
         return self._bus.errors
 
     @property
     def dropped(self) -> int:
-        """Frames lost so far because they were not taken in time."""
+        """Frames lost because they were not taken in time."""
         return self._bus.dropped
 
     def send_all(self, frames: Sequence[Frame]) -> None:

@@ -1,4 +1,4 @@
-"""Any python-can interface as a Port, by its message objects."""
+"""Port for any interface of python-can, by message objects."""
 
 import errno
 from collections.abc import Sequence

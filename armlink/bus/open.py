@@ -1,4 +1,4 @@
-"""Buses by name: `INTERFACE:CHANNEL[@BITRATE]`, any interface that python-can knows."""
+"""Opens buses by name, `INTERFACE:CHANNEL[@BITRATE]`, for any interface of python-can."""
 
 from typing import Any
 
@@ -11,18 +11,18 @@ FORM = "INTERFACE:CHANNEL[@BITRATE], for example socketcan:can0 or socketcan:can
 
 
 def parse_bus(spec: str, default_bitrate: int = 1_000_000) -> Bus:
-    """Take a bus specification apart; raises BadInput with the form that was expected."""
+    """Parse a bus specification; raises BadInput with the expected form."""
     interface, colon, rest = spec.partition(":")
     channel, at, bitrate = rest.partition("@")
     if not (interface and colon and channel):
         raise BadInput(f"bus {spec!r}: expected {FORM}")
     if at and not (bitrate.isdigit() and int(bitrate) > 0):
-        raise BadInput(f"bus {spec!r}: bit rate {bitrate!r}, expected a number of bits a second: {FORM}")
+        raise BadInput(f"bus {spec!r}: bit rate {bitrate!r}, expected bits per second: {FORM}")
     return Bus(interface=interface, channel=channel, bitrate=int(bitrate) if at else default_bitrate)
 
 
 def resolve_bus(spec: str | None, section: Bus) -> Bus:
-    """The bus that the command line names, with the arm file's options where its interface is the same, or that."""
+    """Bus named on the command line, with the arm file's options if the interface is the same; else the arm file's."""
     if spec is None:
         return section
     bus = parse_bus(spec, section.bitrate)
@@ -31,10 +31,10 @@ def resolve_bus(spec: str | None, section: Bus) -> Bus:
 
 
 def open_bus(spec: str | None, section: Bus) -> MessageBus:
-    """Open the bus that `spec` names, or else the arm file's section.
+    """Open the bus that `spec` names, by default that of the arm file's section.
 
-    Raises BadInput for a malformed specification or an interface that python-can does not know, and BusFault where
-    the bus does not exist or cannot be opened.
+    Raises BadInput for a malformed specification or an unknown interface, BusFault if the bus does not exist or cannot
+    be opened.
     """
     import can
     from can.exceptions import CanInterfaceNotImplementedError
@@ -49,16 +49,18 @@ def open_bus(spec: str | None, section: Bus) -> MessageBus:
     try:
         return adapt(can.Bus(interface=bus.interface, channel=bus.channel, **options, **bus.options), name)
     except CanInterfaceNotImplementedError as error:
-        raise BadInput(f"bus {name}: {error}: python-can has no such interface here") from None
+        raise BadInput(f"bus {name}: {error}: unknown interface of python-can") from None
     except TypeError as error:
-        raise BadInput(f"bus {name}: an option of link.bus.options that the interface does not take: {error}") from None
+        raise BadInput(
+            f"bus {name}: link.bus.options has an option that the interface does not accept: {error}"
+        ) from None
     except (can.CanError, OSError, ValueError, ImportError) as error:
         reason = getattr(error, "strerror", None) or error
         raise BusFault(f"bus {name}: cannot open it: {reason}") from None
 
 
 def open_link_bus(spec: str | None, section: LinkSection) -> MessageBus:
-    """Open the bus of an arm's link, or all of its buses as one (BusGroup); `spec` puts every joint on one bus.
+    """Open the bus of an arm's link, several buses as a BusGroup; `spec` puts every joint on one bus.
 
     Raises as open_bus.
     """

@@ -1,4 +1,4 @@
-"""What armlink sees of a CAN bus: frames, and ports that send and receive them."""
+"""Frames and ports: the interface to send and receive on a CAN bus."""
 
 from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
@@ -8,10 +8,10 @@ from armlink.errors import BusFault
 Frame = tuple[int, bytes]
 """Identifier and data."""
 Stamped = tuple[float, int, bytes]
-"""When a frame came, by the machine's monotonic clock [s], its identifier and its data."""
+"""Time of reception by the machine's monotonic clock [s], identifier and data."""
 
 ERROR = 0x20000000
-"""Marks the identifier of an error frame, as in SocketCAN."""
+"""Flag in the identifier of an error frame, as in SocketCAN."""
 
 
 class InterfaceDown(BusFault):
@@ -23,7 +23,7 @@ class Port(Protocol):
 
     @property
     def errors(self) -> int:
-        """Error frames so far."""
+        """Error frames received."""
         ...
 
     @property
@@ -38,7 +38,7 @@ class Port(Protocol):
 
     @property
     def receive(self) -> Callable[[float], Frame | None]:
-        """The next frame, or None after so many seconds without one (0: only what is there already)."""
+        """The next frame, or None after a timeout [s] (0: only frames that are there already)."""
         ...
 
     def send_all(self, frames: Sequence[Frame]) -> None:
@@ -48,7 +48,7 @@ class Port(Protocol):
 
 @runtime_checkable
 class Selectable(Protocol):
-    """A port that the operating system can wait for."""
+    """A port that `select` can wait for."""
 
     def fileno(self) -> int:
         """File descriptor of its socket."""
@@ -57,7 +57,7 @@ class Selectable(Protocol):
 
 @runtime_checkable
 class StampedPort(Protocol):
-    """A port that collects frames with their timestamps, so that its reader may sleep for several cycles."""
+    """A port that collects frames with timestamps, so that its reader may sleep for several cycles."""
 
     def wait(self, timeout: float) -> None:
         """Return when a frame is there, or after `timeout` seconds."""

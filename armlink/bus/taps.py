@@ -1,4 +1,4 @@
-"""Buses and ports that hand on what passes: to a frame log, to statistics of the cycle."""
+"""Taps: a bus or port that passes on its traffic, to a frame log or to statistics."""
 
 from collections.abc import Callable, Sequence
 
@@ -13,12 +13,12 @@ from armlink.errors import BusFault
 
 
 class TappedBus(InProcessBus):
-    """A bus that is only listened to, and whose every message goes to somebody else too, with its time."""
+    """A listen-only bus that also passes every message and its time to `tap`."""
 
     ended = False
 
     def __init__(self, source: MessageSource, tap: Callable[[can.Message, int], None]) -> None:
-        """Take `source`, closed with this one; `tap` gets each message and the interface's time of it [µs]."""
+        """Take ownership of `source`; `tap` gets each message and its timestamp by the interface [µs]."""
         self._source, self._tap = source, tap
         self.clock, self.channel_info = source.clock, source.channel_info
         self._now = (source.clock or MonotonicClock()).now
@@ -26,7 +26,7 @@ class TappedBus(InProcessBus):
         self._newest = 0
 
     def stamp(self) -> float:
-        """When the newest frame came, since the first [s], as the interface stamped it."""
+        """Time of the newest frame since the first [s], by the interface's timestamps."""
         return self._newest / 1e6
 
     def take(self, timeout: float = 0.0) -> Frame | None:
@@ -43,8 +43,8 @@ class TappedBus(InProcessBus):
                 return message.arbitration_id, bytes(message.data)
 
     def put(self, can_id: int, data: bytes) -> None:
-        """Refuse: this bus is only listened to."""
-        raise BusFault(f"bus {self.channel_info}: only listened to")
+        """Raise BusFault: the bus is listen-only."""
+        raise BusFault(f"bus {self.channel_info}: listen-only")
 
     def shutdown(self) -> None:
         """Close the source."""
@@ -52,7 +52,7 @@ class TappedBus(InProcessBus):
 
 
 class TappedPort:
-    """A port whose frames, out and in, go to somebody else too, each with the time at which it passed."""
+    """A port that also passes every frame, sent or received, and its time to `tap`."""
 
     def __init__(self, port: Port, clock: Clock, tap: Callable[[float, int, bytes], None]) -> None:
         """`tap` gets time by `clock` [s], identifier and data."""
@@ -60,12 +60,12 @@ class TappedPort:
 
     @property
     def errors(self) -> int:
-        """Error frames so far."""
+        """Error frames received."""
         return self._port.errors
 
     @property
     def dropped(self) -> int:
-        """Frames lost so far because they were not read in time."""
+        """Frames lost because they were not read in time."""
         return self._port.dropped
 
     def send(self, can_id: int, data: bytes) -> None:

@@ -39,7 +39,7 @@ class Control(IntEnum):
 
 
 NEEDED_MODES = (Mode.POSITION, Mode.TORQUE)
-"""A controller without them is no controller for the link; the profile modes may be missing."""
+"""Modes that every controller must support; the profile modes are optional."""
 MODE_NAMES = {
     Mode.OFF: "no mode",
     Mode.PROFILE_POSITION: "profile position",
@@ -54,7 +54,7 @@ SET_POINT_ACKNOWLEDGED = 0x1000
 
 
 def supports(supported: int, mode: int) -> bool:
-    """Whether 6502h (`supported`) has a mode of operation: bit mode - 1, and mode 0 always."""
+    """Whether 6502h (`supported`) contains a mode of operation: bit mode − 1; mode 0 is always supported."""
     return mode == Mode.OFF or (1 <= mode <= 32 and bool(supported >> (mode - 1) & 1))
 
 
@@ -66,7 +66,7 @@ _BY_4F = {
 }
 _BY_6F = {0x21: State.READY, 0x23: State.SWITCHED_ON, 0x27: State.ENABLED, 0x07: State.QUICK_STOP}
 
-# One step towards ENABLED, DISABLED (switch on disabled) or QUICK_STOP from each state; None where there is nothing to
+# One step towards ENABLED, DISABLED (switch on disabled) or QUICK_STOP from each state; None if there is nothing to
 # command: the state is reached or the drive moves on by itself. Quick stop to enabled is transition 16: power stays on.
 _TO_ENABLED = {
     State.SWITCH_ON_DISABLED: Control.SHUTDOWN,
@@ -87,15 +87,15 @@ _TO_DISABLED = {
 
 
 def state_of(status_word: int) -> State:
-    """State that a status word (6041h) encodes; UNKNOWN where the standard gives the pattern no meaning."""
+    """State that a status word (6041h) encodes; UNKNOWN if the standard does not define the pattern."""
     return _BY_4F.get(status_word & 0x4F) or _BY_6F.get(status_word & 0x6F, State.UNKNOWN)
 
 
 def next_control(state: State, target: State) -> int:
     """Control word for the next step from `state` towards `target` (ENABLED, QUICK_STOP or SWITCH_ON_DISABLED).
 
-    Where the drive moves on by itself (not ready, fault reaction) or the state is unknown the word commands nothing:
-    disable voltage, which is also the low level that the fault reset's rising edge needs.
+    If the drive moves on by itself (not ready, fault reaction) or the state is unknown, the word is disable voltage,
+    which is also the low level that the rising edge of fault reset needs.
     """
     if target is State.ENABLED:
         return int(_TO_ENABLED.get(state, Control.DISABLE_VOLTAGE))
@@ -103,14 +103,14 @@ def next_control(state: State, target: State) -> int:
         return int(_TO_DISABLED.get(state, Control.DISABLE_VOLTAGE))
     if target is State.QUICK_STOP:
         return int(Control.QUICK_STOP)
-    raise ValueError(f"no way to {target.value} is defined: targets are enabled, quick stop, switch on disabled")
+    raise ValueError(f"no transition to {target.value} is defined: targets are enabled, quick stop, switch on disabled")
 
 
 def set_point_control(status_word: int) -> int:
-    """Control word of an enabled drive in profile position mode that is to take its newest target at once.
+    """Control word of an enabled drive in profile position mode, so that it takes its newest target immediately.
 
-    The handshake of CiA 402: new set-point (bit 4) rises, the drive acknowledges (status bit 12), bit 4 falls, the
-    drive takes the acknowledgement back, and so on.
+    Handshake of CiA 402: new set-point (bit 4) rises, the drive acknowledges (status bit 12), bit 4 falls, the drive
+    clears the acknowledgement, and so on.
     """
     acknowledged = status_word & SET_POINT_ACKNOWLEDGED
     return Control.ENABLE | CHANGE_AT_ONCE | (0 if acknowledged else NEW_SET_POINT)

@@ -1,4 +1,4 @@
-"""Electronic data sheets (EDS, CiA 306) of joint controllers: what the arm file names for a joint, else our own."""
+"""Electronic data sheets (EDS, CiA 306) of joint controllers: named in the arm file, by default the bundled one."""
 
 from collections.abc import Iterable
 from importlib.resources import files
@@ -8,39 +8,39 @@ from typing import Any
 import canopen
 
 from armlink.arm_file import ArmFile, DeviceIdentity, LinkJoint
-from armlink.canopen import object_dictionary as objects
+from armlink.canopen import object_dictionary
 from armlink.canopen.object_dictionary import Entry
 from armlink.canopen.pdo import LINK_PDOS
 from armlink.errors import BadInput
 
 SUFFIXES = (".eds", ".dcf")
 OPTIONAL = {
-    objects.TORQUE_OFFSET: "torque offset: nothing latched to clear",
-    objects.PROFILE_VELOCITY: "profile velocity: no profile position mode",
-    objects.TORQUE_SLOPE: "torque slope: no profile torque mode",
-    objects.STORE_MANUFACTURER: "store: a calibration is lost at power-off",
-    objects.HEARTBEAT_PRODUCER: "",
+    object_dictionary.TORQUE_OFFSET: "torque offset: nothing latched to clear",
+    object_dictionary.PROFILE_VELOCITY: "profile velocity: no profile position mode",
+    object_dictionary.TORQUE_SLOPE: "torque slope: no profile torque mode",
+    object_dictionary.STORE_MANUFACTURER: "store: a calibration is lost at power-off",
+    object_dictionary.HEARTBEAT_PRODUCER: "",
 }
-"""Objects that a controller may lack, and what it then does not do."""
+"""Objects that a controller may lack → the function that is then missing."""
 
 
 def used_objects() -> Iterable[Entry]:
     """The objects of a controller that the link uses."""
-    return [value for value in vars(objects).values() if isinstance(value, Entry)]
+    return [value for value in vars(object_dictionary).values() if isinstance(value, Entry)]
 
 
 def bundled_path() -> str:
-    """Path of the data sheet that this package ships."""
+    """Path of the bundled data sheet."""
     return str(files("armlink.canopen").joinpath("eds/joint.eds"))
 
 
 def bundled() -> Any:
-    """The object dictionary of a joint controller from the shipped data sheet, for node 1."""
+    """Object dictionary of a joint controller from the bundled data sheet, for node 1."""
     return canopen.import_od(bundled_path(), 1)
 
 
 def of_joints(arm: ArmFile) -> tuple[Any, ...]:
-    """The object dictionary of each joint's controller, in joint order; raises BadInput as read_sheet."""
+    """Object dictionary of each joint's controller, in joint order; raises BadInput as read_sheet."""
     joints, read = arm.require_link().joints, dict[str | None, Any]()
     for joint in joints:
         if joint.eds not in read:
@@ -49,10 +49,10 @@ def of_joints(arm: ArmFile) -> tuple[Any, ...]:
 
 
 def read_sheet(path: Path, joint: LinkJoint) -> Any:
-    """The object dictionary that a joint's own data sheet describes.
+    """Object dictionary that a joint's own data sheet describes.
 
-    Raises BadInput where the file cannot be read, or where it lacks an object that the link uses, or has it with
-    another length, or not to be mapped into a PDO that the link needs it in.
+    Raises BadInput if the file cannot be read, or if an object that the link uses is missing, has another length, or
+    cannot be mapped into the PDO in which the link needs it.
     """
     where = f"{joint.name}: data sheet {path}"
     if path.suffix.lower() not in SUFFIXES:
@@ -61,28 +61,28 @@ def read_sheet(path: Path, joint: LinkJoint) -> Any:
         sheet = canopen.import_od(str(path), joint.node)
     except OSError as error:
         raise BadInput(f"{where}: {error.strerror or error}: correct eds of this joint under link.joints") from None
-    except Exception as error:  # configparser's and canopen's own, of many kinds
-        raise BadInput(f"{where}: not an EDS as CiA 306 has it: {' '.join(str(error).split())}") from None
+    except Exception as error:  # configparser and canopen raise many kinds
+        raise BadInput(f"{where}: not a valid EDS (CiA 306): {' '.join(str(error).split())}") from None
     for entry in used_objects():
         found = sheet.get_variable(entry.index, entry.sub)
         if found is None and entry not in OPTIONAL:
-            raise BadInput(f"{where}: lacks {entry}, which the link needs: docs/adding-a-drive.md says what for")
+            raise BadInput(f"{where}: lacks {entry}, which the link needs (see docs/adding-a-drive.md)")
         if found is not None and len(found) != entry.bits:
             raise BadInput(f"{where}: {entry} has {len(found)} bits, expected {entry.bits}")
     for pdo in LINK_PDOS:
         for entry in pdo.entries:
             if not sheet.get_variable(entry.index, entry.sub).pdo_mappable:
-                raise BadInput(f"{where}: {entry} cannot be mapped into a PDO, and the link needs it in {pdo.name}")
+                raise BadInput(f"{where}: {entry} cannot be mapped into a PDO, but the link needs it in {pdo.name}")
     return sheet
 
 
 def expected_identity(joint: LinkJoint, sheet: Any) -> DeviceIdentity:
-    """Which controller a joint must have: what the arm file states, and vendor and product of the joint's data sheet.
+    """Identity that a joint's controller must have: from the arm file, else vendor and product of its data sheet.
 
-    The revision is not taken from it: a data sheet often serves later revisions too.
+    The revision of the data sheet is not required: a data sheet often serves later revisions too.
     """
     if joint.eds is None:
         return joint.identity
-    told = sheet.device_information
-    held = DeviceIdentity(vendor=told.vendor_number or None, product=told.product_number or None)
-    return held.model_copy(update=joint.identity.model_dump(exclude_none=True))
+    device = sheet.device_information
+    stated = DeviceIdentity(vendor=device.vendor_number or None, product=device.product_number or None)
+    return stated.model_copy(update=joint.identity.model_dump(exclude_none=True))

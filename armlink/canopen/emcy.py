@@ -1,4 +1,4 @@
-"""Emergency messages: error codes of CiA 301 (table of error classes) and CiA 402-2 to named faults."""
+"""Emergency messages: names of the error codes of CiA 301 (error classes) and CiA 402-2."""
 
 import struct
 
@@ -52,11 +52,11 @@ CLASSES = {
     0xF0: "additional functions",
     0xFF: "manufacturer specific (torque sensor)",
 }
-"""High byte of the code: its class."""
+"""High byte of an error code → its class."""
 
 
 def _phases(base: int, what: str, phases: tuple[str, ...]) -> dict[int, str]:
-    """`what` at `base`, and the same for each phase or number at base + 1 and on."""
+    """Names for `base` and for each phase or number from base + 1 on."""
     return {base: what, **{base + i: f"{what}, {phase}" for i, phase in enumerate(phases, 1)}}
 
 
@@ -202,11 +202,11 @@ NAMES = {
     0xF003: "stroke operation",
     0xF004: "control function",
 }
-"""Codes that the standards name; the rest of a class is the manufacturer's."""
+"""Codes defined by the standards; other codes of a class are manufacturer-specific."""
 
 
 def name_of(code: int) -> str:
-    """What an error code means; by its class, then by its group, where the code itself is unknown."""
+    """Meaning of an error code; of its class or group if the code itself is not defined."""
     if code in NAMES:
         return NAMES[code]
     high = code >> 8
@@ -214,7 +214,7 @@ def name_of(code: int) -> str:
 
 
 def parse(data: bytes) -> tuple[int, int]:
-    """Error code and error register (1001h) of an EMCY frame; a frame that is too short is a generic error."""
+    """Error code and error register (1001h) of an EMCY frame; a truncated frame is a generic error."""
     if len(data) < _EMCY.size:
         return 0x1000, 0xFF
     code, register = _EMCY.unpack_from(data)

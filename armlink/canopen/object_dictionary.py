@@ -1,4 +1,4 @@
-"""The objects of a joint controller's dictionary that the link uses (CiA 301, CiA 402, torque sensor record 2100h)."""
+"""Objects of a joint controller that the link uses (CiA 301, CiA 402, torque sensor record 2100h)."""
 
 import struct
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ class Entry:
 
     @property
     def bits(self) -> int:
-        """Length of the value in bits, as PDO mapping has it."""
+        """Length of the value in bits, as in a PDO mapping entry."""
         return 8 * struct.calcsize("<" + self.code)
 
     @property
@@ -24,7 +24,7 @@ class Entry:
         return self.index << 16 | self.sub << 8 | self.bits
 
     def __str__(self) -> str:
-        """Such as `607Dh:01 lower position limit`."""
+        """For example `607Dh:01 lower position limit`."""
         return f"{self.index:04X}h:{self.sub:02X} {self.name}"
 
 
@@ -75,7 +75,7 @@ RECORD_ID = Entry(0x2100, 7, "I", "record id")
 RECORD_DATE = Entry(0x2100, 8, "I", "record date")
 RECORD_CRC = Entry(0x2100, 9, "I", "record CRC-32")
 TEMPERATURE = Entry(0x2101, 0, "h", "drive temperature")
-"""0.1 °C; not every controller has it."""
+"""Unit 0.1 °C; optional."""
 
 SYNC_ID = 0x80
 NMT_ID = 0x000

@@ -1,25 +1,36 @@
-"""Process data: the mapping that the link uses, its configuration with read-back, and the compiled decoding table."""
+"""Process data objects: the link's mapping, its configuration with read-back, and the decoding table."""
 
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from armlink.canopen import object_dictionary as objects
-from armlink.canopen.object_dictionary import Entry
+from armlink.canopen.object_dictionary import (
+    CONTROL_WORD,
+    MODE,
+    MODE_DISPLAY,
+    MOTOR_TORQUE,
+    POSITION,
+    STATUS_WORD,
+    TARGET_POSITION,
+    TARGET_TORQUE,
+    TORQUE_READING,
+    VELOCITY,
+    Entry,
+)
 
 SYNC_TYPE = 1
-"""Transmission type: RPDO applied at, TPDO sent after every SYNC (CiA 301, 1800h:02)."""
+"""Transmission type: RPDO applied at every SYNC, TPDO sent after it (CiA 301, 1800h:02)."""
 EVENT_TYPE = 255
-"""Transmission type: at once, or when the value changes."""
+"""Transmission type: RPDO applied on reception, TPDO sent when its value changes."""
 STATUS_DECIMATION = 4
-"""TPDO2 is sent after each fourth SYNC."""
+"""TPDO2 is sent after every fourth SYNC."""
 
 _INVALID = 1 << 31
 _NO_REMOTE = 1 << 30
 
 
 class MappingRefused(Exception):
-    """The device holds another mapping than was written."""
+    """The device holds a different mapping from the one that was written."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +39,7 @@ class Pdo:
 
     name: str
     cob_base: int
-    """COB-ID less the node id."""
+    """COB-ID without the node id."""
     communication: int
     """Index of the communication record (1400h or 1800h + n)."""
     mapping: int
@@ -47,20 +58,20 @@ RPDO1 = Pdo(
     0x200,
     0x1400,
     0x1600,
-    (objects.CONTROL_WORD, objects.TARGET_TORQUE, objects.TARGET_POSITION),
+    (CONTROL_WORD, TARGET_TORQUE, TARGET_POSITION),
     SYNC_TYPE,
 )
-RPDO2 = Pdo("RPDO2", 0x300, 0x1401, 0x1601, (objects.MODE,), EVENT_TYPE)
-TPDO1 = Pdo("TPDO1", 0x180, 0x1800, 0x1A00, (objects.POSITION, objects.TORQUE_READING), SYNC_TYPE)
+RPDO2 = Pdo("RPDO2", 0x300, 0x1401, 0x1601, (MODE,), EVENT_TYPE)
+TPDO1 = Pdo("TPDO1", 0x180, 0x1800, 0x1A00, (POSITION, TORQUE_READING), SYNC_TYPE)
 TPDO2 = Pdo(
     "TPDO2",
     0x280,
     0x1801,
     0x1A01,
-    (objects.STATUS_WORD, objects.MOTOR_TORQUE, objects.VELOCITY),
+    (STATUS_WORD, MOTOR_TORQUE, VELOCITY),
     STATUS_DECIMATION,
 )
-TPDO3 = Pdo("TPDO3", 0x380, 0x1802, 0x1A02, (objects.STATUS_WORD, objects.MODE_DISPLAY), EVENT_TYPE)
+TPDO3 = Pdo("TPDO3", 0x380, 0x1802, 0x1A02, (STATUS_WORD, MODE_DISPLAY), EVENT_TYPE)
 LINK_PDOS = (RPDO1, RPDO2, TPDO1, TPDO2, TPDO3)
 
 Write = Callable[[Entry, int], None]
@@ -70,8 +81,8 @@ Read = Callable[[Entry], int]
 def configure(pdo: Pdo, node: int, write: Write, read: Read, deadline_ms: int = 0) -> None:
     """Set one PDO of one node over SDO and read all of it back (CiA 301 section 7.5.2.36: invalid, count 0, entries).
 
-    `deadline_ms` is the RPDO deadline or TPDO event timer (sub-index 5), 0 for none. Raises MappingRefused where the
-    device holds something else than was written.
+    `deadline_ms` is the RPDO deadline or TPDO event timer (sub-index 5), 0 for none. Raises MappingRefused if the
+    device does not hold what was written.
     """
     cob_id = Entry(pdo.communication, 1, "I", f"{pdo.name} COB-ID")
     kind = Entry(pdo.communication, 2, "B", f"{pdo.name} transmission type")
@@ -104,4 +115,6 @@ def decoding_table(nodes: tuple[int, ...]) -> dict[int, tuple[int, Pdo, struct.S
 
 def _same(entry: Entry, written: int, held: int) -> None:
     if held != written:
-        raise MappingRefused(f"{entry}: wrote {written:#x}, the device holds {held:#x}: it does not take this mapping")
+        raise MappingRefused(
+            f"{entry}: wrote {written:#x}, the device holds {held:#x}: it does not accept this mapping"
+        )

@@ -11,24 +11,23 @@ import canopen
 from canopen.sdo.exceptions import SdoAbortedError, SdoError
 
 from armlink.arm_file import ArmFile
-from armlink.canopen import eds_file as data_sheet
-from armlink.canopen import object_dictionary as objects
-from armlink.canopen.object_dictionary import Entry
+from armlink.canopen import eds_file
+from armlink.canopen.object_dictionary import DEVICE_TYPE, Entry
 from armlink.errors import BusFault
 
 logging.getLogger("canopen").addHandler(logging.NullHandler())
 
 SDO_TIMEOUT = 0.3
-"""[s], for one of SDO_TRIES."""
+"""Timeout of each of the SDO_TRIES [s]."""
 SDO_TRIES = 3
 
 ABSENT = (0x06020000, 0x06090011)
 """SDO abort codes: no such object, no such sub-index (CiA 301, 7.2.4.3.17)."""
 MALFORMED = (struct.error, IndexError, ValueError, TypeError)
-"""What canopen's SDO client raises on frames that are none."""
+"""Exceptions that canopen's SDO client raises on malformed frames."""
 
 SDO_LENGTH = 8
-"""[bytes]; CiA 301 7.2.4.3: an SDO has no other length."""
+"""Length of every SDO frame [bytes] (CiA 301, 7.2.4.3)."""
 
 Send = Callable[[int, bytes], None]
 Pump = Callable[[Callable[[], bool], float], bool]
@@ -47,7 +46,7 @@ class PumpedNetwork(canopen.Network):  # type: ignore[misc]
         self._send(can_id, bytes(data))
 
     def notify(self, can_id: int, data: bytearray, timestamp: float) -> None:
-        """Take in an SDO response; other frames are not for canopen, whose handlers raise on those cut short."""
+        """Take in an SDO response; other frames are ignored: canopen's handlers raise on truncated ones."""
         if 0x580 < can_id < 0x600 and len(data) == SDO_LENGTH:
             super().notify(can_id, data, timestamp)
 
@@ -64,7 +63,7 @@ class PumpedResponses:
         self._items.append(item)
 
     def empty(self) -> bool:
-        """Drop what came too late for an earlier request; then there is nothing left."""
+        """Discard late responses to an earlier request, so that the queue is empty."""
         self._items.clear()
         return True
 
@@ -93,7 +92,7 @@ class NodeServices:
         client = self.remote.sdo
         client.MAX_RETRIES = 1
         try:
-            client.upload(objects.DEVICE_TYPE.index, 0)
+            client.upload(DEVICE_TYPE.index, 0)
         except SdoAbortedError:
             return True
         except (SdoError, *MALFORMED):
@@ -103,7 +102,7 @@ class NodeServices:
         return True
 
     def has(self, entry: Entry) -> bool:
-        """Whether the device has an object; raises BusFault where it does not answer."""
+        """Whether the device has an object; raises BusFault if it does not answer."""
         try:
             self._upload(entry)
         except SdoAbortedError as error:
@@ -123,7 +122,7 @@ class NodeServices:
         return struct.unpack("<" + entry.code, data)[0]
 
     def _upload(self, entry: Entry) -> bytes:
-        """An object's bytes; raises BusFault, or SdoAbortedError where the device refuses."""
+        """An object's bytes; raises BusFault, or SdoAbortedError if the device refuses."""
         try:
             return bytes(self.remote.sdo.upload(entry.index, entry.sub))
         except SdoAbortedError:
@@ -131,7 +130,7 @@ class NodeServices:
         except SdoError as error:
             raise self.fault(entry, no_answer(error)) from None
         except MALFORMED as error:
-            raise self.fault(entry, f"an answer that is no SDO: {error}") from None
+            raise self.fault(entry, f"malformed SDO response: {error}") from None
 
     def write(self, entry: Entry, value: float) -> None:
         """Set an object; raises BusFault."""
@@ -142,7 +141,7 @@ class NodeServices:
         except SdoError as error:
             raise self.fault(entry, no_answer(error)) from None
         except MALFORMED as error:
-            raise self.fault(entry, f"an answer that is no SDO: {error}") from None
+            raise self.fault(entry, f"malformed SDO response: {error}") from None
 
     def write_checked(self, entry: Entry, value: float) -> None:
         """Set an object and read it back, bit for bit; raises BusFault."""
@@ -156,23 +155,23 @@ class NodeServices:
             raise self.fault(entry, f"wrote {value}, the device holds {held}")
 
     def read_text(self, index: int) -> str:
-        """A visible string, empty where the device has none."""
+        """A visible string; empty if the device does not have the object."""
         try:
             return str(self.remote.sdo.upload(index, 0).decode("ascii", "replace").rstrip("\0"))
         except (SdoError, *MALFORMED):
             return ""
 
     def fault(self, entry: Entry, what: str) -> BusFault:
-        """A fault of this node, in words: joint, node, object, what."""
+        """A fault of this node that names joint, node and object."""
         return BusFault(f"{self.joint} (node {self.node}): {entry}: {what}")
 
 
 def joint_services(network: PumpedNetwork, arm: ArmFile, pump: Pump) -> tuple[NodeServices, ...]:
     """SDO access to every joint's controller, in joint order; raises BadInput for a wrong data sheet."""
-    pairs = zip(arm.require_link().joints, data_sheet.of_joints(arm), strict=True)
+    pairs = zip(arm.require_link().joints, eds_file.of_joints(arm), strict=True)
     return tuple(NodeServices(network, joint.name, joint.node, sheet, pump) for joint, sheet in pairs)
 
 
 def no_answer(error: SdoError) -> str:
-    """What an SDO that failed without an abort code came to, in words."""
+    """Message for an SDO transfer that failed without an abort code."""
     return f"no answer within {SDO_TRIES} × {SDO_TIMEOUT} s ({error})"

@@ -1,4 +1,4 @@
-"""Units of a joint controller to SI and back: per mille of rated torque, user position units, micronewton-metres."""
+"""Conversion between a joint controller's units (per mille of rated torque, user position units, µN·m) and SI."""
 
 import math
 from dataclasses import dataclass
@@ -8,19 +8,19 @@ from armlink.arm_file import ArmFile
 TORQUE_PER_MICRO = 1e-6
 """2100h:01 is in µN·m."""
 USER_UNITS = 1 << 20
-"""User units of a joint turn, if the controllers are not asked for 6092h."""
+"""User units per joint revolution, assumed if 6092h is not read from the controllers."""
 
 
 @dataclass(frozen=True)
 class Units:
-    """Scales of one joint; a wire value times the scale is SI."""
+    """Scales of one joint: wire value times scale gives SI."""
 
     torque: float
     """One per mille of the rated torque (6076h) [N·m]."""
     position: float
     """One user unit [rad]; velocities are in user units a second."""
     encoder_step: float
-    """What one encoder increment is at the joint [rad]: finer readings are not to be had."""
+    """One encoder increment at the joint [rad]: the resolution of position readings."""
 
 
 def units_from(
@@ -29,8 +29,9 @@ def units_from(
     gear: tuple[int, int],
     feed: tuple[int, int],
 ) -> Units:
-    """Scales from 6076h [mN·m], 608Fh (increments, motor revolutions), 6091h (motor, shaft revolutions), 6092h (feed,
-    shaft revolutions), by CiA 402: user units = increments · 6092 / (608F · 6091), so 6092 is user units a joint turn.
+    """Scales by CiA 402 from 6076h [mN·m], 608Fh (increments, motor revolutions), 6091h (motor, shaft revolutions) and
+    6092h (feed, shaft revolutions): user units = increments · 6092 / (608F · 6091), so 6092h is user units per joint
+    revolution.
 
     Raises ValueError on a zero.
     """
@@ -45,6 +46,6 @@ def units_from(
 
 
 def assumed_units(arm: ArmFile) -> tuple[Units, ...]:
-    """Scales by the arm file's rated torques and USER_UNITS a turn, for listeners, who do not ask the controllers."""
+    """Scales from the arm file's rated torques and USER_UNITS per revolution, for listeners, which read no objects."""
     joints = arm.require_link().joints
     return tuple(units_from(round(joint.rated_torque * 1e3), (1, 1), (1, 1), (USER_UNITS, 1)) for joint in joints)

@@ -1,4 +1,4 @@
-"""What a bus shows of its cycle: period and jitter of SYNC, time from SYNC to the last reading, missed cycles, load."""
+"""Statistics of the cycle on a bus: period and jitter of SYNC, SYNC-to-reading latency, missed cycles, bus load."""
 
 import math
 from array import array
@@ -8,45 +8,45 @@ import numpy as np
 
 from armlink.arrays import Array
 from armlink.bus.frame_bits import frame_bits
-from armlink.canopen import object_dictionary as objects
+from armlink.canopen.object_dictionary import SYNC_ID
 from armlink.canopen.pdo import TPDO1
 
 KEPT = 1_000_000
-"""Cycles whose times are kept; over an hour at 250 Hz."""
+"""Maximum number of cycles whose times are kept; more than an hour at 250 Hz."""
 EDGES_MS = (0.1, 0.2, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.5, 10.0, 20.0, 50.0, 100.0)
-"""Upper ends of the histogram's bins [ms]; the last bin is open."""
+"""Upper edges of the histogram's bins [ms]; the last bin is open."""
 
 
 @dataclass(frozen=True)
 class CycleReport:
-    """Figures over all cycles so far; NaN where no cycle was complete. Times in milliseconds."""
+    """Statistics over all cycles; NaN if none was complete. Times in milliseconds."""
 
     cycles: int
-    """SYNC to SYNC."""
+    """Intervals from SYNC to SYNC."""
     missed: int
-    """Cycles in which a joint's reading (TPDO1) did not come before the next SYNC, or whose own SYNC did not come."""
+    """Cycles in which a joint's reading (TPDO1) did not arrive before the next SYNC, or whose SYNC was missing."""
     period_ms: float
     jitter_ms: float
     """Standard deviation of the period."""
     longest_period_ms: float
     latency_p50_ms: float
-    """SYNC to the last joint's TPDO1, of complete cycles."""
+    """Time from SYNC to the last joint's TPDO1, in complete cycles."""
     latency_p99_ms: float
     latency_p999_ms: float
     latency_max_ms: float
     histogram: tuple[tuple[float, int], ...]
-    """Upper end of each bin of the latency [ms] (inf for the last) and its cycles; empty bins at both ends left out."""
+    """Upper edge of each latency bin [ms] (inf for the last) and its count; empty bins at both ends are omitted."""
     load: float
-    """Share of the time that frames occupied the bus, stuff bits computed from what they carried."""
+    """Share of the time in which frames occupied the bus, with stuff bits computed from their content."""
     bus_ms_per_cycle: float
-    """Time a cycle's frames take on the wire: what every cycle waits for, however fast the host."""
+    """Time that the frames of a cycle take on the wire: a lower bound for every cycle, however fast the host is."""
 
 
 class CycleStats:
-    """Fed with every frame and its time stamp, in the order of the bus."""
+    """Collects statistics from every frame and its timestamp, in bus order."""
 
     def __init__(self, nodes: tuple[int, ...], period: float, bitrate: int) -> None:
-        """`period` of SYNC [s] as the arm file has it, `bitrate` of the bus."""
+        """`period` of SYNC [s] from the arm file, `bitrate` of the bus [bit/s]."""
         self._readings = frozenset(TPDO1.cob_base + node for node in nodes)
         self._period, self._bitrate = period, bitrate
         self._periods, self._latencies = array("d"), array("d")
@@ -55,10 +55,10 @@ class CycleStats:
         self._bits = self._whole = self._missed = self._cycles = 0
 
     def take(self, stamp: float, can_id: int, data: bytes) -> None:
-        """Count a frame that came at `stamp` [s]."""
-        if self._first == self._first:  # what came before the first SYNC is no whole cycle
+        """Count a frame received at `stamp` [s]."""
+        if self._first == self._first:  # frames before the first SYNC belong to no whole cycle
             self._bits += frame_bits(can_id, data)
-        if can_id == objects.SYNC_ID:
+        if can_id == SYNC_ID:
             self._begin(stamp)
         elif can_id in self._waiting:
             self._waiting.discard(can_id)
@@ -81,7 +81,7 @@ class CycleStats:
         self._waiting = set(self._readings)
 
     def report(self) -> CycleReport:
-        """The figures so far."""
+        """Statistics up to now."""
         periods, latencies = np.array(self._periods) * 1e3, np.array(self._latencies) * 1e3
         at = np.percentile(latencies, (50, 99, 99.9, 100)).tolist() if latencies.size else [math.nan] * 4
         elapsed = self._sync - self._first
@@ -101,7 +101,7 @@ class CycleStats:
         )
 
     def as_json(self) -> dict[str, object]:
-        """The report by the names of its fields."""
+        """The report by field name."""
         return asdict(self.report())
 
 

@@ -1,4 +1,4 @@
-"""Watching an arm's bus: what its joints send, decoded, without commanding them."""
+"""Monitor of an arm's bus: decodes what its joints send and commands nothing."""
 
 import math
 from dataclasses import dataclass
@@ -12,8 +12,8 @@ from armlink.bus.message_port import is_data
 from armlink.bus.port import Port
 from armlink.bus.taps import TappedBus, TappedPort
 from armlink.canopen import emcy
-from armlink.canopen import object_dictionary as objects
 from armlink.canopen.cia402 import state_of
+from armlink.canopen.object_dictionary import NMT_ID, NMT_START, NMT_STATES, OPERATIONAL, SYNC_ID
 from armlink.canopen.units import assumed_units
 from armlink.clock import Clock, MonotonicClock
 from armlink.link.cyclic_exchange import NO_STATUS, Loop
@@ -23,27 +23,27 @@ from armlink.monitor.cycle_stats import CycleStats
 
 @dataclass(eq=False)
 class View:
-    """What was heard in one interval, newest values by joint; NaN where none came."""
+    """Newest values of each joint in one interval; NaN if none was received."""
 
     sample: Sample
     rate_hz: float
-    """SYNCs a second."""
+    """SYNCs per second."""
     load: float
-    """Share of the bus that the frames heard and sent took."""
+    """Share of the bus time taken by the frames received and sent."""
 
 
 class Monitor:
-    """Listens to an arm's joints. With `sync` it is the bus's host: starts the nodes (NMT) and sends SYNC itself."""
+    """Listens to an arm's joints. With `sync` it acts as host: starts the nodes (NMT) and sends SYNC itself."""
 
     def __init__(self, arm: ArmFile, bus: MessageBus, sync: bool = False, stats: bool = False) -> None:
-        """`stats`: measure the cycle too, from every frame's time stamp, which costs more than listening alone."""
+        """`stats`: also measure the cycle from the timestamp of every frame, which takes more CPU time."""
         self.section = section = arm.require_link()
         self.names = tuple(joint.name for joint in section.joints)
         self.nodes = tuple(joint.node for joint in section.joints)
         self.clock: Clock = bus.clock or MonotonicClock()
         self._sync, self._period = sync, 1.0 / section.rate
         self.cycle_stats: CycleStats | None = None
-        """Figures of the cycle so far, None where they were not asked for."""
+        """Statistics of the cycle; None unless requested."""
         if stats:
             self.cycle_stats = CycleStats(self.nodes, self._period, section.bus.bitrate)
         self._loop = Loop(self._open_port(bus), self.clock, self.nodes, 0, self._period, bus.clock is not None)
@@ -51,10 +51,10 @@ class Monitor:
         self._loop.on_other = self._count
         self._syncs = 0
         if sync:
-            self._loop.send(objects.NMT_ID, bytes([objects.NMT_START, 0]))
+            self._loop.send(NMT_ID, bytes([NMT_START, 0]))
 
     def _open_port(self, bus: MessageBus) -> Port:
-        """The bus's port; for statistics one that shows every frame, with the interface's times if we only listen."""
+        """Port of the bus; for statistics one that passes on every frame, by a listener with the interface's times."""
         if self.cycle_stats is None:
             return bus.open_port()
         if self._sync:
@@ -63,16 +63,16 @@ class Monitor:
 
     @property
     def frames(self) -> int:
-        """Frames heard and sent so far."""
+        """Frames received and sent."""
         return self._loop.stats.frames
 
     @property
     def errors(self) -> int:
-        """Frames of a wrong length so far."""
+        """Frames with a wrong length."""
         return self._loop.stats.errors
 
     def watch(self, seconds: float) -> View:
-        """Listen for `seconds`; raises BusFault where the bus fails."""
+        """Listen for `seconds`; raises BusFault if the bus fails."""
         start, syncs, bits = self.clock.now(), self._syncs, self._loop.bits
         sample = self._send_syncs(seconds) if self._sync else self._loop.listen(seconds)
         elapsed = self.clock.now() - start
@@ -80,7 +80,7 @@ class Monitor:
         return View(sample, rate, (self._loop.bits - bits) / (self.section.bus.bitrate * elapsed))
 
     def describe(self, view: View) -> dict[str, Any]:
-        """A view as JSON: joints with readings [rad, rad/s, N·m], states and age [s]; bus with rate and load; cycle."""
+        """A view as JSON content: joints (readings [rad, rad/s, N·m], states, age [s]), bus (rate, load), cycle."""
         cycle = {} if self.cycle_stats is None else {"cycle": self.cycle_stats.as_json()}
         return {
             **cycle,
@@ -94,8 +94,8 @@ class Monitor:
         }
 
     def _joint(self, sample: Sample, joint: int) -> dict[str, Any]:
-        sends = math.isfinite(sample.position[joint])  # which only an operational node does
-        nmt = objects.OPERATIONAL if sends else self._loop.node_states.get(joint)
+        sends = math.isfinite(sample.position[joint])  # only operational nodes send TPDOs
+        nmt = OPERATIONAL if sends else self._loop.node_states.get(joint)
         status = int(sample.status[joint])
         return {
             "joint": self.names[joint],
@@ -105,7 +105,7 @@ class Monitor:
             "torque": float(sample.torque[joint]),
             "motor_torque": float(sample.motor_torque[joint]),
             "state": None if status == NO_STATUS else state_of(status).value,
-            "nmt": None if nmt is None else objects.NMT_STATES.get(nmt, str(nmt)),
+            "nmt": None if nmt is None else NMT_STATES.get(nmt, str(nmt)),
             "age": float(sample.age[joint]),
         }
 
@@ -114,7 +114,7 @@ class Monitor:
         count = max(1, round(seconds / self._period))
         start = self.clock.now()
         for cycle in range(count):
-            self._loop.send(objects.SYNC_ID, b"")
+            self._loop.send(SYNC_ID, b"")
             self._syncs += 1
             end = start + (cycle + 1) * self._period
             while (remaining := end - self.clock.now()) > 0:
@@ -128,4 +128,4 @@ class Monitor:
             self.cycle_stats.take(stamp / 1e6, message.arbitration_id, bytes(message.data))
 
     def _count(self, can_id: int, data: bytes) -> None:
-        self._syncs += can_id == objects.SYNC_ID
+        self._syncs += can_id == SYNC_ID

@@ -1,24 +1,24 @@
-"""Which nodes are on a bus, who they are and in which state; nothing is written to them."""
+"""Scan of a bus: which nodes are present, their identity and state; reads only."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping
 
 from armlink.bus.port import Port
-from armlink.canopen import eds_file as data_sheet
+from armlink.canopen.eds_file import bundled
 from armlink.canopen.sdo import NodeServices, PumpedNetwork
 from armlink.clock import Clock
-from armlink.link import controller_setup as device
+from armlink.link.controller_setup import identify
 from armlink.link.types import Identity
 
 SEARCH_SECONDS = 0.3
-"""How long answers to the search are waited for after the last request."""
+"""Wait for responses after the last request of the search [s]."""
 _READ_DEVICE_TYPE = b"\x40\x00\x10\x00\x00\x00\x00\x00"
 
 
 def scan_bus(port: Port, clock: Clock, joints: Mapping[int, str]) -> list[Identity]:
-    """Every node that answers a read of its device type, and those of `joints` (node id → joint name) that do not.
+    """Every node that answers a read of its device type, and the nodes of `joints` (node id → joint name) that do not.
 
-    Sorted by node id. Raises BusFault where a node that answered stops answering.
+    Sorted by node id. Raises BusFault if a node that answered stops answering.
     """
     network = PumpedNetwork(port.send)
 
@@ -26,27 +26,27 @@ def scan_bus(port: Port, clock: Clock, joints: Mapping[int, str]) -> list[Identi
         end = clock.now() + timeout
         while not done():
             frame = port.receive(max(0.0, end - clock.now()))
-            if frame is None or clock.now() > end + SEARCH_SECONDS:  # a node that babbles must not hold the search
+            if frame is None or clock.now() > end + SEARCH_SECONDS:  # a babbling node must not block the search
                 return False
             network.notify(frame[0], bytearray(frame[1]), 0.0)
         return True
 
     found = _search(port, pump, network)
-    dictionary = data_sheet.bundled()
+    dictionary = bundled()
     identities = []
     for node in sorted({*+found, *joints}):
         name = joints.get(node, "")
-        if found[node] > 1:  # whatever one of them is asked, the other answers too
+        if found[node] > 1:  # both nodes would answer every request
             identities.append(Identity(name, node, present=True, answers=found[node]))
         elif found[node]:
-            identities.append(device.identify(NodeServices(network, name, node, dictionary, pump)))
+            identities.append(identify(NodeServices(network, name, node, dictionary, pump)))
         else:
             identities.append(Identity(name, node, present=False))
     return identities
 
 
 def _search(port: Port, pump: Callable[[Callable[[], bool], float], bool], network: PumpedNetwork) -> Counter[int]:
-    """Node id → number of answers to one request."""
+    """Node id → number of responses to one request."""
     found: Counter[int] = Counter()
 
     def answered(can_id: int, data: bytearray, timestamp: float) -> None:
@@ -63,7 +63,7 @@ def _search(port: Port, pump: Callable[[Callable[[], bool], float], bool], netwo
 
 
 def describe_type(device_type: int) -> str:
-    """Device profile of 1000h in words, such as `CiA 402 servo drive`."""
+    """Device profile of 1000h as text, for example `CiA 402 servo drive`."""
     profile = device_type & 0xFFFF
     kind = {0x0001: "frequency converter", 0x0002: "servo drive", 0x0004: "stepper"}.get(device_type >> 16 & 0xFF, "")
     return f"CiA {profile} {kind}".strip() if profile else "no profile"

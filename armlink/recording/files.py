@@ -1,4 +1,4 @@
-"""Recordings loaded from files and saved to them, by suffix."""
+"""Loads and saves recordings by file suffix."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ SUFFIXES = (".csv", ".csv.gz", ".parquet", ".mcap")
 
 
 def load_recording(path: str | Path) -> Recording:
-    """Load `.csv`, `.csv.gz`, `.parquet` or `.mcap`; raises BadInput with one line that names row or column."""
+    """Load `.csv`, `.csv.gz`, `.parquet` or `.mcap`; raises BadInput that names row or column."""
     path = Path(path)
     suffix = _suffix(path)
     if not path.is_file():
@@ -24,7 +24,7 @@ def load_recording(path: str | Path) -> Recording:
 
 
 def save_recording(recording: Recording, path: str | Path) -> None:
-    """Save by suffix (see load_recording); raises BadInput where the recording is not sound."""
+    """Save by suffix (see load_recording); raises BadInput if the recording is not valid."""
     path = Path(path)
     suffix = _suffix(path)
     recording.check(str(path))
@@ -42,4 +42,4 @@ def _suffix(path: Path) -> str:
     for suffix in sorted(SUFFIXES, key=len, reverse=True):
         if path.name.lower().endswith(suffix):
             return suffix
-    raise BadInput(f"{path}: not a recording by its suffix, expected {', '.join(SUFFIXES)}")
+    raise BadInput(f"{path}: not the suffix of a recording, expected {', '.join(SUFFIXES)}")

@@ -1,4 +1,4 @@
-"""Recordings as MCAP in the form of a ROS 2 bag: JointState messages on the topics of contract 2.
+"""Recordings as MCAP in the form of a ROS 2 bag: JointState messages on the topics of docs/formats.md.
 
 `/joint_states` carries position, velocity and effort = torque sensor, `/motor_states` effort = motor torque,
 `/joint_commands` position and effort = commanded position and torque. JointState has no temperature: joint
@@ -31,17 +31,17 @@ TOPICS: dict[str, tuple[str | None, str | None, str | None]] = {
     "/joint_commands": ("position_command", None, "torque_command"),
     "/joint_temperatures": (None, None, "temperature"),
 }
-"""Topic → channels that its position, velocity and effort are."""
+"""Topic → channels carried as position, velocity and effort."""
 FLUSH_SECONDS = 0.5
-"""A killed recorder loses at most this and what the operating system had not written."""
+"""Interval of flushes: a killed recorder loses at most this and what the operating system had not written."""
 _NANO = 1_000_000_000
 
 
 class RecordingWriter:
-    """Writes rows as they come; a context manager that ends the file properly."""
+    """Writes rows one by one; a context manager that completes the file."""
 
     def __init__(self, path: Path, names: tuple[str, ...]) -> None:
-        """Create the file for joints of these names."""
+        """Create the file for joints with these names."""
         self._stream = path.open("wb")
         self._names, self._n = names, len(names)
         self._writer = Writer(self._stream)
@@ -56,7 +56,7 @@ class RecordingWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        """End the file: index and footer."""
+        """Complete the file with index and footer."""
         self._writer.finish()
         self._stream.close()
 
@@ -91,7 +91,7 @@ def save_mcap(recording: Recording, path: Path) -> None:
 
 
 def load_mcap(path: Path) -> Recording:
-    """Load a recording or a ROS 2 bag in MCAP; one that was cut loads up to the cut and says so in `warning`.
+    """Load a recording or a ROS 2 bag in MCAP; a truncated file loads as far as it goes, noted in `warning`.
 
     Time is that of `/joint_states` from its first message; other topics' messages go to the row nearest in time, if
     nearer than half the median period, and are NaN elsewhere. Joints are those of the first `/joint_states` message.
@@ -114,7 +114,7 @@ def load_mcap(path: Path) -> Recording:
 
 
 def _read(path: Path) -> tuple[dict[str, list[JointState]], str]:
-    """Messages by topic in the order of the file, and what to say where the file ends before its end."""
+    """Messages by topic in the order of the file, and a warning if the file is truncated."""
     found: dict[str, list[JointState]] = defaultdict(list)
     topics: dict[int, str] = {}
     schemas: dict[int, Schema] = {}
@@ -151,7 +151,7 @@ def _check_schema(channel: Channel, schemas: dict[int, Schema], path: Path) -> N
 
 
 def _channels_of(topic: str, states: list[JointState], names: tuple[str, ...], source: str) -> dict[str, Array]:
-    """The topic's channels, (K, n) in the order of `names`; joints that a message leaves out are NaN."""
+    """The topic's channels (K, n) in the order of `names`; NaN for joints that a message omits."""
     channels: dict[str, Array] = {}
     for field, name in zip(("position", "velocity", "effort"), TOPICS[topic], strict=True):
         if name is None or not any(getattr(state, field) for state in states):
@@ -179,7 +179,7 @@ def _order(message: tuple[str, ...], names: tuple[str, ...]) -> tuple[list[int],
 
 
 def _align(values: Array, times: Any, stamps: Any, half: float) -> Array:
-    """Values at the rows' stamps: of the nearest message within `half` nanoseconds, NaN where there is none."""
+    """Values at the rows' stamps: from the nearest message within `half` nanoseconds, else NaN."""
     order = np.argsort(times, kind="stable")
     times, values = times[order], values[order]
     after = np.clip(np.searchsorted(times, stamps), 0, times.size - 1)

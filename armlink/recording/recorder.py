@@ -1,4 +1,4 @@
-"""Recording an arm's bus while its host runs it: one row a SYNC, commands included; nothing is sent."""
+"""Records an arm's bus while its host runs: one row per SYNC, with commands; sends nothing."""
 
 import math
 import struct
@@ -9,7 +9,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.bus.can_bus import CanBus, TimedBus
-from armlink.canopen import object_dictionary as objects
+from armlink.canopen.object_dictionary import SYNC_ID
 from armlink.canopen.pdo import RPDO1
 from armlink.canopen.units import assumed_units
 from armlink.clock import Clock, MonotonicClock
@@ -20,10 +20,10 @@ Row = tuple[float, dict[str, Array]]
 
 
 class Recorder:
-    """Iterates over rows: time from the first SYNC [s], and channels of Recording, NaN where nothing came."""
+    """Iterates over rows: time since the first SYNC [s] and channels of Recording, NaN if nothing was received."""
 
     def __init__(self, arm: ArmFile, bus: CanBus) -> None:
-        """Listen to `bus`; times are the frames' own if they have any, else when they were read."""
+        """Listen to `bus`; times are the frames' own timestamps if the bus has them, else when frames were read."""
         section = arm.require_link()
         self.names = tuple(joint.name for joint in section.joints)
         nodes = tuple(joint.node for joint in section.joints)
@@ -46,7 +46,7 @@ class Recorder:
         self._forget()
 
     def rows(self, seconds: float) -> Iterator[Row]:
-        """Rows that are complete within `seconds`, or in a whole log (LogBus); raises BusFault where the bus fails."""
+        """Rows completed within `seconds`, or in a whole log (LogBus); raises BusFault if the bus fails."""
         end = self.clock.now() + seconds
         while (remaining := end - self.clock.now()) > 0 and not (self._timed and self._timed.ended):
             self._loop.receive(min(remaining, WAIT_SECONDS))
@@ -55,13 +55,13 @@ class Recorder:
 
     def _take(self, can_id: int, data: bytes) -> None:
         joint = self._joint_of.get(can_id)
-        if can_id == objects.SYNC_ID:
+        if can_id == SYNC_ID:
             self._complete(self._stamp())
         elif joint is not None and len(data) == RPDO1.layout.size:
             _, self._next_torque[joint], self._next_position[joint] = struct.unpack("<Hhi", data)
 
     def _complete(self, now: float) -> None:
-        """A SYNC: what came since the one before is its row; commands that came before it take effect now."""
+        """A SYNC completes the row of the previous one; commands received before it take effect now."""
         sample = self._loop.sample(now)
         self._loop.drop_readings()
         if self._sync is not None and self._start is not None:

@@ -1,4 +1,4 @@
-"""Recordings: readings of an arm's channels over time, and the columns that stand for them in tables."""
+"""Recordings: an arm's channels over time, and their columns in tables."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -43,9 +43,9 @@ class Recording:
     temperature: Array | None = None
     """[°C], shape (K, n)."""
     names: tuple[str, ...] = ()
-    """Joint names base to tip; `joint_1` … where the file does not say."""
+    """Joint names base to tip; `joint_1` … if the file has no names."""
     warning: str = ""
-    """What the loader left out or could not read; empty when all was read."""
+    """Parts of the file that were ignored or could not be read; empty if everything was read."""
 
     def __post_init__(self) -> None:
         if not self.names:
@@ -57,12 +57,12 @@ class Recording:
         return int(self.position.shape[1])
 
     def channels(self) -> dict[str, Array]:
-        """The channels that are there, by name, each (K, n)."""
+        """The channels present, by name, each (K, n)."""
         found = {name: getattr(self, name) for name in COLUMNS}
         return {name: values for name, values in found.items() if values is not None}
 
     def check(self, source: str) -> "Recording":
-        """Return this recording if it is sound, else raise BadInput with one line that begins with `source`."""
+        """Return this recording if it is valid, else raise BadInput with one line that begins with `source`."""
         if self.t.ndim != 1 or self.t.size < 2:
             raise BadInput(f"{source}: {self.t.size} rows: a recording needs at least two")
         _check_time(self.t, source)
@@ -73,17 +73,17 @@ class Recording:
             _check_finite_or_nan(values, COLUMNS[name], source)
         if not any(getattr(self, name) is not None for name in TORQUE_CHANNELS):
             wanted = ", ".join(f"{COLUMNS[name]}_1" for name in TORQUE_CHANNELS)
-            raise BadInput(f"{source}: no torque channel: at least one of {wanted} … must be there")
+            raise BadInput(f"{source}: no torque channel: at least one of {wanted} … is required")
         return self
 
 
 def default_names(n: int) -> tuple[str, ...]:
-    """`joint_1` … `joint_n`, for files that name no joints."""
+    """`joint_1` … `joint_n`, for files without joint names."""
     return tuple(f"joint_{i}" for i in range(1, n + 1))
 
 
 def columns_of(recording: Recording) -> dict[str, Array]:
-    """The recording as columns of contract 2, `t` first, each (K,)."""
+    """The recording as columns (docs/formats.md), `t` first, each (K,)."""
     columns = {"t": recording.t}
     for name, values in recording.channels().items():
         columns |= {f"{COLUMNS[name]}_{i + 1}": values[:, i] for i in range(recording.n)}
@@ -91,7 +91,7 @@ def columns_of(recording: Recording) -> dict[str, Array]:
 
 
 def channels_of(columns: Mapping[str, Array], source: str) -> dict[str, Array | None]:
-    """Group columns of contract 2 into channels (K, n); raises BadInput naming the first missing column."""
+    """Group columns into channels (K, n); raises BadInput that names the first missing column."""
     n = joint_count(list(columns), source)
     grouped: dict[str, Array | None] = {}
     for name, prefix in COLUMNS.items():
@@ -101,7 +101,7 @@ def channels_of(columns: Mapping[str, Array], source: str) -> dict[str, Array | 
 
 
 def joint_count(columns: list[str], source: str) -> int:
-    """Number of joints that these column names describe; raises BadInput naming a column that is missing."""
+    """Number of joints that the column names describe; raises BadInput that names a missing column."""
     indices = [index for column in columns if (index := _joint_index(column)) is not None]
     n = max(indices, default=1)
     present = set(columns)
@@ -117,12 +117,12 @@ def joint_count(columns: list[str], source: str) -> int:
 
 
 def is_channel(column: str) -> bool:
-    """Whether a column is one of contract 2."""
+    """Whether a column belongs to a channel, or is the time."""
     return column == "t" or _joint_index(column) is not None
 
 
 def slice_rows(recording: Recording, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Recording:
-    """The recording at some of its rows (times unchanged)."""
+    """Some rows of a recording, with their times unchanged."""
     values = {field.name: getattr(recording, field.name) for field in fields(recording)}
     for name, value in values.items():
         if isinstance(value, np.ndarray):

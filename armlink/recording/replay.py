@@ -1,4 +1,4 @@
-"""Raw logs and recordings played again: decoded, shown, or sent as what joints send, on a virtual bus."""
+"""Replay of raw logs and recordings: decoded, shown, or sent onto a virtual bus as the joints would send them."""
 
 import math
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ from armlink.arrays import Array
 from armlink.bus.frame_log import LogBus, LogReader, is_log
 from armlink.bus.open import open_bus, parse_bus
 from armlink.bus.port import Port, Stamped
-from armlink.canopen import object_dictionary as objects
+from armlink.canopen.object_dictionary import SYNC_ID
 from armlink.canopen.pdo import TPDO1, TPDO2, TPDO3
 from armlink.canopen.units import TORQUE_PER_MICRO, assumed_units
 from armlink.clock import Clock, MonotonicClock
@@ -31,7 +31,7 @@ _I16, _I32 = (-(1 << 15), (1 << 15) - 1), (-(1 << 31), (1 << 31) - 1)
 
 
 def recording_of_log(arm: ArmFile, path: Path) -> Recording:
-    """Decode a raw log with the recorder's own decoding; `warning` says where it was cut. Raises BadInput."""
+    """Decode a raw log with the recorder's decoding; `warning` says where the log is truncated. Raises BadInput."""
     bus = LogBus(path)
     recorder = Recorder(arm, bus)
     times: list[float] = []
@@ -43,15 +43,17 @@ def recording_of_log(arm: ArmFile, path: Path) -> Recording:
     warning = bus.reader.warning
     if len(times) < 2:
         cut = f"; {warning}" if warning else ""
-        raise BadInput(f"{path}: {len(times)} whole cycles in {bus.reader.count} frames: no SYNCs of {arm.name}?{cut}")
+        raise BadInput(
+            f"{path}: {len(times)} whole cycles in {bus.reader.count} frames: does it contain SYNCs of {arm.name}?{cut}"
+        )
     stacked = {name: np.array(rows) for name, rows in channels.items()}
     return Recording(t=np.array(times), names=recorder.names, warning=warning, **stacked).check(str(path))
 
 
 def play_onto(arm: ArmFile, source: Path, recording: Recording, spec: str, speed: float) -> int:
-    """Send what the joints sent and SYNC onto a virtual bus, at `speed` times its pace; how many frames.
+    """Send SYNC and the joints' frames onto a virtual bus at `speed` times their pace; returns the number of frames.
 
-    Raises BadInput for a bus that is not virtual, BusFault where it cannot be opened or takes no frames.
+    Raises BadInput for a bus that is not virtual, BusFault if it cannot be opened or takes no frames.
     """
     described = parse_bus(spec)
     virtual = described.interface == "socketcan" and described.channel.startswith("vcan")
@@ -68,17 +70,17 @@ def play_onto(arm: ArmFile, source: Path, recording: Recording, spec: str, speed
 
 
 def frames_of_log(path: Path) -> Iterator[Stamped]:
-    """Time [s], identifier and data of the log's frames that joints or SYNC sent; no command, SDO request or NMT."""
+    """Time [s], identifier and data of SYNC and of the joints' frames in a log; no commands, SDO requests or NMT."""
     for stamp, can_id, data in LogReader(path).frames():
         if can_id & 0x780 in _JOINTS_SEND:
             yield stamp / 1e6, can_id, data
 
 
 def frames_of_recording(arm: ArmFile, recording: Recording) -> Iterator[Stamped]:
-    """Time [s], identifier and data of the frames with which an arm's joints would have sent a recording.
+    """Time [s], identifier and data of the frames by which an arm's joints would have sent a recording.
 
-    SYNC and TPDO1 each row, TPDO2 where there is what it carries; the joints are enabled, in no mode. A missing reading
-    is a frame that is not sent. Raises BadInput for another number of joints.
+    SYNC and TPDO1 for each row, TPDO2 if its values are there; the joints are enabled, in no mode. The frame of a
+    missing reading is left out. Raises BadInput if the number of joints differs.
     """
     joints, units = arm.require_link().joints, assumed_units(arm)
     if recording.n != len(joints):
@@ -88,7 +90,7 @@ def frames_of_recording(arm: ArmFile, recording: Recording) -> Iterator[Stamped]
     motor = nothing if recording.motor_torque is None else recording.motor_torque
     velocity = nothing if recording.velocity is None else recording.velocity
     for row, t in enumerate((recording.t - recording.t[0]).tolist()):
-        yield t, objects.SYNC_ID, b""
+        yield t, SYNC_ID, b""
         for j, (joint, unit) in enumerate(zip(joints, units, strict=True)):
             position, reading = recording.position[row, j], torque[row, j]
             if math.isfinite(position) and math.isfinite(reading):
@@ -102,7 +104,7 @@ def frames_of_recording(arm: ArmFile, recording: Recording) -> Iterator[Stamped]
 
 
 def show(recording: Recording, console: "Console", speed: float, clock: Clock | None = None) -> None:
-    """Show a recording as a table that follows its time, `speed` times as fast; 0: its end at once."""
+    """Show a recording as a table that follows its time at `speed` times its pace; 0: only the last row."""
     from rich.live import Live
 
     clock = clock or MonotonicClock()

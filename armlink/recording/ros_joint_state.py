@@ -1,4 +1,4 @@
-"""`sensor_msgs/msg/JointState` as ROS 2 serialises it: CDR, little endian, doubles aligned to eight bytes."""
+"""ROS 2 serialisation of `sensor_msgs/msg/JointState`: CDR, little endian, doubles aligned to eight bytes."""
 
 import struct
 from collections.abc import Callable, Sequence
@@ -20,15 +20,15 @@ MSG: builtin_interfaces/Time
 int32 sec
 uint32 nanosec
 """
-"""Message definition in the form that rosbag2 stores (encoding `ros2msg`)."""
+"""Message definition as rosbag2 stores it (encoding `ros2msg`)."""
 
-_HEADER = 4  # encapsulation; alignment counts from behind it
+_HEADER = 4  # encapsulation; alignment counts from its end
 _STAMPED = 12  # encapsulation and stamp
 _NANO = 1_000_000_000
 
 
 class JointState(NamedTuple):
-    """One message; a list is empty or as long as `names`."""
+    """One message; each list is empty or as long as `names`."""
 
     stamp: int
     """[ns]."""
@@ -62,7 +62,7 @@ class _Reader:
 
 
 def decode_joint_state(data: bytes) -> JointState:
-    """Decode one message; raises ValueError where the bytes are not one."""
+    """Decode one message; raises ValueError if the bytes are malformed."""
     try:
         reader = _Reader(data, "<" if data[1] & 1 else ">")
         seconds, nanoseconds = struct.unpack_from(reader.order + "iI", data, _HEADER)
@@ -81,13 +81,13 @@ def decode_joint_state(data: bytes) -> JointState:
 
 
 class JointStateDecoder:
-    """Decodes a stream of messages; those that look like one before are taken apart by one compiled layout."""
+    """Decodes a stream of messages; a message with the layout of an earlier one takes a single compiled unpack."""
 
     def __init__(self) -> None:
         self._known: dict[int, tuple[bytes, bytes, tuple[str, ...], struct.Struct, tuple[int, int, int]]] = {}
 
     def __call__(self, data: bytes) -> JointState:
-        """Decode one message; raises ValueError where the bytes are not one."""
+        """Decode one message; raises ValueError if the bytes are malformed."""
         known = self._known.get(len(data))
         if known is not None:
             encapsulation, head, names, layout, counts = known
@@ -127,7 +127,7 @@ class JointStateDecoder:
 def joint_state_encoder(
     names: Sequence[str], lists: tuple[bool, bool, bool]
 ) -> Callable[[int, Sequence[float]], bytes]:
-    """Encoder for messages of these names that carry position, velocity, effort or not (`lists`).
+    """Encoder for messages with these names; `lists`: which of position, velocity and effort they carry.
 
     It takes the stamp [ns] and the numbers of those lists one after the other, len(names) each.
     """
@@ -158,7 +158,7 @@ def joint_state_encoder(
 
 
 def _body(at: int, n: int, lists: tuple[bool, bool, bool]) -> tuple[str, int]:
-    """Struct codes of the three lists that begin at byte `at`, counts and padding included, and where they end."""
+    """Struct codes of the three lists that begin at byte `at`, with counts and padding, and the byte behind them."""
     layout = ""
     for there in lists:
         padded = _aligned(at, 4)

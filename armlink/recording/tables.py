@@ -24,13 +24,13 @@ from armlink.recording.recording import (
     joint_count,
 )
 
-_LOOK_BACK = 20_000  # bytes at the end of a CSV file that tell how long its numbers are
+_LOOK_BACK = 20_000  # bytes at the end of a CSV file that show how long its numbers are
 NAMES_KEY = b"armlink.names"
 """Parquet schema metadata: joint names as JSON."""
 
 
 def load_csv(path: Path) -> Recording:
-    """Load `.csv` or `.csv.gz` with a header row of contract 2's names, up to where it was cut; raises BadInput."""
+    """Load `.csv` or `.csv.gz` with a header row (docs/formats.md), up to a truncation; raises BadInput."""
     content, cut = _content(path)
     header = _header(path, content)
     joint_count(header, str(path))
@@ -53,7 +53,7 @@ def load_csv(path: Path) -> Recording:
 
 
 def load_parquet(path: Path) -> Recording:
-    """Load Parquet with contract 2's column names; joint names from the schema's metadata; raises BadInput."""
+    """Load Parquet with the columns of docs/formats.md, joint names from the schema's metadata; raises BadInput."""
     try:
         table = pa_parquet.read_table(path)
         header = list(table.column_names)
@@ -67,7 +67,7 @@ def load_parquet(path: Path) -> Recording:
 
 
 def save_csv(recording: Recording, path: Path) -> None:
-    """Write `.csv` or `.csv.gz`, numbers with all their digits, NaN as an empty cell."""
+    """Write `.csv` or `.csv.gz` with all digits; NaN becomes an empty cell."""
     table = _table(recording)
     options = pa_csv.WriteOptions(include_header=False, quoting_style="none")
     packed = path.name.lower().endswith(".gz")
@@ -86,7 +86,7 @@ def _recording(table: Any, header: list[str], source: str, names: tuple[str, ...
     columns = {column: _numbers(table.column(column)) for column in table.column_names}
     channels = channels_of(columns, source)
     ignored = [column for column in header if not is_channel(column)]
-    warning = f"columns that are not channels left out: {', '.join(ignored)}" if ignored else ""
+    warning = f"columns ignored because they are no channels: {', '.join(ignored)}" if ignored else ""
     n = joint_count(header, source)
     if names and len(names) != n:
         raise BadInput(f"{source}: {len(names)} joint names for {n} joints")
@@ -103,7 +103,7 @@ def _table(recording: Recording) -> Any:
 
 
 def _content(path: Path) -> tuple[bytes, str]:
-    """The file's whole lines, unpacked, and what to say where it was cut."""
+    """Complete lines of the file, uncompressed, and why it is truncated (empty if it is not)."""
     try:
         content = path.read_bytes()
         cut = ""
@@ -121,7 +121,7 @@ def _content(path: Path) -> tuple[bytes, str]:
 
 
 def _unpacked(packed: bytes) -> tuple[bytes, bool]:
-    """What gzip members hold as far as they go, and whether the last one is whole."""
+    """Content of the gzip members as far as it goes, and whether the last member is complete."""
     parts, ended = [], False
     while packed:
         member = zlib.decompressobj(wbits=31)
@@ -133,9 +133,9 @@ def _unpacked(packed: bytes) -> tuple[bytes, bool]:
 
 
 def _looks_whole(content: bytes) -> bool:
-    """Whether a last line without its end is nevertheless whole: all columns, its last number as long as any before it.
+    """Whether a last line without newline is complete: all columns, its last number as long as any above it.
 
-    A number that is cut has fewer digits behind the point than the others of its column, or is shorter.
+    A truncated number has fewer decimals than the others of its column, or is shorter.
     """
     lines = content[-_LOOK_BACK:].decode("utf-8", "replace").splitlines()
     *before, last = (line.split(",") for line in lines)
@@ -167,7 +167,7 @@ def _header(path: Path, content: bytes) -> list[str]:
         raise BadInput(f"{path}: not a readable CSV file: {_first_line(error)}") from None
     twins = sorted({column for column in header if header.count(column) > 1})
     if twins:
-        raise BadInput(f"{path}: column {twins[0]!r} stands twice in the header row")
+        raise BadInput(f"{path}: column {twins[0]!r} occurs twice in the header row")
     return header
 
 

@@ -8,14 +8,14 @@ from types import FrameType
 from armlink.bus.bus_group import BusGroup, GroupPort
 from armlink.bus.can_bus import CanBus
 from armlink.bus.port import Frame, InterfaceDown, Port
-from armlink.canopen.object_dictionary import NMT_ID
+from armlink.canopen.object_dictionary import NMT_ID, SYNC_ID
 from armlink.errors import BusFault
 from sim_bus.bus.control_pipe import ControlPipe
 from sim_bus.bus.effect_options import Drift
 from sim_bus.bus.fault_injector import Injector
 from sim_bus.bus.fault_kinds import Fault
 from sim_bus.bus.wire_timing import Line
-from sim_bus.simulated_arm import SYNC_ID, SimulatedArm
+from sim_bus.simulated_arm import SimulatedArm
 
 LARGEST_LAG = 0.25
 """What the physics lags behind the clock by more than this is dropped, as after a stopped process [s]."""

@@ -12,10 +12,10 @@ from itertools import count
 from typing import Protocol
 
 from armlink.bus.frame_bits import frame_bits
+from armlink.canopen.object_dictionary import SYNC_ID
 from armlink.errors import BusFault
 from sim_bus.node.pdo import Frame
 
-SYNC_ID = 0x80
 PATIENCE = 0.05
 """How long a host waits for room in its transmit queue [s]."""
 TRANSMIT_QUEUE = 10

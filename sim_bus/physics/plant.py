@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from sim_bus.effects.state import Imperfections
-from sim_bus.physics import gravity as statics
 from sim_bus.physics.friction import dry_friction
+from sim_bus.physics.gravity import gravity_torque, inertia, tilt
 from sim_bus.physics.inertials import Inertials
 from sim_bus.physics.mjcf import build_model
 from sim_bus.physics.motor_lag import LateMotors
@@ -106,7 +106,7 @@ class Plant:
         self._has_rotors = bool(self._rotor_inertia.any())
         self._seat("armature", self._rotor_inertia)
         self._seat("damping", self._viscous)
-        self.model.opt.gravity[:] = statics.tilt(imperfections.tilt).T @ self._gravity
+        self.model.opt.gravity[:] = tilt(imperfections.tilt).T @ self._gravity
         self.model.jnt_stiffness[self._joints] = imperfections.spring[:, 0]
         self.model.qpos_spring[self._dof] = imperfections.spring[:, 1]
         self._inertials.apply(self._imperfections, self._attached)
@@ -131,11 +131,11 @@ class Plant:
 
     def gravity_torque(self, q: Array) -> Array:
         """True holding torque ∂V/∂q at the angles `q` (K, n) → (K, n), everything attached included."""
-        return statics.gravity_torque(self.model, self._dof, q)
+        return gravity_torque(self.model, self._dof, q)
 
     def inertia(self, q: Array) -> Array:
         """Joint-space inertia matrix at the angles `q` (n,) → (n, n) [kg·m²]."""
-        return statics.inertia(self.model, self._dof, q)
+        return inertia(self.model, self._dof, q)
 
     # ---- what it does
 

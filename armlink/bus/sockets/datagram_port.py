@@ -1,6 +1,6 @@
-"""Frames as datagrams of a socket, without an object or a system call a frame: whole batches by sendmmsg and recvmmsg.
+"""Frames as datagrams of a socket, sent and received in batches by sendmmsg and recvmmsg.
 
-What a datagram looks like is the subclass's: SocketCAN's own frames, or python-can's udp_multicast.
+Subclasses define the datagram: SocketCAN's frame or python-can's udp_multicast message.
 """
 
 import ctypes
@@ -17,27 +17,27 @@ from armlink.bus.port import ERROR, Frame, InterfaceDown
 from armlink.errors import BusFault
 
 BATCH = 64
-"""Datagrams a system call takes."""
+"""Datagrams per system call."""
 MOST_BATCHES = 16
-"""Batches taken for one frame: a flood of datagrams that are no frames does not keep a reader for ever."""
+"""Limit of batches read for one frame, so that a flood of other datagrams cannot block a reader."""
 RECEIVE_BUFFER = 1 << 21
-"""Bytes of the socket's receive queue, which the kernel counts with its own overhead: some thousand frames."""
+"""Size of the socket's receive queue [bytes]: some thousand frames with the kernel's overhead."""
 CONTROL = 64
-"""Bytes for the control messages of one datagram."""
+"""Space for the control messages of one datagram [bytes]."""
 NAME = 32
-"""Bytes for the sender's address of one datagram."""
+"""Space for the sender's address of one datagram [bytes]."""
 BUS_OFF = 0x40
-"""Class of error that an error frame's identifier tells."""
+"""Error class bit in the identifier of an error frame."""
 NOT_OURS = 1 << 32
-"""Marks a datagram that is no frame for us: its own echo, or one that cannot be understood."""
+"""Marks a datagram that is no frame for the reader: its own echo, or malformed."""
 FLAGS = 0xE0000000 | NOT_OURS
-"""Identifiers of extended, remote and error frames have one of these, as in SocketCAN."""
+"""Flags of everything but data frames with an 11-bit identifier, as in SocketCAN."""
 _RETRY = 0.002  # [s] between tries while the transmit queue is full
 _TRIES = 25
 _FULL = (errno.ENOBUFS, errno.EAGAIN)
 _DONTWAIT = int(socket.MSG_DONTWAIT)
 _SO_RCVBUFFORCE, _SO_RXQ_OVFL = 33, 40
-_STAMP_ALONE = 32  # bytes of control messages if there is nothing but a time stamp
+_STAMP_ALONE = 32  # bytes of control messages if there is only a timestamp
 _CONTROL_HEADER = struct.Struct("@Nii")
 _LENGTH = struct.Struct("@56xI4x")
 
@@ -63,10 +63,10 @@ class _Message(ctypes.Structure):
 
 
 class Batch:
-    """Preallocated datagrams and the headers that point at them, as sendmmsg and recvmmsg take them."""
+    """Preallocated datagrams and their headers for sendmmsg and recvmmsg."""
 
     def __init__(self, size: int, names: bool = False) -> None:
-        """BATCH datagrams of at most `size` bytes; `names`: with room for each sender's address."""
+        """BATCH datagrams of at most `size` bytes; `names`: with space for each sender's address."""
         self.size = size
         self.content = bytearray(BATCH * size)
         self.names = bytearray(BATCH * NAME if names else 0)
@@ -83,26 +83,26 @@ class Batch:
                 message.header.name, message.header.name_length = name + i * NAME, NAME
 
     def put(self, place: int, datagram: bytes) -> None:
-        """Make `datagram` the one at `place`."""
+        """Set the datagram at `place`."""
         size, start = len(datagram), place * self.size
         self.content[start : start + size] = datagram
         self._vectors[2 * place + 1] = size
 
     def lengths(self, count: int) -> Iterator[tuple[int]]:
-        """Bytes received in each of the first `count` datagrams."""
+        """Length of each of the first `count` datagrams received."""
         return _LENGTH.iter_unpack(self._messages[: count * _LENGTH.size])
 
 
 class DatagramPort(ABC):
-    """A Port on sockets: batches out and in; counts error frames and what the receive queue lost."""
+    """Port on sockets; counts error frames and frames lost by the receive queue."""
 
     def __init__(
         self, name: str, receiving: socket.socket, sending: socket.socket, out: Batch, into: Batch, as_node: bool
     ) -> None:
-        """`name` of the bus for messages; both sockets may be the same one; `as_node` as in open_port."""
+        """`name` of the bus for messages; both sockets may be the same; `as_node` as in CanBus.open_port."""
         self.errors = 0
         self.dropped = 0
-        """Frames that the receive queue lost because they were not read in time (SO_RXQ_OVFL)."""
+        """Frames lost because they were not read in time (SO_RXQ_OVFL)."""
         self._as_node, self._name, self._out, self._in = as_node, name, out, into
         self._number, self._out_number = receiving.fileno(), sending.fileno()
         self._control = ctypes.create_string_buffer(CONTROL)
@@ -110,35 +110,39 @@ class DatagramPort(ABC):
         self._first.control = ctypes.addressof(self._control)
         self._waiting: list[Frame] = []
         self._dry = False
-        """The last batch was all that there was: it need not be asked again at once."""
+        """The last batch emptied the receive queue: the next look needs no system call."""
         library = ctypes.CDLL(None, use_errno=True)
         self._sendmmsg, self._recvmmsg = library.sendmmsg, library.recvmmsg
         self._sendmmsg.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int)
         self._recvmmsg.argtypes = (*self._sendmmsg.argtypes, ctypes.c_void_p)
+        self._prepare(receiving)
+
+    def _prepare(self, receiving: socket.socket) -> None:
+        """Give the socket a large receive queue and a count of lost frames."""
         try:
             receiving.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER)
-        except OSError:  # without CAP_NET_ADMIN as much as net.core.rmem_max allows
+        except OSError:  # without CAP_NET_ADMIN limited by net.core.rmem_max
             receiving.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
         receiving.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
 
     @abstractmethod
     def _encode(self, frames: Sequence[Frame]) -> None:
-        """Put at most BATCH frames into the outgoing batch."""
+        """Encode at most BATCH frames into the outgoing batch."""
 
     @abstractmethod
     def _decode(self, count: int) -> list[Frame]:
-        """The frames in the first `count` datagrams, one each, their identifiers with FLAGS where any is due."""
+        """Decode the first `count` datagrams, one frame each, with FLAGS in identifiers."""
 
     def fileno(self) -> int:
-        """The socket, for select."""
+        """File descriptor of the receiving socket."""
         return self._number
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send one frame; a full transmit queue is tried again for some milliseconds, then BusFault."""
+        """Send one frame; retries for 50 ms if the transmit queue is full, then raises BusFault."""
         self.send_all(((can_id, data),))
 
     def send_all(self, frames: Sequence[Frame]) -> None:
-        """Send the frames in this order, BATCH by one system call; raises BusFault as send."""
+        """Send the frames in this order, BATCH per system call; raises BusFault as send."""
         if len(frames) > BATCH:
             for begin in range(0, len(frames), BATCH):
                 self.send_all(frames[begin : begin + BATCH])
@@ -190,7 +194,7 @@ class DatagramPort(ABC):
         return None
 
     def _fill(self) -> bool:
-        """Take in a batch; False where there is no more."""
+        """Read a batch; False if the receive queue is empty now."""
         self._first.control_length = CONTROL
         count = self._take_batch()
         if not count:
@@ -207,7 +211,7 @@ class DatagramPort(ABC):
         return not self._dry
 
     def _take_batch(self) -> int:
-        """How many datagrams are in the batch now, 0 where nothing was there."""
+        """Read datagrams into the batch; returns their number."""
         count: int = self._recvmmsg(self._number, self._in.address, BATCH, _DONTWAIT, None)
         if count <= 0:
             number = ctypes.get_errno()
@@ -221,14 +225,14 @@ class DatagramPort(ABC):
         return count
 
     def _take_others(self, others: list[int]) -> None:
-        """Frames that are no data frames with an 11-bit identifier: those that tell of errors count."""
+        """Count error frames; raises BusFault for bus-off."""
         errors = [can_id for can_id in others if can_id & ERROR]
         self.errors += len(errors)
         if any(can_id & BUS_OFF for can_id in errors) and not self._as_node:
             raise BusFault(f"bus {self._name}: bus-off: check wiring, termination and bit rate")
 
     def _read_drops(self, length: int) -> None:
-        """The kernel's count of lost frames, 32 bits; among control messages, each aligned to eight bytes."""
+        """Read the kernel's count of lost frames (32 bits) from the control messages, each aligned to eight bytes."""
         control, at = self._control.raw[:length], 0
         while at + _CONTROL_HEADER.size <= length:
             size, level, kind = _CONTROL_HEADER.unpack_from(control, at)

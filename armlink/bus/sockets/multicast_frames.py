@@ -1,8 +1,8 @@
-"""CAN frames as python-can's udp_multicast carries them: a MessagePack map of a message's fields, one a datagram.
+"""Codec of python-can's udp_multicast: one MessagePack map of a message's fields per datagram.
 
-python-can packs the fields in one order, so that all but identifier, length, data and flags is the same in every
-datagram. Datagrams are put together from prepared pieces, and recognised by them; a map of any other order or width is
-unpacked field by field. Identifiers carry SocketCAN's flags.
+python-can packs the fields in a fixed order, so that only identifier, length, data and flags differ between datagrams.
+Datagrams are built from cached parts and recognised by them; a map with another order or integer width is unpacked
+field by field. Identifiers carry SocketCAN's flags.
 """
 
 from functools import lru_cache
@@ -14,7 +14,7 @@ from armlink.bus.port import ERROR
 
 EXTENDED, REMOTE = 0x80000000, 0x40000000
 LONGEST = 1024
-"""Bytes of the longest datagram that is taken for a frame; python-can makes at most 240 without a channel's name."""
+"""Limit of datagrams [bytes]; python-can's have at most 240 without the name of a channel."""
 HEADS_KEPT = 4096
 _DEFAULTS: dict[str, Any] = {
     "timestamp": 0.0,
@@ -29,7 +29,7 @@ _DEFAULTS: dict[str, Any] = {
     "bitrate_switch": False,
     "error_state_indicator": False,
 }
-"""Fields of python-can's Message in the order of its packer, with their values if a map leaves them out."""
+"""Fields of python-can's Message in the order of its packer, with their default values."""
 _FLAGS = tuple(name for name, value in _DEFAULTS.items() if isinstance(value, bool))
 _MOST_DATA = 64
 
@@ -41,16 +41,16 @@ def _key(name: str) -> bytes:
 _BOOL = (b"\xc2", b"\xc3")
 _START = bytes([0x80 | len(_DEFAULTS)]) + _key("timestamp") + b"\xcb"
 _HEAD = len(_START) + 8
-"""Where what comes behind the time begins."""
+"""Offset behind the timestamp."""
 _NO_TIME = _START + bytes(8)
-"""A sender's time is 0, as of messages that a program has made; who receives it stamps it."""
+"""Timestamp 0, as of any message a program sends; the receiver replaces it."""
 _IDENTIFIER = _HEAD + len(_key("arbitration_id"))
 _WIDTHS = {0xCC: 2, 0xCD: 3, 0xCE: 5}
-"""First byte of an identifier above 127 → bytes that it takes."""
+"""First byte of an identifier above 127 → its width [bytes]."""
 
 
 def _head(can_id: int, length: int) -> bytes:
-    """From the identifier to the length of the data, for a frame that is no remote frame."""
+    """Datagram from identifier to length of the data, for any frame but a remote frame."""
     extended, error = bool(can_id & EXTENDED), bool(can_id & ERROR)
     return b"".join(
         (
@@ -63,7 +63,7 @@ def _head(can_id: int, length: int) -> bytes:
 
 
 def _tail(fd: bool, switch: bool, indicator: bool) -> bytes:
-    """What comes behind the data."""
+    """Datagram behind the data."""
     return b"".join(
         _key(name) + _BOOL[value]
         for name, value in (("is_fd", fd), ("bitrate_switch", switch), ("error_state_indicator", indicator))
@@ -75,7 +75,7 @@ _TAILS = {
     _tail(False, False, False): False,
     **{_tail(True, switch, indicator): True for switch in (False, True) for indicator in (False, True)},
 }
-"""Ends of a datagram → whether the frame is CAN FD."""
+"""Valid ends of a datagram → whether the frame is CAN FD."""
 _SENT_TAILS = (_tail(False, False, False), _tail(True, True, False))
 
 
@@ -85,18 +85,18 @@ def _start(can_id: int, length: int) -> bytes:
 
 
 def encode(can_id: int, data: bytes, fd: bool) -> bytes:
-    """The datagram of a frame, with bit-rate switch where it is CAN FD; remote frames cannot be sent."""
+    """Datagram of a data or error frame, with bit-rate switch if it is CAN FD."""
     return _start(can_id, len(data)) + data + _SENT_TAILS[fd]
 
 
 class Decoder:
-    """Datagrams in, frames out; knows again what it has seen."""
+    """Decodes datagrams; caches the parts of those it has seen."""
 
     def __init__(self) -> None:
         self._heads: dict[bytes, tuple[int, int]] = {}
 
     def decode(self, datagram: bytes) -> tuple[int, bytes, bool] | None:
-        """Identifier with flags, data, and whether it is CAN FD; None where the datagram is no valid frame."""
+        """Identifier with flags, data, and whether it is CAN FD; None for an invalid datagram."""
         if datagram.startswith(_START) and len(datagram) > _IDENTIFIER:
             end = _IDENTIFIER + _WIDTHS.get(datagram[_IDENTIFIER], 1) + _BEHIND_IDENTIFIER
             head = datagram[_HEAD:end]
@@ -116,7 +116,7 @@ class Decoder:
 
 
 def _unpack(datagram: bytes) -> tuple[int, bytes, bool] | None:
-    """Any map that python-can takes for a message; None for anything else."""
+    """Decode any map that python-can accepts as a valid message; None for anything else."""
     try:
         fields = msgpack.unpackb(datagram, raw=False)
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException):

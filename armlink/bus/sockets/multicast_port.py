@@ -1,7 +1,8 @@
-"""python-can's udp_multicast as a Port: datagrams made and read without message objects, its own echoes left out.
+"""Port for python-can's udp_multicast, without message objects and without its own echoes.
 
-Frames are received on the python-can bus's socket, which all members share the port of, and sent from a second one,
-whose address says which frames are our own. Multicast loops back to every socket of this machine, ours included.
+Multicast datagrams loop back to every socket on this machine, the sender's included, and all members share one port
+number. Frames are therefore received on the python-can bus's socket but sent from a second socket, whose address
+identifies the echoes.
 """
 
 import contextlib
@@ -30,12 +31,12 @@ class MulticastPort(DatagramPort):
         fd: bool = True,
         as_node: bool = False,
     ) -> None:
-        """Open a socket to send to `group` (address and port) from; `receiving` has joined it.
+        """Open a socket that sends to `group` (address, port); `receiving` has joined it.
 
         `name` of the bus for messages, `as_node` as in CanBus.open_port. Raises BusFault without a route to the group.
         """
         self.ignored = 0
-        """Datagrams so far that were no frames."""
+        """Datagrams received that were no frames."""
         self._fd, self._takes_fd = fd, fd
         self._sending = sending = _connect(name, receiving.family, group, hop_limit)
         self._own = _address(sending)
@@ -44,7 +45,7 @@ class MulticastPort(DatagramPort):
         super().__init__(name, receiving, sending, Batch(256), Batch(LONGEST, names=True), as_node)
 
     def close(self) -> None:
-        """Close the socket that was opened to send from."""
+        """Close the sending socket."""
         self._sending.close()
 
     def _encode(self, frames: Sequence[Frame]) -> None:
@@ -74,7 +75,7 @@ class MulticastPort(DatagramPort):
 
 
 def _connect(name: str, family: int, group: tuple[str, int], hop_limit: int) -> socket.socket:
-    """A socket of our own to the group: connected, so that its address stays as it is."""
+    """A socket connected to the group, so that its source address is fixed."""
     sending = socket.socket(family, socket.SOCK_DGRAM)
     try:
         if family == socket.AF_INET:
@@ -89,7 +90,7 @@ def _connect(name: str, family: int, group: tuple[str, int], hop_limit: int) -> 
 
 
 def _address(sending: socket.socket) -> bytes:
-    """The beginning of sockaddr_in or sockaddr_in6 as the kernel tells it of what this socket sent."""
+    """Beginning of sockaddr_in or sockaddr_in6 that the kernel reports for datagrams from this socket."""
     address, port, *_ = sending.getsockname()
     begin = struct.pack("=H", sending.family) + struct.pack("!H", port)
     packed = socket.inet_pton(sending.family, address.partition("%")[0])
@@ -97,7 +98,7 @@ def _address(sending: socket.socket) -> bytes:
 
 
 def _hear_one_group(receiving: socket.socket) -> None:
-    """Only the group joined, not every group that others on this machine have joined on the same port."""
+    """Receive only the group joined, not groups that other sockets on this machine have joined on the same port."""
     with contextlib.suppress(OSError):
         if receiving.family == socket.AF_INET:
             receiving.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)

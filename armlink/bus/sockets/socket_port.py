@@ -1,4 +1,4 @@
-"""SocketCAN's raw socket as a Port: classical frames, or CAN FD frames with bit-rate switch."""
+"""Port on a raw SocketCAN socket: classical frames, or CAN FD frames with bit-rate switch."""
 
 import socket
 import struct
@@ -15,7 +15,7 @@ class SocketPort(DatagramPort):
     """A raw CAN socket."""
 
     def __init__(self, raw: socket.socket, name: str, fd: bool = False, as_node: bool = False) -> None:
-        """`name` of the bus for messages; `fd`: the socket takes CAN FD frames, and such are sent.
+        """`name` of the bus for messages; `fd`: the socket accepts CAN FD frames, and CAN FD frames are sent.
 
         `as_node` as in CanBus.open_port.
         """

@@ -12,17 +12,18 @@ from armlink.bus.sockets.multicast_port import MulticastPort
 from armlink.bus.sockets.socket_port import SocketPort
 
 MOST_BATCHES = 256
-"""So many batches are taken at once: frames without end do not keep a listener for ever."""
+"""Limit of batches per call, so that a flood cannot block a listener."""
 _SO_TIMESTAMPNS = 35
-_STAMP = struct.Struct("=16xqq32x")  # the first control message of a frame, by the wall clock [s], [ns]; CONTROL bytes
-_CLOCK_TRIES, _CLOCK_SECONDS = 5, 1e-4  # two clocks are read so close together, or so often tried
+_STAMP = struct.Struct("=16xqq32x")  # first control message of a frame: wall clock [s], [ns]
+_CLOCK_TRIES, _CLOCK_SECONDS = 5, 1e-4  # two clocks are read within this time, or this often
 
 
 class Stamping(DatagramPort):
-    """A port whose frames are taken in batches, with their times: by `wait` and `take_all`, not by `receive`."""
+    """A port that is read by `wait` and `take_all`, not by `receive`."""
 
-    def stamp(self, receiving: socket.socket) -> None:
-        """Let the kernel stamp what comes; every datagram has room for its control messages."""
+    def _prepare(self, receiving: socket.socket) -> None:
+        """Turn on the kernel's timestamps; every datagram has space for its control messages."""
+        super()._prepare(receiving)
         receiving.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         self._control = ctypes.create_string_buffer(BATCH * CONTROL)
         base = ctypes.addressof(self._control)
@@ -37,10 +38,10 @@ class Stamping(DatagramPort):
         select.select([self._number], [], [], timeout)
 
     def take_all(self) -> list[Stamped]:
-        """All frames that are there, in their order; raises BusFault.
+        """All frames in the receive queue, in order; raises BusFault.
 
-        The kernel's stamps are by the wall clock: they are brought to the monotonic one by the difference of the two
-        at this moment, and kept between the last call and this one, so that a clock that is set spoils one batch.
+        The kernel's timestamps are in wall-clock time. They are converted by the current difference between both
+        clocks and limited to the interval since the last call, so that setting the clock affects one batch only.
         """
         earliest = self._began
         self._began, ahead = _clocks()
@@ -68,31 +69,13 @@ class Stamping(DatagramPort):
 class StampedSocketPort(Stamping, SocketPort):
     """SocketCAN with timestamps."""
 
-    def __init__(self, raw: socket.socket, name: str, fd: bool = False) -> None:
-        """As SocketPort."""
-        super().__init__(raw, name, fd)
-        self.stamp(raw)
-
 
 class StampedMulticastPort(Stamping, MulticastPort):
     """udp_multicast with timestamps."""
 
-    def __init__(
-        self,
-        receiving: socket.socket,
-        group: tuple[str, int],
-        hop_limit: int,
-        name: str,
-        fd: bool = True,
-        as_node: bool = False,
-    ) -> None:
-        """As MulticastPort."""
-        super().__init__(receiving, group, hop_limit, name, fd, as_node)
-        self.stamp(receiving)
-
 
 def _clocks() -> tuple[float, float]:
-    """The monotonic clock [s], and how far the wall clock is ahead of it [s]."""
+    """Monotonic time [s], and the wall clock's lead over it [s]."""
     for _ in range(_CLOCK_TRIES):
         before, wall, now = time.monotonic(), time.time(), time.monotonic()
         if now - before < _CLOCK_SECONDS:

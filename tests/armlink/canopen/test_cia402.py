@@ -153,7 +153,7 @@ def test_an_unknown_state_is_commanded_nothing():
 
 
 def test_there_is_no_way_to_other_targets():
-    with pytest.raises(ValueError, match="no way to fault"):
+    with pytest.raises(ValueError, match="no transition to fault"):
         next_control(State.READY, State.FAULT)
 
 

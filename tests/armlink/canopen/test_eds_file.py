@@ -96,7 +96,7 @@ def test_a_sheet_of_the_right_product_starts_the_link(arm_of, bus, sheet):
             {"unmapped": ("PDOMapping=1", "PDOMapping=0")},
             r"cannot be mapped into a PDO, .* in RPDO1",
         ),
-        ({"torn": ("[DeviceInfo]", "[DeviceInfo")}, r"not an EDS as CiA 306 has it"),
+        ({"torn": ("[DeviceInfo]", "[DeviceInfo")}, r"not a valid EDS"),
     ],
 )
 def test_what_a_sheet_lacks_is_named(arm_of, sheet, changes, complaint):

@@ -54,7 +54,7 @@ def test_columns_may_be_in_any_order_and_strangers_are_named(tmp_path):
     loaded = load_recording(csv(tmp_path, "tau_1,t,gripper,q_1\n1,0,9,2\n3,0.1,9,nan\n"))
     np.testing.assert_array_equal(loaded.position, [[2], [np.nan]])
     np.testing.assert_array_equal(loaded.torque, [[1], [3]])
-    assert loaded.warning == "columns that are not channels left out: gripper"
+    assert loaded.warning == "columns ignored because they are no channels: gripper"
 
 
 def test_uneven_times_are_fine(tmp_path):
@@ -75,7 +75,7 @@ def test_uneven_times_are_fine(tmp_path):
         ("t,q_1,tau_1\n0,0,0\n1,inf,0\n", "row 2: q_1 is infinite"),
         ("t,q_1,tau_1\n0,0,0\n1,abc,0\n", "invalid value 'abc'"),
         ("t,q_1,tau_1\n0,0,0\n1,0\n", "Expected 3 columns, got 2"),
-        ("t,q_1,q_1,tau_1\n0,0,0,0\n", "'q_1' stands twice"),
+        ("t,q_1,q_1,tau_1\n0,0,0,0\n", "'q_1' occurs twice"),
         ("t,q_1,tau_1\n0,0,0\n", "1 rows: a recording needs at least two"),
         ("t,q_1,tau_1\n", "0 rows"),
         ("", "missing column q_1"),
@@ -92,7 +92,7 @@ def test_a_table_that_cannot_be_used_is_one_line(tmp_path, text, says):
 def test_files_that_are_no_recordings(tmp_path):
     with pytest.raises(BadInput, match=r"no recording .*nothing.csv"):
         load_recording(tmp_path / "nothing.csv")
-    with pytest.raises(BadInput, match=r"by its suffix, expected .csv, .csv.gz, .parquet, .mcap"):
+    with pytest.raises(BadInput, match=r"not the suffix of a recording, expected .csv, .csv.gz, .parquet, .mcap"):
         load_recording(csv(tmp_path, "", "r.txt"))
     for name in ("r.parquet", "r.mcap", "r.csv.gz"):
         with pytest.raises(BadInput, match="r"):
