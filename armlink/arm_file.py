@@ -1,4 +1,4 @@
-"""The arm file: one YAML file that says what the arm is, one section per package (contract 1)."""
+"""The arm file: one YAML file that says what the arm is, one section per package (docs/formats.md, section 1)."""
 
 import hashlib
 import json
@@ -124,7 +124,7 @@ class LinkSection(Section):
     rate: Annotated[FiniteFloat, Field(gt=0, le=1000)] = 250.0
     """SYNC rate [Hz]."""
     deadline: Annotated[FiniteFloat, Field(ge=0.01, le=10)] = 0.1
-    """A joint that hears no command for so long goes to quick stop; a reading this old is a fault [s]."""
+    """A joint that hears no command for this long goes to quick stop; a reading this old is a fault [s]."""
     joints: tuple[LinkJoint, ...]
 
     @property

@@ -8,7 +8,7 @@ class ArmlinkError(Exception):
 
 
 class BadInput(ArmlinkError):
-    """A file, key, value or option that cannot be used: says which, what was expected and how to mend it."""
+    """A file, key, value or option that cannot be used: says which, what was expected and how to fix it."""
 
 
 class Refused(ArmlinkError):

@@ -73,7 +73,7 @@ class Stops(Section):
 
 
 class EffectEntry(BaseModel):
-    """One imperfection: `effect` (an id of contract 4), `joint` (or link) and the effect's parameters by name."""
+    """One imperfection: `effect` (an id, docs/formats.md, section 5), `joint` or link, and its parameters by name."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 

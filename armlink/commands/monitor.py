@@ -17,7 +17,7 @@ def monitor(
     arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
     bus: Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")] = None,
     once: Annotated[bool, typer.Option("--once", help="Show one table and end.")] = False,
-    cycles: Annotated[int, typer.Option(min=0, help="End after so many refreshes (5 a second); 0: Ctrl-C.")] = 0,
+    cycles: Annotated[int, typer.Option(min=0, help="End after this many refreshes (5 a second); 0: Ctrl-C.")] = 0,
     sync: Annotated[bool, typer.Option("--sync", help="Start the nodes and send SYNC, where no host does.")] = False,
     stats: Annotated[
         bool, typer.Option("--stats", help="Period, jitter, latency (p50, p99, p99.9), missed cycles, exact bus load.")

@@ -1,4 +1,4 @@
-"""What the link reads from and sets on one joint's controller before the cycle starts."""
+"""Set-up of one joint's controller before the cycle starts: identity, units, limits, PDO mapping, read back."""
 
 import math
 from collections.abc import Mapping
@@ -29,14 +29,14 @@ _INTERPOLATION_INDEX = Entry(0x60C2, 2, "b", "interpolation time index")
 
 @dataclass(frozen=True)
 class Protection:
-    """What the controller itself watches over."""
+    """Supervision by the controller itself."""
 
     host: int
     """Node id of the host, whose heartbeat the joints watch."""
     deadline_ms: int
-    """A joint that hears no RPDO1 for so long goes to quick stop."""
+    """A joint that hears no RPDO1 for this long goes to quick stop."""
     heartbeat_ms: int
-    """A joint that hears no heartbeat of the host for so long goes to quick stop."""
+    """A joint that hears no heartbeat of the host for this long goes to quick stop."""
     producer_ms: int
     """Period of the joint's own heartbeat."""
 
@@ -79,7 +79,7 @@ IDENTITY_OBJECTS = {
 
 
 def identity_mismatches(stated: DeviceIdentity, found: Mapping[str, int]) -> list[str]:
-    """What of an identity (1018h: vendor, product, revision, serial) is not as the arm file states it, in words."""
+    """Differences between an identity (1018h: vendor, product, revision, serial) and the arm file, in words."""
     mismatches = []
     for key, entry in IDENTITY_OBJECTS.items():
         expected = getattr(stated, key)
@@ -99,7 +99,7 @@ def check_identity(services: NodeServices, joint: LinkJoint) -> None:
 
 
 def refused_identity(name: str, node: int, mismatches: list[str]) -> Refused:
-    """The refusal of a joint's controller, with what differs and how to mend it."""
+    """The refusal of a joint's controller, with what differs and how to fix it."""
     return Refused(
         f"{name} (node {node}): another controller than the arm file states: {'; '.join(mismatches)}: "
         "connect the right arm, or correct identity or eds of this joint under link.joints"
@@ -139,7 +139,7 @@ def check_modes(services: NodeServices) -> int:
 def configure_pdo(services: NodeServices, each: Pdo, deadline_ms: int) -> None:
     """Map one PDO of the link and read the mapping back; raises BusFault naming the joint.
 
-    RPDO1 gets the deadline [ms]: a joint that hears none for so long stops by itself.
+    RPDO1 gets the deadline [ms]: a joint that hears none for this long stops by itself.
     """
 
     def write(entry: Entry, value: int) -> None:
@@ -179,7 +179,7 @@ def configure(
 def settings(
     joint: LinkJoint, unit: Units, limits: JointLimits, period: float, protection: Protection, supported: int
 ) -> list[tuple[Entry, int]]:
-    """What one controller is set to besides its PDOs, in this order.
+    """Settings of one controller besides its PDOs, in this order.
 
     Profile modes, where the device has them (6502h, `supported`), get the arm file's velocity and torque rate.
     """

@@ -1,4 +1,4 @@
-"""One cycle of the link: wait for its time, gate, frames, what came back, faults; the ways into and out of power."""
+"""One cycle of the link: wait for its time, gate, frames, readings, faults; the ways into and out of power."""
 
 import contextlib
 import math
@@ -39,7 +39,7 @@ class Commander:
         self.names, self.n, self.clock, self.period, self.max_age = names, len(names), clock, period, max_age
         self.limits: list[JointLimits] = []
         self.passed: list[Passed] = []
-        """What the last frames carried."""
+        """Contents of the last frames."""
         self.loop, self._lock_step = loop, lock_step
         self._slow_age = max_age + STATUS_DECIMATION * period
         self._supported: list[int] = []
@@ -211,7 +211,7 @@ class Commander:
         return fault
 
     def settle(self) -> None:
-        """Begin anew after an interruption: what came meanwhile, and how late the host was, is forgotten."""
+        """Restart after an interruption: what came meanwhile, and how late the host was, is forgotten."""
         self.loop.settle()
         self._gap, self._gap_at = 0.0, -math.inf
         self._due = self.clock.now()

@@ -23,7 +23,7 @@ COLLECT_SHARE = 0.8
 """Share of a period after SYNC in which TPDOs of this cycle are waited for."""
 
 OWED_CYCLES = 25
-"""A reply that has been owed for so many cycles is lost."""
+"""A reply that has been owed for this many cycles is lost."""
 NO_STATUS = 0xFFFF
 """Stands for the status word of a joint that has sent none; no state of CiA 402."""
 NO_MODE = 0
@@ -99,7 +99,7 @@ class Loop:
         self.set_units((Units(1.0, 1.0, 1.0),) * self.n)
 
     def reset_counters(self) -> None:
-        """Begin to count anew."""
+        """Restart the counters."""
         self.stats, self.bits, self._first, self._counted = Stats(), 0, None, 0
         self._came = [0] * self.n
         self._dropped = self._port.dropped
@@ -257,7 +257,7 @@ class Loop:
             self.statuses[joint], self.displays[joint] = unpack(data)
 
     def count(self, frames: int, size: int) -> None:
-        """Count frames that went over the bus, with so many bytes of data in all."""
+        """Count frames that went over the bus, with this many bytes of data in all."""
         self.stats.frames += frames
         self.bits += FIXED_BITS * frames + 8 * size
 
@@ -278,7 +278,7 @@ class Loop:
             self.on_other(can_id, data)
 
     def sample(self, now: float) -> Sample:
-        """What came since the last sample, newest of each reading, as of time `now`; NaN where nothing came."""
+        """Readings since the last sample, the newest of each, as of time `now`; NaN if there was none."""
         position = np.array(self._position) * self._position_unit
         torque = np.array(self._torque) * TORQUE_PER_MICRO
         if self._slow_came:

@@ -22,7 +22,7 @@ _MODES = ", ".join(f"{int(mode)} ({name})" for mode, name in MODE_NAMES.items())
 
 @dataclass
 class Known:
-    """What is known of the bus and of n joints: the lists are the loop's own, so that it stays what is known now."""
+    """State of the bus and of n joints: live views of the loop's buffers."""
 
     names: Sequence[str]
     statuses: Sequence[int]
@@ -167,7 +167,7 @@ def stuck(known: Known, states: Sequence[State], target: State, modes: Sequence[
 
 
 def bus_fault(names: Sequence[str], watch: BusWatch, dropped: int) -> str | None:
-    """What the bus itself shows: a second host, a duplicated node id, a babbling node, lost frames; or None."""
+    """Faults of the bus itself: a second host, a duplicated node id, a babbling node, lost frames; or None."""
     if watch.intruder:
         return f"another host is on this bus: it sends {watch.intruder}: stop it, only one program may command an arm"
     doubled = watch.doubled

@@ -30,7 +30,7 @@ POSITION_MODES = (int(Mode.POSITION), int(Mode.PROFILE_POSITION))
 TORQUE_MODES = (int(Mode.TORQUE), int(Mode.PROFILE_TORQUE))
 MODES = (OFF, *POSITION_MODES, *TORQUE_MODES)
 LOWEST_WIRE, HIGHEST_WIRE = -(2**31), 2**31 - 1
-"""What 607Ah carries."""
+"""Range of 607Ah."""
 
 BAD_MODE, BAD_NUMBER, COMMAND_AGE = "mode", "number", "command age"
 SAMPLE_AGE, STATE = "sample age", "state"
@@ -73,7 +73,7 @@ class JointLimits:
 
 
 class Seen(NamedTuple):
-    """What is known of one joint when its command is to leave; NaN where a reading is missing or too old."""
+    """State of one joint when its command is about to leave; NaN if a reading is missing or too old."""
 
     torque: float
     """Torque now produced, 6077h [N·m]."""
@@ -88,7 +88,7 @@ class Seen(NamedTuple):
 
 
 class Passed(NamedTuple):
-    """What leaves the gate for one joint; torque and position are also what the next cycle starts from."""
+    """A command that left the gate for one joint; the next cycle starts from its torque and position."""
 
     torque: float
     """Target torque before quantisation [N·m]."""
@@ -129,7 +129,7 @@ def pass_gate(
 
 
 def start_from(limits: JointLimits, produced_torque: float, measured_position: float) -> Passed:
-    """What the first cycle starts from: the torque now produced [N·m], 0 where unknown, and the position [rad]."""
+    """Start of the first cycle: the torque now produced [N·m], 0 if unknown, and the position [rad]."""
     return _passed(limits, produced_torque if math.isfinite(produced_torque) else 0.0, measured_position, OFF)
 
 

@@ -11,11 +11,11 @@ INT16_MAX, INT32_MAX = 2**15 - 1, 2**31 - 1
 POSITION_GAIN_ERROR = 0.02
 """A position sensor may read so much more of its range than is true: the stops are found beyond their nominal place."""
 PRESS_IN = 0.05
-"""A target may lie so far behind a stop [rad], so that a joint can be pressed against it."""
+"""A target may lie this far behind a stop [rad], so that a joint can be pressed against it."""
 OVERSPEED = 1.5
-"""A joint under torque control may turn so many times as fast as max_velocity before it is stopped."""
+"""A joint under torque control may turn this many times as fast as max_velocity before it is stopped."""
 OUTSIDE = 0.1
-"""A joint under torque control may read a position so far outside the target window before it is stopped [rad]."""
+"""A joint under torque control may read a position this far outside the target window before it is stopped [rad]."""
 
 
 def joint_ranges(arm: ArmFile) -> tuple[tuple[float, float], ...]:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import can
 
 SLEEP = 0.04
-"""Frames that bear their time may wait for so long [s]: ten cycles at 250 Hz, half of what a small receive queue holds
+"""Frames that bear their time may wait for this long [s]: ten cycles at 250 Hz, half of what a small receive queue holds
 of a full bus."""
 COMMAND = "Hhi"
 """RPDO1: control word, target torque, target position."""
@@ -126,7 +126,7 @@ class Listener(TorqueSensorRecords):
         return sample
 
     def _hear(self, seconds: float, at_once: bool = False) -> None:
-        """Take in what comes, for at most so long; `at_once`: somebody waits for the very next frame."""
+        """Take in what comes, for at most that long; `at_once`: somebody waits for the very next frame."""
         port = self._port
         if isinstance(port, StampedPort):
             if at_once:

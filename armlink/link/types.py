@@ -1,4 +1,4 @@
-"""What goes into and comes out of a cycle of the link, in SI units."""
+"""Input and output of a cycle of the link, in SI units: commands, samples, counters."""
 
 from collections.abc import Generator
 from dataclasses import dataclass, field
@@ -79,7 +79,7 @@ class Controller(Protocol):
 
 @dataclass(eq=False)
 class Sample:
-    """What n joints read in one cycle; a value that did not come in this cycle is NaN, never the last one."""
+    """Readings of n joints in one cycle; a value that did not come in this cycle is NaN, never the last one."""
 
     t: float
     """Time of the SYNC that asked for it, since the link's first [s]."""

@@ -1,4 +1,4 @@
-"""What passes between a job and the process that makes the cycles."""
+"""Messages between a job and the process that makes the cycles."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

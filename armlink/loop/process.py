@@ -26,7 +26,7 @@ from armlink.loop.realtime import prepare
 IDLE = 0.05
 """Longest wait for the job while the joints are not enabled [s]."""
 SILENT = 3.0
-"""A job that says nothing for so long while joints are under torque control is gone [s]."""
+"""A job that says nothing for this long while joints are under torque control is gone [s]."""
 ENABLING = ("enable", "recover")
 
 

@@ -14,7 +14,7 @@ _LOCK_CURRENT, _LOCK_FUTURE = 1, 2
 
 @dataclass(frozen=True)
 class Realtime:
-    """What the machine permitted."""
+    """Real-time permissions of this process."""
 
     scheduled: bool
     """SCHED_FIFO."""

@@ -29,7 +29,7 @@ ANSWER = 60.0
 SAMPLE = 5.0
 """Longest wait for a sample of an enabled arm [s]."""
 END = 3.0
-"""The process gets so long to leave the joints safe [s]."""
+"""The process gets this long to leave the joints safe [s]."""
 
 
 class RemoteLink:
@@ -57,7 +57,7 @@ class RemoteLink:
         try:
             self._put(Open(arm, bus))
             self.realtime: Realtime = self._answer(0)
-            """What the machine permitted the process that makes the cycles."""
+            """Real-time permissions of the process that makes the cycles."""
         except BaseException:
             self._end()
             raise

@@ -18,7 +18,7 @@ CYCLES = 50
 ANSWERED = 0.9
 """Share of them whose answer must come in its cycle; a busy host misses some."""
 HOLD_SECONDS = 0.3
-"""A stopped joint is watched for so long: does it stay in quick stop, holding?"""
+"""A stopped joint is watched for this long: does it stay in quick stop, holding?"""
 MOVED = 0.05
 """A joint that moves further than this while it should hold ends the test [rad]."""
 LATE_SHARE, LATE_SECONDS = 0.5, 0.03

@@ -8,7 +8,7 @@ import typer
 
 
 class Policies(StrEnum):
-    """What becomes of a drift that was found."""
+    """Treatment of a drift that was found."""
 
     observe = "observe"
     propose = "propose"

@@ -1,4 +1,4 @@
-"""What the sweep commands show to people: progress with time left, plans and results as tables on standard error."""
+"""Terminal output of the sweep commands: progress with time left, plans and results as tables on standard error."""
 
 import sys
 from collections.abc import Callable
@@ -90,7 +90,7 @@ def confirm(question: str) -> None:
 
 
 def print_preflight(found: "Preflight") -> None:
-    """What the pre-flight found, a row a joint."""
+    """Print the findings of the pre-flight, one row per joint."""
     headings = ("joint", "torque noise [N·m]", "torque at rest [N·m]", "drive [°C]", "lower stop", "upper stop [rad]")
     table = Table(*headings, title="Pre-flight")
     for joint, name in enumerate(found.names):

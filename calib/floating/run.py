@@ -131,7 +131,7 @@ class _Run:
             )
 
     def follow(self, floating: Floating, seconds: float) -> None:
-        """Float for so long; see each sample."""
+        """Float for this long; see each sample."""
         link, begin = self._link, self._sample.t
         with closing(link.run(floating)) as samples:
             for sample in samples:

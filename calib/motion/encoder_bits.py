@@ -39,7 +39,7 @@ def stuck_bits(position: Array, resolution: Array, target: Array) -> Iterator[tu
 
 
 def bit_of(counts: float) -> int | None:
-    """The bit whose weight a jump of so many counts is; None: of no bit. The joint may have turned a little."""
+    """The bit whose weight a jump of this many counts is; None: of no bit. The joint may have turned a little."""
     bit = max(round(math.log2(max(counts, 1.0))), 1)
     return bit if abs(counts / 2.0**bit - 1) < JUMP_SLACK else None
 

@@ -10,7 +10,7 @@ from gcomp.arrays import Array, Mask
 MISSING = 0.02
 """Share of a motion's cycles without timely readings above which nothing is said of its encoders."""
 JUMP, JUMP_STEPS = 3.0, 4.0
-"""A position reading that goes so many times as far as the speed limit allows, and so many increments, is no motion."""
+"""A position reading that goes this many times as far as the speed limit allows, and this many increments, is no motion."""
 
 
 class EncoderFault(Refused):
@@ -19,7 +19,7 @@ class EncoderFault(Refused):
     def __init__(self, name: str, seen: str, bit: int | None) -> None:
         """Joint's name, what its readings did, and the bit that would do it."""
         cause = "its encoder or cable" if bit is None else f"bit {bit} of its encoder, which is stuck or lost"
-        super().__init__(f"{name}: {seen}: mend {cause}; nothing found with it would hold")
+        super().__init__(f"{name}: {seen}: repair {cause}: no calibration with it would hold")
 
 
 class EncoderCheck:
@@ -35,7 +35,7 @@ class EncoderCheck:
         """Whether the last reading of each joint was not timely: nothing is said of the way from there."""
 
     def forget(self) -> None:
-        """Begin anew after an interruption: nothing is said of what happened meanwhile."""
+        """Restart after an interruption: nothing is said of what happened meanwhile."""
         self._unsure[:] = True
 
     def see(self, sample: Sample, before: Array) -> None:

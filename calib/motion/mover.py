@@ -30,7 +30,7 @@ CONTACT_LEAD = 0.015
 CONTACT_STILL = 0.15
 """Share of the approach speed below which a joint does not move."""
 CREEP_AHEAD = 10
-"""Rows that creeping is ahead of its samples: a job that is held up stops the creep after so many."""
+"""Rows that creeping is ahead of its samples: a job that is held up stops the creep after this many."""
 CHECK_EVERY = 5
 """Cycles from one look at the settle rule to the next."""
 COAST, COAST_LOOK, COAST_STILL = 5.0, 0.1, 0.002
@@ -54,7 +54,7 @@ class Stalled(Refused):
         self.name, self.position, self.joint = name, position, joint
         super().__init__(
             f"{name}: stopped at {position:.3f} rad on the way to {target:.3f}: its drive is too weak there,"
-            " its position loop does not bear the load, or something is in the way"
+            " its position loop yields to the load, or something is in the way"
         )
 
 

@@ -33,7 +33,7 @@ HOT = 70.0
 
 @dataclass(frozen=True, eq=False)
 class Preflight:
-    """What was found; arrays (n,)."""
+    """Findings before a sweep; arrays (n,)."""
 
     names: tuple[str, ...]
     noise: Array

@@ -124,7 +124,7 @@ class _Pass:
         self._progress(len(self.readings), self.total, left, self._text(reading))
 
     def _text(self, reading: StaticReading) -> str:
-        """What is being done, with a plot of the swept joint's torque in the sweep so far."""
+        """Current step, with a plot of the swept joint's torque in this sweep."""
         if reading.joint is None:
             return f"{reading.sweep} {reading.index + 1}"
         curve = [each.torque[reading.joint] for each in self.readings if each.sweep == reading.sweep]

@@ -1,4 +1,4 @@
-"""What to do when the joints had to be stopped because the cycle stood still: ask, enable again, repeat the reading."""
+"""Stalls of the cycle: the joints were stopped; ask, enable them again, repeat the reading."""
 
 from collections.abc import Callable
 from typing import TypeVar
@@ -18,7 +18,7 @@ def give_up(stall: Stall) -> bool:
 
 
 def bridged(link: ArmDriver, on_stall: OnStall, work: Callable[[], T]) -> T:
-    """What `work` returns; after each Stall that `on_stall` accepts it is done again from its beginning."""
+    """Return the result of `work`; it is repeated from its beginning after each Stall that `on_stall` accepts."""
     while True:
         try:
             return work()

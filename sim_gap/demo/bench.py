@@ -20,7 +20,7 @@ GRAVITY_POSES = 500
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """What stands on the bench. Only `link` may be used to find anything out; the rest is for checking afterwards."""
+    """The bench: arm, link and truth. Estimates may use `link` alone; the rest is for checking afterwards."""
 
     arm: ArmFile
     described: Arm

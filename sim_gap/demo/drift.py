@@ -29,7 +29,7 @@ SETTLED_SECONDS = 15.0
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """What happened."""
+    """Course of the drift."""
 
     joint: int
     gain: float

@@ -1,4 +1,4 @@
-"""What the demo shows in the terminal: tables and one-line findings."""
+"""Terminal output of the demo: tables and one-line findings."""
 
 import numpy as np
 from rich.table import Table
@@ -46,7 +46,7 @@ def verify_table(names: tuple[str, ...], check: Verification, gravity: GravityCh
 
 
 def drift_line(names: tuple[str, ...], drift: Drift) -> str:
-    """What became of the drift, in a sentence."""
+    """Outcome of the drift, in a sentence."""
     name = names[drift.joint]
     what = f"{name} drifted by {drift.gain - 1:+.0%} gain and {drift.offset:+.2f} N·m"
     if drift.detected is None:

@@ -1,4 +1,4 @@
-"""The paper's arm for the observer's tests, from the numbers of theory.md sections 3 and 8."""
+"""The paper's arm for the observer's tests, from the numbers of docs/theory.md, sections 3 and 8."""
 
 import sys
 from pathlib import Path

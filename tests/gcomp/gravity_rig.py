@@ -19,9 +19,9 @@ SARCOS_BETA = np.array(
         *(1.5219, 0.0376, 0.0871, -0.0217, 0.6686, 0.1132, -0.0594),
     ]
 )
-"""Table 2 of the paper, n_7y as its own Table 1 demands it (theory note, section 3) [kg·m]."""
+"""Table 2 of the paper, n_7y as its own Table 1 demands it (docs/theory.md, section 3) [kg·m]."""
 SARCOS_MASS = np.array([8, 6, 5, 3.0264, 1.2, 0.73235, 3.90125])
-SARCOS_MOMENTS = np.array(  # Table 1 of the paper from o_{i-1}, frame-i axes: theory note, section 3
+SARCOS_MOMENTS = np.array(  # Table 1 of the paper from o_{i-1}, frame-i axes: docs/theory.md, section 3
     [
         [0.1116, 0.0485, -0.6305],
         [-0.1063, 0.3289, 0.5566],

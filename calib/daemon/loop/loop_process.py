@@ -190,7 +190,7 @@ def _child(connection: Connection, options: LoopOptions, inherited: Connection |
 
 
 def _send_message(connection: Connection, message: Message, patience: float = 0.0) -> None:
-    """Send, unless the service is so far behind that sending would delay the cycle: then the message is dropped."""
+    """Send, unless the service is this far behind that sending would delay the cycle: then the message is dropped."""
     if select.select([], [connection], [], patience)[1]:
         connection.send(message)
 

@@ -30,7 +30,7 @@ N = DESCRIBED.n
 BLANK = per_joint([UNCALIBRATED] * N)
 RATED = ARM.require_link().rated_torques
 MOMENT_STD = np.repeat([4.4e-3, 4.5e-3, 1.3e-3, 0.9e-3, 0.5e-3, 0.4e-3, 0.3e-3], 2)
-"""Errors of β after a good calibration (theory.md section 6) [kg·m]."""
+"""Errors of β after a good calibration (docs/theory.md, section 6) [kg·m]."""
 ZERO_STD = 5e-4
 SIGMA = 0.05
 WHEN = datetime(2026, 11, 21, tzinfo=UTC)
@@ -95,7 +95,7 @@ def test_its_intervals_hold_the_truth_by_monte_carlo() -> None:
 
 
 def test_its_covariance_is_the_plain_regression_s_where_nothing_else_is_uncertain() -> None:
-    """theory.md 4 (iii): var(k) = σ²/(K Var τ), var(o) = (σ²/K)(1 + τ̄²/Var τ), cov = −τ̄ σ²/(K Var τ)."""
+    """docs/theory.md, section 4 (iii): var(k) = σ²/(K Var τ), var(o) = (σ²/K)(1 + τ̄²/Var τ), cov = −τ̄ σ²/(K Var τ)."""
     random = np.random.default_rng(1)
     drawn = rows(random, np.ones(N), np.zeros(N), count=400)
     of = tuple(f"{name}.position_offset" for name in ARM.joint_names)

@@ -137,7 +137,7 @@ def test_half_turns_and_many_turns_are_exact(sarcos) -> None:
 
 
 def test_gravity_lever_is_what_is_left_of_gravity_across_the_axis() -> None:
-    """theory.md section 2: with joint 1 of the tilted sarcos at 90°, joint 2's axis points along gravity."""
+    """docs/theory.md, section 2: with joint 1 of the tilted sarcos at 90°, joint 2's axis points along gravity."""
     q = np.zeros(7)
     q[0] = np.pi / 2
     assert gravity_levers(make_sarcos(), q)[1] == pytest.approx(0, abs=1e-12)

@@ -1,4 +1,4 @@
-"""What can be told apart, exactly: the ranks and deficits of the theory note, sections 2, 4 and 8."""
+"""What can be told apart, exactly: the ranks and deficits of the docs/theory.md, sections 2, 4 and 8."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The Monte Carlo tables of the theory note, section 7: recursive against global identification, same designs."""
+"""The Monte Carlo tables of the docs/theory.md, section 7: recursive against global identification, same designs."""
 
 from functools import cache
 

@@ -14,7 +14,7 @@ from gcomp.identify.recursive import identify_recursive
 
 @pytest.mark.parametrize("seed", range(50))
 def test_random_arms_are_found_exactly_without_noise(seed: int) -> None:
-    """Recursion, global fit and the truth agree: theory.md section 8, item 1."""
+    """Recursion, global fit and the truth agree: docs/theory.md, section 8, item 1."""
     rng = np.random.default_rng(seed)
     built = make_random_arm(rng)
     arm = built.arm

@@ -1,4 +1,4 @@
-"""The single-joint fit against the precision and friction tables of the theory note, section 5, and by Monte Carlo."""
+"""The single-joint fit against the precision and friction tables of docs/theory.md, section 5, and by Monte Carlo."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The API as contract 8 has it: every route, its form, and one clear error for what cannot be used."""
+"""The API: every route, its form, and one clear error for what cannot be used."""
 
 import json
 from collections.abc import Callable
