@@ -18,14 +18,14 @@ from armlink.canopen.sdo import NodeServices, PumpedNetwork, joint_services
 from armlink.clock import Clock, MonotonicClock
 from armlink.errors import BusFault
 from armlink.link import controller_setup as device
-from armlink.link import torque_sensor_record as calibration
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.faults import bus_fault
 from armlink.link.gate import start_from
 from armlink.link.gate_limits import gate_limits, joint_ranges, target_window
 from armlink.link.guard import Crossed
-from armlink.link.types import Calibration, Command, Controller, Identity, Sample, Samples, Setpoints, Stats
+from armlink.link.torque_sensor_record import TorqueSensorRecords
+from armlink.link.types import Command, Controller, Identity, Sample, Samples, Setpoints, Stats
 
 if TYPE_CHECKING:
     import can
@@ -41,7 +41,7 @@ R = TypeVar("R")
 P = ParamSpec("P")
 
 
-class Link:
+class Link(TorqueSensorRecords):
     """Context manager: `with Link.open(arm) as link: link.start(); link.enable(); link.cycle(command)`.
 
     Leaving it, however, leaves the joints in quick stop, where they hold, unless `disable` was called.
@@ -282,22 +282,9 @@ class Link:
         """Call `function(link, ...)`: in the process that makes the cycles, which is this one."""
         return function(self, *args, **kwargs)
 
-    def read_calibration(self, joint: int) -> Calibration:
-        """The torque sensor record (2100h) that joint 0 … n−1 works with; raises BusFault."""
-        return calibration.read_record(self.services[joint])
-
     def read_temperatures(self) -> Array:
         """Temperatures of the drives (n,) [°C]; NaN for a drive that does not report one. Raises BusFault."""
         return np.array([device.read_temperature(services) for services in self.services])
-
-    def write_calibration(
-        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
-    ) -> Calibration:
-        """Make gain and offset [N·m] active in joint 0 … n−1 (`store`: to flash too); raises BadInput, BusFault.
-
-        While the joints are enabled the cycle goes on with the last command.
-        """
-        return calibration.write_record(self.services[joint], gain, offset, record_id, date, store)
 
     @cached_property
     def services(self) -> tuple[NodeServices, ...]:

@@ -25,9 +25,9 @@ from armlink.canopen.pdo import RPDO1
 from armlink.canopen.sdo import NodeServices, PumpedNetwork, joint_services
 from armlink.canopen.units import assumed_units
 from armlink.clock import Clock, MonotonicClock
-from armlink.link import torque_sensor_record as calibration
 from armlink.link.cyclic_exchange import Loop
-from armlink.link.types import Calibration, Sample, Stats
+from armlink.link.torque_sensor_record import TorqueSensorRecords
+from armlink.link.types import Sample, Stats
 
 if TYPE_CHECKING:
     import can
@@ -41,7 +41,7 @@ NO_COMMAND = bytes(8)
 """Stands for the RPDO1 that has not come yet; this object, not its value."""
 
 
-class Listener:
+class Listener(TorqueSensorRecords):
     """Context manager: `with Listener(arm, bus) as listener: sample = listener.next(0.1)`."""
 
     def __init__(self, arm: ArmFile, bus: "CanBus | can.BusABC") -> None:
@@ -125,16 +125,6 @@ class Listener:
         sample, self._sent = self._ready.popleft()
         return sample
 
-    def read_calibration(self, joint: int) -> Calibration:
-        """The torque sensor record (2100h) of joint 0 … n−1, by SDO: sends; raises BusFault."""
-        return calibration.read_record(self._services[joint])
-
-    def write_calibration(
-        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
-    ) -> Calibration:
-        """Make gain and offset [N·m] active in joint 0 … n−1, by SDO: sends; raises BadInput, BusFault."""
-        return calibration.write_record(self._services[joint], gain, offset, record_id, date, store)
-
     def _hear(self, seconds: float, at_once: bool = False) -> None:
         """Take in what comes, for at most so long; `at_once`: somebody waits for the very next frame."""
         port = self._port
@@ -177,7 +167,8 @@ class Listener:
         self._sync, self._given = now, tuple(self._commands.values())
 
     @cached_property
-    def _services(self) -> tuple[NodeServices, ...]:
+    def services(self) -> tuple[NodeServices, ...]:
+        """SDO access to each joint's controller, in joint order; using it sends."""
         network = PumpedNetwork(self._loop.send)
         self._notify = network.notify
         return joint_services(network, self.arm, self._pump)

@@ -34,13 +34,12 @@ def read_record(services: NodeServices) -> Calibration:
     )
 
 
-def write_record(
-    services: NodeServices, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
-) -> Calibration:
-    """Make a gain and an offset [N·m] the controller's active ones, and return what it then holds.
+def write_record(services: NodeServices, calibration: Calibration, store: bool = False) -> Calibration:
+    """Make a calibration the controller's active one (`store`: in flash too); returns what the controller then holds.
 
-    Raises BadInput for values that no sensor has, BusFault where the controller holds something else than was written.
+    Raises BadInput for values that no sensor has, BusFault if the controller holds something else than was written.
     """
+    gain, offset, record_id, date = calibration.gain, calibration.offset, calibration.record_id, calibration.date
     if not GAIN_RANGE[0] <= gain <= GAIN_RANGE[1]:
         raise BadInput(f"{services.joint}: gain {gain} for the controller: expected {GAIN_RANGE[0]} to {GAIN_RANGE[1]}")
     if not abs(offset) < 1e4:
@@ -57,3 +56,24 @@ def write_record(
     if store:
         services.write(objects.STORE_MANUFACTURER, objects.STORE_SIGNATURE)
     return read_record(services)
+
+
+class TorqueSensorRecords:
+    """Calibrations of all joints' controllers, by SDO: a part of whatever has `services` for them."""
+
+    @property
+    def services(self) -> tuple[NodeServices, ...]:
+        """SDO access to each joint's controller, in joint order."""
+        raise NotImplementedError
+
+    def read_calibration(self, joint: int) -> Calibration:
+        """The active calibration of joint 0 … n−1; raises BusFault."""
+        return read_record(self.services[joint])
+
+    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
+        """Make a calibration active in joint 0 … n−1 (`store`: in flash too); raises BadInput, BusFault.
+
+        While the joints are enabled, the cycle goes on with the last command. Only
+        `calib.install.journaled_write` calls this.
+        """
+        return write_record(self.services[joint], calibration, store)

@@ -11,6 +11,7 @@ from armlink.arrays import Array
 from armlink.canopen.cia402 import Mode, State
 from armlink.link.guard import Guard
 from armlink.link.lateness import Lateness
+from armlink.torque_calibration import TorqueCalibration
 
 
 @dataclass(eq=False)
@@ -128,16 +129,19 @@ class Identity:
 
 
 @dataclass(frozen=True)
-class Calibration:
-    """Torque sensor calibration that a controller holds (2100h): it sends (reading − offset) / gain."""
+class Calibration(TorqueCalibration[float]):
+    """Torque sensor calibration in a joint controller (2100h), and which record it is from."""
 
-    gain: float
-    offset: float
-    """[N·m]."""
-    record_id: int
-    date: int
-    """Seconds since 1970, 0 where none was written."""
-    crc: int
+    record_id: int = 0
+    date: int = 0
+    """Date of the record [s since 1970]; 0 if none was written."""
+    crc: int = 0
+    """CRC-32 as the controller reports it; ignored in a calibration that is to be written."""
+
+    @property
+    def is_blank(self) -> bool:
+        """Whether no calibration was ever written: gain 1, offset 0, record 0."""
+        return (self.gain, self.offset, self.record_id) == (1.0, 0.0, 0)
 
 
 @dataclass

@@ -110,8 +110,6 @@ class ArmDriver(Protocol):
         """Temperatures of the drives (n,) [°C]; NaN for a drive that does not report one. Raises BusFault."""
         ...
 
-    def write_calibration(
-        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
-    ) -> Calibration:
-        """Make gain and offset [N·m] active in joint 0 … n−1; raises BadInput, BusFault."""
+    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
+        """Make a calibration active in joint 0 … n−1 (`store`: in flash too); raises BadInput, BusFault."""
         ...

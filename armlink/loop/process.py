@@ -40,6 +40,8 @@ class DriveLoop:
         self._source: Iterator[Sample] | None = None
         self._last: Command | None = None
         self._id, self._row = 0, -1
+        self._controlled = False
+        """Whether a controller is being run."""
         self._heard = time.monotonic()
 
     def run(self) -> None:
@@ -64,7 +66,9 @@ class DriveLoop:
                 self._chunks.append(setpoints)
             case Run(id, controller):
                 self._begin(id)
-                self._source = self._link.run(controller)
+                self._source, self._controlled = self._link.run(controller), True
+            case Cut() if self._controlled:  # its last torque is right for its last sample alone
+                self._hold_here()
             case Cut():
                 self._chunks.clear()
                 self._source = None
@@ -73,7 +77,7 @@ class DriveLoop:
 
     def _begin(self, id: int) -> None:
         self._chunks.clear()
-        self._source, self._id, self._row = None, id, -1
+        self._source, self._id, self._row, self._controlled = None, id, -1, False
 
     def _call(self, call: Call) -> None:
         link = self._link
@@ -124,7 +128,7 @@ class DriveLoop:
     def _hold_here(self) -> None:
         """Every joint under position control where it stands."""
         self._chunks.clear()
-        self._source = None
+        self._source, self._controlled = None, False
         self._last = Command.hold(self._link.latest_position)
 
     def _mind_silence(self) -> None:

@@ -142,11 +142,9 @@ class RemoteLink:
         found: Array = self._call("read_temperatures")
         return found
 
-    def write_calibration(
-        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
-    ) -> Calibration:
+    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
         """As Link.write_calibration."""
-        found: Calibration = self._call("write_calibration", joint, gain, offset, record_id, date, store)
+        found: Calibration = self._call("write_calibration", joint, calibration, store)
         return found
 
     def inside(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What an arm's drives may do and where its stops are, as arrays."""
+"""Joint range and drive limits of an arm as arrays."""
 
 from dataclasses import dataclass
 
@@ -11,13 +11,18 @@ from gcomp.arrays import Array
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """What the drives may do, and where the stops are; all (n,)."""
+    """Stops, and what the drives are capable of; all (n,)."""
 
     lower: Array
+    """[rad]"""
     upper: Array
+    """[rad]"""
     rated: Array
+    """[N·m]"""
     max_torque: Array
+    """[N·m]"""
     speed: Array
+    """[rad/s]"""
 
     @classmethod
     def of(cls, arm: ArmFile) -> "Limits":

@@ -1,4 +1,4 @@
-"""Torque and position sensor gains and offsets from sweeps; writes a calibration record."""
+"""Gains and offsets of torque and position sensors from sweeps; keeps a calibration record."""
 
 import getpass
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calib.commands.options import Bus, Check, Flash, JsonFile, Replaced, Store
+from calib.commands.options import Bus, Check, Flash, JsonFile, Replaced, Store, Sweeps, SweepsArm
 
 if TYPE_CHECKING:
     from calib.fit.sensor_fit import SensorFit
@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
 
 def calibrate(
-    directories: Annotated[list[Path], typer.Argument(help="Data sets of armlink sweep, without and with load.")],
-    arm: Annotated[str | None, typer.Option(help="Arm file, where it is no longer where the sweep had it.")] = None,
+    directories: Sweeps,
+    arm: SweepsArm = None,
     apply: Annotated[bool, typer.Option("--apply", help="Also write gains and offsets to the controllers.")] = False,
     bus: Bus = None,
     check: Check = True,
@@ -23,29 +23,25 @@ def calibrate(
     replaced: Replaced = None,
     accept: Annotated[
         list[str] | None,
-        typer.Option(help="With --apply: a joint to be written although the model does not hold there."),
+        typer.Option(help="With --apply: a joint to write although the sensor model does not hold there."),
     ] = None,
-    report: Annotated[Path | None, typer.Option(help="Also write a page to file: one self-contained HTML.")] = None,
+    report: Annotated[Path | None, typer.Option(help="Also write a report: one self-contained HTML file.")] = None,
     store: Store = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Fit every sensor to sweeps, all directories in one problem, and keep the result as a calibration record.
+    """Fit all sensors to sweeps, all directories in one problem, and keep the result as a calibration record.
 
     Example: armlink calibrate unloaded loaded --json calibration.json
     """
     from armlink.commands.output import write_json
-    from armlink.errors import BadInput
     from calib.commands.screen import print_lines
+    from calib.commands.sweep_data import load_sweeps
     from calib.fit.sensor_fit import fit_sensors
     from calib.install.apply import Apply, apply_calibration
     from calib.records.records import CalibrationRecord
     from calib.records.store import RecordStore
-    from calib.sweep.dataset import load_data
 
-    if not directories:
-        raise BadInput("calibrate: give the directories that armlink sweep wrote")
-    data = [load_data(path) for path in directories]
-    arm_file = data[0].load_arm(arm)
+    data, arm_file = load_sweeps("calibrate", directories, arm)
     fit = fit_sensors(arm_file, data)
     records = RecordStore(store)
     current = records.current(CalibrationRecord, arm_file)
@@ -103,7 +99,7 @@ def _answer(fit: "SensorFit", record: "CalibrationRecord", applied: bool) -> dic
 
 
 def _attachment(fit: "SensorFit") -> dict[str, list[Any]] | None:
-    """Where the reference mass hung [m], null where not determined."""
+    """Position of the reference mass [m]; None if it is not identifiable."""
     if fit.attachment is None:
         return None
     point, half = fit.attachment
@@ -124,10 +120,10 @@ def _show(fit: "SensorFit") -> None:
     lines += [*fit.imprecise.values(), *([fit.attachment_text] if fit.attachment is not None else [])]
     if fit.gain_ratio is not None:
         ratios = ", ".join(f"{name} {ratio:.4f}" for name, ratio in zip(fit.names, fit.gain_ratio, strict=True))
-        lines.append(f"gains as multiples of the last joint's: {ratios}")
+        lines.append(f"gains relative to the last joint's: {ratios}")
     print_lines(lines)
     print_lines([finding.text for finding in fit.findings], "yellow")
     worst = max(fit.goodness.left_out, key=lambda each: each.ratio, default=None)
     if worst is not None:
-        told = f"{worst.ratio:.1f} times its expected error at worst ({worst.sweep})"
-        print_lines([f"each sweep told by all others: within {told}"])
+        worst_sweep = f"worst sweep ({worst.sweep}) at {worst.ratio:.1f} times its expected error"
+        print_lines([f"cross-validation: {worst_sweep}"])

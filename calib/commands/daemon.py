@@ -48,7 +48,7 @@ def daemon(
     from armlink.bus.open import resolve_bus
     from armlink.errors import BadInput
     from calib.daemon.logs import log_as_json
-    from calib.daemon.loop.loop_process import ChildHost
+    from calib.daemon.loop.loop_process import LoopProcess
     from calib.daemon.options import Options, state_directory
 
     described = load_arm(arm)
@@ -72,7 +72,7 @@ def daemon(
         work=work,
     )
     log_as_json()
-    host = ChildHost(options.loop(described), fork=True)
+    host = LoopProcess(options.loop(described), fork=True)
     from calib.daemon.main_loop import run_daemon  # which takes long to load: the bus process opens the bus meanwhile
 
     run_daemon(options, described, directory, host)

@@ -1,4 +1,4 @@
-"""Calibration and gravity records kept for an arm, and which were current when, by whom and why."""
+"""Records kept for an arm, and which were current when, by whom and why."""
 
 import getpass
 from pathlib import Path
@@ -6,25 +6,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from calib.commands.options import Arm, JsonFile, Store
+
 if TYPE_CHECKING:
     from calib.records.store import Activation, ControllerWrite
 
 
 def history(
-    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
-    store: Annotated[
-        str | None, typer.Option(help="Record store: file or database URL; default: state folder.")
-    ] = None,
-    record: Annotated[str | None, typer.Option(help="Show this record alone, as YAML on standard output.")] = None,
+    arm: Arm,
+    store: Store = None,
+    record: Annotated[str | None, typer.Option(help="Print only this record, as YAML.")] = None,
     import_file: Annotated[
-        Path | None, typer.Option("--import", help="First add the record of this YAML file.")
+        Path | None, typer.Option("--import", help="First add the record in this YAML file.")
     ] = None,
-    activate: Annotated[bool, typer.Option("--activate", help="With --import: also make it the current one.")] = False,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")
-    ] = None,
+    activate: Annotated[bool, typer.Option("--activate", help="With --import: also make it current.")] = False,
+    json_file: JsonFile = None,
 ) -> None:
-    """List the records of an arm, oldest first, and the log of which was current when, by whom and why.
+    """List the records of an arm, oldest first, what became current and what was written to controllers.
 
     Example: armlink history sarcos --json -
     """
@@ -35,7 +33,7 @@ def history(
 
     arm_file, records = load_arm(arm), RecordStore(store)
     if activate and import_file is None:
-        raise BadInput("--activate goes with --import FILE; armlink rollback makes a kept record current again")
+        raise BadInput("--activate: only with --import FILE; armlink rollback makes a kept record current again")
     if import_file is not None:
         imported = records.import_yaml(import_file, arm_file)
         if activate:
@@ -81,7 +79,7 @@ def _print(title: str, rows: list[dict[str, Any]], log: "list[Activation]", writ
         shown = (row["id"], row["kind"], row["created"], row["parent"] or "", row["confirmed_by"] or "", row["note"])
         table.add_row("current" if row["current"] else "", *shown)
     console.print(table)
-    lines = Table("when", "what", "record", "by", "why", title="What was current, and what was written to controllers")
+    lines = Table("when", "what", "record", "by", "why", title="Current records and controller writes")
     happened = [(line.at, f"{line.kind} current", line.record, line.by, line.reason) for line in log]
     happened += [
         (line.at, f"controllers: {line.stage}", line.record, line.by, str(line.body.get("reason", "")))

@@ -1,41 +1,37 @@
-"""Gravity parameters from sweeps, recursive from tip to base and then global; writes a gravity record."""
+"""Gravity parameters from sweeps, recursive from tip to base, then global; keeps a gravity record."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from calib.commands.options import JsonFile, Store, Sweeps, SweepsArm
 
 if TYPE_CHECKING:
     from calib.fit.gravity_fit import GravityFit
 
 
 def identify(
-    directories: Annotated[list[Path], typer.Argument(help="Data sets of armlink sweep, without and with load.")],
-    arm: Annotated[str | None, typer.Option(help="Arm file, where it is no longer where the sweep had it.")] = None,
+    directories: Sweeps,
+    arm: SweepsArm = None,
     calibration: Annotated[
         str | None, typer.Option(help="Id of the calibration record to use; default: fitted from the same sweeps.")
     ] = None,
-    store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")
-    ] = None,
+    store: Store = None,
+    json_file: JsonFile = None,
 ) -> None:
-    """Find the mass moments that gravity compensation needs and keep them as a gravity record.
+    """Identify the mass moments that gravity compensation needs, and keep them as a gravity record.
 
     Example: armlink identify unloaded loaded --json gravity.json
     """
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
+    from calib.commands.sweep_data import load_sweeps
     from calib.fit.gravity_fit import identify_gravity
     from calib.fit.sensor_fit import SensorFit, fit_sensors
     from calib.records.records import CalibrationRecord
     from calib.records.store import RecordStore
-    from calib.sweep.dataset import load_data
 
-    if not directories:
-        raise BadInput("identify: give the directories that armlink sweep wrote")
-    data = [load_data(path) for path in directories]
-    arm_file = data[0].load_arm(arm)
+    data, arm_file = load_sweeps("identify", directories, arm)
     records = RecordStore(store)
     sensors: SensorFit | CalibrationRecord
     used: CalibrationRecord | None

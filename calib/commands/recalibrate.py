@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from calib.commands.options import Bus, Check, Flash, JsonFile, Replaced, Store
+from calib.commands.options import Arm, Bus, Check, Flash, JsonFile, Replaced, Store
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def recalibrate(
-    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
+    arm: Arm,
     data: Annotated[list[Path], typer.Argument(help="Recordings of slow motion or rests, or sweep directories.")],
     held: Annotated[
         Literal["record", "raw"],
@@ -32,9 +32,9 @@ def recalibrate(
     store: Store = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Find gains and offsets against the current gravity record, and keep them; --apply also makes them current.
+    """Find gains and offsets from the current gravity record, and keep them; --apply also makes them current.
 
-    The arm carries nothing, and every joint moves slowly (below 0.1 rad/s) or rests, in both directions.
+    The arm must carry nothing, and every joint must move slowly (below 0.1 rad/s), in both directions, or rest.
 
     Example: armlink recalibrate sarcos slow.mcap --json -
     """
@@ -65,25 +65,25 @@ def recalibrate(
         apply_field(record, arm_file, records, rows, fit, np.array(gravity.beta), how)
     else:
         records.add(record)
-        typer.echo(f"record {record.id} is kept; the controllers hold what they held (--apply writes it)", err=True)
+        typer.echo(f"record {record.id} is kept, not written to the controllers (--apply does that)", err=True)
     write_json(json_file, _answer(fit, record, gravity.id, apply))
 
 
 def _rows(
     arm_file: "ArmFile", data: list[Path], held: "CalibrationRecord | None"
 ) -> "tuple[StaticReadings, dict[str, str]]":
-    """Rows of all recordings and sweeps, and the SHA-256 of each."""
+    """Rows of all recordings and sweeps, and the SHA-256 of each source."""
     import hashlib
-
-    import numpy as np
 
     from armlink.errors import BadInput
     from armlink.recording.files import load_recording
+    from armlink.torque_calibration import UNCALIBRATED, per_joint
     from calib.field.rows import rows_of_recording, rows_of_sweeps
     from calib.sweep.dataset import load_data
 
     n = len(arm_file.joint_names)
-    gain, offset = (np.ones(n), np.zeros(n)) if held is None else (held.values("gain", 1.0), held.values("offset", 0.0))
+    blank = per_joint([UNCALIBRATED] * n)
+    installed = blank if held is None else held.torque_calibration(blank)
     parts, sources = [], {}
     for number, path in enumerate(data):
         if path.is_dir():
@@ -94,7 +94,7 @@ def _rows(
         recording = load_recording(path)
         if recording.n != n:
             raise BadInput(f"{path}: {recording.n} joints, but {arm_file.name} has {n}")
-        parts.append(rows_of_recording(recording, gain, offset, number, str(path)))
+        parts.append(rows_of_recording(recording, installed, number, str(path)))
         sources[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
     return parts[0].joined(*parts[1:]), sources
 
@@ -129,7 +129,7 @@ def _show(fit: "FieldFit") -> None:
     print_intervals("Sensors in the field, ± half of the 95 % interval", fit.names, columns)
     lines = [f"{joint} {parameter}: {reason}" for (joint, parameter), reason in fit.reasons.items()]
     lines.append(
-        f"a factor common to all gains is known to ± {1.96 * fit.common_scale_std:.2%} only (within the intervals):"
-        " these readings cannot tell it from the scale of the gravity record"
+        f"a factor common to all gains is known to ± {1.96 * fit.common_scale_std:.2%} only (within the intervals): in"
+        " these readings it looks the same as the scale of the gravity record"
     )
     print_lines(lines)

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from calib.commands.options import JsonFile, Store
+
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
@@ -20,17 +22,16 @@ def torque(
     arm: Annotated[str, typer.Argument(help="Bundled arm, path of an arm file, or a URDF or MJCF file.")],
     q: Annotated[Path, typer.Option(help="CSV file of poses: a header row with columns q_1 … q_n [rad].")],
     tip: Annotated[
-        str | None, typer.Option(help="Body of the model file that the chain ends in; default: the last that moves.")
+        str | None, typer.Option(help="Last body of the chain in the model file; default: the last that moves.")
     ] = None,
     record: Annotated[
-        str | None, typer.Option(help="Id of a gravity record; default: the model's inertials, else the current one.")
+        str | None,
+        typer.Option(help="Id of a gravity record; default: a model's inertials, else the current record."),
     ] = None,
-    store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")
-    ] = None,
+    store: Store = None,
+    json_file: JsonFile = None,
 ) -> None:
-    """Holding torque against gravity at each pose of a file, one row a pose [N·m].
+    """Holding torque against gravity at each pose of a file, one row per pose [N·m].
 
     Example: armlink torque arm.urdf --q poses.csv --json -
     """
@@ -53,7 +54,7 @@ def torque(
 
 
 def _model(arm: str, tip: str | None, record: str | None, store: str | None) -> "tuple[Arm, Array, str]":
-    """The arm, its mass moments (2n,) [kg·m], and where these come from; raises BadInput or Refused."""
+    """The arm, its mass moments (2n,) [kg·m], and their origin in words; raises BadInput, Refused."""
     import numpy as np
 
     from armlink.arm_file import load_arm
@@ -65,13 +66,13 @@ def _model(arm: str, tip: str | None, record: str | None, store: str | None) -> 
 
     if Path(arm).suffix.lower() in MODEL_SUFFIXES:
         if record is not None:
-            raise BadInput(f"--record {record}: a record belongs to an arm file, and {arm} is a model file")
+            raise BadInput(f"--record {record}: only with an arm file; {arm} is a model file")
         if not Path(arm).is_file():
             raise BadInput(f"no model file {arm}: give the path of a URDF or MJCF file, or of an arm file")
         model = load_model(Path(arm), tip=tip)
         return model.arm, model.beta, f"inertials of {arm}"
     if tip is not None:
-        raise BadInput(f"--tip {tip}: an arm file says so itself, under kinematics")
+        raise BadInput(f"--tip {tip}: only with a URDF or MJCF file; an arm file has its chain under kinematics")
     arm_file = load_arm(arm)
     if record is None and arm_file.model_path is not None:
         model = model_arm(arm_file)

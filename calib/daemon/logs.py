@@ -1,4 +1,4 @@
-"""Structured logs: one JSON object a line on stderr, which systemd's journal or any collector takes as it is."""
+"""Structured logs: one JSON object per line on stderr, for systemd's journal or any log collector."""
 
 import json
 import logging
@@ -9,7 +9,7 @@ _KNOWN = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "ta
 
 
 class JsonFormatter(logging.Formatter):
-    """time, level, logger, message, what was given as `extra`, and the exception where there is one."""
+    """time, level, logger, message, the fields given as `extra`, and the exception if there is one."""
 
     def format(self, record: logging.LogRecord) -> str:
         """One line of JSON."""
@@ -26,10 +26,10 @@ class JsonFormatter(logging.Formatter):
 
 
 def log_as_json(level: int = logging.INFO) -> None:
-    """From now on everything that is logged goes to stderr as JSON."""
+    """Send everything that is logged to stderr as JSON."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonFormatter())
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(level)
-    logging.getLogger("can").setLevel(max(level, logging.WARNING))  # it tells of every socket that it opens
+    logging.getLogger("can").setLevel(max(level, logging.WARNING))  # it logs every socket that it opens

@@ -1,4 +1,4 @@
-"""The daemon's one event loop: bus process, timers, signals, systemd and the web, wired together; nothing else."""
+"""The daemon's event loop: connects bus process, timers, signals, systemd and web server to the service."""
 
 import asyncio
 import importlib
@@ -8,70 +8,45 @@ import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TypeVar
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import ArmlinkError, BadInput
-from armlink.link.types import Calibration
-from calib.daemon.loop.loop_messages import Down
-from calib.daemon.loop.loop_process import ChildHost
+from calib.daemon.environment import Environment
+from calib.daemon.loop.loop_messages import Down, Reply
+from calib.daemon.loop.loop_process import LoopControllers, LoopProcess
 from calib.daemon.notify import Notifier, watchdog_seconds
 from calib.daemon.options import Options
-from calib.daemon.service import Around, Service
-from calib.daemon.view.service_view import ServiceView
-from calib.install.journaled_write import Controllers
+from calib.daemon.service import Service
+from calib.daemon.service_view import ServiceView
+from calib.daemon.state.bus_jobs import InThread
 from calib.records.store import RecordStore
 
-T = TypeVar("T")
 SNAPSHOT_SECONDS = 0.1
 SILENT_SECONDS = 15.0
-"""A bus process that has said nothing for so long hangs: it is killed and begun anew."""
+"""A bus process that sends nothing for this time hangs: it is killed and started again [s]."""
 BEGIN_SECONDS = 30.0
-"""A new bus process may take so long to say its first word."""
+"""Time for a new bus process to send its first message [s]."""
 log = logging.getLogger("armlink.daemon")
 
 
 class Daemon:
-    """Everything that lives as long as the process does."""
+    """Connects the service to process, clock, signals and web server."""
 
-    def __init__(self, options: Options, arm: ArmFile, host: ChildHost, state: Path) -> None:
-        self.options, self.arm, self.host = options, arm, host
+    def __init__(self, options: Options, arm: ArmFile, process: LoopProcess, state: Path) -> None:
+        self.options, self.arm, self.process = options, arm, process
         self._loop = asyncio.get_running_loop()
         self._ended = asyncio.Event()
         self._heard = time.monotonic() + BEGIN_SECONDS
         self._notify, self._watchdog = Notifier(), watchdog_seconds()
-        self._tasks: set[asyncio.Future[Any]] = set()
-        around = Around(time.monotonic, lambda: datetime.now(UTC), self._job, self)
+        port = _CurrentProcess(lambda: self.process)
+        environment = Environment(time.monotonic, lambda: datetime.now(UTC), InThread(self._loop), port)
         settings = options.settings(arm)
-        self.service = Service(arm, settings, options.listen_only, state, RecordStore(options.store), around)
+        self.service = Service(arm, settings, options.listen_only, state, RecordStore(options.store), environment)
         self.view = ServiceView(self.service)
         self._why = "stopped"
 
-    # ---- the service's way to the bus (Port), whichever process it is
-
-    @property
-    def controllers(self) -> Controllers:
-        """This, whose calls go to the bus process of the moment."""
-        return self
-
-    def read_calibration(self, joint: int) -> Calibration:
-        """See LoopControllers."""
-        return self.host.controllers.read_calibration(joint)
-
-    def write_calibration(
-        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
-    ) -> Calibration:
-        """See LoopControllers."""
-        return self.host.controllers.write_calibration(joint, gain, offset, record_id, date, store)
-
-    def sweep(self, poses: int, seed: int) -> Any:
-        """See ChildHost."""
-        return self.host.sweep(poses, seed)
-
-    # ---- life
-
     async def run(self) -> None:
-        """Until SIGTERM or SIGINT; leaves the joints safe."""
+        """Run until SIGTERM or SIGINT; leaves the joints safe."""
         for number, act in {
             signal.SIGTERM: lambda: self._end("SIGTERM"),
             signal.SIGINT: lambda: self._end("SIGINT"),
@@ -79,7 +54,7 @@ class Daemon:
             signal.SIGUSR1: lambda: self.service.tours.request("asked for by signal"),
         }.items():
             self._loop.add_signal_handler(number, act)
-        self._loop.add_reader(self.host.fileno(), self._messages)
+        self._loop.add_reader(self.process.fileno(), self._messages)
         web = asyncio.create_task(self._serve())
         timer = asyncio.create_task(self._timer())
         ended = asyncio.create_task(self._ended.wait())
@@ -91,15 +66,15 @@ class Daemon:
                     ending.result()
         finally:
             self._notify("STOPPING=1")
-            self._loop.remove_reader(self.host.fileno())
-            self.host.close()
+            self._loop.remove_reader(self.process.fileno())
+            self.process.close()
             for task in (web, timer, ended):
                 task.cancel()
             await asyncio.gather(web, timer, ended, return_exceptions=True)
             self.service.close(self._why)
 
     async def _serve(self) -> None:
-        """API and page; what they need is loaded aside, while the arm is observed already."""
+        """API and page; their modules are loaded in a thread, while the arm is observed already."""
         server = await asyncio.to_thread(importlib.import_module, "calib.daemon.web.server")
         given = self.options
         await server.serve(self.view, socket=given.socket, tcp=given.tcp, token=given.token)
@@ -109,15 +84,16 @@ class Daemon:
         self._ended.set()
 
     async def _timer(self) -> None:
-        """Snapshots, the service's second, the watchdog, and a look after the bus process."""
-        ticked, kept_alive, said = 0.0, 0.0, ""
+        """Snapshots, the service's tick, the watchdog, and supervision of the bus process."""
+        ticked, kept_alive, notified = 0.0, 0.0, ""
         due = time.monotonic()
         while True:
             now = time.monotonic()
             self.view.publish()
-            status = f"STATUS={self.service.state} {self.service.fault or self.service.detail}".strip()
-            if status != said:
-                said = status
+            why = self.service.arm_state.fault or self.service.records.detail
+            status = f"STATUS={self.service.state} {why}".strip()
+            if status != notified:
+                notified = status
                 self._notify(status)
             if now - ticked >= 1.0:
                 ticked = now
@@ -132,7 +108,7 @@ class Daemon:
 
     def _messages(self) -> None:
         try:
-            messages = self.host.pump()
+            messages = self.process.pump()
         except EOFError as error:
             self._restart(str(error))
             return
@@ -141,55 +117,54 @@ class Daemon:
             self.service.take(message)
 
     def _restart(self, why: str) -> None:
-        """Begin the bus process anew; until then its joints are held by their own deadlines."""
+        """Replace the bus process; meanwhile the joints' own deadlines hold them."""
         log.error(why)
-        self._loop.remove_reader(self.host.fileno())
-        self.host.close()
+        self._loop.remove_reader(self.process.fileno())
+        self.process.close()
         self.service.take(Down(why))
-        self.host = ChildHost(self.options.loop(self.arm))
+        self.process = LoopProcess(self.options.loop(self.arm))
         self._heard = time.monotonic() + BEGIN_SECONDS
-        self._loop.add_reader(self.host.fileno(), self._messages)
+        self._loop.add_reader(self.process.fileno(), self._messages)
 
     def _reload(self) -> None:
-        """SIGHUP: the arm file and the records anew; a file that cannot be used changes nothing."""
+        """SIGHUP: read the arm file and the records again; an unusable file changes nothing."""
         self._notify("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
         try:
             arm = load_arm(self.options.arm)
             if arm.name != self.arm.name or arm.serial != self.arm.serial or arm.kinematics != self.arm.kinematics:
                 raise BadInput(f"{arm.path}: another arm, serial or kinematics: restart the daemon for that")
         except (ArmlinkError, OSError) as error:
-            self.service.say("refused", None, f"configuration not reloaded: {error}", {})
+            self.service.events.say("refused", None, f"configuration not reloaded: {error}", {})
         else:
-            bus_changed = arm.link != self.arm.link or self.options.settings(arm).work != self.service.settings.work
+            before, settings = self.service.configuration.settings, self.options.settings(arm)
+            bus_changed = arm.link != self.arm.link or settings.work != before.work
             self.arm = arm
-            self.service.reload(arm, self.options.settings(arm))
+            self.service.reload(arm, settings)
             if bus_changed:
                 self._restart("the arm file's link section or the work has changed")
         self._notify("READY=1")
 
-    def _job(self, work: Callable[[], T], done: Callable[[T | Exception], None]) -> None:
-        """Run work that waits for the bus in a thread; its outcome comes back on this loop."""
 
-        def back(future: asyncio.Future[T]) -> None:
-            self._tasks.discard(future)
-            if future.cancelled():
-                return
-            error = future.exception()
-            self.service.guard(lambda: done(error if isinstance(error, Exception) else future.result()))
+class _CurrentProcess:
+    """The service's `Port`: whichever bus process is the present one."""
 
-        future = self._loop.run_in_executor(None, work)
-        self._tasks.add(future)
-        future.add_done_callback(back)
+    def __init__(self, process: Callable[[], LoopProcess]) -> None:
+        self.controllers = LoopControllers(lambda request: process().ask(request))
+        self._process = process
+
+    def sweep(self, poses: int, seed: int, /) -> Reply | None:
+        """Ask for a tour of poses."""
+        return self._process().sweep(poses, seed)
 
 
-def run_daemon(options: Options, arm: ArmFile, state: Path, host: ChildHost) -> None:
-    """Run until told to stop, with a bus process that is there already; it has ended when this returns."""
+def run_daemon(options: Options, arm: ArmFile, state: Path, process: LoopProcess) -> None:
+    """Run until a signal to stop, with a bus process already started; it has ended when this returns."""
 
     async def main() -> None:
         try:
-            daemon = Daemon(options, arm, host, state)
+            daemon = Daemon(options, arm, process, state)
         except BaseException:
-            host.close()
+            process.close()
             raise
         await daemon.run()
 

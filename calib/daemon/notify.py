@@ -1,19 +1,19 @@
-"""Telling systemd how the service is (sd_notify): ready, reloading, stopping, alive, one line of status."""
+"""Notifies systemd (sd_notify): ready, reloading, stopping, alive, one line of status."""
 
 import os
 import socket
 
 
 class Notifier:
-    """Sends to the socket of NOTIFY_SOCKET; does nothing where systemd did not give one."""
+    """Sends to the socket of NOTIFY_SOCKET; does nothing if there is none."""
 
     def __init__(self, address: str | None = None) -> None:
-        """`address` is by default that of the environment; a leading @ stands for an abstract socket."""
+        """`address` defaults to the environment's; a leading @ means an abstract socket."""
         given = os.environ.get("NOTIFY_SOCKET", "") if address is None else address
         self._address = "\0" + given[1:] if given.startswith("@") else given
 
     def __call__(self, *lines: str) -> None:
-        """Send assignments such as READY=1; a socket that is gone is no reason to stop."""
+        """Send assignments such as READY=1; a missing socket is ignored."""
         if not self._address:
             return
         try:
@@ -24,7 +24,7 @@ class Notifier:
 
 
 def watchdog_seconds() -> float | None:
-    """How often systemd wants to hear WATCHDOG=1 at least [s]; None where it does not ask this process."""
+    """Longest time between two WATCHDOG=1 that systemd accepts [s]; None if it has no watchdog on this process."""
     given, of = os.environ.get("WATCHDOG_USEC", ""), os.environ.get("WATCHDOG_PID", "")
     if not given.isdigit() or int(given) == 0 or (of and of != str(os.getpid())):
         return None

@@ -1,4 +1,4 @@
-"""What the command line says; light to import, so that the bus process is begun before the rest is loaded."""
+"""Command-line options; light to import, so that the bus process starts before the rest is loaded."""
 
 import os
 import time
@@ -13,7 +13,7 @@ from calib.daemon.settings import DaemonSection, Policy, daemon_section
 
 @dataclass(frozen=True)
 class Options:
-    """The command line."""
+    """Options of `armlink daemon`."""
 
     arm: str
     bus: str | None = None
@@ -26,7 +26,7 @@ class Options:
     work: bool = False
 
     def settings(self, arm: ArmFile) -> DaemonSection:
-        """The arm file's section, with what the command line says instead."""
+        """The arm file's section, overridden by the command line."""
         given: dict[str, Any] = {} if self.policy is None else {"policy": self.policy}
         if self.work:
             given["work"] = True
@@ -38,7 +38,7 @@ class Options:
 
 
 def state_directory(given: Path | None, arm: ArmFile) -> Path:
-    """Where the daemon keeps what it knows: --state, else systemd's STATE_DIRECTORY, else the user's own."""
+    """Directory of journal and recordings: --state, else systemd's STATE_DIRECTORY, else the user's state directory."""
     if given is not None:
         return given
     of_systemd = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]

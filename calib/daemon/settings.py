@@ -1,6 +1,6 @@
-"""What a person may set of the daemon: the arm file's section `daemon`, read again at SIGHUP."""
+"""The arm file's section `daemon`, read again at SIGHUP, and the configuration in use."""
 
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import Annotated, Literal
 
 from pydantic import Field, FiniteFloat, PositiveFloat, field_validator
@@ -12,32 +12,32 @@ Policy = Literal["observe", "propose", "apply"]
 
 
 class RecordingSettings(Section):
-    """Recordings that the daemon keeps by itself (MCAP), the oldest dropped first."""
+    """The daemon's own recordings (MCAP); the oldest are dropped first."""
 
     enabled: bool = True
     rate: Annotated[FiniteFloat, Field(gt=0, le=1000)] = 25.0
-    """Rows a second; at most the SYNC rate."""
+    """Rows per second [Hz], at most the SYNC rate."""
     minutes: PositiveFloat = 10.0
-    """Length of one file."""
+    """Length of one file [min]."""
     quota_mb: PositiveFloat = 2000.0
-    """All files together."""
+    """All files together [MB]."""
 
 
 class DaemonSection(Section):
     """The arm file's section `daemon`; every key has a default."""
 
     policy: Policy = "propose"
-    """What becomes of a drift that was found: nothing, a proposal, or a new record written to the controller."""
+    """Reaction to a drift: an event only, a proposal, or a new record written to the controller."""
     rest_between_writes: PositiveFloat = 600.0
     """At most one recalibration of a joint in this time [s]."""
     writes_per_day: Annotated[int, Field(ge=1)] = 24
-    """At most so many recalibrations of the arm by the daemon's own decision."""
+    """Limit for recalibrations of the arm that the daemon decides on itself."""
     sweep_when_undecided: bool = False
-    """Whether the daemon may sweep the arm by itself where watching cannot decide; only where it drives the bus."""
+    """Whether the daemon may sweep the arm if watching cannot decide; only if it drives the bus."""
     sweep_every_hours: PositiveFloat | None = None
-    """Sweep so often; only where the daemon drives the bus."""
+    """Time between sweeps [h]; only if the daemon drives the bus."""
     work: bool = False
-    """Whether the daemon, where it drives the bus, moves the arm among random poses: a stand-in for ordinary work."""
+    """Whether the daemon, if it drives the bus, moves the arm among random poses, in place of ordinary work."""
     recording: RecordingSettings = RecordingSettings()
     observer: dict[str, FiniteFloat] = Field(default_factory=dict)
     """Thresholds of the observer (calib/observer/config.py) that differ from their defaults."""
@@ -52,7 +52,7 @@ class DaemonSection(Section):
         return given
 
     def observer_config(self) -> ObserverConfig:
-        """The observer's thresholds; whole numbers stay whole."""
+        """The observer's thresholds; integers stay integers."""
         whole = {field.name for field in fields(ObserverConfig) if field.type == "int" or field.type is int}
         return ObserverConfig(
             **{name: int(value) if name in whole else value for name, value in self.observer.items()}  # type: ignore[arg-type]
@@ -62,3 +62,17 @@ class DaemonSection(Section):
 def daemon_section(arm: ArmFile) -> DaemonSection:
     """The arm file's section, or the defaults."""
     return arm.daemon if isinstance(arm.daemon, DaemonSection) else DaemonSection()
+
+
+@dataclass
+class Configuration:
+    """Arm file, settings and mode in use. A reload replaces arm and settings; every part reads them here."""
+
+    arm: ArmFile
+    settings: DaemonSection
+    listen_only: bool
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Joints, base to tip."""
+        return self.arm.joint_names

@@ -1,8 +1,8 @@
 """Calibration in the field, without a mass: gains and offsets from slow motion and the identified gravity parameters.
 
 v_i = K_i τ_i(q; β) + O_i + s_i f_i, with s_i the side of approach and f_i hysteresis or friction that the sensor sees;
-β ~ N(β̂, Cov β̂) from the gravity record and position offsets within what is known of them, all joints in one problem
-(theory.md sections 4 (iii) and 7). The intervals hold the gravity record's own error, which does not average out.
+β ~ N(β̂, Cov β̂) from the gravity record and position offsets with their standard deviations, all joints in one problem
+(docs/theory.md, section 4.3). The intervals include the gravity record's own error, which does not average out.
 """
 
 from dataclasses import dataclass
@@ -21,41 +21,41 @@ from gcomp.identify.readings import StaticReadings
 Flags = npt.NDArray[np.bool_]
 
 GAIN_STD = 0.02
-"""A gain known no better than this, as a ratio, is not told from the offset."""
+"""Relative standard deviation above which a gain counts as not separable from the offset."""
 OFFSET_STD = 0.005
-"""Likewise an offset, as a share of rated torque."""
+"""Likewise of an offset, as a share of rated torque."""
 DRIFT = 0.05
-"""Standard deviation of the drift that a gain may have had which these rows do not show, as a ratio."""
+"""Standard deviation allowed for the drift of a gain that these rows do not show, as a ratio."""
 ROUNDS = 4
-"""Gauss-Newton steps, each with the noise brought to the scatter that is there."""
+"""Gauss-Newton steps, each with the noise scaled to the residuals' scatter."""
 PAYLOAD_EVIDENCE = 10.0
-"""BIC by which a payload may be worse than new gains and offsets and still cannot be excluded."""
+"""BIC difference up to which a payload that explains the rows worse than new gains and offsets is not excluded."""
 
 
 @dataclass(frozen=True, eq=False)
 class FieldFit:
-    """Gains and offsets (n,) as the sensors have them now; NaN where these rows do not separate them, and why."""
+    """Present gains and offsets of the sensors (n,); NaN with a reason if these rows do not separate them."""
 
     names: tuple[str, ...]
     gain: Array
     offset: Array
     """[N·m]"""
     covariance: Array
-    """Of (gain, offset) of each joint (n, 2, 2); NaN where there is no value."""
+    """Of (gain, offset) of each joint (n, 2, 2); NaN without a value."""
     hysteresis: Array
-    """Half the difference between both directions (n,) [N·m]; NaN where only one was seen."""
+    """Half the difference between both directions (n,) [N·m]; NaN if only one was seen."""
     reasons: dict[tuple[str, Parameter], str]
     common_scale_std: float
-    """Standard deviation of a factor common to all gains, which comes from the gravity record alone."""
+    """Standard deviation of a factor common to all gains; it comes from the gravity record alone."""
     residual: Array
-    """Readings less fit (K, n) [N·m], NaN where none counts."""
+    """Readings minus fit (K, n) [N·m]; NaN for readings that do not count."""
     torque: Array
     """Model torque (K, n) [N·m]."""
     rows: Array
-    """Rows that count (n,)."""
+    """Number of rows that count (n,)."""
 
     def std(self, parameter: Parameter) -> Array:
-        """Standard deviations of "gain" or "offset" (n,), NaN where there is no value."""
+        """Standard deviations of "gain" or "offset" (n,); NaN without a value."""
         place = 0 if parameter == "gain" else 1
         std: Array = np.sqrt(self.covariance[:, place, place])
         return std
@@ -69,15 +69,15 @@ class FieldFit:
 def fit_field(
     arm: ArmFile, rows: StaticReadings, gravity: GravityRecord, calibration: CalibrationRecord | None
 ) -> FieldFit:
-    """Gains and offsets from slow rows; `calibration` gives the position sensors and what was in force.
+    """Gains and offsets from slow rows; `calibration` has the position sensors and the torque calibration in use.
 
-    Raises Refused where a payload explains the rows as well, or the records are of another arm; BadInput.
+    Raises Refused if a payload explains the rows as well, or the records are of another arm; BadInput.
     """
     belief = belief_of(arm, gravity, calibration)
     n, q = belief.arm.n, rows.position * belief.position_gain + belief.position_offset
     if not np.isfinite(rows.torque).any():
         raise BadInput("no torque reading counts")
-    gain, sigma = belief.installed[0], rows.sigma
+    gain, sigma = belief.installed.gain, rows.sigma
     noise, prior = sigma, belief.prior(np.ones(n))
     for _ in range(ROUNDS):
         columns = field_columns(belief, rows, q, gain)
@@ -87,7 +87,7 @@ def fit_field(
         gain, noise = solved.value[:n], sigma * np.maximum(factor, 1.0)
     unseen = np.sqrt(np.diag(solved.covariance)[:n]) > GAIN_STD * np.abs(gain)
     if unseen.any():
-        columns = field_columns(belief, rows, q, np.where(unseen, belief.installed[0], gain))
+        columns = field_columns(belief, rows, q, np.where(unseen, belief.installed.gain, gain))
         solved = solve(columns, rows.torque, noise, belief.prior(np.where(unseen, DRIFT, 1.0)))
     if calibration is not None:
         _refuse_payload(belief, rows, q, noise, solved.chi2)
@@ -103,7 +103,7 @@ def _scatter(score: Array) -> Array:
 
 
 def _correlation(residual: Array, series: npt.NDArray[np.int64]) -> Array:
-    """Factor (n,) on the standard deviation of a row for neighbouring residuals that are alike: √(1 + 2 Σ ρ_k)."""
+    """Factor (n,) on the standard deviation of a row for correlated neighbours: √(1 + 2 Σ ρ_k)."""
     factor = np.ones(residual.shape[1])
     for joint in range(residual.shape[1]):
         parts = [residual[series == each, joint] for each in np.unique(series)]
@@ -120,12 +120,12 @@ def _correlation(residual: Array, series: npt.NDArray[np.int64]) -> Array:
 
 
 def _refuse_payload(belief: Belief, rows: StaticReadings, q: Array, noise: Array, chi2: float) -> None:
-    """Raise Refused where the installed pairs do not fit, and a payload with them does as well as new pairs do."""
+    """Raise Refused if the installed calibration does not fit, but fits as well as a new one with a payload added."""
     n = belief.arm.n
-    base = field_columns(belief, rows, q, belief.installed[0])
+    base = field_columns(belief, rows, q, belief.installed.gain)
     held = belief.prior_installed()
     fixed, by_point = payload_columns(belief.arm)
-    load = gravity_regressor(belief.arm, q) @ np.column_stack([fixed, by_point]) * belief.installed[0][:, None]
+    load = gravity_regressor(belief.arm, q) @ np.column_stack([fixed, by_point]) * belief.installed.gain[:, None]
     with_load = solve(
         np.concatenate([base, load], axis=2),
         rows.torque,
@@ -138,7 +138,7 @@ def _refuse_payload(belief: Belief, rows: StaticReadings, q: Array, noise: Array
     if as_installed > as_load + PAYLOAD_EVIDENCE and mass > 0 and as_load < chi2 + 2 * n * log_rows + PAYLOAD_EVIDENCE:
         raise Refused(
             f"a payload of {mass:.2f} kg explains these readings as well as other gains do: take it off and record"
-            " again (or, if there is none, sweep with a reference mass)"
+            " again; if there is none, sweep with a reference mass"
         )
 
 
@@ -159,12 +159,12 @@ def _report(belief: Belief, rows: StaticReadings, columns: Array, solved: Soluti
         if len(here) and len(sides) < 2:
             hysteresis[j] = np.nan
             reasons[name, "offset"] = (
-                "it was approached from one side only, so that friction or hysteresis looks the same: move it both ways"
+                "it was approached from one side only, where friction or hysteresis looks the same: move it both ways"
             )
         elif len(here) and np.sqrt(pairs[j, 1, 1]) > OFFSET_STD * belief.rated[j]:
             reasons[name, "offset"] = (
-                f"it cannot be told from the gain: ± {2 * np.sqrt(pairs[j, 1, 1]):.2g} N·m only, since torque stays"
-                f" between {here.min():.2f} and {here.max():.2f} N·m"
+                f"it cannot be separated from the gain: known to ± {2 * np.sqrt(pairs[j, 1, 1]):.2g} N·m only, as"
+                f" torque stays between {here.min():.2f} and {here.max():.2f} N·m"
             )
     for place, (parameter, value) in enumerate((("gain", gain), ("offset", offset))):
         for j, name in enumerate(names):
@@ -191,8 +191,8 @@ def _report(belief: Belief, rows: StaticReadings, columns: Array, solved: Soluti
 def _no_gain(torque: Array) -> str:
     spread = float(np.std(torque))
     if np.abs(torque).max() < 1e-3:
-        return "gravity does not act on it: its axis is vertical in all of these poses"
+        return "gravity does not act on it: its axis is vertical in all these poses"
     return (
-        f"it cannot be told from the offset: gravity torque varies by {spread:.2g} N·m only (standard deviation) in"
-        " these poses: move it, or the joints beyond it, further"
+        f"it cannot be separated from the offset: gravity torque varies by only {spread:.2g} N·m (standard deviation)"
+        " in these poses: move it, or the joints beyond it, further"
     )

@@ -1,26 +1,27 @@
-"""The field calibration's linear problem: what is believed beforehand, its columns, and least squares with a prior."""
+"""Linear problem of the field calibration: prior, columns, and least squares with that prior."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, per_joint
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
-from calib.records.records import PARAMETERS, Array, CalibrationRecord, GravityRecord
+from calib.records.records import Array, CalibrationRecord, GravityRecord
 from gcomp.arm.arm import Arm
 from gcomp.gravity.torque import gravity_regressor, gravity_stiffness
 from gcomp.identify.readings import StaticReadings
 
 HYSTERESIS = 0.01
-"""Standard deviation of f_i believed beforehand, as a share of rated torque."""
+"""Prior standard deviation of f_i, as a share of rated torque (docs/theory.md, section 4.3)."""
 UNKNOWN_MOMENT = 10.0
-"""Standard deviation of a mass moment that the gravity record could not determine [kg·m]."""
+"""Prior standard deviation of a mass moment that is not identifiable in the gravity record [kg·m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """What is known before the rows are looked at."""
+    """Prior knowledge, from the records."""
 
     arm: Arm
     rated: Array
@@ -30,28 +31,26 @@ class Belief:
     position_gain: Array
     position_offset: Array
     position_std: Array
-    installed: tuple[Array, Array]
-    """Gain and offset of the record in force (n,)."""
+    installed: TorqueCalibration[Array]
+    """The current record's (n,)."""
     spread: tuple[Array, Array] | None
-    """Their standard deviations (n,), NaN where not known; None where there is no record."""
+    """Its standard deviations of gain and offset (n,), NaN if unknown; None without a record."""
 
     def prior(self, gain_share: Array) -> tuple[Array, Array]:
-        """(mean, std) of all parameters with gains around those in force by a share of them, offsets unknown."""
-        gain, offset = self.installed
-        return self._prior(gain_share * np.abs(gain), 10 * self.rated, (gain, offset))
+        """(mean, std) of all parameters: gains around the installed ones within a share of them, offsets unknown."""
+        return self._prior(gain_share * np.abs(self.installed.gain), 10 * self.rated)
 
     def prior_installed(self) -> tuple[Array, Array]:
-        """(mean, std) with gains and offsets as the record in force has them."""
-        gain, offset = self.installed
-        of_gain, of_offset = self.spread or (np.zeros_like(gain), np.zeros_like(offset))
-        tight = np.fmax(of_gain, 1e-3 * np.abs(gain)), np.fmax(of_offset, 1e-3 * self.rated)
-        return self._prior(*tight, (gain, offset))
+        """(mean, std) of all parameters, gains and offsets as in the current record."""
+        of_gain, of_offset = self.spread or (np.zeros_like(self.rated), np.zeros_like(self.rated))
+        tight = np.fmax(of_gain, 1e-3 * np.abs(self.installed.gain)), np.fmax(of_offset, 1e-3 * self.rated)
+        return self._prior(*tight)
 
-    def _prior(self, gain_std: Array, offset_std: Array, mean: tuple[Array, Array]) -> tuple[Array, Array]:
+    def _prior(self, gain_std: Array, offset_std: Array) -> tuple[Array, Array]:
         others = self.root.shape[1] + len(self.rated)
         zeros = np.zeros(len(self.rated) + others)
         return (
-            np.concatenate([*mean, zeros]),
+            np.concatenate([self.installed.gain, self.installed.offset, zeros]),
             np.concatenate([gain_std, offset_std, HYSTERESIS * self.rated, np.ones(others)]),
         )
 
@@ -67,7 +66,7 @@ class Solution:
 
 
 def solve(columns: Array, torque: Array, sigma: Array, prior: tuple[Array, Array]) -> Solution:
-    """Parameters (p,) of torque = columns @ parameters, columns (K, n, p), prior (mean, std); NaN is left out."""
+    """Parameters (p,) of torque = columns @ parameters, columns (K, n, p), prior (mean, std); NaN rows are left out."""
     counted = np.isfinite(torque)
     design = columns[counted] / sigma[counted][:, None]
     target = torque[counted] / sigma[counted]
@@ -82,7 +81,7 @@ def solve(columns: Array, torque: Array, sigma: Array, prior: tuple[Array, Array
 
 
 def belief_of(arm: ArmFile, gravity: GravityRecord, calibration: CalibrationRecord | None) -> Belief:
-    """From the records; raises Refused where one is of another arm."""
+    """From the records; raises Refused if one is of another arm."""
     described, n = gcomp_arm(arm), len(arm.joint_names)
     values, vectors = np.linalg.eigh(np.array(gravity.require(arm).covariance))
     root = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -93,26 +92,23 @@ def belief_of(arm: ArmFile, gravity: GravityRecord, calibration: CalibrationReco
     if calibration is not None:
         calibration.require(arm)
         zero_std = np.where(np.isnan(calibration.std("position_offset")), zero_std, calibration.std("position_offset"))
-    values_of = {}
-    for name in PARAMETERS:
-        default = 1.0 if name.endswith("gain") else 0.0
-        values_of[name] = np.full(n, default) if calibration is None else calibration.values(name, default)
+    blank = per_joint([UNCALIBRATED] * n)
     spread = None if calibration is None else (calibration.std("gain"), calibration.std("offset"))
     return Belief(
         arm=described,
-        rated=np.array([joint.rated_torque for joint in arm.require_link().joints]),
+        rated=arm.require_link().rated_torques,
         beta=np.array(gravity.beta),
         root=np.hstack([root, unknown]),
-        position_gain=values_of["position_gain"],
-        position_offset=values_of["position_offset"],
+        position_gain=np.ones(n) if calibration is None else calibration.values("position_gain", 1.0),
+        position_offset=np.zeros(n) if calibration is None else calibration.values("position_offset", 0.0),
         position_std=np.maximum(zero_std, 1e-6),
-        installed=(values_of["gain"], values_of["offset"]),
+        installed=blank if calibration is None else calibration.torque_calibration(blank),
         spread=spread,
     )
 
 
 def field_columns(belief: Belief, rows: StaticReadings, q: Array, gain: Array) -> Array:
-    """(K, n, p): by gain, offset, hysteresis of each joint, by β in units of its root, by position offsets [std]."""
+    """Columns (K, n, p): gains, offsets, hysteresis, β in units of its root, position offsets in units of their std."""
     n, each = belief.arm.n, np.eye(belief.arm.n)
     regressor = gravity_regressor(belief.arm, q)
     torque = regressor @ belief.beta

@@ -1,4 +1,4 @@
-"""Rows for a calibration in the field: slow instants of a recording, or the readings of sweeps."""
+"""Rows for a field calibration: slow windows of a recording, or the readings of sweeps."""
 
 from dataclasses import replace
 
@@ -6,37 +6,40 @@ import numpy as np
 
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording
+from armlink.torque_calibration import TorqueCalibration
 from calib.fit.sweep_readings import sweep_readings
 from calib.sweep.dataset import SweepData
 from gcomp.arrays import Array
 from gcomp.identify.readings import StaticReadings
 
 WINDOW = 0.25
-"""Samples are averaged over so long: one row [s]."""
+"""Length of a window, which is averaged to one row [s]."""
 FEWEST_SAMPLES = 3
+"""Samples of a window; its slope and scatter need as many."""
 SLOW = 0.1
-"""A window counts where no joint moves faster: centrifugal torque is then at most 0.1 N·m at 10 kg·m² [rad/s]."""
+"""Largest speed of any joint in a window that counts: centrifugal torque is then below 0.1 N·m at 10 kg·m² [rad/s]."""
 STEADY = 0.05
-"""And where no joint's speed changes faster [rad/s²]."""
+"""Largest change of any joint's speed [rad/s²] (docs/theory.md, section 6.1)."""
 MOVED = 0.004
-"""Way of a joint from which on its direction counts as changed [rad]."""
+"""Motion of a joint after which its direction counts as changed [rad]."""
 FEWEST_ROWS = 12
+"""Rows that a recording must have: three unknowns a joint, and some more for the scatter."""
 
 
-def rows_of_recording(recording: Recording, gain: Array, offset: Array, number: int, source: str) -> StaticReadings:
+def rows_of_recording(recording: Recording, held: TorqueCalibration[Array], number: int, source: str) -> StaticReadings:
     """Windows of a recording in which all joints move slowly and steadily.
 
-    `gain` and `offset` (n,) are the pairs that the controllers held: what they sent is turned back to the sensors' own
-    readings. Raises BadInput where there is no joint torque, or nothing slow enough.
+    `held` (n,) is what the controllers held: what they sent is turned back into the sensors' own readings. Raises
+    BadInput if there is no joint torque, or nothing slow enough.
     """
     if recording.torque is None:
         raise BadInput(f"{source}: no joint torque (columns tau_1 …): calibration needs the torque sensors' readings")
     keep = np.isfinite(recording.position).all(axis=1) & np.isfinite(recording.torque).all(axis=1)
     t, position = recording.t[keep], recording.position[keep]
-    torque = recording.torque[keep] * gain + offset
+    torque = held.apply(recording.torque[keep])
     windows = _windows(t)
     if not windows:
-        raise BadInput(f"{source}: no {WINDOW} s with {FEWEST_SAMPLES} samples of every joint in it")
+        raise BadInput(f"{source}: no window of {WINDOW} s has {FEWEST_SAMPLES} samples of every joint")
     slopes = np.array([_slope(t[each], position[each]) for each in windows])
     middles = np.array([t[each].mean() for each in windows])
     change = np.abs(np.diff(slopes, axis=0)) / np.diff(middles)[:, None]
@@ -45,7 +48,7 @@ def rows_of_recording(recording: Recording, gain: Array, offset: Array, number: 
     slow = (np.abs(slopes).max(axis=1) <= SLOW) & steady
     if slow.sum() < FEWEST_ROWS:
         raise BadInput(
-            f"{source}: {int(slow.sum())} instants of {WINDOW} s are slow enough, at least {FEWEST_ROWS} are needed:"
+            f"{source}: {int(slow.sum())} windows of {WINDOW} s are slow enough, at least {FEWEST_ROWS} are needed:"
             f" record rests, or motion below {SLOW} rad/s without jerks"
         )
     means = np.array([position[each].mean(axis=0) for each in windows])
@@ -62,18 +65,18 @@ def rows_of_recording(recording: Recording, gain: Array, offset: Array, number: 
 
 
 def rows_of_sweeps(data: SweepData, number: int) -> StaticReadings:
-    """The unloaded readings of a sweep data set; raises BadInput where a reference mass was attached."""
+    """The unloaded readings of a sweep data set; raises BadInput if a reference mass was attached."""
     if data.manifest.reference_mass > 0:
         raise BadInput(
-            f"{data.path}: swept with a reference mass of {data.manifest.reference_mass:g} kg: this takes the arm as"
-            " its gravity record knows it, without a mass (armlink calibrate takes both)"
+            f"{data.path}: swept with a reference mass of {data.manifest.reference_mass:g} kg: the field"
+            " calibration needs the arm without a mass (armlink calibrate takes both)"
         )
     readings = sweep_readings([data]).readings
     return replace(readings, series=np.full(len(readings), number))
 
 
 def _windows(t: Array) -> list[slice]:
-    """Windows of WINDOW seconds with enough samples and no gap in them."""
+    """Windows of WINDOW seconds with enough samples and without gaps."""
     windows, begin = [], 0
     while begin < len(t):
         end = int(np.searchsorted(t, t[begin] + WINDOW))

@@ -7,6 +7,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
+from armlink.torque_calibration import TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
 from calib.fit.sensor_fit import SensorFit
 from calib.fit.sweep_readings import SweepReadings, sweep_readings
@@ -87,10 +88,11 @@ def calibrated(rows: SweepReadings, calibration: Parameters, which: Mask) -> Sta
     """Rows as true angles [rad] and torques [N·m] by the calibration, own sensors of swept joints alone."""
     readings = rows.readings
     own = rows.own
+    sensors = TorqueCalibration(calibration.gain, calibration.offset)
     true = replace(
         readings,
         position=joint_positions(calibration, readings),
-        torque=np.where(own, (readings.torque - calibration.offset) / calibration.gain, np.nan),
+        torque=np.where(own, sensors.invert(readings.torque), np.nan),
         sigma=readings.sigma / np.abs(calibration.gain),
     )
     return true.rows(which & own.any(axis=1))

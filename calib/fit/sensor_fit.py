@@ -7,6 +7,7 @@ import numpy as np
 from scipy import stats
 
 from armlink.arm_file import ArmFile
+from armlink.torque_calibration import TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.fit.examination import Goodness, examine
@@ -202,7 +203,7 @@ def _modelled(arm: ArmFile, fit: GlobalFit, rows: SweepReadings) -> Array:
 def _friction(fit: GlobalFit, rows: SweepReadings) -> Array:
     """Half difference (n,) between the directions of motor torque less sensor torque [N·m]."""
     gain = np.where(np.abs(fit.complete.gain) > 1e-6, fit.complete.gain, 1.0)
-    sensed = (rows.readings.torque - fit.complete.offset) / gain
+    sensed = TorqueCalibration(gain, fit.complete.offset).invert(rows.readings.torque)
     return _half_difference(rows.motor_torque - sensed, rows)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from armlink.errors import BadInput
+from armlink.torque_calibration import TorqueCalibration
 from calib.motion.static_reading import StaticReading, batch, stack
 from calib.sweep.dataset import SweepData
 from gcomp.arrays import Array, Mask
@@ -64,11 +65,11 @@ def sweep_readings(data: Sequence[SweepData]) -> SweepReadings:
     noise, sigma = _noise(taken, np.array(data[0].manifest.rated_torque))
     resolution = np.max([each.resolution for each in data], axis=0)
     sent = batch(taken, sigma)
-    gain = np.array([each.manifest.installed_gain for each in data])
-    offset = np.array([each.manifest.installed_offset for each in data])
+    gain = np.array([each.manifest.installed_gain for each in data])[source]
+    offset = np.array([each.manifest.installed_offset for each in data])[source]
     readings = replace(
         sent,
-        torque=sent.torque * gain[source] + offset[source],
+        torque=TorqueCalibration(gain, offset).apply(sent.torque),
         load=np.array([each.manifest.reference_mass for each in data])[source],
         series=np.array([sweeps.index(name) for name in names]),
     )

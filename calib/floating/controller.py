@@ -1,43 +1,43 @@
-"""Gravity compensation: the identified torque fed forward, so that the arm stays where a hand leaves it.
+"""Gravity compensation: the identified torque is fed forward, so that the arm stays where a hand leaves it.
 
-Pure: positions in, torques out (Ma & Hollerbach, Figure 1). Beside gravity there is as little as possible: damping,
-steep near the speed limit, soft ends near the stops, and where the arm rests a small detent, which holds what the model
-is wrong by.
+Pure: positions in, torques out (Ma & Hollerbach, Figure 1). Three terms are added to gravity: damping, steep near the
+speed limit; soft ends near the stops; and at rest a small detent, which holds the arm against the model's error.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from calib.records.records import Array
 from gcomp.arm.arm import Arm
+from gcomp.arrays import Array
 from gcomp.gravity.batch import GravityModel
 
 
 @dataclass(frozen=True)
 class FloatConfig:
-    """How an arm floats."""
+    """Feel and safety of a floating arm; tests/calib/floating/test_float.py holds the arm to them."""
 
     speed_time: float = 0.01
-    """Time constant of the speed filter, since positions of an encoder are coarse [s]."""
+    """Time constant of the speed filter [s]: 2.5 cycles at 250 Hz, against the steps of the encoder."""
     damping_share: float = 0.02
     """Damping torque at the largest speed, as a share of rated torque."""
     fast_share: float = 0.7
-    """Above this share of the largest speed damping grows steeply, so that the gate need not stop the arm."""
+    """Above this share of the largest speed damping grows steeply, so that the speed gate does not have to stop the
+    arm."""
     fast_damping: float = 0.5
-    """Damping torque added at the largest speed, as a share of rated torque."""
+    """Further damping torque at the largest speed, as a share of rated torque."""
     soft_end: float = 0.12
     """Distance from a stop at which the soft end begins [rad]."""
     soft_share: float = 0.3
     """Torque of the soft end at the stop, as a share of rated torque."""
     detent_share: float = 0.01
-    """Largest torque of the detent, as a share of rated torque: no more than a hand overcomes unawares."""
+    """Largest torque of the detent, as a share of rated torque: a hand overcomes it without noticing."""
     detent_width: float = 0.01
-    """Way after which the detent gives its largest torque and follows [rad]."""
+    """Deflection at which the detent reaches its largest torque and begins to follow [rad]."""
 
 
 class FloatControl:
-    """`torque(position)` once a cycle. Positions are those that the joints' own sensors read."""
+    """`torque(position)` once per cycle. Positions are readings of the joints' own sensors."""
 
     def __init__(
         self,
@@ -50,9 +50,9 @@ class FloatControl:
         position_gain: Array | None = None,
         position_offset: Array | None = None,
     ) -> None:
-        """beta (2n,) [kg·m]; rated torque (n,) [N·m], max_velocity (n,) [rad/s]; period of a cycle [s].
+        """beta (2n,) [kg·m]; rated torque (n,) [N·m]; max_velocity (n,) [rad/s]; period of a cycle [s].
 
-        Position gain and offset (n,) of the calibration record turn readings into true angles.
+        position_gain and position_offset (n,) of the calibration record convert readings to true angles.
         """
         self.config = config or FloatConfig()
         self._model, self._arm = GravityModel(arm, beta), arm
@@ -63,16 +63,20 @@ class FloatControl:
         self._speed: Array = np.zeros(arm.n)
         self._detent: Array = np.zeros(arm.n)
 
-    def torque(self, position: Array) -> Array:
-        """Target torque (n,) [N·m] at position readings (n,) [rad]; a missing one counts as the last."""
+    def torque(self, position: Array, elapsed: float | None = None) -> Array:
+        """Target torque (n,) [N·m] at position readings (n,) [rad], `elapsed` seconds after those before.
+
+        The last reading replaces a missing one (NaN); without a time a period has passed.
+        """
         angle = self._gain * position + self._offset
         if self._last is None:
             if np.isnan(angle).any():
                 return np.full(angle.size, np.nan)
             self._last, self._detent = angle.copy(), angle.copy()
         angle = np.where(np.isnan(angle), self._last, angle)
-        share = min(self._period / self.config.speed_time, 1.0)
-        self._speed += share * ((angle - self._last) / self._period - self._speed)
+        period = self._period if elapsed is None else max(elapsed, self._period / 2)
+        share = min(period / self.config.speed_time, 1.0)
+        self._speed += share * ((angle - self._last) / period - self._speed)
         self._last = angle
         gravity: Array = np.asarray(self._model.one(angle))
         return gravity + self._damping() + self._soft_ends(angle) + self._hold(angle)
@@ -92,7 +96,7 @@ class FloatControl:
         return -self._rated * (config.damping_share * relative + config.fast_damping * beyond * np.sign(relative))
 
     def _soft_ends(self, angle: Array) -> Array:
-        """A spring over the last way to each stop, damped on the way in alone."""
+        """A spring near each stop, damped towards the stop only."""
         config, arm = self.config, self._arm
         width = np.minimum(config.soft_end, (arm.upper - arm.lower) / 6)
         into_lower = np.clip((arm.lower + width - angle) / width, 0.0, 1.0)
@@ -104,7 +108,7 @@ class FloatControl:
         return np.where(finite, self._rated * (spring + damped), 0.0)
 
     def _hold(self, angle: Array) -> Array:
-        """A spring to where the joint rests, which gives way beyond its largest torque and follows, as dry friction."""
+        """A spring to the rest position, which beyond its largest torque follows the joint, as dry friction does."""
         width = self.config.detent_width
         self._detent = np.clip(self._detent, angle - width, angle + width)
         return self.config.detent_share * self._rated * (self._detent - angle) / width

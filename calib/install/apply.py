@@ -1,20 +1,24 @@
-"""`--apply` of `armlink calibrate` and `recalibrate`: gates, check motion, write, check motion again."""
+"""`--apply`: gates, check motion, write, check motion; for records from sweeps, from slow motion and from earlier."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
-from armlink.link.link import Link
+from armlink.loop.driver import ArmDriver
+from armlink.loop.open import open_arm
 from calib.field.field_fit import FieldFit
-from calib.field.field_record import check_field_heldout
+from calib.field.heldout import heldout_errors
+from calib.fit.findings import Finding
+from calib.fit.heldout import heldout_scores, worse_joint
 from calib.fit.sensor_fit import SensorFit
+from calib.fit.sweep_readings import sweep_readings
 from calib.install.check_motion import CheckMotion
-from calib.install.journaled_write import install, mend
-from calib.install.plausibility import check_bounds, check_change, check_gates, check_holds, past_changes
-from calib.records.records import Array, CalibrationRecord
+from calib.install.journaled_write import install, recover
+from calib.install.plausibility import Admitted, GateRefused, Refusal, admit, admit_rollback
+from calib.records.records import Array, CalibrationRecord, GravityRecord
 from calib.records.store import RecordStore
 from calib.sweep.dataset import SweepData
 from gcomp.identify.readings import StaticReadings
@@ -22,7 +26,7 @@ from gcomp.identify.readings import StaticReadings
 
 @dataclass(frozen=True)
 class Apply:
-    """How a record from sweeps goes to the controllers."""
+    """How a record is written to the controllers."""
 
     by: str
     """Who ordered it."""
@@ -31,7 +35,7 @@ class Apply:
     replaced: Sequence[str] = ()
     """Joints whose sensor was exchanged: their change is not judged by their history."""
     accepted: Sequence[str] = ()
-    """Joints that are written although the model does not hold there."""
+    """Joints that are written although the sensor model does not hold there."""
     check: bool = True
     """Make the check motion before and after."""
     flash: bool = False
@@ -48,14 +52,13 @@ def apply_calibration(
 ) -> tuple[str, ...]:
     """Write a record that was fitted to sweeps to the controllers and make it current; returns the joints written.
 
-    `data` are those sweeps, `fit` their fit, whose gravity model the check motion is judged by. The record is kept in
-    any case. Raises Refused where a gate or the check says no, BusFault; the controllers then hold what they held.
+    `data` are those sweeps, `fit` their fit, whose gravity model judges the check motion. The record is kept in any
+    case. Raises Refused if a gate or the check refuses, BusFault; the controllers then hold what they held before.
     """
-    _require(record, arm, store, how)
-    check_holds(fit.goodness.findings, how.accepted)
-    check_gates(record, arm, store, data, how.replaced)
+    _keep(record, arm, store, how)
+    admitted = admit_sweeps(record, arm, store, data, fit.goodness.findings, how)
     beta = None if np.isnan(fit.value("gain")).all() else fit.fit.complete.beta
-    return _write(record, arm, store, beta, how, "sweeps")
+    return _write(lambda link: admitted, record, arm, store, beta, how, "sweeps")
 
 
 def apply_field(
@@ -68,35 +71,110 @@ def apply_field(
     how: Apply,
 ) -> tuple[str, ...]:
     """The same for a record of `armlink recalibrate`, from slow rows."""
-    _require(record, arm, store, how)
-    check_bounds(record, arm)
-    old = store.current(CalibrationRecord, arm)
-    if old is not None:
-        check_change(record, old, past_changes(store, arm), arm, how.replaced)
-        check_field_heldout(rows, fit, old)
-    return _write(record, arm, store, beta, how, "slow motion")
+    _keep(record, arm, store, how)
+    admitted = admit(record, arm, store, how.replaced)
+    if admitted.before is not None:
+        _refuse_worse(arm, admitted.before, *heldout_errors(rows, fit, admitted.before))
+    return _write(lambda link: admitted, record, arm, store, beta, how, "slow motion")
 
 
-def _require(record: CalibrationRecord, arm: ArmFile, store: RecordStore, how: Apply) -> None:
-    """Keep the record; raise Refused where there is nothing to write, BadInput on an unknown joint."""
-    for option, joints in (("--replaced", how.replaced), ("--accept", how.accepted)):
-        for unknown in sorted(set(joints) - set(arm.joint_names)):
-            raise BadInput(f"{option} {unknown}: no such joint; the arm has {', '.join(arm.joint_names)}")
+def apply_rollback(
+    record: CalibrationRecord, arm: ArmFile, store: RecordStore, how: Apply, reason: str
+) -> tuple[str, ...]:
+    """Write an earlier record to the controllers and make it current again; returns the joints written.
+
+    Its only gate is the distance from what the controllers hold. Raises Refused, BusFault.
+    """
+    gravity = store.current(GravityRecord, arm)
+    beta = None if gravity is None else np.array(gravity.beta)
+
+    def gate(link: ArmDriver) -> Admitted:
+        held = {joint: link.read_calibration(joint) for joint in range(link.n)}
+        return admit_rollback(record, arm, store, held, how.replaced)
+
+    _check_names(arm, how)
+    return _write(gate, record, arm, store, beta, how, reason)
+
+
+def admit_sweeps(
+    record: CalibrationRecord,
+    arm: ArmFile,
+    store: RecordStore,
+    data: Sequence[SweepData],
+    findings: Sequence[Finding],
+    how: Apply,
+) -> Admitted:
+    """The gates of a record from sweeps: the model holds, bounds, change, held-out data; raises GateRefused."""
+    check_holds(findings, how.accepted)
+    admitted = admit(record, arm, store, how.replaced)
+    if admitted.before is not None and not how.replaced:
+        check_heldout(record, admitted.before, arm, data, store.current(GravityRecord, arm))
+    return admitted
+
+
+def check_holds(findings: Sequence[Finding], accepted: Sequence[str] = ()) -> None:
+    """Raise GateRefused if the fit found that the sensor model does not hold on a joint that was not `accepted` so."""
+    broken = next((each for each in findings if each.breaks_model and each.joint not in accepted), None)
+    if broken is not None:
+        why = broken.text.removeprefix(f"{broken.joint}: ").rstrip(".")
+        raise GateRefused(Refusal.MODEL, broken.joint, why=why)
+
+
+def check_heldout(
+    new: CalibrationRecord,
+    old: CalibrationRecord,
+    arm: ArmFile,
+    data: Sequence[SweepData],
+    gravity: GravityRecord | None = None,
+) -> None:
+    """Raise GateRefused if held-out readings of a joint are predicted worse than by the old record.
+
+    New gains, offsets and mass moments are estimated from the other steps; the old record's gains and offsets are
+    fixed, and so are the mass moments of `gravity`; without it those are estimated too.
+    """
+    rows = sweep_readings([each.require(arm) for each in data])
+    beta = None if gravity is None else np.array(gravity.require(arm).beta)
+    fresh = heldout_scores(new, arm, rows, refit=True)
+    _refuse_worse(arm, old, fresh, heldout_scores(old, arm, rows, refit=False, beta=beta))
+
+
+def _refuse_worse(arm: ArmFile, old: CalibrationRecord, new_errors: Array, old_errors: Array) -> None:
+    worse = worse_joint(new_errors, old_errors)
+    if worse is not None:
+        raise GateRefused(Refusal.HELD_OUT, arm.joint_names[worse[0]], ratio=worse[1], record=old.id)
+
+
+def _keep(record: CalibrationRecord, arm: ArmFile, store: RecordStore, how: Apply) -> None:
+    """Keep the record; raise Refused if there is nothing to write, BadInput on an unknown joint."""
+    _check_names(arm, how)
     store.add(record.require(arm))
     if all(joint.offset is None for joint in record.joints):
         raise Refused("--apply: no joint has a gain or an offset, so nothing is written")
 
 
+def _check_names(arm: ArmFile, how: Apply) -> None:
+    for option, joints in (("--replaced", how.replaced), ("--accept", how.accepted)):
+        for unknown in sorted(set(joints) - set(arm.joint_names)):
+            raise BadInput(f"{option} {unknown}: no such joint; the arm has {', '.join(arm.joint_names)}")
+
+
 def _write(
-    record: CalibrationRecord, arm: ArmFile, store: RecordStore, beta: Array | None, how: Apply, source: str
+    gate: Callable[[ArmDriver], Admitted],
+    record: CalibrationRecord,
+    arm: ArmFile,
+    store: RecordStore,
+    beta: Array | None,
+    how: Apply,
+    reason: str,
 ) -> tuple[str, ...]:
     exchanged = f"; sensor exchanged: {', '.join(how.replaced)}" if how.replaced else ""
-    with Link.open(arm, how.bus) as link:
+    with open_arm(arm, how.bus) as link:
         link.start()
-        mend(arm, store, link)
+        recover(arm, store, link)
+        admitted = gate(link)
         motion = CheckMotion(link, arm, record, beta) if how.check else None
         if motion is not None:
             link.enable()
             motion.before()
-        after = None if motion is None else motion.after
-        return install(record, arm, store, link, by=how.by, reason=source + exchanged, check=after, flash=how.flash)
+        check = None if motion is None else motion.after
+        return install(admitted, store, link, by=how.by, reason=reason + exchanged, check=check, flash=how.flash)

@@ -1,16 +1,16 @@
-"""The check after a calibration was written: a small motion before and after, and what is worse afterwards.
+"""Check of a write: the same small motion before and after it, and whether the readings are worse afterwards.
 
-Each joint goes at most `AMPLITUDE` from where it stands, all stay `MARGIN` from their stops, and the arm returns to
-where it was. Two things are judged: whether every controller now sends what its new pair makes of the old readings,
-and, where there is a gravity model, whether readings fit it worse than before.
+Each joint moves at most `AMPLITUDE` from its present position, stays `MARGIN` off its stops, and returns. Two things
+are judged: whether every controller now sends the old readings converted by its new calibration, and, if there is a
+gravity model, whether the readings fit it worse than before.
 """
 
 import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
-from armlink.link.link import Link
 from armlink.link.types import Calibration
+from armlink.loop.driver import ArmDriver
 from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
@@ -20,7 +20,7 @@ from calib.records.records import Array, CalibrationRecord
 from gcomp.gravity.torque import gravity_torque
 
 AMPLITUDE = 0.2
-"""Largest way of a joint from where it stands [rad]."""
+"""Largest excursion of a joint [rad]."""
 MARGIN = 0.1
 """Distance kept from the stops [rad]; a joint nearer to one moves away from it."""
 SPEED = 0.3
@@ -28,18 +28,19 @@ SPEED = 0.3
 ACCELERATION = 1.0
 """[rad/s²]"""
 POSES = 4
+"""Two patterns of signs, each both ways."""
 FLOOR = 0.004
-"""Difference of readings or of RMS that does not count, as a share of rated torque: friction of the drives' servo that
-holds a joint a little elsewhere the second time, and the torque noise."""
+"""Difference of readings or of RMS that does not count, as a share of rated torque: twice the torque noise of the
+simulated arm (0.2 %), as the servo's friction holds a joint a little off the first position the second time."""
 WORSE = 1.1
-"""RMS against the model afterwards over before from which on it is worse, beside the floor."""
+"""Ratio of RMS against the model, after over before, above which the fit is worse if the FLOOR is exceeded too."""
 
 
 class CheckMotion:
     """The same small motion before and after a write; the link must have been enabled."""
 
-    def __init__(self, link: Link, arm: ArmFile, record: CalibrationRecord, beta: Array | None) -> None:
-        """Where the arm stands now is its middle; `beta` (2n,) [kg·m] is None where no gravity model is known."""
+    def __init__(self, link: ArmDriver, arm: ArmFile, record: CalibrationRecord, beta: Array | None) -> None:
+        """The motion is around the arm's present pose; `beta` (2n,) [kg·m] is None if no gravity model is known."""
         self._link, self._arm, self._record, self._beta = link, arm, record, beta
         self._limits, self._names = Limits.of(arm), arm.joint_names
         self._installed: list[Calibration] = []
@@ -47,14 +48,14 @@ class CheckMotion:
         self._poses: Array = np.empty((0, link.n))
 
     def before(self) -> None:
-        """Make the motion and keep its readings; raises Refused where the arm cannot move, BusFault."""
+        """Make the motion and keep its readings; raises Refused if the arm cannot move, BusFault."""
         self._installed = [self._link.read_calibration(joint) for joint in range(self._link.n)]
         mover = self._mover()
         self._poses = check_poses(mover.position, self._limits)
         self._before = self._run(mover)
 
     def after(self) -> str | None:
-        """Make it again: what is worse now, None where nothing is; raises Refused, BusFault."""
+        """Make it again; a complaint if something is worse now, else None. Raises Refused, BusFault."""
         assert self._before
         old = self._installed
         new = [self._link.read_calibration(joint) for joint in range(self._link.n)]
@@ -81,13 +82,15 @@ class CheckMotion:
     def _not_converted(
         self, readings: list[StaticReading], old: list[Calibration], new: list[Calibration]
     ) -> str | None:
-        """Whether some controller does not send what its new pair makes of the old reading."""
+        """A complaint about a controller that does not send the old reading converted by its new calibration."""
         before, after = stack(self._before, "torque"), stack(readings, "torque")
         for j, name in enumerate(self._names):
-            expected = (before[:, j] * old[j].gain + old[j].offset - new[j].offset) / new[j].gain
+            expected = new[j].invert(old[j].apply(before[:, j]))
             away = float(np.mean(after[:, j] - expected))
             if abs(away) > FLOOR * self._limits.rated[j]:
-                return f"{name}: sends {away:+.3f} N·m more than its new pair makes of the same readings"
+                return (
+                    f"{name}: its readings differ by {away:+.3f} N·m from the old ones converted by its new calibration"
+                )
         return None
 
     def _fits_worse(self, readings: list[StaticReading]) -> str | None:
@@ -101,8 +104,7 @@ class CheckMotion:
         return f"{self._names[j]}: in the check motion {after[j]:.3f} N·m RMS against the model, {before[j]:.3f} before"
 
     def _rms(self, readings: list[StaticReading], beta: Array) -> Array:
-        record = self._record
-        q = stack(readings, "position") * record.values("position_gain", 1.0) + record.values("position_offset", 0.0)
+        q = self._record.angle(stack(readings, "position"))
         residual: Array = stack(readings, "torque") - gravity_torque(gcomp_arm(self._arm), beta, q)
         rms: Array = np.sqrt(np.mean(residual**2, axis=0))
         return rms

@@ -1,4 +1,4 @@
-"""The cause test: which one effect explains a window's torque residual, if any does (theory.md section 6)."""
+"""The cause test: which single effect explains a window's torque residual, if any (docs/theory.md, section 6)."""
 
 from dataclasses import dataclass, field
 from itertools import combinations, pairwise, product
@@ -7,27 +7,27 @@ import numpy as np
 
 from calib.observer.config import ObserverConfig
 from calib.observer.effect_dictionary import DRIFT, Entry, Window, class_of, dictionary, kin
-from calib.observer.gravity_belief import ModelBelief
+from calib.observer.gravity_belief import GravityBelief
 from calib.records.records import Array
 from gcomp.gravity.torque import gravity_levers
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the window says. `values` and `covariance` are the parameters of the winning entry."""
+    """Result of one test. `values` and `covariance` are the parameters of the winning entry."""
 
     cause: str
     """none, unknown, ambiguous, temperature (several zeros at once) or the winning entry's cause."""
     joint: int | None
-    """Index of the joint, None where it concerns the arm."""
+    """Index of the joint, None if it concerns the whole arm."""
     confidence: float
-    """Share of the winner among all classes, exp(−BIC/2) weighted; for unknown and ambiguous that of the best entry."""
+    """Weight exp(−BIC/2) of the winner among all classes; for unknown and ambiguous that of the best entry."""
     values: Array
     covariance: Array
     evidence: dict[str, float] = field(default_factory=dict)
     """BIC of the best entry of each class above the best one; `misfit` of the winner in standard deviations."""
     rivals: tuple[str, ...] = ()
-    """Classes that fit as well, where ambiguous."""
+    """Classes that fit as well, if ambiguous."""
     beside: int | None = None
     """Another joint whose sensor drifts at the same time."""
 
@@ -56,10 +56,10 @@ class _Fit:
 
 
 class CauseTest:
-    """The dictionary fitted to one window, the model's error marginalised: covariance σ²I + Y Cov(β) Yᵀ + H Σ_q Hᵀ."""
+    """The dictionary fitted to one window, with model error marginalised: covariance σ²I + Y Cov(β) Yᵀ + H Σ_q Hᵀ."""
 
-    def __init__(self, belief: ModelBelief, window: Window, sigma: Array, config: ObserverConfig) -> None:
-        """sigma (n,) [N·m]: standard deviation of one row."""
+    def __init__(self, belief: GravityBelief, window: Window, sigma: Array, config: ObserverConfig) -> None:
+        """sigma (n,) [N·m]: standard deviation of one row's torque."""
         self.belief, self.window, self._config = belief, window, config
         residual, nuisance = belief.residual(window.position, window.torque, config.position_std)
         noise = np.tile(sigma, len(window.position))
@@ -67,14 +67,14 @@ class CauseTest:
         covariance[np.diag_indices_from(covariance)] += noise**2
         self.entries = list(dictionary(belief.arm, belief.beta, window))
         stacked = np.column_stack([residual.ravel(), *(entry.columns for entry in self.entries)])
-        white: Array = np.linalg.solve(np.linalg.cholesky(covariance), stacked)  # scipy would take longer to load
+        white: Array = np.linalg.solve(np.linalg.cholesky(covariance), stacked)  # scipy takes longer to load
         self._white: Array = white[:, 0]
         ends = np.cumsum([1, *(entry.columns.shape[1] for entry in self.entries)])
         self._columns: list[Array] = [white[:, start:end] for start, end in pairwise(ends)]
         self.chi2_none = float(self._white @ self._white)
 
     def verdict(self) -> Verdict:
-        """Which class wins, and whether it is decided."""
+        """The winning class, or why none wins."""
         fits = sorted(map(self._fit, range(len(self.entries))), key=lambda fit: fit.bic)
         best, config = fits[0], self._config
         classes = {"none": self.chi2_none}
@@ -107,7 +107,7 @@ class CauseTest:
         return answer(winner.cause, best, name)
 
     def _fit(self, *indices: int) -> _Fit:
-        """Generalised least squares of entries together; columns that these poses do not tell apart never win."""
+        """Generalised least squares of entries together; columns that are collinear at these poses never win."""
         columns = np.hstack([self._columns[index] for index in indices])
         entries = [self.entries[index] for index in indices]
         count = columns.shape[1]
@@ -125,9 +125,9 @@ class CauseTest:
         return _Fit(entries[0], chi2 + price * np.log(len(self._white)), chi2, back @ explained, back @ back.T)
 
     def _two_drifts(self) -> Verdict | None:
-        """Two joints that drift at once, where that alone explains the window; else None.
+        """Two joints that drift at once, if that alone explains the window; else None.
 
-        Competes with one joint's drift beside an effect on the whole arm: a payload picked up meanwhile, say.
+        Competes with the drift of one joint together with an effect on the whole arm, such as a payload picked up.
         """
         whole = [index for index, entry in enumerate(self.entries) if entry.joint is None]
         drifts = [index for index, entry in enumerate(self.entries) if entry.cause == "drift"]
@@ -147,11 +147,11 @@ class CauseTest:
         return Verdict("drift", first, confidence, fit.values, fit.covariance, evidence, beside=second)
 
     def _weighs(self, payload: _Fit) -> bool:
-        """Whether a payload's mass can be: positive, or what the model believes to be carried taken off."""
+        """Whether a payload's mass is possible: positive, or no more taken off than the model carries as a tool."""
         return bool(payload.values[0] > min(0.0, -1.2 * self.belief.mass))
 
     def _all_zeros(self) -> Verdict | None:
-        """The zeros of several sensors moved together, where that alone explains the window: as temperature does it."""
+        """The zeros of several sensors moved together, as temperature moves them, if that alone explains the window."""
         zeros = [self._index("offset", joint) for joint in range(self.belief.arm.n)]
         fit = self._fit(*zeros)
         misfit = self._misfit(fit.chi2, len(zeros))
@@ -160,9 +160,9 @@ class CauseTest:
         return Verdict("temperature", None, 1.0, fit.values, fit.covariance, {"misfit": misfit})
 
     def drift(self, joint: int, cause: str, beside: int | None = None) -> tuple[Array, Array]:
-        """Gain and offset change of a joint (2,), as `cause` (gain, offset or drift) has it, and covariance (2, 2).
+        """Change of a joint's gain and offset (2,) under `cause` (gain, offset or drift), and covariance (2, 2).
 
-        Where the joint `beside` drifts too, both are fitted together.
+        If the joint `beside` drifts too, both are fitted together.
         """
         also = [] if beside is None else [self._index("drift", beside)]
         fit = self._fit(self._index(cause, joint), *also)
@@ -173,12 +173,12 @@ class CauseTest:
         return values, covariance
 
     def loss(self, joint: int, simple: str, full: str, beside: int | None = None) -> float:
-        """How much worse (BIC) the drift `simple` of a joint explains the window than `full` (gain, offset, drift)."""
+        """BIC of a joint's drift `simple` above that of `full` (each gain, offset or drift)."""
         also = [] if beside is None else [self._index("drift", beside)]
         return self._fit(self._index(simple, joint), *also).bic - self._fit(self._index(full, joint), *also).bic
 
     def lever_share(self, joint: int) -> float:
-        """Largest Γ_j/g that the window reached."""
+        """Largest Γ_j/g in the window: gravity's lever on the joint as a share of g."""
         levers = gravity_levers(self.belief.arm, self.window.position)[:, joint]
         return float(levers.max() / np.linalg.norm(self.belief.arm.gravity))
 

@@ -1,5 +1,6 @@
-"""The check after a recalibration: at the arm's next rests, do readings fit the model worse than with the old pair?"""
+"""The check after a recalibration: at the arm's next rests, does the model fit worse than with the old calibration?"""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,58 +15,65 @@ from calib.records.records import Array, CalibrationRecord, GravityRecord
 from gcomp.gravity.torque import gravity_torque
 
 ROWS = 12
-"""Rests at other poses after which the check decides."""
+"""Rests at other poses after which the check decides. An RMS of so few is known to ± 20 % (1/√(2 · 12)), but both RMS
+are of the same rests."""
 WORSE = 1.1
-"""RMS with the new pair over RMS with the old one from which on it is worse, beside the floor."""
+"""RMS with the new calibration over RMS with the old one from which on it is worse, beside the floor."""
 FLOOR = 0.0005
-"""Difference in RMS that does not count, as a share of rated torque: half of what one rest's average scatters."""
+"""Difference in RMS that does not count, as a share of rated torque: half of the scatter of one rest's average."""
 
 
 @dataclass(frozen=True)
 class Checked:
-    """What the check found."""
+    """Outcome of the check."""
 
     verdict: Literal["kept", "worse"]
     joint: int
+    """Joint with the largest increase of RMS, or the smallest decrease."""
     why: str
-    """RMS against the model with the old and the new pair, in words."""
+    """RMS against the model with the old and the new calibration, in words."""
 
 
 class AfterWrite:
-    """Feed every sample to `handle`; it moves nothing, so the arm's own work must bring it to other poses."""
+    """Check at rests of the arm's own work: feed every sample to `handle`. It moves nothing itself."""
 
     def __init__(
         self,
         arm: ArmFile,
         gravity: GravityRecord,
         record: CalibrationRecord,
-        joint: int,
-        old: Calibration,
-        new: Calibration,
+        old: Mapping[int, Calibration],
+        new: Mapping[int, Calibration],
     ) -> None:
-        """`old` and `new` are what joint's controller held before and holds since (gain, offset [N·m])."""
+        """`old` and `new`: calibrations of the joints written, before and after. Raises Refused for another arm."""
         self._arm, self._beta = gcomp_arm(arm), np.array(gravity.require(arm).beta)
-        self._position = record.values("position_gain", 1.0), record.values("position_offset", 0.0)
+        self._record = record
         self._rests = RestDetector(len(record.joints), ObserverConfig())
-        self._joint, self._old, self._new = joint, old, new
-        self._floor = FLOOR * arm.require_link().joints[joint].rated_torque
-        self._name = record.joints[joint].name
-        self._rows: list[tuple[float, float]] = []
+        self._joints, self._names = list(old), [record.joints[j].name for j in old]
+        self._pairs = [(old[j], new[j]) for j in old]
+        self._floor = FLOOR * arm.require_link().rated_torques[self._joints]
+        self._before: list[list[float]] = []
+        self._after: list[list[float]] = []
 
     def handle(self, t: float, position: Array, torque: Array) -> Checked | None:
         """Take one sample as the controllers send it ((n,), SI); the outcome once there are enough rests, else None."""
         row = self._rests.handle(t, position, torque)
         if row is None:
             return None
-        q = row.position * self._position[0] + self._position[1]
-        model = float(gravity_torque(self._arm, self._beta, q[None])[0, self._joint])
-        sent, old, new = float(row.torque[self._joint]), self._old, self._new
-        as_before = (sent * new.gain + new.offset - old.offset) / old.gain
-        self._rows.append((as_before - model, sent - model))
-        return self._decide() if len(self._rows) >= ROWS else None
+        model = gravity_torque(self._arm, self._beta, self._record.angle(row.position)[None])[0, self._joints].tolist()
+        sent = row.torque[self._joints].tolist()
+        as_before = [old.invert(new.apply(now)) for (old, new), now in zip(self._pairs, sent, strict=True)]
+        self._before.append([value - at for value, at in zip(as_before, model, strict=True)])
+        self._after.append([value - at for value, at in zip(sent, model, strict=True)])
+        return self._decide() if len(self._after) >= ROWS else None
 
     def _decide(self) -> Checked:
-        before, after = (float(np.sqrt(np.mean(np.square(column)))) for column in zip(*self._rows, strict=True))
-        worse = after > WORSE * before and after - before > self._floor
-        why = f"{self._name}: RMS against the model {after:.3f} N·m at {ROWS} rests, {before:.3f} with the old pair"
-        return Checked("worse" if worse else "kept", self._joint, why)
+        before, after = (np.sqrt(np.mean(np.square(rows), axis=0)) for rows in (self._before, self._after))
+        worse = (after > WORSE * before) & (after - before > self._floor)
+        counted = worse if worse.any() else np.ones(len(worse), dtype=bool)
+        k = int(np.argmax(np.where(counted, (after - before) / self._floor, -np.inf)))
+        why = (
+            f"{self._names[k]}: RMS against the model {after[k]:.3f} N·m at {ROWS} rests, {before[k]:.3f} with the old"
+            " pair"
+        )
+        return Checked("worse" if worse.any() else "kept", self._joints[k], why)

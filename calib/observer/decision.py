@@ -1,9 +1,11 @@
-"""From a drift verdict to what may be written: the rules at the end of theory.md section 6."""
+"""From a drift verdict to a finding that may be written: the rules at the end of docs/theory.md, section 6."""
 
 from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 
+from armlink.torque_calibration import TorqueCalibration
 from calib.motion.static_reading import StaticReading
 from calib.observer.cause_test import CauseTest, Verdict
 from calib.observer.config import ObserverConfig
@@ -12,26 +14,48 @@ from calib.records.records import Array
 
 @dataclass(frozen=True)
 class Finding:
-    """How one joint's sensor changed against what is installed, and why that may not be written, if so."""
+    """Change of one joint's sensor against the installed calibration, and the reasons against writing it, if any."""
 
     joint: int
     cause: str
     """gain, offset or drift (both)."""
     gain: float
-    """Relative gain: 1 where it has not changed."""
+    """Relative gain: 1 if it has not changed."""
     offset: float
     """[N·m], of the reading as installed."""
     covariance: Array
-    """(2, 2) of gain and offset; 0 where not estimated."""
+    """Of gain and offset (2, 2); 0 for what is not estimated."""
     rows: int
     confidence: float
     refused: tuple[str, ...] = ()
+
+    @property
+    def change(self) -> TorqueCalibration[float]:
+        """What the sensor as installed does to a torque: it reads gain · τ + offset instead of τ."""
+        return TorqueCalibration(self.gain, self.offset)
 
     @property
     def std(self) -> tuple[float, float]:
         """Standard deviations of gain and offset [N·m]."""
         gain, offset = np.sqrt(np.diag(self.covariance))
         return float(gain), float(offset)
+
+    def as_json(self) -> dict[str, Any]:
+        """JSON values, without the reasons for a refusal."""
+        return {
+            "joint": int(self.joint),
+            "cause": self.cause,
+            "gain": float(self.gain),
+            "offset": float(self.offset),
+            "rows": int(self.rows),
+            "confidence": float(self.confidence),
+            "covariance": self.covariance.tolist(),
+        }
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> Self:
+        """The finding that `as_json` wrote."""
+        return cls(**{**values, "covariance": np.array(values["covariance"])})
 
 
 @dataclass(frozen=True)
@@ -46,7 +70,7 @@ class Agreeing:
 def agreed(first: CauseTest, second: CauseTest, joint: int, beside: int | None, limit: float) -> bool:
     """Whether two disjoint windows find the same gain and offset change of a joint: χ²₂ of the difference.
 
-    Where gravity does not load the joint, the offset alone is compared. `beside`: a joint that drifts at the same time.
+    If gravity does not load the joint, only the offset is compared. `beside`: a joint that drifts at the same time.
     """
     (a, cov_a), (b, cov_b) = (window.drift(joint, "drift", beside) for window in (first, second))
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
@@ -56,20 +80,20 @@ def agreed(first: CauseTest, second: CauseTest, joint: int, beside: int | None, 
 
 
 def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig) -> Finding:
-    """The finding for one joint of a drift verdict on all rows that agree, with every rule that forbids to write it."""
+    """The finding for one joint of a drift verdict on all rows that agree, with every rule that forbids a write."""
     cause, refused = verdict.cause, []
     beside = verdict.other(joint)
     change, covariance = test.drift(joint, cause, beside)
     weak_lever = test.lever_share(joint) < config.lever_share
     if cause != "offset" and (weak_lever or covariance[0, 0] > config.gain_std**2):
-        told = f"gain known to {np.sqrt(covariance[0, 0]):.2%} only, {config.gain_std:.2%} is asked: sweep this joint"
+        std = f"gain known to {np.sqrt(covariance[0, 0]):.2%} only, {config.gain_std:.2%} is required: sweep this joint"
         if test.loss(joint, "offset", cause, beside) < config.evidence:
-            cause = "offset"  # as well explained without the gain, which stays frozen
+            cause = "offset"  # explained as well without the gain, which keeps its value
             change, covariance = test.drift(joint, cause, beside)
         else:
-            refused.append("gravity's lever too short for a gain" if weak_lever else told)
+            refused.append("gravity's lever too short for a gain" if weak_lever else std)
     if covariance[1, 1] > config.offset_std**2:
-        refused.append(f"offset known to {np.sqrt(covariance[1, 1]):.3f} N·m only, {config.offset_std} is asked")
+        refused.append(f"offset known to {np.sqrt(covariance[1, 1]):.3f} N·m only, {config.offset_std} is required")
     if _distance(change, covariance) < config.significance:
         refused.append(f"change is less than {config.significance:g} standard deviations")
     if len(set(np.sign(test.window.direction[:, joint])) - {0.0}) < 2:
@@ -91,7 +115,7 @@ def _distance(change: Array, covariance: Array) -> float:
 
 
 def _alike(test: CauseTest, joint: int, significance: float) -> int:
-    """How many joints, each taken alone, changed their gain by a factor that cannot be told from this joint's."""
+    """Number of joints that, each fitted alone, changed their gain by the same factor as this joint within noise."""
     fits = [test.drift(j, "gain") for j in range(test.belief.arm.n)]
     changes = np.array([change[0] for change, _ in fits])
     stds = np.array([np.sqrt(covariance[0, 0]) for _, covariance in fits])

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.motion.static_reading import StaticReading
-from calib.records.records import Array
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
+from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_regressor, gravity_stiffness
 
 CAUSES = {
@@ -28,7 +28,7 @@ DRIFT = ("gain", "offset", "drift")
 
 @dataclass(frozen=True)
 class Window:
-    """K rows: true-angle positions (K, n) [rad], torque readings as installed (K, n) [N·m], directions (K, n)."""
+    """K rows: true angles (K, n) [rad], torque readings as installed (K, n) [N·m], directions of approach (K, n)."""
 
     position: Array
     torque: Array
@@ -48,11 +48,11 @@ class Entry:
     cause: str
     """A key of CAUSES."""
     joint: int | None
-    """Index of the joint, None where it concerns the arm."""
+    """Index of the joint; None if it concerns the whole arm."""
     columns: Array
     """Change of the torque readings per unit of each parameter, (K·n, p)."""
     price: int | None = None
-    """Parameters that it is charged for in the BIC; by default those that it has."""
+    """Parameters charged in the BIC; by default the number of columns."""
 
     def contains(self, other: "Entry") -> bool:
         """Whether the other is a special case of this one: fewer of its effects, at the same joint."""
@@ -60,7 +60,7 @@ class Entry:
 
 
 def dictionary(arm: Arm, beta: Array, window: Window) -> Iterator[Entry]:
-    """Every entry of the dictionary for the poses of a window; beta (2n,) [kg·m] is the model believed."""
+    """Every entry of the dictionary for the poses of a window; beta (2n,) [kg·m] is the present gravity model."""
     q, n = window.position, arm.n
     regressor = gravity_regressor(arm, q)
     torque = regressor @ beta
@@ -86,7 +86,7 @@ def dictionary(arm: Arm, beta: Array, window: Window) -> Iterator[Entry]:
     across = np.linalg.svd(arm.gravity[None])[2][1:] * np.linalg.norm(arm.gravity)
     tilted = [gravity_regressor(replace(arm, gravity=direction), q) @ beta for direction in across]
     yield Entry("tilt", None, np.stack(tilted, axis=-1).reshape(-1, 2))
-    # a payload explains nine tenths of a common scale and is far more frequent: same price, so that it wins
+    # a payload explains nine tenths of a common scale and is far more frequent: at the same price it wins
     yield Entry("scale", None, torque.reshape(-1, 1), price=4)
 
 
@@ -97,5 +97,5 @@ def class_of(entry: Entry) -> str:
 
 
 def kin(entry: Entry, winner: Entry) -> bool:
-    """Whether an entry is no rival: same class, or the winner is a special case of it."""
+    """Whether an entry is not a rival: it is of the same class, or the winner is a special case of it."""
     return class_of(entry) == class_of(winner) or entry.contains(winner)

@@ -1,4 +1,4 @@
-"""What the observer says: events and estimates."""
+"""The observer's events."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -7,41 +7,27 @@ import numpy as np
 
 from calib.observer.cause_test import Verdict
 from calib.observer.decision import Finding
-from calib.records.records import Array
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something that the observer has to say. `kind`: alarm, outliers, verdict, proposal or undecided."""
+    """One event. `kind`: alarm, outliers, verdict, proposal or undecided."""
 
     t: float
     kind: str
     joint: str | None
     evidence: dict[str, Any] = field(default_factory=dict)
     finding: Finding | None = None
-    """What to write, for a proposal."""
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """Gain and offset of every joint against the installed calibration, with standard deviations; (n,) each."""
-
-    gain: Array
-    gain_std: Array
-    offset: Array
-    """[N·m]"""
-    offset_std: Array
-    accepted: Array
-    """Rows that went into each."""
+    """The change to write, for a proposal."""
 
 
 def verdict_evidence(verdict: Verdict, names: tuple[str, ...]) -> dict[str, Any]:
-    """A verdict as an event shows it: cause, confidence, how far behind the other classes are, parameters.
+    """A verdict as the evidence of an event: cause, confidence, BIC of the other classes, parameters.
 
     A payload has `mass` [kg] and `com`, its centre of mass in the last link's bar frame [m].
     """
     beside: dict[str, Any] = {} if verdict.beside is None else {"beside": names[verdict.beside]}
-    if verdict.cause in ("payload", "tool"):  # parameters: mass, and mass times its place
+    if verdict.cause in ("payload", "tool"):  # parameters: mass and first moment
         mass = float(verdict.values[0])
         beside = {"mass": mass, "com": (verdict.values[1:] / mass).tolist()}
     return {

@@ -1,9 +1,10 @@
-"""The observer: watches ordinary motion and says when a joint's torque sensor has drifted, and by how much.
+"""The observer: watches ordinary motion and reports when a joint's torque sensor has drifted, and by how much.
 
-Pure: samples in, events out; no bus, clock, file or thread. Readings are those of the installed calibration, so that
-every estimate is relative to it: reading = gain·τ + offset with gain 1 and offset 0 while nothing has drifted.
+Pure: samples in, events out; no bus, clock, file or thread. Readings are those of the installed calibration, and every
+estimate is relative to it: reading = gain·τ + offset, with gain 1 and offset 0 while nothing has drifted.
 """
 
+from copy import copy
 from dataclasses import replace
 from typing import Any
 
@@ -12,20 +13,23 @@ import numpy as np
 from calib.motion.static_reading import StaticReading
 from calib.observer.cause_test import CauseTest, Verdict
 from calib.observer.config import ObserverConfig
-from calib.observer.cusum import Cusum
 from calib.observer.decision import Agreeing, Finding, agreed, decide
-from calib.observer.effect_dictionary import Window
-from calib.observer.events import Estimate, Event, verdict_evidence
-from calib.observer.gravity_belief import ModelBelief
-from calib.observer.pose_memory import Places
+from calib.observer.events import Event, verdict_evidence
+from calib.observer.gravity_belief import GravityBelief
+from calib.observer.investigation import Investigation
 from calib.observer.rest_detector import RestDetector
-from calib.observer.sensor_filter import SensorFilter
-from calib.records.records import Array, CalibrationRecord, GravityRecord
+from calib.observer.tracking.sensor_filter import Estimate
+from calib.observer.tracking.tracking import Tracking
+from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arm.arm import Arm
+from gcomp.arrays import Array
+
+SCHEMA = 1
+"""Version of the saved format."""
 
 
 class Observer:
-    """`handle(sample)` → events; `estimate()`; `install(joint)` after a new calibration was written."""
+    """`handle(sample)` → events; `estimate()`; `install(finding)` after a new calibration was written."""
 
     def __init__(
         self,
@@ -40,29 +44,26 @@ class Observer:
         """Watch an arm.
 
         beta (2n,) [kg·m] and its covariance (2n, 2n) as the gravity record has them; sigma (n,) [N·m], standard
-        deviation of one averaged torque reading to begin with, which the readings themselves tell afterwards; position
-        gains and offsets (n,) of the calibration record.
+        deviation of one averaged torque reading to begin with, replaced by the measured one; position gains and offsets
+        (n,) of the calibration record.
         """
         self.arm, self.config = arm, config or ObserverConfig()
-        self.belief = ModelBelief(arm, beta, beta_covariance)
-        self.sigma: Array = np.asarray(sigma, dtype=float)
         self._position_gain = np.ones(arm.n) if position_gain is None else position_gain
         self._position_offset = np.zeros(arm.n) if position_offset is None else position_offset
-        self.rows = 0
-        self.held = False
-        """Whether an alarm stands: estimates are held until a verdict."""
-        self.rest = RestDetector(arm.n, self.config)
-        self.filter = SensorFilter(arm.n, self.config)
-        self.cusum = Cusum(arm.n, self.config)
-        self.places = Places(arm.n, self.config.place_size, self.config.places, self.config.place_memory)
-        self.window: list[StaticReading] = []
-        self.fresh = self.repeated = 0
-        self.doubtful = False
-        self.first: Agreeing | None = None
-        self.said: tuple[str, tuple[int, ...]] | None = None
-        self.reasons: tuple[str, ...] = ()
-        self.learnt = self.carrying = 0
+        self._rest = RestDetector(arm.n, self.config)
+        self._tracking = Tracking(GravityBelief(arm, beta, beta_covariance), sigma, self.config)
+        self._investigation = Investigation(arm.n, self.config)
         self._proposed = np.full(arm.n, -np.inf)
+
+    @property
+    def rows(self) -> int:
+        """Rests used."""
+        return self._tracking.rows
+
+    @property
+    def held(self) -> bool:
+        """Whether an alarm is open: estimates are held until a verdict."""
+        return self._investigation.held
 
     @classmethod
     def of_records(
@@ -73,139 +74,135 @@ class Observer:
         rated_torque: Array,
         config: ObserverConfig | None = None,
     ) -> "Observer":
-        """Observer of an arm with these records in force; rated_torque (n,) [N·m] scales the noise assumed at first."""
+        """Observer against these records; rated_torque (n,) [N·m] scales the noise assumed at first."""
         config = config or ObserverConfig()
         sigma = config.noise_share * np.asarray(rated_torque, dtype=float)
         position = (calibration.values("position_gain", 1.0), calibration.values("position_offset", 0.0))
         return cls(arm, np.array(gravity.beta), np.array(gravity.covariance), sigma, config, *position)
 
     def handle(self, t: float, position: Array, torque: Array) -> list[Event]:
-        """Take one sample: readings (n,) in SI units, NaN where missing; returns what there is to say, if anything."""
-        row = self.rest.handle(t, position, torque)
+        """Take one sample: readings (n,) in SI units, NaN if missing; returns events, usually none."""
+        row = self._rest.handle(t, position, torque)
         return [] if row is None else self.handle_row(row)
 
     def handle_row(self, row: StaticReading) -> list[Event]:
-        """Take one row: what `handle` makes of a stop."""
-        self.rows += 1
-        angle = self._position_gain * row.position + self._position_offset
-        row = replace(row, position=angle)
-        if np.isfinite(row.torque_error).all():
-            weight = 1 / min(self.rows + self.config.noise_rows, self.config.noise_memory)
-            self.sigma = np.sqrt((1 - weight) * self.sigma**2 + weight * row.torque_error**2)
-        events = [] if self.held else self._watch(row)
-        if events:
-            self._start_test()
-            return events
-        if not self._is_new(row):
+        """Take one row: the average over one stop, as the rest detector makes it."""
+        row = replace(row, position=self._angle(row.position))
+        self._tracking.count(row)
+        alarms = [] if self.held else self._tracking.watch(row)
+        if alarms:
+            self._investigation.start()
+            return [self._event(row.t, kind, joint, **evidence) for kind, joint, evidence in alarms]
+        if not self._investigation.add(row):
             return self._repeat(row.t)
-        self.window.append(row)
-        self.fresh += 1
-        if self.fresh < (self.config.window if self.held else self.config.audit_rows):
+        if not self._investigation.is_due():
             return []
-        self.fresh = 0
         return self._test(row.t) if self.held else self._audit(row.t)
 
     def estimate(self) -> Estimate:
-        """Gain and offset of every joint against the installed calibration, as known now."""
-        gain_std, offset_std = np.sqrt(np.diagonal(self.filter.covariance, axis1=1, axis2=2)).T
-        gain, offset = self.filter.state.T.copy()
-        return Estimate(gain, gain_std, offset, offset_std, self.filter.accepted.copy())
+        """Current gain and offset of every joint against the installed calibration."""
+        return self._tracking.filter.estimate()
+
+    def model_torque(self, position: Array) -> Array:
+        """Gravity torque (n,) [N·m] that the observer believes at position readings (n,) [rad]."""
+        torque: Array = self._tracking.belief.torque(self._angle(position)[None])[0]
+        return torque
 
     def install(self, finding: Finding) -> None:
-        """The finding was written to the controller: from now on readings are right again, as far as it was known."""
-        floor = np.diag([self.config.drift_gain**2, self.config.drift_offset**2])
-        self.filter.restart(finding.joint, covariance=finding.covariance + floor)
-        self.places.forget()
+        """The finding was written to the controller: readings are correct again within the finding's uncertainty."""
+        self._tracking.install(finding)
         self._resume()
 
-    def _watch(self, row: StaticReading) -> list[Event]:
-        """Filter and change detection; returns alarms."""
-        q, noise = row.position, self.sigma**2
-        torque = self.belief.torque(q[None])[0]
-        of_model = self.belief.torque_variance(q, self.config.position_std)
-        expected, left = self.places.expected(q, of_model, noise)
-        alarms = self.cusum.handle(row.torque - torque - expected, torque, noise + left)
-        if alarms:
-            return [self._event(row.t, "alarm", joint, channel=channel) for joint, channel in alarms]
-        if self.places.seen(q) < self.config.place_rows:
-            self.filter.handle(row.torque, torque, noise + of_model)
-        self.places.add(q, row.torque - torque)
-        over = np.flatnonzero(self.filter.rejected >= self.config.outliers_in_a_row)
-        return [self._event(row.t, "outliers", int(joint), rows=self.config.outliers_in_a_row) for joint in over]
+    def save(self) -> dict[str, Any]:
+        """State of all parts as JSON values, without times, since clocks restart with the machine."""
+        return {"schema": SCHEMA} | self._tracking.save() | self._rest.save() | self._investigation.save()
+
+    def restore(self, values: dict[str, Any]) -> bool:
+        """Continue from saved values of the same arm and records; False, and nothing changed, if they do not fit."""
+        tracking, rest, investigation = copy(self._tracking), copy(self._rest), copy(self._investigation)
+        if values.get("schema") != SCHEMA or not (tracking.restore(values) and rest.restore(values)):
+            return False
+        if not investigation.restore(values, tracking.cause_test):
+            return False
+        self._tracking, self._rest, self._investigation = tracking, rest, investigation
+        return True
+
+    def _angle(self, position: Array) -> Array:
+        """True angles of position readings."""
+        return np.asarray(self._position_gain * position + self._position_offset)
 
     def _audit(self, t: float) -> list[Event]:
-        """No alarm stands: test the last rows all the same, for what is too small or too slow for an alarm."""
-        del self.window[: -self.config.longest_window]
-        verdict = self.cause_test(self.window).verdict()
+        """No alarm is open: test the last rows for effects that are too small or too slow for an alarm."""
+        window = self._investigation.window
+        del window[: -self.config.longest_window]
+        verdict = self._tracking.cause_test(window).verdict()
         if verdict.cause == "none":
-            if self.learnt < self.config.baseline_rows:
-                window = Window.of(self.window[-self.config.audit_rows :])
-                self.belief.learn(window.position, window.torque, self.sigma)
-                self.places.forget()
-                self.learnt += self.config.audit_rows
+            if self._tracking.belief.learnt < self.config.baseline_rows:
+                self._tracking.learn(window[-self.config.audit_rows :])
             return []
         if verdict.cause in ("unknown", "ambiguous"):
-            return []  # an alarm will come if it lasts
-        self._start_test()
-        return [self._event(t, "verdict", verdict.joint, **verdict_evidence(verdict, self.arm.names))]
+            return []  # an alarm follows if it lasts
+        self._investigation.start()
+        return [self._verdict(t, verdict)]
 
     def _test(self, t: float) -> list[Event]:
-        """An alarm stands and its window is full: say what it was, and propose where two windows agree on a drift."""
-        test = self.cause_test(self.window)
+        """An alarm is open and its window is full: report the cause; propose once two windows agree on a drift."""
+        state = self._investigation
+        test = self._tracking.cause_test(state.window)
         verdict = test.verdict()
-        if verdict.cause == "ambiguous" and len(self.window) < self.config.longest_window:
-            return []  # more rows may tell
-        window, self.window = self.window, []
-        doubted, self.doubtful = self.doubtful, verdict.cause == "unknown"
-        if self.doubtful and not doubted:
-            return []  # the cause may have changed within this window: one more
+        if verdict.cause == "ambiguous" and len(state.window) < self.config.longest_window:
+            return []  # more rows may decide
+        window, state.window = state.window, []
+        doubted, state.doubtful = state.doubtful, verdict.cause == "unknown"
+        if state.doubtful and not doubted:
+            return []  # the cause may have changed within this window: wait for another one
         if verdict.cause == "none":
             self._resume()
-            return [self._event(t, "verdict", verdict.joint, **verdict_evidence(verdict, self.arm.names))]
+            return [self._verdict(t, verdict)]
         if not verdict.is_drift:
-            self.first = None
-            return self._carried(t, verdict) or self._say(t, verdict)
-        self.carrying = 0
-        return self._say(t, verdict) + self._confirm(t, window, test, verdict)
+            state.first = None
+            return self._carried(t, verdict) or self._report(t, verdict)
+        state.carrying = 0
+        return self._report(t, verdict) + self._confirm(t, window, test, verdict)
 
     def _carried(self, t: float, verdict: Verdict) -> list[Event]:
-        """A payload that stays is a tool, one taken off again was none: the model takes it over, watching goes on."""
-        self.carrying = self.carrying + 1 if verdict.cause == "payload" else 0
-        if not self.carrying:
+        """A payload that stays is a tool: the model takes it over and watching resumes; likewise when it is removed."""
+        state, belief = self._investigation, self._tracking.belief
+        state.carrying = state.carrying + 1 if verdict.cause == "payload" else 0
+        if not state.carrying:
             return []
         mass, std = float(verdict.values[0]), float(np.sqrt(verdict.covariance[0, 0]))
-        off = self.belief.mass > 0 and abs(mass + self.belief.mass) < 0.05 * self.belief.mass + 5 * std
-        if self.carrying < self.config.tool_windows and not off:
+        off = belief.mass > 0 and abs(mass + belief.mass) < 0.05 * belief.mass + 5 * std
+        if state.carrying < self.config.tool_windows and not off:
             return []
-        self.belief.carry(verdict.values, verdict.covariance)
-        self.places.forget()
+        self._tracking.carry(verdict.values, verdict.covariance)
         self._resume()
-        evidence = verdict_evidence(replace(verdict, cause="tool"), self.arm.names)
-        return [self._event(t, "verdict", None, **evidence)]
+        return [self._verdict(t, replace(verdict, cause="tool", joint=None))]
 
     def _confirm(self, t: float, window: list[StaticReading], test: CauseTest, verdict: Verdict) -> list[Event]:
-        """A window says drift: once another one before it agrees, decide on the rows of all that agree."""
-        first, self.first = self.first, Agreeing(window, test, frozenset(verdict.joints))
+        """A window found a drift: once the window before it agrees, decide on the rows of both."""
+        first, agreeing = self._investigation.first, Agreeing(window, test, frozenset(verdict.joints))
+        self._investigation.first = agreeing
         for joint in verdict.joints:
             change, covariance = test.drift(joint, verdict.cause, verdict.other(joint))
-            self.filter.restart(joint, 1 + change[0], change[1], covariance)
-        if first is None or first.joints != self.first.joints:
+            self._tracking.filter.restart(joint, 1 + change[0], change[1], covariance)
+        if first is None or first.joints != agreeing.joints:
             return []
         for joint in verdict.joints:
             if not agreed(first.test, test, joint, verdict.other(joint), self.config.agreement):
                 return self._undecided(t, joint, "two windows disagree: still drifting")
         rows = (first.rows + window)[-self.config.longest_window :]
-        together = self.cause_test(rows)
-        self.first = Agreeing(rows, together, first.joints)
+        together = self._tracking.cause_test(rows)
+        self._investigation.first = Agreeing(rows, together, first.joints)
         verdict = together.verdict()
         if not verdict.is_drift or frozenset(verdict.joints) != first.joints:
             return self._undecided(t, None, "all windows together say something else")
         return [event for joint in verdict.joints for event in self._decide(t, together, verdict, joint)]
 
     def _decide(self, t: float, test: CauseTest, verdict: Verdict, joint: int) -> list[Event]:
-        """The estimate from all rows that agree, as a proposal or with what forbids it."""
+        """The estimate from all rows that agree, as a proposal or with the reasons against one."""
         finding = decide(test, verdict, joint, self.config)
-        self.filter.restart(joint, finding.gain, finding.offset, finding.covariance)
+        self._tracking.filter.restart(joint, finding.gain, finding.offset, finding.covariance)
         if finding.refused:
             return self._undecided(t, joint, *finding.refused)
         if t - self._proposed[joint] < self.config.rest_between_writes:
@@ -215,50 +212,32 @@ class Observer:
         evidence = {"gain": finding.gain, "offset": finding.offset, **std, "rows": finding.rows}
         return [replace(self._event(t, "proposal", joint, **evidence), finding=finding)]
 
-    def cause_test(self, rows: list[StaticReading]) -> CauseTest:
-        """The cause test of these rows, by what is believed now."""
-        return CauseTest(self.belief, Window.of(rows), self.sigma, self.config)
-
-    def _start_test(self) -> None:
-        self._clear()
-        self.held = True
-
     def _resume(self) -> None:
-        self._clear()
-        self.held = False
-        self.cusum.reset()
-
-    def _clear(self) -> None:
-        self.said, self.first, self.doubtful, self.reasons = None, None, False, ()
-        self.window, self.fresh, self.repeated = [], 0, 0
-        self.carrying = 0
-
-    def _is_new(self, row: StaticReading) -> bool:
-        """Whether the window has few enough rows of this place that one more would not only wind it up."""
-        away = [np.abs(kept.position - row.position).max() for kept in self.window]
-        return sum(bool(far < self.config.place_size) for far in away) < self.config.place_rows
+        self._investigation.resume()
+        self._tracking.resume()
 
     def _repeat(self, t: float) -> list[Event]:
-        """One more row of a place that the window knows: too many of them under an alarm, and no test is possible."""
-        self.repeated += self.held
-        if self.repeated < self.config.patience:
+        """A pose that the window has already; too many of them under an alarm make a test impossible."""
+        state = self._investigation
+        state.repeated += self.held
+        if state.repeated < self.config.patience:
             return []
-        self._clear()
+        state.clear()
         return self._undecided(t, None, "too few different poses to tell a cause: sweep, or move more")
 
     def _undecided(self, t: float, joint: int | None, *reasons: str) -> list[Event]:
-        """Why nothing is proposed, once as long as it stays the same."""
-        before, self.reasons = self.reasons, reasons
+        """The reasons why nothing is proposed, reported when they change."""
+        before, self._investigation.reasons = self._investigation.reasons, reasons
         return [] if before == reasons else [self._event(t, "undecided", joint, reasons=list(reasons))]
 
-    def _say(self, t: float, verdict: Verdict) -> list[Event]:
-        """The verdict's event, once as long as it stays the same."""
-        said, self.said = self.said, (verdict.cause, verdict.joints)
-        return (
-            []
-            if said == self.said
-            else [self._event(t, "verdict", verdict.joint, **verdict_evidence(verdict, self.arm.names))]
-        )
+    def _report(self, t: float, verdict: Verdict) -> list[Event]:
+        """The verdict as an event, reported when it changes."""
+        before, now = self._investigation.reported, (verdict.cause, verdict.joints)
+        self._investigation.reported = now
+        return [] if before == now else [self._verdict(t, verdict)]
+
+    def _verdict(self, t: float, verdict: Verdict) -> Event:
+        return self._event(t, "verdict", verdict.joint, **verdict_evidence(verdict, self.arm.names))
 
     def _event(self, t: float, kind: str, joint: int | None, **evidence: Any) -> Event:
         return Event(t, kind, None if joint is None else self.arm.names[joint], evidence)

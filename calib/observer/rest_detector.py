@@ -1,27 +1,33 @@
 """Rest detection: turns samples into rows, one averaged row per stop of the arm."""
 
+from typing import Any
+
 import numpy as np
 
 from calib.motion.static_reading import StaticReading
 from calib.observer.config import ObserverConfig
-from calib.records.records import Array
+from calib.observer.saved_values import UNREADABLE
+from gcomp.arrays import Array, as_array
 
 
 class RestDetector:
-    """Averages position and torque over each rest, which position alone tells: velocity from an encoder is coarse."""
+    """Averages position and torque over each rest.
+
+    Rest is detected from position alone, because velocity derived from an encoder is coarse.
+    """
 
     def __init__(self, n: int, config: ObserverConfig) -> None:
         """n joints."""
         self._config = config
         self._anchor = np.full(n, np.nan)
         self._since, self._last = -np.inf, -np.inf
-        self.left = np.full(n, np.nan)
-        self.direction = np.zeros(n)
+        self._last_stop = np.full(n, np.nan)
+        self._direction = np.zeros(n)
         self._samples: list[tuple[float, Array, Array]] = []
         self._done = False
 
     def handle(self, t: float, position: Array, torque: Array) -> StaticReading | None:
-        """Take one sample (SI, (n,) each, NaN where missing); the row of this rest once it is complete, else None."""
+        """Take one sample (SI, (n,) each, NaN if missing); returns the row of this rest once complete, else None."""
         config = self._config
         if np.isnan(position).any() or np.isnan(torque).any():
             return None
@@ -36,13 +42,29 @@ class RestDetector:
             return None
         return self._complete()
 
+    def save(self) -> dict[str, Any]:
+        """Directions of the last motion and the last stop, as JSON values."""
+        stop = [None if np.isnan(q) else float(q) for q in self._last_stop]
+        return {"direction": self._direction.tolist(), "left": stop}
+
+    def restore(self, values: dict[str, Any]) -> bool:
+        """Continue from saved values; False, and nothing changed, if they do not fit."""
+        shape = self._direction.shape
+        try:
+            direction = as_array("direction", values["direction"], shape)
+            last_stop = as_array("left", [np.nan if q is None else q for q in values["left"]], shape, finite=False)
+        except UNREADABLE:
+            return False
+        self._direction, self._last_stop = direction, last_stop
+        return True
+
     def _restart(self, t: float, position: Array, moved: bool) -> None:
         if moved:
             step = position - self._anchor
-            self.direction = np.where(np.abs(step) > self._config.still_band / 2, np.sign(step), self.direction)
+            self._direction = np.where(np.abs(step) > self._config.still_band / 2, np.sign(step), self._direction)
         self._anchor, self._since = position.copy(), t
         self._samples.clear()
-        away = np.abs(position - self.left).max()
+        away = np.abs(position - self._last_stop).max()
         self._done = self._done and bool(away < self._config.new_pose)
 
     def _complete(self) -> StaticReading:
@@ -51,7 +73,7 @@ class RestDetector:
         half = len(times) // 2
         error = np.abs(torques[:half].mean(axis=0) - torques[half:].mean(axis=0)) / 2
         here: Array = positions.mean(axis=0)
-        self.left, self._done = here, True
+        self._last_stop, self._done = here, True
         return StaticReading.of(
-            float(times.mean()), here, torques.mean(axis=0), self.direction, count=len(times), torque_error=error
+            float(times.mean()), here, torques.mean(axis=0), self._direction, count=len(times), torque_error=error
         )

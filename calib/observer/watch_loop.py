@@ -1,4 +1,4 @@
-"""Watches an arm at work: samples to the observer, findings to recalibration, estimates kept for a report."""
+"""Watches an arm at work: samples to the observer, findings to recalibration, estimates to a report."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ from calib.records.records import Array
 
 
 class Cycling(Protocol):
-    """What watching needs of the link (`armlink.link.link.Link`)."""
+    """The part of the link (`armlink.link.link.Link`) that watching needs."""
 
     def cycle(self, command: Command) -> Sample:
         """One cycle; raises BusFault."""
@@ -22,7 +22,7 @@ class Cycling(Protocol):
 
 @dataclass
 class WatchHistory:
-    """What happened, for reports: estimates once a row, and all events. Times by the samples' clock [s]."""
+    """Estimates once per row, and all events, for reports. Times by the samples' clock [s]."""
 
     t: list[float] = field(default_factory=list)
     gain: list[Array] = field(default_factory=list)
@@ -35,7 +35,7 @@ class WatchHistory:
     recalibrations: list[tuple[float, Recalibration]] = field(default_factory=list)
 
     def first(self, kind: str, joint: str, after: float = 0.0) -> float | None:
-        """Time of the first event of a kind on a joint from `after` on, None where there was none."""
+        """Time of the first event of a kind on a joint from `after` on; None if there was none."""
         times = (event.t for event in self.events if event.kind == kind and event.joint == joint and event.t >= after)
         return next(times, None)
 
@@ -48,10 +48,10 @@ def watch(
     recalibrator: Recalibrator | None = None,
     on_sample: Callable[[Sample, WatchHistory], bool] | None = None,
 ) -> WatchHistory:
-    """Run the arm along position targets (n,) [rad], one a cycle, for so many seconds of its clock, and observe.
+    """Run the arm along position targets (n,) [rad], one per cycle, for `seconds` of its clock, and observe.
 
-    A finding goes to the recalibrator; where that writes it, the observer takes it as installed. `on_sample` sees each
-    sample and ends the watch by returning True. Raises BusFault.
+    Findings go to the recalibrator; the observer takes those that it writes as installed. `on_sample` sees each sample
+    and ends the watch by returning True. Raises BusFault.
     """
     history, end = WatchHistory(), None
     for target in targets:
@@ -89,7 +89,7 @@ def _recalibrate(event: Event, observer: Observer, recalibrator: Recalibrator, h
 
 
 def _check(sample: Sample, observer: Observer, recalibrator: Recalibrator, history: WatchHistory) -> None:
-    """After a recalibration: what made the readings worse is taken back."""
+    """After a recalibration: take it back if it made the readings worse."""
     checked = recalibrator.sample(sample.t, sample.position, sample.torque)
     if checked is None or checked.verdict == "kept":
         return

@@ -1,16 +1,16 @@
-"""Small files that are written whole or not at all."""
+"""Atomic writes of small text files."""
 
 import os
 from pathlib import Path
 
 
 def part_of(path: Path) -> Path:
-    """What the file is called while it is being written."""
+    """Path of the file while it is being written."""
     return path.with_name(path.name + ".part")
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write a text file that has its name only once it is on disk; raises OSError."""
+    """Write a text file atomically: it gets its name once it is on disk. Raises OSError."""
     with part_of(path).open("w", encoding="utf-8") as part:
         part.write(text)
         part.flush()

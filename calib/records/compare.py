@@ -1,4 +1,4 @@
-"""What changed between two records of one arm, per joint, in units and in standard deviations."""
+"""Differences between two records of one arm, per joint, in units and in standard deviations."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ UNITS = {"gain": "1", "offset": "N·m", "position_gain": "1", "position_offset":
 
 @dataclass(frozen=True)
 class Change:
-    """One parameter of one joint in two records; None where a record has no value."""
+    """One parameter of one joint in two records; None for a missing value."""
 
     joint: str
     parameter: str
@@ -22,28 +22,28 @@ class Change:
     before: float | None
     after: float | None
     std: float | None
-    """Standard deviation of the change, both records taken as independent; None where neither was estimated."""
+    """Standard deviation of the change, both records taken as independent; None if neither was estimated."""
 
     @property
     def change(self) -> float | None:
-        """After less before, None where either is missing."""
+        """After minus before; None if either is missing."""
         return None if self.before is None or self.after is None else self.after - self.before
 
     @property
     def deviations(self) -> float | None:
-        """The change in standard deviations, None where that is not known."""
+        """The change in standard deviations; None if that is not known."""
         change = self.change
         return None if change is None or not self.std else change / self.std
 
 
 def differences(before: CalibrationRecord | GravityRecord, after: CalibrationRecord | GravityRecord) -> list[Change]:
-    """Every parameter of both records, joints base to tip; raises Refused where they are not comparable."""
+    """Every parameter of both records, joints base to tip; raises Refused, BadInput if they are not comparable."""
     for what in ("arm", "serial", "description_hash"):
         ours, theirs = getattr(before, what), getattr(after, what)
         if ours != theirs:
             name = what.partition("_")[0]
             raise Refused(
-                f"records {before.id} and {after.id}: {name} {ours[:12]} and {theirs[:12]} have nothing common"
+                f"records {before.id} and {after.id}: {name} {ours[:12]} and {theirs[:12]} have nothing in common"
             )
     if isinstance(before, CalibrationRecord) and isinstance(after, CalibrationRecord):
         return _of_calibration(before, after)

@@ -1,4 +1,4 @@
-"""The record store's database: its URL, how it is opened, and its schema brought up to date."""
+"""Database of the record store: URL, opening, schema migration."""
 
 import os
 import sqlite3
@@ -15,10 +15,10 @@ from calib.records.schema import MIGRATIONS
 
 HEAD = MIGRATIONS[-1]
 BUSY_SECONDS = 10
-"""How long another writer of an SQLite store is waited for [s]."""
+"""Wait for another writer of an SQLite store [s]."""
 _VERSION = "alembic_version"
 _LOCK = 0x61726D6C
-"""PostgreSQL's advisory lock that one process at a time holds while it writes, as SQLite's writers do."""
+"""Advisory lock on PostgreSQL that serialises writers, as SQLite does by itself."""
 
 
 def default_url() -> str:
@@ -28,9 +28,9 @@ def default_url() -> str:
 
 
 def open_database(url: str) -> sa.Engine:
-    """Open, and make where missing, the database at an SQLAlchemy URL or a file path, with today's schema.
+    """Open, or create, the database at an SQLAlchemy URL or a file path, with the present schema.
 
-    An older schema is migrated; raises BadInput for a newer one, or where the database cannot be opened.
+    An older schema is migrated; raises BadInput for a newer one, or if the database cannot be opened.
     """
     full = _full_url(url)
     try:
@@ -45,7 +45,7 @@ def open_database(url: str) -> sa.Engine:
 
 @contextmanager
 def transaction(engine: sa.Engine) -> Iterator[sa.Connection]:
-    """One writing transaction: all of it is on disk when it returns, or nothing is. Raises BadInput where it fails."""
+    """One writing transaction: all of it is on disk when it returns, or nothing is. Raises BadInput if it fails."""
     try:
         with engine.execution_options(writing=True).begin() as connection:
             _lock(connection)
@@ -53,11 +53,13 @@ def transaction(engine: sa.Engine) -> Iterator[sa.Connection]:
     except (sa.exc.OperationalError, sa.exc.InternalError) as error:
         reason = first_line(error.orig if error.orig is not None else error)
         shown = engine.url.render_as_string(hide_password=True)
-        raise BadInput(f"record store {shown}: nothing was written: {reason}: mend that and run it again") from None
+        raise BadInput(
+            f"record store {shown}: nothing was written: {reason}: fix that and run the command again"
+        ) from None
 
 
 def _migrate(engine: sa.Engine) -> None:
-    """Bring the schema to HEAD; a store from before migrations has the tables of 0001 and no version."""
+    """Migrate the schema to HEAD; a store older than migrations has the tables of 0001 and no version."""
     with engine.connect() as connection:
         if _version(connection) == HEAD:
             return
@@ -131,7 +133,7 @@ def _prepare_sqlite(engine: sa.Engine) -> None:
 
 
 def _to_write_ahead_log(connection: sqlite3.Connection) -> None:
-    """Switch the journal mode; where two do so at once SQLite tells one of them "locked" without any waiting."""
+    """Switch the journal mode; if two processes do so at once, SQLite answers one "locked" without waiting."""
     end = time.monotonic() + BUSY_SECONDS
     while True:
         try:
@@ -144,5 +146,5 @@ def _to_write_ahead_log(connection: sqlite3.Connection) -> None:
 
 
 def first_line(error: BaseException) -> str:
-    """The first line of what an error says."""
+    """First line of an error's message."""
     return str(error).strip().partition("\n")[0]

@@ -1,4 +1,4 @@
-"""Calibration and gravity records: what was found about one arm, by what and from what."""
+"""Calibration and gravity records of one arm, with their covariance and provenance."""
 
 import hashlib
 from collections.abc import Sequence
@@ -13,6 +13,7 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, FiniteFloat, V
 
 from armlink.arm_file import ArmFile, describe
 from armlink.errors import BadInput, Refused
+from armlink.torque_calibration import UNKNOWN, TorqueCalibration
 
 Array = npt.NDArray[np.float64]
 Matrix = tuple[tuple[FiniteFloat, ...], ...]
@@ -25,38 +26,38 @@ class _Frozen(BaseModel):
 
 
 class Record(_Frozen):
-    """What every record carries: whose it is, when, by what and from what it was made. Records never change."""
+    """Common part of all records: arm, date, software, sources. Records never change."""
 
     kind: str
     schema_version: int = 1
     arm: str
     serial: str
     description_hash: str
-    """SHA-256 of the arm's kinematics; of another description the numbers mean nothing."""
+    """SHA-256 of the arm's kinematics; the numbers are valid for this description only."""
     created: AwareDatetime
     software: str
     sources: dict[str, str] = {}
-    """Name and SHA-256 of every data set and recording that went in."""
+    """Name and SHA-256 of every data set and recording used."""
     confirmed_by: str | None = None
-    """Who let it pass: a user's name, or the policy that applied it by itself; None where nobody has."""
+    """A user's name, or the policy that applied it automatically; None if not confirmed."""
     parent: str | None = None
-    """Id of the record that this one replaces."""
+    """Id of the record that this one replaced."""
     note: str = ""
 
     SCHEMA: ClassVar[int] = 1
 
     @property
     def id(self) -> str:
-        """Eight hex digits of the content's SHA-256; as a number it fits record id of object 2100h (UNSIGNED32)."""
+        """Eight hex digits of the content's SHA-256; as a number it fits the record id of object 2100h (UNSIGNED32)."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:8]
 
     @property
     def number(self) -> int:
-        """`id` as the unsigned 32-bit number that a controller keeps beside its gain and offset."""
+        """`id` as the UNSIGNED32 that a controller keeps beside its gain and offset (2100h:07)."""
         return int(self.id, 16)
 
     def require(self, arm: ArmFile) -> Self:
-        """This record, if it is of this arm; else raises Refused with one line that names what differs."""
+        """This record, if it is of this arm; else raises Refused with one line that names the difference."""
         differing = {
             "arm": (self.arm, arm.name),
             "serial": (self.serial, arm.serial),
@@ -65,7 +66,9 @@ class Record(_Frozen):
         }
         for what, (ours, wanted) in differing.items():
             if ours != wanted:
-                raise Refused(f"record {self.id}: {what} is {ours}, but {wanted} is wanted: made for something else")
+                raise Refused(
+                    f"record {self.id}: {what} is {ours}, but {wanted} is wanted: the record is of another arm"
+                )
         return self
 
     def to_yaml(self) -> str:
@@ -76,7 +79,7 @@ class Record(_Frozen):
 class JointCalibration(_Frozen):
     """Sensor parameters of one joint: v = gain·τ + offset, θ = position_gain·φ + position_offset.
 
-    A parameter is None where the data could not determine it; `not_identifiable` then says why.
+    A parameter is None if the data could not determine it; `not_identifiable` then has the reason.
     """
 
     name: str
@@ -102,6 +105,12 @@ class JointCalibration(_Frozen):
             raise ValueError(f"joint {self.name}: a gain of 0 is not a sensor")
         return self
 
+    def torque_calibration(self, missing: TorqueCalibration[float] = UNKNOWN) -> TorqueCalibration[float]:
+        """Gain and offset of the torque sensor; those of `missing` if they are not identifiable."""
+        return TorqueCalibration(
+            missing.gain if self.gain is None else self.gain, missing.offset if self.offset is None else self.offset
+        )
+
 
 class CalibrationRecord(Record):
     """Sensor gains and offsets of all joints, base to tip."""
@@ -109,7 +118,7 @@ class CalibrationRecord(Record):
     kind: Literal["calibration"] = "calibration"
     joints: Annotated[tuple[JointCalibration, ...], Field(min_length=1)]
     covariance_of: tuple[str, ...] = ()
-    """What rows and columns of `covariance` stand for: "joint_1.gain", …, those that were estimated."""
+    """Names of the rows and columns of `covariance`: "joint_1.gain", …; only parameters that were estimated."""
     covariance: Matrix = ()
 
     @model_validator(mode="after")
@@ -122,31 +131,50 @@ class CalibrationRecord(Record):
         return self
 
     def values(self, parameter: Parameter, missing: float = np.nan) -> Array:
-        """One parameter of all joints (n,), `missing` where it is not identifiable."""
+        """One parameter of all joints (n,); `missing` for those not identifiable."""
         found = [getattr(joint, parameter) for joint in self.joints]
         return np.array([missing if value is None else value for value in found])
 
+    def torque_calibration(
+        self, missing: TorqueCalibration[float] | TorqueCalibration[Array] = UNKNOWN
+    ) -> TorqueCalibration[Array]:
+        """Gains and offsets of all torque sensors (n,); those of `missing` if they are not identifiable."""
+        gain, offset = self.values("gain"), self.values("offset")
+        return TorqueCalibration(
+            np.where(np.isnan(gain), missing.gain, gain), np.where(np.isnan(offset), missing.offset, offset)
+        )
+
+    def angle(self, reading: Array) -> Array:
+        """Joint angles (…, n) [rad] from position readings; a sensor without a calibration counts as exact."""
+        angle: Array = reading * self.values("position_gain", 1.0) + self.values("position_offset", 0.0)
+        return angle
+
+    def is_installed(self, held: Sequence[TorqueCalibration[float]]) -> bool:
+        """Whether controllers that hold `held`, joint by joint, hold this record, as REAL32 keeps it."""
+        pairs = zip(self.joints, held, strict=True)
+        return all(joint.torque_calibration(now).matches(now) for joint, now in pairs)
+
     def std(self, parameter: Parameter) -> Array:
-        """Standard deviations of one parameter of all joints (n,), NaN where it was not estimated."""
+        """Standard deviations of one parameter of all joints (n,); NaN for those not estimated."""
         place = {name: index for index, name in enumerate(self.covariance_of)}
         names = [f"{joint.name}.{parameter}" for joint in self.joints]
         return np.array([self.covariance[place[n]][place[n]] ** 0.5 if n in place else np.nan for n in names])
 
 
 class GravityRecord(Record):
-    """Gravity parameters β = (n_1x, n_1y, …, n_nx, n_ny) [kg·m] (theory.md section 2) and how well they are known."""
+    """Gravity parameters β = (n_1x, n_1y, …, n_nx, n_ny) [kg·m] (docs/theory.md, section 2) and their covariance."""
 
     kind: Literal["gravity"] = "gravity"
     names: Annotated[tuple[str, ...], Field(min_length=1)]
     """Joint names, base to tip."""
     beta: tuple[FiniteFloat, ...]
-    """(2n,); 0 where gravity cannot determine it."""
+    """(2n,) [kg·m]; 0 for those not identifiable."""
     covariance: Matrix
-    """(2n, 2n) [kg²·m²]; 0 where not determined."""
+    """(2n, 2n) [kg²·m²]; 0 for those not identifiable."""
     identifiable: tuple[bool, ...]
     """(2n,)"""
     gravity: Annotated[tuple[FiniteFloat, ...], Field(min_length=3, max_length=3)]
-    """Acceleration of gravity used, base frame [m/s²]: β scales with it."""
+    """Acceleration of gravity used, base frame [m/s²]; the scale of β depends on it."""
     calibration: str | None = None
     """Id of the calibration record whose sensors measured it."""
 
@@ -173,13 +201,13 @@ def provenance(arm: ArmFile, sources: dict[str, str] | None = None, created: dat
 
 
 def matrix(values: npt.ArrayLike) -> Matrix:
-    """A (P, P) array as a record keeps it, made exactly symmetric."""
+    """A (P, P) array as nested tuples, made exactly symmetric."""
     array = np.asarray(values, dtype=float)
     return tuple(tuple(row) for row in ((array + array.T) / 2).tolist())
 
 
 def parse_record(content: Any, origin: str) -> CalibrationRecord | GravityRecord:
-    """A record from a mapping, of whichever kind it says; a key `id` must match. Raises BadInput with one line."""
+    """A record of either kind from a mapping; its key `id`, if present, must match. Raises BadInput with one line."""
     kinds: dict[Any, type[CalibrationRecord] | type[GravityRecord]] = {
         "calibration": CalibrationRecord,
         "gravity": GravityRecord,
@@ -193,7 +221,7 @@ def parse_record(content: Any, origin: str) -> CalibrationRecord | GravityRecord
     except ValidationError as error:
         raise BadInput(f"{origin}: {describe(error)}") from None
     if content.get("id", record.id) != record.id:
-        raise BadInput(f"{origin}: content was changed: it says id {content['id']}, but its content makes {record.id}")
+        raise BadInput(f"{origin}: content was changed: its id is {content['id']}, but the content gives {record.id}")
     return record
 
 

@@ -1,4 +1,4 @@
-"""Tables of the record store. What changes here needs a migration in `calib/records/migrations/versions`."""
+"""Tables of the record store. A change here needs a migration in `calib/records/migrations/versions`."""
 
 import sqlalchemy as sa
 
@@ -37,14 +37,14 @@ WRITES = sa.Table(
     sa.Column("stage", sa.String, nullable=False),
     sa.Column("body", sa.Text, nullable=False),
 )
-"""Journal of writes to controllers: `begun` with what each held before, then `finished` or `undone`."""
+"""Journal of writes to controllers: stage `begun` with the calibrations held before, then `finished` or `undone`."""
 
 MIGRATIONS = ("0001", "0002")
 """Revisions of the schema, oldest first; the last one makes the tables above."""
 
 
 def append_only(table: str, dialect: str) -> list[str]:
-    """Statements after which the database itself refuses to change or delete a row of a table."""
+    """Statements that make the database itself refuse to change or delete rows of a table."""
     if dialect == "sqlite":
         return [
             f"CREATE TRIGGER IF NOT EXISTS {table}_no_{change.lower()} BEFORE {change} ON {table} "

@@ -1,4 +1,4 @@
-"""The record store: append-only, on SQLite by default or PostgreSQL by URL; what is current is the last activation."""
+"""The record store: append-only, SQLite by default or PostgreSQL by URL; the last activation says what is current."""
 
 import json
 from collections.abc import Sequence
@@ -43,19 +43,19 @@ class ControllerWrite:
     by: str
     stage: str
     body: dict[str, Any]
-    """begun: `before`, what each controller held; undone: `reason`."""
+    """begun: `before` (what each controller held), `reason`, `gates`; undone: `reason`."""
 
 
 class RecordStore:
-    """Records, and the log of which was current when. Nothing is changed or deleted; going back is an append too."""
+    """Records, and the log of which was current when. Nothing is changed or deleted; a roll-back is an append too."""
 
     def __init__(self, url: str | None = None) -> None:
-        """Open, and make where missing, the store at an SQLAlchemy URL or a file path; raises BadInput if it cannot."""
+        """Open, or create, the store at an SQLAlchemy URL or a file path; raises BadInput if that fails."""
         self._engine = open_database(url or default_url())
         self.url = self._engine.url.render_as_string(hide_password=True)
 
     def close(self) -> None:
-        """Let go of the database."""
+        """Close the database."""
         self._engine.dispose()
 
     def add(self, record: AnyRecord) -> str:
@@ -67,32 +67,22 @@ class RecordStore:
             if known is None:
                 connection.execute(RECORDS.insert().values(row))
             elif known != row["body"]:
-                raise Refused(f"record {record.id}: another record has this id already; make it again")
+                raise Refused(f"record {record.id}: another record has this id already; repeat the command")
         return record.id
 
     def get(self, record_id: str) -> AnyRecord:
-        """The record of that id; raises Refused where there is none."""
+        """The record of that id; raises Refused if there is none."""
         with self._engine.connect() as connection:
             body = connection.execute(sa.select(RECORDS.c.body).where(RECORDS.c.id == record_id)).scalar()
         if body is None:
-            raise Refused(f"no record {record_id} in {self.url}; armlink history ARM lists those that there are")
+            raise Refused(f"no record {record_id} in {self.url}; armlink history ARM lists the records")
         return parse_record(json.loads(body), f"record {record_id}")
 
-    def activate(
-        self, record_id: str, arm: ArmFile, by: str, reason: str, finishes: ControllerWrite | None = None
-    ) -> Activation:
-        """Make a kept record the current one of its kind; raises Refused if it is of another arm.
-
-        `finishes` is the journal's write to the controllers that ends well with it, in the same transaction.
-        """
+    def activate(self, record_id: str, arm: ArmFile, by: str, reason: str) -> Activation:
+        """Make a kept record the current one of its kind; raises Refused if it is of another arm."""
         record = self.get(record_id).require(arm)
-        row = {"record": record.id, "kind": record.kind, "arm": arm.name, "serial": arm.serial, "by": by}
-        row |= {"reason": reason, "at": _now()}
         with transaction(self._engine) as connection:
-            number = connection.execute(ACTIVATIONS.insert().values(row).returning(ACTIVATIONS.c.number)).scalar_one()
-            if finishes is not None:
-                connection.execute(WRITES.insert().values(_write_row(finishes, arm, record.id, "finished", {})))
-        return Activation(number, record.id, record.kind, row["at"], by, reason)
+            return _activate(connection, record, arm, by, reason)
 
     def put(self, record: AnyRecord, arm: ArmFile, by: str, reason: str) -> str:
         """Append a record and make it current; returns its id."""
@@ -100,7 +90,7 @@ class RecordStore:
         return self.activate(record.id, arm, by, reason).record
 
     def former(self, arm: ArmFile, record_id: str) -> AnyRecord:
-        """A record that was current before and is not now; raises Refused if it never was, or is of another arm."""
+        """A record that was current before and is not now; raises Refused if there is none, or it is of another arm."""
         record = self.get(record_id).require(arm)
         log = [line.record for line in self.activations(arm) if line.kind == record.kind]
         if record_id not in log:
@@ -110,21 +100,24 @@ class RecordStore:
         return record
 
     def rollback(self, arm: ArmFile, to: str, by: str, reason: str = "rollback") -> Activation:
-        """Go back to a record that was current before; raises Refused if it never was, or is now."""
+        """Return to a record that was current before; raises Refused if it never was, or is now."""
         return self.activate(self.former(arm, to).id, arm, by, reason)
 
     def current(self, kind: type[R], arm: ArmFile) -> R | None:
-        """The current record of a kind, None where there is none yet.
+        """The current record of a kind; None if there is none yet.
 
-        Raises Refused where it is of another description of this arm: a changed arm needs a new calibration.
+        Raises Refused if it is of another description of this arm: a changed arm needs a new calibration.
         """
-        wanted = kind.model_fields["kind"].default
-        log = [line for line in self.activations(arm) if line.kind == wanted]
-        if not log:
+        found = self._current_id(kind.model_fields["kind"].default, arm)
+        if found is None:
             return None
-        record = self.get(log[-1].record).require(arm)
+        record = self.get(found).require(arm)
         assert isinstance(record, kind)
         return record
+
+    def _current_id(self, kind: str, arm: ArmFile) -> str | None:
+        log = [line.record for line in self.activations(arm) if line.kind == kind]
+        return log[-1] if log else None
 
     def activations(self, arm: ArmFile) -> list[Activation]:
         """The activation log of this arm (name and serial), oldest first."""
@@ -135,29 +128,51 @@ class RecordStore:
             return [Activation(*row) for row in connection.execute(wanted)]
 
     def history(self, arm: ArmFile) -> list[AnyRecord]:
-        """All records of this arm (name and serial), oldest first, of whatever description."""
+        """All records of this arm (name and serial), oldest first, of any description."""
         rows = RECORDS.c
         wanted = sa.select(rows.id, rows.body).where(rows.arm == arm.name, rows.serial == arm.serial)
         with self._engine.connect() as connection:
             found = connection.execute(wanted.order_by(rows.created, rows.id)).all()
         return [parse_record(json.loads(body), f"record {record_id}") for record_id, body in found]
 
-    def begin_write(self, record_id: str, arm: ArmFile, by: str, before: Sequence[dict[str, Any]]) -> ControllerWrite:
-        """Note, before any controller is touched, what each holds: what a write that is killed is undone by."""
-        line = ControllerWrite(0, record_id, _now(), by, "begun", {"before": list(before)})
+    def begin_write(
+        self, record_id: str, arm: ArmFile, by: str, before: Sequence[dict[str, Any]], *, reason: str, gates: str
+    ) -> ControllerWrite:
+        """Note what each controller holds, before any is written: from that an interrupted write is undone."""
+        body = {"before": list(before), "reason": reason, "gates": gates}
+        line = ControllerWrite(0, record_id, _now(), by, "begun", body)
         with transaction(self._engine) as connection:
             row = _write_row(line, arm, record_id, line.stage, line.body)
             number = connection.execute(WRITES.insert().values(row).returning(WRITES.c.number)).scalar_one()
         return replace(line, number=number)
 
+    def finish_write(self, line: ControllerWrite, arm: ArmFile) -> None:
+        """End a write that succeeded and make its record current, unless it is already; both or neither."""
+        record, current = self.get(line.record), self._current_id("calibration", arm)
+        with transaction(self._engine) as connection:
+            if record.id != current:
+                _activate(connection, record, arm, line.by, str(line.body["reason"]))
+            connection.execute(WRITES.insert().values(_write_row(line, arm, record.id, "finished", {})))
+
+    def last_write(self, arm: ArmFile) -> ControllerWrite | None:
+        """Line `begun` of the newest write to this arm's controllers that succeeded; None if there is none."""
+        begun: ControllerWrite | None = None
+        last: ControllerWrite | None = None
+        for line in self.writes(arm):
+            if line.stage == "begun":
+                begun = line
+            elif line.stage == "finished":
+                last = begun
+        return last
+
     def undo_write(self, line: ControllerWrite, arm: ArmFile, reason: str) -> None:
-        """Note that the controllers hold again what they held before that write."""
+        """Note that the controllers hold the calibrations from before that write again."""
         with transaction(self._engine) as connection:
             row = _write_row(line, arm, line.record, "undone", {"reason": reason})
             connection.execute(WRITES.insert().values(row))
 
     def unfinished_write(self, arm: ArmFile) -> ControllerWrite | None:
-        """The write to this arm's controllers that was begun and never ended, as after a power loss; else None."""
+        """The write to this arm's controllers that was begun but not ended, as after a power loss; None if none is."""
         log = self.writes(arm)
         return log[-1] if log and log[-1].stage == "begun" else None
 
@@ -172,13 +187,13 @@ class RecordStore:
     def import_yaml(self, path: Path, arm: ArmFile) -> str:
         """Append the record of a YAML file (as `Record.to_yaml` wrote it), not making it current; returns its id.
 
-        Raises BadInput where the file is no record or was changed, Refused where it is of another arm.
+        Raises BadInput if the file is no record or was changed, Refused if it is of another arm.
         """
         return self.add(load_yaml(path).require(arm))
 
 
 def load_yaml(path: Path) -> AnyRecord:
-    """The record of a YAML file (as `Record.to_yaml` wrote it); raises BadInput where it is none or was changed."""
+    """The record of a YAML file (as `Record.to_yaml` wrote it); raises BadInput if it is none or was changed."""
     try:
         content: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -187,12 +202,19 @@ def load_yaml(path: Path) -> AnyRecord:
 
 
 def export_yaml(record: Record, path: Path) -> None:
-    """Write a record to a YAML file, whole or not at all."""
+    """Write a record to a YAML file, atomically."""
     write_whole(path, record.to_yaml())
 
 
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def _activate(connection: sa.Connection, record: AnyRecord, arm: ArmFile, by: str, reason: str) -> Activation:
+    row = {"record": record.id, "kind": record.kind, "arm": arm.name, "serial": arm.serial, "by": by}
+    row |= {"reason": reason, "at": _now()}
+    number = connection.execute(ACTIVATIONS.insert().values(row).returning(ACTIVATIONS.c.number)).scalar_one()
+    return Activation(number, record.id, record.kind, row["at"], by, reason)
 
 
 def _write_row(line: ControllerWrite, arm: ArmFile, record: str, stage: str, body: dict[str, Any]) -> dict[str, Any]:

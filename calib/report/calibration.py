@@ -1,4 +1,4 @@
-"""The report of a calibration as one page to file: what, from what, per joint and sweep, before and after."""
+"""Report of a calibration as one HTML page: sources, results per joint and sweep, comparison with the last record."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
+from calib.fit.heldout import heldout_scores
 from calib.fit.sensor_fit import SensorFit
-from calib.install.plausibility import heldout_scores
 from calib.records.compare import differences
 from calib.records.records import Array, CalibrationRecord, Parameter
 from calib.report.figures import before_after_figure, joint_figure, left_out_figure, sweep_rows, sweeps_of
@@ -27,14 +28,14 @@ PARAMETERS: tuple[tuple[Parameter, str, str], ...] = (
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
-    """What a report is made of."""
+    """Data, fit and records of one calibration."""
 
     arm: ArmFile
     data: Sequence[SweepData]
     fit: SensorFit
     record: CalibrationRecord
     before: CalibrationRecord | None
-    """The record in force until now."""
+    """The current record until now; None if this is the first."""
 
 
 def write_report(done: Calibrated, path: Path) -> None:
@@ -55,7 +56,7 @@ def _identity(done: Calibrated) -> Section:
         ["arm", escape(f"{record.arm}, serial {record.serial}")],
         ["description (SHA-256)", f"<small>{record.description_hash}</small>"],
         ["record", record.id + (f", replaces {record.parent}" if record.parent else ", the first of this arm")],
-        ["confirmed by", escape(record.confirmed_by or "nobody yet: kept, not written to controllers")],
+        ["confirmed by", escape(record.confirmed_by or "not confirmed: kept, not written to controllers")],
         [
             "readings",
             f"{len(done.fit.rows.swept)}, χ² {done.fit.fit.chi2:.0f} at {done.fit.fit.dof} degrees of freedom",
@@ -65,7 +66,7 @@ def _identity(done: Calibrated) -> Section:
         load = f"{data.manifest.reference_mass:g} kg attached" if data.manifest.reference_mass else "no mass"
         when = f"{data.manifest.created:%Y-%m-%d %H:%M} UTC"
         rows.append([f"sweeps {escape(data.path.name)}", f"{load}, {when}<br><small>SHA-256 {data.digest}</small>"])
-    return Section("What was calibrated", html, (), [ReportTable(("", ""), rows, texts=2)])
+    return Section("Calibration", html, (), [ReportTable(("", ""), rows, texts=2)])
 
 
 def _sensors(done: Calibrated) -> Section:
@@ -89,23 +90,19 @@ def _sensors(done: Calibrated) -> Section:
 
 
 def _comparison(done: Calibrated) -> Section:
-    """Before and after: pairs in force until now against the new ones, on the same readings."""
+    """The calibration in use until now against the new one, on the same readings."""
     before, record, names = done.before, done.record, done.fit.names
     n = len(names)
     if before is None:
         manifest = done.data[0].manifest
-        old, label = (
-            (np.array(manifest.installed_gain), np.array(manifest.installed_offset)),
-            "the controllers' pairs",
-        )
+        old, label = manifest.installed, "the controllers' values"
     else:
-        old, label = (before.values("gain", 1.0), before.values("offset", 0.0)), f"record {before.id}"
-    new = _or(record.values("gain"), old[0]), _or(record.values("offset"), old[1])
-    rms = [_rms_of_pair(done, *pair) for pair in (old, new)]
+        old, label = before.torque_calibration(UNCALIBRATED), f"record {before.id}"
+    rms = [_rms_of_pair(done, pair) for pair in (old, record.torque_calibration(old))]
     shown = np.isfinite(rms[0]) & np.isfinite(rms[1])
     text = (
-        "Calibrated torque less model torque over all readings without load: with the pairs in force until now, and"
-        " with the new ones."
+        "Calibrated torque minus model torque over all readings without load, with the calibration in use until now and"
+        " with the new one."
     )
     figures = []
     if shown.any():
@@ -116,7 +113,7 @@ def _comparison(done: Calibrated) -> Section:
     if before is not None:
         tables.append(_changes(before, record))
     else:
-        text += " This arm had no record before, so there is none to compare with."
+        text += " This arm had no record before."
     return Section("Before and after", paragraph(text), figures, tables)
 
 
@@ -137,14 +134,14 @@ def _changes(before: CalibrationRecord, record: CalibrationRecord) -> ReportTabl
     return ReportTable(header, rows, f"Against record {before.id} of {before.created:%Y-%m-%d %H:%M} UTC.", texts=2)
 
 
-def _rms_of_pair(done: Calibrated, gain: Array, offset: Array) -> Array:
-    """RMS (n,) of torque by a pair less model over own readings without load [N·m]; NaN where there is none."""
+def _rms_of_pair(done: Calibrated, pair: TorqueCalibration[Array]) -> Array:
+    """RMS (n,) [N·m] of calibrated minus model torque over own readings without load; NaN without any."""
     fit, rows = done.fit, done.fit.rows
     complete = fit.fit.complete
     counted = np.isfinite(rows.readings.torque) & (rows.readings.load == 0)[:, None]
     q = rows.readings.position * complete.position_gain + complete.position_offset
     model = gravity_torque(gcomp_arm(done.arm), complete.beta, q)
-    left = np.where(counted, (rows.readings.torque - offset) / gain - model, np.nan)
+    left = np.where(counted, pair.invert(rows.readings.torque) - model, np.nan)
     total = np.where(counted, left, 0.0)
     rms: Array = np.sqrt((total**2).sum(axis=0) / np.maximum(counted.sum(axis=0), 1))
     return np.where(counted.any(axis=0), rms, np.nan)
@@ -153,8 +150,8 @@ def _rms_of_pair(done: Calibrated, gain: Array, offset: Array) -> Array:
 def _sweeps(done: Calibrated) -> list[Section]:
     arm, fit = gcomp_arm(done.arm), done.fit
     text = (
-        "Up (▸) and down (◂), a colour a sweep. The line is the fit of all sweeps of all joints together; bars are the"
-        " 95 % interval of one reading."
+        "Upward (▸) and downward (◂) readings, one colour per sweep. Lines: the fit to all sweeps of all joints. Bars:"
+        " the 95 % interval of one reading."
     )
     left_out = {each.sweep: each for each in fit.goodness.left_out}
     sections = []
@@ -163,7 +160,7 @@ def _sweeps(done: Calibrated) -> list[Section]:
         for sweep in sweeps_of(fit, joint):
             at = sweep_rows(fit, joint, sweep)
             residual = fit.fit.residual[at, joint]
-            told = left_out.get(sweep)
+            others = left_out.get(sweep)
             angle = fit.rows.readings.position[at, joint]
             rows.append(
                 [
@@ -173,7 +170,7 @@ def _sweeps(done: Calibrated) -> list[Section]:
                     f"{angle.min():.2f}\u202f…\u202f{angle.max():.2f}".replace("-", "\u2212"),
                     _number(float(np.sqrt(np.nanmean(residual**2))), ".4f"),
                     _number(float(np.nanmax(np.abs(residual))), ".4f"),
-                    "–" if told is None else f"{told.rms:.4f} ({told.ratio:.1f} ×)",
+                    "–" if others is None else f"{others.rms:.4f} ({others.ratio:.1f} ×)",
                 ]
             )
         header = (
@@ -183,9 +180,9 @@ def _sweeps(done: Calibrated) -> list[Section]:
             "range [rad]",
             "residual RMS [N·m]",
             "largest [N·m]",
-            "told by the others [N·m]",
+            "cross-validation RMS [N·m]",
         )
-        caption = "“Told by the others”: RMS of this sweep less a fit without it, and that over what is to be expected."
+        caption = "Cross-validation: RMS of this sweep minus a fit without it, and its ratio to the expected error."
         figures = [joint_figure(arm, fit, joint)] if rows else []
         sections.append(
             Section(f"Sweeps of {fit.names[joint]}", paragraph(text), figures, [ReportTable(header, rows, caption)])
@@ -195,25 +192,21 @@ def _sweeps(done: Calibrated) -> list[Section]:
 
 
 def _left_out(done: Calibrated) -> Section:
-    """The paper's Figure 6 on steps that the fit has not seen."""
+    """The paper's Figure 6 on held-out steps."""
     rows, fit = done.fit.rows, done.fit
     score = heldout_scores(done.record, done.arm, rows, refit=True)
     own = rows.own & (rows.readings.load == 0)[:, None]
     complete = fit.fit.complete
-    sensor = np.where(own, (rows.readings.torque - complete.offset) / complete.gain, np.nan)
+    pair = TorqueCalibration(complete.gain, complete.offset)
+    sensor = np.where(own, pair.invert(rows.readings.torque), np.nan)
     model = sensor - np.where(own, score * rows.readings.sigma, np.nan) / complete.gain
     text = (
-        "Torque at steps that were left out (every second step of each sweep, then the others): the model fitted"
-        " without them, solid, and the sensor, dashed. Poses that no sweep has: armlink verify --report."
+        "Torque at held-out steps (every second step of each sweep, then the others): the model fitted without them,"
+        " solid, and the sensor, dashed. For poses that are in no sweep: armlink verify --report."
     )
     return Section(
         "Model against sensor (the paper's Figure 6)", paragraph(text), [left_out_figure(fit.names, sensor, model)]
     )
-
-
-def _or(found: Array, held: Array) -> Array:
-    """What was found, and what is held where nothing was."""
-    return np.where(np.isnan(found), held, found)
 
 
 def _interval(value: float, half: float) -> str:

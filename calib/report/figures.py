@@ -1,4 +1,4 @@
-"""Figures of the calibration report: sweeps with their fits, before and after, changes, and the paper's Figure 6."""
+"""Figures of the calibration report: sweeps with their fits, before and after, and the paper's Figure 6."""
 
 from typing import Any
 
@@ -24,20 +24,20 @@ PANEL = 230
 
 
 def sweeps_of(fit: SensorFit, joint: int) -> list[str]:
-    """Names of a joint's sweeps, as PASS/sweep, in the order they were taken."""
+    """Names of a joint's sweeps, as PASS/sweep, in the order of measurement."""
     series = fit.rows.readings.series[fit.rows.swept == joint]
     return [fit.rows.sweeps[sweep] for sweep in dict.fromkeys(series.tolist())]
 
 
 def sweep_rows(fit: SensorFit, joint: int, sweep: str) -> Indices:
-    """Rows of one sweep, by position."""
+    """Rows of one sweep, in order of position."""
     at = np.flatnonzero((fit.rows.swept == joint) & (fit.rows.readings.series == fit.rows.sweeps.index(sweep)))
     return at[np.argsort(fit.rows.readings.position[at, joint])]
 
 
 def joint_figure(arm: Arm, fit: SensorFit, joint: int) -> Any:
     """One joint's sweeps: readings over position with the fitted curve, and residuals with their 95 % intervals."""
-    titles = ("sensor reading [N·m]", "reading less fit [N·m]")
+    titles = ("sensor reading [N·m]", "reading minus fit [N·m]")
     figure = make_subplots(rows=1, cols=2, column_widths=[0.58, 0.42], subplot_titles=titles, horizontal_spacing=0.1)
     add_sweeps(figure, arm, fit, joint, row=1, intervals=True)
     figure.update_xaxes(title_text="position reading [rad]")
@@ -65,7 +65,7 @@ def add_sweeps(figure: Any, arm: Arm, fit: SensorFit, joint: int, row: int, *, i
 
 
 def curve(arm: Arm, fit: SensorFit, rows: Indices, joint: int) -> tuple[Array, Array]:
-    """(Position, reading) of the fitted model between the first and the last of one sweep's rows."""
+    """(Position, reading) of the fitted model over the range of one sweep's rows."""
     readings = fit.rows.readings
     position = np.repeat(readings.position[rows].mean(axis=0)[None], CURVE_POINTS, axis=0)
     position[:, joint] = np.linspace(
@@ -76,7 +76,7 @@ def curve(arm: Arm, fit: SensorFit, rows: Indices, joint: int) -> tuple[Array, A
 
 
 def before_after_figure(names: tuple[str, ...], before: Array, after: Array, label: str) -> Any:
-    """RMS of calibrated torque less model per joint (n,) [N·m], with the pairs before and with the new ones."""
+    """RMS of calibrated minus model torque per joint (n,) [N·m], with the old and with the new calibration."""
     figure = go.Figure()
     figure.add_bar(x=list(names), y=before, name=label, marker_color=GREY)
     figure.add_bar(x=list(names), y=after, name="this calibration", marker_color=COLOURS[0])
@@ -87,7 +87,7 @@ def before_after_figure(names: tuple[str, ...], before: Array, after: Array, lab
 
 
 def left_out_figure(names: tuple[str, ...], sensor: Array, model: Array) -> Any:
-    """As the paper's Figure 6: number of the reading against torque (K, n) [N·m], NaN left out."""
+    """As the paper's Figure 6: torque (K, n) [N·m] over the number of the reading; NaN is left out."""
     rms = [_rms(sensor[:, j] - model[:, j]) for j in range(len(names))]
     columns = [np.isfinite(sensor[:, j] - model[:, j]) for j in range(len(names))]
     return _panels(
@@ -98,7 +98,7 @@ def left_out_figure(names: tuple[str, ...], sensor: Array, model: Array) -> Any:
 
 
 def verify_figure(check: Verification) -> Any:
-    """The paper's Figure 6: pose number against torque, model solid, sensor dashed, a panel a joint."""
+    """The paper's Figure 6: torque over pose number, model solid, sensor dashed, one panel per joint."""
     return _panels(
         [f"{name}, RMS {rms:.3f} N·m" for name, rms in zip(check.names, check.rms, strict=True)],
         [(check.model[:, j], check.sensor[:, j]) for j in range(len(check.names))],

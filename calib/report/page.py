@@ -1,4 +1,4 @@
-"""One self-contained HTML page out of sections: text, tables and plotly figures, readable on screen and on paper."""
+"""One self-contained HTML page from sections: text, tables and plotly figures, for screen and paper."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -16,20 +16,20 @@ class Section:
     title: str
     html: str = ""
     figures: Sequence[Any] = ()
-    """plotly figures, shown one under the other."""
+    """plotly figures, shown below one another."""
     tables: Sequence["ReportTable"] = ()
     """Shown before the figures."""
 
 
 @dataclass(frozen=True)
 class ReportTable:
-    """A table with a caption; numbers come formatted."""
+    """A table with a caption; numbers are formatted already."""
 
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
     caption: str = ""
     texts: int = field(default=1, kw_only=True)
-    """How many columns, from the left, are text; the others are numbers and set to the right."""
+    """Number of text columns, from the left; the others are numbers, aligned right."""
 
 
 def paragraph(text: str) -> str:
@@ -38,7 +38,7 @@ def paragraph(text: str) -> str:
 
 
 def render(path: Path, title: str, sections: Sequence[Section], subtitle: str = "") -> None:
-    """Write the page; plotly's script goes in once, so the file opens without a network. Raises OSError."""
+    """Write the page with plotly's script inside, so that it opens without a network. Raises OSError."""
     from jinja2 import Environment, PackageLoader
     from plotly.offline import get_plotlyjs
 
@@ -56,7 +56,7 @@ def _figure(figure: Any) -> str:
 
 
 def style(figure: Any) -> None:
-    """Give a plotly figure the page's look: quiet grid, one typeface, room for its labels."""
+    """Set a plotly figure's grid, typeface and margins to those of the page."""
     figure.update_layout(
         template="plotly_white",
         font={"family": "system-ui, sans-serif", "size": 13, "color": "#1c2733"},

@@ -1,4 +1,4 @@
-"""The report of a verification: the paper's Figure 6 and its figures, as one page to file."""
+"""Report of a verification as one HTML page, with the paper's Figure 6."""
 
 from html import escape
 from pathlib import Path
@@ -15,11 +15,11 @@ def write_report(
 ) -> None:
     """Write one self-contained HTML file; raises OSError."""
     verdict = "passed" if result.passed else "not passed"
-    sensors = "the controllers' own" if calibration is None else f"record {calibration.id}"
-    skipped = f" {result.skipped} poses were out of the drives' reach and left out." if result.skipped else ""
+    sensors = "the controllers' own calibration" if calibration is None else f"calibration record {calibration.id}"
+    skipped = f" {result.skipped} poses were out of the drives' reach and were skipped." if result.skipped else ""
     html = f'<p><span class="verdict">{verdict}</span></p>' + paragraph(
-        f"Gravity record {gravity.id} against the sensors calibrated by {sensors}, at {len(result.sensor)} random poses"
-        f" that no fit has seen.{skipped}"
+        f"Gravity record {gravity.id} against the torque sensors with {sensors}, at {len(result.sensor)} random poses"
+        f" that were not used for a fit.{skipped}"
     )
     header = ("joint", "RMS [N·m]", "allowed RMS", "largest [N·m]", "model's own standard deviation", "largest torque")
     numbers = (

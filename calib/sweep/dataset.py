@@ -16,6 +16,7 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, V
 
 from armlink.arm_file import ArmFile, describe, load_arm
 from armlink.errors import BadInput, Refused
+from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration
 from calib.motion.static_reading import StaticReading, stack
 from calib.plan.types import SweepPlan
 from calib.records.atomic_file import part_of, write_whole
@@ -50,9 +51,11 @@ class Manifest(_Model):
     software: str
 
     @classmethod
-    def of(cls, arm: ArmFile, reference_mass: float, installed: Sequence[tuple[float, float]] | None = None) -> Self:
-        """The manifest of a new data set of this arm; `installed` are the controllers' (gain, offset), default 1, 0."""
-        pairs = installed or [(1.0, 0.0)] * len(arm.joint_names)
+    def of(
+        cls, arm: ArmFile, reference_mass: float, installed: Sequence[TorqueCalibration[float]] | None = None
+    ) -> Self:
+        """The manifest of a new data set of this arm; `installed` is what the controllers hold, by default nothing."""
+        pairs = installed or [UNCALIBRATED] * len(arm.joint_names)
         return cls(
             arm=arm.name,
             serial=arm.serial,
@@ -61,11 +64,16 @@ class Manifest(_Model):
             names=arm.joint_names,
             reference_mass=reference_mass,
             rated_torque=tuple(arm.require_link().rated_torques.tolist()),
-            installed_gain=tuple(gain for gain, _ in pairs),
-            installed_offset=tuple(offset for _, offset in pairs),
+            installed_gain=tuple(each.gain for each in pairs),
+            installed_offset=tuple(each.offset for each in pairs),
             created=datetime.now(UTC).replace(microsecond=0),
             software=f"armlink {version('armlink')}",
         )
+
+    @property
+    def installed(self) -> TorqueCalibration[Array]:
+        """What the controllers held while the data was taken (n,)."""
+        return TorqueCalibration(np.array(self.installed_gain), np.array(self.installed_offset))
 
 
 class PlanLine(_Model):

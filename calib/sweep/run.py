@@ -54,7 +54,7 @@ def run_sweep(
     Raises BadInput, Refused if the arm cannot be swept, BusFault; every reading made is on disk.
     """
     installed = [link.read_calibration(joint) for joint in range(link.n)]
-    manifest = Manifest.of(arm, reference_mass, [(each.gain, each.offset) for each in installed])
+    manifest = Manifest.of(arm, reference_mass, installed)
     with DataWriter(out, manifest, resume) as writer:
         data = load_data(out)
         mover = Mover(link, sweep_section(arm), Limits.of(arm))

@@ -8,6 +8,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from armlink.loop.driver import ArmDriver
+from armlink.torque_calibration import TorqueCalibration, per_joint
 from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import SweepSection, sweep_section
@@ -116,30 +117,17 @@ def verify_poses(limits: Limits, section: SweepSection, count: int, seed: int, b
 class _Sensors:
     """From what the controllers send to angles and torques."""
 
-    installed_gain: Array
-    installed_offset: Array
-    gain: Array
-    offset: Array
-    position_gain: Array
-    position_offset: Array
+    installed: TorqueCalibration[Array]
+    calibrated: TorqueCalibration[Array]
+    record: CalibrationRecord | None
 
     @classmethod
     def of(cls, link: ArmDriver, record: CalibrationRecord | None) -> "_Sensors":
-        installed = [link.read_calibration(joint) for joint in range(link.n)]
-        gain, offset = np.array([each.gain for each in installed]), np.array([each.offset for each in installed])
-        if record is None:
-            return cls(gain, offset, gain, offset, np.ones(link.n), np.zeros(link.n))
-        return cls(
-            gain,
-            offset,
-            np.where(np.isnan(record.values("gain")), gain, record.values("gain")),
-            np.where(np.isnan(record.values("offset")), offset, record.values("offset")),
-            record.values("position_gain", 1.0),
-            record.values("position_offset", 0.0),
-        )
+        installed = per_joint(link.read_calibration(joint) for joint in range(link.n))
+        return cls(installed, installed if record is None else record.torque_calibration(installed), record)
 
     def angle(self, reading: Array) -> Array:
-        return reading * self.position_gain + self.position_offset
+        return reading if self.record is None else self.record.angle(reading)
 
     def torque(self, reading: Array) -> Array:
-        return (reading * self.installed_gain + self.installed_offset - self.offset) / self.gain
+        return self.calibrated.invert(self.installed.apply(reading))

@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from armlink.link.link import Link
+from armlink.torque_calibration import TorqueCalibration
 from calib.records.records import CalibrationRecord
 from gcomp.arm.arm import Arm
 from gcomp.gravity.torque import gravity_torque
@@ -42,11 +43,10 @@ class Bench:
 
     def sensor_error(self, joint: int) -> tuple[float, float]:
         """(Gain error, offset error [N·m]) of what a joint's controller sends now, against the truth."""
-        held, true = self.link.read_calibration(joint), self.simulated.true_sensors
-        return (
-            float(true.gain[joint]) / held.gain - 1.0,
-            (float(true.offset[joint]) - held.offset) / held.gain,
-        )
+        true = self.simulated.true_sensors
+        sensor = TorqueCalibration(float(true.gain[joint]), float(true.offset[joint]))
+        error = sensor.relative_to(self.link.read_calibration(joint))
+        return error.gain - 1.0, error.offset
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ def check_gravity(bench: Bench, beta: Array, record: CalibrationRecord, seed: in
     angles = bench.random_poses(GRAVITY_POSES, seed)
     truth = bench.truth
     reading = (angles - truth.position_offset) / truth.position_gain
-    reported = record.values("position_gain", missing=1.0) * reading + record.values("position_offset", missing=0.0)
+    reported = record.angle(reading)
     true = bench.simulated.gravity_torque(angles)
     error = gravity_torque(bench.described, beta, reported) - true
     return GravityCheck(

@@ -17,7 +17,8 @@ from armlink.recording.recording import Recording
 from calib.arm.kinematics import gcomp_arm
 from calib.fit.gravity_fit import identify_gravity
 from calib.fit.sensor_fit import fit_sensors
-from calib.observer.recalibrator import write_record
+from calib.install.apply import Apply, admit_sweeps
+from calib.install.journaled_write import install
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
 from calib.sweep.dataset import SweepData
@@ -79,10 +80,10 @@ def _work(
         sensors = fit_sensors(arm, data)
     gravity = identify_gravity(arm, data, sensors)
     record = sensors.record(arm)
-    store.put(record, arm, by=BY, reason="sweeps without and with reference mass")
     gravity_record = gravity.record(arm, record)
     store.put(gravity_record, arm, by=BY, reason="sweeps")
-    written = write_record(record, link)
+    admitted = admit_sweeps(record, arm, store, data, sensors.goodness.findings, Apply(BY, accepted=arm.joint_names))
+    written = install(admitted, store, link, by=BY, reason="sweeps without and with reference mass", check=None)
     teller.show(calibration_table(bench, sensors))
     teller.say(f"record {record.id} written to {len(written)} controllers and read back")
     with teller.stage("verifying at poses that the fit has not seen") as report:

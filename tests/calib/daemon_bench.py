@@ -9,11 +9,14 @@ import numpy as np
 
 from armlink.arm_file import ArmFile, load_arm
 from calib.arm.kinematics import gcomp_arm
+from calib.daemon.environment import Environment
 from calib.daemon.loop.loop_messages import LoopOptions
-from calib.daemon.loop.loop_process import InlineHost
-from calib.daemon.service import Around, Service
+from calib.daemon.loop.loop_process import InlineLoop
+from calib.daemon.service import Service
+from calib.daemon.service_view import ServiceView
 from calib.daemon.settings import DaemonSection
-from calib.daemon.view.service_view import ServiceView
+from calib.install.journaled_write import install
+from calib.install.plausibility import admit
 from calib.records.records import CalibrationRecord, GravityRecord, JointCalibration, matrix, provenance
 from calib.records.store import RecordStore
 from gcomp.arm.mass_moments import base_parameters
@@ -89,9 +92,9 @@ class DaemonBench:
         options = LoopOptions(
             self.arm, work=self.work, pace=False, seed=self.seed + int(self.now()), open_bus=self._open
         )
-        self.host = InlineHost(options)
-        around = Around(self.now, self.wall, run_now, self.host)
-        self.service = Service(self.arm, self.settings, False, self.directory / "state", self.store, around)
+        self.host = InlineLoop(options)
+        environment = Environment(self.now, self.wall, run_now, self.host)
+        self.service = Service(self.arm, self.settings, False, self.directory / "state", self.store, environment)
         self.view = ServiceView(self.service)
 
     def _open(self) -> LockStepBus:
@@ -103,14 +106,13 @@ class DaemonBench:
 
     def install(self) -> None:
         """Write the current record to the controllers, as `armlink calibrate --apply` does."""
-        from calib.observer.recalibrator import write_record
-
         record = self.store.current(CalibrationRecord, self.arm)
         assert record is not None
         for message in self.host.pump():
             self.service.take(message)
-        write_record(record, self.host.controllers)
-        self.service.in_force.held(None)
+        admitted = admit(record, self.arm, self.store)
+        install(admitted, self.store, self.host.controllers, by="ann", reason="sweep", check=None)
+        self.service.records.held(None)
 
     def now(self) -> float:
         return self.simulated.time

@@ -1,5 +1,6 @@
 """Two joint controllers in memory, and the record that they hold."""
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -40,20 +41,23 @@ def record(**changes: object) -> CalibrationRecord:
     return CalibrationRecord(**provenance(ARM, created=datetime(2026, 11, 21, tzinfo=UTC)), **(content | changes))
 
 
+def as_real32(given: Calibration) -> Calibration:
+    """As a controller keeps it."""
+    return replace(given, gain=float(np.float32(given.gain)), offset=float(np.float32(given.offset)))
+
+
 class Controllers:
     """Two joint controllers; REAL32, as a real one holds it."""
 
     def __init__(self, gain: float = 1.1, offset: float = -0.4) -> None:
-        self.held = [Calibration(float(np.float32(gain)), float(np.float32(offset)), 0, 0, 0) for _ in NAMES]
+        self.held = [as_real32(Calibration(gain, offset)) for _ in NAMES]
         self.broken = False
 
     def read_calibration(self, joint: int) -> Calibration:
         return self.held[joint]
 
-    def write_calibration(
-        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
-    ) -> Calibration:
+    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
         if self.broken:
             raise BusFault("no answer")
-        self.held[joint] = Calibration(float(np.float32(gain)), float(np.float32(offset)), record_id, 0, 0)
+        self.held[joint] = as_real32(calibration)
         return self.held[joint]

@@ -12,10 +12,11 @@ from fast_arm import PERIOD, FastArm
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import BusFault
 from armlink.link.types import Calibration, Stats
+from calib.daemon.environment import Environment
 from calib.daemon.loop.loop_messages import Batch, Progress, Reply, Up
-from calib.daemon.service import Around, Service
+from calib.daemon.service import Service
+from calib.daemon.service_view import ServiceView
 from calib.daemon.settings import DaemonSection
-from calib.daemon.view.service_view import ServiceView
 from calib.records.records import CalibrationRecord, GravityRecord, JointCalibration, matrix, provenance
 from calib.records.store import RecordStore
 
@@ -47,8 +48,9 @@ class FastDaemon:
         self.wall_shift, self.clock_shift = timedelta(), 0.0
         self.store = RecordStore(str(directory / "records.db"))
         self.controllers, self.port = self, self
-        self.ids = [0] * self.fast.n
+        self.ids, self.dates = [0] * self.fast.n, [0] * self.fast.n
         self.sdo: list[str] = []
+        self.run_aside = run_now
         self.on_write: Callable[[int], None] = lambda joint: None
         self.touring, self.job_after = 0, self.fast.job
         if records:
@@ -72,9 +74,9 @@ class FastDaemon:
         return CalibrationRecord(**provenance(self.arm, created=START), joints=joints), gravity
 
     def start(self, up: bool = True) -> None:
-        around = Around(self.now, self.wall, run_now, self)
+        environment = Environment(self.now, self.wall, lambda work, done: self.run_aside(work, done), self)
         state = self.directory / "state"
-        self.service = Service(self.arm, self.settings, self.listen_only, state, self.store, around)
+        self.service = Service(self.arm, self.settings, self.listen_only, state, self.store, environment)
         self.view = ServiceView(self.service)
         if up:
             self.service.take(Up(None if self.listen_only else self.held()))
@@ -92,17 +94,15 @@ class FastDaemon:
 
     def read_calibration(self, joint: int) -> Calibration:
         self.sdo.append(f"read {joint}")
-        return Calibration(
-            float(self.fast.held_gain[joint]), float(self.fast.held_offset[joint]), self.ids[joint], 0, 0
-        )
+        gain, offset = float(self.fast.held_gain[joint]), float(self.fast.held_offset[joint])
+        return Calibration(gain, offset, self.ids[joint], self.dates[joint])
 
-    def write_calibration(
-        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
-    ) -> Calibration:
+    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
         self.sdo.append(f"write {joint}")
         self.on_write(joint)
-        self.fast.held_gain[joint], self.fast.held_offset[joint] = np.float32(gain), np.float32(offset)
-        self.ids[joint] = record_id
+        self.fast.held_gain[joint] = np.float32(calibration.gain)
+        self.fast.held_offset[joint] = np.float32(calibration.offset)
+        self.ids[joint], self.dates[joint] = calibration.record_id, calibration.date
         return self.read_calibration(joint)
 
     def sweep(self, poses: int, seed: int) -> Reply | None:

@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from armlink.arm_file import ArmFile, parse_arm
+from armlink.link.types import Calibration
+from calib.install.journaled_write import Controllers
 from calib.records.records import CalibrationRecord, GravityRecord, JointCalibration, matrix, provenance
 
 WHEN = datetime(2026, 11, 21, 2, 0, tzinfo=UTC)
@@ -17,6 +19,13 @@ def arm_file(**changes: object) -> ArmFile:
 
 
 ARM = arm_file()
+
+
+def put_on(controllers: Controllers, record: CalibrationRecord) -> None:
+    """A record on the controllers, as if it had been there before the test: no gate, no journal."""
+    for j, joint in enumerate(record.joints):
+        wanted = joint.torque_calibration(controllers.read_calibration(j))
+        controllers.write_calibration(j, Calibration(wanted.gain, wanted.offset, record.number))
 
 
 def calibration(gain: float = 1.02, parent: str | None = None) -> CalibrationRecord:

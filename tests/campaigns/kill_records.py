@@ -6,7 +6,7 @@ Exit status 1 if a record is torn or lost, the store does not open, or controlle
 A child process keeps records, makes them current and writes them to two controllers whose memory is a file, object by
 object as 2100h is written, and notes after each step what it was told is done. The parent kills it at a random moment
 and looks: each record that was acknowledged is there and whole, no other has half a body, the current one is
-no older than the last that was acknowledged, and after `mend` the controllers hold the pair of the current record.
+no older than the last that was acknowledged, and after `recover` the controllers hold the pair of the current record.
 """
 
 import argparse
@@ -29,7 +29,9 @@ from postgres import server
 from armlink.arm_file import ArmFile, parse_arm
 from armlink.errors import BadInput
 from armlink.link.types import Calibration
-from calib.install.journaled_write import install, mend, same_real32
+from armlink.torque_calibration import UNCALIBRATED
+from calib.install.journaled_write import install, recover
+from calib.install.plausibility import admit_rollback
 from calib.records.records import CalibrationRecord, JointCalibration, provenance
 from calib.records.store import RecordStore
 
@@ -75,15 +77,13 @@ class Memory:
     def read_calibration(self, joint: int) -> Calibration:
         """The active pair."""
         active = self._load()[joint]["active"]
-        return Calibration(active["gain"], active["offset"], int(active["record_id"]), int(active["date"]), 0)
+        return Calibration(active["gain"], active["offset"], int(active["record_id"]), int(active["date"]))
 
-    def write_calibration(
-        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
-    ) -> Calibration:
+    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
         """Stage object after object, then activate: a kill may come between any two."""
-        for key, value in (("gain", gain), ("offset", offset), ("record_id", record_id), ("date", date)):
+        for key in ("gain", "offset", "record_id", "date"):
             held = self._load()
-            held[joint]["staged"][key] = value
+            held[joint]["staged"][key] = getattr(calibration, key)
             self._save(held)
         held = self._load()
         held[joint]["active"] = dict(held[joint]["staged"])
@@ -105,7 +105,9 @@ def work(url: str, folder: Path, first: int) -> None:
     with (folder / "done").open("a") as done:
         for number in range(first, first + 1000):
             if number % 3 == 0:
-                install(numbered(number), ARM, store, memory, by="child", reason="write")
+                held = {j: memory.read_calibration(j) for j in range(len(NAMES))}
+                admitted = admit_rollback(numbered(number), ARM, store, held)
+                install(admitted, store, memory, by="child", reason="write", check=None)
                 done.write(f"installed {number}\n")
             else:
                 store.add(numbered(number))
@@ -125,15 +127,15 @@ def look(url: str, folder: Path) -> list[str]:
     wrong += [f"record {n} was acknowledged and is lost" for _, n in answered if n not in kept]
     wrong += [f"record {n} is torn" for n, record in kept.items() if record != numbered(int(n))]
     memory = Memory(folder / "controllers.json")
-    mend(ARM, store, memory)
+    recover(ARM, store, memory)
     current = store.current(CalibrationRecord, ARM)
     installed = [int(n) for what, n in answered if what == "installed"]
     if installed and (current is None or int(current.note) < max(installed)):
         wrong.append(f"{max(installed)} was acknowledged as current, now it is {current.note if current else None}")
     for j, name in enumerate(NAMES):
         held = memory.read_calibration(j)
-        pair = (1.0, 0.0) if current is None else (current.joints[j].gain or 0.0, current.joints[j].offset or 0.0)
-        if not (same_real32(held.gain, pair[0]) and same_real32(held.offset, pair[1])):
+        pair = UNCALIBRATED if current is None else current.joints[j].torque_calibration()
+        if not pair.matches(held):
             wrong.append(f"{name} holds {held.gain}, {held.offset}, the current record has {pair}")
     if store.unfinished_write(ARM) is not None:
         wrong.append("a write is still open after mending")

@@ -1,4 +1,4 @@
-"""The bus loop: drives the bus or listens to it, cycle by cycle; knows no web, no database and no observer."""
+"""The bus loop: drives the bus or listens to it, cycle by cycle; has no web, database or observer."""
 
 import math
 import time
@@ -12,43 +12,44 @@ from armlink.link.link import Link
 from armlink.link.listener import Listener
 from armlink.link.types import Calibration, Command, Sample
 from calib.arm.kinematics import gcomp_arm
-from calib.daemon.loop.loop_messages import Array, Batch, Down, LoopOptions, Message, Progress, Reply, Request, Up
+from calib.daemon.loop.loop_messages import Batch, Down, LoopOptions, Message, Progress, Reply, Request, Up
 from calib.motion.random_work import WorkMotion, work_pieces
+from gcomp.arrays import Array
 
 BATCH_SECONDS = 0.1
-"""Samples go to the service so often: the snapshot rate of contract 8."""
+"""Time between two batches to the service [s]: the stream's 10 Hz (docs/daemon-api.md)."""
 RETRY_SECONDS = 1.0
-"""A bus that is not there is tried again after this time."""
+"""Time between two attempts to open the bus [s]."""
 TOUR = WorkMotion(reach=10.0)
-"""A tour's moves may go from one end of a joint's range to the other."""
+"""A tour's moves may span the whole range of a joint [rad]."""
 SILENCE_SECONDS = 0.5
-"""A bus without SYNC, or joints without readings, for so long is reported."""
+"""A bus without SYNC for this time is reported [s]."""
 
 
 class ArmLoop:
-    """`run()` makes cycles for a tenth of a second and returns what there is to say; `handle` does what is asked.
+    """`run()` runs the cycles of a tenth of a second and returns messages; `handle` carries out a request.
 
-    A fault of bus or joint is a message, never an exception: the bus is opened again until it works.
+    A fault of bus or joint is a message, never an exception: the bus is opened again until that succeeds.
     """
 
     def __init__(self, options: LoopOptions) -> None:
         self.options = options
         self._tour: list[int] | None = None
-        self._told = -1
+        self._reported = -1
         self._source: Link | Listener | None = None
         self._targets: Iterator[Array] | None = None
         self._shift = 0.0
-        self._said: str | None = None
+        self._reason: str | None = None
         self._heard = math.inf
         self._real_start: tuple[float, float] | None = None
 
     @property
     def source(self) -> Link | Listener | None:
-        """The open link or listener, None while there is none."""
+        """The open link or listener; None while there is none."""
         return self._source
 
     def run(self) -> list[Message]:
-        """Cycles for BATCH_SECONDS, or one try to open the bus."""
+        """Cycles for BATCH_SECONDS, or one attempt to open the bus."""
         try:
             if self._source is None:
                 return [self._open()]
@@ -58,23 +59,23 @@ class ArmLoop:
             return self._down(str(error))
 
     def wait(self) -> float:
-        """How long to wait before the next run() [s]: 0 while the bus is there."""
+        """Time to wait before the next run() [s]: 0 while the bus is open."""
         return 0.0 if self._source is not None else RETRY_SECONDS
 
     def close(self) -> None:
-        """Let go of the bus; joints that were enabled are in quick stop, holding."""
+        """Close the bus; joints that were enabled hold in quick stop."""
         source, self._source, self._targets, self._tour = self._source, None, None, None
         if source is not None:
             try:
                 source.__exit__(None, None, None)
             except (ArmlinkError, OSError):
-                return  # it is gone already: the joints' own deadlines stop them
+                return  # the bus is gone already: the joints' own deadlines stop them
 
     def handle(self, request: Request) -> Reply:
-        """Do what is asked; every failure is in the reply."""
+        """Carry out a request; every failure is in the reply."""
         source = self._source
         if source is None:
-            return Reply(request.id, error=self._said or "the bus is not open", status=BusFault.exit_status)
+            return Reply(request.id, error=self._reason or "the bus is not open", status=BusFault.exit_status)
         try:
             return Reply(request.id, self._do(source, request))
         except BusFault as error:
@@ -94,9 +95,9 @@ class ArmLoop:
         raise BusFault(f"the loop knows no request {request.what!r}")
 
     def _sweep(self, source: Link | Listener, poses: int, seed: int) -> int:
-        """From now on the arm tours so many poses all over its range, then holds; `run` tells how far it is."""
+        """Begin a tour of `poses` poses over the whole range, then hold; `run` reports the progress."""
         if not isinstance(source, Link):
-            raise Refused("a sweep moves the arm, and this daemon only listens: let its controller move it more")
+            raise Refused("a sweep moves the arm, and this daemon only listens: move the arm with its own controller")
         self._tour = [0, poses]
         self._targets = self._touring(source, poses, seed)
         return poses
@@ -114,7 +115,7 @@ class ArmLoop:
         link = Link(options.arm, bus)
         self._source = link
         link.start()
-        held = [link.read_calibration(joint) for joint in range(link.n)]  # before there are cycles to wait for
+        held = [link.read_calibration(joint) for joint in range(link.n)]  # before SDO has to wait for cycles
         sample = link.enable()
         self._shift = link.clock.now() - sample.t
         self._targets = self._motion(link)
@@ -122,11 +123,11 @@ class ArmLoop:
         return self._up(held)
 
     def _up(self, held: list[Calibration] | None) -> Up:
-        self._said = None
+        self._reason = None
         return Up(None if held is None else tuple((each.gain, each.offset, each.record_id) for each in held))
 
     def _down(self, reason: str) -> list[Message]:
-        self._said = reason
+        self._reason = reason
         return [Down(reason)]
 
     def _cycle(self) -> list[Message]:
@@ -139,11 +140,11 @@ class ArmLoop:
             messages: list[Message] = [Batch.of(rows, source.stats, heard)] if rows else []
             return messages + self._silence(source, bool(rows))
         messages = [Batch.of(rows, source.stats)]
-        if self._tour is not None and self._tour[0] != self._told:
-            self._told = self._tour[0]
+        if self._tour is not None and self._tour[0] != self._reported:
+            self._reported = self._tour[0]
             messages.append(Progress(*self._tour))
-            if self._told >= self._tour[1]:
-                self._tour, self._told = None, -1
+            if self._reported >= self._tour[1]:
+                self._tour, self._reported = None, -1
         return messages
 
     def _drive(self, link: Link) -> list[tuple[float, Sample, Array, Array]]:
@@ -167,19 +168,19 @@ class ArmLoop:
         return rows
 
     def _silence(self, listener: Listener, heard: bool) -> list[Message]:
-        """Say once that nobody sends SYNC, and when somebody does again."""
+        """Report once that no SYNC arrives, and once that it is back."""
         now = listener.clock.now()
         if heard:
             self._heard = now
-            if self._said is not None:
+            if self._reason is not None:
                 return [self._up(None)]
             return []
-        if now - self._heard <= SILENCE_SECONDS or self._said is not None:
+        if now - self._heard <= SILENCE_SECONDS or self._reason is not None:
             return []
         return self._down(f"no SYNC on {listener.bus.channel_info}: is the arm's controller running?")
 
     def _motion(self, link: Link) -> Iterator[Array]:
-        """Targets, one a cycle: where the arm stands, or ordinary work where that was asked for."""
+        """Targets, one per cycle: the present position, or ordinary work if configured."""
         if self.options.work:
             for pose in self._poses(link, self.options.seed, WorkMotion()):
                 yield from pose
@@ -188,7 +189,7 @@ class ArmLoop:
             yield here
 
     def _touring(self, link: Link, poses: int, seed: int) -> Iterator[Array]:
-        """Targets of a tour over the whole range, then back to what it did before."""
+        """Targets of a tour over the whole range, then of the motion before it."""
         for done, pose in enumerate(self._poses(link, seed, TOUR), start=1):
             yield from pose
             if self._tour is not None:
@@ -198,19 +199,19 @@ class ArmLoop:
         yield from self._motion(link)
 
     def _poses(self, link: Link, seed: int, motion: WorkMotion) -> Iterator[Array]:
-        """Pieces (K, n) of motion without end, each to another pose and a rest there."""
+        """Endless pieces of motion (K, n), each to another pose with a rest there."""
         arm = gcomp_arm(self.options.arm)
         speed = np.array([joint.max_velocity for joint in self.options.arm.require_link().joints])
         random = np.random.default_rng([seed, 8])
         return work_pieces(link.position_sent, arm.lower, arm.upper, speed, link.period, random, motion)
 
     def _keep_pace(self, link: Link) -> None:
-        """An in-process arm's time is as fast as the machine: wait for the machine's clock."""
+        """Run an in-process simulated arm in real time: wait for the machine's clock."""
         if not self.options.pace or link.bus.clock is None:
             return
         now, real = link.clock.now(), time.monotonic()
         if self._real_start is None or real - self._real_start[1] - (now - self._real_start[0]) > 1.0:
-            self._real_start = (now, real)  # the machine is slower than the arm: do not make up for it
+            self._real_start = (now, real)  # the machine is too slow: do not catch up
         ahead = (now - self._real_start[0]) - (real - self._real_start[1])
         if ahead > 0:
             time.sleep(ahead)

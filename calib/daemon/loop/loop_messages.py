@@ -1,4 +1,4 @@
-"""What passes between the bus loop and the service: samples in batches, answers; never a lock, never a wait."""
+"""Messages between the bus loop and the service: samples in batches, requests and replies."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -10,41 +10,41 @@ from numpy.typing import NDArray
 from armlink.arm_file import ArmFile
 from armlink.bus.can_bus import CanBus
 from armlink.link.types import Sample, Stats
+from gcomp.arrays import Array
 
-Array = NDArray[np.float64]
 CHANNELS = ("position", "velocity", "torque", "motor_torque", "torque_command", "position_command")
 
 
 @dataclass
 class LoopOptions:
-    """What the loop needs to know."""
+    """Settings of the bus loop."""
 
     arm: ArmFile
     bus: str | None = None
     listen_only: bool = False
     work: bool = False
     pace: bool = True
-    """In-process simulated arm: keep to the machine's time. Without, simulated time passes as fast as it can."""
+    """In-process simulated arm: run in real time; without, simulated time passes as fast as it can."""
     seed: int = 0
     open_bus: Callable[[], CanBus] | None = field(default=None, repr=False)
-    """Gives the bus in tests; by default it is opened by name."""
+    """Returns the bus, in tests; by default it is opened by name."""
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Samples of a tenth of a second."""
+    """The samples of a tenth of a second."""
 
     t: Array
     """(K,) by the loop's monotonic clock [s]."""
     channels: dict[str, Array]
-    """Names of CHANNELS → (K, n), NaN where missing."""
+    """Name of CHANNELS → (K, n), SI units, NaN if missing."""
     status: NDArray[np.int64]
     """Newest status words (n,)."""
     age: Array
-    """Time since position and torque last came (n,) [s]."""
+    """Time since position and torque last arrived (n,) [s]."""
     stats: Stats
     emergencies: tuple[tuple[int, int, int], ...] = ()
-    """(Joint, code, error register) of emergencies heard beside another controller."""
+    """(Joint, code, error register) of emergencies heard while only listening."""
 
     @classmethod
     def of(
@@ -71,22 +71,22 @@ class Batch:
 
 @dataclass(frozen=True)
 class Up:
-    """The bus is there and the joints answer."""
+    """The bus is open and the joints answer."""
 
     held: tuple[tuple[float, float, int], ...] | None
-    """Gain, offset [N·m] and record id that each controller holds; None where only listened to."""
+    """Gain, offset [N·m] and record id in each controller; None if the loop only listens."""
 
 
 @dataclass(frozen=True)
 class Down:
-    """The bus or a joint is not there, or has failed; tried again by itself."""
+    """The bus or a joint is missing or has failed; the loop retries on its own."""
 
     reason: str
 
 
 @dataclass(frozen=True)
 class Request:
-    """Something that the service asks of the loop."""
+    """A request of the service to the loop."""
 
     id: int
     what: Literal["read", "write", "sweep", "stop"]
@@ -95,7 +95,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Reply:
-    """The answer to a request; `error` is one line where it failed."""
+    """The reply to a request; `error` is one line if it failed."""
 
     id: int
     value: Any = None
@@ -106,7 +106,7 @@ class Reply:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a sweep is."""
+    """Progress of a tour of poses."""
 
     done: int
     total: int
@@ -115,7 +115,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class Alive:
-    """The loop runs and has nothing else to say."""
+    """Sign of life when there is nothing else to send."""
 
 
 Message = Alive | Batch | Up | Down | Reply | Progress

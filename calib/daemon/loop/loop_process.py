@@ -1,4 +1,4 @@
-"""Where the bus loop runs: in this thread (`InlineHost`, lock-step) or in a process of its own (`ChildHost`)."""
+"""Runs the bus loop in this thread (`InlineLoop`, lock-step) or in a process of its own (`LoopProcess`)."""
 
 import gc
 import itertools
@@ -17,16 +17,16 @@ from armlink.link.types import Calibration
 from calib.daemon.loop.loop_messages import Alive, LoopOptions, Message, Reply, Request
 
 ANSWER_SECONDS = 10.0
-"""A request that the loop has not answered by then has failed [s]."""
+"""A request that the loop has not answered within this time has failed [s]."""
 END_SECONDS = 2.0
-"""The loop's process gets so long to leave the joints safe [s]."""
+"""Time for the loop's process to leave the joints safe, before it is killed [s]."""
 Ask = Callable[[Request], Reply]
 
 _numbers = itertools.count(1)
 
 
 class LoopControllers:
-    """Object 2100h of every joint by way of the bus loop; waits for the answer."""
+    """Object 2100h of every joint through the bus loop; waits for the answer."""
 
     def __init__(self, ask: Ask) -> None:
         self._ask = ask
@@ -35,12 +35,9 @@ class LoopControllers:
         """Active gain and offset [N·m] of joint j; raises BusFault."""
         return self._call("read", joint=joint)
 
-    def write_calibration(
-        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
-    ) -> Calibration:
+    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
         """Stage, read back and make active; raises BadInput, BusFault."""
-        given = {"joint": joint, "gain": gain, "offset": offset, "record_id": record_id, "date": date, "store": store}
-        return self._call("write", **given)
+        return self._call("write", joint=joint, calibration=calibration, store=store)
 
     def _call(self, what: Any, **arguments: Any) -> Calibration:
         reply = self._ask(Request(next(_numbers), what, arguments))
@@ -56,8 +53,8 @@ def error_of(reply: Reply) -> ArmlinkError:
     return kinds.get(reply.status, BusFault)(reply.error)
 
 
-class InlineHost:
-    """The loop in this thread: `pump` makes a tenth of a second of cycles."""
+class InlineLoop:
+    """The loop in this thread: `pump` runs the cycles of a tenth of a second."""
 
     def __init__(self, options: LoopOptions) -> None:
         from calib.daemon.loop.arm_loop import ArmLoop
@@ -70,7 +67,7 @@ class InlineHost:
         return self.loop.handle(Request(next(_numbers), "sweep", {"poses": poses, "seed": seed}))
 
     def pump(self) -> list[Message]:
-        """Cycles, and what they bring."""
+        """Run cycles; returns their messages."""
         return self.loop.run()
 
     def close(self) -> None:
@@ -78,11 +75,11 @@ class InlineHost:
         self.loop.close()
 
 
-class ChildHost:
-    """The loop in a process of its own, so that nothing here can hold up a cycle."""
+class LoopProcess:
+    """The loop in a process of its own, so that nothing in the service can delay a cycle."""
 
     def __init__(self, options: LoopOptions, fork: bool = False) -> None:
-        """Start the process; `fork` is quicker, and for a process without threads alone."""
+        """Start the process; `fork` is faster, but only safe while this process has no other threads."""
         context = multiprocessing.get_context("fork") if fork else multiprocessing.get_context("spawn")
         self._ours, theirs = context.Pipe()
         inherited = self._ours if fork else None
@@ -93,7 +90,6 @@ class ChildHost:
         theirs.close()
         self._waiting: dict[int, Future[Reply]] = {}
         self._sending = threading.Lock()
-        self.controllers = LoopControllers(self._ask)
 
     @property
     def pid(self) -> int | None:
@@ -110,7 +106,7 @@ class ChildHost:
         return None
 
     def pump(self) -> list[Message]:
-        """All messages that are there; raises EOFError where the process has ended."""
+        """All messages waiting; raises EOFError if the process has ended."""
         messages: list[Message] = []
         try:
             while self._ours.poll():
@@ -127,7 +123,7 @@ class ChildHost:
         return messages
 
     def close(self) -> None:
-        """End the process; it leaves the joints safe. One that does not end is killed: the joints' deadlines act."""
+        """End the process, which leaves the joints safe; if it does not end it is killed, and the joints time out."""
         self._send(Request(0, "stop"))
         self._process.join(END_SECONDS)
         if self._process.is_alive():
@@ -136,7 +132,8 @@ class ChildHost:
         self._give_up()
         self._ours.close()
 
-    def _ask(self, request: Request) -> Reply:
+    def ask(self, request: Request) -> Reply:
+        """Send a request and wait for its reply."""
         answer: Future[Reply] = Future()
         self._waiting[request.id] = answer
         if not self._send(request):
@@ -165,12 +162,14 @@ class ChildHost:
 
 
 def _child(connection: Connection, options: LoopOptions, inherited: Connection | None) -> None:
-    """The process: cycles until it is told to stop, or nobody listens any more."""
+    """Main function of the process: cycles until asked to stop, or until the service is gone."""
     if inherited is not None:
-        inherited.close()  # the service's end: held here, nobody would see the service end
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the whole group: the service ends us
+        inherited.close()  # the service's end: kept open here, it would hide that the service has ended
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # Ctrl-C reaches the whole process group; the service ends this process
     signal.signal(signal.SIGTERM, lambda number, frame: _raise_end())
-    from calib.daemon.loop.arm_loop import ArmLoop  # what it loads, the service does not need
+    from calib.daemon.loop.arm_loop import ArmLoop  # not loaded in the service
 
     loop = ArmLoop(options)
     gc.collect()
@@ -178,20 +177,20 @@ def _child(connection: Connection, options: LoopOptions, inherited: Connection |
     try:
         while True:
             for message in loop.run() or [Alive()]:
-                _tell(connection, message)
+                _send_message(connection, message)
             while connection.poll(loop.wait()):
                 request = connection.recv()
                 if request.what == "stop":
                     return
-                _tell(connection, loop.handle(request), patience=1.0)
+                _send_message(connection, loop.handle(request), patience=1.0)
     except (EOFError, OSError, _End):
-        return  # the service has gone: leave the joints safe
+        return  # the service is gone: leave the joints safe
     finally:
         loop.close()
 
 
-def _tell(connection: Connection, message: Message, patience: float = 0.0) -> None:
-    """Send unless the service is so far behind that it would hold up the cycle: then the message is lost."""
+def _send_message(connection: Connection, message: Message, patience: float = 0.0) -> None:
+    """Send, unless the service is so far behind that sending would delay the cycle: then the message is dropped."""
     if select.select([], [connection], [], patience)[1]:
         connection.send(message)
 

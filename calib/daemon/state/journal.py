@@ -1,12 +1,13 @@
-"""The daemon's journal: events, estimates over time, proposals, decisions, the observer's belief; one SQLite file.
+"""The daemon's journal: events, proposals, decisions, estimates over time and the observer's state, in one SQLite file.
 
-Events, proposals and decisions are append-only (SQLite itself refuses changes). What belongs together is one
-transaction: a kill at any moment leaves all of it or none.
+Events, proposals and decisions are append-only (SQLite triggers refuse changes). Rows that belong together are written
+in one transaction: a kill at any moment leaves all of them or none.
 """
 
 import json
+import logging
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -14,10 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from armlink.errors import BadInput
+from calib.daemon.state.proposal_row import ProposalRow
+from calib.observer.decision import Finding
 
 SCHEMA = 1
 CACHE_KB = 256
-"""Pages of the file that SQLite keeps in memory: its own 2 MB would fill over days, as if memory leaked."""
+"""SQLite's page cache: the default 2 MB fills over days, which looks like a memory leak."""
 _TABLES = """
 CREATE TABLE IF NOT EXISTS events (
     id INTEGER PRIMARY KEY AUTOINCREMENT, time TEXT NOT NULL, t REAL NOT NULL, kind TEXT NOT NULL, joint TEXT,
@@ -37,26 +40,12 @@ CREATE INDEX IF NOT EXISTS decisions_proposal ON decisions(proposal);
 """
 _APPEND_ONLY = ("events", "proposals", "decisions")
 
-
-@dataclass(frozen=True)
-class ProposalRow:
-    """A proposal with the newest decision on it."""
-
-    id: int
-    time: datetime
-    joint: str
-    record: str
-    base: str
-    finding: dict[str, Any]
-    state: str
-    by: str | None
-    decided: datetime | None
-    note: str
+log = logging.getLogger("armlink.daemon")
 
 
 @dataclass(frozen=True)
 class Belief:
-    """The observer's state as it was saved, and the records that it was relative to."""
+    """The observer's saved state, and the records that it is relative to."""
 
     calibration: str | None
     gravity: str | None
@@ -64,11 +53,13 @@ class Belief:
 
 
 class Journal:
-    """One process writes it; any other may read it. Raises sqlite3.Error where the disk fails."""
+    """One process writes it; any other may read it. Raises sqlite3.Error if the disk fails."""
 
     def __init__(self, path: Path) -> None:
-        """Open or make it; raises BadInput where that cannot be."""
+        """Open or create it; raises BadInput if that is not possible."""
         self.path = path
+        self.trouble = ""
+        """Why nothing can be written, in one line; empty while it can."""
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._db = sqlite3.connect(path, isolation_level=None, timeout=10.0)
@@ -96,7 +87,7 @@ class Journal:
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
-        """Everything inside is on disk at its end, or nothing is; transactions may stand inside one another."""
+        """Everything inside is on disk at its end, or nothing is; transactions may be nested."""
         if self._db.in_transaction:
             yield
             return
@@ -107,6 +98,16 @@ class Journal:
             self._db.execute("ROLLBACK")
             raise
         self._db.execute("COMMIT")
+        self.trouble = ""
+
+    def guard(self, act: Callable[[], object]) -> None:
+        """Call `act`, which writes; a failing disk is logged and shown in the status, and stops nothing."""
+        try:
+            act()
+        except sqlite3.Error as error:
+            if not self.trouble:
+                log.error("journal: %s", error)
+            self.trouble = f"the journal cannot be written: {error}"
 
     # ---- events
 
@@ -133,20 +134,20 @@ class Journal:
 
     @property
     def last_event(self) -> int:
-        """Id of the newest event, 0 where there is none."""
+        """Id of the newest event; 0 if there is none."""
         return int(self._db.execute("SELECT COALESCE(MAX(id), 0) FROM events").fetchone()[0])
 
     # ---- proposals
 
-    def add_proposal(self, time: datetime, joint: str, record: str, base: str, finding: dict[str, Any]) -> int:
-        """Append a proposal, pending, and return its id; earlier pending ones of the joint are superseded."""
+    def add_proposal(self, time: datetime, joint: str, record: str, base: str, finding: Finding) -> int:
+        """Append a pending proposal and return its id; earlier pending ones of the joint are superseded."""
         with self.transaction():
             for earlier in self.proposals():
                 if earlier.joint == joint and earlier.state == "pending":
                     self.decide(earlier.id, time, "superseded", "daemon", "a newer proposal")
             cursor = self._db.execute(
                 "INSERT INTO proposals(time, joint, record, base, finding) VALUES (?, ?, ?, ?, ?)",
-                (_iso(time), joint, record, base, json.dumps(finding)),
+                (_iso(time), joint, record, base, json.dumps(finding.as_json())),
             )
         assert cursor.lastrowid is not None
         return cursor.lastrowid
@@ -173,7 +174,7 @@ class Journal:
     # ---- belief and history
 
     def save_belief(self, time: datetime, calibration: str | None, gravity: str | None, state: dict[str, Any]) -> None:
-        """Replace what is kept of the observer, whole or not at all."""
+        """Replace the observer's saved state, whole or not at all."""
         with self.transaction():
             self._db.execute(
                 "INSERT OR REPLACE INTO belief(one, time, calibration, gravity, state) VALUES (1, ?, ?, ?, ?)",
@@ -181,7 +182,7 @@ class Journal:
             )
 
     def belief(self) -> Belief | None:
-        """What was kept of the observer, None where nothing was or it cannot be read."""
+        """The observer's saved state; None if there is none or it cannot be read."""
         row = self._db.execute("SELECT calibration, gravity, state FROM belief").fetchone()
         try:
             return None if row is None else Belief(row[0], row[1], json.loads(row[2]))
@@ -199,7 +200,7 @@ class Journal:
     def history(
         self, since: datetime | None, until: datetime | None, most: int
     ) -> list[tuple[datetime, float, str | None, dict[str, Any]]]:
-        """Estimates of a time span, oldest first, thinned evenly to at most `most`; the newest is always there."""
+        """Estimates of a time span, oldest first, thinned evenly to at most `most`; always includes the newest."""
         span = (_iso(since) if since else "", _iso(until) if until else "9999")
         count = int(self._db.execute("SELECT COUNT(*) FROM history WHERE time >= ? AND time <= ?", span).fetchone()[0])
         step = max(1, -(-count // max(most, 1)))
@@ -211,7 +212,7 @@ class Journal:
         return [(datetime.fromisoformat(time), t, record, json.loads(found)) for time, t, record, found in rows]
 
     def thin_history(self, before: datetime, keep_every: int) -> None:
-        """Of the estimates before a time keep one in `keep_every`."""
+        """Keep one in `keep_every` of the estimates before a time."""
         with self.transaction():
             self._db.execute("DELETE FROM history WHERE time < ? AND id % ? != 0", (_iso(before), keep_every))
 
@@ -230,7 +231,7 @@ def _proposal(row: tuple[Any, ...]) -> ProposalRow:
         joint=joint,
         record=record,
         base=base,
-        finding=json.loads(finding),
+        values=json.loads(finding),
         state=state or "pending",
         by=by,
         decided=None if decided is None else datetime.fromisoformat(decided),

@@ -1,37 +1,40 @@
-"""Recordings that the daemon keeps by itself: MCAP files of some minutes, the oldest dropped when the quota is full."""
+"""The daemon's own recordings: MCAP files of some minutes each; the oldest are dropped when the quota is full."""
 
 import logging
 from datetime import UTC, datetime
 from pathlib import Path
 
+from armlink.recording.mcap import RecordingWriter
 from calib.daemon.loop.loop_messages import Batch
-from calib.daemon.settings import RecordingSettings
+from calib.daemon.settings import Configuration, RecordingSettings
 
 log = logging.getLogger("armlink.daemon")
 GAP = 1.0
-"""A pause in the samples longer than this begins another file [s]."""
+"""A pause in the samples longer than this begins a new file [s]."""
+RETRY_SECONDS = 60.0
+"""After a failure nothing is written for this time [s]."""
 
 
 class Recordings:
-    """Writes every so many-th sample; a disk that is full or fails is logged and never stops the daemon.
+    """Writes samples at the configured rate; a disk that is full or fails is logged and never stops the daemon.
 
-    Files are numbered, since clocks are set back.
+    Files are numbered, because the clock that stamps their names may be set back.
     """
 
-    def __init__(self, directory: Path, names: tuple[str, ...], settings: RecordingSettings) -> None:
-        """Files go to `directory`, which is made when the first one is."""
-        from armlink.recording.mcap import RecordingWriter
-
-        self._make = RecordingWriter
-        self._directory, self._names, self.settings = directory, names, settings
+    def __init__(self, directory: Path, configuration: Configuration) -> None:
+        """Files go to `directory`, which is made with the first one."""
+        self._directory, self._configuration = directory, configuration
         self._writer: RecordingWriter | None = None
         self._begun = self._last = self._due = -float("inf")
         self._failed_at = -float("inf")
 
+    @property
+    def _settings(self) -> RecordingSettings:
+        return self._configuration.settings.recording
+
     def append(self, batch: Batch) -> None:
-        """Write what is due of a batch."""
-        settings = self.settings
-        if not settings.enabled or batch.t[-1] - self._failed_at < 60.0:
+        """Write the samples of a batch that are due."""
+        if not self._settings.enabled or batch.t[-1] - self._failed_at < RETRY_SECONDS:
             return
         try:
             if batch.t[0] - self._last > GAP or batch.t[0] < self._last or self._old(float(batch.t[0])):
@@ -53,14 +56,14 @@ class Recordings:
                 log.error("recordings: %s", error)
 
     def _old(self, t: float) -> bool:
-        return self._writer is not None and t - self._begun > self.settings.minutes * 60.0
+        return self._writer is not None and t - self._begun > self._settings.minutes * 60.0
 
     def _write(self, batch: Batch) -> None:
         assert self._writer is not None
         for k, t in enumerate(batch.t.tolist()):
             if t < self._due:
                 continue
-            self._due = max(self._due + 1 / self.settings.rate, t + 0.5 / self.settings.rate)
+            self._due = max(self._due + 1 / self._settings.rate, t + 0.5 / self._settings.rate)
             self._writer.append(t - self._begun, {name: values[k] for name, values in batch.channels.items()})
 
     def _rotate(self, t: float) -> None:
@@ -70,14 +73,14 @@ class Recordings:
         last = max((path.name for path in self._directory.glob("*.mcap")), default="0")
         number = int(last.partition("-")[0]) + 1 if last.partition("-")[0].isdigit() else 1
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-        self._writer = self._make(self._directory / f"{number:08d}-{stamp}.mcap", self._names)
+        self._writer = RecordingWriter(self._directory / f"{number:08d}-{stamp}.mcap", self._configuration.names)
         self._begun = self._due = t
 
     def _keep_quota(self) -> None:
-        """Drop the oldest files until the rest, one more of the largest size included, fits the quota."""
+        """Drop the oldest files until the rest and one more of the largest size fit the quota."""
         files = sorted(self._directory.glob("*.mcap"), key=lambda path: path.name)
         sizes = [path.stat().st_size for path in files]
-        room = self.settings.quota_mb * 1e6 - max(sizes, default=0)
+        room = self._settings.quota_mb * 1e6 - max(sizes, default=0)
         total = sum(sizes)
         for path, size in zip(files, sizes, strict=True):
             if total <= room:

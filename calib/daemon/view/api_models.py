@@ -1,4 +1,4 @@
-"""The answers of the API (contract 8), typed.
+"""The answers of the API, typed (docs/daemon-api.md).
 
 A missing number is None. Times are ISO 8601 with zone (`time`) and monotonic seconds (`t`, which a reboot resets).
 """
@@ -11,7 +11,7 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
 
 
 class State(StrEnum):
-    """What the daemon is doing."""
+    """Activity of the daemon."""
 
     STARTING = "starting"
     OBSERVING = "observing"
@@ -30,26 +30,26 @@ class Answer(BaseModel):
 
 
 class BusHealth(Answer):
-    """The bus as the loop counts it, since it was last opened."""
+    """Counters of the bus loop since the bus was last opened."""
 
     connected: bool
-    """Whether frames of the joints are coming in."""
+    """Whether frames of the joints are arriving."""
     fault: str | None = None
     """Why not, in one line."""
     rate_hz: float = 0.0
-    """Cycles (SYNC) a second."""
+    """Cycles (SYNC) per second."""
     load: float = 0.0
-    """Share of the bus taken."""
+    """Bus load as a share of its capacity."""
     frames: int = 0
     missed: int = 0
-    """Sensor frames that did not come in their cycle."""
+    """Sensor frames that did not arrive in their cycle."""
     late: int = 0
-    """Cycles of our own that began more than a tenth of a period late."""
+    """Own cycles that began more than a tenth of a period late."""
     errors: int = 0
 
 
 class RecordsInForce(Answer):
-    """Ids of the records in force, None where there is none."""
+    """Ids of the records in force; None if there is none."""
 
     calibration: str | None = None
     gravity: str | None = None
@@ -60,7 +60,7 @@ class Status(Answer):
 
     state: State
     detail: str = ""
-    """Why it is in this state, in one line; empty where there is nothing to say."""
+    """Reason for this state, in one line; may be empty."""
     arm: str
     serial: str
     version: str
@@ -72,14 +72,14 @@ class Status(Answer):
     bus: BusHealth
     records: RecordsInForce
     held: bool = False
-    """Whether an alarm stands, so that estimates are held until its cause is known."""
+    """Whether an alarm is open, so that estimates are held until its cause is known."""
     rows: int = 0
     """Rests of the arm that the observer has used since the daemon first ran with these records."""
     pending_proposals: int = 0
     last_event: int = 0
-    """Id of the newest event, 0 where there is none."""
+    """Id of the newest event; 0 if there is none."""
     report: Path | None = None
-    """The newest report (HTML) of a sweep, where there is one."""
+    """The newest report (HTML) of a sweep, if there is one."""
 
 
 class JointNow(Answer):
@@ -93,15 +93,15 @@ class JointNow(Answer):
     model_torque: float | None
     """Gravity model at this position [N·m]."""
     residual: float | None
-    """Torque less model torque [N·m]; means something at rest."""
+    """Torque minus model torque [N·m]; meaningful at rest."""
     state: str
     """CiA 402 state in words; "unknown" before the first status word."""
     sample_age_s: float | None
-    """Time since position and torque last came; None where they never did."""
+    """Time since position and torque last arrived; None if they never did."""
 
 
 class JointEstimate(Answer):
-    """One joint of GET /api/estimates: against the installed record, where gain 1 and offset 0 mean no change."""
+    """One joint of GET /api/estimates, against the installed record: gain 1 and offset 0 mean no change."""
 
     joint: str
     gain: float
@@ -110,7 +110,7 @@ class JointEstimate(Answer):
     """[N·m]"""
     offset_std: float
     samples: int
-    """Rests of the arm that went into it."""
+    """Rests of the arm used for the estimate."""
     last_accepted: AwareDatetime | None
     installed_gain: float | None
     """Gain and offset [N·m] of the record in force."""
@@ -128,7 +128,7 @@ class EventRecord(Answer):
     roll-back, sweep, fault, recovered, started, stopped, configuration, clock."""
     joint: str | None
     text: str
-    """For people, one line."""
+    """One line, for people."""
     evidence: dict[str, Any]
 
 
@@ -143,7 +143,7 @@ class HistoryPoint(Answer):
     offset: float
     offset_std: float
     record: str | None
-    """Calibration record in force then: against it gain and offset are measured."""
+    """Calibration record in force at that time; gain and offset are relative to it."""
 
 
 class Proposal(Answer):
@@ -164,7 +164,7 @@ class Proposal(Answer):
     rows: int
     confidence: float
     record: str
-    """Id of the record that approval puts in force."""
+    """Id of the record that approval makes current."""
     base: str
     """Id of the record that it replaces."""
     decided_at: AwareDatetime | None = None
@@ -174,7 +174,7 @@ class Proposal(Answer):
 
 
 class Overview(Answer):
-    """GET /api/overview: all that the page shows, in one answer."""
+    """GET /api/overview: everything that the page shows, in one answer."""
 
     status: Status
     joints: tuple[JointNow, ...]
@@ -186,7 +186,7 @@ class Overview(Answer):
 
 
 class JointsItem(Answer):
-    """Stream item, ten times a second."""
+    """Item of the stream, ten times per second."""
 
     type: Literal["joints"] = "joints"
     time: AwareDatetime
@@ -197,7 +197,7 @@ class JointsItem(Answer):
 
 
 class EventItem(Answer):
-    """Stream item, as it comes."""
+    """Item of the stream, one per event."""
 
     type: Literal["event"] = "event"
     event: EventRecord

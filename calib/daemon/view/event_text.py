@@ -1,17 +1,16 @@
-"""What the observer says, as the event log has it: kind, one line for people, evidence as JSON."""
+"""The observer's events as the event log has them: kind, one line for people, evidence."""
 
-import math
 from dataclasses import replace
 from typing import Any
 
 from calib.observer.effect_dictionary import DRIFT
 from calib.observer.events import Event
 
-Told = tuple[str, str, dict[str, Any]]
+Description = tuple[str, str, dict[str, Any]]
 """(kind, text, evidence)"""
 
 _EFFECTS = {
-    "friction": "friction shows in the sensor",
+    "friction": "friction appears in the sensor's readings",
     "spring": "a spring (cable, hose) pulls at the joint",
     "slip": "the position reading has slipped",
     "tilt": "the base has tilted",
@@ -20,23 +19,22 @@ _EFFECTS = {
 }
 
 
-def told(event: Event) -> Told:
-    """An observer's event in the terms of contract 8."""
-    evidence = clean(event.evidence)
-    joint = event.joint or "the arm"
+def describe(event: Event) -> Description:
+    """An observer's event in the terms of the API (docs/daemon-api.md)."""
+    joint, evidence = event.joint or "the arm", event.evidence
     if event.kind == "alarm":
         return "alarm", f"{joint}: sensor and model disagree ({evidence.get('channel', '?')})", evidence
     if event.kind == "outliers":
         return "alarm", f"{joint}: {evidence.get('rows', 'several')} readings in a row are far from the model", evidence
     if event.kind == "undecided":
-        return "undecided", f"{joint}: nothing is changed: {'; '.join(evidence.get('reasons', []))}", evidence
+        return "undecided", f"{joint}: nothing changed: {'; '.join(evidence.get('reasons', []))}", evidence
     if event.kind == "proposal":
         return "drift", f"{joint}: sensor drift confirmed: {_change(evidence)}", evidence
     return _verdict(joint, evidence)
 
 
 def one_alarm_a_joint(events: list[Event]) -> list[Event]:
-    """The same events, several alarms of one joint at one time as one: all its channels."""
+    """The same events, with simultaneous alarms of one joint merged into one that lists all its channels."""
     channels: dict[str | None, list[str]] = {}
     for event in events:
         if event.kind == "alarm":
@@ -50,35 +48,21 @@ def one_alarm_a_joint(events: list[Event]) -> list[Event]:
     return merged
 
 
-def clean(value: Any) -> Any:
-    """A value that JSON can carry: numbers that are not finite become None."""
-    if isinstance(value, dict):
-        return {str(key): clean(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [clean(item) for item in value]
-    if isinstance(value, bool | str) or value is None:
-        return value
-    if isinstance(value, int):
-        return value
-    value = float(value)
-    return value if math.isfinite(value) else None
-
-
-def _verdict(joint: str, evidence: dict[str, Any]) -> Told:
+def _verdict(joint: str, evidence: dict[str, Any]) -> Description:
     cause, sure = evidence["cause"], f"confidence {evidence['confidence']:.1%}"
     if cause in DRIFT:
         beside = f", and {evidence['beside']}" if "beside" in evidence else ""
         return "drift", f"{joint}{beside}: the torque sensor drifts ({cause}); {sure}; not written yet", evidence
     if cause == "none":
-        return "clear", "sensors and model agree again: what it was is over (a collision, a contact, a load)", evidence
+        return "clear", "sensors and model agree again: the cause is gone (a collision, a contact, a load)", evidence
     if cause in ("payload", "tool"):
         return "payload", f"{_load(cause, evidence)}; {sure}", evidence
     if cause == "ambiguous":
-        return "undecided", f"cannot be told apart yet: {', '.join(evidence['rivals'])}; {sure}", evidence
+        return "undecided", f"cause still ambiguous: {', '.join(evidence['rivals'])}; {sure}", evidence
     if cause == "unknown":
         return (
             "contact",
-            "contact, or several things at once: no single cause explains it; estimates are held",
+            "contact, or several effects at once: no single cause explains the readings; estimates are held",
             evidence,
         )
     return "effect", f"{joint}: {_EFFECTS.get(cause, cause)}; {sure}; estimates are held", evidence
@@ -87,9 +71,9 @@ def _verdict(joint: str, evidence: dict[str, Any]) -> Told:
 def _load(cause: str, evidence: dict[str, Any]) -> str:
     mass, place = evidence["mass"], ", ".join(f"{x:.3f}" for x in evidence["com"])
     if mass < 0:
-        return f"{-mass:.3f} kg taken off at ({place}) m of the last link"
-    held = "estimates are held" if cause == "payload" else "it stays: a tool, in the model from now on"
-    return f"payload of {mass:.3f} kg at ({place}) m of the last link; {held}"
+        return f"{-mass:.3f} kg removed at ({place}) m in the last link's frame"
+    held = "estimates are held" if cause == "payload" else "it stays: a tool, part of the model from now on"
+    return f"payload of {mass:.3f} kg at ({place}) m in the last link's frame; {held}"
 
 
 def _change(evidence: dict[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""The stream: every client has a short queue of its own; a slow one loses the oldest items and holds nobody up."""
+"""The stream's fan-out: each client has a short queue; a slow one loses the oldest items and delays no one else."""
 
 import asyncio
 from collections import deque
@@ -6,13 +6,13 @@ from collections import deque
 from calib.daemon.view.api_models import EventItem, JointsItem
 
 QUEUE_ITEMS = 50
-"""Items that wait for one client at most: five seconds of joints."""
+"""Largest number of items that wait for one client: five seconds of joints."""
 
 Item = JointsItem | EventItem
 
 
 class Client:
-    """One client's items; used on the event loop's thread alone."""
+    """One client's items; used on the event loop's thread only."""
 
     def __init__(self, hub: "Hub") -> None:
         self._hub = hub
@@ -20,7 +20,7 @@ class Client:
         self._more = asyncio.Event()
 
     def put(self, item: Item) -> None:
-        """Take one more item; where the queue is full the oldest one is lost."""
+        """Add an item; if the queue is full the oldest one is lost."""
         self._items.append(item)
         self._more.set()
 
@@ -32,7 +32,7 @@ class Client:
         return self._items.popleft()
 
     def close(self) -> None:
-        """No more items."""
+        """Unsubscribe."""
         self._hub.clients.discard(self)
 
 

@@ -1,6 +1,6 @@
-"""What the web layer may ask of the daemon, and what it may be refused.
+"""The interface of the service to the web layer, and its refusals.
 
-Everything here is called on the service's one event loop (asyncio, the same thread): an answer never waits for the bus.
+All calls are made on the service's event loop (asyncio, the same thread); no answer waits for the bus.
 """
 
 from datetime import datetime
@@ -19,15 +19,30 @@ from calib.daemon.view.api_models import (
 
 
 class NotPossible(Exception):
-    """An approval or rejection that cannot be done now; the message says why (HTTP 409)."""
+    """An approval or rejection that is not possible now; the message says why (HTTP 409)."""
 
 
 class NoSuch(Exception):
-    """No proposal or joint of that id or name; the message lists what there is (HTTP 404)."""
+    """No proposal or joint of that id or name (HTTP 404)."""
+
+
+class Decisions(Protocol):
+    """Decisions that a person may take through the API. Raises NoSuch, NotPossible."""
+
+    def approve(self, number: int, by: str) -> Proposal:
+        """Write a pending proposal and make its record current.
+
+        It is `approved` at once, and `applied` or `failed` a moment later (an event).
+        """
+        ...
+
+    def reject(self, number: int, by: str) -> Proposal:
+        """Drop a pending proposal."""
+        ...
 
 
 class Subscription(Protocol):
-    """One client's stream: bounded; a client that is too slow loses the oldest items, never holds the daemon up."""
+    """One client's stream: bounded; a client that is too slow loses the oldest items and never delays the daemon."""
 
     async def get(self) -> JointsItem | EventItem:
         """The next item."""
@@ -39,7 +54,12 @@ class Subscription(Protocol):
 
 
 class DaemonView(Protocol):
-    """What the web layer may ask. Nothing here commands torque or motion."""
+    """Everything that the web layer can reach. Nothing here commands torque or motion."""
+
+    @property
+    def decisions(self) -> Decisions:
+        """Approval and rejection of proposals."""
+        ...
 
     def status(self) -> Status:
         """State, bus and records."""
@@ -54,15 +74,15 @@ class DaemonView(Protocol):
         ...
 
     def events(self, after: int = 0, limit: int = 500) -> tuple[EventRecord, ...]:
-        """Events with a larger id, oldest first, at most `limit` of them: the next ones are `after` the last."""
+        """At most `limit` events with an id above `after`, oldest first; ask again after the last id for more."""
         ...
 
     def history(
         self, joint: str | None, since: datetime | None = None, until: datetime | None = None, most: int = 2000
     ) -> tuple[HistoryPoint, ...]:
-        """Estimates over time, oldest first, thinned evenly to at most `most` a joint; raises NoSuch.
+        """Estimates over time, oldest first, thinned evenly to at most `most` per joint; raises NoSuch.
 
-        Without a joint those of every joint, joint after joint.
+        Without a joint: those of every joint, one joint after the other.
         """
         ...
 
@@ -70,17 +90,6 @@ class DaemonView(Protocol):
         """Newest first."""
         ...
 
-    def approve(self, proposal: int, by: str) -> Proposal:
-        """Put a pending proposal in force; it is `approved` at once, `applied` or `failed` a moment later (an event).
-
-        Raises NoSuch, NotPossible.
-        """
-        ...
-
-    def reject(self, proposal: int, by: str) -> Proposal:
-        """Drop a pending proposal. Raises NoSuch, NotPossible."""
-        ...
-
     def subscribe(self) -> Subscription:
-        """A new client of the stream; it begins with the present joints."""
+        """A new client of the stream, which begins with the present joints."""
         ...

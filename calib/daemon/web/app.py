@@ -1,4 +1,4 @@
-"""The FastAPI application: routes, page, and one form of error for everything that goes wrong."""
+"""The FastAPI application: routes, page, and one format for all errors."""
 
 import logging
 from collections.abc import Awaitable, Callable
@@ -19,13 +19,13 @@ from calib.daemon.web.peer import App
 from calib.daemon.web.routes import ERRORS, api_router
 from calib.daemon.web.stream import Streams
 
-PURPOSE = "Reads what armlink knows of an arm; decides on proposed recalibrations. Commands neither torque nor motion."
+PURPOSE = "Shows the observed state of an arm; decides on proposed recalibrations. Commands neither torque nor motion."
 
 _log = logging.getLogger(__name__)
 
 
 def make_app(view: DaemonView, access: Access | None = None) -> tuple[App, Streams]:
-    """The guarded ASGI application on a view, and its streams (to close at the end)."""
+    """The guarded ASGI application on a view, and its streams, to be closed at the end."""
     streams = Streams(view)
     files = page_files()
     app = open_app(view, streams, files)
@@ -34,7 +34,7 @@ def make_app(view: DaemonView, access: Access | None = None) -> tuple[App, Strea
 
 
 def open_app(view: DaemonView, streams: Streams, files: dict[str, PageFile]) -> FastAPI:
-    """The application without the guard before it."""
+    """The application without the guard."""
     app = Described(
         title="armlink daemon",
         description=PURPOSE,
@@ -82,17 +82,17 @@ async def _bad_parameter(_: Request, error: Exception) -> Response:
     if first["type"] == "json_invalid":
         return JSONResponse({"error": "the body is not JSON"}, 422)
     if first["type"] == "extra_forbidden":
-        return JSONResponse({"error": f"{where[:80]}: there is no parameter of that name here"}, 422)
+        return JSONResponse({"error": f"{where[:80]}: there is no parameter of that name"}, 422)
     given = "" if first["type"] == "missing" else f" (got {str(first.get('input'))[:80]!r})"
     return JSONResponse({"error": f"{where}: {first['msg'].removeprefix('Value error, ')}{given}"}, 422)
 
 
 async def _of_http(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
-    what = {404: f"there is no {request.url.path[:200]}", 405: f"{request.method} is not possible here"}
+    what = {404: f"there is no {request.url.path[:200]}", 405: f"{request.method} is not allowed here"}
     return JSONResponse({"error": what.get(error.status_code, str(error.detail))}, error.status_code, error.headers)
 
 
 async def _unexpected(request: Request, error: Exception) -> Response:
     _log.error("%s %s failed", request.method, request.url.path, exc_info=error)
-    return JSONResponse({"error": "this failed inside the daemon; its log says why"}, 500)
+    return JSONResponse({"error": "internal error; the daemon's log says why"}, 500)

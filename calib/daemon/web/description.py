@@ -1,4 +1,4 @@
-"""The OpenAPI description: FastAPI's own, with what it cannot know: the stream's items and the token."""
+"""The OpenAPI description: FastAPI's own, completed by the stream's items and the token."""
 
 from typing import Any
 
@@ -7,14 +7,14 @@ from pydantic import TypeAdapter
 
 from calib.daemon.view.api_models import StreamItem
 
-TOKEN = {"type": "http", "scheme": "bearer", "description": "TCP only; the Unix socket's mode says who may come there"}
+TOKEN = {"type": "http", "scheme": "bearer", "description": "TCP only; the Unix socket's file mode controls access"}
 
 
 class Described(FastAPI):
-    """An application that completes its description when it is first asked for: that takes a fifth of a second."""
+    """An application that completes its description on the first request for it, which takes 0.2 s."""
 
     def openapi(self) -> dict[str, Any]:
-        """The whole description."""
+        """The complete description."""
         if self.openapi_schema is None:
             _complete(super().openapi())
         return super().openapi()

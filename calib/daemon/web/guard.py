@@ -1,4 +1,4 @@
-"""What stands before every request: Host, rate, token, origin, size; and the headers that go on every answer."""
+"""Checks before every request: Host, rate, token, origin, size; and the headers of every answer."""
 
 import asyncio
 import hmac
@@ -15,18 +15,18 @@ from calib.daemon.web.peer import App, Message, Peer, Receive, Scope, Send, peer
 from calib.daemon.web.rate import Rate, RateLimit
 
 BODY_LIMIT = 4096
-"""Bytes; the only bodies are names and reasons."""
+"""Largest body [bytes]; the only bodies are names."""
 HEAD_LIMIT = 16384
-"""Bytes of the request line and headers together."""
+"""Largest request line and headers together [bytes]."""
 BODY_SECONDS = 10.0
-"""A body that has not come by then is given up."""
+"""A body that has not arrived within this time is refused [s]."""
 REQUESTS = Rate(burst=60, per_second=20)
-"""Of one TCP address; a page needs three requests to load and four in two seconds then."""
+"""Per TCP address; the page needs three requests to load, then four in two seconds."""
 WRONG_TOKENS = Rate(burst=5, per_second=0.2)
-"""Of one TCP address."""
+"""Per TCP address."""
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 CSP = "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-"""Of whatever does not say otherwise: nothing in it may run or be shown."""
+"""Default policy: nothing in the answer may run or be shown."""
 HEADERS = {
     "content-security-policy": CSP,
     "x-content-type-options": "nosniff",
@@ -41,19 +41,19 @@ _LABEL = re.compile(r"[a-z0-9_-]+")
 
 @dataclass(frozen=True)
 class Access:
-    """Who may come in over TCP."""
+    """Access over TCP."""
 
     token: str | None = None
-    """None: nobody."""
+    """None: no access."""
     hosts: frozenset[str] = frozenset()
-    """Names, beside the connection's own address, that a Host header may have."""
+    """Names that a Host header may have beside the connection's own address."""
     open_paths: frozenset[str] = frozenset()
     """The page, which needs no token."""
     now: Callable[[], float] = field(default=time.monotonic, repr=False)
 
 
 class Denied(Exception):
-    """A request that goes no further."""
+    """A request that is refused here."""
 
     def __init__(self, status: int, why: str, headers: dict[str, str] | None = None) -> None:
         super().__init__(why)
@@ -61,10 +61,10 @@ class Denied(Exception):
 
 
 class Guard:
-    """ASGI middleware. On the Unix socket its mode says who may come; on TCP the token does, and addresses are limited.
+    """ASGI middleware. The Unix socket's file mode controls access to it; TCP needs the token, and has rate limits.
 
-    The Host must be one of ours on both, or a page of another origin could come in through a rebound name (on the
-    Unix socket through an SSH forward).
+    On both, Host must be one of the daemon's names: otherwise a page of another origin could get in through DNS
+    rebinding (on the Unix socket through an SSH forward).
     """
 
     def __init__(self, app: App, access: Access) -> None:
@@ -72,7 +72,7 @@ class Guard:
         self._requests, self._wrong = RateLimit(REQUESTS), RateLimit(WRONG_TOKENS)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Let a request through to the application, or answer it here."""
+        """Pass a request on to the application, or refuse it."""
         if scope["type"] != "http":
             return
         headers = _headers(scope)
@@ -80,7 +80,7 @@ class Guard:
             self._check(scope, peer_of(scope))
             body = await _read_body(headers, receive)
         except Denied as denied:
-            if _has_body(headers):  # what has not come of it is discarded, within the bounds of `linger`
+            if _has_body(headers):  # the rest of it is discarded, within the bounds of `linger`
                 denied.headers["connection"] = "close"
             await _answer(denied, send)
             return
@@ -121,11 +121,11 @@ class Guard:
         if wait := self._wrong.take(peer.address, self.access.now()):
             retry = {"retry-after": str(math.ceil(wait))}
             raise Denied(429, f"too many wrong tokens from {peer.address}: wait {math.ceil(wait)} s", retry)
-        raise Denied(401, "the token is wrong: it stands in the file given as --token-file", challenge)
+        raise Denied(401, "the token is wrong: it is in the file given as --token-file", challenge)
 
 
 def names_of_host(host: str) -> frozenset[str]:
-    """Names that a Host header may have when the server listens on `host`: itself and the machine's own name."""
+    """Valid Host names of a server that listens on `host`: that and the machine's own name."""
     machine = socket.gethostname().lower()
     return frozenset({host.lower(), machine, f"{machine}.local"})
 
@@ -135,7 +135,7 @@ def _headers(scope: Scope) -> dict[str, str]:
 
 
 def _host_name(header: str) -> str:
-    """Host header without its port, in small letters; empty where it is none."""
+    """Host header without its port, in lower case; empty if it is not valid."""
     host = header.strip().lower()
     if host.startswith("["):
         return host[1:].partition("]")[0]
@@ -157,7 +157,7 @@ def _has_body(headers: dict[str, str]) -> bool:
 
 
 async def _read_body(headers: dict[str, str], receive: Receive) -> bytes:
-    """The whole body; raises Denied where it is too large or too slow."""
+    """The whole body; raises Denied if it is too large or too slow."""
     too_large = Denied(413, f"a request's body may have {BODY_LIMIT} bytes")
     length = headers.get("content-length", "0")
     if not length.isdigit() or int(length[:20]) > BODY_LIMIT:
@@ -181,7 +181,7 @@ async def _read_body(headers: dict[str, str], receive: Receive) -> bytes:
 
 
 def _replay(body: bytes, receive: Receive) -> Receive:
-    """`receive` that first gives the body that was read."""
+    """A `receive` that first returns the body already read."""
     first = True
 
     async def replay() -> Message:

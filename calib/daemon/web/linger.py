@@ -1,18 +1,18 @@
-"""Ends a connection in stages (RFC 9112, section 9.6) and within bounds, so that its last answer is not lost."""
+"""Ends a connection in stages (RFC 9112, section 9.6), within bounds, so that its last answer is not lost."""
 
 import asyncio
 from typing import Any
 
 LINGER_BYTES = 1024 * 1024
-"""What a client may send after the last answer; one that sends more is cut."""
+"""Bytes that a client may send after the last answer; one that sends more is cut."""
 LINGER_SECONDS = 1.5
-"""Time for that, counted from the end of the answer; shorter than the server's own end (`server.CLOSING_SECONDS`)."""
+"""Time for that from the end of the answer [s]; shorter than the server's own end (`server.CLOSING_SECONDS`)."""
 FLUSH_SECONDS = 30.0
-"""An answer that the client has not taken by then, counted from `close`, is given up."""
+"""An answer that the client has not accepted within this time from `close` is given up [s]."""
 
 
 class LingeringTransport:
-    """A transport whose `close` sends what is unsent, half-closes, discards what comes, and ends when the client does.
+    """A transport whose `close` sends the rest, half-closes, discards what arrives, and ends when the client does.
 
     A socket that is closed with bytes of the client unread makes the kernel reset the connection, and a client that is
     still sending gets an error instead of the answer. `abort` cuts the connection at once. The rest is the plain
@@ -36,14 +36,14 @@ class LingeringTransport:
             self._plain.write(data)
 
     def close(self) -> None:
-        """End the connection; its protocol gets `connection_lost` at the end and nothing before."""
+        """End the connection; its protocol gets `connection_lost` at the end and nothing before it."""
         if not self.is_closing():
             self._lingers = True
             _Drain(self._plain).begin()
 
 
 class _Drain(asyncio.Protocol):
-    """Takes the place of a connection's protocol until the client has closed, or has used up its bytes or its time."""
+    """Replaces a connection's protocol until the client closes or has used up its bytes or its time."""
 
     def __init__(self, transport: asyncio.Transport) -> None:
         self._transport, self._owner = transport, transport.get_protocol()
@@ -53,9 +53,9 @@ class _Drain(asyncio.Protocol):
         self._end = self._loop.call_later(seconds, transport.abort)
 
     def begin(self) -> None:
-        """Half-close, once all is sent, and read on even if reading was paused."""
+        """Half-close once everything is sent, and keep reading even if reading was paused."""
         self._transport.set_protocol(self)
-        self._transport.set_write_buffer_limits(high=0)  # resume_writing then says that all is sent
+        self._transport.set_write_buffer_limits(high=0)  # resume_writing is then called once everything is sent
         try:
             self._transport.write_eof()
         except OSError:  # the client has reset it already
@@ -63,7 +63,7 @@ class _Drain(asyncio.Protocol):
         self._transport.resume_reading()
 
     def resume_writing(self) -> None:
-        """All is sent: the time to close begins."""
+        """Everything is sent: the time to close begins."""
         self._end.cancel()
         self._end = self._loop.call_later(LINGER_SECONDS, self._transport.abort)
 
@@ -74,6 +74,6 @@ class _Drain(asyncio.Protocol):
             self._transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Hand on to the connection's own protocol."""
+        """Pass on to the connection's own protocol."""
         self._end.cancel()
         self._owner.connection_lost(exc)

@@ -1,4 +1,4 @@
-"""GET /metrics: the daemon's numbers as Prometheus text. Names and meanings stand in docs/daemon-api.md."""
+"""GET /metrics: the daemon's metrics as Prometheus text; docs/daemon-api.md lists them."""
 
 from collections.abc import Callable, Iterable
 
@@ -12,12 +12,12 @@ from calib.daemon.web.stream import Streams
 
 PREFIX = "armlink_"
 BUS = (
-    ("rate_hz", "bus_rate_hertz", "Cycles (SYNC) a second."),
-    ("load", "bus_load_ratio", "Share of the bus that is taken."),
+    ("rate_hz", "bus_rate_hertz", "Cycles (SYNC) per second."),
+    ("load", "bus_load_ratio", "Bus load as a share of its capacity."),
 )
 BUS_COUNTERS = (
     ("frames", "bus_frames", "Frames sent and received since the bus was last opened."),
-    ("missed", "bus_missed", "Sensor frames that did not come in their cycle."),
+    ("missed", "bus_missed", "Sensor frames that did not arrive in their cycle."),
     ("late", "bus_late_cycles", "Cycles that began more than a tenth of a period late."),
     ("errors", "bus_errors", "Error frames and frames of a wrong length."),
 )
@@ -25,15 +25,15 @@ JOINT = (
     ("position", "joint_position_radians", "Position sensor."),
     ("torque", "joint_torque_newton_metres", "Torque sensor as the controller calibrates it."),
     ("model_torque", "joint_model_torque_newton_metres", "Gravity model at this position."),
-    ("residual", "joint_residual_newton_metres", "Torque less model torque; means something at rest."),
-    ("sample_age_s", "joint_sample_age_seconds", "Time since position and torque last came."),
+    ("residual", "joint_residual_newton_metres", "Torque minus model torque; meaningful at rest."),
+    ("sample_age_s", "joint_sample_age_seconds", "Time since position and torque last arrived."),
 )
 ESTIMATE = (
     ("gain", "sensor_gain_ratio", "Gain against the record in force; 1 is no change."),
     ("gain_std", "sensor_gain_std_ratio", "Standard deviation of the gain."),
     ("offset", "sensor_offset_newton_metres", "Offset against the record in force; 0 is no change."),
     ("offset_std", "sensor_offset_std_newton_metres", "Standard deviation of the offset."),
-    ("samples", "sensor_rests", "Rests of the arm that went into the estimate."),
+    ("samples", "sensor_rests", "Rests of the arm used for the estimate."),
 )
 
 
@@ -49,14 +49,14 @@ class DaemonCollector(Collector):
         yield from _of_status(status)
         yield from _of_joints(JOINT, self._view.joints())
         yield from _of_joints(ESTIMATE, self._view.estimates())
-        yield GaugeMetricFamily(PREFIX + "stream_clients", "Clients of the stream now.", self._streams.clients)
+        yield GaugeMetricFamily(PREFIX + "stream_clients", "Present clients of the stream.", self._streams.clients)
         yield CounterMetricFamily(
             PREFIX + "stream_cut_off", "Clients of the stream cut off because they did not read.", self._streams.cut_off
         )
 
 
 def metrics_text(view: DaemonView, streams: Streams) -> Callable[[], bytes]:
-    """A function that gives the text of one scrape."""
+    """A function that returns the text of one scrape."""
     registry = CollectorRegistry()
     registry.register(DaemonCollector(view, streams))
     ProcessCollector(registry=registry)
@@ -65,25 +65,25 @@ def metrics_text(view: DaemonView, streams: Streams) -> Callable[[], bytes]:
 
 def _of_status(status: Status) -> Iterable[Metric]:
     identity = {"arm": status.arm, "serial": status.serial, "version": status.version, "policy": status.policy}
-    yield InfoMetricFamily(PREFIX + "daemon", "Which arm, software and policy.", identity)
+    yield InfoMetricFamily(PREFIX + "daemon", "Arm, software and policy.", identity)
     state = GaugeMetricFamily(PREFIX + "state", "1 for the state that the daemon is in.", labels=["state"])
     for each in State:
         state.add_metric([each.value], float(status.state is each))
     yield state
-    yield GaugeMetricFamily(PREFIX + "uptime_seconds", "Since the daemon started.", status.uptime_s)
-    yield GaugeMetricFamily(PREFIX + "bus_connected", "1 while frames of the joints come in.", status.bus.connected)
+    yield GaugeMetricFamily(PREFIX + "uptime_seconds", "Time since the daemon started.", status.uptime_s)
+    yield GaugeMetricFamily(PREFIX + "bus_connected", "1 while frames of the joints arrive.", status.bus.connected)
     for key, name, text in BUS:
         yield GaugeMetricFamily(PREFIX + name, text, getattr(status.bus, key))
     for key, name, text in BUS_COUNTERS:
         yield CounterMetricFamily(PREFIX + name, text, getattr(status.bus, key))
-    yield GaugeMetricFamily(PREFIX + "estimates_held", "1 while an alarm stands whose cause is not known.", status.held)
+    yield GaugeMetricFamily(PREFIX + "estimates_held", "1 while the cause of an alarm is not known.", status.held)
     yield GaugeMetricFamily(PREFIX + "observed_rests", "Rests of the arm that the observer has used.", status.rows)
-    yield GaugeMetricFamily(PREFIX + "proposals_pending", "Proposals to decide on.", status.pending_proposals)
-    yield CounterMetricFamily(PREFIX + "events", "Events so far: the id of the newest one.", status.last_event)
+    yield GaugeMetricFamily(PREFIX + "proposals_pending", "Pending proposals.", status.pending_proposals)
+    yield CounterMetricFamily(PREFIX + "events", "Number of events: the id of the newest one.", status.last_event)
 
 
 def _of_joints(families: Iterable[tuple[str, str, str]], joints: Iterable[Answer]) -> Iterable[Metric]:
-    """One gauge a family, one value a joint; a missing value is left out."""
+    """One gauge per family, one value per joint; missing values are omitted."""
     joints = tuple(joints)
     for key, name, text in families:
         family = GaugeMetricFamily(PREFIX + name, text, labels=["joint"])

@@ -1,6 +1,6 @@
-"""The page: one HTML document with its style and script inside, put together from `static/` once at the start.
+"""The page: one HTML document with its style and script inside, assembled from `static/` once at the start.
 
-A single answer is a single round trip, also where the network is slow; and nothing else of the disk can be asked for.
+It takes a single round trip even on a slow network, and no other file of the disk can be requested.
 """
 
 import base64
@@ -30,7 +30,7 @@ class PageFile:
 
 
 def page_files() -> dict[str, PageFile]:
-    """Path of the URL → file; there is only `/`."""
+    """URL path → file; there is only `/`."""
     script, style = joined("page.js"), _static("page.css")
     icon = base64.b64encode(_static("icon.svg").encode()).decode()
     page = _static("index.html").replace("ICON", f"data:image/svg+xml;base64,{icon}")
@@ -42,9 +42,9 @@ def page_files() -> dict[str, PageFile]:
 
 
 def joined(name: str) -> str:
-    """A module of `static/` and all that it imports, each once and before who needs it, as one module.
+    """A module of `static/` and everything that it imports, each once and before its users, as one module.
 
-    They share one scope then: a name at the top level of two of them is an error that the browser reports.
+    They share one scope: the same top-level name in two of them is an error that the browser reports.
     """
     order: list[str] = []
 

@@ -1,4 +1,4 @@
-"""What a request may carry, typed: unknown names, empty values and times without a zone are dealt with here."""
+"""Parameters of requests, typed: unknown names, empty values and times without a zone are handled here."""
 
 import re
 from datetime import UTC, datetime
@@ -7,7 +7,7 @@ from typing import Annotated, Any, Self
 from pydantic import AfterValidator, AwareDatetime, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 LARGEST_ID = 2**63 - 1
-"""What a database's whole number holds."""
+"""Largest integer of SQLite."""
 EARLIEST, LATEST = datetime(1970, 1, 2, tzinfo=UTC), datetime(2999, 12, 31, tzinfo=UTC)
 
 Id = Annotated[int, Field(ge=0, le=LARGEST_ID)]
@@ -17,7 +17,7 @@ class ApiError(BaseModel):
     """Every answer that is not 2xx."""
 
     error: str
-    """One line: what is wrong, and what was expected."""
+    """One line: the problem, and what was expected."""
 
 
 def _empty_is_none(value: Any) -> Any:
@@ -25,7 +25,7 @@ def _empty_is_none(value: Any) -> Any:
 
 
 def _plus_sent_as_space(value: Any) -> Any:
-    """A + that was not written as %2B arrives as a space: 2026-01-01T08:00:00 02:00."""
+    """A + that is not escaped as %2B arrives as a space: 2026-01-01T08:00:00 02:00."""
     return re.sub(r"(?<=[T ]\d\d:\d\d)(:[\d.]+)? (?=\d\d:\d\d$)", r"\1+", value) if isinstance(value, str) else value
 
 
@@ -53,7 +53,7 @@ class EventsQuery(_Query):
     after: Annotated[Id, BeforeValidator(lambda value: 0 if value == "" else value)] = 0
     """Events with a larger id."""
     limit: Annotated[int, Field(ge=1, le=1000)] = 500
-    """At most so many, the oldest first: ask again after the last id."""
+    """Largest number of events, oldest first; ask again after the last id for more."""
 
 
 class HistoryQuery(_Query):
@@ -63,7 +63,7 @@ class HistoryQuery(_Query):
     since: Annotated[Instant, Field(alias="from")] = None
     until: Annotated[Instant, Field(alias="to")] = None
     limit: Annotated[int, Field(ge=2, le=20000)] = 2000
-    """At most so many points a joint, thinned evenly."""
+    """Largest number of points per joint, thinned evenly."""
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
@@ -76,22 +76,22 @@ class OverviewQuery(_Query):
     """GET /api/overview."""
 
     seconds: Annotated[float, Field(ge=0, le=1e9)] = 3600.0
-    """History of so long; 0: all there is."""
+    """Time span of the history [s]; 0: all of it."""
     limit: Annotated[int, Field(ge=2, le=2000)] = 120
-    """At most so many points of history a joint, thinned evenly."""
+    """Largest number of history points per joint, thinned evenly."""
     events: Annotated[int, Field(ge=1, le=500)] = 500
-    """At most so many."""
+    """Largest number of events."""
 
 
 class StreamQuery(_Query):
     """GET /api/stream."""
 
     after: Annotated[Id | None, BeforeValidator(_empty_is_none)] = None
-    """Begin with all events after this id, as the header Last-Event-ID does; without: only new ones."""
+    """Begin with all events after this id, like the header Last-Event-ID; without it: only new ones."""
 
 
 class Decision(BaseModel):
-    """Body of approve and reject; may be left out."""
+    """Body of approve and reject; optional."""
 
     model_config = ConfigDict(extra="forbid")
 

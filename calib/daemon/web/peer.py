@@ -1,4 +1,4 @@
-"""Who is at the other end of a connection, and uvicorn's HTTP protocol with limits on what one connection may hold."""
+"""The peer of a connection, and uvicorn's HTTP protocol with limits on the resources of one connection."""
 
 import asyncio
 import json
@@ -24,9 +24,9 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 PEER = "armlink.peer"
 """Key of the ASGI scope that holds the Peer."""
 HEAD_SECONDS = 10.0
-"""A connection that has not sent the whole head of a request by then, since it was made or began one, is cut."""
+"""A connection that has not sent a complete request head within this time is cut [s]."""
 WRITE_BUFFER = 32 * 1024
-"""Bytes that may wait in the process for one client; a stream's item is about 2 kB."""
+"""Bytes buffered for one client; an item of the stream is about 2 kB."""
 _UCRED = struct.Struct("3i")
 
 _log = logging.getLogger(__name__)
@@ -39,16 +39,16 @@ class Peer:
     name: str
     """For the audit trail: "ann (uid 1000) on the socket", "tcp 127.0.0.1"."""
     address: str
-    """What the rate limit counts by: the address on TCP, empty on the Unix socket."""
+    """Key of the rate limit: the address on TCP, empty on the Unix socket."""
     tcp: bool
     local: str = ""
-    """Our own address of this connection (TCP): a Host that is right for it."""
+    """Local address of this connection (TCP), a valid Host for it."""
     abort: Callable[[], None] = lambda: None
     """Cuts the connection at once, unsent bytes included."""
 
 
 UNKNOWN = Peer("unknown", "unknown", tcp=True)
-"""A scope without a peer is taken for the least trusted one."""
+"""A scope without a peer counts as the least trusted one."""
 
 
 def peer_of(scope: Scope) -> Peer:
@@ -69,12 +69,12 @@ def describe_peer(transport: asyncio.Transport) -> Peer:
 
 
 class BoundedProtocol(H11Protocol):
-    """uvicorn's protocol, which names the peer, keeps few bytes, does not wait for ever and ends in stages."""
+    """uvicorn's protocol, which passes the peer to the application, buffers little, and ends in time and in stages."""
 
     _deadline: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Note who it is and start the clock for the first request."""
+        """Identify the peer and start the deadline of the first request."""
         super().connection_made(cast(asyncio.Transport, LingeringTransport(transport)))
         transport.set_write_buffer_limits(high=WRITE_BUFFER)
         peer, app = describe_peer(transport), self.app
@@ -87,17 +87,17 @@ class BoundedProtocol(H11Protocol):
         self._mind_the_clock()
 
     def data_received(self, data: bytes) -> None:
-        """As uvicorn's, which would wait for the rest of a head for ever."""
+        """As uvicorn's, with a deadline for the rest of the head."""
         super().data_received(data)
         self._mind_the_clock()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Stop the clock."""
+        """Stop the deadline."""
         self._stop_the_clock()
         super().connection_lost(exc)
 
     def shutdown(self) -> None:
-        """The server ends: an idle connection does at once, one that lingers in less time than the server takes."""
+        """The server ends: close an idle connection at once; one that lingers ends within the server's own time."""
         if self.transport.is_closing():
             return
         if self._awaits_head() and not self.transport.get_write_buffer_size():
@@ -106,7 +106,7 @@ class BoundedProtocol(H11Protocol):
             super().shutdown()
 
     def send_400_response(self, msg: str) -> None:
-        """What is not HTTP gets the API's form of error too."""
+        """Answer what is not HTTP in the API's error format."""
         body = json.dumps({"error": "this is not a valid HTTP request"}).encode()
         headers = [("content-type", "application/json"), ("content-length", str(len(body))), ("connection", "close")]
         try:
@@ -115,7 +115,7 @@ class BoundedProtocol(H11Protocol):
         except h11.LocalProtocolError:  # it is in the middle of an answer already
             _log.debug("%s: malformed request during an answer", msg)
         self.transport.close()
-        if not self._awaits_head():  # the application has a request whose rest is not HTTP
+        if not self._awaits_head():  # the application has a request, and what follows it is not HTTP
             self.cycle.disconnected = True
             self.cycle.message_event.set()
 

@@ -1,4 +1,4 @@
-"""The API's routes (contract 8). All read, except the two that decide on a proposal; none can command motion."""
+"""The API's routes (docs/daemon-api.md). All read, except the two that decide on a proposal; none commands motion."""
 
 from collections.abc import Callable
 from datetime import timedelta
@@ -24,17 +24,17 @@ from calib.daemon.web.peer import Peer, peer_of
 from calib.daemon.web.stream import StreamResponse, Streams
 
 REFUSALS: dict[int | str, dict[str, Any]] = {
-    400: {"model": ApiError, "description": "Not HTTP, or the Host header is no name of this daemon"},
+    400: {"model": ApiError, "description": "Not HTTP, or the Host header is not a name of this daemon"},
     401: {"model": ApiError, "description": "TCP only: the token is missing or wrong"},
-    408: {"model": ApiError, "description": "The body did not come in time"},
+    408: {"model": ApiError, "description": "The body did not arrive in time"},
     413: {"model": ApiError, "description": "The body is too large"},
-    422: {"model": ApiError, "description": "A parameter cannot be used"},
+    422: {"model": ApiError, "description": "A parameter is not valid"},
     429: {"model": ApiError, "description": "Too many requests, or too many clients on the stream"},
 }
-NO_SUCH: dict[int | str, dict[str, Any]] = {404: {"model": ApiError, "description": "There is no such thing"}}
+NO_SUCH: dict[int | str, dict[str, Any]] = {404: {"model": ApiError, "description": "Not found"}}
 NOT_NOW: dict[int | str, dict[str, Any]] = {
-    403: {"model": ApiError, "description": "A page of another origin asked"},
-    409: {"model": ApiError, "description": "This cannot be decided now"},
+    403: {"model": ApiError, "description": "The request came from a page of another origin"},
+    409: {"model": ApiError, "description": "No decision is possible now"},
 }
 STREAM: dict[int | str, dict[str, Any]] = {
     200: {
@@ -46,7 +46,7 @@ REPORT_CSP = (
     "sandbox allow-scripts allow-downloads; default-src 'none'; script-src 'unsafe-inline';"
     " style-src 'unsafe-inline'; img-src data: blob:"
 )
-"""The report is one file with its scripts inside; it may neither ask this daemon nor anyone else anything."""
+"""The report is one file with its scripts inside; it may not send requests to this daemon or anyone else."""
 
 ProposalId = Annotated[int, Path(ge=1, le=LARGEST_ID)]
 OptionalDecision = Annotated[Decision | None, Body()]
@@ -63,21 +63,21 @@ def api_router(view: DaemonView, streams: Streams, metrics: Callable[[], bytes])
     async def stream(
         query: Annotated[StreamQuery, Query()], last_event_id: Annotated[Id | None, Header()] = None
     ) -> Response:
-        """Joints at 10 Hz and events as they come; an event that a slow client missed still comes, in order."""
+        """Joints at 10 Hz, and events as they happen; a slow client still gets every event, in order."""
         if streams.is_full:
             raise TooMany(f"{streams.clients} clients are on the stream already")
         return StreamResponse(streams, query.after if last_event_id is None else last_event_id)
 
     @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}}, tags=["now"])
     async def prometheus() -> Response:
-        """Numbers for Prometheus."""
+        """Metrics for Prometheus."""
         return Response(metrics(), media_type="text/plain; version=0.0.4; charset=utf-8")
 
     return router
 
 
 class TooMany(Exception):
-    """No room for one more client (HTTP 429)."""
+    """No room for another client (HTTP 429)."""
 
 
 def _add_now(router: APIRouter, view: DaemonView) -> None:
@@ -88,7 +88,7 @@ def _add_now(router: APIRouter, view: DaemonView) -> None:
 
     @router.get("/api/joints", tags=["now"])
     async def joints() -> tuple[JointNow, ...]:
-        """Every joint as last heard, base to tip."""
+        """Latest readings of every joint, base to tip."""
         return view.joints()
 
     @router.get("/api/estimates", tags=["now"])
@@ -98,7 +98,7 @@ def _add_now(router: APIRouter, view: DaemonView) -> None:
 
     @router.get("/api/overview", response_model=Overview, tags=["now"])
     async def overview(query: Annotated[OverviewQuery, Query()]) -> Response:
-        """All that the page shows in one answer: as the other routes have it, of the past the newest."""
+        """Everything that the page shows, in one answer, with the newest events and history."""
         status = view.status()
         since = status.time - timedelta(seconds=query.seconds) if query.seconds else None
         answer = Overview(
@@ -120,7 +120,7 @@ def _add_past(router: APIRouter, view: DaemonView) -> None:
 
     @router.get("/api/history", response_model=tuple[HistoryPoint, ...], responses=NO_SUCH, tags=["past"])
     async def history(query: Annotated[HistoryQuery, Query()]) -> Response:
-        """Gain and offset over time, oldest first; without a joint, joint after joint."""
+        """Gain and offset over time, oldest first; without a joint, one joint after the other."""
         points = view.history(query.joint or None, query.since, query.until, query.limit)
         return Response(_HISTORY.dump_json(points), media_type="application/json")
 
@@ -145,17 +145,17 @@ def _add_proposals(router: APIRouter, view: DaemonView) -> None:
 
     @router.post("/api/proposals/{id}/approve", responses=NO_SUCH | NOT_NOW, tags=["proposals"])
     async def approve(request: Request, id: ProposalId, decision: OptionalDecision = None) -> Proposal:
-        """Let a pending proposal be written to the controller; `applied` or `failed` follows as an event."""
-        return view.approve(id, _who(decision, peer_of(request.scope)))
+        """Write a pending proposal to the controller; `applied` or `failed` follows as an event."""
+        return view.decisions.approve(id, _who(decision, peer_of(request.scope)))
 
     @router.post("/api/proposals/{id}/reject", responses=NO_SUCH | NOT_NOW, tags=["proposals"])
     async def reject(request: Request, id: ProposalId, decision: OptionalDecision = None) -> Proposal:
         """Drop a pending proposal."""
-        return view.reject(id, _who(decision, peer_of(request.scope)))
+        return view.decisions.reject(id, _who(decision, peer_of(request.scope)))
 
 
 def _who(decision: Decision | None, peer: Peer) -> str:
-    """For the audit trail: the name given, and always where the request came from."""
+    """For the audit trail: the name given, and always the peer of the connection."""
     return peer.name if decision is None or decision.by is None else f"{decision.by} ({peer.name})"
 
 

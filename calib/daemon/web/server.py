@@ -1,4 +1,4 @@
-"""Serves the API and the page on a Unix socket, and on TCP where that was asked for."""
+"""Serves the API and the page on a Unix socket, and on TCP if configured."""
 
 import asyncio
 import contextlib
@@ -18,16 +18,16 @@ from calib.daemon.web.guard import Access, names_of_host
 from calib.daemon.web.peer import BoundedProtocol
 
 SOCKET_MODE = 0o660
-"""Owner and group; everyone else is kept out by the file system."""
+"""Access for owner and group only."""
 SHORTEST_TOKEN = 16
 MOST_CONNECTIONS = 512
 CLOSING_SECONDS = 2
 
 
 async def serve(view: DaemonView, *, socket: Path | None, tcp: tuple[str, int] | None, token: str | None) -> None:
-    """Serve until cancelled, then remove the socket file. Raises BadInput where it cannot listen.
+    """Serve until cancelled, then remove the socket file. Raises BadInput if it cannot listen.
 
-    On the Unix socket, mode 0660, the file system says who may come; TCP needs a token of at least 16 characters.
+    The Unix socket has mode 0660, so that the file system controls access; TCP needs a token of at least 16 characters.
     """
     if tcp is not None and (token is None or len(token) < SHORTEST_TOKEN):
         raise BadInput(f"--tcp needs --token-file with a token of at least {SHORTEST_TOKEN} characters")
@@ -47,7 +47,7 @@ def unix_socket(path: Path) -> Iterator[sockets.socket]:
     """A bound socket of mode 0660 under any umask, not yet listening; its file is removed at the end.
 
     The mode is set before bind for what the umask leaves, and after it for the rest; until `listen` nobody can connect.
-    Raises BadInput where the path is taken or cannot be made.
+    Raises BadInput if the path is taken or cannot be created.
     """
     _make_room(path)
     with sockets.socket(sockets.AF_UNIX, sockets.SOCK_STREAM) as sock:
@@ -67,7 +67,7 @@ def unix_socket(path: Path) -> Iterator[sockets.socket]:
 
 @contextlib.contextmanager
 def tcp_socket(host: str, port: int) -> Iterator[sockets.socket]:
-    """A bound TCP socket, not yet listening; raises BadInput where the address cannot be used."""
+    """A bound TCP socket, not yet listening; raises BadInput if the address cannot be used."""
     try:
         family, kind, protocol, _, address = sockets.getaddrinfo(host, port, type=sockets.SOCK_STREAM)[0]
         with sockets.socket(family, kind, protocol) as sock:
@@ -79,10 +79,10 @@ def tcp_socket(host: str, port: int) -> Iterator[sockets.socket]:
 
 
 def _make_room(path: Path) -> None:
-    """Remove the file that a killed daemon left; raises BadInput where it is in use, or no socket at all."""
+    """Remove the socket file of a killed daemon; raises BadInput if it is in use or not a socket."""
     try:
         if not stat.S_ISSOCK(path.lstat().st_mode):
-            raise BadInput(f"--socket {path}: there is a file of that name which is no socket")
+            raise BadInput(f"--socket {path}: there is a file of that name that is no socket")
         with sockets.socket(sockets.AF_UNIX, sockets.SOCK_STREAM) as probe:
             probe.settimeout(1.0)
             probe.connect(str(path))
@@ -105,7 +105,7 @@ def _identity(path: Path) -> tuple[int, int] | None:
 
 
 class _Server(uvicorn.Server):
-    """uvicorn's server, which leaves the process's signals alone: the service has its own handlers."""
+    """uvicorn's server without its signal handlers: the service has its own."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:

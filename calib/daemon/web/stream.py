@@ -1,4 +1,4 @@
-"""The stream: server-sent events to many clients, each bounded; one that does not read is cut off."""
+"""The stream: server-sent events to many clients, each bounded; a client that does not read is cut off."""
 
 import asyncio
 import logging
@@ -11,12 +11,12 @@ from calib.daemon.view.view import DaemonView
 from calib.daemon.web.peer import Message, Receive, Scope, Send, peer_of
 
 SEND_SECONDS = 5.0
-"""A client that takes nothing for so long is cut off."""
+"""A client that accepts nothing for this time is cut off [s]."""
 IDLE_SECONDS = 5.0
-"""Where there is nothing to say for so long, a comment finds out whether the client is still there."""
+"""After this time without an item a comment is sent, to find out whether the client is still there [s]."""
 MOST_CLIENTS = 200
 RETRY = b"retry: 2000\n\n"
-"""Browsers come back after two seconds."""
+"""Browsers reconnect after two seconds."""
 
 _log = logging.getLogger(__name__)
 
@@ -30,16 +30,16 @@ class Streams:
         self._item: JointsItem | None = None
         self._bytes = b""
         self.cut_off = 0
-        """Clients cut off so far because they did not read."""
+        """Number of clients cut off because they did not read."""
 
     @property
     def clients(self) -> int:
-        """How many are connected."""
+        """Number of clients connected."""
         return len(self._tasks)
 
     @property
     def is_full(self) -> bool:
-        """Whether no further client is taken."""
+        """Whether no further client is accepted."""
         return self.clients >= MOST_CLIENTS
 
     def close(self) -> None:
@@ -48,13 +48,13 @@ class Streams:
             task.cancel()
 
     def encode(self, item: JointsItem) -> bytes:
-        """A joints item as it goes over the wire; encoded once for all clients that get the same one."""
+        """A joints item as sent; encoded once for all clients that get the same one."""
         if item is not self._item:
             self._item, self._bytes = item, b"event: joints\ndata: " + item.model_dump_json().encode() + b"\n\n"
         return self._bytes
 
     async def run(self, scope: Scope, receive: Receive, send: Send, after: int | None) -> None:
-        """Serve one client until it goes: all events after id `after` (None: only new ones), then what comes."""
+        """Serve one client until it leaves: all events after id `after` (None: only new ones), then new items."""
         client = asyncio.create_task(self._send_all(send, after))
         self._tasks.add(client)
         gone = asyncio.create_task(_until_gone(receive))
@@ -92,7 +92,7 @@ class Streams:
                     await _send(send, b": nothing new\n\n")
                 elif isinstance(item, JointsItem):
                     await _send(send, self.encode(item))
-                elif item.event.id > after:  # also those that a slow client's queue has dropped before it
+                elif item.event.id > after:  # including those that a slow client's queue has dropped before it
                     after = await self._catch_up(send, after)
         finally:
             subscription.close()
@@ -111,18 +111,18 @@ class StreamResponse(StreamingResponse):
     """Response of GET /api/stream."""
 
     def __init__(self, streams: Streams, after: int | None) -> None:
-        """Events after id `after` come first; None: only new ones."""
+        """Begin with the events after id `after`; None: only new ones."""
         super().__init__((), media_type="text/event-stream", headers={"x-accel-buffering": "no"})
         self._streams, self._after = streams, after
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve until the client goes."""
+        """Serve until the client leaves."""
         await send({"type": "http.response.start", "status": 200, "headers": self.raw_headers})
         await self._streams.run(scope, receive, send, self._after)
 
 
 async def _send(send: Send, data: bytes, more: bool = True) -> None:
-    """Raises TimeoutError where the client does not take it."""
+    """Raises TimeoutError if the client does not accept it."""
     message: Message = {"type": "http.response.body", "body": data, "more_body": more}
     async with asyncio.timeout(SEND_SECONDS):
         await send(message)

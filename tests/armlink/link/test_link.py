@@ -7,7 +7,7 @@ import pytest
 
 from armlink.errors import BadInput, BusFault, Refused
 from armlink.link.link import Link
-from armlink.link.types import Command
+from armlink.link.types import Calibration, Command
 
 SWITCH_ON_DISABLED, ENABLED, QUICK_STOP, FAULT = 0x40, 0x27, 0x07, 0x08
 OFF, POSITION, TORQUE = 0, 8, 10
@@ -273,7 +273,7 @@ def test_an_mode_off_joint_is_switched_off_and_no_fault(enabled, bus):
 
 def test_calibration_is_staged_checked_and_made_active(enabled, bus):
     bus.sent.clear()
-    held = enabled.write_calibration(1, 1.05, -0.25, record_id=7, date=1_700_000_000)
+    held = enabled.write_calibration(1, Calibration(1.05, -0.25, record_id=7, date=1_700_000_000))
     writes = [(index, sub) for index, sub, _ in sdo_writes(bus, 2)]
     assert writes == [(0x2100, 4), (0x2100, 5), (0x2100, 7), (0x2100, 8), (0x2100, 9), (0x2100, 6)]
     assert held.gain == np.float32(1.05)
@@ -285,7 +285,7 @@ def test_calibration_is_staged_checked_and_made_active(enabled, bus):
 
 
 def test_storing_to_flash_only_on_request(enabled, bus):
-    enabled.write_calibration(0, 1.0, 0.0, record_id=1, store=True)
+    enabled.write_calibration(0, Calibration(1.0, 0.0, record_id=1), store=True)
     assert (0x1010, 4, 0x65766173) in sdo_writes(bus, 1)
     assert not [write for write in sdo_writes(bus, 2) if write[0] == 0x1010]
 
@@ -293,7 +293,7 @@ def test_storing_to_flash_only_on_request(enabled, bus):
 @pytest.mark.parametrize(("gain", "offset"), [(np.nan, 0.0), (0.0, 0.0), (-1.0, 0.0), (1.0, np.inf)])
 def test_a_calibration_that_no_sensor_has_is_refused(enabled, gain, offset):
     with pytest.raises(BadInput, match="joint_1: "):
-        enabled.write_calibration(0, gain, offset, record_id=1)
+        enabled.write_calibration(0, Calibration(gain, offset, record_id=1))
 
 
 def test_while_a_controller_thinks_the_cycle_goes_on(enabled, bus):

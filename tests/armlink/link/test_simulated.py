@@ -7,7 +7,7 @@ import yaml
 from armlink.arm_file import bundled_arms, load_arm, parse_arm
 from armlink.errors import BusFault, Refused
 from armlink.link.link import Link
-from armlink.link.types import Command
+from armlink.link.types import Calibration, Command
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
@@ -52,7 +52,7 @@ def test_a_calibration_that_is_applied_makes_the_reading_right(link, simulated):
     sample = link.enable()
     truth = simulated.true_sensors
     for joint in range(link.n):
-        link.write_calibration(joint, float(truth.gain[joint]), float(truth.offset[joint]), record_id=1)
+        link.write_calibration(joint, Calibration(float(truth.gain[joint]), float(truth.offset[joint]), record_id=1))
     samples = run(link, Command.hold(sample.position), 1.5)[-100:]
     angle = np.mean([s.position for s in samples], axis=0) * truth.position_gain + truth.position_offset
     torque = np.mean([s.torque for s in samples], axis=0)

@@ -12,6 +12,7 @@ from fake_joints import FakeBus
 from armlink.arm_file import Bus
 from armlink.bus.open import open_bus, open_link_bus
 from armlink.link.listener import Listener
+from armlink.link.types import Calibration
 
 pytestmark = pytest.mark.vcan
 
@@ -94,7 +95,7 @@ def test_a_calibration_is_read_and_written_between_the_cycles(arm_of):
         for cycle in range(10):
             controller.send(0x80, b"")
             controller.send(0x181, READING.pack(0, 1_000_000 * cycle))
-        held = listener.write_calibration(1, 1.25, -0.5, record_id=7)
+        held = listener.write_calibration(1, Calibration(1.25, -0.5, record_id=7))
         assert (held.gain, held.offset, held.record_id) == (1.25, -0.5, 7)
         assert listener.read_calibration(1).gain == 1.25
         assert [sample.torque[0] for sample in taken(listener)] == list(range(9))

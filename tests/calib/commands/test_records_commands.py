@@ -82,9 +82,18 @@ def test_rollback_with_apply_writes_the_controllers_first(kept, capsys) -> None:
     """On the simulated arm's own bus; where no controller answers, the log stays as it was."""
     path, first, second = kept
     assert run(["rollback", "sarcos", "--to", first, "--store", path, "--apply"]) == 0
-    assert "written to 7 controllers" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "written to 7 controllers" in said
+    assert "the only gate of a roll-back is the distance" in " ".join(said.split())
+    assert RecordStore(path).writes(load_arm("sarcos"))[0].body["gates"].startswith("roll-back: only the distance")
     assert run(["rollback", "sarcos", "--to", second, "--store", path, "--apply", "--bus", "socketcan:no_such_bus"]) > 1
     assert [line.record for line in RecordStore(path).activations(load_arm("sarcos"))] == [first, second, first]
+
+
+def test_rollback_knows_the_joints_that_it_is_told_of(kept, capsys) -> None:
+    path, first, _ = kept
+    assert run(["rollback", "sarcos", "--to", first, "--store", path, "--apply", "--replaced", "joint_9"]) == 2
+    assert "--replaced joint_9: no such joint" in capsys.readouterr().err
 
 
 def with_spread(record: CalibrationRecord, gain_std: float) -> CalibrationRecord:

@@ -15,11 +15,11 @@ from armlink.bus.open import open_link_bus
 from armlink.errors import BadInput, BusFault
 from armlink.link.link import Link
 from armlink.link.listener import Listener
-from armlink.link.types import Command
+from armlink.link.types import Calibration, Command
 from calib.arm.kinematics import gcomp_arm
 from calib.daemon.loop.arm_loop import ArmLoop
 from calib.daemon.loop.loop_messages import Batch, Down, LoopOptions, Up
-from calib.daemon.loop.loop_process import ChildHost
+from calib.daemon.loop.loop_process import LoopProcess
 from calib.daemon.settings import DaemonSection
 from calib.daemon.view.api_models import State
 from calib.motion.random_work import work_targets
@@ -63,7 +63,7 @@ def test_a_fault_of_a_joint_is_a_message_and_the_bus_is_opened_again(tmp_path: P
 def test_errors_of_the_bus_loop_come_back_as_what_they_are(tmp_path: Path) -> None:
     bench = DaemonBench(tmp_path, settings=settings("observe"), work=False)
     with pytest.raises(BadInput, match="gain 9"):
-        bench.host.controllers.write_calibration(0, 9.0, 0.0, 1)
+        bench.host.controllers.write_calibration(0, Calibration(9.0, 0.0, 1))
     bench.host.close()
     with pytest.raises(BusFault):
         bench.host.controllers.read_calibration(0)
@@ -126,7 +126,7 @@ def test_beside_another_controller_it_hears_all_and_sends_nothing(tmp_path: Path
             truth = link.cycle(Command.hold(next(targets)))
     loop = ArmLoop(LoopOptions(arm, listen_only=True, open_bus=lambda: Tap(bus.frames)))
     service = bench.service
-    service.listen_only = True
+    service.configuration.listen_only = True
     messages = [message for _ in range(120) for message in loop.run()]
     for message in messages:
         service.take(message)
@@ -173,7 +173,7 @@ def no_bus() -> None:
 
 
 def test_the_bus_process_ends_when_the_service_is_gone() -> None:
-    host = ChildHost(LoopOptions(load_arm("sarcos"), open_bus=no_bus), fork=True)
+    host = LoopProcess(LoopOptions(load_arm("sarcos"), open_bus=no_bus), fork=True)
     assert host._ours.poll(60.0)
     assert isinstance(host.pump()[0], Down)
     host._ours.close()  # as the kernel does where the service is killed

@@ -7,9 +7,11 @@ import os
 import socket
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from daemon_bench import run_now
 from fast_daemon import QUIET, FastDaemon
 
 from armlink.arm_file import load_arm
@@ -22,6 +24,7 @@ from calib.daemon.settings import DaemonSection
 from calib.daemon.state.journal import Journal
 from calib.daemon.view.api_models import State
 from calib.daemon.view.view import NoSuch, NotPossible
+from calib.observer.recalibrator import Recalibrator
 from calib.records.records import CalibrationRecord
 
 
@@ -65,18 +68,18 @@ def test_under_propose_nothing_is_written_until_a_person_approves(tmp_path: Path
     assert proposal.state == "pending"
     assert daemon.view.status().pending_proposals == 1
     assert not any(call.startswith("write") for call in daemon.sdo)
-    approved = daemon.view.approve(proposal.id, "ann")
+    approved = daemon.view.decisions.approve(proposal.id, "ann")
     assert (approved.state, approved.decided_by) == ("applied", "ann")
     assert abs(daemon.fast.error()[0][2]) < 0.003
     assert daemon.store.activations(daemon.arm)[-1].by == "ann"
     with pytest.raises(NotPossible, match="applied already"):
-        daemon.view.approve(proposal.id, "ann")
+        daemon.view.decisions.approve(proposal.id, "ann")
 
 
 def test_a_rejected_proposal_changes_nothing(tmp_path: Path) -> None:
     daemon = drifted(tmp_path, "propose")
     before = daemon.store.current(CalibrationRecord, daemon.arm)
-    assert daemon.view.reject(daemon.view.proposals()[0].id, "ann").state == "rejected"
+    assert daemon.view.decisions.reject(daemon.view.proposals()[0].id, "ann").state == "rejected"
     assert daemon.store.current(CalibrationRecord, daemon.arm) == before
     assert daemon.of_kind("rejected")[0].evidence["by"] == "ann"
 
@@ -91,7 +94,7 @@ def test_under_observe_a_drift_is_an_event_alone(tmp_path: Path) -> None:
 def test_listening_only_sends_nothing_until_something_is_approved(tmp_path: Path) -> None:
     daemon = drifted(tmp_path, "propose", listen_only=True)
     assert daemon.sdo == []
-    daemon.view.approve(daemon.view.proposals()[0].id, "ann")
+    daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann")
     assert abs(daemon.fast.error()[0][2]) < 0.003
 
 
@@ -111,7 +114,7 @@ def test_a_joint_is_recalibrated_by_itself_no_oftener_than_the_limit(tmp_path: P
 def test_a_write_that_fails_is_said_and_the_old_record_stays(tmp_path: Path) -> None:
     daemon = drifted(tmp_path, "propose")
     daemon.on_write = daemon.broken
-    answer = daemon.view.approve(daemon.view.proposals()[0].id, "ann")
+    answer = daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann")
     assert answer.state == "failed"
     assert "joint gone" in answer.note
     assert daemon.store.current(CalibrationRecord, daemon.arm).id == answer.base
@@ -152,7 +155,7 @@ def test_payload_is_an_event_with_mass_and_centre_and_nothing_is_written(tmp_pat
 
 def test_after_a_kill_it_knows_everything(tmp_path: Path) -> None:
     daemon = drifted(tmp_path, "propose")
-    daemon.service.keeping.keep()
+    daemon.service.save()
     events, estimates, proposals = daemon.view.events(), daemon.view.estimates(), daemon.view.proposals()
     rows = daemon.view.status().rows
     daemon.kill()
@@ -162,7 +165,7 @@ def test_after_a_kill_it_knows_everything(tmp_path: Path) -> None:
     assert daemon.view.status().rows == rows
     for before, after in zip(estimates, daemon.view.estimates(), strict=True):
         assert after.model_copy(update={"last_accepted": before.last_accepted}) == before
-    daemon.view.approve(proposals[0].id, "ann")
+    daemon.view.decisions.approve(proposals[0].id, "ann")
     assert abs(daemon.fast.error()[0][2]) < 0.003
 
 
@@ -188,8 +191,9 @@ def test_an_approval_cut_off_after_the_write_is_in_force(tmp_path: Path) -> None
     daemon = drifted(tmp_path, "propose")
     proposal = daemon.view.proposals()[0]
     daemon.service.journal.decide(proposal.id, daemon.wall(), "approved", "ann")
-    daemon.service.keeping.keep()
-    daemon.service.recalibrations.recalibrator.apply(daemon.store.get(proposal.record), 2, "ann")
+    daemon.service.save()
+    recalibrator = Recalibrator(daemon.arm, daemon, daemon.store, "propose")
+    recalibrator.apply(daemon.store.get(proposal.record), 2, "ann")
     rows = daemon.view.status().rows
     daemon.kill()
     daemon.start()
@@ -208,6 +212,30 @@ def test_controllers_that_lost_power_get_the_record_again(tmp_path: Path) -> Non
     daemon.service.take(Up(daemon.held()))
     assert daemon.of_kind("recalibration")[-1].evidence["restored"]
     assert abs(daemon.fast.error()[0][2]) < 0.003
+
+
+def test_a_bus_that_comes_back_during_a_write_is_compared_after_it(tmp_path: Path) -> None:
+    daemon = drifted(tmp_path, "propose")
+    jobs: list[tuple[Any, Any]] = []
+    daemon.run_aside = lambda work, done: jobs.append((work, done))
+    daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann")
+    daemon.fast.held_gain[5] = 1.3
+    daemon.service.take(Down("no power"))
+    daemon.service.take(Up(daemon.held()))
+    daemon.service.tick()
+    assert not daemon.of_kind("configuration")
+    (write,) = jobs
+    run_now(*write)
+    daemon.run_aside = run_now
+    daemon.service.tick()
+    assert daemon.of_kind("configuration")[0].evidence["joints"] == ["joint_6"]
+
+
+def test_an_error_that_is_no_fault_of_the_bus_is_raised(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings())
+    with pytest.raises(ZeroDivisionError):
+        daemon.service.jobs.start(lambda: 1 / 0, lambda outcome: None)
+    assert not daemon.service.jobs.busy
 
 
 def test_under_propose_readings_of_other_calibrations_are_converted(tmp_path: Path) -> None:
@@ -239,7 +267,7 @@ def test_a_bus_that_comes_and_goes_is_shown_and_does_not_fill_the_journal(tmp_pa
 def test_a_joint_that_falls_silent_is_a_fault(tmp_path: Path) -> None:
     daemon = FastDaemon(tmp_path, 1, settings())
     daemon.run(5)
-    batch = daemon.service.batch
+    batch = daemon.service.arm_state.batch
     batch.age[3] = 1.7
     assert daemon.view.status().state is State.FAULT
     assert daemon.view.status().detail == "joint_4: no reading for 1.7 s"
@@ -268,7 +296,7 @@ def test_a_reload_changes_the_policy_and_keeps_what_was_learnt(tmp_path: Path) -
     daemon.service.reload(daemon.arm, settings("apply", observer={"window": 16}))
     status = daemon.view.status()
     assert (status.policy, status.rows) == ("apply", rows)
-    assert daemon.service.watcher.observer.config.window == 16
+    assert daemon.service.records.observation.feed.observer.config.window == 16
 
 
 def test_a_full_disk_is_shown_and_stops_nothing(tmp_path: Path) -> None:
@@ -335,7 +363,7 @@ def test_events_proposals_and_decisions_cannot_be_changed(tmp_path: Path) -> Non
     import sqlite3
 
     daemon = drifted(tmp_path, "propose")
-    daemon.view.reject(1, "ann")
+    daemon.view.decisions.reject(1, "ann")
     for statement in ("UPDATE events SET text = ''", "DELETE FROM proposals", "DELETE FROM decisions"):
         with pytest.raises(sqlite3.IntegrityError, match="append-only"):
             daemon.service.journal._db.execute(statement)

@@ -14,6 +14,7 @@ from armlink.cli import run
 from armlink.errors import BadInput, Refused
 from armlink.recording.files import save_recording
 from armlink.recording.recording import Recording
+from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, per_joint
 from calib.arm.kinematics import gcomp_arm
 from calib.field.field_fit import fit_field
 from calib.field.rows import rows_of_recording
@@ -26,6 +27,7 @@ from gcomp.identify.readings import StaticReadings
 ARM = load_arm("sarcos")
 DESCRIBED = gcomp_arm(ARM)
 N = DESCRIBED.n
+BLANK = per_joint([UNCALIBRATED] * N)
 RATED = np.array([joint.rated_torque for joint in ARM.require_link().joints])
 MOMENT_STD = np.repeat([4.4e-3, 4.5e-3, 1.3e-3, 0.9e-3, 0.5e-3, 0.4e-3, 0.3e-3], 2)
 """Errors of β after a good calibration (theory.md section 6) [kg·m]."""
@@ -121,7 +123,7 @@ def test_a_torque_that_does_not_vary_gives_no_gain_and_under_load_no_offset() ->
     )  # a drift of 5 % would be more than the 0.5 % of rated torque asked of an offset
     assert heavy.any()
     assert np.isnan(fit.offset[heavy]).all()
-    assert "cannot be told from the gain" in fit.reasons[ARM.joint_names[int(np.argmax(heavy))], "offset"]
+    assert "cannot be separated from the gain" in fit.reasons[ARM.joint_names[int(np.argmax(heavy))], "offset"]
 
 
 def test_an_axis_along_gravity_has_an_offset_and_no_gain() -> None:
@@ -182,7 +184,7 @@ def recording(random: np.random.Generator, gain: np.ndarray, offset: np.ndarray,
 def test_slow_motion_gives_what_rests_give() -> None:
     random = np.random.default_rng(7)
     gain, offset = random.uniform(0.9, 1.1, N), random.normal(0, 0.5, N)
-    taken = rows_of_recording(recording(random, gain, offset, 0.08), np.ones(N), np.zeros(N), 0, "slow")
+    taken = rows_of_recording(recording(random, gain, offset, 0.08), BLANK, 0, "slow")
     fit = fit_field(ARM, taken, gravity(np.array(BETA)), calibration())
     known = np.isfinite(fit.gain)
     assert known[:6].all()
@@ -196,7 +198,7 @@ def test_what_the_controllers_held_is_taken_out_again() -> None:
     raw = recording(random, np.full(N, 1.1), np.full(N, 0.4), 0.08)
     assert raw.torque is not None
     sent = Recording(t=raw.t, position=raw.position, torque=(raw.torque - 0.2) / 0.9, names=raw.names)
-    taken = rows_of_recording(sent, np.full(N, 0.9), np.full(N, 0.2), 0, "slow")
+    taken = rows_of_recording(sent, TorqueCalibration(np.full(N, 0.9), np.full(N, 0.2)), 0, "slow")
     fit = fit_field(ARM, taken, gravity(np.array(BETA)), calibration(gain=0.9))
     assert fit.gain[:4] == pytest.approx([1.1] * 4, rel=5e-3)
 
@@ -204,10 +206,10 @@ def test_what_the_controllers_held_is_taken_out_again() -> None:
 def test_fast_motion_and_missing_torque_are_refused_in_one_line() -> None:
     fast = recording(np.random.default_rng(9), np.ones(N), np.zeros(N), 1.0)
     with pytest.raises(BadInput, match="slow enough"):
-        rows_of_recording(fast, np.ones(N), np.zeros(N), 0, "fast.csv")
+        rows_of_recording(fast, BLANK, 0, "fast.csv")
     without = Recording(t=fast.t, position=fast.position, motor_torque=fast.torque, names=fast.names)
     with pytest.raises(BadInput, match="no joint torque"):
-        rows_of_recording(without, np.ones(N), np.zeros(N), 0, "x")
+        rows_of_recording(without, BLANK, 0, "x")
 
 
 @pytest.fixture

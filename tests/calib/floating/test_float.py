@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from daemon_bench import good_records
+from made_records import put_on
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.link.link import Link
@@ -12,7 +13,6 @@ from armlink.link.types import Command, Sample
 from calib.arm.kinematics import gcomp_arm
 from calib.floating.controller import FloatConfig, FloatControl
 from calib.floating.run import run_float
-from calib.observer.recalibrator import write_record
 from gcomp.gravity.torque import gravity_torque
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
@@ -51,7 +51,7 @@ def floated(arm: ArmFile, script: list[tuple[float, list[float]]], seconds: floa
     with link:
         link.start()
         link.enable()
-        write_record(calibration, link)
+        put_on(link, calibration)
         run_float(link, arm, np.array(gravity.beta), calibration, seconds=seconds, on_sample=hand)
     return np.array(hand.positions), link
 
@@ -92,7 +92,7 @@ class Peer:
         self.link = Link(arm, LockStepBus(arm=self.simulated))
         self.link.start()
         self.goal = self.link.enable().position.copy()
-        write_record(calibration, self.link)
+        put_on(self.link, calibration)
         self.felt = [np.zeros(self.link.n)]
 
     def reflect(self, master: Sample) -> np.ndarray:
@@ -123,7 +123,7 @@ def test_a_master_arm_is_a_float_plus_a_peer(pushed: bool) -> None:
     with link, peer.link:
         link.start()
         link.enable()
-        write_record(calibration, link)
+        put_on(link, calibration)
         beta = np.array(gravity.beta)
         run_float(link, arm, beta, calibration, seconds=1.6, reflect=peer.reflect, on_sample=watch)
     before, after = positions[240], positions[-1]

@@ -1,4 +1,4 @@
-"""The cause test against the Monte Carlo table of theory.md section 6."""
+"""The cause test against the Monte Carlo table of docs/theory.md, section 6."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -10,13 +10,13 @@ from effects_on_readings import CONFIG, SIGMA, payload
 
 from calib.observer.cause_test import CauseTest, Verdict
 from calib.observer.effect_dictionary import Window, dictionary
-from calib.observer.gravity_belief import ModelBelief
+from calib.observer.gravity_belief import GravityBelief
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.gravity.torque import gravity_regressor, gravity_stiffness, gravity_torque
 
 MODEL_STD = np.repeat([4.4, 4.5, 1.3, 0.9, 0.5, 0.4, 0.3], 2) * 1e-3
-"""Errors of a good calibration, kg·m (theory.md section 6)."""
+"""Errors of a good calibration, kg·m (docs/theory.md, section 6)."""
 
 Effect = Callable[[Arm, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.random.Generator], str]
 """(arm, beta, q, direction, readings to change, random) -> the right answer."""
@@ -124,7 +124,7 @@ def verdict(arm, beta, effect, rows, random, model_std=None) -> tuple[str, Verdi
     truth = effect(arm, beta, q, direction, v, random)
     v += SIGMA * random.normal(size=v.shape)
     std = np.zeros(beta.size) if model_std is None else model_std
-    belief = ModelBelief(arm, beta + std * random.normal(size=beta.size), np.diag(std**2))
+    belief = GravityBelief(arm, beta + std * random.normal(size=beta.size), np.diag(std**2))
     return truth, CauseTest(belief, Window(q, v, direction), np.full(arm.n, SIGMA), CONFIG).verdict()
 
 
@@ -207,7 +207,7 @@ def test_the_estimate_holds_the_truth_as_often_as_its_covariance_says(sarcos, sa
         v = gravity_torque(sarcos, sarcos_beta, q)
         v[:, 2] = 1.03 * v[:, 2] + 0.3
         v += SIGMA * random.normal(size=v.shape)
-        belief = ModelBelief(sarcos, sarcos_beta + MODEL_STD * random.normal(size=14), np.diag(MODEL_STD**2))
+        belief = GravityBelief(sarcos, sarcos_beta + MODEL_STD * random.normal(size=14), np.diag(MODEL_STD**2))
         test = CauseTest(belief, Window(q, v, np.ones_like(q)), np.full(7, SIGMA), CONFIG)
         change, covariance = test.drift(2, "drift")
         error = change - (0.03, 0.3)
@@ -244,7 +244,7 @@ def test_one_pose_cannot_blame_a_payload(sarcos, sarcos_beta) -> None:
     v = gravity_torque(sarcos, sarcos_beta, q)
     payload(0.5)(sarcos, sarcos_beta, q, np.ones_like(q), v, random)
     test = CauseTest(
-        ModelBelief(sarcos, sarcos_beta, np.zeros((14, 14))), Window(q, v, q * 0), np.full(7, SIGMA), CONFIG
+        GravityBelief(sarcos, sarcos_beta, np.zeros((14, 14))), Window(q, v, q * 0), np.full(7, SIGMA), CONFIG
     )
     assert test.verdict().cause != "payload"
 
@@ -256,6 +256,6 @@ def test_a_vertical_joint_that_gravity_does_not_load_has_only_an_offset(sarcos, 
     v = gravity_torque(upright, sarcos_beta, q)
     v[:, 0] += 0.2
     v += SIGMA * random.normal(size=v.shape)
-    belief = ModelBelief(upright, sarcos_beta, np.zeros((14, 14)))
+    belief = GravityBelief(upright, sarcos_beta, np.zeros((14, 14)))
     said = CauseTest(belief, Window(q, v, random.choice([-1.0, 1.0], q.shape)), np.full(7, SIGMA), CONFIG).verdict()
     assert (said.cause, said.joint) == ("offset", 0)

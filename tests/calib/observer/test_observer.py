@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,6 @@ from calib.motion.static_reading import StaticReading
 from calib.observer.config import ObserverConfig
 from calib.observer.events import Event
 from calib.observer.observer import Observer
-from calib.observer.state import restore_observer, save_observer
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.gravity.torque import gravity_regressor, gravity_torque
@@ -307,9 +307,9 @@ def test_a_restored_observer_goes_on_as_if_nothing_had_been(sarcos, sarcos_beta,
         bench.drift(2, gain=1.03, offset=0.3)
         bench.work(rows - 60 if rows > 60 else 0)
         if restart:
-            saved = json.loads(json.dumps(save_observer(bench.observer)))
+            saved = json.loads(json.dumps(bench.observer.save()))
             again = Observer(sarcos, sarcos_beta, np.zeros((14, 14)), SIGMA)
-            assert restore_observer(again, saved)
+            assert again.restore(saved)
             bench.observer = again
         bench.work(80)
         return [(event.t, event.kind) for event in bench.events]
@@ -320,8 +320,32 @@ def test_a_restored_observer_goes_on_as_if_nothing_had_been(sarcos, sarcos_beta,
 def test_a_state_that_does_not_fit_changes_nothing(sarcos, sarcos_beta) -> None:
     bench = Bench(sarcos, sarcos_beta, 160)
     bench.work(30)
-    good = save_observer(bench.observer)
+    good = bench.observer.save()
     for change in ({"schema": 99}, {"sigma": [1.0]}, {"state": [[float("nan"), 0.0]] * 7}, {"window": [[1.0]]}):
-        assert not restore_observer(bench.observer, {**good, **change})
-    assert not restore_observer(bench.observer, {})
-    assert save_observer(bench.observer) == good
+        assert not bench.observer.restore({**good, **change})
+    assert not bench.observer.restore({})
+    assert bench.observer.save() == good
+
+
+def test_a_state_saved_by_version_0_1_is_restored(sarcos, sarcos_beta) -> None:
+    """saved_state.json: a drift of joint 3, between two windows that agree; written by armlink 0.1."""
+    saved = json.loads((Path(__file__).parent / "saved_state.json").read_text(encoding="utf-8"))
+    bench = Bench(sarcos, sarcos_beta, 150)
+    bench.work(60)
+    bench.drift(2, gain=1.03, offset=0.3)
+    bench.work(35)
+    bench.observer = Observer(sarcos, sarcos_beta, np.zeros((14, 14)), SIGMA)
+    assert bench.observer.restore(saved)
+    assert bench.observer.save() == saved
+    assert [(event.t, event.kind, event.joint) for event in bench.work(80)] == [(200.0, "proposal", "joint_3")]
+
+
+@pytest.mark.parametrize(
+    "part", ["beta", "factor", "state", "recent", "sums", "places", "window", "first", "said", "direction", "left"]
+)
+def test_a_part_that_does_not_fit_leaves_the_others_as_they_were(sarcos, sarcos_beta, part) -> None:
+    saved = json.loads((Path(__file__).parent / "saved_state.json").read_text(encoding="utf-8"))
+    observer = Observer(sarcos, sarcos_beta, np.zeros((14, 14)), SIGMA)
+    before = observer.save()
+    assert not observer.restore({**saved, part: [["x"]]})
+    assert observer.save() == before

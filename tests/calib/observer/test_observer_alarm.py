@@ -1,4 +1,4 @@
-"""Rest detection, filter and alarm, against the figures of theory.md section 6."""
+"""Rest detection, filter and alarm, against the figures of docs/theory.md, section 6."""
 
 from dataclasses import replace
 
@@ -7,9 +7,9 @@ import pytest
 
 from calib.motion.static_reading import StaticReading
 from calib.observer.config import ObserverConfig
-from calib.observer.cusum import Cusum
 from calib.observer.rest_detector import RestDetector
-from calib.observer.sensor_filter import SensorFilter
+from calib.observer.tracking.cusum import Cusum
+from calib.observer.tracking.sensor_filter import SensorFilter
 from gcomp.gravity.torque import gravity_torque
 
 CONFIG = ObserverConfig()
@@ -60,7 +60,7 @@ def test_false_alarms_are_rarer_than_one_in_5000_rows(sarcos, sarcos_beta) -> No
 
 
 def test_the_filter_tracks_to_the_accuracy_of_its_random_walk(sarcos, sarcos_beta) -> None:
-    """Steady state of theory.md: std(o) about 0.007 N·m, std(k) 0.044 … 0.12 % on joints 1 to 6."""
+    """Steady state of docs/theory.md, section 6: std(o) about 0.007 N·m, std(k) 0.044 … 0.12 % on joints 1 to 6."""
     random = np.random.default_rng(2)
     torque = gravity_torque(sarcos, sarcos_beta, random.uniform(sarcos.lower, sarcos.upper, (900, 7)))
     tracked = SensorFilter(7, replace(CONFIG, excitation_std=1.0))  # the figures are without the excitation gate

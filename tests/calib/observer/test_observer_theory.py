@@ -1,4 +1,4 @@
-"""What theory.md promises of the observer as a whole (section 8, item 9) that no part of it shows alone."""
+"""Properties of the observer as a whole that no part shows alone (docs/theory.md, section 8, item 9)."""
 
 from collections import Counter
 
@@ -7,9 +7,9 @@ import pytest
 from effects_on_readings import CONFIG, SIGMA, payload
 
 from calib.observer.cause_test import CauseTest
-from calib.observer.cusum import Cusum
 from calib.observer.effect_dictionary import Window
-from calib.observer.gravity_belief import ModelBelief
+from calib.observer.gravity_belief import GravityBelief
+from calib.observer.tracking.cusum import Cusum
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.gravity.torque import gravity_regressor, gravity_torque
 
@@ -33,7 +33,7 @@ def cause_of_pickup(arm, beta, mass, random) -> str:
         return "no alarm"
     fresh = slice(row + 1, row + 1 + FRESH)
     window = Window(q[fresh], reading[fresh], random.choice([-1.0, 1.0], (FRESH, arm.n)))
-    exact = ModelBelief(arm, beta, np.zeros((beta.size, beta.size)))
+    exact = GravityBelief(arm, beta, np.zeros((beta.size, beta.size)))
     verdict = CauseTest(exact, window, np.full(arm.n, SIGMA), CONFIG).verdict()
     return "drift" if verdict.is_drift else verdict.cause
 

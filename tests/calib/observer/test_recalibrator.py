@@ -7,9 +7,10 @@ import pytest
 from fake_controllers import ARM, NAMES, Controllers, joint, record
 
 from armlink.errors import BusFault, Refused
+from armlink.torque_calibration import TorqueCalibration
 from calib.observer.check_at_rests import Checked
 from calib.observer.decision import Finding
-from calib.observer.recalibrator import Recalibrator, compose, recalibrated, write_record
+from calib.observer.recalibrator import Recalibrator, recalibrated
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
 
@@ -30,13 +31,14 @@ def test_composition_makes_the_reading_right_again() -> None:
     torque, (k, o) = np.array([-20.0, 0.0, 35.0]), (1.1, -0.4)
     sensor = 1.03 * k * torque + o + 0.33
     slope, constant = np.polyfit(torque, (sensor - o) / k, 1)
-    gain, offset = compose(k, o, finding(slope, constant))
-    np.testing.assert_allclose((sensor - offset) / gain, torque, atol=1e-12)
+    new = TorqueCalibration(k, o).compose(finding(slope, constant).change)
+    np.testing.assert_allclose(new.invert(sensor), torque, atol=1e-12)
 
 
 def test_two_recalibrations_compose_to_the_whole_drift() -> None:
-    once = compose(1.1, -0.4, finding(1.03, 0.3))
-    np.testing.assert_allclose(compose(*once, finding(1 / 1.03, -0.3 / 1.03)), (1.1, -0.4), atol=1e-12)
+    once = TorqueCalibration(1.1, -0.4).compose(finding(1.03, 0.3).change)
+    twice = once.compose(finding(1 / 1.03, -0.3 / 1.03).change)
+    np.testing.assert_allclose((twice.gain, twice.offset), (1.1, -0.4), atol=1e-12)
 
 
 def test_the_new_record_follows_from_the_old(store: RecordStore) -> None:
@@ -87,7 +89,8 @@ def test_what_the_check_finds_worse_is_undone(store: RecordStore) -> None:
     assert (controllers.held[1].gain, controllers.held[1].record_id) == (pytest.approx(1.1), record().number)
     assert store.activations(ARM)[-1].reason.startswith("elbow: RMS 0.9")
     assert outcome.undo is not None
-    np.testing.assert_allclose(compose(1.1 * 1.03, -0.4 + 1.1 * 0.3, outcome.undo), (1.1, -0.4), atol=1e-6)
+    old = TorqueCalibration(1.1 * 1.03, -0.4 + 1.1 * 0.3).compose(outcome.undo.change)
+    np.testing.assert_allclose((old.gain, old.offset), (1.1, -0.4), atol=1e-6)
     with pytest.raises(Refused, match="none before it"):
         recalibrator.undo(Checked("worse", 1, "again"))
 
@@ -158,9 +161,15 @@ def test_an_arm_without_a_record_is_refused(tmp_path: Path) -> None:
         Recalibrator(ARM, Controllers(), RecordStore(str(tmp_path / "records.db")), "apply")
 
 
-def test_write_record_puts_a_whole_record_on_the_controllers() -> None:
+def test_restore_puts_a_whole_record_on_the_controllers(store: RecordStore) -> None:
+    """A gain that is not identifiable stays what the controller holds; the log of current records does not grow."""
     controllers = Controllers(gain=1.0, offset=0.0)
     vertical = record(joints=(joint("shoulder", gain=None), joint("elbow")), covariance_of=(), covariance=())
-    assert write_record(vertical, controllers) == NAMES
+    store.put(vertical, ARM, by="ann", reason="sweep")
+    log = store.activations(ARM)
+    assert Recalibrator(ARM, controllers, store, "propose").restore() == NAMES
+    assert store.activations(ARM) == log
+    assert [line.stage for line in store.writes(ARM)] == ["begun", "finished"]
+    assert [held.date for held in controllers.held] == [int(vertical.created.timestamp())] * 2
     assert [held.gain for held in controllers.held] == [1.0, pytest.approx(1.1)]
     assert [held.offset for held in controllers.held] == [pytest.approx(-0.4)] * 2

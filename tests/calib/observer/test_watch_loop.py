@@ -4,6 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fake_controllers import as_real32
+from made_records import put_on
 
 from armlink.arm_file import ArmFile, parse_arm
 from armlink.link.link import Link
@@ -12,7 +14,7 @@ from calib.arm.kinematics import gcomp_arm
 from calib.motion.random_work import WorkMotion, work_targets
 from calib.observer.config import ObserverConfig
 from calib.observer.observer import Observer
-from calib.observer.recalibrator import Recalibrator, write_record
+from calib.observer.recalibrator import Recalibrator
 from calib.observer.watch_loop import WatchHistory, watch
 from calib.records.records import CalibrationRecord, GravityRecord, JointCalibration, matrix, provenance
 from calib.records.store import RecordStore
@@ -83,7 +85,7 @@ class MadeUpLink:
     def __init__(self, arm: ArmFile, truth: Truth) -> None:
         self.arm, self.beta = gcomp_arm(arm), base_parameters(gcomp_arm(arm), MASS, MASS[:, None] * CENTRE)
         self.position_gain, self.gain, self.offset = truth.position_gain, truth.gain.copy(), truth.offset.copy()
-        self.held = [Calibration(1.0, 0.0, 0, 0, 0) for _ in NAMES]
+        self.held = [Calibration(1.0, 0.0) for _ in NAMES]
         self.random, self.t = np.random.default_rng(0), 0.0
         self.here, self.torque = np.full(3, np.nan), np.zeros(3)
 
@@ -101,10 +103,8 @@ class MadeUpLink:
     def read_calibration(self, joint: int) -> Calibration:
         return self.held[joint]
 
-    def write_calibration(
-        self, joint: int, gain: float, offset: float, record_id: int, date: int = 0, store: bool = False
-    ) -> Calibration:
-        self.held[joint] = Calibration(float(np.float32(gain)), float(np.float32(offset)), record_id, 0, 0)
+    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
+        self.held[joint] = as_real32(calibration)
         return self.held[joint]
 
 
@@ -118,7 +118,7 @@ class Setup:
         self.record, gravity = records(arm, truth)
         self.store = RecordStore(str(tmp_path / "records.db"))
         self.store.put(self.record, arm, by="ann", reason="sweep")
-        write_record(self.record, self.link)
+        put_on(self.link, self.record)
         self.arm = arm
         self.observer = Observer.of_records(self.link.arm, self.record, gravity, RATED, QUICK)
         self.recalibrator = Recalibrator(arm, self.link, self.store, policy)  # type: ignore[arg-type]
@@ -198,7 +198,7 @@ def test_on_the_simulated_arm_a_drift_is_found_and_put_right(tmp_path: Path) -> 
     with Link(arm, LockStepBus(arm=simulated)) as link:
         link.start()
         link.enable()
-        write_record(record, link)
+        put_on(link, record)
         described = gcomp_arm(arm)
         observer = Observer.of_records(described, record, gravity, RATED, QUICK)
         recalibrator = Recalibrator(arm, link, store, "apply")

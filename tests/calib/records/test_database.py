@@ -162,7 +162,7 @@ def test_a_full_disk_is_said_and_nothing_is_lost(tmp_path: Path) -> None:
     store = RecordStore(str(path))
     store.put(calibration(), ARM, by="ann", reason="sweep")
     script = (
-        "import resource, sys, test_records as t\n"
+        "import resource, sys, made_records as t\n"
         "from armlink.errors import BadInput\n"
         "from calib.records.store import RecordStore\n"
         "store = RecordStore(sys.argv[1])\n"

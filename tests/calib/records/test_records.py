@@ -157,7 +157,7 @@ def test_two_open_stores_see_one_another(tmp_path: Path) -> None:
 def test_a_process_killed_while_it_writes_leaves_whole_records(tmp_path: Path) -> None:
     """SIGKILL inside the transaction: the record before stands, the one begun is gone."""
     script = (
-        "import os, signal, sys, test_records as t\n"
+        "import os, signal, sys, made_records as t\n"
         "from calib.records.database import transaction\n"
         "from calib.records.schema import RECORDS\n"
         "from calib.records.store import RecordStore\n"

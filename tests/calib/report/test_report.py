@@ -10,12 +10,14 @@ from synthetic_sweeps import passes
 
 from armlink.errors import Refused
 from calib.field.field_fit import fit_field
-from calib.field.field_record import check_field_heldout, field_record
+from calib.field.field_record import field_record
+from calib.field.heldout import heldout_errors
 from calib.field.rows import rows_of_sweeps
 from calib.fit.findings import Finding
 from calib.fit.gravity_fit import identify_gravity
+from calib.fit.heldout import heldout_scores, worse_joint
 from calib.fit.sensor_fit import SensorFit, fit_sensors
-from calib.install.plausibility import check_gates, check_heldout, check_holds, heldout_scores
+from calib.install.apply import Apply, admit_sweeps, check_heldout, check_holds
 from calib.records.compare import differences
 from calib.records.records import CalibrationRecord, JointCalibration
 from calib.records.store import RecordStore
@@ -61,7 +63,7 @@ def test_the_report_says_what_from_what_and_per_joint_and_opens_without_complain
         "the model holds",
         "Before and after",
         "Figure 6",
-        "told by the others",
+        "cross-validation RMS",
     ):
         assert said in document, said
     for name in ARM.joint_names:
@@ -91,12 +93,12 @@ def test_held_out_steps_are_as_far_off_as_their_noise(fit, record) -> None:
 
 def test_the_gates_let_a_right_calibration_pass_and_name_what_is_wrong(record, tmp_path) -> None:
     store = RecordStore(str(tmp_path / "records.db"))
-    check_gates(record, ARM, store, DATA)  # the first of this arm
+    admit_sweeps(record, ARM, store, DATA, (), Apply("ann"))  # the first of this arm
     store.put(changed(record, 2, gain=1.03, offset=0.2), ARM, by="ann", reason="sweeps")
-    check_gates(record, ARM, store, DATA)
+    admit_sweeps(record, ARM, store, DATA, (), Apply("ann"))
     jumped = changed(record, 0, gain=1.3)
     with pytest.raises(Refused, match=f"{ARM.joint_names[0]}: gain .* covariance and history allow"):
-        check_gates(jumped, ARM, store, DATA)
+        admit_sweeps(jumped, ARM, store, DATA, (), Apply("ann"))
 
 
 def test_a_joint_on_which_the_model_does_not_hold_is_not_written() -> None:
@@ -123,7 +125,7 @@ def test_sweeps_that_disagree_with_one_another_do_not_replace_a_good_record(fit,
         spoilt.append(type(data)(data.path, data.manifest, tuple(readings), data.plan, data.resolution, data.digest))
     gravity = identify_gravity(ARM, DATA, fit).record(ARM, record)
     check_heldout(record.model_copy(update={"note": "new"}), record, ARM, DATA, gravity)
-    with pytest.raises(Refused, match=f"{ARM.joint_names[1]}: readings left out of the fit"):
+    with pytest.raises(Refused, match=f"{ARM.joint_names[1]}: held-out data is predicted with"):
         check_heldout(record.model_copy(update={"note": "new"}), record, ARM, spoilt, gravity)
 
 
@@ -143,7 +145,7 @@ def test_sweeps_without_a_mass_recalibrate_against_the_gravity_record(fit, recor
     assert new.joints[1].gain == pytest.approx(TRUTH.gain[1], rel=0.01)
     for joint, parameter in found.reasons:
         assert f"{joint} {parameter}" in new.note  # carried over, and said so
-    check_field_heldout(rows, found, later)
+    assert worse_joint(*heldout_errors(rows, found, later)) is None
 
 
 def test_a_pass_with_a_mass_is_not_taken_for_the_bare_arm() -> None:

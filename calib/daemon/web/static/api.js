@@ -1,4 +1,4 @@
-// Requests to the daemon: the token where one is needed, errors as one line, and the stream that comes back by itself.
+// Requests to the daemon: with a token if needed, errors as one line, and a stream that reconnects on its own.
 
 const KEY = "armlink-token";
 let asking = null;
@@ -29,7 +29,7 @@ async function request(path, options = {}) {
     const headers = { ...options.headers, ...(sent ? { Authorization: `Bearer ${sent}` } : {}) };
     const answer = await fetch(path, { ...options, headers, cache: "no-store" });
     if (answer.status !== 401) return answer;
-    if (sent === token()) await askToken(sent !== null); // else another request has asked meanwhile
+    if (sent === token()) await askToken(sent !== null); // else another request has asked for it meanwhile
   }
 }
 
@@ -49,7 +49,7 @@ export async function blob(path) {
   return answer.ok ? answer.blob() : answerOf(answer);
 }
 
-// Calls on.joints, on.event, on.open and on.lost for ever. EventSource cannot send a token, hence fetch.
+// Calls on.joints, on.event, on.open and on.lost until the page is closed. EventSource cannot send a token, hence fetch.
 export async function stream(on, after) {
   let last = after;
   const silence = 8000;
@@ -75,9 +75,9 @@ export async function stream(on, after) {
           if (fields.data) on[fields.event]?.(JSON.parse(fields.data));
         }
       }
-      on.lost("the daemon has ended the connection");
+      on.lost("the daemon closed the connection");
     } catch (error) {
-      on.lost(abort.signal.aborted ? "the daemon is silent" : error.message);
+      on.lost(abort.signal.aborted ? "the daemon does not respond" : error.message);
     }
     clearTimeout(timer);
     await new Promise((wake) => setTimeout(wake, 1000));

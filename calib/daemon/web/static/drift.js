@@ -1,14 +1,14 @@
-// Gain and offset over time: what is fetched, what is kept, and when it is drawn again.
+// Gain and offset over time: fetching, caching and redrawing.
 
 import { get } from "./api.js";
 import { by, category, gainIsOff, make, number, offsetIsOff, signed } from "./format.js";
 import { drawJoint, drawTimeline } from "./plot.js";
 
-const POINTS = 120; // a joint, in one request
-const MOST = 1500; // a joint, kept before all is fetched again, thinned
+const POINTS = 120; // per joint, in one request
+const MOST = 1500; // per joint, cached until everything is fetched again, thinned
 const history = new Map();
 const events = [];
-const live = new Map(); // the estimate of this moment: the last point of each line
+const live = new Map(); // the present estimate: the last point of each line
 let seconds = 3600;
 let now = Date.now();
 let drawn = false;
@@ -36,12 +36,12 @@ export function setHistory(points) {
 
 const since = () => (seconds ? new Date(now - 1000 * seconds).toISOString() : "");
 
-// All of the time range anew; the caller draws.
+// Fetches the whole time range again; the caller draws.
 export async function fetchHistory() {
   setHistory(await get(`/api/history?limit=${POINTS}&from=${encodeURIComponent(since())}`));
 }
 
-// The caller draws.
+// Fetches points newer than the cached ones; the caller draws.
 export async function fetchNew() {
   const newest = Math.max(0, ...[...history.values()].map((points) => points.at(-1).at));
   if (!newest || [...history.values()].some((points) => points.length > MOST)) return fetchHistory();
@@ -70,7 +70,7 @@ function niceHalf(values, least) {
   return [1, 1.5, 2, 3, 5, 7, 10].map((step) => step * ten).find((value) => value >= wanted * 0.999);
 }
 
-// One scale for all joints, so that the one that drifts stands out.
+// One scale for all joints, which makes a drifting one conspicuous.
 function halves(shown) {
   const all = shown.flatMap(([, points]) => points);
   const middle = (key) => all.map((p) => p[key]).sort((a, b) => a - b)[Math.floor(all.length / 2)] ?? 0;

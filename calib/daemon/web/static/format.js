@@ -1,4 +1,4 @@
-// Numbers, times and small pieces of the page.
+// Formatting of numbers and times, and small helpers of the page.
 
 export const MISSING = "–";
 
@@ -32,7 +32,7 @@ export function make(tag, properties = {}, ...children) {
 
 export const by = (id) => document.getElementById(id);
 
-// Text is set only where it differs: ten updates a second must not make the browser lay out what has not changed.
+// Sets text only if it differs, so that ten updates per second do not cause a new layout of unchanged content.
 export function put(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
@@ -44,10 +44,10 @@ const CATEGORIES = {
   change: ["recalibration", "approved", "rejected", "roll-back", "check", "sweep", "recovered"],
 };
 
-// Which of the four colours an event has; empty for the others (started, stopped, clear, configuration, clock).
+// The colour of an event; empty for those without one (started, stopped, clear, configuration, clock).
 export const category = (kind) => Object.keys(CATEGORIES).find((name) => CATEGORIES[name].includes(kind)) ?? "";
 
-// What is called a drift on the page: beyond three standard deviations and beyond the accuracy asked of a calibration.
+// The page marks a drift beyond three standard deviations and beyond the required accuracy of a calibration.
 export const GAIN_OFF = 0.003;
 export const OFFSET_OFF = 0.05;
 export const gainIsOff = (one) => Math.abs(one.gain - 1) > Math.max(GAIN_OFF, 3 * one.gain_std);

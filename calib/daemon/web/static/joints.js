@@ -1,4 +1,4 @@
-// The table of joints: readings ten times a second, estimates every few seconds.
+// The table of joints: readings ten times per second, estimates every two seconds.
 
 import { by, gainIsOff, make, MISSING, number, offsetIsOff, put, signed } from "./format.js";
 
@@ -59,15 +59,15 @@ export function showJoints(joints) {
 
 function interval(cell, value, std, digits, off) {
   cell.classList.toggle("off", off);
-  const around = std > 0 ? ` ± ${number(1.96 * std, digits)}` : ""; // 0: left as it was, since only the other one drifts
+  const around = std > 0 ? ` ± ${number(1.96 * std, digits)}` : ""; // 0: unchanged, because only the other one drifts
   cell.replaceChildren(signed(value, digits), make("span", { className: "pm" }, around));
 }
 
-// What the estimates say in one line.
+// Summary of the estimates in one line.
 export function verdict(estimates) {
   const drifting = estimates.filter((one) => gainIsOff(one) || offsetIsOff(one)).map((one) => one.joint);
-  if (drifting.length) return `${drifting.join(", ")}: the torque sensor reads other than calibrated.`;
-  return estimates.length ? `All ${estimates.length} torque sensors read as calibrated.` : "";
+  if (drifting.length) return `${drifting.join(", ")}: the torque sensor has drifted from its calibration.`;
+  return estimates.length ? `All ${estimates.length} torque sensors agree with their calibration.` : "";
 }
 
 export function showEstimates(estimates) {

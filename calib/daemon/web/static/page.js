@@ -1,4 +1,4 @@
-// The page: what the daemon says, at a glance. Everything it knows comes from the API; it sends nothing but decisions.
+// The page: the daemon's state at a glance. All data come from the API; it sends nothing but decisions.
 
 import { blob, forgetToken, get, stream, token } from "./api.js";
 import { addEvent, draw, drawIfChanged, fetchNew, initRanges, overviewQuery, setHistory, setLive, setNow } from "./drift.js";
@@ -7,14 +7,14 @@ import { by, clock, duration, put, whole } from "./format.js";
 import { showEstimates, showJoints, verdict } from "./joints.js";
 import { fetchProposals, showProposals } from "./proposals.js";
 
-const SLOW = 2000; // ms between looks at what changes slowly
+const SLOW = 2000; // ms between updates of what changes slowly
 let status = null;
 let connected = false;
-let said = "";
+let summary = "";
 
 const WORDS = { lost: "NO CONNECTION", fault: "FAULT", alarm: "ALARM", decide: "DECISION NEEDED" };
 
-// The daemon's own state; while it observes, also whether an alarm stands and whether somebody must decide.
+// The daemon's own state; while it observes, also an open alarm or a pending decision.
 function shownState(state) {
   if (!connected) return "lost";
   if (state !== "observing") return state;
@@ -25,9 +25,9 @@ function shownState(state) {
 function showState(state, detail) {
   const shown = shownState(state);
   const own = {
-    alarm: "Something has changed: its cause is being found, estimates are held.",
-    decide: `${said} A new calibration waits for your decision.`,
-    observing: said,
+    alarm: "Sensors and model disagree: the cause is being determined, estimates are held.",
+    decide: `${summary} A new calibration waits for your decision.`,
+    observing: summary,
   };
   document.body.dataset.state = shown;
   put(by("state-word"), WORDS[shown] ?? shown);
@@ -55,19 +55,19 @@ function showStatus() {
   put(by("serial"), status.serial);
   put(by("version"), `armlink ${status.version}`);
   const { calibration, gravity } = status.records;
-  put(by("records"), calibration ? ` (record ${calibration}, gravity ${gravity ?? "none"})` : ": there is none, sweep and calibrate first");
+  put(by("records"), calibration ? ` (record ${calibration}, gravity ${gravity ?? "none"})` : ": none yet, sweep and calibrate first");
   showState(status.state, status.detail || status.bus.fault || "");
   showBus(status.bus);
   showLink();
   by("forget").hidden = token() === null;
-  by("openapi").hidden = token() !== null; // a link cannot send the token
+  by("openapi").hidden = token() !== null; // a link cannot send a token
   if (status.report && !by("report").dataset.there) showReport();
 }
 
 function showLink() {
   if (!status || !connected) return;
   const listens = status.listen_only ? "listens only" : "drives the bus";
-  put(by("link"), `live · policy ${status.policy} · ${listens} · running for ${duration(status.uptime_s)} · ${whole(status.rows)} rests seen`);
+  put(by("link"), `live · policy ${status.policy} · ${listens} · running for ${duration(status.uptime_s)} · ${whole(status.rows)} rests used`);
 }
 
 function showReport() {
@@ -75,7 +75,7 @@ function showReport() {
   paragraph.dataset.there = "yes";
   const link = Object.assign(document.createElement("a"), { href: "/api/report", target: "_blank", rel: "noopener", textContent: "Open the newest report" });
   link.addEventListener("click", async (event) => {
-    if (token() === null) return; // the Unix socket asks for none: an ordinary link
+    if (token() === null) return; // the Unix socket needs none: an ordinary link
     event.preventDefault();
     const file = Object.assign(document.createElement("a"), { href: URL.createObjectURL(await blob("/api/report")), download: "armlink-report.html" });
     file.click();
@@ -91,12 +91,12 @@ const on = {
   },
   lost(why) {
     connected = false;
-    showState("lost", `No connection to the daemon: ${why}. What stands below is old. Trying again.`);
+    showState("lost", `No connection to the daemon: ${why}. The values below are old. Reconnecting.`);
     put(by("link"), status ? `last heard ${clock(status.time)}` : "");
   },
   joints(item) {
     setNow(item.time);
-    if (status.state !== item.state) status.detail = ""; // it was said of another state
+    if (status.state !== item.state) status.detail = ""; // it belonged to the previous state
     status = { ...status, state: item.state, bus: item.bus, time: item.time };
     showJoints(item.joints);
     showBus(item.bus);
@@ -112,7 +112,7 @@ const on = {
 async function slowly() {
   const [now, estimates] = await Promise.all([get("/api/status"), get("/api/estimates"), fetchProposals(), fetchNew()]);
   status = now;
-  said = verdict(estimates);
+  summary = verdict(estimates);
   setNow(status.time);
   showStatus();
   showEstimates(estimates);
@@ -123,7 +123,7 @@ async function slowly() {
 async function forEver() {
   for (;;) {
     await new Promise((wake) => setTimeout(wake, SLOW));
-    if (connected && !document.hidden) await slowly().catch(() => {}); // the stream says when the daemon is gone
+    if (connected && !document.hidden) await slowly().catch(() => {}); // the stream reports that the daemon is gone
   }
 }
 
@@ -132,7 +132,7 @@ async function start() {
   const all = await get(`/api/overview?${overviewQuery()}`);
   status = all.status;
   connected = true;
-  said = verdict(all.estimates);
+  summary = verdict(all.estimates);
   setNow(status.time);
   showStatus();
   showJoints(all.joints);
@@ -143,7 +143,7 @@ async function start() {
   for (const event of all.events) { addEvent(event); showEvent(event); }
   draw();
   initRanges();
-  document.body.dataset.shown = Math.round(performance.now()); // ms until everything stood here
+  document.body.dataset.shown = Math.round(performance.now()); // ms until everything was shown
   stream(on, status.last_event);
   forEver();
 }

@@ -1,4 +1,4 @@
-// Plots as SVG: one joint's gain and offset, one above the other, and the events, all on one time axis.
+// SVG plots: gain and offset of one joint, one above the other, and the events, all on one time axis.
 
 const LEFT = 46, RIGHT = 6, PANEL = 62, GAP = 20, AXIS = 20;
 
@@ -56,7 +56,7 @@ function panel(points, range, width, top, half, name, digits, unit) {
   return group;
 }
 
-// A new record makes a new line: estimates before and after are against different calibrations.
+// A new record begins a new line: estimates before and after are relative to different calibrations.
 function pieces(points) {
   const found = [];
   for (const point of points) {
@@ -87,7 +87,7 @@ export function drawJoint(figure, width, range, points, events, halves) {
 
 const LANES = ["fault", "drift", "load", "change"];
 
-// All events of the arm, a lane for each colour.
+// All events of the arm, one lane per colour.
 export function drawTimeline(figure, width, range, events) {
   const lane = 15, height = LANES.length * lane + AXIS + 4, bottom = height - AXIS, x = across(range, width);
   const drawing = svg("svg", { viewBox: `0 0 ${width} ${height}`, height, role: "img" });

@@ -1,11 +1,11 @@
-// Proposals: those that wait for a decision, the dialog that asks twice, and those that are decided.
+// Proposals: pending ones, the confirmation dialog, and decided ones.
 
 import { get, post } from "./api.js";
 import { by, clock, make, number, signed } from "./format.js";
 
 const NAME = "armlink-name";
 
-// What changes; a drift of the gain alone leaves the offset, and the other way round, with a standard deviation of 0.
+// The change; if only the gain or only the offset drifts, the other has a standard deviation of 0.
 function change(one) {
   const gain = `gain ${signed(100 * (one.gain - 1), 2)} ± ${number(196 * one.gain_std, 2)} %`;
   const offset = `offset ${signed(one.offset, 3)} ± ${number(1.96 * one.offset_std, 3)} N·m`;
@@ -34,8 +34,8 @@ function decide(one, verb) {
   const dialog = by("ask-decision");
   by("decision-title").textContent = verb === "approve" ? `Write the new calibration to ${one.joint}?` : `Drop the proposal for ${one.joint}?`;
   by("decision-text").textContent = verb === "approve"
-    ? `Record ${one.record} goes to the controller and is read back: ${change(one)}. The arm is not moved. armlink rollback goes back.`
-    : `${change(one)} stays as it is measured now; nothing is written.`;
+    ? `Record ${one.record} goes to the controller and is read back: ${change(one)}. The arm does not move. armlink rollback undoes it.`
+    : `${change(one)} stays uncorrected; nothing is written.`;
   by("decision-yes").textContent = verb === "approve" ? "Approve" : "Reject";
   by("decision-error").textContent = "";
   by("by").value = localStorage.getItem(NAME) ?? "";

@@ -47,6 +47,7 @@ class MadeUpView:
 
     def __init__(self) -> None:
         self.clients: set[MadeUpSubscription] = set()
+        self.decisions = self
         self.begin()
 
     def begin(self) -> None:

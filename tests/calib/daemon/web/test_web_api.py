@@ -89,10 +89,10 @@ def test_a_proposal_is_decided_once_and_by_somebody(server: Served, view: MadeUp
         ("GET", "/api/history?from=2026-05-01T08:00:00", 422, "timezone"),
         ("GET", "/api/history?from=0001-01-01T00:00:00%2B14:00", 422, "between 1970 and 2999"),
         ("GET", "/api/history?from=2026-05-02T00:00:00Z&to=2026-05-01T00:00:00Z", 422, "from is later than to"),
-        ("GET", "/api/proposals/0/approve", 405, "GET is not possible"),
+        ("GET", "/api/proposals/0/approve", 405, "GET is not allowed"),
         ("POST", "/api/proposals/0/approve", 422, "id"),
         ("POST", "/api/proposals/one/approve", 422, "id"),
-        ("POST", "/api/status", 405, "POST is not possible"),
+        ("POST", "/api/status", 405, "POST is not allowed"),
         ("GET", "/api/stream?after=x", 422, "after"),
         ("GET", "/api/torque", 404, "/api/torque"),
         ("GET", "/static/../app.py", 404, "there is no"),
@@ -138,12 +138,12 @@ def test_a_failure_inside_shows_no_traceback(server: Served, view: MadeUpView, m
     monkeypatch.setattr(view, "estimates", broken)
     answer = server.client().get("/api/estimates")
     assert answer.status_code == 500
-    assert answer.json() == {"error": "this failed inside the daemon; its log says why"}
+    assert answer.json() == {"error": "internal error; the daemon's log says why"}
 
 
 def test_nothing_commands_torque_or_motion(server: Served, view: MadeUpView) -> None:
     """Read is separate from control: by the description, by the routes there are, and by what the view offers."""
-    from calib.daemon.view.view import DaemonView
+    from calib.daemon.view.view import DaemonView, Decisions
     from calib.daemon.web.app import open_app
 
     described = server.client().get("/openapi.json").json()["paths"]
@@ -154,9 +154,10 @@ def test_nothing_commands_torque_or_motion(server: Served, view: MadeUpView) -> 
     app = open_app(view, Streams(view), page_files())
     known = {*described, "/openapi.json", *page_files()}
     assert all(path in known for path in route_paths(app.routes))
-    offered = {name for name in vars(DaemonView) if not name.startswith("_")}
+    offered, decided = ({name for name in vars(seen) if not name.startswith("_")} for seen in (DaemonView, Decisions))
     reading = {"status", "joints", "estimates", "events", "history", "proposals", "subscribe"}
-    assert offered == reading | {"approve", "reject"}
+    assert offered == reading | {"decisions"}
+    assert decided == {"approve", "reject"}
 
 
 def route_paths(routes: Any) -> set[str]:

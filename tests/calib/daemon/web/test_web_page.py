@@ -233,4 +233,4 @@ def test_a_daemon_that_goes_is_missed_and_found_again(browser: Browser, tmp_path
         page = open_page(browser, server)
         expect(page.locator("#state")).to_have_text("observing")
     expect(page.locator("#state")).to_have_text("NO CONNECTION")
-    expect(page.locator("#detail")).to_contain_text("What stands below is old")
+    expect(page.locator("#detail")).to_contain_text("The values below are old")

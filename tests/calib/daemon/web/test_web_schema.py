@@ -15,7 +15,7 @@ from schemathesis.specs.openapi.checks import (
 from served_page import TOKEN, Served, served
 from small_arm import small_arm
 
-from calib.daemon.view.service_view import ServiceView
+from calib.daemon.service_view import ServiceView
 from calib.daemon.web.rate import RateLimit
 
 CHECKS = [not_a_server_error, content_type_conformance, response_schema_conformance, status_code_conformance]
@@ -65,8 +65,8 @@ def test_generated_requests_to_a_whole_daemon_find_no_5xx(tmp_path: Path, monkey
     def begin() -> ServiceView:
         bench = DaemonBench(tmp_path, small_arm())
         bench.run(3.0)
-        bench.service.keeping.keep(history=True)
-        bench.service.say("drift", "elbow", "gain", {"value": float("inf")})
+        bench.service.save(history=True)
+        bench.service.events.say("drift", "elbow", "gain", {"value": float("inf")})
         return bench.view
 
     with served(begin, tmp_path / "api.sock") as server:

@@ -15,7 +15,7 @@ from made_up_view import NAMES, MadeUpView
 from served_page import Served, served
 from small_arm import small_arm
 
-from calib.daemon.view.service_view import ServiceView
+from calib.daemon.service_view import ServiceView
 from calib.daemon.web import stream as stream_module
 from calib.daemon.web.stream import Streams
 

@@ -1,0 +1,274 @@
+"""From findings to calibrations in the controllers: policy, rate limit, approval, write, check, roll-back."""
+
+from collections import deque
+from collections.abc import Callable
+from datetime import datetime
+
+from armlink.errors import ArmlinkError, Refused
+from calib.daemon.observing.observer_feed import Samples
+from calib.daemon.settings import Configuration
+from calib.daemon.state.arm_state import ArmState
+from calib.daemon.state.bus_jobs import BusJobs
+from calib.daemon.state.event_log import EventLog
+from calib.daemon.state.journal import Journal
+from calib.daemon.state.proposal_row import ProposalRow
+from calib.daemon.view.api_models import Proposal
+from calib.daemon.view.view import NoSuch, NotPossible
+from calib.observer.check_at_rests import Checked
+from calib.observer.decision import Finding
+from calib.observer.recalibrator import APPLIED_BY, Recalibration, Recalibrator
+from calib.records.records import CalibrationRecord
+from calib.records.store import RecordStore
+
+Installed = Callable[[CalibrationRecord, Finding], None]
+
+DAY = 86400.0
+WAITING = 1000
+"""Batches that wait for an alarm to be explained: 100 s; a cause test takes 40 s (`ObserverConfig.window`)."""
+
+
+class RecalibrationWorkflow:
+    """Carries proposals through, one at a time; every step is kept in the journal."""
+
+    def __init__(
+        self,
+        configuration: Configuration,
+        store: RecordStore,
+        arm_state: ArmState,
+        journal: Journal,
+        events: EventLog,
+        jobs: BusJobs,
+    ) -> None:
+        self._configuration, self._names = configuration, configuration.names
+        self._store, self._arm_state = store, arm_state
+        self._journal, self._events, self._jobs = journal, events, jobs
+        self._recalibrator: Recalibrator | None = None
+        self._installed: Installed = lambda record, finding: None
+        self._waiting: list[Finding] = []
+        self._checking: tuple[str, ...] = ()
+        self._unexplained: deque[Samples] = deque(maxlen=WAITING)
+
+    def begin(self, recalibrator: Recalibrator, installed: Installed) -> Finding | None:
+        """Follow other records from now on; approvals that a kill interrupted are closed.
+
+        `installed` is called with each record that becomes current, once its finding is written. Returns the finding
+        that led to the record now in force, if one did.
+        """
+        self._recalibrator, self._installed = recalibrator, installed
+        self._waiting, self._checking, self._unexplained = [], (), deque(maxlen=WAITING)
+        current, last = recalibrator.record, None
+        for row in self._journal.proposals():
+            if row.record == current.id and row.state in ("applied", "approved"):
+                last = row.finding
+            if row.state != "approved":
+                continue
+            if row.record == current.id:
+                with self._journal.transaction():
+                    self._applied(row, row.by or "daemon", current)
+            else:
+                note = "interrupted before it was in force"
+                self._journal.decide(row.id, self._events.now(), "failed", "daemon", note)
+        return last
+
+    # ---- what the observer found
+
+    def found(self, finding: Finding) -> None:
+        """Do with a finding what the policy says."""
+        policy = self._configuration.settings.policy
+        if policy == "observe":
+            return
+        if self._jobs.busy:
+            self._waiting.append(finding)
+            return
+        recalibrator, automatic = self._active(), policy == "apply"
+        by, ask = (APPLIED_BY if automatic else None), not self._configuration.listen_only or automatic
+
+        def done(outcome: Recalibration | ArmlinkError) -> None:
+            if isinstance(outcome, ArmlinkError):
+                self._refused(finding, outcome)
+            else:
+                self._proposed(finding, outcome, automatic)
+            self._next()
+
+        self._jobs.start(lambda: recalibrator.propose(finding, by, ask), done)
+
+    def _proposed(self, finding: Finding, outcome: Recalibration, automatic: bool) -> None:
+        joint, record = outcome.joint, outcome.record
+        now = self._events.now()
+        with self._journal.transaction():
+            number = self._journal.add_proposal(now, joint, record.id, record.parent or "", finding)
+            std = dict(zip(("gain_std", "offset_std"), finding.std, strict=True))
+            evidence = {"proposal": number, "record": record.id, "gain": finding.gain, "offset": finding.offset, **std}
+            text = f"{joint}: record {record.id} proposed: gain {outcome.gain:.5f}, offset {outcome.offset:.3f} N·m"
+            self._events.say("proposal", joint, text, evidence)
+        if not automatic:
+            return
+        limit = self._limit(joint, now)
+        if limit:
+            self._events.say("undecided", joint, f"{joint}: not written automatically: {limit}", {"proposal": number})
+            return
+        try:
+            self._write(self._row(number), APPLIED_BY)
+        except NotPossible as error:
+            self._events.say("refused", joint, f"not recalibrated: {error}", {"proposal": number})
+
+    def _limit(self, joint: str, now: datetime) -> str:
+        """The rate limit that forbids a write now, empty if none does; a clock that was set back counts as no time."""
+        applied = [row for row in self._journal.proposals() if row.state == "applied" and row.decided is not None]
+        ages = [(row.joint, abs((now - row.decided).total_seconds())) for row in applied if row.decided is not None]
+        settings = self._configuration.settings
+        if any(name == joint and age < settings.rest_between_writes for name, age in ages):
+            return f"at most one recalibration of a joint in {settings.rest_between_writes:g} s"
+        if sum(age < DAY for _, age in ages) >= settings.writes_per_day:
+            return f"{settings.writes_per_day} recalibrations within a day are the limit"
+        return ""
+
+    # ---- what a person decides
+
+    def approve(self, number: int, by: str) -> Proposal:
+        """Write a pending proposal and make its record current; raises NoSuch, NotPossible."""
+        row = self._row(number)
+        if not self._arm_state.connected:
+            reason = self._arm_state.fault or "starting"
+            raise NotPossible(f"the bus is not connected ({reason}): nothing can be written")
+        self._write(row, by)
+        return self._row(number).answer()
+
+    def _write(self, row: ProposalRow, by: str) -> None:
+        recalibrator, number = self._active(), row.id
+        _require_pending(row)
+        if self._jobs.busy:
+            raise NotPossible("another recalibration is under way: try again in a moment")
+        current = recalibrator.record.id
+        if row.base != current:
+            raise NotPossible(f"proposal {number} follows from record {row.base}, but {current} is in force now")
+        with self._journal.transaction():
+            self._journal.decide(number, self._events.now(), "approved", by)
+            self._events.say("approved", row.joint, f"{row.joint}: approved by {by}", {"proposal": number, "by": by})
+        joint = self._names.index(row.joint)
+
+        def work() -> CalibrationRecord:
+            record = self._store.get(row.record)
+            assert isinstance(record, CalibrationRecord)
+            recalibrator.apply(record, joint, by)
+            return record
+
+        def done(outcome: CalibrationRecord | ArmlinkError) -> None:
+            if isinstance(outcome, ArmlinkError):
+                with self._journal.transaction():
+                    self._journal.decide(number, self._events.now(), "failed", "daemon", str(outcome))
+                    self._refused(row.finding, outcome, number)
+            else:
+                with self._journal.transaction():
+                    self._applied(row, by, outcome)
+                    self._installed(outcome, row.finding)
+            self._next()
+
+        self._jobs.start(work, done)
+
+    def reject(self, number: int, by: str) -> Proposal:
+        """Drop a pending proposal; raises NoSuch, NotPossible."""
+        row = self._row(number)
+        self._active()
+        _require_pending(row)
+        with self._journal.transaction():
+            self._journal.decide(number, self._events.now(), "rejected", by)
+            self._events.say("rejected", row.joint, f"{row.joint}: rejected by {by}", {"proposal": number, "by": by})
+        return self._row(number).answer()
+
+    # ---- after a write
+
+    def _applied(self, row: ProposalRow, by: str, record: CalibrationRecord) -> None:
+        """Keep and report that a proposal's record is current."""
+        self._checking = (row.joint,)
+        joint = record.joints[row.finding.joint]
+        gain = "as before" if joint.gain is None else f"{joint.gain:.5f}"
+        text = f"{row.joint}: record {record.id} in force: gain {gain}, offset {joint.offset or 0.0:.3f} N·m"
+        evidence = {"proposal": row.id, "record": record.id, "replaces": row.base, "by": by, "applied": True}
+        self._journal.decide(row.id, self._events.now(), "applied", by)
+        self._events.say("recalibration", row.joint, text, evidence)
+
+    def restore(self) -> tuple[str, ...]:
+        """Write the current record to controllers that hold another calibration; returns the joints written."""
+        return self._active().restore()
+
+    def restored(self, joints: tuple[str, ...]) -> None:
+        """The current record was written to the controllers of these joints: `watch` checks it."""
+        self._checking = joints
+
+    def watch(self, samples: Samples, held: bool) -> None:
+        """Give decimated samples to the check after a write; a write that made the readings worse is taken back.
+
+        While an alarm is open (`held`) they wait until its cause is `explained`: a payload says nothing of the sensor.
+        """
+        if not self._checking or self._jobs.busy:
+            return
+        if held:
+            self._unexplained.append(samples)
+            return
+        self._unexplained.clear()
+        self._check(samples)
+
+    def explained(self, kind: str, joint: str | None) -> None:
+        """An alarm's cause is known: samples that waited count if it is a drift of the joint just recalibrated."""
+        waiting, self._unexplained = list(self._unexplained), deque(maxlen=WAITING)
+        if kind != "drift" or joint not in self._checking:
+            return
+        for samples in waiting:
+            self._check(samples)
+
+    def _check(self, samples: Samples) -> None:
+        for t, position, torque in zip(*samples, strict=True):
+            checked = self._active().sample(float(t), position, torque)
+            if checked is not None:
+                self._checking = ()
+                self._checked(checked)
+                return
+
+    def _checked(self, checked: Checked) -> None:
+        joint = self._names[checked.joint]
+        why = checked.why.removeprefix(f"{joint}: ")
+        if checked.verdict == "kept":
+            self._events.say("check", joint, f"{joint}: recalibration holds: {why}", {"kept": True})
+            return
+
+        def done(outcome: Recalibration | ArmlinkError) -> None:
+            if isinstance(outcome, ArmlinkError):
+                self._events.say("refused", joint, f"{joint}: roll-back failed: {outcome}", {})
+            else:
+                text = f"{joint}: rolled back to record {outcome.record.id}: {why}"
+                self._events.say("roll-back", joint, text, {"record": outcome.record.id, "why": checked.why})
+                if outcome.undo is not None:  # else a whole record: the service sees that another one is current
+                    self._installed(outcome.record, outcome.undo)
+            self._next()
+
+        recalibrator = self._active()
+        self._jobs.start(lambda: recalibrator.undo(checked), done)
+
+    # ---- inside
+
+    def _next(self) -> None:
+        if self._waiting and not self._jobs.busy:
+            self.found(self._waiting.pop(0))
+
+    def _refused(self, finding: Finding, error: ArmlinkError, number: int | None = None) -> None:
+        joint = self._names[finding.joint]
+        kind = "refused" if isinstance(error, Refused) else "fault"
+        evidence = {} if number is None else {"proposal": number}
+        self._events.say(kind, joint, f"not recalibrated: {error}", evidence)
+
+    def _active(self) -> Recalibrator:
+        if self._recalibrator is None:
+            raise NotPossible("no calibration and gravity records are in force yet: the status says what is missing")
+        return self._recalibrator
+
+    def _row(self, number: int) -> ProposalRow:
+        row = self._journal.proposal(number)
+        if row is None:
+            raise NoSuch(f"no proposal {number}")
+        return row
+
+
+def _require_pending(row: ProposalRow) -> None:
+    if row.state != "pending":
+        raise NotPossible(f"proposal {row.id} is {row.state} already")

@@ -1,0 +1,79 @@
+"""The arm as last heard: bus connection, newest batch, faults."""
+
+import logging
+from collections.abc import Callable
+from typing import Any
+
+from armlink.canopen import emcy
+from calib.daemon.loop.loop_messages import Batch
+from calib.daemon.state.event_log import EventLog
+
+STALE = 1.0
+"""A joint that is silent for longer is a fault [s]: ten batches."""
+FAULT_EVENTS_AN_HOUR = 20
+"""Further faults within the hour go to the process's log only, so that a loose plug does not fill the journal."""
+
+log = logging.getLogger("armlink.daemon")
+
+
+class ArmState:
+    """Holds what the bus loop reports of bus and joints; turns its faults into events."""
+
+    def __init__(self, names: tuple[str, ...], events: EventLog, monotonic: Callable[[], float]) -> None:
+        self._names, self._events, self._monotonic = names, events, monotonic
+        self.connected: bool | None = None
+        """Whether the joints answer; None until the bus loop has reported for the first time."""
+        self.fault = ""
+        """Why not, in one line."""
+        self.batch: Batch | None = None
+        """The newest samples."""
+        self._heard_at = -float("inf")
+        self._fault_times: list[float] = []
+
+    @property
+    def late(self) -> float:
+        """Time since the newest batch, or since the bus came back [s]; 0 before the first batch."""
+        return 0.0 if self.batch is None else max(self._monotonic() - self._heard_at, 0.0)
+
+    @property
+    def silent(self) -> str:
+        """The joint that has sent nothing for too long, in words; empty if all send."""
+        if self.batch is None:
+            return ""
+        late = self.late if self.connected else 0.0
+        ages = [float(age) + late for age in self.batch.age]
+        worst = max(range(len(ages)), key=ages.__getitem__)
+        return f"{self._names[worst]}: no reading for {ages[worst]:.1f} s" if ages[worst] > STALE else ""
+
+    def heard(self, batch: Batch) -> None:
+        """Take samples and the emergencies among them."""
+        self.batch, self._heard_at = batch, self._monotonic()
+        for joint, code, register in batch.emergencies:
+            if code:
+                text = f"{self._names[joint]}: emergency {code:04X}h, {emcy.name_of(code)}"
+                self._report("fault", self._names[joint], text, {"code": code, "register": register})
+
+    def up(self) -> None:
+        """The joints answer."""
+        back = self.connected is False
+        self.connected, self.fault, self._heard_at = True, "", self._monotonic()
+        if back:
+            self._report("recovered", None, "the bus is back", {})
+
+    def down(self, reason: str) -> None:
+        """The bus or a joint has failed."""
+        was, self.connected = self.connected, False
+        changed, self.fault = reason != self.fault, reason
+        if was is not False:
+            self._report("fault", None, reason, {})
+        elif changed:
+            log.warning(reason)
+
+    def _report(self, kind: str, joint: str | None, text: str, evidence: dict[str, Any]) -> None:
+        now = self._monotonic()
+        self._fault_times = [t for t in self._fault_times if now - t < 3600.0]
+        if len(self._fault_times) >= FAULT_EVENTS_AN_HOUR:
+            log.warning(text)
+            return
+        self._fault_times.append(now)
+        self._events.say(kind, joint, text, evidence)

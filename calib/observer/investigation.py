@@ -1,0 +1,111 @@
+"""The rows gathered for the next cause test, and the results of the tests before it."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from calib.motion.static_reading import StaticReading
+from calib.observer.cause_test import CauseTest
+from calib.observer.config import ObserverConfig
+from calib.observer.decision import Agreeing
+from calib.observer.saved_values import UNREADABLE
+from gcomp.arrays import as_array
+
+
+class Investigation:
+    """Progress from an alarm to a decision; with no alarm, the rows of the next audit."""
+
+    def __init__(self, n: int, config: ObserverConfig) -> None:
+        """n joints."""
+        self._n, self._config = n, config
+        self.held = False
+        """Whether an alarm is open: estimates are held until a verdict."""
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget every row and result."""
+        self.window: list[StaticReading] = []
+        self.fresh = self.repeated = self.carrying = 0
+        """New rows since the last test; repeated poses; consecutive windows that found the same payload."""
+        self.doubtful = False
+        """Whether the last window had no single cause."""
+        self.first: Agreeing | None = None
+        """Rows that found a drift, to be confirmed by the next window."""
+        self.reported: tuple[str, tuple[int, ...]] | None = None
+        """The last verdict reported: cause and joints."""
+        self.reasons: tuple[str, ...] = ()
+        """The last reasons reported for not deciding."""
+
+    def start(self) -> None:
+        """Begin with fresh rows: an alarm, or an audit that found something."""
+        self.clear()
+        self.held = True
+
+    def resume(self) -> None:
+        """End: the cause is known and dealt with."""
+        self.clear()
+        self.held = False
+
+    def add(self, row: StaticReading) -> bool:
+        """Take a row; False if the window has enough rows of this pose already."""
+        away = [np.abs(kept.position - row.position).max() for kept in self.window]
+        if sum(bool(far < self._config.place_size) for far in away) >= self._config.place_rows:
+            return False
+        self.window.append(row)
+        self.fresh += 1
+        return True
+
+    def is_due(self) -> bool:
+        """Whether there are rows enough for the next test; if so their count starts again."""
+        due = self.fresh >= (self._config.window if self.held else self._config.audit_rows)
+        if due:
+            self.fresh = 0
+        return due
+
+    def save(self) -> dict[str, Any]:
+        """Rows and results as JSON values."""
+        first, said = self.first, self.reported
+        return {
+            "held": self.held,
+            "carrying": self.carrying,
+            "doubtful": self.doubtful,
+            "window": _save_rows(self.window),
+            "fresh": self.fresh,
+            "repeated": self.repeated,
+            "first": None if first is None else {"rows": _save_rows(first.rows), "joints": sorted(first.joints)},
+            "said": None if said is None else [said[0], list(said[1])],
+            "reasons": list(self.reasons),
+        }
+
+    def restore(self, values: dict[str, Any], cause_test: Callable[[list[StaticReading]], CauseTest]) -> bool:
+        """Continue from saved values; False, and nothing changed, if they do not fit.
+
+        `cause_test` makes the test of the rows to be confirmed, by the restored belief.
+        """
+        try:
+            window, first, said = _read_rows(values["window"], self._n), values["first"], values["said"]
+            if first is not None:
+                rows = _read_rows(first["rows"], self._n)
+                first = Agreeing(rows, cause_test(rows), frozenset(map(int, first["joints"])))
+            if said is not None:
+                said = (str(said[0]), tuple(said[1]))
+            fresh, repeated, carrying = (int(values[name]) for name in ("fresh", "repeated", "carrying"))
+            held, doubtful, reasons = bool(values["held"]), bool(values["doubtful"]), tuple(values["reasons"])
+        except UNREADABLE:
+            return False
+        self.window, self.first, self.reported, self.reasons = window, first, said, reasons
+        self.fresh, self.repeated, self.carrying = fresh, repeated, carrying
+        self.held, self.doubtful = held, doubtful
+        return True
+
+
+def _save_rows(rows: list[StaticReading]) -> list[list[Any]]:
+    return [[row.t, row.position.tolist(), row.torque.tolist(), row.direction.tolist()] for row in rows]
+
+
+def _read_rows(values: Any, n: int) -> list[StaticReading]:
+    return [
+        StaticReading.of(float(t), *(as_array("row", column, (n,)) for column in (position, torque, direction)))
+        for t, position, torque, direction in values
+    ]

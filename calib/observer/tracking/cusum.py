@@ -1,0 +1,52 @@
+"""Change detection: log-likelihood CUSUM per joint on the residual against the installed calibration."""
+
+from typing import Any
+
+import numpy as np
+
+from calib.observer.config import ObserverConfig
+from calib.observer.saved_values import UNREADABLE
+from gcomp.arrays import Array, as_array
+
+CHANNELS = ("gain up", "gain down", "offset up", "offset down")
+
+
+class Cusum:
+    """Four channels per joint, h ∈ {±δ_k τ, ±δ_o}: S ← max(0, S + (h e − h²/2)/R), alarm above the threshold.
+
+    The residual e is taken against the installed calibration, because the innovations of a tracking filter would hide
+    slow drift (docs/theory.md, section 6).
+    """
+
+    def __init__(self, n: int, config: ObserverConfig) -> None:
+        """n joints."""
+        self._config = config
+        self._sums: Array = np.zeros((n, len(CHANNELS)))
+
+    def handle(self, residual: Array, torque: Array, variance: Array) -> list[tuple[int, str]]:
+        """Update with one row; returns joints and channels in alarm.
+
+        residual and model torque (n,) [N·m], variance of the residual (n,) [N²·m²].
+        """
+        gain = self._config.alarm_gain * torque
+        offset = np.full_like(torque, self._config.alarm_offset)
+        change = np.stack([gain, -gain, offset, -offset], axis=1)
+        ratio = (change * residual[:, None] - change**2 / 2) / variance[:, None]
+        self._sums = np.maximum(0.0, self._sums + ratio)
+        return [(int(j), CHANNELS[c]) for j, c in np.argwhere(self._sums > self._config.alarm_threshold)]
+
+    def reset(self) -> None:
+        """Set every sum to zero."""
+        self._sums = np.zeros_like(self._sums)
+
+    def save(self) -> dict[str, Any]:
+        """The sums as JSON values."""
+        return {"sums": self._sums.tolist()}
+
+    def restore(self, values: dict[str, Any]) -> bool:
+        """Continue from saved values; False, and nothing changed, if they do not fit."""
+        try:
+            self._sums = as_array("sums", values["sums"], self._sums.shape)
+        except UNREADABLE:
+            return False
+        return True
