@@ -25,8 +25,8 @@ ARM = """
 
 
 def cases() -> list[Case]:
-    """One case: recordings a second, each measured with its cluster already up."""
-    scratch = TemporaryDirectory(prefix="armlink-fleet-")  # goes with the functions that use it
+    """One case: recordings per second, each measured with a running cluster."""
+    scratch = TemporaryDirectory(prefix="armlink-fleet-")  # lives as long as the functions that use it
     folder = Path(scratch.name)
     (folder / "sim.xml").write_text(ARM, encoding="utf-8")
     (folder / "runs").mkdir()
@@ -36,7 +36,7 @@ def cases() -> list[Case]:
     def on(workers: int) -> float:
         with cluster(None, workers) as client:
             found = find_cases(Path(scratch.name) / "runs", folder / "sim.xml")
-            list(diagnose_fleet(found[: 2 * workers], client))  # every worker has loaded what it needs
+            list(diagnose_fleet(found[: 2 * workers], client))  # every worker has loaded its modules
             start = time.perf_counter()
             answers = dict(diagnose_fleet(found, client))
             taken = time.perf_counter() - start

@@ -1,4 +1,4 @@
-"""The diagnosis, every effect competing, against mujoco.sysid told which effect it is: one recording, seven joints."""
+"""Diagnosis among all effects against mujoco.sysid with the effect given: one recording, seven joints."""
 
 from collections.abc import Callable
 from contextlib import redirect_stdout
@@ -34,14 +34,14 @@ LARGEST = 10.0
 
 @dataclass(frozen=True)
 class Wrong:
-    """What the recorded arm has and the nominal model has not, (n,) each."""
+    """Effects of the recorded arm that the nominal model lacks, (n,) each."""
 
     frictionloss: Array
     damping: Array
 
 
 def cases() -> list[Case]:
-    """Time, and error on motion not fitted, of the same two fits."""
+    """Time, and error on held-out data, of the same two fits."""
     peer = "mujoco.sysid fitting friction loss and damping of every joint"
     name = "diagnose_vs_mujoco_sysid"
     errors: tuple[Figure, Figure] = (lambda: float(ours().mean()), lambda: heldout_error(sysid()))
@@ -53,7 +53,7 @@ def cases() -> list[Case]:
 
 @cache
 def ours() -> Array:
-    """The diagnosis, timed once: RMS per joint on the other motion after the diagnosis, (n,) [N·m]."""
+    """The diagnosis, timed once: RMS per joint on held-out data after the diagnosis, (n,) [N·m]."""
     train, other = recordings()
     answer = diagnose(ARM, [train], [other])
     assert answer.verdict == "explained"
@@ -93,7 +93,7 @@ def sysid() -> Wrong:
 
 
 def heldout_error(fitted: Wrong) -> float:
-    """Mean over the joints of the RMS on the other motion [N·m], measured as the diagnosis measures its own."""
+    """Mean over the joints of the RMS on held-out data [N·m], with the diagnosis's own measure."""
     spec = read_spec(Path(ARM))
     _put(spec, fitted)
     signals = prepare(recordings()[1], load_model(spec.compile()).arm)
@@ -102,7 +102,7 @@ def heldout_error(fitted: Wrong) -> float:
 
 @cache
 def recordings() -> tuple[Recording, Recording]:
-    """Training and other motion of the same wrong arm."""
+    """Training and held-out recordings of the same arm with errors."""
     random, n = np.random.default_rng(1), load_model(ARM).n
     wrong = Wrong(random.uniform(0.3, 2.0, n), random.uniform(0.3, 2.0, n))
     return _record(wrong, 1), _record(wrong, 2)
@@ -129,7 +129,7 @@ def _record(wrong: Wrong, seed: int) -> Recording:
 
 
 def _driven() -> Any:
-    """The nominal arm with a plain motor and a position sensor a joint, both named after it, stops and contacts off."""
+    """The nominal arm with a motor and a position sensor per joint, named after it, without stops and contacts."""
     spec = read_spec(Path(ARM))
     for old in (*spec.actuators, *spec.sensors):
         spec.delete(old)
@@ -143,7 +143,7 @@ def _driven() -> Any:
 
 
 def _setter(joint: str, quantity: str) -> Callable[[Any, Any], None]:
-    """What puts a fitted value into the model."""
+    """Function that writes a fitted value into the model."""
 
     def put(spec: Any, parameter: Any) -> None:
         value = float(parameter.value[0])

@@ -1,4 +1,4 @@
-"""The cyclic path against canopen, on SocketCAN: this host's vcan0 or, where it has none, a user-mode kernel's."""
+"""The cyclic path against canopen, on SocketCAN: this host's vcan0, else a user-mode kernel's."""
 
 import json
 import subprocess
@@ -15,7 +15,7 @@ PEER = "canopen RemoteNode, PDO variables"
 
 
 def cases() -> list[Case]:
-    """Cycles a second and CPU a frame; with-vcan's reason is raised where no vcan0 can be had."""
+    """Cycles per second and CPU per frame; fails with with-vcan's reason if there is no vcan0."""
     return [
         _case("link_cycle_vs_canopen", "cycles/s", "cycles", less_is_better=False),
         _case("link_cpu_per_frame_vs_canopen", "µs", "cpu", less_is_better=True),
@@ -23,7 +23,7 @@ def cases() -> list[Case]:
 
 
 def _case(name: str, unit: str, key: str, less_is_better: bool) -> Case:
-    """A case whose runs were taken in turn by link_cycle.py in one session; the first pair is the warm-up."""
+    """A case with runs taken in turn by link_cycle.py in one session; the first pair is the warm-up."""
     ours, peer = (iter([run[side][key] for run in _session()]) for side in ("ours", "peer"))
     return Case(name, unit, lambda: next(ours), lambda: next(peer), PEER, less_is_better, RUNS)
 

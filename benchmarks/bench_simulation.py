@@ -15,7 +15,7 @@ CYCLES = 500
 
 
 def cases() -> list[Case]:
-    """One case: seconds of the arm's time that pass in a second of ours, its bus at 250 Hz."""
+    """One case: simulated seconds per second, with the bus at 250 Hz."""
     bus = LockStepBus("sarcos")
     atexit.register(bus.shutdown)
     link = Link(load_arm("sarcos"), bus)

@@ -37,7 +37,7 @@ def processor_time(process: int) -> float:
 
 
 def main(channel: str = "vcan0", seconds: float = 40.0, phase: Path | None = None) -> int:
-    """Measure for so many seconds and print the figures; `phase` is told what is going on, for `outside`."""
+    """Measure for `seconds` and print the figures; `phase` is told the current phase, for `outside`."""
     from daemon_bench import good_records
 
     from armlink.arm_file import load_arm
@@ -72,14 +72,14 @@ def main(channel: str = "vcan0", seconds: float = 40.0, phase: Path | None = Non
             tell("")
         finally:
             daemon.terminate()
-            os.killpg(host.pid, signal.SIGTERM)  # its nodes are a process of their own
+            os.killpg(host.pid, signal.SIGTERM)  # its nodes run in a separate process
             daemon.wait()
             host.wait()
     return 0
 
 
 def outside(seconds: float = 40.0) -> int:
-    """Run it in user-mode-linux and print the share of a core that all of that takes in either phase."""
+    """Run it in user-mode-linux and print the share of a core that it takes in each phase."""
     with tempfile.TemporaryDirectory() as name:
         phase, now, since = Path(name) / "phase", "", (0.0, 0.0)
         phase.write_text(now)
@@ -101,7 +101,7 @@ def outside(seconds: float = 40.0) -> int:
 
 
 def _family(process: int) -> set[int]:
-    """A process and all that come from it."""
+    """A process and its descendants."""
     parents = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -115,7 +115,7 @@ def _family(process: int) -> set[int]:
 
 
 def _observing(daemon: "subprocess.Popen[bytes]", folder: Path) -> float:
-    """Seconds until it observes."""
+    """Time until it observes [s]."""
     began = time.monotonic()
     while time.monotonic() - began < BEFORE:
         try:

@@ -1,4 +1,4 @@
-"""Chosen stops against random ones and all joints at once: prints the table of docs/appendix/identification.md."""
+"""Chosen stops against random ones and all joints at once; prints the table of docs/appendix/identification.md."""
 
 import numpy as np
 from rich.console import Console

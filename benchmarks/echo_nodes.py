@@ -1,4 +1,4 @@
-"""Seven joint controllers that cost next to nothing, for whoever is on the bus: each answers SYNC with its TPDO1.
+"""Seven joint controllers of negligible cost: each answers SYNC with its TPDO1.
 
 Where the kernel has can-gw, the kernel itself answers: a gateway rule a node turns each SYNC into that node's TPDO1, no
 process runs. What a host needs before it cycles (SDO, NMT, the way to operation enabled) is answered by a process with
@@ -35,7 +35,7 @@ def readings(node: int) -> bytes:
 
 
 def answer_in_kernel(channel: str) -> bool:
-    """Let the kernel answer SYNC for every node from now on, instead of the process; False where it cannot."""
+    """Let the kernel answer SYNC for every node instead of the process; False if it cannot."""
     try:
         with can.Bus(interface="socketcan", channel=channel) as bus:
             bus.send(can.Message(arbitration_id=QUIET, is_extended_id=False))
@@ -54,13 +54,13 @@ def answer_in_kernel(channel: str) -> bool:
 
 
 def remove_gateway() -> None:
-    """Take all gateway rules away."""
+    """Remove all gateway rules."""
     every = _attribute(_SOURCE, bytes(4)) + _attribute(_DESTINATION, bytes(4))
     _ask_kernel(_RTM_DELROUTE, struct.pack("=BBH", socket.AF_CAN, _CAN_TO_CAN, 0) + every)
 
 
 def start_nodes(channel: str) -> multiprocessing.Process:
-    """The process of the tests' nodes on SocketCAN `channel`; SYNC reaches it until hear_no_sync."""
+    """The process of the tests' nodes on SocketCAN `channel`; it answers SYNC until answer_in_kernel."""
     listens = multiprocessing.Event()
     process = multiprocessing.Process(target=_serve, args=(channel, listens), daemon=True)
     process.start()

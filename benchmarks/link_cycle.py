@@ -25,7 +25,7 @@ FRAMES = 2 * len(NODES) + 1
 
 
 class NoPause(MonotonicClock):
-    """The machine's clock for a host that does not wait for its turn."""
+    """The machine's clock, for a host that cycles without pause."""
 
     def sleep_until(self, instant: float) -> None:
         """Return at once."""
@@ -42,7 +42,7 @@ class OurHost:
         self.command = Command.hold(self.link.enable().position)
 
     def cycles(self, count: int) -> None:
-        """So many cycles; every reading must have come."""
+        """Run `count` cycles; every reading must arrive."""
         missed = self.link.stats.missed
         for _ in range(count):
             sample = self.link.cycle(self.command)
@@ -78,7 +78,7 @@ class PeerHost:
             self.came.set()
 
     def cycles(self, count: int) -> None:
-        """So many cycles; every reading must have come."""
+        """Run `count` cycles; every reading must arrive."""
         for _ in range(count):
             self.came.clear()
             self.missing = len(NODES)
@@ -92,7 +92,7 @@ class PeerHost:
 
 
 def run(kind: str, channel: str, seconds: float) -> dict[str, float]:
-    """Cycles a second and CPU a frame [µs] of one host in this process, over `seconds`."""
+    """Cycles per second and CPU per frame [µs] of one host in this process, over `seconds`."""
     nodes = start_nodes(channel)
     host = {"ours": OurHost, "peer": PeerHost}[kind](channel)
     kernel = answer_in_kernel(channel)
@@ -112,7 +112,7 @@ def run(kind: str, channel: str, seconds: float) -> dict[str, float]:
 
 
 def main(channel: str, runs: int, seconds: float) -> None:
-    """Measure in turn, each host in a process of its own."""
+    """Measure in turn, each host in its own process."""
     results = []
     for _ in range(runs):
         taken = {}

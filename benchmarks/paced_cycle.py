@@ -2,7 +2,7 @@
 
     scripts/with-vcan .venv/bin/python benchmarks/paced_cycle.py [CHANNEL [SECONDS [RATE]]]
 
-Seven joints whose nodes cost next to nothing (echo_nodes.py): the host's process is what is measured. Prints JSON.
+Seven joints with nodes of negligible cost (echo_nodes.py), so that only the host's process is measured. Prints JSON.
 """
 
 import json
@@ -20,7 +20,7 @@ from armlink.link.types import Command
 
 
 def main(channel: str = "vcan0", seconds: float = 60.0, rate: float = 250.0) -> None:
-    """Cycle for so many seconds and print the figures."""
+    """Cycle for `seconds` and print the figures."""
     nodes = start_nodes(channel)
     bus = {"interface": "socketcan", "channel": channel}
     arm = make_arm(len(NODES), link={"bus": bus, "rate": rate, "deadline": 10.0})
@@ -45,7 +45,7 @@ def main(channel: str = "vcan0", seconds: float = 60.0, rate: float = 250.0) -> 
             remove_gateway()
         nodes.terminate()
     periods = np.diff(latenesses) * 1e3
-    # what the wire itself takes of a cycle at 1 Mbit/s: 7 RPDO1, SYNC, 7 TPDO1, and 7 TPDO2 in every fourth
+    # share of a cycle on the wire at 1 Mbit/s: 7 RPDO1, SYNC, 7 TPDO1, and 7 TPDO2 in every fourth
     data = RPDO1.layout.pack(15, 0, 1000)
     typical = frame_bits(0x80, b"") + sum(frame_bits(base + n, data) for base in (0x200, 0x180) for n in NODES)
     typical += sum(frame_bits(0x280 + n, data) for n in NODES) / 4

@@ -2,8 +2,8 @@
 
     .venv/bin/python benchmarks/paced_multicast.py [SECONDS [RATE]]
 
-`armlink sim sarcos` runs in a process of its own, a Link cycles it holding. CPU time counts, not elapsed time, so that
-other processes on the machine do not spoil the figures. Prints JSON.
+`armlink sim sarcos` runs in its own process; a Link cycles it while holding. CPU time is measured, not elapsed time, so
+that other processes affect the figures little. Prints JSON.
 """
 
 import json
@@ -22,14 +22,14 @@ GROUP = "239.74.163.31"
 
 
 def cpu_seconds(pid: int) -> float:
-    """CPU time of a process so far, user and system [s]."""
+    """User and system time of a process [s]."""
     with open(f"/proc/{pid}/stat") as file:
         fields = file.read().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def main(seconds: float = 20.0, rate: float = 250.0) -> None:
-    """Cycle for so many seconds and print the figures."""
+    """Cycle for `seconds` and print the figures."""
     os.environ["CAN_CONFIG"] = json.dumps({"port": 44200 + os.getpid() % 1000})
     name = f"udp_multicast:{GROUP}"
     entry = "from armlink.cli import main; main()"

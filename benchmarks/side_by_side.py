@@ -1,4 +1,4 @@
-"""Measuring two ways of the same thing in one session: runs taken in turn, medians compared."""
+"""Compares two implementations in one session: runs taken in turn, medians compared."""
 
 import statistics
 import time
@@ -11,7 +11,7 @@ Figure = Callable[[], float]
 
 @dataclass(frozen=True)
 class Case:
-    """One comparison. `ours` and `peer` each do one run and return its figure in `unit`."""
+    """One comparison; `ours` and `peer` each perform one run and return its figure in `unit`."""
 
     name: str
     unit: str
@@ -21,7 +21,7 @@ class Case:
     less_is_better: bool = True
     runs: int = 15
     warm_up: bool = True
-    """Whether each is run once before it counts; not where the figure already leaves its own start out."""
+    """Whether a first run is discarded; not needed if the figure already excludes start-up."""
 
 
 def seconds(work: Callable[[], Any], repeat: int = 1, scale: float = 1.0) -> Figure:
@@ -37,7 +37,7 @@ def seconds(work: Callable[[], Any], repeat: int = 1, scale: float = 1.0) -> Fig
 
 
 def measure(case: Case) -> dict[str, Any]:
-    """Run a case; ratio is above 1 where ours is better."""
+    """Run a case; ratio is above 1 if ours is better."""
     if case.warm_up:
         case.ours(), case.peer()
     taken = [(case.ours(), case.peer()) for _ in range(case.runs)]

@@ -1,1 +1,1 @@
-"""The simulated arm: a MuJoCo plant behind CANopen joint nodes that answer frames as drives do."""
+"""Simulated arm: a MuJoCo plant behind CANopen nodes that respond as drives do."""

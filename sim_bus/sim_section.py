@@ -1,4 +1,4 @@
-"""The arm file's `sim` section: what the simulated arm truly is. Only `sim_bus` reads it; the fit never does."""
+"""The arm file's `sim` section: true parameters of the simulated arm, which no fit may read."""
 
 from typing import Annotated, Any
 
@@ -11,7 +11,7 @@ from sim_bus.effects.registry import check_entry
 Vector3 = Annotated[tuple[FiniteFloat, ...], Field(min_length=3, max_length=3)]
 DEFAULT_BITS = 16
 NOISE_SHARE = 0.002
-"""Standard deviation of the torque sensors' noise where the file gives none, as a share of rated torque."""
+"""Default standard deviation of the torque sensors' noise, as a share of rated torque."""
 
 
 class LinkBody(Section):
@@ -34,7 +34,7 @@ class LinkBody(Section):
 
 
 class Sensors(Section):
-    """Sensors, one value a joint: torque `v = gain·τ + offset`, position `θ = position_gain·φ + position_offset`."""
+    """Sensors, one value per joint: torque `v = gain·τ + offset`, position `θ = position_gain·φ + position_offset`."""
 
     gain: tuple[FiniteFloat, ...] | None = None
     """Default 1."""
@@ -47,33 +47,33 @@ class Sensors(Section):
     noise: tuple[Annotated[FiniteFloat, Field(ge=0)], ...] | None = None
     """Standard deviation of the torque reading's noise [N·m], default 0.2 % of rated torque."""
     bits: Annotated[int, Field(ge=8, le=24)] | tuple[Annotated[int, Field(ge=8, le=24)], ...] = DEFAULT_BITS
-    """Resolution of the torque sensor over ±2 rated torques, and of the position sensor over a turn."""
+    """Resolution of the torque sensor over ±2 rated torques, and of the position sensor over a revolution [bit]."""
 
 
 class Servo(Section):
-    """The drives' own position loop and ramps."""
+    """Position loop and ramps of the drives."""
 
     bandwidth: PositiveFloat = 40.0
-    """Natural frequency of the position loop, from the arm's own inertia [rad/s]."""
+    """Natural frequency of the position loop with the arm's own inertia [rad/s]."""
     damping: PositiveFloat = 1.0
     """Damping ratio of the position loop."""
     deadband: PositiveFloat = 2e-4
-    """Position error below which the integrator rests, so that it does not hunt under stiction [rad]."""
+    """Dead band of the integrator, against hunting under stiction [rad]."""
     quick_stop_deceleration: PositiveFloat = 5.0
     """[rad/s²]."""
     brake: bool = True
-    """Whether a holding brake closes where the drive is not enabled."""
+    """Whether a holding brake closes while the drive is not enabled."""
 
 
 class Stops(Section):
-    """The mechanical stops."""
+    """Mechanical stops."""
 
     time_constant: PositiveFloat = 0.004
-    """Of the contact's spring and damper, critically damped [s]."""
+    """Time constant of the contact's critically damped spring and damper [s]."""
 
 
 class EffectEntry(BaseModel):
-    """One imperfection: `effect` (an id, docs/formats.md, section 5), `joint` or link, and its parameters by name."""
+    """One imperfection: `effect` (an id of the catalogue), `joint` (or link) and its parameters by name."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
@@ -87,12 +87,12 @@ class EffectEntry(BaseModel):
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """The effect's parameters as the file gives them."""
+        """The effect's parameters as in the file."""
         return dict(self.model_extra or {})
 
 
 class SimSection(Section):
-    """The `sim` section. `links` may be absent where `kinematics.model` (URDF or MJCF) carries the inertials."""
+    """The `sim` section. `links` may be absent if `kinematics.model` (URDF or MJCF) has the inertial parameters."""
 
     links: tuple[LinkBody, ...] | None = None
     sensors: Sensors = Sensors()
@@ -100,20 +100,20 @@ class SimSection(Section):
     servo: Servo = Servo()
     stops: Stops = Stops()
     step: Annotated[FiniteFloat, Field(gt=0, le=0.005)] = 0.001
-    """Time step of the physics [s]; the SYNC period is a whole number of steps, each at most this."""
+    """Maximum time step of the physics [s]; the SYNC period is a whole number of steps."""
     start: tuple[FiniteFloat, ...] | None = None
-    """Joint angles at power-on [rad]; default the middle of each joint's range."""
+    """Joint angles at power-on [rad]; default: middle of each joint's range."""
 
 
 def sim_section(arm: ArmFile) -> SimSection:
-    """The arm's `sim` section, its lists checked against the number of joints. Raises BadInput."""
+    """The arm's `sim` section, lists checked against the number of joints. Raises BadInput."""
     section = arm.require(SimSection, "sim")
     count = len(arm.joint_names)
     lists: dict[str, Any] = {"links": section.links, "start": section.start}
     lists |= {f"sensors.{key}": getattr(section.sensors, key) for key in Sensors.model_fields}
     for key, values in lists.items():
         if isinstance(values, tuple) and len(values) != count:
-            raise BadInput(f"{arm.path}: key sim.{key}: {len(values)} values, expected {count}, one a joint")
+            raise BadInput(f"{arm.path}: key sim.{key}: {len(values)} values, expected {count}, one per joint")
     if section.links is None and arm.kinematics.model is None:
         raise BadInput(f"{arm.path}: key sim.links is missing: mass, com and inertia of each link")
     for number, entry in enumerate(section.effects):

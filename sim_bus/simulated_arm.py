@@ -1,4 +1,4 @@
-"""The whole simulated arm behind its frames: plant, sensors, drives and one CANopen node a joint."""
+"""The simulated arm: plant, sensors, drives and one CANopen node per joint."""
 
 import struct
 from collections import deque
@@ -30,10 +30,10 @@ TARGETS = {(0x6071, 0), (0x607A, 0), (0x60FF, 0)}
 
 
 class SimulatedArm:
-    """Frames in by on_frame(), frames out in `outbox`, time by advance(). Deterministic given truth and seed."""
+    """Takes frames by on_frame(), sends to `outbox`, advances by advance(). Deterministic for truth and seed."""
 
     def __init__(self, arm: ArmFile, truth: Truth, seed: int = 0) -> None:
-        """Power the arm on: every node boots. Raises BadInput where the arm file lacks what a simulation needs."""
+        """Power on: every node boots. Raises BadInput if the arm file is insufficient for simulation."""
         section, link = sim_section(arm), arm.require_link()
         self.arm, self.truth, self.names, self.n = arm, truth, arm.joint_names, len(arm.joint_names)
         self.time = 0.0
@@ -66,10 +66,10 @@ class SimulatedArm:
         self.drives.take_commands()
         self.drives.sample(0.0, 0.0)
 
-    # ---- the bus's side
+    # ---- bus
 
     def on_frame(self, can_id: int, data: bytes) -> None:
-        """A frame from the bus: SYNC samples and applies; PDO, SDO, NMT and heartbeat as CiA 301 has them."""
+        """Process a frame: SYNC samples and applies targets; PDO, SDO, NMT and heartbeat by CiA 301."""
         slot = self._pdos.receive.get(can_id)
         if slot is not None:
             self._receive_pdo(slot, data)
@@ -88,12 +88,12 @@ class SimulatedArm:
             self.supervision.heartbeat(can_id - 0x700, self.time)
 
     def waits_for_sync(self, can_id: int) -> bool:
-        """Whether such a frame is only kept until the next SYNC: a synchronous RPDO."""
+        """Whether a frame takes effect at the next SYNC only: a synchronous RPDO."""
         slot = self._pdos.receive.get(can_id)
         return slot is not None and slot[0].kind <= 240
 
     def advance(self, duration: float) -> None:
-        """Let simulated time pass [s], in pieces of at most one SYNC period."""
+        """Advance simulated time [s], in steps of at most one SYNC period."""
         remaining = duration
         while remaining > 1e-9:
             piece = min(remaining, self.period)
@@ -111,35 +111,35 @@ class SimulatedArm:
             self._pdos.send_events()
 
     def reboot(self, joint: int) -> None:
-        """Power cycle of one joint's controller: what is not stored is lost."""
+        """Power-cycle one joint's controller: volatile settings are lost."""
         self._nmt.command(self.nodes[joint], RESET_NODE, self.time)
 
     @property
     def period(self) -> float:
-        """What one SYNC stands for: 1006h where it is set, else the arm file's rate [s]."""
+        """SYNC period: 1006h if set, else from the arm file's rate [s]."""
         return self._period
 
     @property
     def operational(self) -> bool:
-        """Whether any node is operational, so that SYNC means something."""
+        """Whether any node is operational and thus reacts to SYNC."""
         return any(self._operational)
 
-    # ---- the plant's side: what a fit must not see
+    # ---- truth, hidden from any fit
 
     def gravity_torque(self, q: Array) -> Array:
         """True holding torque at the true angles `q` (K, n) → (K, n) [N·m], by MuJoCo."""
         return self.plant.gravity_torque(q)
 
     def attach_mass(self, mass: float, point: Array | None = None) -> None:
-        """Bolt `mass` [kg] on, at `point` of the last bar frame [m] or where the truth says."""
+        """Attach `mass` [kg] at `point` of the last bar frame [m], by default at the true attachment."""
         self.plant.attach_mass(mass, self.truth.attachment if point is None else point)
 
     def detach_mass(self) -> None:
-        """Take the attached mass off."""
+        """Remove the attached mass."""
         self.plant.detach_mass()
 
     def drift(self, joint: int | str, gain: float, offset: float) -> None:
-        """Change a torque sensor from now on: its gain `gain` times as large, its offset `offset` [N·m] larger."""
+        """Change a torque sensor from now on: multiply its gain by `gain`, add `offset` [N·m]."""
         self.sensors.drift(self._place(joint), gain, offset)
 
     def set_effects(self, entries: Iterable[EffectSetting]) -> None:
@@ -154,18 +154,18 @@ class SimulatedArm:
 
     @property
     def effects(self) -> tuple[EffectSetting, ...]:
-        """The imperfections in force."""
+        """Current imperfections."""
         return self._entries
 
     @property
     def true_sensors(self) -> Truth:
-        """The sensors as they are now, drifts and effects included."""
+        """True sensor parameters at present, drifts and effects included."""
         sensors, truth = self.sensors, self.truth
         return Truth(
             sensors.gain, sensors.offset, sensors.position_gain, sensors.position_offset, attachment=truth.attachment
         )
 
-    # ---- inside
+    # ---- internals
 
     def _send(self, frame: Frame) -> None:
         self.outbox.append(frame)
@@ -239,7 +239,7 @@ class SimulatedArm:
             self._apply(node)
 
     def _apply(self, node: Node) -> None:
-        """Bring objects that were written into force."""
+        """Apply objects that were written."""
         bring_into_force(node, self.drives)
         self._watching = self.drives.needs_watch
         self.supervision.configure(node, self.time)

@@ -1,4 +1,4 @@
-"""The hidden truth of one simulated arm: what its sensors really do, which the fit must find and never sees."""
+"""Hidden truth of a simulated arm: true sensor parameters, which a fit must find without seeing them."""
 
 from dataclasses import dataclass
 
@@ -27,7 +27,7 @@ class Truth:
     position_offset: Array
     """[rad]."""
     attachment: Array
-    """Where a reference mass is bolted on, in the last link's bar frame [m] (3,)."""
+    """Attachment point of a reference mass in the last link's bar frame [m] (3,)."""
 
     def __post_init__(self) -> None:
         """Freeze the arrays."""
@@ -38,7 +38,7 @@ class Truth:
 
     @classmethod
     def of(cls, arm: ArmFile) -> "Truth":
-        """The truth that the arm file's `sim.sensors` states. Raises BadInput."""
+        """The truth stated in the arm file's `sim.sensors`. Raises BadInput."""
         n, sensors = len(arm.joint_names), sim_section(arm).sensors
 
         def values(given: tuple[float, ...] | None, default: float) -> Array:
@@ -54,9 +54,10 @@ class Truth:
 
     @classmethod
     def draw(cls, arm: ArmFile, seed: int) -> "Truth":
-        """A truth drawn uniformly: gains 0.9 to 1.1, offsets ±5 % of rated torque, position gains 0.99 to 1.01.
+        """Draw a truth from uniform distributions.
 
-        The reference mass sits up to 0.15 m to the side of the flange. Raises BadInput.
+        Gains 0.9 to 1.1, offsets ±5 % of rated torque, position gains 0.99 to 1.01. The reference mass
+        is up to 0.15 m to the side of the flange. Raises BadInput.
         """
         random, stated = np.random.default_rng(seed), cls.of(arm)
         rated = arm.require_link().rated_torques

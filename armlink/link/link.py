@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 PATIENCE = 2.5
 """Readings may be this many periods old while a motion goes on; a reply that comes a period late is within it."""
 LISTEN_PERIODS, LISTEN_SECONDS = 2, 0.1
-"""Before anything is sent to the nodes, another host is listened for: this many periods, and at least so long [s]: a host
-on a busy computer may well pause for some 0.05 s."""
+"""Another host is listened for before anything is sent to the nodes: this many periods, and at least this long [s],
+since a host on a busy computer may pause for some 0.05 s."""
 
 
 R = TypeVar("R")

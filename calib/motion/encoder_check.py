@@ -10,7 +10,7 @@ from gcomp.arrays import Array, Mask
 MISSING = 0.02
 """Share of a motion's cycles without timely readings above which nothing is said of its encoders."""
 JUMP, JUMP_STEPS = 3.0, 4.0
-"""A position reading that goes this many times as far as the speed limit allows, and this many increments, is no motion."""
+"""A change of a position reading beyond this many times the speed limit, plus this many increments, is no motion."""
 
 
 class EncoderFault(Refused):

@@ -1,13 +1,13 @@
-"""Changing a simulated arm while it runs, from any other process: lines of text through a named pipe.
+"""Changes a running simulated arm from another process: lines of text through a named pipe.
 
 | line | does |
 |---|---|
 | `effect ID:JOINT:VALUE` | adds an imperfection to those there are |
-| `effects none` | takes all imperfections away, those of the arm file too |
+| `effects none` | removes all imperfections, those of the arm file too |
 | `drift JOINT:GAIN:OFFSET` | changes a torque sensor from now on |
 | `fault ID:JOINT:VALUE` | injects a fault |
 | `faults none` | ends all faults |
-| `mass KG`, `mass 0` | bolts a mass to the flange, takes it off |
+| `mass KG`, `mass 0` | attaches a mass to the flange, removes it |
 """
 
 import os
@@ -23,7 +23,7 @@ WORDS = "effect ID:JOINT:VALUE, effects none, drift JOINT:GAIN:OFFSET, fault ID:
 
 
 def obey(line: str, injector: Injector) -> None:
-    """Do what one line says. Raises BadInput."""
+    """Execute one line. Raises BadInput."""
     arm, (word, _, text) = injector.arm, line.strip().partition(" ")
     text = text.strip()
     if word == "effect":
@@ -54,10 +54,10 @@ def _mass(text: str) -> float:
 
 
 class ControlPipe:
-    """A named pipe whose lines are obeyed; what cannot be is returned in words, and the arm runs on."""
+    """A named pipe of commands; an invalid command is reported and the arm keeps running."""
 
     def __init__(self, path: Path) -> None:
-        """Make the pipe, or take one that is there. Raises BadInput where the path is something else."""
+        """Create the pipe, or use an existing one. Raises BadInput if the path is something else."""
         self.path = path
         try:
             if not path.exists():
@@ -66,14 +66,16 @@ class ControlPipe:
             else:
                 self._made = False
             if not stat.S_ISFIFO(path.stat().st_mode):
-                raise BadInput(f"--control {path}: is no named pipe: give a path that does not exist yet")
-            self._file = os.open(path, os.O_RDWR | os.O_NONBLOCK)  # written to as well, so that it never ends
+                raise BadInput(f"--control {path}: is not a named pipe: give a path that does not exist yet")
+            self._file = os.open(
+                path, os.O_RDWR | os.O_NONBLOCK
+            )  # also open for writing, so that it never reaches its end
         except OSError as error:
             raise BadInput(f"--control {path}: {error.strerror}") from None
         self._rest = b""
 
     def poll(self, injector: Injector) -> list[str]:
-        """Obey the lines that have come; what was wrong with them."""
+        """Execute the lines received; returns error messages."""
         try:
             self._rest += os.read(self._file, 65536)
         except BlockingIOError:
@@ -89,7 +91,7 @@ class ControlPipe:
         return wrong
 
     def close(self) -> None:
-        """Close the pipe; one that was made goes away."""
+        """Close the pipe; remove it if it was created here."""
         os.close(self._file)
         if self._made:
             self.path.unlink(missing_ok=True)

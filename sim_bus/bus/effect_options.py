@@ -1,4 +1,4 @@
-"""Effects and drifts as the command line writes them."""
+"""Effects and drifts as given on the command line."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,15 +21,15 @@ class Drift:
 
     joint: str
     gain: float
-    """Factor."""
+    """Factor of the gain."""
     offset: float
-    """Added [N·m]."""
+    """Added to the offset [N·m]."""
     time: float
-    """When [s]."""
+    """Time of the change [s]."""
 
 
 def parse_effect(text: str, joints: Sequence[str]) -> EffectEntry:
-    """One `--effect`. Values without names are the effect's parameters in their order. Raises BadInput."""
+    """Parse one `--effect`; values without names are its parameters in order. Raises BadInput."""
     effect_id, colon, rest = text.partition(":")
     joint, second, values = rest.partition(":")
     if not (colon and second and effect_id and values):
@@ -49,7 +49,7 @@ def parse_effect(text: str, joints: Sequence[str]) -> EffectEntry:
 
 
 def _parameters(text: str, effect_id: str, items: list[str]) -> dict[str, Any]:
-    """Named values as they are; unnamed ones spread over the parameters, vectors taking as many as they need."""
+    """Parameters by name; values without names are assigned in order, several to a vector."""
     if all("=" in item for item in items):
         return {name: _value(text, value) for name, _, value in (item.partition("=") for item in items)}
     found: dict[str, Any] = {}
@@ -61,7 +61,7 @@ def _parameters(text: str, effect_id: str, items: list[str]) -> dict[str, Any]:
         found[parameter.name] = remaining[:size] if size else remaining[0]
         remaining = remaining[max(size, 1) :]
     if remaining:
-        raise BadInput(f"--effect {text!r}: {len(remaining)} values too many; expected {EFFECT_FORM}")
+        raise BadInput(f"--effect {text!r}: {len(remaining)} too many values; expected {EFFECT_FORM}")
     return found
 
 
@@ -75,7 +75,7 @@ def _value(text: str, item: str) -> float | str:
 
 
 def parse_drift(text: str, joints: Sequence[str]) -> Drift:
-    """One `--drift`. Raises BadInput."""
+    """Parse one `--drift`. Raises BadInput."""
     change, at, time = text.partition("@")
     parts = change.split(":")
     try:
@@ -87,5 +87,5 @@ def parse_drift(text: str, joints: Sequence[str]) -> Drift:
     if drift.joint not in joints:
         raise BadInput(f"--drift {text!r}: no joint {drift.joint!r}; there are {', '.join(joints)}")
     if drift.gain == 0.0:
-        raise BadInput(f"--drift {text!r}: a gain factor of 0 leaves no signal; expected {DRIFT_FORM}")
+        raise BadInput(f"--drift {text!r}: a gain factor of 0 removes the signal; expected {DRIFT_FORM}")
     return drift

@@ -1,4 +1,4 @@
-"""Faults between the simulated arm and its bus: stands in for the arm, frame by frame, once a fault is injected."""
+"""Injects faults between the simulated arm and its bus, frame by frame, with the interface of the arm."""
 
 import math
 import struct
@@ -12,31 +12,31 @@ from sim_bus.node.pdo import Frame
 from sim_bus.simulated_arm import SimulatedArm
 
 ERROR_FLAG = 0x20000000
-"""Marks an error frame, as SocketCAN does; the class of error stands below it."""
+"""Flag of an error frame, as in SocketCAN; the lower bits are the error class."""
 PROTOCOL_ERROR, BUS_OFF, RESTARTED = 0x08, 0x40, 0x100
 ABORT_CODE, STORM_CODE = 0x08000022, 0x7305
 BABBLE = (0x001, bytes(8))
 SERVICE, NODE = 0x780, 0x7F
 TPDO1, SDO_ANSWER, SDO_REQUEST = 0x180, 0x580, 0x600
 TO_NODES = (0x200, 0x300, 0x400, 0x500, SDO_REQUEST)
-"""Services of frames to one node: RPDO1 to 4 and SDO."""
+"""Function codes of frames to one node: RPDO1 to 4 and SDO."""
 HOST_REFUSES = {
     "bus.off": "bus-off: check wiring, termination and bit rate",
     "bus.full": "transmit queue stays full: does any node acknowledge?",
     "link.down": "cannot send: Network is down",
 }
-"""Faults of the host's own interface, and what a host is told that sends meanwhile."""
+"""Faults of the host's interface → error when the host sends."""
 
 
 class Injector:
-    """The arm's side of a faulty bus: on_frame(), advance() and `outbox` as a SimulatedArm has them."""
+    """The arm's end of a faulty bus, with on_frame(), advance() and `outbox` of a SimulatedArm."""
 
     def __init__(self, arm: SimulatedArm, seed: int = 0) -> None:
-        """No fault yet; `seed` is of the faults that strike a share of frames."""
+        """Start without faults; `seed` is for faults that affect a share of the frames."""
         self.arm = arm
         self.outbox, arm.outbox = arm.outbox, deque()
         self.dropped = 0
-        """Frames that the host lost because its receive queue was full."""
+        """Frames lost by the host's full receive queue."""
         self._sent = arm.outbox
         self._random = np.random.default_rng((seed, 2))
         self._planned: list[Fault] = []
@@ -45,13 +45,13 @@ class Injector:
         self._owed: dict[tuple[str, int], float] = {}
 
     def inject(self, fault: Fault) -> None:
-        """Let a fault happen now, or at its time."""
+        """Inject a fault now, or at its time."""
         self._planned.append(fault)
         self._planned.sort(key=lambda planned: planned.time)
         self._begin()
 
     def clear(self) -> None:
-        """End every fault."""
+        """End all faults."""
         self._planned.clear()
         for node in self.arm.nodes:
             node.unplugged = False
@@ -63,13 +63,13 @@ class Injector:
 
     @property
     def refusal(self) -> str:
-        """Why the host's interface takes no frame now; empty where it does."""
+        """Why the host's interface rejects frames at present; empty if it accepts them."""
         return next((words for fault, words in HOST_REFUSES.items() if fault in self._until), "")
 
-    # ---- as the arm
+    # ---- interface of the arm
 
     def on_frame(self, can_id: int, data: bytes) -> None:
-        """A frame from the host, as far as it gets there."""
+        """Process a frame from the host, unless a fault stops it."""
         self._begin()
         if self.refusal:
             return
@@ -83,7 +83,7 @@ class Injector:
         self._carry()
 
     def advance(self, duration: float) -> None:
-        """Let simulated time pass [s]."""
+        """Advance simulated time [s]."""
         self._begin()
         self.arm.advance(duration)
         for (fault, place), rate in self._on.items():
@@ -97,7 +97,7 @@ class Injector:
         self._carry()
         self._end()
 
-    # ---- inside
+    # ---- internals
 
     def _begin(self) -> None:
         while self._planned and self._planned[0].time <= self.arm.time:
@@ -134,7 +134,7 @@ class Injector:
                 self.arm.nodes[self.arm.names.index(what)].unplugged = False
 
     def _answered(self, place: int, request: bytes) -> bool:
-        """Whether the faults deal with an SDO request: by an abort, or by no answer."""
+        """Whether a fault handles an SDO request, by an abort or by silence."""
         if ("sdo.abort", place) in self._on:
             answer = struct.pack("<B3sI", 0x80, request[1:4].ljust(3, b"\0"), ABORT_CODE)
             self._sent.append((SDO_ANSWER + self.arm.nodes[place].node_id, answer))
@@ -143,7 +143,7 @@ class Injector:
         return ("sdo.timeout", place) in self._on
 
     def _carry(self) -> None:
-        """What the nodes sent, to the host, as far as it gets there and as it gets there."""
+        """Pass the nodes' frames on to the host, changed or dropped by faults."""
         sent, lost = self._sent, bool(self.refusal)
         most = self._on.get(("reader.slow", -1), math.inf)
         while sent:

@@ -1,4 +1,4 @@
-"""Which faults can be injected, as text: `ID:JOINT:VALUE`, `ID::VALUE` where no joint is concerned, `…@T` for later."""
+"""Faults that can be injected, as text: `ID:JOINT:VALUE`, `ID::VALUE` for the bus or host, `…@T` at time T."""
 
 import math
 from collections.abc import Sequence
@@ -11,12 +11,12 @@ FORM = "ID:JOINT[:VALUE][@T] or ID::VALUE[@T], for example node.silent:joint_2 o
 
 @dataclass(frozen=True)
 class FaultKind:
-    """One kind of fault: whether it concerns a joint's node, what its value means, and what happens."""
+    """One kind of fault: whether it belongs to a joint, meaning of its value, and its effect."""
 
     id: str
     per_joint: bool
     value: str
-    """Meaning and unit of the value; empty where it takes none."""
+    """Meaning and unit of the value; empty if there is none."""
     default: float
     does: str
 
@@ -50,23 +50,23 @@ class Fault:
     id: str
     joint: str = ""
     value: float = math.nan
-    """NaN: the kind's default."""
+    """NaN: default of the kind."""
     time: float = 0.0
-    """When, by the simulated time [s]; at once where that is past."""
+    """Simulated time of the fault [s]; if it is past, immediately."""
 
     @property
     def kind(self) -> FaultKind:
-        """What it is."""
+        """Its kind."""
         return KINDS[self.id]
 
     @property
     def amount(self) -> float:
-        """The value, or the kind's default."""
+        """The value, or the default of the kind."""
         return self.kind.default if math.isnan(self.value) else self.value
 
 
 def parse_fault(text: str, joints: Sequence[str]) -> Fault:
-    """One `--fault`. Raises BadInput."""
+    """Parse one `--fault`. Raises BadInput."""
     what, at, time = text.partition("@")
     parts = what.split(":")
     kind = KINDS.get(parts[0])
@@ -74,7 +74,9 @@ def parse_fault(text: str, joints: Sequence[str]) -> Fault:
         raise BadInput(f"fault {text!r}: no fault {parts[0]!r}; there are {', '.join(KINDS)}")
     joint, value = [*parts[1:], "", ""][:2]
     if len(parts) > 3 or bool(joint) != kind.per_joint:
-        raise BadInput(f"fault {text!r}: {'name a joint' if kind.per_joint else 'it has no joint'}; expected {FORM}")
+        raise BadInput(
+            f"fault {text!r}: {'a joint is missing' if kind.per_joint else 'it takes no joint'}; expected {FORM}"
+        )
     if joint and joint not in joints:
         raise BadInput(f"fault {text!r}: no joint {joint!r}; there are {', '.join(joints)}")
     try:

@@ -1,4 +1,4 @@
-"""An in-process CAN bus with the simulated arm on it: SYNC advances the physics by one period, nothing ever sleeps."""
+"""In-process CAN bus with the simulated arm: SYNC advances the physics by one period; nothing sleeps."""
 
 from threading import RLock
 from typing import Any
@@ -18,10 +18,10 @@ from sim_bus.truth import Truth
 
 
 class SimulatedClock:
-    """The simulated arm's time as a clock; sleeping lets the arm run."""
+    """The simulated arm's time as a clock; sleeping advances the arm."""
 
     def __init__(self, bus: "LockStepBus", lock: RLock) -> None:
-        """The clock of the arm on `bus`, which `lock` guards."""
+        """Clock of the arm on `bus`, protected by `lock`."""
         self._arm, self._bus, self._lock = bus.arm, bus, lock
 
     def now(self) -> float:
@@ -29,14 +29,14 @@ class SimulatedClock:
         return self._arm.time
 
     def sleep_until(self, instant: float) -> None:
-        """Let simulated time pass until `instant` [s]; at once where it is past."""
+        """Advance simulated time to `instant` [s]; returns immediately if it is past."""
         with self._lock:
             if instant > self._arm.time + 1e-9:
                 self._bus.line.advance(instant - self._arm.time)
 
 
 class LockStepBus(can.BusABC, InProcessBus):  # type: ignore[misc]
-    """One endpoint of a CAN bus whose other end is the arm. As a python-can interface: `armlink_sim:ARM`.
+    """Host's end of a CAN bus with the simulated arm; as an interface of python-can: `armlink_sim:ARM`.
 
     `recv` pops what the nodes sent; where there is nothing and `timeout` is positive, simulated time passes instead,
     up to the first frame, and None is returned if none comes. A timeout of None is a second.
@@ -47,7 +47,7 @@ class LockStepBus(can.BusABC, InProcessBus):  # type: ignore[misc]
     def __init__(
         self, channel: Any = None, *, arm: SimulatedArm | None = None, seed: int = 0, load: float = 0.0, **options: Any
     ) -> None:
-        """On the arm given, or on a new one from the arm file (or bundled arm) `channel`; `load` [kg] is at its tip.
+        """Bus of `arm`, or of a new arm from arm file or bundled arm `channel`, with `load` [kg] at its tip.
 
         Raises BadInput.
         """
@@ -58,10 +58,10 @@ class LockStepBus(can.BusABC, InProcessBus):  # type: ignore[misc]
                 arm.attach_mass(load)
         self.arm = arm
         self.line: Line = arm
-        """What stands between this end and the arm: the arm itself, faults, a wire."""
+        """The arm, or the fault injector or wire in front of it."""
         self.wire: Wire | None = None
         self.errors = 0
-        """Error frames so far."""
+        """Error frames received."""
         self._injector: Injector | None = None
         self._lock = RLock()
         self.clock: SimulatedClock = SimulatedClock(self, self._lock)
@@ -74,16 +74,16 @@ class LockStepBus(can.BusABC, InProcessBus):  # type: ignore[misc]
 
     @property
     def dropped(self) -> int:
-        """Frames that were lost because nobody took them in time."""
+        """Frames lost because they were not taken in time."""
         return self._injector.dropped if self._injector else 0
 
     def inject(self, fault: Fault | str) -> None:
-        """Let a fault happen, as `armlink sim --fault` writes it. Raises BadInput."""
+        """Inject a fault, also as text of `armlink sim --fault`. Raises BadInput."""
         with self._lock:
             self._faults().inject(parse_fault(fault, self.arm.names) if isinstance(fault, str) else fault)
 
     def clear_faults(self) -> None:
-        """End every fault."""
+        """End all faults."""
         with self._lock:
             self._faults().clear()
 
@@ -104,7 +104,7 @@ class LockStepBus(can.BusABC, InProcessBus):  # type: ignore[misc]
             raise can.CanOperationError(str(error)) from None
 
     def put(self, can_id: int, data: bytes) -> None:
-        """As send, without a message object. Raises BusFault where the interface takes no frame."""
+        """As send, without a message object. Raises BusFault if the interface rejects the frame."""
         line = self.line
         with self._lock:
             if self._injector and (why := self._injector.refusal):
@@ -114,7 +114,7 @@ class LockStepBus(can.BusABC, InProcessBus):  # type: ignore[misc]
                 line.advance(self.arm.period)
 
     def take(self, timeout: float = 0.0) -> Frame | None:
-        """As recv, without a message object; error frames are counted. Raises BusFault where one says bus-off."""
+        """As recv, without a message object; counts error frames. Raises BusFault for bus-off."""
         while True:
             frame = self._next(timeout)
             if frame is None or not frame[0] & ERROR_FLAG:
@@ -129,14 +129,14 @@ class LockStepBus(can.BusABC, InProcessBus):  # type: ignore[misc]
         return self._outbox.popleft() if self._outbox else None
 
     def _wait(self, timeout: float) -> None:
-        """Let time pass until a frame comes; another thread may send meanwhile, as python-can's Notifier has it."""
+        """Advance time until a frame arrives; another thread may send meanwhile (python-can's Notifier)."""
         deadline = self.arm.time + timeout
         while not self._outbox and self.arm.time < deadline - 1e-9:
             with self._lock:
                 self.line.advance(min(self.arm.period, deadline - self.arm.time))
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """The next frame that a node sent, or None."""
+        """The next frame from a node, or None."""
         frame = self._next(1.0 if timeout is None else timeout)
         if frame is None:
             return None

@@ -1,4 +1,4 @@
-"""A simulated arm on a bus of python-can's, in a process of its own: real time, or in lock-step with SYNC."""
+"""Runs a simulated arm on a bus, in real time or in lock-step with SYNC."""
 
 import signal
 import time
@@ -18,20 +18,20 @@ from sim_bus.bus.wire_timing import Line
 from sim_bus.simulated_arm import SimulatedArm
 
 LARGEST_LAG = 0.25
-"""What the physics lags behind the clock by more than this is dropped, as after a stopped process [s]."""
+"""Maximum lag of the physics behind the clock; the rest is dropped, as after a stopped process [s]."""
 TICK = 0.01
-"""Without a frame that needs it, physics lag behind the clock by this much at most [s], or until a timer is due."""
+"""Maximum lag of the physics between frames that need it, unless a timer is due earlier [s]."""
 LATE = 2 * TICK
-"""Longer than this without a turn and it was this process that did not listen, not the host that was silent [s]."""
+"""A lag beyond this means that this process was late, not that the host was silent [s]."""
 MOST_FRAMES = 1000
-"""Frames dealt with in one turn: a flood does not keep physics and timers waiting for ever."""
+"""Limit of frames per turn, so that a flood cannot block physics and timers."""
 LOCKSTEP_PATIENCE = 1.0
-"""In lock-step, so long without a SYNC and time goes on by itself, so that nodes notice a host that died [s]."""
+"""In lock-step, time runs again this long after the last SYNC, so that nodes notice a dead host [s]."""
 INTERRUPTED, TERMINATED = 130, 0
 
 
 class Server:
-    """Frames from the bus into the arm, and back."""
+    """Passes frames between bus and arm."""
 
     def __init__(
         self,
@@ -43,12 +43,12 @@ class Server:
         faults: Sequence[Fault] = (),
         control: ControlPipe | None = None,
     ) -> None:
-        """`now` is the clock that the physics follows unless `lockstep`; `control` gives orders while it runs."""
+        """`now` is the clock of the physics unless `lockstep`; `control` takes commands while it runs."""
         self._arm, self._lockstep, self._now = arm, lockstep, now
         self._port = bus.open_port(as_node=True)
         ports = self._port.members if isinstance(self._port, GroupPort) else (self._port,)
         *self._others, self._leading = ports
-        """Of several buses the last gives SYNC: a host fills them in their order."""
+        """The last of several buses provides SYNC: a host sends to them in order."""
         self._of_port: dict[Port, set[int]] = {port: set() for port in ports}
         """Nodes on each of several buses."""
         if isinstance(bus, BusGroup):
@@ -61,16 +61,16 @@ class Server:
             for fault in faults:
                 self._injector.inject(fault)
         self.on_wrong: Callable[[str], None] = lambda wrong: None
-        """Takes what was wrong with an order."""
+        """Called with the error message of a command."""
         self._synced = now()
         self._drifts = sorted(drifts, key=lambda drift: drift.time)
         self._offset = now() - arm.time
         self._ended: int | None = None
         self.lost = 0
-        """Frames that the bus did not take, at most."""
+        """Upper bound of the frames that the bus did not accept."""
 
     def run(self) -> int:
-        """Serve until SIGINT (130) or SIGTERM (0). Raises BusFault where the bus goes away."""
+        """Serve until SIGINT (130) or SIGTERM (0). Raises BusFault if the bus fails."""
         before = {number: signal.signal(number, self._end) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
             while self._ended is None:
@@ -81,7 +81,7 @@ class Server:
         return self._ended
 
     def turn(self) -> None:
-        """Wait for at most a tick, then deal with everything that is there."""
+        """Wait up to a tick, then process all frames."""
         receive = self._leading.receive
         try:
             frame = receive(TICK if self._lockstep else max(self._until_tick(), 0.0))
@@ -92,7 +92,7 @@ class Server:
                 self._heard(frame, self._leading)
                 frame = receive(0.0)
             self._take_from_others()
-        except InterfaceDown:  # it may come up again, and until then nodes hear nothing
+        except InterfaceDown:  # may come up again; until then nodes receive nothing
             pass
         if self._lockstep or self._until_tick() <= 0.0:
             self._let_time_pass()
@@ -102,7 +102,7 @@ class Server:
         self._flush()
 
     def _until_tick(self) -> float:
-        """Time until physics and timers must go on without a frame [s]."""
+        """Time until physics and timers must advance without a frame [s]."""
         due = min(self._arm.supervision.due, self._arm.time + TICK)
         return due + self._offset - self._now()
 
@@ -112,7 +112,7 @@ class Server:
                 self._heard(frame, port)
 
     def _heard(self, frame: Frame, port: Port) -> None:
-        """What a host sends on every bus counts once: SYNC on the leading one, NMT commands on each node's own."""
+        """Count frames sent to every bus once: SYNC on the leading bus, NMT commands on each node's own."""
         can_id, data = frame
         if self._others and can_id == NMT_ID and len(data) == 2:
             command, addressed = data
@@ -131,7 +131,7 @@ class Server:
         self._flush()
 
     def _let_time_pass(self) -> None:
-        """Bring the physics up to the clock; in lock-step time rests while SYNCs come to operational nodes."""
+        """Advance the physics to the clock; in lock-step time rests while operational nodes get SYNC."""
         if self._lockstep and self._arm.operational and self._now() - self._synced < LOCKSTEP_PATIENCE:
             self._offset = self._now() - self._arm.time
         lag = self._now() - self._offset - self._arm.time
@@ -153,7 +153,7 @@ class Server:
             outbox.clear()
             try:
                 self._port.send_all(frames)
-            except BusFault:  # as on a dead bus
+            except BusFault:  # lost, as on a dead bus
                 self.lost += len(frames)
 
     def _end(self, number: int, _frame: FrameType | None) -> None:

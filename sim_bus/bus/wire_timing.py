@@ -1,9 +1,9 @@
-"""The wire's own time: frames one after the other at a bit rate, the lowest identifier first, queues that fill up.
+"""Timing of the wire: frames in sequence at a bit rate, arbitration by identifier, transmit queues of limited length.
 
-Stands in for the arm on a LockStepBus: what the host sends waits in its transmit queue (in order), what nodes send in
-their mailboxes; whenever the wire is free the lowest identifier of those waiting goes (ISO 11898-1, 10.4.3), for as
-long as its bits take, stuff bits included. What is not through when a period is over comes in the next. Within a period
-the physics is not divided: nodes sample when the SYNC arrives, then the whole period passes.
+Takes the place of the arm on a LockStepBus. Frames of the host wait in its transmit queue (in order), frames of nodes
+in their mailboxes. Whenever the wire is free, the lowest identifier wins arbitration (ISO 11898-1, 10.4.3) and
+occupies the wire for its bits, stuff bits included. Frames left at the end of a period follow in the next. A period
+of the physics is not divided: nodes sample when SYNC arrives, then the whole period passes.
 """
 
 import heapq
@@ -17,13 +17,13 @@ from armlink.errors import BusFault
 from sim_bus.node.pdo import Frame
 
 PATIENCE = 0.05
-"""How long a host waits for room in its transmit queue [s]."""
+"""Longest wait of a host for space in its transmit queue [s]."""
 TRANSMIT_QUEUE = 10
-"""Frames that a host's transmit queue holds: SocketCAN's default (txqueuelen)."""
+"""Length of a host's transmit queue: SocketCAN's default (txqueuelen)."""
 
 
 class Line(Protocol):
-    """The arm, or what stands in for it."""
+    """The arm, or what takes its place."""
 
     outbox: deque[Frame]
 
@@ -31,22 +31,22 @@ class Line(Protocol):
         """A frame from the host."""
 
     def advance(self, duration: float) -> None:
-        """Let simulated time pass [s]."""
+        """Advance simulated time [s]."""
 
 
 class Wire:
-    """A bus of `bitrate` [bit/s] before `line`; on_frame(), advance() and `outbox` as the arm has them."""
+    """A wire of `bitrate` [bit/s] in front of `line`, with on_frame(), advance() and `outbox` of the arm."""
 
     def __init__(self, line: Line, bitrate: int, transmit_queue: int = TRANSMIT_QUEUE) -> None:
         """An idle bus."""
         self.line, self.bitrate, self.transmit_queue = line, bitrate, transmit_queue
         self.outbox: deque[Frame] = deque()
         self.time = self._free = 0.0
-        """The bus's time [s]: end of the last period; when the wire is free."""
+        """Times [s]: end of the last period; when the wire becomes free."""
         self.full = 0
-        """How often a frame of the host's found the transmit queue full, and waited."""
+        """Number of the host's frames that had to wait for a full transmit queue."""
         self._busy = self._waited = self._cycling = 0.0
-        """Of the cycles: time with a frame on the wire; from their starts to their last frames; their own [s]."""
+        """Sums over cycles [s]: time with a frame on the wire; time from start to last frame; length."""
         self._on_wire = 0.0
         self._host: deque[Frame] = deque()
         self._nodes: list[tuple[int, int, bytes]] = []
@@ -55,29 +55,29 @@ class Wire:
 
     @property
     def load(self) -> float:
-        """Share of the cycles' time in which a frame is on the wire."""
+        """Share of the cycle time in which a frame is on the wire."""
         return self._busy / self._cycling if self._cycling else 0.0
 
     @property
     def wait_share(self) -> float:
-        """Share of the cycles in which the host can but wait for the wire: from their starts to their last frames."""
+        """Share of the cycle time from start to last frame, in which the host waits for the wire."""
         return self._waited / self._cycling if self._cycling else 0.0
 
     def on_frame(self, can_id: int, data: bytes) -> None:
-        """Queue a frame of the host's; where the queue is full the host waits until a frame has gone.
+        """Queue a frame of the host; if the queue is full, the host waits until a frame has been sent.
 
-        Raises BusFault where that takes longer than a host is patient.
+        Raises BusFault if that takes longer than PATIENCE.
         """
         self._free = max(self._free, self.time)
         while len(self._host) >= self.transmit_queue:
             self.full += 1
             if self._free > self.time + PATIENCE:
-                raise BusFault("wire: transmit queue stays full: frames of higher priority take the whole bus")
+                raise BusFault("wire: transmit queue stays full: frames of higher priority occupy the whole bus")
             self._send_next()
         self._host.append((can_id, data))
 
     def advance(self, duration: float) -> None:
-        """Let simulated time pass [s]: the frames that it has room for, then the physics."""
+        """Advance simulated time [s]: first the frames that fit, then the physics."""
         end = self.time + duration
         self._free = max(self._free, self.time)
         self._collect()
@@ -93,7 +93,7 @@ class Wire:
         self.time = end
 
     def _send_next(self) -> None:
-        """Let the winner of the arbitration through."""
+        """Send the frame that wins arbitration."""
         if self._host and (not self._nodes or self._host[0][0] <= self._nodes[0][0]):
             can_id, data = self._host.popleft()
             self._occupy(can_id, data)
@@ -111,7 +111,7 @@ class Wire:
         self._on_wire += time
 
     def _collect(self) -> None:
-        """What the nodes have to send."""
+        """Collect the nodes' frames."""
         sent = self.line.outbox
         while sent:
             can_id, data = sent.popleft()

@@ -1,1 +1,1 @@
-"""Sub-commands of `armlink` that sim_bus contributes."""
+"""Sub-commands of `armlink` from sim_bus."""

@@ -7,7 +7,7 @@ import typer
 
 
 def sim(
-    arm: Annotated[str, typer.Argument(help="A bundled arm's name, or the path of an arm file with a sim section.")],
+    arm: Annotated[str, typer.Argument(help="Bundled arm, or path of an arm file with a sim section.")],
     bus: Annotated[str, typer.Option(help="INTERFACE:CHANNEL[@BITRATE]; default the arm file's.")] = "",
     effect: Annotated[
         list[str] | None,
@@ -15,23 +15,23 @@ def sim(
     ] = None,
     drift: Annotated[
         list[str] | None,
-        typer.Option(help="JOINT:GAIN:OFFSET@T: at T s the torque sensor changes, by a factor and by N·m."),
+        typer.Option(help="JOINT:GAIN:OFFSET@T: torque sensor drift at T s, a factor and an offset in N·m."),
     ] = None,
     fault: Annotated[
         list[str] | None,
-        typer.Option(help="ID:JOINT[:VALUE][@T] or ID::VALUE[@T]: a fault at T s; docs/faults.md lists them."),
+        typer.Option(help="ID:JOINT[:VALUE][@T] or ID::VALUE[@T]: a fault at T s (see docs/faults.md)."),
     ] = None,
     control: Annotated[
         Path | None,
         typer.Option(
-            help="Named pipe to make: lines such as 'effect friction.coulomb:joint_2:1' or 'fault …' change it."
+            help="Named pipe to create for commands, such as 'effect friction.coulomb:joint_2:1' or 'fault …'."
         ),
     ] = None,
     seed: Annotated[
-        int | None, typer.Option(help="Draw the sensors' truth from this seed; default is what the arm file states.")
+        int | None, typer.Option(help="Draw the true sensor parameters from this seed; default: from the arm file.")
     ] = None,
     lockstep: Annotated[
-        bool, typer.Option(help="Each SYNC advances the physics by one period, whatever the time of day.")
+        bool, typer.Option(help="Each SYNC advances the physics by one period, independent of real time.")
     ] = False,
 ) -> int:
     """Run a simulated arm on a CAN bus until SIGINT or SIGTERM.
@@ -53,8 +53,8 @@ def sim(
     from sim_bus.simulated_arm import SimulatedArm
     from sim_bus.truth import Truth
 
-    # MuJoCo reads the time some twenty times a step for its profile: a system call each in a user-mode kernel, where it
-    # made a step forty times as long. Here nobody reads that profile.
+    # MuJoCo reads the time about twenty times a step for its profiler, which is not used here. In a user-mode kernel
+    # each is a system call and made a step forty times as long.
     mujoco.set_mjcb_time(lambda: 0.0)
     described = load_arm(arm)
     entries = [parse_effect(text, described.joint_names) for text in effect or ()]
@@ -64,7 +64,9 @@ def sim(
     simulated = SimulatedArm(described, truth, seed or 0)
     simulated.set_effects([*simulated.effects, *entries])
     if resolve_bus(bus or None, described.require_link().bus).interface == "armlink_sim":
-        raise BadInput("sim: bus armlink_sim is a simulated arm itself; give --bus socketcan:vcan0, for example")
+        raise BadInput(
+            "sim: bus armlink_sim is itself a simulated arm: choose another, for example --bus socketcan:vcan0"
+        )
     endpoint = open_link_bus(bus or None, described.require_link())
     if not lockstep:
         prepare(SIMULATED)

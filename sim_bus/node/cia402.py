@@ -1,4 +1,4 @@
-"""The drive's side of the CiA 402 state machine, as a table."""
+"""State machine of a CiA 402 drive, as a table."""
 
 from enum import IntEnum
 
@@ -17,7 +17,7 @@ class State(IntEnum):
 
 
 class Command(IntEnum):
-    """What a control word asks for."""
+    """Commands of the control word."""
 
     NONE = 0
     DISABLE_VOLTAGE = 1
@@ -58,11 +58,11 @@ TRANSITIONS = {
     (State.QUICK_STOP, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,
     (State.FAULT, Command.FAULT_RESET): State.SWITCH_ON_DISABLED,
 }
-"""Transitions 2 to 12, 15 and 16; READY to ENABLED runs 3 and 4 in one. What is not here changes nothing."""
+"""Transitions 2 to 12, 15 and 16; READY to ENABLED combines 3 and 4. Other commands have no effect."""
 
 
 def command(word: int, previous: int) -> Command:
-    """The command in control word `word` (6040h), given the one before it: a fault reset is an edge of bit 7."""
+    """Command of a control word (6040h), given the previous one: fault reset is a rising edge of bit 7."""
     if word & 0x80:
         return Command.NONE if previous & 0x80 else Command.FAULT_RESET
     if not word & 0x02:
@@ -75,5 +75,5 @@ def command(word: int, previous: int) -> Command:
 
 
 def next_state(state: State, asked: Command) -> State:
-    """Where the drive goes from `state`."""
+    """The state that follows `state`."""
     return TRANSITIONS.get((state, asked), state)

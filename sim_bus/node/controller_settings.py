@@ -1,4 +1,4 @@
-"""A joint controller's settings: what it powers on with, and how written objects come into force in the drive."""
+"""Settings of a joint controller: power-on values, and how written objects take effect in the drive."""
 
 from zlib import crc32
 
@@ -12,14 +12,14 @@ from sim_bus.node.position_torque_loops import FEED, UNIT
 from sim_bus.sim_section import sim_section
 
 APPLIED = (0x6007, 0x605A, 0x6065, 0x607D, 0x6085, 0x60C2)
-"""Objects of the drive profile that come into force when written."""
+"""Objects of the drive profile that take effect when written."""
 
 TEMPERATURE = 310
-"""Of every drive [0.1 °C]."""
+"""Temperature of every drive [0.1 °C]."""
 
 
 def power_on_values(arm: ArmFile, joint: LinkJoint, increments: int) -> dict[Key, int | str]:
-    """Objects of one joint that differ from the EDS's defaults; `increments` are the encoder's a joint turn."""
+    """Objects of one joint that differ from the EDS's defaults; `increments` of the encoder per joint revolution."""
     link, servo = arm.require_link(), sim_section(arm).servo
     deceleration = round(servo.quick_stop_deceleration / UNIT)
     return {
@@ -39,7 +39,7 @@ def power_on_values(arm: ArmFile, joint: LinkJoint, increments: int) -> dict[Key
 
 
 def bring_into_force(node: Node, drives: Drives) -> None:
-    """Take the node's calibration record and drive settings over into its drive."""
+    """Apply the node's calibration record and drive settings to its drive."""
     joint, record, loops, window = node.place, node.record.active, drives.loops, node.value(0x6065)
     drives.gain[joint], drives.offset[joint] = record.gain, record.offset
     drives.quick_stop_option[joint] = node.value(0x605A)

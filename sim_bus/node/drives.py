@@ -1,4 +1,4 @@
-"""The joints' drives as CiA 402 sees them: states, modes, readings; for all joints at once."""
+"""The joints' drives (CiA 402): states, modes and readings, for all joints at once."""
 
 from collections.abc import Callable
 
@@ -23,20 +23,20 @@ from sim_bus.physics.plant import Plant
 from sim_bus.physics.sensors import Sensors
 
 SUPPORTED_MODES = sum(1 << (mode - 1) for mode in (PROFILE_POSITION, PROFILE_TORQUE, CSP, CSV, CST))
-"""6502h."""
+"""Supported drive modes (6502h)."""
 VELOCITY_FILTER = 0.008
-"""Time constant of the velocity reading's low pass [s]."""
+"""Time constant of the low-pass filter of velocity readings [s]."""
 REMOTE, INTERNAL_LIMIT, FOLLOWS = 0x0210, 0x0800, 0x1000
 FOLLOWING_ERROR = 0x8611
 UNWATCHED = 0xFFFFFFFF
-"""6065h: following errors are not watched."""
+"""6065h: following errors are not monitored."""
 
 
 class Drives:
     """All joints' drives; arrays (n,)."""
 
     def __init__(self, arm: ArmFile, plant: Plant, sensors: Sensors, signals: Signals) -> None:
-        """Switched off, at the plant's present position."""
+        """Drives switched off, at the plant's present position."""
         self.n = n = plant.n
         self._plant, self._sensors = plant, sensors
         self.loops = Loops(arm, plant, sensors, signals)
@@ -44,11 +44,11 @@ class Drives:
         self.state = [State.SWITCH_ON_DISABLED] * n
         self.quick_stop_option = [6] * n
         self.following_window = np.full(n, np.inf)
-        """6065h [rad]."""
+        """Following error window (6065h) [rad]."""
         self.refused_modes: list[set[int]] = [set() for _ in range(n)]
-        """Modes that each drive does not enter."""
+        """Modes that each drive refuses."""
         self.gain, self.offset = np.ones(n), np.zeros(n)
-        """Calibration in force (2100h)."""
+        """Active calibration (2100h)."""
         self.on_state: Callable[[int], None] = lambda joint: None
         self.on_fault: Callable[[int, int], None] = lambda joint, code: None
         self._words = [0] * n
@@ -67,7 +67,7 @@ class Drives:
     # ---- readings
 
     def sample(self, time: float, elapsed: float) -> None:
-        """Read the sensors at `time` [s], `elapsed` after the last time, into the signals."""
+        """Sample the sensors at `time` [s], `elapsed` [s] after the last sample, into the signals."""
         plant = self._plant
         counts = self._sensors.position_counts(plant.motor_position)
         if elapsed > 0:
@@ -89,7 +89,7 @@ class Drives:
     # ---- commands
 
     def take_commands(self) -> None:
-        """Act on new control words, modes and limits in the signals."""
+        """Process new control words, modes and limits in the signals."""
         if self._limit_in.tobytes() != self._seen_limit.tobytes():
             self._seen_limit[:] = self._limit_in
             self.loops.reconfigure()
@@ -112,7 +112,7 @@ class Drives:
             self.enter(joint, state)
 
     def enter(self, joint: int, state: State) -> None:
-        """Go to `state`: the power stage follows, the status word too."""
+        """Enter `state`, with power stage and status word."""
         self.state[joint] = state
         mode = int(self.loops.mode[joint])
         if state is State.ENABLED:
@@ -125,7 +125,7 @@ class Drives:
         self.on_state(joint)
 
     def quick_stop(self, joint: int) -> None:
-        """Quick stop an enabled drive as 605Ah says: 0 disables; 1, 2 stop then disable; 5 to 8 stop and hold."""
+        """Quick stop an enabled drive by 605Ah: 0 disables; 1, 2 stop, then disable; 5 to 8 stop and hold."""
         if self.quick_stop_option[joint] == 0:
             self.enter(joint, State.SWITCH_ON_DISABLED)
             return
@@ -133,13 +133,13 @@ class Drives:
         self.enter(joint, State.QUICK_STOP)
 
     def fault(self, joint: int, code: int) -> None:
-        """Go to fault with error code `code` (603Fh): the torque goes, the brake closes."""
+        """Enter fault with error code `code` (603Fh): torque off, brake closed."""
         self.enter(joint, State.FAULT)
         self.error_code[joint] = code
         self.on_fault(joint, code)
 
     def watch(self) -> None:
-        """What the drives themselves watch: following error (6065h), and the end of a quick stop."""
+        """Monitor following errors (6065h) and the end of a quick stop."""
         error = self.loops.following_error
         for joint in np.flatnonzero(np.abs(error) > self.following_window):
             if self.state[joint] is State.ENABLED:
@@ -154,7 +154,7 @@ class Drives:
         return bool(self.loops.stopping.any() or np.isfinite(self.following_window).any())
 
     def _select_mode(self, joint: int) -> None:
-        """Enter the mode asked for; an unsupported one is displayed as 0 and holds the position."""
+        """Enter the requested mode; an unsupported one is displayed as 0 and holds the position."""
         asked = int(self._mode_in[joint])
         mode = asked if asked in KINDS and asked not in self.refused_modes[joint] else 0
         self._mode_out[joint] = mode

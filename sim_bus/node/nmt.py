@@ -12,17 +12,17 @@ STATES = {0x01: OPERATIONAL, 0x02: STOPPED, 0x80: PRE_OPERATIONAL}
 
 
 class NetworkManagement:
-    """NMT states of all nodes; `operational[j]` tells the process data's side which may use PDOs."""
+    """NMT states of all nodes; `operational[j]`: whether node j may use PDOs."""
 
     def __init__(
         self, nodes: list[Node], drives: Drives, supervision: Supervision, apply: Callable[[Node], None]
     ) -> None:
-        """`apply` brings a node's objects into force after a reset."""
+        """`apply` applies a node's objects after a reset."""
         self._nodes, self._drives, self._supervision, self._apply = nodes, drives, supervision, apply
         self.operational = bytearray(len(nodes))
 
     def frame(self, data: bytes, time: float) -> None:
-        """An NMT command."""
+        """Process an NMT command."""
         if len(data) < 2:
             return
         for node in self._nodes:
@@ -30,7 +30,7 @@ class NetworkManagement:
                 self.command(node, data[0], time)
 
     def command(self, node: Node, asked: int, time: float) -> None:
-        """Bring one node into the state asked for."""
+        """Bring one node into the commanded state."""
         if asked in (RESET_NODE, RESET_COMMUNICATION):
             if asked == RESET_NODE:
                 self._drives.enter(node.place, State.SWITCH_ON_DISABLED)
@@ -44,5 +44,5 @@ class NetworkManagement:
             self._supervision.left_operational(node, time)
 
     def update(self) -> None:
-        """Take over what the nodes did by themselves (1029h)."""
+        """Update after nodes changed their own state (1029h)."""
         self.operational[:] = bytes(node.nmt == OPERATIONAL for node in self._nodes)

@@ -27,11 +27,11 @@ class Node:
         self.place, self.node_id = place, node_id
         self.object_dictionary = data_sheet()
         self.identity: dict[Key, int | str] = {}
-        """Values that differ from the EDS's defaults, whatever is restored."""
+        """Values that differ from the EDS's defaults, kept when defaults are restored."""
         self.record = TorqueRecord()
         self.nmt = INITIALISING
         self.unplugged = False
-        """Cut off from the bus: it hears nothing."""
+        """Disconnected from the bus."""
         self.errors: list[int] = []
         self.on_write: Callable[[Key], None] = lambda key: None
         self.on_pdo_change: Callable[[], None] = lambda: None
@@ -74,7 +74,7 @@ class Node:
             self._values[key] = bytes(data)
 
     def raw(self, index: int, sub: int = 0) -> bytes:
-        """The object's bytes now."""
+        """Current bytes of an object."""
         if (index, sub) in self._signals:
             return bytes(self._signals[index, sub][self.place].tobytes())
         if index == 0x2100:
@@ -84,7 +84,7 @@ class Node:
         return self._values[index, sub]
 
     def value(self, index: int, sub: int = 0) -> int:
-        """An integer object's value now."""
+        """Current value of an integer object."""
         entry = variable(index, sub)
         assert entry is not None
         return int(np.frombuffer(self.raw(index, sub), DTYPES[entry.data_type])[0])
@@ -147,7 +147,7 @@ class Node:
     # ---- PDO objects
 
     def pdos(self, receive: bool) -> list[PdoParameters]:
-        """The node's RPDOs or TPDOs as its objects state them."""
+        """The node's RPDOs or TPDOs by its objects."""
         parameters = []
         for number in range(4):
             communication, mapping = (0x1400, 0x1600) if receive else (0x1800, 0x1A00)
@@ -187,16 +187,16 @@ class Node:
     # ---- services
 
     def on_sdo(self, data: bytes) -> None:
-        """A frame to the SDO server."""
+        """Pass a frame to the SDO server."""
         if len(data) == 8 and self.nmt in (PRE_OPERATIONAL, OPERATIONAL):
             self._server.on_request(0x600 + self.node_id, bytearray(data), None)
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        """What the SDO server answers."""
+        """Send a response of the SDO server."""
         self._outbox((can_id, bytes(data)))
 
     def emergency(self, code: int, register: int, manufacturer: bytes = b"") -> None:
-        """Send an EMCY frame: error code, error register, five bytes of the manufacturer's."""
+        """Send an EMCY frame: error code, error register, five manufacturer-specific bytes."""
         if code:
             self.errors.append(code)
         else:

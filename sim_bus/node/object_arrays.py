@@ -1,4 +1,4 @@
-"""The objects of all joints that PDOs can carry, as one array per object: the cyclic path works on them whole."""
+"""PDO-mappable objects of all joints, one array per object, for the cyclic path."""
 
 from functools import cache
 from typing import Any
@@ -17,12 +17,12 @@ Key = tuple[int, int]
 
 @cache
 def data_sheet() -> canopen.ObjectDictionary:
-    """The joint's EDS, for node id 0: an entry whose `relative` is true adds the node's own."""
+    """The joint's EDS for node id 0; entries with `relative` add the node's id."""
     return canopen.import_od(bundled_path(), node_id=0)
 
 
 def variable(index: int, sub: int) -> ODVariable | None:
-    """The EDS's entry, or None where there is none."""
+    """The EDS's entry, or None."""
     item = data_sheet().get(index)
     if item is None or isinstance(item, ODVariable):
         return item if sub == 0 else None
@@ -33,10 +33,10 @@ def variable(index: int, sub: int) -> ODVariable | None:
 
 
 class Signals:
-    """`values[index, sub]` is an (n,) array in the object's own type; the same arrays stay for good."""
+    """`values[index, sub]` is an (n,) array of the object's type; the arrays are never replaced."""
 
     def __init__(self, n: int) -> None:
-        """All joints at the EDS's defaults."""
+        """Start with the EDS's defaults."""
         entries = [
             entry
             for item in data_sheet().values()

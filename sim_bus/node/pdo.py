@@ -1,4 +1,4 @@
-"""PDOs of all nodes, compiled from their 1400h to 1A03h objects: nodes with equal mappings share one packed array."""
+"""PDOs of all nodes, compiled from objects 1400h to 1A03h; nodes with equal mappings share a packed array."""
 
 from collections import defaultdict
 from collections.abc import Callable
@@ -15,12 +15,12 @@ Frame = tuple[int, bytes]
 
 @dataclass(frozen=True)
 class PdoParameters:
-    """One PDO of one node as its objects state it."""
+    """One PDO of one node, from its objects."""
 
     node: int
-    """Place of the node in the arm, from 0."""
+    """Index of the node in the arm."""
     number: int
-    """From 0."""
+    """Number of the PDO, from 0."""
     cob_id: int
     kind: int
     """Transmission type: 0 to 240 synchronous, 254 and 255 event-driven."""
@@ -43,7 +43,7 @@ class PdoGroup:
     """PDOs of one kind, number and mapping over several nodes."""
 
     def __init__(self, members: list[PdoParameters], signals: Signals) -> None:
-        """Lay the members' data out one after the other."""
+        """Lay out the members' data one after the other."""
         self.kind, self.number = members[0].kind, members[0].number
         self.cob_ids = [member.cob_id for member in members]
         self.nodes = [member.node for member in members]
@@ -60,12 +60,12 @@ class PdoGroup:
         self.fresh = bytearray(len(members))
         self.sent = [b""] * len(members)
         self.settled = b""
-        """What was packed when every member had sent its latest."""
+        """Packed data when every member had last sent."""
         self._all_fresh = bytearray(b"\1" * len(members))
         self._none_fresh = bytes(len(members))
 
     def take(self) -> NDArray[np.intp] | None:
-        """Copy what was received since the last call into the signals; the nodes concerned, or None."""
+        """Copy data received since the last call into the signals; returns the nodes, or None."""
         if self.fresh == self._none_fresh:
             return None
         if self.whole and self.fresh == self._all_fresh:
@@ -81,7 +81,7 @@ class PdoGroup:
         return rows
 
     def pack(self) -> bytes:
-        """All members' data as they would be sent now."""
+        """Pack the current data of all members."""
         for field, signal in self.fields:
             field[:] = signal if self.whole else signal[self.rows]
         return bytes(self.buffer)
@@ -91,7 +91,7 @@ class PdoTable:
     """All PDOs of the arm. `receive` maps a COB-ID to (group, place)."""
 
     def __init__(self, signals: Signals, operational: bytearray, outbox: Callable[[Frame], None]) -> None:
-        """`operational[j]` tells whether node j may use PDOs; frames go to `outbox`."""
+        """`operational[j]`: whether node j may use PDOs; frames go to `outbox`."""
         self._signals, self._operational, self._outbox = signals, operational, outbox
         self.receive: dict[int, tuple[PdoGroup, int]] = {}
         self.sync_receive: list[PdoGroup] = []
@@ -120,7 +120,7 @@ class PdoTable:
                         self._outbox((cob_id, data[place * size : (place + 1) * size]))
 
     def send_events(self) -> None:
-        """Send the event-driven TPDOs whose content changed."""
+        """Send event-driven TPDOs with changed content."""
         for group in self._event_send:
             data, size = group.pack(), group.size
             if data == group.settled:

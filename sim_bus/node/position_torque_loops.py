@@ -1,9 +1,9 @@
-"""The drives' torque and position loops, for all joints at once.
+"""Torque and position loops of the drives, for all joints at once.
 
 The motor torque is `drive − stiffness·q − damping·q̇`, clamped to the max torque (6072h); the plant evaluates it at
 every step of the physics. `drive` is the target torque in torque modes and
-`stiffness·target + damping·target rate + integral + feed-forward` in position modes. The integrator rests within a dead
-band and at the clamp, so that it neither hunts under stiction nor winds up on a stop.
+`stiffness·target + damping·target rate + integral + feed-forward` in position modes. The integrator is stopped within a
+dead band and at the clamp, to avoid hunting under stiction and wind-up on a stop.
 """
 
 import numpy as np
@@ -17,28 +17,28 @@ from sim_bus.physics.sensors import Sensors
 from sim_bus.sim_section import sim_section
 
 FEED = 1 << 20
-"""User units a joint revolution (6092h)."""
+"""User units per joint revolution (6092h)."""
 UNIT = 2 * np.pi / FEED
 OFF, TORQUE, POSITION = 0, 1, 2
 PROFILE_POSITION, PROFILE_TORQUE, CSP, CSV, CST = 1, 4, 8, 9, 10
 KINDS = {PROFILE_POSITION: POSITION, PROFILE_TORQUE: TORQUE, CSP: POSITION, CSV: POSITION, CST: TORQUE}
 LATE_SHARE = 0.5
-"""Most of a motor's inertia that damping may amount to, times the motor's lateness."""
+"""Stability limit with a motor delay: damping times delay is at most this share of the motor's inertia."""
 INTEGRAL_SHARE = 0.3
-"""Integral action: stiffness · bandwidth · this."""
+"""Integral gain = this · stiffness · bandwidth."""
 TUNING_POSES = 50
-"""The loops are tuned for the largest inertia among so many poses, so that they are stable in all of them."""
+"""Number of poses; the loops are tuned for the largest inertia among them."""
 UNFINISHED = 0.05
-"""An approach to a cyclic position target goes on between SYNCs if at least this share of its time is left."""
+"""Interpolation of a position target continues between SYNCs if more than this share of its time is left."""
 SPARE_ACCELERATION = 100.0
-"""The loops are tuned for the inertia of the bare arm plus what rated torque accelerates by this much [rad/s²]."""
+"""The loops are tuned for the bare arm's inertia plus rated torque divided by this acceleration [rad/s²]."""
 
 
 class Loops:
     """Targets and integrators; arrays (n,)."""
 
     def __init__(self, arm: ArmFile, plant: Plant, sensors: Sensors, signals: Signals) -> None:
-        """No joint powered."""
+        """Start with all joints unpowered."""
         section, self.n = sim_section(arm).servo, plant.n
         self._plant, self._sensors = plant, sensors
         self.rated = arm.require_link().rated_torques
@@ -51,7 +51,7 @@ class Loops:
         self.kind, self.mode = np.zeros(self.n, int), np.zeros(self.n, int)
         self.stopping = np.zeros(self.n, bool)
         self.limit = np.zeros(self.n)
-        """Max torque in force [N·m]."""
+        """Active torque limit [N·m]."""
         self._torque, self._target, self._rate = np.zeros(self.n), plant.motor_position, np.zeros(self.n)
         self._integral = np.zeros(self.n)
         self._fresh: dict[int, NDArray[np.bool_]] = {
@@ -62,23 +62,23 @@ class Loops:
         self._profile_acceleration, self._torque_slope = signals[0x6083, 0], signals[0x6087, 0]
         self._max_torque_in = signals[0x6072, 0]
         self.interpolation = np.zeros(self.n)
-        """60C2h: time over which a cyclic position target is approached [s]."""
+        """Interpolation time of cyclic position targets (60C2h) [s]."""
         self._left = np.zeros(self.n)
-        """Time left of an approach that one piece after SYNC did not finish [s]."""
+        """Interpolation time left after the first step behind SYNC [s]."""
         self._approaching = False
         self.lowest, self.highest = np.full(self.n, -np.inf), np.full(self.n, np.inf)
         """Software position limits (607Dh) in user units."""
         self.reconfigure()
 
     def fresh(self, index: int, rows: NDArray[np.intp] | int) -> None:
-        """Targets in object `index` came for the joints `rows`: from now on they count."""
+        """Mark targets in object `index` as received for the joints `rows`."""
         waiting = self._fresh[index]
         if not waiting[rows].all():
             waiting[rows] = True
             self._select()
 
     def start(self, joint: int, kind: int, mode: int) -> None:
-        """Change a joint's loop without a bump: from the torque it now transmits and the position it now has."""
+        """Switch a joint's loop without a bump, from its present torque and position."""
         plant = self._plant
         powered = self.kind[joint] != OFF or not self._with_brake
         torque = float((plant.drive_torque if powered else plant.link_torque)[joint])
@@ -92,7 +92,7 @@ class Loops:
         self._integral[joint] = torque + self._d[joint] * velocity if kind == POSITION else 0.0
 
     def stop(self, joint: int) -> None:
-        """Brake a joint to rest with its quick stop deceleration and hold it there."""
+        """Decelerate a joint to rest (quick stop deceleration) and hold it there."""
         velocity = self._plant.motor_velocity[joint]
         self.start(joint, POSITION, int(self.mode[joint]))
         self._rate[joint] = velocity
@@ -106,11 +106,11 @@ class Loops:
 
     @property
     def following_error(self) -> Array:
-        """How far position-controlled joints are from their targets [rad]; 0 for the others."""
+        """Following error of position-controlled joints [rad]; 0 for the others."""
         return np.where(self.kind == POSITION, self._target - self._plant.motor_position, 0.0)
 
     def reconfigure(self) -> None:
-        """Pass modes and limits on to the plant."""
+        """Apply modes and limits to the plant."""
         self.limit = self._max_torque_in * self._per_mille
         closed, bandwidth = self.kind == POSITION, self._stable_bandwidth()
         self._closed = closed.astype(float)
@@ -125,14 +125,14 @@ class Loops:
         self._select()
 
     def _stable_bandwidth(self) -> Array:
-        """The section's bandwidth, or less where the motor is late for what it turns at least."""
+        """The configured bandwidth, reduced as far as a motor's delay requires."""
         turned = np.minimum(self._inertia, self._plant.rotor_inertia)
         damped = 2 * self._damping_ratio * self._inertia
         most = LATE_SHARE * turned / (damped * np.maximum(self._plant.lateness, 1e-9))
         return np.asarray(np.minimum(most, self._bandwidth))
 
     def _select(self) -> None:
-        """Which joints follow which target."""
+        """Update which joints follow which target."""
         torque, position, velocity = self._fresh.values()
         free = ~self.stopping
         self._cyclic_torque = (self.mode == CST) & (self.kind == TORQUE) & torque
@@ -146,7 +146,7 @@ class Loops:
         self._any_slow = bool((self._profile_torque | self._profile_position | self._cyclic_velocity).any())
 
     def advance(self, duration: float, synchronous: bool) -> None:
-        """Run loops and plant for `duration` [s]; `synchronous` where it follows a SYNC, which brings new targets."""
+        """Run loops and plant for `duration` [s]; `synchronous`: directly after a SYNC with its new targets."""
         np.copyto(self._torque, self._torque_in * self._per_mille, where=self._cyclic_torque)
         if self._any_slow:
             self._follow_profiles(duration)
@@ -168,7 +168,7 @@ class Loops:
             self._plant.step(level, level, duration)
 
     def _plan(self, duration: float, synchronous: bool) -> None:
-        """Rates at which the position targets move during the next `duration`."""
+        """Set the rates of the position targets for the next `duration` [s]."""
         if self._any_position:
             if synchronous:
                 wanted = np.minimum(np.maximum(self._position_in, self.lowest), self.highest)
@@ -189,7 +189,7 @@ class Loops:
             np.copyto(self._rate, slower, where=self.stopping)
 
     def _follow_profiles(self, duration: float) -> None:
-        """Profile torque (slope 6087h), profile position (6081h, 6083h) and cyclic velocity (60FFh)."""
+        """Follow profile torque (slope 6087h), profile position (6081h, 6083h) and cyclic velocity (60FFh)."""
         step = self._torque_slope * (self._per_mille * duration)
         wanted = self._torque_in * self._per_mille
         ramped = self._torque + np.clip(wanted - self._torque, -step, step)

@@ -1,4 +1,4 @@
-"""What each node watches: its own heartbeat's clock, the master's heartbeat, RPDO deadlines and the SYNC period."""
+"""Timers of each node: its own heartbeat, the master's heartbeat, RPDO deadlines and the SYNC period."""
 
 import math
 import struct
@@ -21,7 +21,7 @@ class Supervision:
     """Timers of all nodes. `due` is the time of the next one [s]."""
 
     def __init__(self, nodes: list[Node], drives: Drives, outbox: Callable[[Frame], None]) -> None:
-        """Nothing is watched until configure() finds it in the objects."""
+        """Nothing is monitored before configure()."""
         self._nodes, self._drives, self._outbox = nodes, drives, outbox
         n = len(nodes)
         self.due = math.inf
@@ -35,7 +35,7 @@ class Supervision:
         self._sync_due = [math.inf] * n
 
     def configure(self, node: Node, time: float) -> None:
-        """Take 1006h, 1016h, 1017h and the RPDOs' event timers over; what did not change keeps running."""
+        """Read 1006h, 1016h, 1017h and the RPDOs' event timers; unchanged timers keep running."""
         j = node.place
         period = node.value(0x1017) / 1000
         if period != self._produce[j][0]:
@@ -55,20 +55,20 @@ class Supervision:
         self._schedule()
 
     def heartbeat(self, master: int, time: float) -> None:
-        """A heartbeat of node id `master`: arms, or puts off, the consumers that wait for it."""
+        """A heartbeat of node id `master` arrived: start or restart its consumers' timers."""
         for node, consumed, due in zip(self._nodes, self._consume, self._consume_due, strict=True):
             if master in consumed and not node.unplugged:
                 due[master] = time + consumed[master]
         self._schedule()
 
     def rpdo(self, joint: int, number: int, time: float) -> None:
-        """RPDO `number` of a node came."""
+        """RPDO `number` of a node arrived."""
         if number in self._rpdo[joint]:
             self._rpdo_due[joint][number] = time + self._rpdo[joint][number]
             self.due = min(self.due, time + self._rpdo[joint][number])
 
     def sync(self, time: float) -> None:
-        """A SYNC came."""
+        """A SYNC arrived."""
         if any(self._sync):
             for node, period in zip(self._nodes, self._sync, strict=True):
                 if not node.unplugged:
@@ -76,7 +76,7 @@ class Supervision:
             self.due = min(self.due, *self._sync_due)
 
     def postpone(self, seconds: float) -> None:
-        """Let all deadlines of the host begin later: the simulated arm itself did not listen for so long."""
+        """Postpone all deadlines for the host [s], because the simulated arm itself was late."""
         for table in (*self._consume_due, *self._rpdo_due):
             for key in table:
                 table[key] += seconds
@@ -84,13 +84,13 @@ class Supervision:
         self._schedule()
 
     def left_operational(self, node: Node, time: float) -> None:
-        """NMT took the node out of operational: deadlines of PDOs rest, and an enabled drive acts as 6007h says."""
+        """A node left operational: its PDO deadlines stop, and an enabled drive acts by 6007h."""
         self._rpdo_due[node.place] = {}
         self._sync_due[node.place] = math.inf
         self._abort_connection(node)
 
     def check(self, time: float) -> None:
-        """Do what is due at `time`."""
+        """Handle the timers that are due at `time` [s]."""
         for node in self._nodes:
             j = node.place
             period, due = self._produce[j]
@@ -117,7 +117,7 @@ class Supervision:
             node.nmt = {0: PRE_OPERATIONAL, 2: STOPPED}.get(node.value(0x1029, 1), OPERATIONAL)
 
     def _abort_connection(self, node: Node, code: int = 0) -> None:
-        """The abort connection option (6007h): 0 nothing, 1 fault, 2 disable voltage, 3 quick stop."""
+        """Act by the abort connection option (6007h): 0 nothing, 1 fault, 2 disable voltage, 3 quick stop."""
         if self._drives.state[node.place] is not State.ENABLED:
             return
         option = node.value(0x6007)

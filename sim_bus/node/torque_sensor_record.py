@@ -2,15 +2,15 @@
 
 | sub | type | access | |
 |---|---|---|---|
-| 1 | I32 | ro | reading [µN·m], `(v − offset) / gain` with the gain and offset in force |
-| 2, 3 | REAL32 | ro | gain and offset [N·m] in force; 1 and 0 when new |
+| 1 | I32 | ro | reading [µN·m], `(v − offset) / gain` with the active gain and offset |
+| 2, 3 | REAL32 | ro | active gain and offset [N·m]; 1 and 0 when new |
 | 4, 5 | REAL32 | rw | staged gain and offset |
-| 6 | U8 | rw | write 1: the staged record comes into force; reads 1 where staged and in force are the same |
+| 6 | U8 | rw | write 1: activate the staged record; reads 1 if staged and active record are equal |
 | 7, 8 | U32 | rw | record id and date (seconds since 1970-01-01), staged with 4 and 5 |
 | 9 | U32 | rw | CRC-32 (IEEE 802.3, as `zlib.crc32`) over the 16 bytes `<ffII` of 4, 5, 7 and 8 |
 
-Writing 6 aborts with 0609 0030h where the CRC does not match, the gain is zero or a value is not finite; what is in
-force then stays. A record in force is lost at reset unless 1010h:4 (or :1) has stored it.
+Writing 6 aborts with 0609 0030h if the CRC does not match, the gain is zero or a value is not finite; the active record
+is then unchanged. The active record is lost at reset unless it was stored by 1010h:4 (or :1).
 """
 
 import math
@@ -34,34 +34,34 @@ class Record:
 
     @property
     def content(self) -> bytes:
-        """What the CRC covers."""
+        """Bytes covered by the CRC."""
         return struct.pack("<ffII", self.gain, self.offset, self.record_id, self.date)
 
 
 class TorqueRecord:
-    """The record in force, the staged one, and the one in non-volatile memory."""
+    """The active record, the staged one, and the one in non-volatile memory."""
 
     def __init__(self) -> None:
-        """A new controller's."""
+        """Records of a new controller."""
         self._kept = Record()
         self.reset()
 
     def reset(self) -> None:
-        """Power-on: what is kept comes into force."""
+        """Power-on: activate the stored record."""
         self.active = self._kept
         self._staged: dict[int, bytes] = dict(zip((4, 5, 7, 8), _fields(self.active), strict=True))
         self._crc = zlib.crc32(self.active.content)
 
     def store(self) -> None:
-        """Keep what is in force over a reset."""
+        """Store the active record."""
         self._kept = self.active
 
     def forget(self) -> None:
-        """Keep a new controller's record; what is in force stays until the next reset."""
+        """Store default values; the active record stays until the next reset."""
         self._kept = Record()
 
     def read(self, sub: int) -> bytes:
-        """The bytes of a sub-index other than the reading."""
+        """Bytes of a sub-index, except the reading."""
         if sub == 0:
             return b"\x09"
         if sub == 6:

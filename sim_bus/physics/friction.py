@@ -6,7 +6,7 @@ from armlink.arrays import Array
 from sim_bus.effects.state import Imperfections
 
 RESTING = 1e-4
-"""Slower than this a joint rests, and its motor tells where it is heading [rad/s]."""
+"""Below this velocity a joint is at rest, and the motor torque gives its direction [rad/s]."""
 
 
 def dry_friction(state: Imperfections, velocity: Array, load: Array, motor_torque: Array) -> Array:

@@ -1,4 +1,4 @@
-"""What a compiled model says of poses, without moving it."""
+"""Statics of a compiled model: gravity torque and inertia at given poses."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Masses, centres of mass and inertias of the links in the physics: nominal, with effects, with what is attached."""
+"""Inertial parameters of the links in the physics: nominal, with effects and attached masses."""
 
 from typing import Any
 
@@ -14,14 +14,14 @@ class Inertials:
     """Keeps the nominal values of a compiled model and writes changed ones into it."""
 
     def __init__(self, model: Any, bodies: list[int], payload_body: int) -> None:
-        """`bodies` carry the links, base to tip; `payload_body` what is attached."""
+        """`bodies` carry the links, base to tip; `payload_body` the attached mass."""
         self._model, self._bodies, self._payload = model, bodies, payload_body
         self._mass: Array = model.body_mass.copy()
         self._com: Array = model.body_ipos.copy()
         self._inertia = _full_inertia(model)
 
     def apply(self, state: Imperfections, attached: Array) -> None:
-        """Set the model to nominal, plus the effects, plus `attached` (mass [kg], point in the last bar frame [m])."""
+        """Set the nominal values plus effects plus `attached` (mass [kg], point in the last bar frame [m])."""
         model, bodies = self._model, self._bodies
         mass, com, inertia = self._mass.copy(), self._com.copy(), self._inertia.copy()
         com[bodies] += state.mass_moment / mass[bodies, None]

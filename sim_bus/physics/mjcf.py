@@ -1,4 +1,4 @@
-"""The arm as a MuJoCo model: one body a link whose frame is the bar frame, joint ranges that are mechanical stops."""
+"""The arm as a MuJoCo model: one body per link in the bar frame, joint ranges as mechanical stops."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +14,7 @@ from sim_bus.sim_section import LinkBody, SimSection, sim_section
 
 STOP_IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)
 FRICTION_IMPEDANCE = (0.9999, 0.9999, 0.001, 0.5, 2.0)
-"""So close to 1 that what rests under stiction creeps by some µrad/s at most."""
+"""Solver impedance, close enough to 1 that creep under stiction is a few µrad/s."""
 TINY_INERTIA = 1e-9
 
 
@@ -25,15 +25,15 @@ class BuiltModel:
     model: Any
     """mujoco.MjModel."""
     bodies: tuple[int, ...]
-    """Of the links, base to tip."""
+    """Bodies of the links, base to tip."""
     payload_body: int
-    """Body fixed in the last link's bar frame that carries what is attached; almost massless when nothing is."""
+    """Body in the last link's bar frame for an attached mass; almost massless without one."""
     spec: Any
-    """mujoco.MjSpec that it was compiled from."""
+    """mujoco.MjSpec of the model."""
 
 
 def build_model(arm: ArmFile, state: Imperfections) -> BuiltModel:
-    """The arm's chain as a compiled model with a motor a joint, geared as `state` says.
+    """The arm's chain as a compiled model with a motor per joint, with transmissions by `state`.
 
     Raises BadInput where a model file does not fit.
     """
@@ -75,7 +75,7 @@ def _from_denavit_hartenberg(arm: ArmFile, section: SimSection) -> Any:
 
 
 def _from_model(arm: ArmFile, section: SimSection) -> Any:
-    """The model file's chain, everything that moves beside it frozen, its contacts and actuators left out."""
+    """The model file's chain, other joints frozen, without contacts and actuators."""
     path = arm.model_path
     try:
         spec = mujoco.MjSpec.from_file(str(path))
@@ -106,7 +106,7 @@ def _set_options(spec: Any, arm: ArmFile, section: SimSection) -> None:
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.iterations, option.ls_iterations = 50, 50
-    option.tolerance, option.ls_tolerance = 1e-12, 1e-6  # looser ones let stiction chatter
+    option.tolerance, option.ls_tolerance = 1e-12, 1e-6  # looser tolerances make stiction chatter
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     spec.compiler.balanceinertia = False
     spec.compiler.fusestatic = False
@@ -122,11 +122,11 @@ def _set_joint(joint: Any, section: SimSection) -> None:
 def _set_friction(what: Any, section: SimSection) -> None:
     what.solref_friction = [2 * section.step, 1.0]
     what.solimp_friction = FRICTION_IMPEDANCE
-    what.frictionloss = 1.0  # so that every motor has its row; the plant sets the level
+    what.frictionloss = 1.0  # so that every motor has a constraint row; the plant sets the level
 
 
 def _add_gear(spec: Any, place: int, names: list[str], state: Imperfections, section: SimSection) -> tuple[str, Any]:
-    """Add the transmission between a joint and its motor; the name and kind of what the motor drives."""
+    """Add the transmission between a joint and its motor; returns name and kind of the driven element."""
     name, of_joint, of_tendon = names[place], mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_TENDON
     others = [(names[other], state.coupling[place, other]) for other in np.flatnonzero(state.coupling[place])]
     if state.soft[place]:

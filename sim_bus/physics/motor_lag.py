@@ -1,4 +1,4 @@
-"""Motors that make their torque late: a pure delay, then a lag of first order."""
+"""Motors with delayed torque: a dead time, then a first-order lag."""
 
 import numpy as np
 
@@ -7,17 +7,17 @@ from sim_bus.effects.state import Imperfections
 
 
 class LateMotors:
-    """Torques asked for in, torques made out, step by step; arrays (n,)."""
+    """Turns demanded into actual torques, step by step; arrays (n,)."""
 
     def __init__(self, imperfections: Imperfections, torque: Array) -> None:
-        """Motors that make `torque` now [N·m]."""
+        """Motors that produce `torque` at the start [N·m]."""
         self._lag, self._delay = imperfections.actuator_lag, imperfections.actuator_delay
         self._made = torque / imperfections.actuator_gain
         self._time = 0.0
         self._asked: list[tuple[float, Array]] = [(0.0, self._made)]
 
     def torque(self, asked: Array, duration: float) -> Array:
-        """The torque made during the next `duration` [s], `asked` being asked for from now on."""
+        """Torque during the next `duration` [s], with `asked` demanded from now on."""
         due = self._delayed(asked)
         with np.errstate(divide="ignore"):
             share = np.where(self._lag > 0, 1.0 - np.exp(-duration / self._lag), 1.0)
@@ -26,7 +26,7 @@ class LateMotors:
         return self._made
 
     def _delayed(self, asked: Array) -> Array:
-        """What was asked for `delay` ago, held between steps."""
+        """Torque demanded `delay` ago, held between steps."""
         self._asked.append((self._time, asked))
         oldest = self._time - self._delay.max()
         while len(self._asked) > 1 and self._asked[1][0] <= oldest + 1e-12:

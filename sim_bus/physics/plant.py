@@ -25,14 +25,14 @@ from sim_bus.sim_section import sim_section
 
 FRICTION_AT_DOF = int(mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
 BRAKE_SHARE = 3.0
-"""What the holding brake holds, in maximal torques."""
+"""Holding torque of the brake, in units of the maximum torque."""
 
 
 class Plant:
-    """The arm as a physical thing. All arrays (n,) in joint order, true angles [rad], torques [N·m]."""
+    """Physics of the arm. All arrays (n,) in joint order, true angles [rad], torques [N·m]."""
 
     def __init__(self, arm: ArmFile, imperfections: Imperfections) -> None:
-        """Build it at rest in its start position (mid-range by default). Raises BadInput."""
+        """Build the arm at rest in its start position (default: mid-range). Raises BadInput."""
         self._arm, self._section, link = arm, sim_section(arm), arm.require_link()
         self.n = n = len(link.joints)
         self._attached = np.zeros(4)
@@ -47,7 +47,7 @@ class Plant:
         self.set_imperfections(imperfections)
 
     def _build(self, state: Imperfections) -> None:
-        """A model with motors geared as `state` says."""
+        """Build a model with the transmissions of `state`."""
         built = build_model(self._arm, state)
         self.model, names = built.model, self._arm.joint_names
         self.data = data = mujoco.MjData(self.model)
@@ -77,12 +77,12 @@ class Plant:
             self._gears.settle(data.qpos, torque)
             self._gears.settle_speed(data.qvel)
 
-    # ---- what it is
+    # ---- properties
 
     def set_imperfections(self, imperfections: Imperfections) -> None:
-        """Take over masses, base, friction and gears of `imperfections`; the joints' motion stays.
+        """Apply masses, base, friction and transmissions of `imperfections`; the joints' motion is kept.
 
-        Raises ValueError where they cannot be simulated.
+        Raises ValueError if they cannot be simulated.
         """
         rotors = rotor_inertia(self._arm.joint_names, imperfections, self._joint_inertia)
         if imperfections.gearing != self._gearing:
@@ -120,24 +120,24 @@ class Plant:
         mujoco.mj_forward(self.model, self.data)
 
     def attach_mass(self, mass: float, point: Array) -> None:
-        """Bolt a point mass [kg] on at `point` of the last link's bar frame [m]; it replaces an earlier one."""
+        """Attach a point mass [kg] at `point` of the last link's bar frame [m], in place of an earlier one."""
         self._attached = np.array([mass, *np.asarray(point, float)])
         self._inertials.apply(self._imperfections, self._attached)
         mujoco.mj_forward(self.model, self.data)
 
     def detach_mass(self) -> None:
-        """Take off what attach_mass put on."""
+        """Remove the attached mass."""
         self.attach_mass(0.0, np.zeros(3))
 
     def gravity_torque(self, q: Array) -> Array:
-        """True holding torque ∂V/∂q at the angles `q` (K, n) → (K, n), everything attached included."""
+        """True holding torque ∂V/∂q at the angles `q` (K, n) → (K, n), with the attached mass."""
         return gravity_torque(self.model, self._dof, q)
 
     def inertia(self, q: Array) -> Array:
         """Joint-space inertia matrix at the angles `q` (n,) → (n, n) [kg·m²]."""
         return inertia(self.model, self._dof, q)
 
-    # ---- what it does
+    # ---- state and steps
 
     @property
     def position(self) -> Array:
@@ -151,37 +151,37 @@ class Plant:
 
     @property
     def motor_position(self) -> Array:
-        """Angles at which the motors stand, counted at the joint: what position sensors turn with."""
+        """Motor angles referred to the joints, which position sensors measure."""
         return self.position if self._gears is None else self._gears.shown(self._positions)
 
     @property
     def motor_velocity(self) -> Array:
-        """Velocities of the motors, counted at the joint."""
+        """Motor velocities referred to the joints."""
         return self.velocity if self._gears is None else self._gears.shown(self._velocities)
 
     @property
     def motor_torque(self) -> Array:
-        """Torque that each motor makes."""
+        """Torque of each motor."""
         return self._motor_torques.copy()
 
     @property
     def lateness(self) -> Array:
-        """How late the motors make their torque [s]."""
+        """Delay of the motors' torque [s]."""
         return self._imperfections.actuator_delay + self._imperfections.actuator_lag
 
     @property
     def rotor_inertia(self) -> Array:
-        """Inertia of the motors that can turn while their link stands [kg·m²], infinite for the others."""
+        """Inertia of motors behind elastic transmissions [kg·m²]; infinite for rigid ones."""
         return np.where(self._imperfections.soft, self._rotor_inertia, np.inf)
 
     @property
     def drive_torque(self) -> Array:
-        """Torque that the drive believes its motor makes: current times nominal torque constant."""
+        """Motor torque estimated by the drive: current times nominal torque constant."""
         return self.motor_torque / self._imperfections.actuator_gain
 
     @property
     def link_torque(self) -> Array:
-        """Torque that each transmission passes on to its link: what an ideal joint torque sensor reads."""
+        """Torque that each transmission passes on to its link, as an ideal joint torque sensor measures it."""
         data, dof, gears = self.data, self._dof, self._gears
         if gears is not None:
             speed, acceleration = gears.turned(self._velocities), gears.turned(self._accelerations)
@@ -235,7 +235,7 @@ class Plant:
             level = level + slope
 
     def _asked(self, level: Array, duration: float) -> Array:
-        """What late motors make of the drive's torque; the ripple is taken off on the way to the link."""
+        """Torque of delayed motors for the drive's demand; ripple is subtracted on the way to the link."""
         assert self._motors is not None
         stiffness, damping, limit = self._servo
         position = self.motor_position
@@ -245,10 +245,10 @@ class Plant:
         self.data.qfrc_applied[self._dof] = -self._lost
         return self._motors.torque(np.clip(wanted, -limit, limit), duration)
 
-    # ---- inside
+    # ---- internals
 
     def _set_friction(self) -> None:
-        """Level of dry friction at the present velocity and load, or the brake's."""
+        """Set dry friction for the present velocity and load, or the brake's."""
         state = self._imperfections
         level = state.coulomb
         if not state.steady_friction:
@@ -257,7 +257,7 @@ class Plant:
         self._seat("frictionloss", np.where(self._braked, self._brake_torque, level))
 
     def _seat(self, quantity: str, values: Array) -> None:
-        """Give the motors their friction, damping or inertia."""
+        """Set friction, damping or inertia of the motors."""
         on_dofs = getattr(self.model, f"dof_{quantity}")
         if self._gears is None:
             on_dofs[self._dof] = values
@@ -265,7 +265,7 @@ class Plant:
             self._gears.seat(on_dofs, getattr(self.model, f"tendon_{quantity}"), values)
 
     def _friction_rows(self) -> Any:
-        """Places of the joints that have a friction constraint, in the order of the constraints."""
+        """Indices of the joints with a friction constraint, in the order of the constraints."""
         data = self.data
         if data.nf == self.n:
             return slice(0, self.n)

@@ -14,10 +14,10 @@ NOISE_BLOCK = 512
 
 
 class Sensors:
-    """What the joints' sensors read; all arrays (n,)."""
+    """Readings of the joints' sensors; all arrays (n,)."""
 
     def __init__(self, arm: ArmFile, truth: Truth, imperfections: Imperfections, seed: int) -> None:
-        """Sensors of `truth`; `seed` is the noise's."""
+        """Sensors with the parameters of `truth`; `seed` of the noise."""
         section, link = sim_section(arm).sensors, arm.require_link()
         rated = link.rated_torques
         n = len(rated)
@@ -36,7 +36,7 @@ class Sensors:
         self.set_imperfections(imperfections)
 
     def set_imperfections(self, imperfections: Imperfections) -> None:
-        """Take over the sensors' part of `imperfections`."""
+        """Apply the sensors' part of `imperfections`."""
         self._imperfections = state = imperfections
         self.gain = self._truth.gain * state.torque_gain * self._drift_gain
         self.offset = self._truth.offset + state.torque_offset + self._drift_offset
@@ -53,13 +53,13 @@ class Sensors:
         self._eccentric = bool(state.eccentricity.any())
 
     def drift(self, joint: int, gain: float, offset: float) -> None:
-        """From now on the torque sensor's gain is `gain` times as large and its offset `offset` [N·m] larger."""
+        """Multiply the torque sensor's gain by `gain` and add `offset` [N·m] from now on."""
         self._drift_gain[joint] *= gain
         self._drift_offset[joint] += offset
         self.set_imperfections(self._imperfections)
 
     def torque(self, link_torque: Array, time: float) -> Array:
-        """The raw readings `v` [N·m] of the transmitted torques at `time` [s]."""
+        """Raw readings `v` [N·m] of the transmitted torques at `time` [s]."""
         if self._delayed:
             link_torque = self._delay(link_torque, time)
         if self._bent:
@@ -77,21 +77,21 @@ class Sensors:
         return counts * self.torque_step
 
     def position_counts(self, angle: Array) -> Array:
-        """The readings `φ` of true angles in the encoders' whole increments."""
+        """Readings `φ` of true angles in whole encoder increments."""
         return np.rint(self.reading_of(angle) / self.position_step)
 
     def reading_of(self, angle: Array) -> Array:
-        """The exact `φ` with `θ = position_gain·φ + position_offset + amplitude·sin(φ + phase)`."""
+        """Exact solution `φ` of `θ = position_gain·φ + position_offset + amplitude·sin(φ + phase)`."""
         reading = (angle - self.position_offset) / self.position_gain
         if self._eccentric:
             amplitude, phase = self._imperfections.eccentricity.T
-            for _ in range(8):  # contracts by amplitude / gain each time
+            for _ in range(8):  # fixed-point iteration, contracts by amplitude / gain
                 bent = amplitude * np.sin(reading + phase)
                 reading = (angle - self.position_offset - bent) / self.position_gain
         return reading
 
     def angle_of(self, reading: Array) -> Array:
-        """The true angle θ that shows as `reading`."""
+        """True angle θ for a reading φ."""
         angle = self.position_gain * reading + self.position_offset
         if self._eccentric:
             amplitude, phase = self._imperfections.eccentricity.T
@@ -107,7 +107,7 @@ class Sensors:
         return np.clip(torque, -state.torque_saturation, state.torque_saturation)
 
     def _delay(self, torque: Array, time: float) -> Array:
-        """Each joint's torque as it was `torque_delay` ago, linear between samples."""
+        """Each joint's torque `torque_delay` ago, interpolated linearly between samples."""
         delays = self._imperfections.torque_delay
         self._late.append((time, torque))
         while len(self._late) > 2 and self._late[1][0] <= time - delays.max():

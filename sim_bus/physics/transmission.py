@@ -1,11 +1,11 @@
-"""Transmissions that are no rigid one-to-one gears: motors behind springs with play, motors that other joints turn too.
+"""Elastic and coupled transmissions: motors behind springs with play, motors that turn with several joints.
 
-Motor i turns by `φ_i = θ_i + Σ_j c_ij·θ_j` where its gear is rigid, c the coupling. Behind a spring it is a mass of
-its own: the gear passes on `s = K·stretch + d·(rate of twist)`, where the twist is `φ_i − θ_i − Σ_j c_ij·θ_j` and the
-stretch what of it goes beyond half the play to either side; within the play, and where the sum would pull, it passes on
-nothing. The drives know the coupling and work in joint angles: their encoder shows `φ_i − Σ_j c_ij·θ_j`, and a torque
-on joint i alone is asked of all motors that it takes. So coupling shows in what is lost: a motor's friction, ripple and
-rotor inertia follow its own angle, and load joint j by c_ij.
+With a rigid gear, motor i turns by `φ_i = θ_i + Σ_j c_ij·θ_j`, with the coupling c. Behind a spring it is a separate
+mass: the gear transmits `s = K·stretch + d·(rate of twist)`, with the twist `φ_i − θ_i − Σ_j c_ij·θ_j` and the stretch
+as its part beyond half the play to either side. It transmits nothing within the play, or if the sum would pull. The
+drives know the coupling and work in joint angles: their encoder shows `φ_i − Σ_j c_ij·θ_j`, and a torque on joint i
+alone is distributed to all motors involved. Coupling therefore appears in the losses only: a motor's friction, ripple
+and rotor inertia follow its own angle, and load joint j by c_ij.
 """
 
 from typing import Any
@@ -16,22 +16,22 @@ from armlink.arrays import Array
 from sim_bus.effects.state import Imperfections
 
 ROTOR_SHARE = 0.1
-"""A motor behind a spring has at least this share of its joint's inertia, where nothing says more."""
+"""Default inertia of a motor behind a spring, as a share of its joint's inertia."""
 DAMPING_RATIO = 0.04
-"""Of the spring with the rotor on it."""
+"""Damping ratio of rotor and spring."""
 PHASE_A_STEP = 0.25
-"""Most that the rotor's oscillation on the spring may turn in one step of the physics [rad]."""
+"""Maximum phase of the rotor's oscillation on the spring per physics step [rad]."""
 FINEST_STEP = 5e-5
-"""Finest step that is taken for a stiff spring [s]."""
+"""Minimum step for a stiff spring [s]."""
 HARD_GEAR_STEP = 2.5e-4
-"""Step for which a gear with play, but without an elasticity, is as stiff as can be [s]; late motors take it too."""
+"""Step for gears with play but no elasticity, made as stiff as it allows, and for delayed motors [s]."""
 
 
 class Transmissions:
-    """Of one built model; arrays (n,) over joints, (s,) over those with springs."""
+    """Transmissions of a built model; arrays (n,) over joints, (s,) over joints with springs."""
 
     def __init__(self, model: Any, names: tuple[str, ...], state: Imperfections) -> None:
-        """Of a model that was built for `state`; configure() comes next."""
+        """Transmissions of a model built for `state`; to be followed by configure()."""
         self._n, nv = len(names), model.nv
         self._links = np.array([model.joint(name).dofadr[0] for name in names])
         self.soft = np.flatnonzero(state.soft)
@@ -52,7 +52,7 @@ class Transmissions:
         self._owner |= {(False, int(t)): int(j) for j, t in zip(self._shared, self._tendons, strict=True)}
 
     def configure(self, state: Imperfections, rotors: Array) -> None:
-        """Take over stiffness and play; `rotors` (n,) as rotor_inertia() says."""
+        """Set stiffness and play; `rotors` (n,) from rotor_inertia()."""
         rotor, given = rotors[self.soft], state.elasticity[self.soft]
         self.stiffness = np.where(np.isfinite(given), given, rotor * (PHASE_A_STEP / HARD_GEAR_STEP) ** 2)
         self._half_play = state.backlash[self.soft] / 2
@@ -61,16 +61,16 @@ class Transmissions:
         self.step_time = PHASE_A_STEP / fastest if fastest else np.inf
         """Longest step that resolves the springs [s]."""
 
-    # ---- where motors have what
+    # ---- parameters of the motors
 
     def seat(self, on_dofs: Array, on_tendons: Array, values: Array) -> None:
-        """Give each motor its share of friction, damping or inertia, there where the motor turns."""
+        """Set each motor's friction, damping or inertia at the degree of freedom where it turns."""
         on_dofs[self._links] = np.where(self._rigid, values, 0.0)
         on_dofs[self.rotors] = values[self.soft]
         on_tendons[self._tendons] = values[self._shared]
 
     def friction(self, data: Any, dof_kind: int) -> Array:
-        """Dry friction's torque on each motor now; `dof_kind` is the constraints' type at degrees of freedom."""
+        """Present dry friction torque on each motor; `dof_kind` is the constraint type at degrees of freedom."""
         torque, rows = np.zeros(self._n), slice(data.ne, data.ne + data.nf)
         kinds, places = data.efc_type[rows], data.efc_id[rows]
         for kind, place, force in zip(kinds, places, data.efc_force[rows], strict=True):
@@ -80,14 +80,14 @@ class Transmissions:
     # ---- motion of the motors
 
     def settle(self, position: Array, torque: Array) -> None:
-        """Put the rotors where they carry `torque` (n,) at rest; `position` (nv,) is changed."""
+        """Place the rotors so that they carry `torque` (n,) at rest; changes `position` (nv,)."""
         load = torque[self.soft]
         stretch = load / self.stiffness + self._half_play * np.sign(load)
         position[self.rotors] = 0.0
         position[self.rotors] = stretch - self._twist @ position
 
     def settle_speed(self, velocity: Array) -> None:
-        """Let the rotors turn with their links; `velocity` (nv,) is changed."""
+        """Make the rotors turn with their links; changes `velocity` (nv,)."""
         velocity[self.rotors] = 0.0
         velocity[self.rotors] = -self._twist @ velocity
 
@@ -97,14 +97,14 @@ class Transmissions:
         return turned
 
     def shown(self, dofs: Array) -> Array:
-        """What the drives' encoders see of it, in joint angles."""
+        """Values at the drives' encoders, in joint coordinates."""
         shown: Array = self._reading @ dofs
         return shown
 
     # ---- torques
 
     def spring(self, data: Any) -> Array:
-        """Torque that each spring passes on to its link now (s,)."""
+        """Present torque of each spring on its link (s,)."""
         twist = self._twist @ data.qpos
         stretch = twist - np.minimum(np.maximum(twist, -self._half_play), self._half_play)
         torque = self.stiffness * stretch + self._damping * (self._twist @ data.qvel)
@@ -116,14 +116,14 @@ class Transmissions:
         return forces
 
     def on_links(self, data: Any, made: Array, passed: Array) -> Array:
-        """Torque on each link: what rigid gears have `passed` of what motors `made`, what springs pass on, coupling."""
+        """Torque on each link: `passed` by rigid gears of the motors' `made` torque, plus springs and coupling."""
         own = passed.copy()
         own[self.soft] = self.spring(data)
         return own + self._coupling.T @ (own - made)
 
 
 def rotor_inertia(names: tuple[str, ...], state: Imperfections, inertia: Array) -> Array:
-    """Inertia of the motors behind springs, 0 for the others, where the joints have `inertia` (n,) [kg·m²].
+    """Inertia of the motors behind springs, 0 for the others, with joint inertias `inertia` (n,) [kg·m²].
 
     Raises ValueError where a spring is too stiff to be simulated.
     """
@@ -139,10 +139,10 @@ def rotor_inertia(names: tuple[str, ...], state: Imperfections, inertia: Array) 
 
 
 def rotor_name(joint: str) -> str:
-    """Name in the model of the motor behind a spring."""
+    """Name of the motor behind a spring in the model."""
     return f"rotor {joint}"
 
 
 def tendon_name(joint: str) -> str:
-    """Name in the model of the angle of a motor that turns with several joints."""
+    """Name of the angle of a coupled motor in the model."""
     return f"motor angle {joint}"

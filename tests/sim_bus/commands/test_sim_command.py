@@ -174,5 +174,5 @@ def test_orders_through_a_pipe_change_the_running_arm(ends: tuple[can.BusABC, ca
 
 def test_a_file_is_no_pipe(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(BadInput, match="no named pipe"):
+    with pytest.raises(BadInput, match="is not a named pipe"):
         ControlPipe(tmp_path / "file")
