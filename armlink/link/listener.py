@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     import can
 
 SLEEP = 0.04
-"""Frames with a time stamp may wait for this long [s]: ten cycles at 250 Hz, half of what a small receive queue holds of
-a full bus."""
+"""Frames with a time stamp may wait for this long [s]: ten cycles at 250 Hz, half of what a small receive queue holds
+of a full bus."""
 COMMAND = "Hhi"
 """RPDO1: control word, target torque, target position."""
 NO_COMMAND = bytes(8)
