@@ -8,7 +8,7 @@ from armlink.bus.bus_watchdog import BusWatch
 from armlink.canopen import emcy
 from armlink.canopen import object_dictionary as objects
 from armlink.canopen.cia402 import MODE_NAMES, Mode, State, state_of
-from armlink.errors import BusFault, Silence
+from armlink.errors import BusFault, Silence, Stall
 from armlink.link import gate
 from armlink.link.gate import OFF, JointLimits, Passed, Seen
 from armlink.link.types import Command
@@ -49,7 +49,8 @@ def find_fault(known: Known, now: float, modes: Sequence[int], max_age: float) -
     if known.emergencies or known.restarted or known.node_states:
         fault = node_fault(known)
         if fault:
-            return BusFault(fault)
+            watchdog = bool(known.emergencies) and next(iter(known.emergencies))[1] in WATCHDOGS
+            return Stall(fault) if watchdog else BusFault(fault)
     oldest = min(known.seen)
     if not now - oldest <= max_age:
         return _silence(known, now, max_age)

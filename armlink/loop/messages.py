@@ -9,7 +9,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.errors import ArmlinkError
-from armlink.link.types import Controller, Sample, Setpoints
+from armlink.link.types import Sample, Setpoints
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,8 @@ class Run:
     """A controller to run."""
 
     id: int
-    controller: Controller
+    controller: bytes
+    """A pickled Controller: what it imports may take longer than a cycle, so that the loop unpickles it beside them."""
 
 
 @dataclass(frozen=True)

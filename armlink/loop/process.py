@@ -5,12 +5,14 @@ when there is nothing left. When the job ends or is killed the joints are stoppe
 joints are under torque control, they are held where they stand; under position control they keep their targets.
 """
 
+import pickle
 import signal
 import socket
 import sys
 import time
 from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 
@@ -18,13 +20,15 @@ from armlink.errors import ArmlinkError, Stall
 from armlink.link.gate import TORQUE_MODES
 from armlink.link.guard import Crossed
 from armlink.link.link import Link
-from armlink.link.types import Command, Sample, Setpoints
+from armlink.link.types import Command, Controller, Sample, Setpoints
 from armlink.loop.channel import Channel, Closed
 from armlink.loop.messages import Alive, Answer, Call, Cut, Open, Play, Run, Stopped, pack
 from armlink.loop.realtime import prepare
 
 IDLE = 0.05
 """Longest wait for the job while the joints are not enabled [s]."""
+SWITCH = 5e-4
+"""Longest time for which another thread of this process holds up a cycle [s]."""
 SILENT = 3.0
 """A job that says nothing for this long while joints are under torque control is gone [s]."""
 ENABLING = ("enable", "recover")
@@ -42,6 +46,9 @@ class DriveLoop:
         self._id, self._row = 0, -1
         self._controlled = False
         """Whether a controller is being run."""
+        self._beside = ThreadPoolExecutor(1)
+        self._unpickled: Future[Controller] | None = None
+        """A controller that is on its way."""
         self._heard = time.monotonic()
 
     def run(self) -> None:
@@ -66,18 +73,19 @@ class DriveLoop:
                 self._chunks.append(setpoints)
             case Run(id, controller):
                 self._begin(id)
-                self._source, self._controlled = self._link.run(controller), True
+                self._unpickled = self._beside.submit(pickle.loads, controller)
             case Cut() if self._controlled:  # its last torque is right for its last sample alone
                 self._hold_here()
             case Cut():
                 self._chunks.clear()
-                self._source = None
+                self._source = self._unpickled = None
             case Alive():
                 pass
 
     def _begin(self, id: int) -> None:
         self._chunks.clear()
         self._source, self._id, self._row, self._controlled = None, id, -1, False
+        self._unpickled = None
 
     def _call(self, call: Call) -> None:
         link = self._link
@@ -112,6 +120,9 @@ class DriveLoop:
         self._channel.flush()
 
     def _next(self) -> tuple[int, Sample]:
+        if self._unpickled is not None and self._unpickled.done():
+            self._source, self._controlled = self._link.run(self._unpickled.result()), True
+            self._unpickled = None
         while True:
             if self._source is None and self._chunks:
                 self._source = self._link.play(self._chunks.popleft())
@@ -128,7 +139,7 @@ class DriveLoop:
     def _hold_here(self) -> None:
         """Every joint under position control where it stands."""
         self._chunks.clear()
-        self._source, self._controlled = None, False
+        self._source, self._controlled, self._unpickled = None, False, None
         self._last = Command.hold(self._link.latest_position)
 
     def _mind_silence(self) -> None:
@@ -154,6 +165,7 @@ def main(number: int) -> None:
             return
         with link:
             channel.put(Answer(0, prepare()))
+            sys.setswitchinterval(SWITCH)
             DriveLoop(channel, link).run()
     except Closed:
         return

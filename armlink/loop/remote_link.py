@@ -2,6 +2,7 @@
 
 import contextlib
 import itertools
+import pickle
 import socket
 import subprocess
 import sys
@@ -173,7 +174,7 @@ class RemoteLink:
     def run(self, controller: Controller) -> Samples:
         """As Link.run, in the other process."""
         number = next(self._numbers)
-        self._put(Run(number, controller))
+        self._put(Run(number, pickle.dumps(controller)))
         yield from self._take(number, sys.maxsize)
 
     def catch_up(self) -> None:

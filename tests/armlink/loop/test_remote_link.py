@@ -34,6 +34,7 @@ CONTENT = {
     },
     "link": {
         "rate": 100,
+        "deadline": 0.5,
         "joints": [
             {"name": "j1", "node": 1, "rated_torque": 40.0, "max_torque": 40.0},
             {"name": "j2", "node": 2, "rated_torque": 20.0, "max_torque": 20.0},
@@ -92,11 +93,11 @@ def cycles(link: RemoteLink, command: Command) -> None:
 
 def test_a_job_that_stands_still_costs_no_cycle(started: tuple[RemoteLink, subprocess.Popen[bytes]]) -> None:
     link, _ = started
-    targets = rows(link, 1.0, 0.3)
+    targets = rows(link, 2.0, 0.3)
     samples = []
     for sample in link.play(Setpoints.follow(targets)):
         if len(samples) == 10:
-            time.sleep(0.6)  # six deadlines
+            time.sleep(1.2)  # more than two deadlines
         samples.append(sample)
     assert len(samples) == len(targets)
     assert np.abs(samples[-1].position - targets[-1]).max() < 0.05
@@ -173,11 +174,11 @@ def test_a_loop_that_stands_still_says_that_the_host_was_late(
     for _ in range(20):
         link.cycle(hold)
     os.kill(link.pid, signal.SIGSTOP)
-    time.sleep(1.0)
+    time.sleep(2.0)
     os.kill(link.pid, signal.SIGCONT)
-    with pytest.raises(HostLate, match=r"the host was \d+ ms late \(limit 100 ms\)") as late:
+    with pytest.raises(HostLate, match=r"the host was \d+ ms late \(limit 500 ms\)") as late:
         cycles(link, hold)
-    assert 0.5 < late.value.late < 5.0
+    assert 1.0 < late.value.late < 10.0
     sample = link.recover()
     assert all(state_of(int(status)) is State.ENABLED for status in sample.status)
     assert np.isfinite(link.cycle(Command.hold(link.position_sent)).position).all()
@@ -214,7 +215,7 @@ def test_the_joints_stop_when_job_or_loop_is_killed(tmp_path: Path, who: str) ->
         assert job.stdout is not None
         loop = int(job.stdout.readline())
         os.kill(job.pid if who == "job" else loop, signal.SIGKILL)
-        time.sleep(1.0)
+        time.sleep(2.5)
         job.kill()
         job.wait()
         end = time.monotonic() + 10
