@@ -34,6 +34,10 @@ class GravityModel:
         self._moments = self.beta[::2] + 1j * self.beta[1::2]
         self._twists = [without_rounding(alpha) for alpha in arm.alpha]
 
+    def __reduce__(self) -> "tuple[Callable[[Arm, Array], GravityModel], tuple[Arm, Array]]":
+        """Pickled without the function of `one`, which is compiled again where it is unpickled."""
+        return _ready, (self.arm, self.beta)
+
     @cached_property
     def one(self) -> Callable[[Array], Array]:
         """Holding torque (n,) [N·m] at one pose q (n,) [rad] in a few microseconds, as a function without checks."""
@@ -74,6 +78,13 @@ class GravityModel:
             np.multiply(gravity, space.moment[i], out=space.moment[i])
             _turn_about_x(ca, sa, gravity.imag, z, gravity.imag, next_z, space.spare)
             z, next_z = next_z, z
+
+
+def _ready(arm: Arm, beta: Array) -> GravityModel:
+    """A model whose `one` is compiled already."""
+    model = GravityModel(arm, beta)
+    _ = model.one
+    return model
 
 
 class _Space:

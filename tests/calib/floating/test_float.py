@@ -1,6 +1,8 @@
 """Float: the simulated arm stays where a hand leaves it, and nothing a hand does leads past what is allowed."""
 
+import pickle
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from armlink.link.link import Link
 from armlink.link.types import Command, Sample
 from calib.arm.kinematics import gcomp_arm
 from calib.floating.controller import FloatConfig, FloatControl
-from calib.floating.run import run_float
+from calib.floating.run import Floating, run_float
 from gcomp.gravity.torque import gravity_torque
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
@@ -210,3 +212,10 @@ def test_a_joint_without_stops_floats_too() -> None:
     described = replace(gcomp_arm(arm), lower=np.full(7, -np.inf), upper=np.full(7, np.inf))
     law = FloatControl(described, np.zeros(14), np.ones(7), np.ones(7), 0.004)
     assert np.isfinite(law.torque(np.zeros(7))).all()
+
+
+def test_the_float_passes_to_the_process_that_makes_the_cycles(control: FloatControl) -> None:
+    position = np.zeros(len(control.speed))
+    floating = pickle.loads(pickle.dumps(Floating(control, position)))
+    sample = SimpleNamespace(position=position, t=0.0)
+    np.testing.assert_array_equal(floating.command(sample).torque, Floating(control, position).command(sample).torque)
