@@ -9,6 +9,8 @@ import numpy as np
 from armlink.arrays import Array
 
 V = TypeVar("V", float, Array)
+GAIN_RANGE = (0.5, 2.0)
+"""Gains beyond these are no gains of a sensor; none is ever put into force."""
 REAL32_STEP = 1e-6
 """Relative difference that REAL32 in a controller may make to a value, the rounding of decimal output included."""
 
@@ -55,6 +57,22 @@ class TorqueCalibration(Generic[V]):
     def matches(self: "TorqueCalibration[float]", held: "TorqueCalibration[float]") -> bool:
         """Whether `held`, read from a controller, equals this in REAL32; False with NaN."""
         return same_real32(self.gain, held.gain) and same_real32(self.offset, held.offset)
+
+
+@dataclass(frozen=True)
+class Calibration(TorqueCalibration[float]):
+    """Torque calibration of one joint that is in force, in its controller or in the host, and of which record it is."""
+
+    record_id: int = 0
+    date: int = 0
+    """Date of the record [s since 1970]; 0 if none was written."""
+    crc: int = 0
+    """CRC-32 as the controller reports it; ignored in a calibration that is to be written."""
+
+    @property
+    def is_blank(self) -> bool:
+        """Whether no calibration was ever written: gain 1, offset 0, record 0."""
+        return (self.gain, self.offset, self.record_id) == (1.0, 0.0, 0)
 
 
 def per_joint(calibrations: Iterable[TorqueCalibration[float]]) -> TorqueCalibration[Array]:

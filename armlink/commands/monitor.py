@@ -77,12 +77,12 @@ def _table(title: str, answer: dict[str, Any]) -> "Group":
     for joint in answer["joints"]:
         table.add_row(
             joint["joint"],
-            str(joint["node"]),
+            str(joint.get("node", joint.get("id", "—"))),
             _number(joint["position"], "{:+.4f}"),
             _number(joint["torque"], "{:+.2f}"),
             _number(joint["motor_torque"], "{:+.2f}"),
             joint["state"] or "—",
-            joint["nmt"] or "—",
+            joint.get("nmt") or "—",
             _number(joint["age"], "{:.1f}"),
         )
     bus = answer["bus"]

@@ -1,11 +1,13 @@
 """What all drive families have in common: names, power states, faults told by readings. Families derive from it."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from armlink.arm_file import LinkJoint
+from armlink.bus.port import Frame
 from armlink.drives.family import Ask
-from armlink.drives.orders import Order, Power, Reading
+from armlink.drives.orders import DriveIdentity, Order, Power, Reading
 from armlink.drives.traits import Traits
 from armlink.errors import BusFault, Stall
 
@@ -80,6 +82,10 @@ class BasicDrives:
                 return BusFault(f"{self.where(joint)}: power is {power.value}, expected on")
         return None
 
+    def has_restarted(self) -> bool:
+        """See Drives: no drive tells."""
+        return False
+
     def own_stop(self) -> str:
         """See Drives."""
         for joint, power in enumerate(self.powers):
@@ -97,6 +103,34 @@ class BasicDrives:
     def forget(self) -> None:
         """See Drives."""
         self.faults = [""] * self.m
+
+    def missing(self, ask: Ask) -> list[int]:
+        """See Drives: those that `identify` does not find."""
+        return [each.joint for each in self.identify(ask) if not each.present]
+
+    def identify(self, ask: Ask) -> list[DriveIdentity]:
+        """See Drives."""
+        raise NotImplementedError
+
+    def cycle_ids(self) -> frozenset[int]:
+        """See Drives: none."""
+        return frozenset()
+
+    def reading_ids(self) -> Mapping[int, int]:
+        """See Drives: all that belongs to one joint."""
+        return {can_id: joint for can_id, joint in self.routes().items() if joint >= 0}
+
+    def routes(self) -> Mapping[int, int]:
+        """See Drives."""
+        raise NotImplementedError
+
+    def details(self, joint: int, sends: bool) -> Mapping[str, Any]:
+        """See Drives: its id on the bus."""
+        return {"id": self.rows[joint].settings.address}
+
+    def poll(self, first: bool) -> list[Frame]:
+        """See Drives: none."""
+        return []
 
     def recover(self, ask: Ask) -> None:
         """See Drives: nothing to do."""

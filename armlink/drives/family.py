@@ -20,14 +20,16 @@ Everything runs in one thread. No method may block, but those that get an `Ask`.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import Frame
+from armlink.drives.board import Board
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup, power_name
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
 from armlink.errors import BusFault
+from armlink.torque_calibration import Calibration
 
 T = TypeVar("T")
 
@@ -83,6 +85,10 @@ class Drives(Protocol):
         """Identifiers that only a host sends, and what they are: heard from another, they are a second host."""
         ...
 
+    def missing(self, ask: Ask) -> list[int]:
+        """Drives that do not answer. Sets nothing."""
+        ...
+
     def identify(self, ask: Ask) -> list[DriveIdentity]:
         """Ask every drive what it is; one that does not answer is there with `present` false. Sets nothing."""
         ...
@@ -132,6 +138,10 @@ class Drives(Protocol):
         """
         ...
 
+    def has_restarted(self) -> bool:
+        """Whether a drive has restarted since the set-up, so that its settings are lost."""
+        ...
+
     def own_stop(self) -> str:
         """The first drive that stopped by itself because it did not hear its host, in words; empty if none."""
         ...
@@ -152,11 +162,59 @@ class Drives(Protocol):
         """Temperature of a drive [°C], NaN if it has none."""
         ...
 
+    def cycle_ids(self) -> frozenset[int]:
+        """Identifiers of a frame that begins a cycle (SYNC); empty where none does."""
+        ...
+
+    def reading_ids(self) -> Mapping[int, int]:
+        """Identifiers of the frames that bring a position → joint; for statistics of the cycle."""
+        ...
+
+    def details(self, joint: int, sends: bool) -> Mapping[str, Any]:
+        """What else the family knows of a drive, by name, for the monitor; `sends`: its readings come."""
+        ...
+
+    def poll(self, first: bool) -> list[Frame]:
+        """Frames by which a monitor without a host makes the drives send readings, and that command nothing; empty
+        where there are none. `first`: what comes before all others."""
+        ...
+
     def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
         """Joint (or BROADCAST) and order of a host's frame, for listening beside another host; None if it is none.
 
         Fields that the frame does not tell are NaN.
         """
+        ...
+
+
+@runtime_checkable
+class FillsBoard(Protocol):
+    """Drives whose cyclic frames fill the board without a Reading between, where every microsecond counts."""
+
+    def fill(self, board: Board, places: Sequence[int]) -> dict[int, Callable[[bytes], None]]:
+        """Identifier → what puts such a frame's data on the board; `places` of these joints on it."""
+        ...
+
+
+@runtime_checkable
+class KeepsCalibration(Protocol):
+    """Drives that keep gain and offset of their torque reading, and apply them."""
+
+    def read_calibration(self, joint: int, ask: Ask) -> Calibration:
+        """The calibration that is active; raises BusFault."""
+        ...
+
+    def write_calibration(self, joint: int, ask: Ask, calibration: Calibration, store: bool = False) -> Calibration:
+        """Make a calibration active (`store`: in flash too), read it back; raises BadInput, BusFault."""
+        ...
+
+
+@runtime_checkable
+class Replays(Protocol):
+    """Drives whose frames can be made again from a recording."""
+
+    def replayed(self, first: bool, readings: Sequence[Reading]) -> list[Frame]:
+        """Frames by which host and drives would have brought these readings in a cycle; `first`: of the recording."""
         ...
 
 

@@ -21,6 +21,15 @@ class Mode(IntEnum):
     TORQUE = 10
 
 
+MODE_NAMES = {
+    Mode.OFF: "no mode",
+    Mode.PROFILE_POSITION: "profile position",
+    Mode.PROFILE_TORQUE: "profile torque",
+    Mode.POSITION: "cyclic synchronous position",
+    Mode.TORQUE: "cyclic synchronous torque",
+}
+
+
 class Power(Enum):
     """Power of a drive, as its frames tell it, and as an order wants it (ON, STOPPED or OFF)."""
 

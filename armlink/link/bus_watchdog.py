@@ -25,7 +25,8 @@ class BusWatch:
         self._doubled: set[int] = set()
         self._double_cycles = [0] * joints
         self._crowded_cycles = 0
-        self._last: int | None = None
+        self.last_id: int | None = None
+        """Identifier of the newest frame that was no reading."""
         self.syncs = 0
         """SYNCs sent."""
         self.readings = [0] * joints
@@ -37,7 +38,7 @@ class BusWatch:
     def clear(self) -> None:
         """Reset everything for a new start of the link."""
         self.restarted.clear()
-        self.syncs, self.readings = 0, [0] * len(self.readings)
+        self.syncs, self.readings[:] = 0, [0] * len(self.readings)
         self.intruder = ""
         """Description of a frame received that only the host may send; empty if there was none."""
         self.flooded = False
@@ -58,7 +59,7 @@ class BusWatch:
 
     def other(self, can_id: int) -> None:
         """A frame arrived that is no process data of a joint."""
-        self._last = can_id
+        self.last_id = can_id
         if can_id in self._ours and not self.intruder:
             self.intruder = f"{self._ours[can_id]} ({can_id:03X}h)"
 
@@ -84,4 +85,4 @@ class BusWatch:
     @property
     def last(self) -> str:
         """COB-ID of the newest frame that was no process data: the probable source of a flood."""
-        return "none" if self._last is None else f"{self._last:03X}h"
+        return "none" if self.last_id is None else f"{self.last_id:03X}h"

@@ -7,91 +7,84 @@ from collections.abc import Sequence
 import numpy as np
 
 from armlink.clock import Clock
-from armlink.drives.canopen.cia402 import Control, Mode, State, next_control, set_point_control, state_of, supports
-from armlink.drives.canopen.pdo import STATUS_DECIMATION
+from armlink.drives.family import Drives
+from armlink.drives.orders import Mode, Order, Power
 from armlink.errors import BusFault, HostLate, Refused, Silence
 from armlink.link.cyclic_exchange import Loop
-from armlink.link.faults import Known, bus_fault, find_fault, node_fault, refusal, stopped_itself, stuck
-from armlink.link.gate import JointLimits, Passed, Seen, pass_gate, start_from
+from armlink.link.faults import bus_fault, refusal, silence
+from armlink.link.gate import JointLimits, Seen, beyond, hold_at, pass_gate, start_from
+from armlink.link.integral import Integral
 from armlink.link.types import Command, Sample
 
 ENABLE_SECONDS = 3.0
-"""The joints must reach a commanded CiA 402 state within this time."""
+"""The joints must reach a commanded power state within this time."""
 STOP_CYCLES = 25
-"""Cycles in which a quick stop is repeated until every joint reports it."""
+"""Cycles in which a stop is repeated until every joint reports it."""
 MEMORY = 1.0
 """So long after the host was late, joints that stop by themselves are put down to it [s]: their watches run on the
 heartbeat too, which they may miss for twice `link.deadline`."""
 BLAME_SHARE = 0.5
 """A host that was late by this share of `link.deadline` explains a watchdog that acts at the whole of it."""
-OFF, PROFILE_POSITION, PROFILE_TORQUE = int(Mode.OFF), int(Mode.PROFILE_POSITION), int(Mode.PROFILE_TORQUE)
-ENABLE, QUICK_STOP = int(Control.ENABLE), int(Control.QUICK_STOP)
-DISABLE_VOLTAGE = int(Control.DISABLE_VOLTAGE)
+SLOWEST = 4
+"""Motor torque and velocity come in every this many cycles, at the least often."""
+OFF, POSITION = int(Mode.OFF), int(Mode.POSITION)
+ALWAYS = (OFF, POSITION, int(Mode.TORQUE))
+"""Modes that the set-up has checked; profile modes are checked in each command."""
 
 
 class Commander:
-    """Turns commands into frames for n joints, through the gate and nothing else, and readings into faults."""
+    """Turns commands into orders for n joints, through the gate and nothing else, and readings into faults."""
 
     def __init__(
         self, loop: Loop, clock: Clock, names: tuple[str, ...], period: float, max_age: float, lock_step: bool
     ) -> None:
-        """`max_age` is the oldest command and reading that count [s]; in lock-step a SYNC is the period itself."""
+        """`max_age` is the oldest command and reading that count [s]; in lock-step a cycle is the period itself."""
         self.names, self.n, self.clock, self.period, self.max_age = names, len(names), clock, period, max_age
         self.limits: list[JointLimits] = []
-        self.passed: list[Passed] = []
-        """Contents of the last frames."""
+        self.passed: list[Order] = []
+        """Orders of the last frames."""
         self.loop, self._lock_step = loop, lock_step
-        self._slow_age = max_age + STATUS_DECIMATION * period
-        self._supported: list[int] = []
-        self._modes = [OFF] * self.n
+        loop.verify = self._verify
+        self._slow_age = max_age + SLOWEST * period
+        self._modes_of: list[frozenset[int]] = [frozenset()] * self.n
         self._commanded = [OFF] * self.n
-        self._mode_since = [-math.inf] * self.n
-        self._known = Known(
-            names,
-            loop.statuses,
-            loop.displays,
-            loop.seen,
-            self._mode_since,
-            loop.emergencies,
-            loop.node_states,
-            loop.watch.restarted,
-        )
+        self._integrals: list[Integral | None] = [None] * self.n
+        self._with_gains = False
+        self._seen_now: list[Seen] = []
         self._due = 0.0
         self.late = 0.0
         """How late the present cycle began [s]."""
         self._gap, self._gap_at = 0.0, -math.inf
-        """Longest time without a SYNC of late, less a period, and when it ended [s]."""
+        """Longest time without commands of late, less a period, and when it ended [s]."""
 
-    def begin(self, limits: list[JointLimits], passed: list[Passed], supported: list[int]) -> None:
-        """Take over configured nodes: limits, what the first cycle starts from, supported modes (6502h)."""
-        self.limits, self.passed, self._supported = limits, passed, supported
+    def begin(self, limits: list[JointLimits], passed: list[Order], modes: list[frozenset[int]]) -> None:
+        """Take over drives that are set up: limits, what the first cycle starts from, modes that each has."""
+        self.limits, self.passed, self._modes_of = limits, passed, modes
+        self._integrals = [Integral() if each.kp else None for each in limits]
+        self._with_gains = any(each is not None for each in self._integrals)
         self._due = self.clock.now()
 
     def command(self, command: Command) -> Sample:
         """One cycle of a command; raises Refused where the gate refuses it, BusFault for a fault."""
         modes, torques, positions = self._numbers(command)
         self._await_turn()
-        loop, passed, now = self.loop, self.passed, self.clock.now()
+        passed, now = self.passed, self.clock.now()
         age = 0.0 if command.t is None else now - command.t
         fault = self._fault(now, self._commanded)
-        seen = self._seen(now, fault is None)
-        control, stopped = [ENABLE] * self.n, False
+        self._seen_now = seen = self._seen(now, fault is None)
+        if self._with_gains:
+            self._integrate(modes, torques, seen)
+        refused = False
         for joint, mode in enumerate(modes):
             limits, held = self.limits[joint], passed[joint]
-            passed[joint] = pass_gate(limits, mode, torques[joint], positions[joint], age, held, seen[joint])
-            if passed[joint].refused:
-                control[joint], stopped = QUICK_STOP, True
-            elif mode == OFF:
-                control[joint] = DISABLE_VOLTAGE
-            else:
-                if mode != self._modes[joint]:
-                    self._select(joint, mode, now)
-                if mode == PROFILE_POSITION:
-                    control[joint] = set_point_control(loop.statuses[joint])
+            order = pass_gate(limits, mode, torques[joint], positions[joint], age, held, seen[joint])
+            passed[joint] = order
+            if order.refused:
+                refused = True
         self._commanded = modes
-        sample = loop.exchange(control, [each.torque_wire for each in passed], [each.position_wire for each in passed])
+        sample = self.loop.exchange(passed)
         sample.late = self.late
-        why = stopped and refusal(self.names, command, age, passed, seen, self.limits)
+        why = refused and refusal(self.names, command, age, passed, seen, self.limits)
         if why:
             raise Refused(f"gate: {why}")
         fault = fault or self._fault(now, modes)
@@ -99,72 +92,112 @@ class Commander:
             raise fault
         return sample
 
-    def stand(self, control: list[int]) -> Sample:
-        """A cycle that commands no motion: control words; targets as the joints stand and pull now.
+    def _integrate(self, modes: list[int], torques: list[float], seen: list[Seen]) -> None:
+        """Feed-forward of joints whose drives have no integral term, in place of their target torque."""
+        for joint, integral in enumerate(self._integrals):
+            if integral is not None:
+                limits, mode = self.limits[joint], modes[joint]
+                torque = integral.update(limits, mode, self.passed[joint].position, seen[joint])
+                if mode == POSITION:
+                    torques[joint] = torque
 
-        A joint that is enabled keeps the target position that it has: one that followed the reading would sag.
+    def stand(self, power: Sequence[Power], walk: bool = False) -> Sample:
+        """A cycle that commands no motion: power states; targets as the joints stand and pull now.
+
+        A joint that is ON keeps the target position that it has: one that followed the reading would sag.
         """
         self._await_turn()
-        loop = self.loop
-        for joint, (limits, passed) in enumerate(zip(self.limits, self.passed, strict=True)):
-            position, mode = loop.latest_position[joint], OFF
-            if state_of(loop.statuses[joint]) is State.ENABLED or not math.isfinite(position):
-                position, mode = passed.position, int(Mode.POSITION)
-            self.passed[joint] = start_from(limits, loop.latest_motor_torque[joint], position)._replace(mode=mode)
-        return loop.exchange(
-            control, [each.torque_wire for each in self.passed], [each.position_wire for each in self.passed]
-        )
+        loop, now = self.loop, self.clock.now()
+        self._seen_now = seen = self._seen(now, True)
+        for group in loop.groups:
+            for drive, place in enumerate(group.places):
+                limits, held = self.limits[place], self.passed[place]
+                wanted, position = power[place], loop.latest_position[place]
+                on = group.drives.power(drive) is Power.ON
+                if on or not math.isfinite(position):
+                    position = held.position
+                integral = self._integrals[place]
+                if integral is None:
+                    order = start_from(limits, loop.latest_motor_torque[place], position)
+                else:
+                    torque = 0.0
+                    if on:
+                        torque = integral.update(limits, POSITION, position, seen[place])
+                    else:
+                        integral.reset()
+                    order = hold_at(limits, torque, position, seen[place])
+                mode = POSITION if on or walk or wanted is Power.ON else OFF
+                self.passed[place] = order._replace(power=wanted, walk=walk, mode=mode)
+        return loop.exchange(self.passed)
 
-    def walk(self, target: State) -> Sample:
-        """Cycle until every joint is in `target`, each by the next control word of the table; returns the last sample.
+    def walk(self, target: Power) -> Sample:
+        """Cycle until every joint is in `target` (ON or OFF), a step each cycle; returns the last sample.
 
-        To be enabled also takes that the joint displays position control and has told the torque that it now produces.
+        To be ON also takes that the joint is in position control and has told the torque that it now produces.
         Raises BusFault naming the joint that does not get there.
         """
-        loop, start = self.loop, self.clock.now()
-        for joint in range(self.n):
-            loop.send_mode(joint, Mode.POSITION)
-            self._modes[joint] = int(Mode.POSITION)
-            self._mode_since[joint] = start
-        self._commanded = modes = self._modes.copy() if target is State.ENABLED else [OFF] * self.n
-        states, since = [State.UNKNOWN] * self.n, [math.inf] * self.n
-        control = [self._first_word(status, target) for status in loop.statuses]
+        loop = self.loop
+        on = target is Power.ON
+        self._commanded = [POSITION if on else OFF] * self.n
+        since = [math.inf] * self.n
+        drives = [(group.drives, drive, place) for group in loop.groups for drive, place in enumerate(group.places)]
         for _ in range(max(int(ENABLE_SECONDS / self.period), STOP_CYCLES)):
-            sample = self.stand(control)
+            sample = self.stand([target] * self.n, walk=True)
             now = self.clock.now()
-            states = [state_of(int(status)) for status in sample.status]
-            since = [min(s, now) if state is target else math.inf for s, state in zip(since, states, strict=True)]
-            if all(state is target for state in states) and np.isfinite(sample.position).all():
+            reached = True
+            for each, drive, place in drives:
+                if each.power(drive) is target:
+                    since[place] = min(since[place], now)
+                else:
+                    since[place], reached = math.inf, False
+            if reached and np.isfinite(sample.position).all():
                 told = all(slow >= s for slow, s in zip(loop.slow_seen, since, strict=True))
-                if target is not State.ENABLED or (told and loop.displays == modes):
+                if not on or ((told or self._torque_untold()) and all(each.ready(drive) for each, drive, _ in drives)):
+                    for place, order in enumerate(self.passed):
+                        self.passed[place] = order._replace(walk=False)
                     return sample
-            if loop.watch.restarted or loop.watch.intruder:
+            if loop.watch.intruder or self.restarted():
                 break
-            for joint, state in enumerate(states):
-                reset_again = state is State.FAULT and control[joint] == Control.FAULT_RESET
-                control[joint] = DISABLE_VOLTAGE if reset_again else next_control(state, target)
-        known = self._known
-        restarted = node_fault(known) if known.restarted and not known.emergencies else None
-        raise BusFault(
-            bus_fault(self.names, loop.watch, 0) or restarted or stuck(known, states, target, modes, ENABLE_SECONDS)
+        raise BusFault(self._stuck(target, drives))
+
+    def _stuck(self, target: Power, drives: Sequence[tuple[Drives, int, int]]) -> str:
+        loop = self.loop
+        why = bus_fault(self.names, loop.watch, 0)
+        if why:
+            return why
+        for group in loop.groups:
+            alarm = group.drives.alarm() if self.restarted() else None
+            if alarm:
+                return str(alarm)
+        for each, drive, _ in drives:
+            if each.power(drive) is not target or (target is Power.ON and not each.ready(drive)):
+                return each.stuck(drive, target, ENABLE_SECONDS)
+        return f"no complete set of readings within {ENABLE_SECONDS} s of cycles: frames are lost"
+
+    def restarted(self) -> bool:
+        """Whether some drive has restarted."""
+        return any(group.drives.has_restarted() for group in self.loop.groups)
+
+    def _torque_untold(self) -> bool:
+        """Whether the joints that have not told their torque cannot be ordered to make one."""
+        return all(
+            slow > -math.inf or Mode.TORQUE not in modes
+            for slow, modes in zip(self.loop.slow_seen, self._modes_of, strict=True)
         )
 
-    @staticmethod
-    def _first_word(status: int, target: State) -> int:
-        """A word that changes nothing yet, so that the next one is an edge; a joint with power keeps it."""
-        state = state_of(status)
-        if state is State.QUICK_STOP:
-            return QUICK_STOP
-        return next_control(state, target) if state is State.ENABLED else DISABLE_VOLTAGE
-
-    def quick_stop(self) -> None:
-        """Quick stop of every joint, repeated until all report it, as far as the bus still carries it."""
-        control = [QUICK_STOP] * self.n
+    def stop(self) -> None:
+        """Stop every joint, repeated until none is ON, as far as the bus still carries it."""
+        power = [Power.STOPPED] * self.n
         with contextlib.suppress(BusFault):
             for _ in range(STOP_CYCLES):
-                sample = self.stand(control)
-                if not any(state_of(int(status)) is State.ENABLED for status in sample.status):
+                self.stand(power)
+                if not self._any_on():
                     break
+
+    def _any_on(self) -> bool:
+        return any(
+            group.drives.power(drive) is Power.ON for group in self.loop.groups for drive in range(len(group.places))
+        )
 
     def _numbers(self, command: Command) -> tuple[list[int], list[float], list[float]]:
         """A command's fields as lists; raises Refused where they are not n numbers each, or a mode is not supported."""
@@ -178,9 +211,9 @@ class Commander:
                 )
         modes: list[int] = command.mode.tolist()
         for joint, mode in enumerate(modes):
-            if mode in (PROFILE_POSITION, PROFILE_TORQUE) and not supports(self._supported[joint], mode):
-                held = self._supported[joint]
-                raise Refused(f"gate: {self.names[joint]}: mode {mode} is not supported: 6502h is {held:#x}")
+            if mode and mode not in self._modes_of[joint] and mode in Mode.__members__.values():
+                held = ", ".join(str(each) for each in sorted(self._modes_of[joint]) if each)
+                raise Refused(f"gate: {self.names[joint]}: mode {mode} is not supported: its drive has {held}")
         return modes, command.torque.tolist(), command.position.tolist()
 
     def _seen(self, now: float, healthy: bool) -> list[Seen]:
@@ -192,23 +225,52 @@ class Commander:
             seen.append(Seen(torque, loop.latest_position[joint], velocity, now - loop.seen[joint], healthy))
         return seen
 
-    def _select(self, joint: int, mode: int, now: float) -> None:
-        self.loop.send_mode(joint, mode)
-        self._modes[joint], self._mode_since[joint] = mode, now
+    def _verify(self, joint: int, sent: Order) -> None:
+        """Raise Refused where the bytes that are about to leave order a joint something beyond a limit."""
+        passed = self.passed[joint]
+        if passed.power is not Power.ON:
+            return
+        limits = self.limits[joint]
+        wrong = beyond(limits, passed, sent, self._seen_now[joint])
+        if wrong:
+            raise Refused(
+                f"gate: {self.names[joint]}: the frame would carry {wrong}, limits {limits.most_sent:.6g} N·m and "
+                f"{limits.lower:.4g} to {limits.upper:.4g} rad: nothing is sent"
+            )
 
     def _fault(self, now: float, modes: Sequence[int]) -> BusFault | None:
         """The fault at time `now`; what the host's own lateness explains is put down to that and to nothing else."""
-        fault = find_fault(self._known, now, modes, self.max_age)
+        fault = self._drive_fault(now, modes)
         shown = bus_fault(self.names, self.loop.watch, self.loop.dropped)
         if self._gap_at + MEMORY >= now and self._gap > self.max_age:
-            return HostLate(self._gap, self.max_age, stopped_itself(self._known))
+            return HostLate(self._gap, self.max_age, self._own_stop())
         if fault is None:
             return None if shown is None else BusFault(shown)
         if self._gap_at + MEMORY >= now and self._gap > BLAME_SHARE * self.max_age:
-            stopped = stopped_itself(self._known)
+            stopped = self._own_stop()
             if stopped or isinstance(fault, Silence):
                 return HostLate(self._gap, self.max_age, stopped)
         return fault
+
+    def _drive_fault(self, now: float, modes: Sequence[int]) -> BusFault | None:
+        groups = self.loop.groups
+        for group in groups:
+            fault = group.drives.alarm()
+            if fault is not None:
+                return fault
+        silent = silence(self.names, self.loop.seen, now, self.max_age)
+        if silent is not None:
+            return silent
+        for group in groups:
+            own = modes if len(groups) == 1 else [modes[place] for place in group.places]
+            fault = group.drives.fault(own, now)
+            if fault is not None:
+                return fault
+        return None
+
+    def _own_stop(self) -> str:
+        """The first joint that stopped itself since it did not hear its host, in words; empty if none."""
+        return next((stop for group in self.loop.groups if (stop := group.drives.own_stop())), "")
 
     def settle(self) -> None:
         """Restart after an interruption: what came meanwhile, and how late the host was, is forgotten."""

@@ -1,83 +1,75 @@
-"""The cyclic path: RPDOs, SYNC, TPDOs decoded through a compiled table. One loop owns the port."""
+"""The cyclic path: orders out as frames, readings in. One loop owns the port."""
 
 import math
-import struct
-from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armlink.arrays import Array
 from armlink.bus.frame_bits import FIXED_BITS
-from armlink.bus.port import Port
+from armlink.bus.port import Frame, Port
 from armlink.clock import Clock
-from armlink.drives.canopen import emcy
-from armlink.drives.canopen import object_dictionary as objects
-from armlink.drives.canopen.pdo import RPDO1, RPDO2, TPDO1, TPDO2, decoding_table, host_frames
-from armlink.drives.canopen.units import TORQUE_PER_MICRO, Units
+from armlink.drives.board import Board, Event
+from armlink.drives.family import ANY, FillsBoard
+from armlink.drives.orders import Order, Reading, power_code
 from armlink.link.bus_watchdog import MOST_FRAMES, BusWatch
+from armlink.link.groups import Group, traits_of
+from armlink.link.joint_values import JointValues
 from armlink.link.types import Sample, Stats
 
 COLLECT_SHARE = 0.8
-"""Share of a period after SYNC in which TPDOs of this cycle are waited for."""
-
+"""Share of a period after the commands in which their replies are waited for."""
 OWED_CYCLES = 25
 """A reply that has been owed for this many cycles is lost."""
-NO_STATUS = 0xFFFF
-"""Stands for the status word of a joint that has sent none; no state of CiA 402."""
-NO_MODE = 0
-"""Stands for the mode display of a joint that has sent none: no mode is active."""
-EMERGENCIES_KEPT = 64
-"""So many emergencies are kept; a storm of them costs no memory."""
-_SYNC = (objects.SYNC_ID, b"")
-_OPERATIONAL = bytes([objects.OPERATIONAL])
+BUS_BITS = 34
+"""Identifiers carry the number of their bus from this bit on, where there are several."""
+_UNTAGGED = (1 << BUS_BITS) - 1
 
 
 class Loop:
-    """Frames of one cycle out and in, for n joints; knows no states, no limits and no faults, only keeps them."""
+    """Frames of one cycle out and in, for n joints; knows no limits and judges nothing, only keeps what came."""
 
     def __init__(
-        self, port: Port, clock: Clock, nodes: tuple[int, ...], host: int, period: float, lock_step: bool
+        self, port: Port, clock: Clock, groups: Sequence[Group], values: JointValues, period: float, lock_step: bool
     ) -> None:
-        self.nodes, self.n = nodes, len(nodes)
-        self.period, self.heartbeat_cycles = period, 1
+        """`values` turns values of drives into those of joints and back; in lock-step sending is the period itself."""
+        self.groups, self.n, self.values = tuple(groups), sum([len(group.places) for group in groups]), values
+        self.period = period
         self.stats = Stats()
-        self.emergencies: deque[tuple[int, int, int]] = deque(maxlen=EMERGENCIES_KEPT)
-        """(joint index, code, error register) in the order of arrival, the newest; resets (code 0) are not kept."""
-        self.node_states: dict[int, int] = {}
-        """Joint index → NMT state of its newest heartbeat; only those received while cycling."""
-        self.watch = BusWatch(len(nodes), host_frames(nodes, host))
+        self.board = board = Board(self.n)
+        self.watch = BusWatch(self.n, _commands(groups))
+        board.on_again = self.watch.again
+        board.readings = self.watch.readings
         self.withheld: frozenset[int] = frozenset()
-        """Joints that get no RPDO1, so that their own deadline is put to the test."""
-        self.beating = True
-        """Whether the host's heartbeat is sent; not, so that the joints' watching it is put to the test."""
-        self.on_other: Callable[[int, bytes], None] = lambda can_id, data: None
-        """Takes frames that are no process data: SDO responses."""
+        """Joints that get no command, so that their own deadline is put to the test."""
+        self.verify: Callable[[int, Order], None] = lambda joint, sent: None
+        """Called with what the bytes that are about to leave order a joint; raises where that is beyond a limit."""
+        self.on_frame: Callable[[int, bytes], None] | None = None
+        """Also gets each frame that is no reading of the fast way, while somebody waits for an answer."""
+        self.on_unknown: Callable[[int, bytes], None] = lambda can_id, data: None
+        """Takes frames that no drive of ours sends, such as those of another host."""
         self._port, self._clock = port, clock
         self._patience = 0.0 if lock_step else COLLECT_SHARE * period
-        self._table = {
-            can_id: (joint, {TPDO1: 0, TPDO2: 1}.get(pdo, 2), layout.unpack, layout.size)
-            for can_id, (joint, pdo, layout) in decoding_table(nodes).items()
-        }
-        self._joint_of = {node: joint for joint, node in enumerate(nodes)}
-        self._command = RPDO1.layout.pack
-        self._command_ids = tuple(RPDO1.cob_base + node for node in nodes)
-        self._heartbeat_id = objects.HEARTBEAT_ID + host
-        self._position: list[float] = [math.nan] * self.n
-        self._torque: list[float] = [math.nan] * self.n
-        self._motor: list[float] = [math.nan] * self.n
-        self._velocity: list[float] = [math.nan] * self.n
-        self.statuses: list[int] = [NO_STATUS] * self.n
-        """Newest status word (6041h) of each joint."""
-        self.displays: list[int] = [NO_MODE] * self.n
-        """Newest mode of operation display (6061h) of each joint."""
-        self._awaited = self._counted = self._dropped = 0
-        self._came = [0] * self.n
-        """Readings of each joint that came, in their cycle or late."""
+        self._alone = self.groups[0] if len(self.groups) == 1 and values.plain else None
+        traits = traits_of(self.groups, self.n)
+        cadences = {each.cadence for each in traits}
+        self._pass_time: Callable[[float], None] | None = None
+        if lock_step and "sync" not in cadences:
+            self._pass_time = getattr(port, "pass_time", None)
+        board.asked = [int(each.cadence != "cyclic") for each in traits]
+        self._expected = sum(board.asked)
+        self._fast: dict[int, Callable[[bytes], None]] = {}
+        self._others: dict[int, Callable[[int, bytes], None]] = {}
+        self._any: list[Callable[[int, bytes], None]] = []
+        for group in self.groups:
+            self._route(group)
+        self._leaving: list[Frame] = []
+        """Frames of the newest cycle, which have passed the check."""
+        self._counted = self._dropped = 0
         self.bits = 0
         """Bits that the frames so far took on the wire, without stuff bits (bus_load.frame_bits has them)."""
-        self._slow_came = False
         self._nothing = np.full(self.n, math.nan)
         self.seen = [-math.inf] * self.n
         """When position and torque of each joint last came, by the clock [s]."""
@@ -85,23 +77,31 @@ class Loop:
         self.latest_position = [math.nan] * self.n
         """Newest position of each joint whenever it came [rad]; for the gate, never for a sample."""
         self.latest_motor_torque = [math.nan] * self.n
-        """Newest torque actual value of each joint whenever it came [N·m]; for the gate, never for a sample."""
+        """Newest motor torque of each joint whenever it came [N·m]; for the gate, never for a sample."""
         self.latest_velocity = [math.nan] * self.n
         """Newest velocity of each joint whenever it came [rad/s]; for the gate, never for a sample."""
         self.slow_seen = [-math.inf] * self.n
         """When motor torque and velocity of each joint last came, by the clock [s]."""
         self.synced = -math.inf
-        """When the last SYNC left, by the clock [s]."""
-        self._owed = [0] * self.n
-        """Replies of each joint to earlier SYNCs that are still to come, or lost."""
+        """When the last commands left, by the clock [s]."""
         self._owed_for = 0
         """Cycles for which some reply has been owed."""
-        self.set_units((Units(1.0, 1.0, 1.0),) * self.n)
+
+    def _route(self, group: Group) -> None:
+        drives, tag = group.drives, group.tag
+        fast = drives.fill(self.board, group.places) if isinstance(drives, FillsBoard) else {}
+        self._fast |= {can_id | tag: take for can_id, take in fast.items()}
+        take = partial(self._take_drive, group)
+        for can_id in drives.routes():
+            if can_id == ANY:
+                self._any.append(take)
+            elif can_id not in fast:
+                self._others[can_id | tag] = take
 
     def reset_counters(self) -> None:
         """Restart the counters."""
         self.stats, self.bits, self._first, self._counted = Stats(), 0, None, 0
-        self._came = [0] * self.n
+        self.board.came, self.board.errors = [0] * self.n, 0
         self._dropped = self._port.dropped
 
     @property
@@ -109,20 +109,10 @@ class Loop:
         """Frames that this host lost because it read too slowly, since the counters began."""
         return self._port.dropped - self._dropped
 
-    def set_units(self, units: tuple[Units, ...]) -> None:
-        """Scales of the joints."""
-        self._torque_unit = np.array([unit.torque for unit in units])
-        self._position_unit = np.array([unit.position for unit in units])
-        self._position_scale = [unit.position for unit in units]
-
     def send(self, can_id: int, data: bytes) -> None:
         """Send one frame and count it."""
         self._port.send(can_id, data)
         self.count(1, len(data))
-
-    def send_mode(self, joint: int, mode: int) -> None:
-        """RPDO2: the mode of one joint."""
-        self.send(RPDO2.cob_base + self.nodes[joint], struct.pack("<b", mode))
 
     def receive(self, timeout: float) -> bool:
         """Take one frame in, waiting for it at most `timeout` seconds; False where none came."""
@@ -135,15 +125,16 @@ class Loop:
         return True
 
     def drain(self) -> None:
-        """Take in all that came between cycles; readings among it are late: newest known, but of no sample."""
-        self._awaited = 0
+        """Take in all that came between cycles; replies among it are late: newest known, but of no sample."""
+        board = self.board
+        board.awaited = 0
         self._take_what_is_there()
         self._keep_late()
         self.watch.cycle_ends(self.stats.frames - self._counted)
         self._counted = self.stats.frames
-        if self._slow_came:
+        if board.slow_came:
             self._keep_slow(self._clock.now())
-        self.drop_readings()
+        board.drop()
 
     def _take_what_is_there(self) -> None:
         for _ in range(MOST_FRAMES):
@@ -151,49 +142,40 @@ class Loop:
                 return
         self.watch.flooded = True
 
-    def drop_readings(self) -> None:
-        """Forget position and torque that came: what comes from now on belongs to the next sample."""
-        self._position, self._torque = [math.nan] * self.n, [math.nan] * self.n
-
     def _keep_late(self) -> None:
-        """Readings that came after their cycle: as old as the last SYNC at least."""
-        for joint, raw in enumerate(self._position):
-            if raw == raw:  # not NaN
-                self.latest_position[joint] = raw * self._position_scale[joint]
+        """Replies that came after their cycle: as old as the last commands at least."""
+        board, values = self.board, self.values
+        for joint, raw in enumerate(board.position):
+            if raw == raw and board.asked[joint]:  # not NaN
+                self.latest_position[joint] = values.position_of(joint, raw)
                 self.seen[joint] = max(self.seen[joint], self.synced)
-                self._owed[joint] = max(self._owed[joint] - 1, 0)
+                board.owed[joint] = max(board.owed[joint] - 1, 0)
 
     def settle(self) -> None:
         """After an interruption: nothing is owed, nothing was lost, no node is crowding the bus."""
         self.drain()
         self.synced = -math.inf
-        self._owed, self._owed_for = [0] * self.n, 0
+        self.board.owed, self._owed_for = [0] * self.n, 0
         self._dropped = self._port.dropped
         self.watch.settle()
 
-    def exchange(self, control: list[int], torque_wire: list[int], position_wire: list[int]) -> Sample:
-        """One cycle: RPDO1 of every joint, heartbeat when due, SYNC, then the TPDOs that it brings."""
-        command = self._command
-        frames = [
-            (can_id, command(control[joint], torque_wire[joint], position_wire[joint]))
-            for joint, can_id in enumerate(self._command_ids)
-            if joint not in self.withheld
-        ]
-        if self.beating and self.stats.cycles % self.heartbeat_cycles == 0:
-            frames.append((self._heartbeat_id, _OPERATIONAL))
-        frames.append(_SYNC)
-        now = self._clock.now()
+    def exchange(self, orders: Sequence[Order]) -> Sample:
+        """One cycle: the frames of the orders, then the readings that they bring; raises as `verify`."""
+        board, now = self.board, self._clock.now()
+        frames = self._encode(orders, now)
         if self._first is None:
             self._first = now
-        self._awaited = self.n
+        board.awaited = self._expected
         self.watch.syncs += 1
         self.stats.asked += 1
         self._port.send_all(frames)
         self.count(len(frames), sum([len(data) for _, data in frames]))
+        if self._pass_time is not None:
+            self._pass_time(self.period)
         self.synced = now
         end = now + self._patience
         for _ in range(MOST_FRAMES):
-            if self._awaited <= 0:
+            if board.awaited <= 0:
                 break
             if not self.receive(0.0):
                 remaining = end - self._clock.now()
@@ -201,20 +183,43 @@ class Loop:
                     break
         delay = self._clock.now() - now
         self._take_what_is_there()
-        self.stats.missed += self._awaited
-        timely = None if self._awaited <= 0 and not self._owed_for else self._timely()
+        self.stats.missed += board.awaited
+        timely = None if board.awaited <= 0 and not self._owed_for else self._timely()
         sample = self.sample(now)
         sample.timely, sample.delay = timely, delay
         return sample
 
+    def _encode(self, orders: Sequence[Order], now: float) -> list[Frame]:
+        """Frames of the orders, every group's; what their bytes say is checked before they may leave."""
+        group = self._alone
+        if group is not None and not self.withheld:
+            frames = group.drives.frames(orders, now)
+        else:
+            frames = []
+            driven = [None if j in self.withheld else self.values.order(j, order) for j, order in enumerate(orders)]
+            for each in self.groups:
+                own = each.drives.frames([driven[place] for place in each.places], now)
+                frames += [(can_id | each.tag, data) for can_id, data in own] if each.tag else own
+        if frames != self._leaving:
+            self._leaving = []
+            for each in self.groups:
+                for joint, place in enumerate(each.places):
+                    sent = each.drives.sent(joint)
+                    if sent is not None:
+                        self.verify(place, self.values.ordered(place, sent))
+            self._leaving = frames
+        return frames
+
     def _timely(self) -> NDArray[np.bool_]:
-        """Which readings are replies to this cycle's SYNC; replies that are owed for long are lost."""
-        came = [raw == raw for raw in self._position]
-        timely = np.array([here and not owed for here, owed in zip(came, self._owed, strict=True)])
-        self._owed = [owed + (not here) for here, owed in zip(came, self._owed, strict=True)]
-        self._owed_for = self._owed_for + 1 if any(self._owed) else 0
+        """Which readings are replies to this cycle's commands; replies that are owed for long are lost."""
+        board = self.board
+        came = [raw == raw for raw in board.position]
+        timely = np.array([here and not owed for here, owed in zip(came, board.owed, strict=True)])
+        pairs = zip(came, board.owed, board.asked, strict=True)
+        board.owed = [owed + (asked and not here) for here, owed, asked in pairs]
+        self._owed_for = self._owed_for + 1 if any(board.owed) else 0
         if self._owed_for > OWED_CYCLES:
-            self._owed, self._owed_for = [0] * self.n, 0
+            board.owed, self._owed_for = [0] * self.n, 0
         return timely
 
     def listen(self, seconds: float) -> Sample:
@@ -230,74 +235,79 @@ class Loop:
         if elapsed > 0:
             self.stats.rate_hz = self.stats.cycles / elapsed
             self.stats.load = self.bits / (bitrate * elapsed)
-        self.stats.came = tuple(self._came)
+        self.stats.came = tuple(self.board.came)
 
     def take(self, can_id: int, data: bytes) -> None:
         """Take one frame in, for what it is; who takes it counts it."""
-        entry = self._table.get(can_id)
-        if entry is None:
-            self._take_other(can_id, data)
+        fast = self._fast.get(can_id)
+        if fast is not None:
+            fast(data)
             return
-        joint, kind, unpack, size = entry
-        if len(data) != size:
-            self.stats.errors += 1
-        elif kind == 0:
-            self.watch.readings[joint] += 1
-            self._came[joint] += 1
-            if self._position[joint] != self._position[joint]:  # NaN: the first in this cycle
-                self._awaited -= 1
-            else:
-                self._owed[joint] = max(self._owed[joint] - 1, 0)
-                self.watch.again(joint)
-            self._position[joint], self._torque[joint] = unpack(data)
-        elif kind == 1:
-            self.statuses[joint], self._motor[joint], self._velocity[joint] = unpack(data)
-            self._slow_came = True
-        else:
-            self.statuses[joint], self.displays[joint] = unpack(data)
+        take = self._others.get(can_id)
+        if take is not None:
+            self.watch.last_id = can_id
+            take(can_id, data)
+            return
+        self.watch.other(can_id)
+        for take in self._any:
+            take(can_id, data)
+        self.on_unknown(can_id, data)
 
     def count(self, frames: int, size: int) -> None:
         """Count frames that went over the bus, with this many bytes of data in all."""
         self.stats.frames += frames
         self.bits += FIXED_BITS * frames + 8 * size
 
-    def _take_other(self, can_id: int, data: bytes) -> None:
-        self.watch.other(can_id)
-        joint = self._joint_of.get(can_id & 0x7F)
-        service = can_id & 0x780
-        if joint is not None and service == objects.EMCY_ID:
-            code, register = emcy.parse(data)
-            if code:
-                self.emergencies.append((joint, code, register))
-        elif joint is not None and service == objects.HEARTBEAT_ID:
-            state = data[0] & 0x7F if data else 0
-            self.node_states[joint] = state
-            if state == 0:
-                self.watch.restarted.add(joint)
-        else:
-            self.on_other(can_id, data)
+    def _take_drive(self, group: Group, can_id: int, data: bytes) -> None:
+        """A frame for a family's own `take`."""
+        if self.on_frame is not None:
+            self.on_frame(can_id, data)
+        if can_id & ~_UNTAGGED != group.tag:
+            return
+        reading = group.drives.take(can_id & _UNTAGGED, data, self._clock.now())
+        if reading is not None:
+            self._keep_reading(group.places[reading.joint], reading)
+
+    def _keep_reading(self, joint: int, reading: Reading) -> None:
+        board = self.board
+        if reading.position == reading.position:  # not NaN
+            board.reading(joint, reading.position, reading.sensor_torque)
+        if reading.motor_torque == reading.motor_torque or reading.velocity == reading.velocity:
+            board.slow(joint, reading.motor_torque, reading.velocity)
+        if reading.power is not None:
+            board.status[joint] = power_code(reading.power)
+        if reading.fault:
+            event = Event(joint, "", reading.fault)
+            if not board.events or board.events[-1] != event:
+                board.events.append(event)
 
     def sample(self, now: float) -> Sample:
         """Readings since the last sample, the newest of each, as of time `now`; NaN if there was none."""
-        position = np.array(self._position) * self._position_unit
-        torque = np.array(self._torque) * TORQUE_PER_MICRO
-        if self._slow_came:
+        board, values = self.board, self.values
+        position = values.position(np.array(board.position))
+        if board.slow_came:
             motor, velocity = self._keep_slow(now)
-            self._motor, self._velocity = [math.nan] * self.n, [math.nan] * self.n
-            self._slow_came = False
+            board.motor, board.velocity = [math.nan] * self.n, [math.nan] * self.n
+            board.slow_came = False
         else:
             motor, velocity = self._nothing.copy(), self._nothing.copy()
+        torque = values.torque(np.array(board.sensor), motor)
         for joint in self._keep(position, self.latest_position):
             self.seen[joint] = now
         self.stats.cycles += 1
-        status: NDArray[np.int64] = np.array(self.statuses, np.int64)
+        self.stats.errors = board.errors
+        status: NDArray[np.int64] = np.array(board.status, np.int64)
         age: Array = now - np.array(self.seen)
         return Sample(now - (self._first or 0.0), position, velocity, torque, motor, status, age)
 
+    def drop_readings(self) -> None:
+        """Forget what came: what comes from now on belongs to the next sample."""
+        self.board.position, self.board.sensor = [math.nan] * self.n, [math.nan] * self.n
+
     def _keep_slow(self, now: float) -> tuple[Array, Array]:
         """Motor torque and velocity that came, also kept as the newest known."""
-        motor = np.array(self._motor) * self._torque_unit
-        velocity = np.array(self._velocity) * self._position_unit
+        motor = self.values.motor(np.array(self.board.motor))
+        velocity = self.values.velocity(np.array(self.board.velocity))
         for joint in self._keep(motor, self.latest_motor_torque):
             self.slow_seen[joint] = now
         self._keep(velocity, self.latest_velocity)
@@ -311,3 +321,8 @@ class Loop:
                 latest[joint] = value
                 came.append(joint)
         return came
+
+
+def _commands(groups: Sequence[Group]) -> dict[int, str]:
+    """Identifiers that only a host sends, of all groups."""
+    return {can_id | group.tag: what for group in groups for can_id, what in group.drives.commands().items()}

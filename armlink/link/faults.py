@@ -1,126 +1,35 @@
-"""Faults that a cycle shows, in words: which joint, what, and what to do. Pure."""
+"""Faults that the link itself finds, in words: silence, refused commands, irregular traffic. Pure."""
 
 import math
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
-from armlink.drives.canopen import emcy
-from armlink.drives.canopen import object_dictionary as objects
-from armlink.drives.canopen.cia402 import MODE_NAMES, Mode, State, state_of
-from armlink.errors import BusFault, Silence, Stall
+from armlink.drives.orders import MODE_NAMES, Order
+from armlink.errors import Silence
 from armlink.link import gate
 from armlink.link.bus_watchdog import BusWatch
-from armlink.link.gate import OFF, JointLimits, Passed, Seen
+from armlink.link.gate import JointLimits, Seen
 from armlink.link.types import Command
 
-ENABLED_BITS = 0x27
-WATCHDOGS = frozenset({0x8130, 0x8250, 0x8700})
-"""Emergencies of a node that does not hear its host: heartbeat, RPDO deadline, SYNC (CiA 301)."""
-_FAULTS = (State.FAULT, State.FAULT_REACTION)
 _MODES = ", ".join(f"{int(mode)} ({name})" for mode, name in MODE_NAMES.items())
 
 
-@dataclass
-class Known:
-    """State of the bus and of n joints: live views of the loop's buffers."""
-
-    names: Sequence[str]
-    statuses: Sequence[int]
-    """Newest status words (6041h)."""
-    displays: Sequence[int]
-    """Newest mode displays (6061h)."""
-    seen: Sequence[float]
-    """When position and torque came, by the clock [s]."""
-    mode_since: Sequence[float]
-    """When each joint's mode was commanded, by the clock [s]."""
-    emergencies: Collection[tuple[int, int, int]]
-    """(joint, code, error register)."""
-    node_states: Mapping[int, int]
-    """NMT states by joint, of the newest heartbeat."""
-    restarted: Collection[int]
-    """Joints whose controller has sent its boot-up message."""
-
-
-def find_fault(known: Known, now: float, modes: Sequence[int], max_age: float) -> BusFault | None:
-    """The first fault at time `now` if every joint with a mode was to be enabled in it, or None.
-
-    A mode must be displayed, and a reading must have come, within `max_age` [s].
-    """
-    if known.emergencies or known.restarted or known.node_states:
-        fault = node_fault(known)
-        if fault:
-            watchdog = bool(known.emergencies) and next(iter(known.emergencies))[1] in WATCHDOGS
-            return Stall(fault) if watchdog else BusFault(fault)
-    oldest = min(known.seen)
-    if not now - oldest <= max_age:
-        return _silence(known, now, max_age)
-    for joint, (mode, status, display) in enumerate(zip(modes, known.statuses, known.displays, strict=True)):
-        if mode != OFF and display != mode and not now - known.mode_since[joint] <= max_age:
-            return BusFault(f"{known.names[joint]}: {refused_mode(mode, display)}")
-        if status & 0x6F == ENABLED_BITS:
-            continue
-        state = state_of(status)
-        if mode != OFF or state in _FAULTS:
-            told = f"{state.value} (status word {status:#06x}), expected operation enabled"
-            return BusFault(f"{known.names[joint]}: {told}")
-    return None
-
-
-def _silence(known: Known, now: float, max_age: float) -> Silence:
-    """Which joints have sent no reading for longer than `max_age` [s]."""
-    silent = [name for name, seen in zip(known.names, known.seen, strict=True) if not now - seen <= max_age]
-    who = "no joint" if len(silent) == len(known.names) > 1 else silent[0]
+def silence(names: Sequence[str], seen: Sequence[float], now: float, max_age: float) -> Silence | None:
+    """Which joints have sent no reading for longer than `max_age` [s]; `seen` is when they last did [s]."""
+    if now - min(seen) <= max_age:
+        return None
+    silent = [name for name, at in zip(names, seen, strict=True) if not now - at <= max_age]
+    who = "no joint" if len(silent) == len(names) > 1 else silent[0]
     what = "has sent a reading" if who == "no joint" else "no reading"
-    age = now - min(known.seen)
+    age = now - min(seen)
     colon = "" if who == "no joint" else ":"
     return Silence(f"{who}{colon} {what} for {age * 1e3:.0f} ms, limit {max_age * 1e3:.0f} ms")
-
-
-def is_own_watchdog(known: Known, joint: int) -> bool:
-    """Whether a joint stopped by itself, as it must when it does not hear its host."""
-    codes = {code for place, code, _ in known.emergencies if place == joint}
-    return bool(codes & WATCHDOGS) or (not codes and state_of(known.statuses[joint]) is State.QUICK_STOP)
-
-
-def stopped_itself(known: Known) -> str:
-    """The first joint that its own watch of the host has stopped, in words; empty if there is none."""
-    for joint, name in enumerate(known.names):
-        if is_own_watchdog(known, joint):
-            codes = [code for place, code, _ in known.emergencies if place == joint and code in WATCHDOGS]
-            why = f" (emergency {codes[0]:04X}h, {emcy.name_of(codes[0])})" if codes else ""
-            return f"{name} stopped itself{why}"
-    return ""
-
-
-def node_fault(known: Known) -> str | None:
-    """The first fault of a node, whatever its drive is doing: emergency, restart, NMT state; or None."""
-    for joint, code, register in known.emergencies:
-        return f"{known.names[joint]}: emergency {code:04X}h, {emcy.name_of(code)} (error register {register:02X}h)"
-    for joint in sorted(known.restarted):
-        return (
-            f"{known.names[joint]}: its controller has restarted (boot-up message): calibration and mode are lost; "
-            "find out why, then start again"
-        )
-    for joint, state in known.node_states.items():
-        if state != objects.OPERATIONAL:
-            found = objects.NMT_STATES.get(state, str(state))
-            return f"{known.names[joint]}: NMT state is {found}, expected operational"
-    return None
-
-
-def refused_mode(mode: int, display: int) -> str:
-    """That a controller does not enter a mode that it was told to."""
-    return (
-        f"refuses mode {mode} ({MODE_NAMES[Mode(mode)]}): its mode display 6061h is {display}; "
-        "look at its error code 603Fh and at what 6502h says it supports"
-    )
 
 
 def refusal(
     names: Sequence[str],
     command: Command,
     age: float,
-    passed: Sequence[Passed],
+    passed: Sequence[Order],
     seen: Sequence[Seen],
     limits: Sequence[JointLimits],
 ) -> str | None:
@@ -151,20 +60,6 @@ def refusal(
         if why == gate.ENTRY:
             return f"{name}: the torque now produced (6077h) is not known, and torque control would start from zero"
     return None
-
-
-def stuck(known: Known, states: Sequence[State], target: State, modes: Sequence[int], seconds: float) -> str:
-    """Why the joints did not all reach `target` in their `modes` within `seconds`: the first that did not."""
-    for joint, code, _ in known.emergencies:
-        if states[joint] is not target:
-            return f"{known.names[joint]}: {states[joint].value} after emergency {code:04X}h, {emcy.name_of(code)}"
-    for name, state in zip(known.names, states, strict=True):
-        if state is not target:
-            return f"{name}: stays in {state.value}, expected {target.value} within {seconds} s"
-    for name, mode, display in zip(known.names, modes, known.displays, strict=True):
-        if mode not in (Mode.OFF, display):
-            return f"{name}: {refused_mode(mode, display)}"
-    return f"no complete set of readings within {seconds} s of cycles: frames are lost"
 
 
 def bus_fault(names: Sequence[str], watch: BusWatch, dropped: int) -> str | None:

@@ -20,21 +20,26 @@ its produced torque with the target torque, so that a change of mode starts from
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
-from armlink.drives.canopen.cia402 import Mode
+from armlink.drives.orders import Mode, Order, Power
 
 OFF = int(Mode.OFF)
 POSITION_MODES = (int(Mode.POSITION), int(Mode.PROFILE_POSITION))
 TORQUE_MODES = (int(Mode.TORQUE), int(Mode.PROFILE_TORQUE))
 MODES = (OFF, *POSITION_MODES, *TORQUE_MODES)
-LOWEST_WIRE, HIGHEST_WIRE = -(2**31), 2**31 - 1
-"""Range of 607Ah."""
+ON, STOPPED, NO_POWER = Power.ON, Power.STOPPED, Power.OFF
 
 BAD_MODE, BAD_NUMBER, COMMAND_AGE = "mode", "number", "command age"
 SAMPLE_AGE, STATE = "sample age", "state"
 VELOCITY, WINDOW, ENTRY = "velocity", "window", "entry"
+LEASH = 0.97
+"""Share of max_torque that gains, targets and feed-forward may come to together; the rest is for their rounding."""
+EXACT, ROUNDED = 1 + 1e-6, 1e-6
+"""Rounding of a bound in single precision: relative, and absolute for positions [rad]."""
+LED_BACK = 1e-3
+"""Rounding of a target outside the window, on its way back [rad]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,65 +56,48 @@ class JointLimits:
     """Lower end of the target window [rad]."""
     upper: float
     """Upper end of the target window [rad]."""
-    torque_unit: float
-    """One per mille of the rated torque [N·m]."""
-    position_unit: float
-    """One user unit [rad]."""
     overspeed: float
     """A joint under torque control that turns faster is refused [rad/s]."""
     outside: float
     """A joint under torque control that reads a position further outside the window is refused [rad]."""
     max_age: float
     """Oldest command and oldest reading that count [s]."""
-    lowest_wire: int = field(init=False)
-    """Least 607Ah within the window, user units."""
-    highest_wire: int = field(init=False)
-    """Greatest 607Ah within the window, user units."""
+    period: float = 0.0
+    """Of the cycle [s]."""
+    kp: float = 0.0
+    """Gain of a drive that has no integral term of its own [N·m/rad]; 0: it has a position controller of its own."""
+    kd: float = 0.0
+    """[N·m·s/rad]."""
+    most_sent: float = 0.0
+    """Most that the bytes of a frame may say, where the host's calibration makes it more than max_torque [N·m]."""
 
     def __post_init__(self) -> None:
-        """Work out what does not change from cycle to cycle."""
-        object.__setattr__(self, "lowest_wire", math.ceil(self.lower / self.position_unit))
-        object.__setattr__(self, "highest_wire", math.floor(self.upper / self.position_unit))
+        """Without a calibration in the host the bytes say what the joint is to make."""
+        object.__setattr__(self, "most_sent", max(self.most_sent, self.max_torque))
 
 
 class Seen(NamedTuple):
     """State of one joint when its command is about to leave; NaN if a reading is missing or too old."""
 
     torque: float
-    """Torque now produced, 6077h [N·m]."""
+    """Torque now produced [N·m]."""
     position: float
     """[rad]."""
     velocity: float
-    """606Ch [rad/s]."""
+    """[rad/s]."""
     age: float
     """Time since the position came [s]."""
     healthy: bool
     """Neither the bus nor a node nor a drive has a fault."""
 
 
-class Passed(NamedTuple):
-    """A command that left the gate for one joint; the next cycle starts from its torque and position."""
-
-    torque: float
-    """Target torque before quantisation [N·m]."""
-    position: float
-    """Target position before quantisation [rad]."""
-    torque_wire: int
-    """6071h, per mille of the rated torque, rounded towards zero."""
-    position_wire: int
-    """607Ah, user units, rounded into the window."""
-    refused: str
-    """Why the command was refused, so that the joint must be stopped; empty where it passed."""
-    mode: int
-    """Mode that was commanded, 0 where that was refused."""
-
-
 def pass_gate(
-    limits: JointLimits, mode: int, torque: float, position: float, age: float, held: Passed, seen: Seen
-) -> Passed:
+    limits: JointLimits, mode: int, torque: float, position: float, age: float, held: Order, seen: Seen
+) -> Order:
     """Limit one joint's command (torque [N·m], position [rad]), decided `age` seconds ago.
 
-    `held` is what passed in the cycle before, `seen` what is known of the joint now.
+    `held` is what passed in the cycle before, `seen` what is known of the joint now. Under position control of a drive
+    without an integral term `torque` is the feed-forward.
     """
     refused = _refusal(limits, mode, torque, position, age, held, seen)
     start_torque, start_position = held.torque, held.position
@@ -118,19 +106,44 @@ def pass_gate(
     if held.mode not in POSITION_MODES and math.isfinite(seen.position):
         start_position = seen.position
     if refused:
-        return _passed(limits, start_torque, start_position, OFF, refused)
+        return _passed(limits, start_torque, start_position, OFF, STOPPED, refused)
     if mode in TORQUE_MODES:
-        return _passed(limits, _towards(start_torque, torque, limits.torque_step), seen.position, mode)
+        return _passed(limits, _towards(start_torque, torque, limits.torque_step), seen.position, mode, ON)
     if mode in POSITION_MODES:
-        goal = _within(position, limits.lower, limits.upper)
-        produced = seen.torque if math.isfinite(seen.torque) else start_torque
-        return _passed(limits, produced, _towards(start_position, goal, limits.position_step), mode)
-    return _passed(limits, 0.0, start_position, mode)
+        goal = _towards(start_position, _within(position, limits.lower, limits.upper), limits.position_step)
+        if limits.kp:
+            return _leashed(limits, mode, torque, goal, start_position, seen)
+        return _passed(limits, seen.torque if math.isfinite(seen.torque) else start_torque, goal, mode, ON)
+    return _passed(limits, 0.0, start_position, mode, NO_POWER)
 
 
-def start_from(limits: JointLimits, produced_torque: float, measured_position: float) -> Passed:
+def _leashed(limits: JointLimits, mode: int, torque: float, goal: float, start: float, seen: Seen) -> Order:
+    """An order with gains whose torque kp (q* − q) + kd (v* − v) + τ is within the limit, as the joint is seen now."""
+    kp, kd, most = limits.kp, limits.kd, limits.max_torque * LEASH
+    stretch = most / kp
+    position = _within(goal, seen.position - stretch, seen.position + stretch)
+    velocity = (position - start) / limits.period if position == goal and limits.period else 0.0
+    moving = kd * (velocity - (seen.velocity if math.isfinite(seen.velocity) else 0.0))
+    if abs(moving) > most:  # a joint that is thrown about: damping alone, as much as the limit allows
+        speed = abs(seen.velocity) if math.isfinite(seen.velocity) else 0.0
+        velocity, kd = 0.0, min(kd, most / speed) if speed else kd
+        moving = -kd * seen.velocity if speed else 0.0
+    pull = kp * (position - seen.position) + moving
+    torque = _within(pull + torque, -most, most) - pull
+    return Order(ON, False, mode, position, velocity, torque, kp, kd)
+
+
+def hold_at(limits: JointLimits, torque: float, position: float, seen: Seen) -> Order:
+    """An order to hold a position that was passed before, `torque` being the torque that is produced [N·m]."""
+    if limits.kp and math.isfinite(seen.position):
+        return _leashed(limits, int(Mode.POSITION), torque, position, position, seen)
+    return _passed(limits, torque if math.isfinite(torque) else 0.0, position, int(Mode.POSITION), ON)
+
+
+def start_from(limits: JointLimits, produced_torque: float, measured_position: float) -> Order:
     """Start of the first cycle: the torque now produced [N·m], 0 if unknown, and the position [rad]."""
-    return _passed(limits, produced_torque if math.isfinite(produced_torque) else 0.0, measured_position, OFF)
+    torque = produced_torque if math.isfinite(produced_torque) else 0.0
+    return _passed(limits, torque, measured_position, OFF, NO_POWER)
 
 
 def is_fresh(age: float, limit: float) -> bool:
@@ -139,7 +152,7 @@ def is_fresh(age: float, limit: float) -> bool:
 
 
 def _refusal(
-    limits: JointLimits, mode: int, torque: float, position: float, age: float, held: Passed, seen: Seen
+    limits: JointLimits, mode: int, torque: float, position: float, age: float, held: Order, seen: Seen
 ) -> str:
     """Why a command is not passed on, or an empty text."""
     if mode not in MODES:
@@ -163,14 +176,33 @@ def _refusal(
     return ""
 
 
-def _passed(limits: JointLimits, torque: float, position: float, mode: int, refused: str = "") -> Passed:
-    """Quantise; rounding never leads out of the torque limit, nor out of the window from within."""
+def _passed(limits: JointLimits, torque: float, position: float, mode: int, power: Power, refused: str = "") -> Order:
+    """An order for a drive with a position controller of its own."""
     torque = _within(torque, -limits.max_torque, limits.max_torque)
-    lowest, highest = LOWEST_WIRE, HIGHEST_WIRE
-    if limits.lower <= position <= limits.upper:
-        lowest, highest = limits.lowest_wire, limits.highest_wire
-    position_wire = max(lowest, min(highest, round(position / limits.position_unit)))
-    return Passed(torque, position, int(torque / limits.torque_unit), position_wire, refused, mode)
+    return Order(power, False, mode, position, 0.0, torque, 0.0, 0.0, refused)
+
+
+def beyond(limits: JointLimits, passed: Order, sent: Order, seen: Seen) -> str:
+    """What in an order, as its bytes tell it, is beyond a limit, in words; empty if nothing. The last check of all.
+
+    `passed` is the order that the bytes stand for: outside the window a target may lie only where the gate led it.
+    """
+    if sent.power is not ON:
+        return ""
+    if sent.mode in TORQUE_MODES:
+        return "" if abs(sent.torque) <= limits.most_sent * EXACT else f"torque {sent.torque:.6g} N·m"
+    if sent.mode not in POSITION_MODES:
+        return ""
+    inside = limits.lower <= passed.position <= limits.upper
+    room = (ROUNDED if inside else LED_BACK) + (EXACT - 1) * abs(sent.position)
+    lower, upper = min(limits.lower, passed.position), max(limits.upper, passed.position)
+    if not lower - room <= sent.position <= upper + room:
+        return f"position {sent.position:.6g} rad"
+    if not (sent.kp or sent.kd):
+        return "" if not abs(sent.torque) > limits.most_sent * EXACT else f"torque {sent.torque:.6g} N·m"
+    velocity = seen.velocity if math.isfinite(seen.velocity) else 0.0
+    total = sent.kp * (sent.position - seen.position) + sent.kd * (sent.velocity - velocity) + sent.torque
+    return "" if abs(total) <= limits.most_sent * EXACT else f"gains and targets for {total:.6g} N·m"
 
 
 def _towards(start: float, goal: float, step: float) -> float:

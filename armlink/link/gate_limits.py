@@ -1,13 +1,10 @@
-"""The gate's limits of an arm, from its file and its controllers' units."""
-
-import math
+"""The gate's limits of an arm, from its file."""
 
 from armlink.arm_file import ArmFile, LinkJoint
-from armlink.drives.canopen.units import Units
+from armlink.drives.orders import Gains, Limits
 from armlink.errors import BadInput
 from armlink.link.gate import JointLimits
 
-INT16_MAX, INT32_MAX = 2**15 - 1, 2**31 - 1
 POSITION_GAIN_ERROR = 0.02
 """A position sensor may read so much more of its range than is true: the stops are found beyond their nominal place."""
 PRESS_IN = 0.05
@@ -45,32 +42,33 @@ def target_window(lower: float, upper: float) -> tuple[float, float]:
     return lower - margin, upper + margin
 
 
-def gate_limits(
-    joint: LinkJoint, window: tuple[float, float], unit: Units, period: float, max_age: float
-) -> JointLimits:
-    """Limits for the gate of one joint with its target window [rad] and the oldest reading that counts [s].
-
-    Raises BadInput where they fit no frame.
-    """
-    if joint.max_torque / unit.torque > INT16_MAX:
-        most = INT16_MAX * unit.torque
-        raise BadInput(f"{joint.name}: max_torque {joint.max_torque} N·m: 6071h carries at most {most:.6g} N·m")
-    if max(map(abs, window)) / unit.position > INT32_MAX:
-        raise BadInput(f"{joint.name}: its range is more than 607Ah carries at {unit.position:.3g} rad a user unit")
-    return JointLimits(
+def drive_limits(joint: LinkJoint, window: tuple[float, float], period: float, deadline: float) -> Limits:
+    """Limits of one joint with its target window [rad], as a drive family gets them."""
+    return Limits(
         max_torque=joint.max_torque,
-        torque_step=joint.max_torque_rate * period,
-        position_step=joint.max_velocity * period,
+        torque_rate=joint.max_torque_rate,
+        max_velocity=joint.max_velocity,
         lower=window[0],
         upper=window[1],
-        torque_unit=unit.torque,
-        position_unit=unit.position,
-        overspeed=OVERSPEED * joint.max_velocity,
-        outside=OUTSIDE,
-        max_age=max_age,
+        deadline=deadline,
+        period=period,
     )
 
 
-def milliseconds(seconds: float) -> int:
-    """Whole milliseconds, at least one."""
-    return max(1, math.ceil(seconds * 1e3 - 1e-9))
+def gate_limits(limits: Limits, gains: Gains | None = None, max_torque: float | None = None) -> JointLimits:
+    """Limits for the gate of one joint; `gains` of a drive without an integral term, `max_torque` where a calibration
+    in the host leaves less than the arm file's [N·m]."""
+    return JointLimits(
+        max_torque=limits.max_torque if max_torque is None else max_torque,
+        torque_step=limits.torque_rate * limits.period,
+        position_step=limits.max_velocity * limits.period,
+        lower=limits.lower,
+        upper=limits.upper,
+        overspeed=OVERSPEED * limits.max_velocity,
+        outside=OUTSIDE,
+        max_age=limits.deadline,
+        period=limits.period,
+        kp=gains.kp if gains else 0.0,
+        kd=gains.kd if gains else 0.0,
+        most_sent=limits.max_torque,
+    )

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property
 from types import TracebackType
 from typing import TYPE_CHECKING, Concatenate, ParamSpec, Self, TypeVar
 
@@ -13,19 +12,19 @@ from armlink.arrays import Array
 from armlink.bus.adapters import as_bus
 from armlink.bus.can_bus import CanBus
 from armlink.clock import Clock, MonotonicClock
-from armlink.drives.canopen import object_dictionary as objects
-from armlink.drives.canopen.cia402 import State
-from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork, joint_services
+from armlink.drives.orders import DriveIdentity, Order, Power, Setup
 from armlink.errors import BusFault
-from armlink.link import controller_setup as device
+from armlink.link.ask import LinkAsk
+from armlink.link.calibrations import Calibrations
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.faults import bus_fault
 from armlink.link.gate import start_from
-from armlink.link.gate_limits import gate_limits, joint_ranges, target_window
+from armlink.link.gate_limits import drive_limits, gate_limits, joint_ranges, target_window
+from armlink.link.groups import Group, make_groups
 from armlink.link.guard import Crossed
-from armlink.link.torque_sensor_record import TorqueSensorRecords
-from armlink.link.types import Command, Controller, Identity, Sample, Samples, Setpoints, Stats
+from armlink.link.joint_values import values_of
+from armlink.link.types import Command, Controller, Sample, Samples, Setpoints, Stats
 
 if TYPE_CHECKING:
     import can
@@ -41,7 +40,7 @@ R = TypeVar("R")
 P = ParamSpec("P")
 
 
-class Link(TorqueSensorRecords):
+class Link(Calibrations):
     """Context manager: `with Link.open(arm) as link: link.start(); link.enable(); link.cycle(command)`.
 
     Leaving it, however, leaves the joints in quick stop, where they hold, unless `disable` was called.
@@ -52,16 +51,19 @@ class Link(TorqueSensorRecords):
         self.arm, self.bus = arm, as_bus(bus)
         self.section = section = arm.require_link()
         self.names = tuple(joint.name for joint in section.joints)
-        self.nodes = tuple(joint.settings.node for joint in section.joints)
         self.n, self.rate, self.period = len(self.names), section.rate, 1.0 / section.rate
         self._lock_step = self.bus.clock is not None
         self.clock: Clock = clock or self.bus.clock or MonotonicClock()
         self.windows = [target_window(*limits) for limits in joint_ranges(arm)]
-        self.protection = device.protection_of(section)
-        port, host = self.bus.open_port(), self.protection.host
-        self._loop = Loop(port, self.clock, self.nodes, host, self.period, self._lock_step)
-        self._loop.heartbeat_cycles = max(1, int(section.deadline / 2 * self.rate))
+        self.groups: tuple[Group, ...] = make_groups(arm, self.bus)
+        """The drives by family and bus."""
+        self.values = values_of(arm, self.groups)
+        self._loop = Loop(self.bus.open_port(), self.clock, self.groups, self.values, self.period, self._lock_step)
         self.commander = Commander(self._loop, self.clock, self.names, self.period, section.deadline, self._lock_step)
+        self.ask = LinkAsk(self._loop, self.clock, self._pump)
+        """Requests to drives, outside of cycles or between them."""
+        self.setups: list[Setup] = []
+        """What start() found, in joint order."""
         self._cycling = self._enabled = False
         self._since = 0.0
         self.position_step = np.full(self.n, np.inf)
@@ -111,45 +113,55 @@ class Link(TorqueSensorRecords):
     @property
     def torque_sent(self) -> Array:
         """Target torque of the last frames [N·m], (n,)."""
-        pairs = zip(self.commander.passed, self.commander.limits, strict=True)
-        return np.array([passed.torque_wire * limits.torque_unit for passed, limits in pairs])
+        return np.array([order.torque for order in self._sent])
 
     @property
     def position_sent(self) -> Array:
         """Target position of the last frames [rad], (n,)."""
-        pairs = zip(self.commander.passed, self.commander.limits, strict=True)
-        return np.array([passed.position_wire * limits.position_unit for passed, limits in pairs])
+        return np.array([order.position for order in self._sent])
 
-    def scan(self) -> list[Identity]:
-        """Identity and state of each joint's controller; one that does not answer is there with `present` false."""
-        return [
-            device.identify(services) if services.present() else Identity(services.joint, services.node, present=False)
-            for services in self.services
-        ]
+    @property
+    def _sent(self) -> list[Order]:
+        """Orders as their bytes tell them; as they passed where the bytes carry no target."""
+        found = list(self.commander.passed)
+        for group in self.groups:
+            for drive, place in enumerate(group.places):
+                sent = group.drives.sent(drive)
+                if sent is not None and found:
+                    found[place] = self.values.ordered(place, sent)
+        return found
+
+    def scan(self) -> list[DriveIdentity]:
+        """Identity and state of each joint's drive; one that does not answer is there with `present` false."""
+        found = {
+            group.places[each.joint]: replace(each, joint=group.places[each.joint])
+            for group in self.groups
+            for each in group.drives.identify(self._ask(group))
+        }
+        return [found[joint] for joint in range(self.n)]
 
     def start(self) -> None:
-        """Check the nodes, map PDOs, set the device's own limits, start them (NMT).
+        """Check the drives, set them up with the device's own limits, start them.
 
         Raises Refused for another controller than the arm file states, BusFault, BadInput.
         """
-        missing = [f"{each.joint} (node {each.node})" for each in self.services if not each.present()]
+        missing = [
+            f"{self.names[group.places[joint]]} ({self.section.joints[group.places[joint]].settings.address})"
+            for group in self.groups
+            for joint in group.drives.missing(self._ask(group))
+        ]
         if missing:
             channel = self.bus.channel_info
-            raise BusFault(f"no answer from {', '.join(missing)} on {channel}: is it powered, and its node id right?")
+            raise BusFault(f"no answer from {', '.join(missing)} on {channel}: is it powered, and its id right?")
         self.require_alone()
+        self._set_up()
         loop = self._loop
-        for services, joint in zip(self.services, self.section.joints, strict=True):
-            device.check_identity(services, joint)
-        self.send_nmt(objects.NMT_PRE_OPERATIONAL)
-        self._configure()
         loop.drain()
         self._alone()
-        loop.node_states.clear()
-        loop.emergencies.clear()
+        for group in self.groups:
+            group.drives.forget()
         loop.reset_counters()
         self._since = self.clock.now()
-        for node in self.nodes:
-            self.send_nmt(objects.NMT_START, node)
         self._cycling = True
 
     def require_alone(self) -> None:
@@ -162,71 +174,71 @@ class Link(TorqueSensorRecords):
 
     def _alone(self) -> None:
         """Raise BusFault where another host was heard or a controller has restarted."""
-        watch = self._loop.watch
-        restarts = [self.names[joint] for joint in sorted(watch.restarted)]
-        if restarts:
-            raise BusFault(f"{restarts[0]}: its controller has just restarted (boot-up message): start again")
-        fault = bus_fault(self.names, watch, 0)
+        for group in self.groups:
+            if group.drives.has_restarted():
+                raise group.drives.alarm() or BusFault("a controller has just restarted: start again")
+        fault = bus_fault(self.names, self._loop.watch, 0)
         if fault:
             raise BusFault(fault)
 
-    def _configure(self) -> None:
-        """Set every controller up and read it back; what the first cycle starts from."""
-        limits, passed, units, supported = [], [], [], []
-        for joint, services in enumerate(self.services):
-            row, window = self.section.joints[joint], self.windows[joint]
-            unit = device.read_units(services, row)
-            limit = gate_limits(row, window, unit, self.period, self.section.deadline)
-            supported.append(device.check_modes(services))
-            device.configure(services, row, unit, limit, self.period, self.protection, supported[-1])
-            torque = services.read(objects.MOTOR_TORQUE) * unit.torque
-            passed.append(start_from(limit, torque, services.read(objects.POSITION) * unit.position))
-            self._loop.displays[joint] = services.read(objects.MODE_DISPLAY)
-            self._loop.statuses[joint] = services.read(objects.STATUS_WORD)
+    def _set_up(self) -> None:
+        """Set every drive up; what the first cycle starts from."""
+        period, deadline = self.period, self.section.deadline
+        pairs = zip(self.section.joints, self.windows, strict=True)
+        wanted = [drive_limits(row, window, period, deadline) for row, window in pairs]
+        found: dict[int, Setup] = {}
+        for group in self.groups:
+            own = [self.values.limits(place, wanted[place]) for place in group.places]
+            found |= dict(zip(group.places, group.drives.set_up(self._ask(group), own), strict=True))
+        self.setups = [found[joint] for joint in range(self.n)]
+        self.position_step = np.array([each.position_step for each in self.setups]) / self.values.gear
+        limits, passed = [], []
+        for joint, setup in enumerate(self.setups):
+            gains = self.values.gains(joint, setup.gains)
+            limit = gate_limits(wanted[joint], gains, self.values.reach(joint, wanted[joint].max_torque))
+            torque = self.values.torque_of(joint, setup.torque)
+            passed.append(start_from(limit, torque, self.values.position_of(joint, setup.position)))
             limits.append(limit)
-            units.append(unit)
-        self._loop.set_units(tuple(units))
-        self.position_step = np.array([max(unit.position, unit.encoder_step) for unit in units])
-        self.commander.begin(limits, passed, supported)
-
-    def send_nmt(self, command: int, node: int = 0) -> None:
-        """An NMT command (CiA 301) to one node, or to all."""
-        self._loop.send(objects.NMT_ID, bytes([command, node]))
+        self.commander.begin(limits, passed, [each.modes for each in self.setups])
 
     def enable(self) -> Sample:
-        """Walk every joint to operation enabled under position control where it stands, and return the last sample.
+        """Walk every joint to ON, under position control where it stands, and return the last sample.
 
         Faults are reset on the way. Raises BusFault naming the joint and the state it stays in.
         """
         self._require_start()
-        self._loop.emergencies.clear()
+        self._forget()
         self.commander.settle()
-        sample = self.commander.walk(State.ENABLED)
-        self._loop.emergencies.clear()
-        self._loop.node_states.clear()
+        sample = self.commander.walk(Power.ON)
+        self._forget()
         self._enabled = True
         self._last = Command.hold(np.array(self._loop.latest_position))
         return sample
 
     def recover(self) -> Sample:
-        """After a Stall: start the nodes that left operation, and enable every joint where it stands."""
+        """After a Stall: bring drives back that left the communication, and enable every joint where it stands."""
         self._require_start()
-        for node in self.nodes:
-            self.send_nmt(objects.NMT_START, node)
+        for group in self.groups:
+            group.drives.recover(self._ask(group))
         return self.enable()
+
+    def _forget(self) -> None:
+        self._loop.board.events.clear()
+        for group in self.groups:
+            group.drives.forget()
 
     def disable(self) -> None:
         """Take the power from every joint: a joint without a brake falls. Raises BusFault."""
         self._require_start()
         self._enabled = False
-        self.commander.walk(State.SWITCH_ON_DISABLED)
+        self.commander.walk(Power.OFF)
 
     def _require_start(self) -> None:
         if not self._cycling:
             raise BusFault("the nodes are not started: start() comes first")
 
     def cycle(self, command: Command) -> Sample:
-        """One cycle: wait for its time, gate, RPDOs, SYNC, TPDOs.
+        """One cycle: wait for its time, gate, frames out, readings in.
 
         Raises Refused where the gate refuses the command, BusFault for a fault of bus or joint; the joints have been
         sent to quick stop before either is raised. Raises Crossed if a joint crossed a bound of the command's guard:
@@ -276,22 +288,11 @@ class Link(TorqueSensorRecords):
         if not self._enabled:
             return
         self._enabled = False
-        self.commander.quick_stop()
+        self.commander.stop()
 
     def inside(self, function: "Callable[Concatenate[Link, P], R]", *args: P.args, **kwargs: P.kwargs) -> R:
         """Call `function(link, ...)`: in the process that makes the cycles, which is this one."""
         return function(self, *args, **kwargs)
-
-    def read_temperatures(self) -> Array:
-        """Temperatures of the drives (n,) [°C]; NaN for a drive that does not report one. Raises BusFault."""
-        return np.array([device.read_temperature(services) for services in self.services])
-
-    @cached_property
-    def services(self) -> tuple[NodeServices, ...]:
-        """SDO access to each joint's controller, in joint order."""
-        network = PumpedNetwork(self._loop.send)
-        self._loop.on_other = lambda can_id, data: network.notify(can_id, bytearray(data), 0.0)
-        return joint_services(network, self.arm, self._pump)
 
     def _pump(self, done: Callable[[], bool], timeout: float) -> bool:
         """Run the loop until `done` or the time is over; enabled joints get their last command in every cycle."""

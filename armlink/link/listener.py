@@ -1,19 +1,16 @@
-"""Listening to an arm that another controller commands: one sample a SYNC of that controller; nothing is sent.
+"""Listening to an arm that another controller commands: one sample a cycle of that controller; nothing is sent.
 
-On SocketCAN and udp_multicast it sleeps for several cycles and then takes all that came, each SYNC with the kernel's
-own time of it; on other buses it wakes for each frame, whose time is when it was read.
+A cycle begins with SYNC; of drives without SYNC with the command to the joint that was commanded first. On SocketCAN
+and udp_multicast it sleeps for several cycles and then takes all that came, each frame with the kernel's own time; on
+other buses it wakes for each frame, whose time is when it was read.
 
-The one exception is asked for by name: `write_calibration` and `read_calibration` use SDO on object 2100h.
+The one exception is asked for by name: `write_calibration` and `read_calibration` ask the drives.
 """
 
-import struct
 from collections import deque
 from collections.abc import Callable
-from functools import cached_property
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
-
-import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
@@ -21,12 +18,13 @@ from armlink.bus.adapters import as_bus
 from armlink.bus.can_bus import CanBus
 from armlink.bus.port import StampedPort
 from armlink.clock import Clock, MonotonicClock
-from armlink.drives.canopen import object_dictionary as objects
-from armlink.drives.canopen.pdo import RPDO1
-from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork, joint_services
-from armlink.drives.canopen.units import assumed_units
+from armlink.drives.board import Event
+from armlink.link.ask import LinkAsk
+from armlink.link.calibrations import Calibrations
 from armlink.link.cyclic_exchange import Loop
-from armlink.link.torque_sensor_record import TorqueSensorRecords
+from armlink.link.foreign_host import Commands, ForeignHost
+from armlink.link.groups import make_groups
+from armlink.link.joint_values import values_of
 from armlink.link.types import Sample, Stats
 
 if TYPE_CHECKING:
@@ -35,13 +33,9 @@ if TYPE_CHECKING:
 SLEEP = 0.04
 """Frames with a time stamp may wait for this long [s]: ten cycles at 250 Hz, half of what a small receive queue holds
 of a full bus."""
-COMMAND = "Hhi"
-"""RPDO1: control word, target torque, target position."""
-NO_COMMAND = bytes(8)
-"""Stands for the RPDO1 that has not come yet; this object, not its value."""
 
 
-class Listener(TorqueSensorRecords):
+class Listener(Calibrations):
     """Context manager: `with Listener(arm, bus) as listener: sample = listener.next(0.1)`."""
 
     def __init__(self, arm: ArmFile, bus: "CanBus | can.BusABC") -> None:
@@ -49,24 +43,24 @@ class Listener(TorqueSensorRecords):
         self.arm, self.bus = arm, as_bus(bus)
         self.section = section = arm.require_link()
         self.names = tuple(joint.name for joint in section.joints)
-        self.nodes = tuple(joint.settings.node for joint in section.joints)
         self.n, self.period = len(self.names), 1.0 / section.rate
         self.clock: Clock = self.bus.clock or MonotonicClock()
         self._port = self.bus.open_listening_port()
-        self._loop = Loop(self._port, self.clock, self.nodes, 0, self.period, self.bus.clock is not None)
-        units = assumed_units(arm)
-        self._loop.set_units(units)
-        self._loop.on_other = self._take_other
-        self._torque_unit = np.array([unit.torque for unit in units])
-        self._position_unit = np.array([unit.position for unit in units])
-        self._commands = {RPDO1.cob_base + node: NO_COMMAND for node in self.nodes}
-        self._layout = struct.Struct("<" + self.n * COMMAND)
-        self._ready: deque[tuple[Sample, tuple[bytes, ...]]] = deque()
-        self._sent = self._given = (NO_COMMAND,) * self.n
-        """RPDO1 of each joint: for the sample that `next` gave last, and for the one that is coming in."""
+        self.groups = make_groups(arm, self.bus)
+        self.values = values_of(arm, self.groups)
+        lock_step = self.bus.clock is not None
+        self._loop = Loop(self._port, self.clock, self.groups, self.values, self.period, lock_step)
+        self._loop.on_unknown = self._take_unknown
+        self.ask = LinkAsk(self._loop, self.clock, self._pump)
+        self._host = ForeignHost(self.groups, self.values)
+        self._ready: deque[tuple[Sample, Commands]] = deque()
+        self._sent: Commands = ()
+        self._given: Commands = ()
+        """Commands for the sample that `next` gave last, and for the one that is coming in."""
+        self._decoded: tuple[Array, Array] | None = None
         self._sync: float | None = None
         self._since: float | None = None
-        self._notify: Callable[[int, bytearray, float], None] | None = None
+        self._now = 0.0
 
     def __enter__(self) -> Self:
         """The listener itself."""
@@ -84,31 +78,25 @@ class Listener(TorqueSensorRecords):
         return self._loop.stats
 
     @property
-    def emergencies(self) -> deque[tuple[int, int, int]]:
-        """(Joint, code, error register) of every emergency heard; the caller may clear it."""
-        return self._loop.emergencies
-
-    @property
-    def node_states(self) -> dict[int, int]:
-        """Joint → NMT state of its newest heartbeat, 0 for boot-up; the caller may clear it."""
-        return self._loop.node_states
+    def emergencies(self) -> deque[Event]:
+        """Everything that drives told of themselves; the caller may clear it."""
+        return self._loop.board.events
 
     @property
     def torque_sent(self) -> Array:
         """Target torque of the other controller for the last sample of `next` [N·m], (n,); NaN before its first."""
-        return self._decoded(1, self._torque_unit)
+        return self._commands[0]
 
     @property
     def position_sent(self) -> Array:
         """Likewise target position [rad]."""
-        return self._decoded(2, self._position_unit)
+        return self._commands[1]
 
-    def _decoded(self, place: int, unit: Array) -> Array:
-        values: Array = np.array(self._layout.unpack(b"".join(self._sent))[place::3]) * unit
-        for joint, data in enumerate(self._sent):
-            if data is NO_COMMAND:
-                values[joint] = np.nan
-        return values
+    @property
+    def _commands(self) -> tuple[Array, Array]:
+        if self._decoded is None:
+            self._decoded = self._host.decode(self._sent)
+        return self._decoded
 
     def next(self, timeout: float) -> Sample | None:
         """The next complete sample, or None where no SYNC completes one within `timeout` [s]; raises BusFault.
@@ -123,6 +111,7 @@ class Listener(TorqueSensorRecords):
                     return None
                 self._hear(remaining)
         sample, self._sent = self._ready.popleft()
+        self._decoded = None
         return sample
 
     def _hear(self, seconds: float, at_once: bool = False) -> None:
@@ -138,22 +127,17 @@ class Listener(TorqueSensorRecords):
             frame = port.receive(seconds)
             frames = [] if frame is None else [(self.clock.now(), *frame)]
         self._loop.count(len(frames), sum([len(data) for _, _, data in frames]))
-        commands, take = self._commands, self._loop.take
+        take = self._loop.take
         for t, can_id, data in frames:
-            if can_id in commands:
-                if len(data) == len(NO_COMMAND):
-                    commands[can_id] = data
-            elif can_id == objects.SYNC_ID:
-                self._complete(t)
-            else:
-                take(can_id, data)
+            self._now = t
+            take(can_id, data)
 
-    def _take_other(self, can_id: int, data: bytes) -> None:
-        if self._notify is not None:
-            self._notify(can_id, bytearray(data), 0.0)
+    def _take_unknown(self, can_id: int, data: bytes) -> None:
+        if self._host.begins(can_id, data):
+            self._complete(self._now)
 
     def _complete(self, now: float) -> None:
-        """A SYNC: what came since the one before is its sample."""
+        """A cycle begins: what came since the one before is its sample."""
         if self._sync is None or self._since is None:
             self._loop.reset_counters()
             self._loop.drop_readings()
@@ -164,14 +148,7 @@ class Listener(TorqueSensorRecords):
             self._loop.stats.missed += sum([value != value for value in sample.position.tolist()])  # NaN
             self._loop.drop_readings()
             self._ready.append((sample, self._given))
-        self._sync, self._given = now, tuple(self._commands.values())
-
-    @cached_property
-    def services(self) -> tuple[NodeServices, ...]:
-        """SDO access to each joint's controller, in joint order; using it sends."""
-        network = PumpedNetwork(self._loop.send)
-        self._notify = network.notify
-        return joint_services(network, self.arm, self._pump)
+        self._sync, self._given = now, self._host.commands()
 
     def _pump(self, done: Callable[[], bool], timeout: float) -> bool:
         """Go on listening until `done` or the time is over."""

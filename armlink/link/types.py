@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armlink.arrays import Array
-from armlink.drives.canopen.cia402 import Mode, State
+from armlink.drives.orders import Mode
 from armlink.link.guard import Guard
 from armlink.link.lateness import Lateness
-from armlink.torque_calibration import TorqueCalibration
+from armlink.torque_calibration import Calibration as Calibration
 
 
 @dataclass(eq=False)
@@ -92,7 +92,7 @@ class Sample:
     motor_torque: Array
     """Torque actual value 6077h [N·m], (n,); each fourth cycle (TPDO2), NaN in the others."""
     status: NDArray[np.int64]
-    """Newest status word 6041h, (n,); sent when it changes, so the last one stands."""
+    """Newest state code of each drive, (n,), by its family (`armlink.link.groups.state_name` has the words)."""
     age: Array
     """Time since position and torque last came [s], (n,); 0 where they came in this cycle, inf before the first."""
     timely: NDArray[np.bool_] | None = None
@@ -107,41 +107,6 @@ class Sample:
     def all_timely(self) -> bool:
         """Whether the readings of all joints are timely."""
         return self.timely is None or bool(self.timely.all())
-
-
-@dataclass(frozen=True)
-class Identity:
-    """One node as `scan` finds it."""
-
-    joint: str
-    """Joint name of the arm file; empty for a node that the arm file does not know."""
-    node: int
-    present: bool
-    name: str = ""
-    device_type: int = 0
-    vendor: int = 0
-    product: int = 0
-    revision: int = 0
-    serial: int = 0
-    state: State = State.UNKNOWN
-    answers: int = 1
-    """How many answered one request at this node id; more than one is a duplicated id."""
-
-
-@dataclass(frozen=True)
-class Calibration(TorqueCalibration[float]):
-    """Torque sensor calibration in a joint controller (2100h), and which record it is from."""
-
-    record_id: int = 0
-    date: int = 0
-    """Date of the record [s since 1970]; 0 if none was written."""
-    crc: int = 0
-    """CRC-32 as the controller reports it; ignored in a calibration that is to be written."""
-
-    @property
-    def is_blank(self) -> bool:
-        """Whether no calibration was ever written: gain 1, offset 0, record 0."""
-        return (self.gain, self.offset, self.record_id) == (1.0, 0.0, 0)
 
 
 @dataclass

@@ -5,7 +5,8 @@ from typing import Any, Concatenate, ParamSpec, Protocol, Self, TypeVar
 
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
-from armlink.link.types import Calibration, Command, Controller, Identity, Sample, Samples, Setpoints, Stats
+from armlink.drives.orders import DriveIdentity
+from armlink.link.types import Calibration, Command, Controller, Sample, Samples, Setpoints, Stats
 
 R = TypeVar("R")
 P = ParamSpec("P")
@@ -55,7 +56,7 @@ class ArmDriver(Protocol):
         """Stop the joints and close the bus."""
         ...
 
-    def scan(self) -> list[Identity]:
+    def scan(self) -> list[DriveIdentity]:
         """Identity and state of each joint's controller."""
         ...
 

@@ -15,8 +15,9 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
+from armlink.drives.orders import DriveIdentity
 from armlink.errors import BusFault
-from armlink.link.types import Calibration, Command, Controller, Identity, Sample, Samples, Setpoints, Stats
+from armlink.link.types import Calibration, Command, Controller, Sample, Samples, Setpoints, Stats
 from armlink.loop.channel import Channel, Closed
 from armlink.loop.messages import Alive, Answer, Call, Cut, Open, Play, Run, Stopped, unpack
 from armlink.loop.realtime import Realtime
@@ -99,9 +100,9 @@ class RemoteLink:
         found: Stats = self._call("stats")
         return found
 
-    def scan(self) -> list[Identity]:
+    def scan(self) -> list[DriveIdentity]:
         """Identity and state of each joint's controller."""
-        found: list[Identity] = self._call("scan")
+        found: list[DriveIdentity] = self._call("scan")
         return found
 
     def start(self) -> None:

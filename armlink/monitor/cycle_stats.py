@@ -1,15 +1,18 @@
-"""Statistics of the cycle on a bus: period and jitter of SYNC, SYNC-to-reading latency, missed cycles, bus load."""
+"""Statistics of the cycle on a bus: period, jitter, latency of readings, missed cycles, bus load.
+
+A cycle begins with SYNC, of drives without SYNC with the command to the first of them that is commanded.
+"""
 
 import math
 from array import array
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from armlink.arrays import Array
 from armlink.bus.frame_bits import frame_bits
-from armlink.drives.canopen.object_dictionary import SYNC_ID
-from armlink.drives.canopen.pdo import TPDO1
+from armlink.link.groups import Group
 
 KEPT = 1_000_000
 """Maximum number of cycles whose times are kept; more than an hour at 250 Hz."""
@@ -24,7 +27,7 @@ class CycleReport:
     cycles: int
     """Intervals from SYNC to SYNC."""
     missed: int
-    """Cycles in which a joint's reading (TPDO1) did not arrive before the next SYNC, or whose SYNC was missing."""
+    """Cycles in which a joint's reading did not arrive before the next SYNC, or whose SYNC was missing."""
     period_ms: float
     jitter_ms: float
     """Standard deviation of the period."""
@@ -45,9 +48,12 @@ class CycleReport:
 class CycleStats:
     """Collects statistics from every frame and its timestamp, in bus order."""
 
-    def __init__(self, nodes: tuple[int, ...], period: float, bitrate: int) -> None:
-        """`period` of SYNC [s] from the arm file, `bitrate` of the bus [bit/s]."""
-        self._readings = frozenset(TPDO1.cob_base + node for node in nodes)
+    def __init__(self, groups: Sequence[Group], period: float, bitrate: int) -> None:
+        """`period` of the cycle [s] from the arm file, `bitrate` of the bus [bit/s]."""
+        self._readings = frozenset(can_id | group.tag for group in groups for can_id in group.drives.reading_ids())
+        syncs = [can_id | group.tag for group in groups for can_id in group.drives.cycle_ids()]
+        self._begins = min(syncs, default=None)
+        self._commands = frozenset(can_id | group.tag for group in groups for can_id in group.drives.commands())
         self._period, self._bitrate = period, bitrate
         self._periods, self._latencies = array("d"), array("d")
         self._waiting: set[int] = set()
@@ -58,7 +64,9 @@ class CycleStats:
         """Count a frame received at `stamp` [s]."""
         if self._first == self._first:  # frames before the first SYNC belong to no whole cycle
             self._bits += frame_bits(can_id, data)
-        if can_id == SYNC_ID:
+        if self._begins is None and can_id in self._commands:
+            self._begins = can_id
+        if can_id == self._begins:
             self._begin(stamp)
         elif can_id in self._waiting:
             self._waiting.discard(can_id)

@@ -12,11 +12,12 @@ from armlink.bus.message_port import is_data
 from armlink.bus.port import Port
 from armlink.bus.taps import TappedBus, TappedPort
 from armlink.clock import Clock, MonotonicClock
-from armlink.drives.canopen import emcy
-from armlink.drives.canopen.cia402 import state_of
-from armlink.drives.canopen.object_dictionary import NMT_ID, NMT_START, NMT_STATES, OPERATIONAL, SYNC_ID
-from armlink.drives.canopen.units import assumed_units
-from armlink.link.cyclic_exchange import NO_STATUS, Loop
+from armlink.drives.board import NO_STATUS
+from armlink.errors import BadInput
+from armlink.link.cyclic_exchange import Loop
+from armlink.link.foreign_host import ForeignHost
+from armlink.link.groups import make_groups
+from armlink.link.joint_values import values_of
 from armlink.link.types import Sample
 from armlink.monitor.cycle_stats import CycleStats
 
@@ -27,31 +28,43 @@ class View:
 
     sample: Sample
     rate_hz: float
-    """SYNCs per second."""
+    """Cycles per second."""
     load: float
     """Share of the bus time taken by the frames received and sent."""
 
 
 class Monitor:
-    """Listens to an arm's joints. With `sync` it acts as host: starts the nodes (NMT) and sends SYNC itself."""
+    """Listens to an arm's joints. With `sync` it acts as host where the family has frames that only make drives send
+    readings (CANopen: NMT start and SYNC)."""
 
     def __init__(self, arm: ArmFile, bus: MessageBus, sync: bool = False, stats: bool = False) -> None:
         """`stats`: also measure the cycle from the timestamp of every frame, which takes more CPU time."""
         self.section = section = arm.require_link()
         self.names = tuple(joint.name for joint in section.joints)
-        self.nodes = tuple(joint.settings.node for joint in section.joints)
+        self._groups = make_groups(arm, bus)
+        self._families = [joint.settings.family for joint in section.joints]
+        values = values_of(arm, self._groups)
         self.clock: Clock = bus.clock or MonotonicClock()
         self._sync, self._period = sync, 1.0 / section.rate
         self.cycle_stats: CycleStats | None = None
         """Statistics of the cycle; None unless requested."""
         if stats:
-            self.cycle_stats = CycleStats(self.nodes, self._period, section.bus.bitrate)
-        self._loop = Loop(self._open_port(bus), self.clock, self.nodes, 0, self._period, bus.clock is not None)
-        self._loop.set_units(assumed_units(arm))
-        self._loop.on_other = self._count
+            self.cycle_stats = CycleStats(self._groups, self._period, section.bus.bitrate)
+        lock_step = bus.clock is not None
+        self._loop = Loop(self._open_port(bus), self.clock, self._groups, values, self._period, lock_step)
+        self._loop.on_unknown = self._count
+        self._host = ForeignHost(self._groups, values)
         self._syncs = 0
         if sync:
-            self._loop.send(NMT_ID, bytes([NMT_START, 0]))
+            silent = [group.family.name for group in self._groups if not group.drives.poll(first=False)]
+            if silent:
+                raise BadInput(f"monitor --sync: drives of the family {silent[0]} send readings to commands alone")
+            self._poll(first=True)
+
+    def _poll(self, first: bool) -> None:
+        for group in self._groups:
+            for can_id, data in group.drives.poll(first):
+                self._loop.send(can_id | group.tag, data)
 
     def _open_port(self, bus: MessageBus) -> Port:
         """Port of the bus; for statistics one that passes on every frame, by a listener with the interface's times."""
@@ -86,27 +99,27 @@ class Monitor:
             **cycle,
             "joints": [self._joint(view.sample, joint) for joint in range(len(self.names))],
             "emergencies": [
-                {"joint": self.names[joint], "code": f"{code:04X}h", "meaning": emcy.name_of(code)}
-                for joint, code, _ in self._loop.emergencies
+                {"joint": self.names[each.joint], "code": each.code, "meaning": each.meaning}
+                for each in self._loop.board.events
             ],
             "bus": {"rate_hz": view.rate_hz, "load": view.load, "frames": self.frames, "errors": self.errors}
             | {"dropped": self._loop.dropped},
         }
 
     def _joint(self, sample: Sample, joint: int) -> dict[str, Any]:
-        sends = math.isfinite(sample.position[joint])  # only operational nodes send TPDOs
-        nmt = OPERATIONAL if sends else self._loop.node_states.get(joint)
+        sends = math.isfinite(sample.position[joint])
         status = int(sample.status[joint])
+        group = next(group for group in self._groups if joint in group.places)
         return {
             "joint": self.names[joint],
-            "node": self.nodes[joint],
+            "family": self._families[joint],
             "position": float(sample.position[joint]),
             "velocity": float(sample.velocity[joint]),
             "torque": float(sample.torque[joint]),
             "motor_torque": float(sample.motor_torque[joint]),
-            "state": None if status == NO_STATUS else state_of(status).value,
-            "nmt": None if nmt is None else NMT_STATES.get(nmt, str(nmt)),
+            "state": None if status == NO_STATUS else group.family.state_name(status),
             "age": float(sample.age[joint]),
+            **group.drives.details(group.places.index(joint), sends),
         }
 
     def _send_syncs(self, seconds: float) -> Sample:
@@ -114,7 +127,7 @@ class Monitor:
         count = max(1, round(seconds / self._period))
         start = self.clock.now()
         for cycle in range(count):
-            self._loop.send(SYNC_ID, b"")
+            self._poll(first=False)
             self._syncs += 1
             end = start + (cycle + 1) * self._period
             while (remaining := end - self.clock.now()) > 0:
@@ -128,4 +141,4 @@ class Monitor:
             self.cycle_stats.take(stamp / 1e6, message.arbitration_id, bytes(message.data))
 
     def _count(self, can_id: int, data: bytes) -> None:
-        self._syncs += can_id == SYNC_ID
+        self._syncs += self._host.begins(can_id, data)

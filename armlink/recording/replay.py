@@ -13,10 +13,10 @@ from armlink.bus.frame_log import LogBus, LogReader, is_log
 from armlink.bus.open import open_bus, parse_bus
 from armlink.bus.port import Port, Stamped
 from armlink.clock import Clock, MonotonicClock
-from armlink.drives.canopen.object_dictionary import SYNC_ID
-from armlink.drives.canopen.pdo import TPDO1, TPDO2, TPDO3
-from armlink.drives.canopen.units import TORQUE_PER_MICRO, assumed_units
+from armlink.drives.family import Replays
+from armlink.drives.orders import Reading
 from armlink.errors import BadInput
+from armlink.link.groups import make_groups
 from armlink.recording.recorder import Recorder
 from armlink.recording.recording import Recording
 
@@ -24,10 +24,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 VIRTUAL_INTERFACES = ("virtual", "udp_multicast")
-_JOINTS_SEND = (0x080, 0x180, 0x280, 0x380, 0x480, 0x580, 0x700)
-_ENABLED = 0x27
 _REFRESH = 0.2  # [s]
-_I16, _I32 = (-(1 << 15), (1 << 15) - 1), (-(1 << 31), (1 << 31) - 1)
 
 
 def recording_of_log(arm: ArmFile, path: Path) -> Recording:
@@ -63,44 +60,48 @@ def play_onto(arm: ArmFile, source: Path, recording: Recording, spec: str, speed
         )
     bus = open_bus(spec, arm.require_link().bus)
     try:
-        frames = frames_of_log(source) if is_log(source) else frames_of_recording(arm, recording)
+        frames = frames_of_log(arm, source) if is_log(source) else frames_of_recording(arm, recording)
         return _play(frames, bus.open_port(), MonotonicClock(), speed)
     finally:
         bus.shutdown()
 
 
-def frames_of_log(path: Path) -> Iterator[Stamped]:
-    """Time [s], identifier and data of SYNC and of the joints' frames in a log; no commands, SDO requests or NMT."""
+def frames_of_log(arm: ArmFile, path: Path) -> Iterator[Stamped]:
+    """Time [s], identifier and data of SYNC and of the drives' frames in a log; no commands, requests or NMT."""
+    groups = make_groups(arm)
+    taken = {can_id for group in groups for can_id in (*group.drives.routes(), *group.drives.cycle_ids())}
     for stamp, can_id, data in LogReader(path).frames():
-        if can_id & 0x780 in _JOINTS_SEND:
+        if can_id in taken:
             yield stamp / 1e6, can_id, data
 
 
 def frames_of_recording(arm: ArmFile, recording: Recording) -> Iterator[Stamped]:
-    """Time [s], identifier and data of the frames by which an arm's joints would have sent a recording.
+    """Time [s], identifier and data of the frames by which an arm's drives would have sent a recording.
 
-    SYNC and TPDO1 for each row, TPDO2 if its values are there; the joints are enabled, in no mode. The frame of a
-    missing reading is left out. Raises BadInput if the number of joints differs.
+    The frame of a missing reading is left out. Raises BadInput if the number of joints differs, or for a family whose
+    frames cannot be made from readings.
     """
-    joints, units = arm.require_link().joints, assumed_units(arm)
+    joints = arm.require_link().joints
     if recording.n != len(joints):
         raise BadInput(f"recording of {recording.n} joints, but {arm.name} has {len(joints)}")
+    groups = make_groups(arm)
+    for group in groups:
+        if not isinstance(group.drives, Replays):
+            raise BadInput(f"replay: drives of the family {group.family.name} cannot be replayed onto a bus")
     nothing = np.full_like(recording.position, math.nan)
     torque = nothing if recording.torque is None else recording.torque
     motor = nothing if recording.motor_torque is None else recording.motor_torque
     velocity = nothing if recording.velocity is None else recording.velocity
     for row, t in enumerate((recording.t - recording.t[0]).tolist()):
-        yield t, SYNC_ID, b""
-        for j, (joint, unit) in enumerate(zip(joints, units, strict=True)):
-            position, reading = recording.position[row, j], torque[row, j]
-            if math.isfinite(position) and math.isfinite(reading):
-                counts = _whole(position / unit.position, _I32), _whole(reading / TORQUE_PER_MICRO, _I32)
-                yield t, TPDO1.cob_base + joint.settings.node, TPDO1.layout.pack(*counts)
-            if row == 0:
-                yield t, TPDO3.cob_base + joint.settings.node, TPDO3.layout.pack(_ENABLED, 0)
-            if math.isfinite(motor[row, j]) and math.isfinite(velocity[row, j]):
-                values = _whole(motor[row, j] / unit.torque, _I16), _whole(velocity[row, j] / unit.position, _I32)
-                yield t, TPDO2.cob_base + joint.settings.node, TPDO2.layout.pack(_ENABLED, *values)
+        columns = (recording.position[row], velocity[row], motor[row], torque[row])
+        for group in groups:
+            readings = [
+                Reading(joint, *[float(column[place]) for column in columns])  # type: ignore[arg-type]
+                for joint, place in enumerate(group.places)
+            ]
+            assert isinstance(group.drives, Replays)
+            for can_id, data in group.drives.replayed(row == 0, readings):
+                yield t, can_id, data
 
 
 def show(recording: Recording, console: "Console", speed: float, clock: Clock | None = None) -> None:
@@ -137,7 +138,3 @@ def _table(recording: Recording, row: int) -> Any:
     for joint, name in enumerate(recording.names):
         table.add_row(name, *(f"{values[row, joint]:+.4f}" for values in channels.values()))
     return table
-
-
-def _whole(value: float, limits: tuple[int, int]) -> int:
-    return max(limits[0], min(limits[1], round(value)))

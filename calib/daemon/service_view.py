@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from armlink.drives.canopen.cia402 import state_of
+from armlink.link.groups import state_name
 from calib.daemon.observing.observation import Observation
 from calib.daemon.service import Service
 from calib.daemon.view.api_models import (
@@ -24,9 +24,6 @@ from calib.daemon.view.api_models import (
 )
 from calib.daemon.view.fan_out import Client
 from calib.daemon.view.view import Decisions, NoSuch
-
-NO_STATUS = 0xFFFF
-"""Stands for the status word of a joint that has sent none."""
 
 
 class ServiceView:
@@ -72,14 +69,16 @@ class ServiceView:
         names, arm_state = self._service.configuration.names, self._service.arm_state
         batch = arm_state.batch
         if batch is None:
-            return tuple(_joint(name, math.nan, math.nan, math.nan, NO_STATUS, math.inf) for name in names)
+            return tuple(_joint(name, math.nan, math.nan, math.nan, "unknown", math.inf) for name in names)
         position, torque = batch.channels["position"][-1], batch.channels["torque"][-1]
         model = np.full(len(names), math.nan)
         if self._observation is not None:
             torque = self._observation.feed.reading(torque)
             if np.isfinite(position).all():
                 model = self._observation.feed.observer.model_torque(position)
-        columns = zip(names, position, torque, model, batch.status.tolist(), batch.age + arm_state.late, strict=True)
+        arm = self._service.configuration.arm
+        states = [state_name(arm, joint, code) for joint, code in enumerate(batch.status.tolist())]
+        columns = zip(names, position, torque, model, states, batch.age + arm_state.late, strict=True)
         return tuple(_joint(*column) for column in columns)
 
     def estimates(self) -> tuple[JointEstimate, ...]:
@@ -167,14 +166,14 @@ def _number(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _joint(name: str, position: float, torque: float, model: float, status: int, age: float) -> JointNow:
+def _joint(name: str, position: float, torque: float, model: float, state: str, age: float) -> JointNow:
     return JointNow(
         joint=name,
         position=_number(position),
         torque=_number(torque),
         model_torque=_number(model),
         residual=_number(torque - model),
-        state="unknown" if status == NO_STATUS else state_of(status).value,
+        state=state,
         sample_age_s=_number(age),
     )
 

@@ -13,9 +13,8 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
-from armlink.link.torque_sensor_record import GAIN_RANGE
 from armlink.link.types import Calibration
-from armlink.torque_calibration import UNKNOWN, TorqueCalibration
+from armlink.torque_calibration import GAIN_RANGE, UNKNOWN, TorqueCalibration
 from calib.records.records import CalibrationRecord, Parameter
 from calib.records.store import RecordStore
 from gcomp.arrays import Array

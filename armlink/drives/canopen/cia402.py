@@ -2,6 +2,9 @@
 
 from enum import Enum, IntEnum
 
+from armlink.drives.orders import MODE_NAMES as MODE_NAMES
+from armlink.drives.orders import Mode
+
 
 class State(Enum):
     """States of the power drive system (CiA 402, 6041h)."""
@@ -17,16 +20,6 @@ class State(Enum):
     UNKNOWN = "unknown"
 
 
-class Mode(IntEnum):
-    """Modes of operation (6060h) that the link commands."""
-
-    OFF = 0
-    PROFILE_POSITION = 1
-    PROFILE_TORQUE = 4
-    POSITION = 8  # cyclic synchronous position
-    TORQUE = 10  # cyclic synchronous torque
-
-
 class Control(IntEnum):
     """Commands of the control word (6040h)."""
 
@@ -40,13 +33,6 @@ class Control(IntEnum):
 
 NEEDED_MODES = (Mode.POSITION, Mode.TORQUE)
 """Modes that every controller must support; the profile modes are optional."""
-MODE_NAMES = {
-    Mode.OFF: "no mode",
-    Mode.PROFILE_POSITION: "profile position",
-    Mode.PROFILE_TORQUE: "profile torque",
-    Mode.POSITION: "cyclic synchronous position",
-    Mode.TORQUE: "cyclic synchronous torque",
-}
 NEW_SET_POINT, CHANGE_AT_ONCE = 0x10, 0x20
 """Bits 4 and 5 of the control word in profile position mode."""
 SET_POINT_ACKNOWLEDGED = 0x1000

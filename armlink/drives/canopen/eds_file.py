@@ -1,6 +1,6 @@
 """Electronic data sheets (EDS, CiA 306) of joint controllers: named in the arm file, by default the bundled one."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -22,11 +22,20 @@ OPTIONAL = {
     object_dictionary.HEARTBEAT_PRODUCER: "",
 }
 """Objects that a controller may lack → the function that is then missing."""
+_STOCK = (
+    object_dictionary.RPDO_DEADLINE,
+    object_dictionary.TARGET_VELOCITY,
+    object_dictionary.POSITION_SI_UNIT,
+    object_dictionary.VELOCITY_SI_UNIT,
+    object_dictionary.INTERPOLATION_VALUE,
+    object_dictionary.INTERPOLATION_INDEX,
+)
+"""Objects that only stock devices are asked for, or that are not in every data sheet."""
 
 
 def used_objects() -> Iterable[Entry]:
-    """The objects of a controller that the link uses."""
-    return [value for value in vars(object_dictionary).values() if isinstance(value, Entry)]
+    """The objects of a controller with our torque sensor record that the link uses."""
+    return [value for value in vars(object_dictionary).values() if isinstance(value, Entry) and value not in _STOCK]
 
 
 def bundled_path() -> str:
@@ -39,9 +48,9 @@ def bundled() -> Any:
     return canopen.import_od(bundled_path(), 1)
 
 
-def of_joints(arm: ArmFile) -> tuple[Any, ...]:
-    """Object dictionary of each joint's controller, in joint order; raises BadInput as read_sheet."""
-    joints, read = arm.require_link().joints, dict[str | None, Any]()
+def of_joints(arm: ArmFile, joints: Sequence[LinkJoint]) -> tuple[Any, ...]:
+    """Object dictionary of each joint's controller; raises BadInput as read_sheet."""
+    read = dict[str | None, Any]()
     for joint in joints:
         if joint.eds not in read:
             read[joint.eds] = bundled() if joint.eds is None else read_sheet(arm.path.parent / joint.eds, joint)

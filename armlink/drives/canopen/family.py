@@ -3,28 +3,40 @@
 from collections.abc import Sequence
 
 from armlink.arm_file import ArmFile, LinkJoint
+from armlink.drives.board import NO_STATUS
+from armlink.drives.canopen.cia402 import state_of
 from armlink.drives.canopen.settings import CanopenSettings
 from armlink.drives.family import Drives, Family
 from armlink.drives.traits import Traits
-from armlink.errors import BusFault
+
+TRAITS = Traits(
+    torque="link",
+    calibration="controller",
+    silence="holds",
+    bounds=("torque", "window"),
+    cadence="sync",
+    frame="11",
+)
+"""Of a drive with our torque sensor record."""
 
 
 def build(arm: ArmFile, joints: Sequence[LinkJoint]) -> Drives:
     """Drives of these joints."""
-    raise BusFault("the link still drives CANopen by its own cycle")
+    from armlink.drives.canopen.drives import CanopenDrives  # imports the canopen package, which takes its time
+
+    return CanopenDrives(arm, joints, TRAITS)
+
+
+def state_name(code: int) -> str:
+    """State in words, from the status word (6041h)."""
+    return "unknown" if code == NO_STATUS else state_of(code).value
 
 
 FAMILY = Family(
     name="canopen",
-    traits=Traits(
-        torque="link",
-        calibration="controller",
-        silence="holds",
-        bounds=("torque", "window"),
-        cadence="sync",
-        frame="11",
-    ),
+    traits=TRAITS,
     settings=CanopenSettings,
     build=build,
+    state_name=state_name,
     summary="CiA 402 (CANopen), with or without our torque sensor object 2100h",
 )

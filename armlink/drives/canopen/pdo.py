@@ -2,7 +2,7 @@
 
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from armlink.drives.canopen.object_dictionary import (
     CONTROL_WORD,
@@ -50,6 +50,10 @@ class Pdo:
     entries: tuple[Entry, ...]
     transmission: int
 
+    def with_entries(self, entries: tuple[Entry, ...]) -> "Pdo":
+        """The same PDO with other objects in it."""
+        return self if entries == self.entries else replace(self, entries=entries)
+
     @property
     def layout(self) -> struct.Struct:
         """The payload, little endian without padding (CiA 301)."""
@@ -81,10 +85,11 @@ Write = Callable[[Entry, int], None]
 Read = Callable[[Entry], int]
 
 
-def configure(pdo: Pdo, node: int, write: Write, read: Read, deadline_ms: int = 0) -> None:
+def configure(pdo: Pdo, node: int, write: Write, read: Read, deadline_ms: int | None = 0) -> None:
     """Set one PDO of one node over SDO and read all of it back (CiA 301 section 7.5.2.36: invalid, count 0, entries).
 
-    `deadline_ms` is the RPDO deadline or TPDO event timer (sub-index 5), 0 for none. Raises MappingRefused if the
+    `deadline_ms` is the RPDO deadline or TPDO event timer (sub-index 5), 0 for none, None for
+    a device without it. Raises MappingRefused if the
     device does not hold what was written.
     """
     cob_id = Entry(pdo.communication, 1, "I", f"{pdo.name} COB-ID")
@@ -92,7 +97,9 @@ def configure(pdo: Pdo, node: int, write: Write, read: Read, deadline_ms: int = 
     timer = Entry(pdo.communication, 5, "H", f"{pdo.name} event timer")
     count = Entry(pdo.mapping, 0, "B", f"{pdo.name} number of mapped objects")
     value = pdo.cob_base + node | (_NO_REMOTE if pdo.communication >= 0x1800 else 0)
-    settings = [(kind, pdo.transmission), (timer, deadline_ms)]
+    settings = [(kind, pdo.transmission)]
+    if deadline_ms is not None:
+        settings.append((timer, deadline_ms))
     settings += [
         (Entry(pdo.mapping, i, "I", f"{pdo.name} mapping {i}"), entry.mapping) for i, entry in enumerate(pdo.entries, 1)
     ]
@@ -105,15 +112,6 @@ def configure(pdo: Pdo, node: int, write: Write, read: Read, deadline_ms: int = 
     for entry, setting in [*settings, (count, len(pdo.entries))]:
         _same(entry, setting, read(entry))
     _same(cob_id, value & ~_NO_REMOTE, read(cob_id) & ~_NO_REMOTE)
-
-
-def decoding_table(nodes: tuple[int, ...]) -> dict[int, tuple[int, Pdo, struct.Struct]]:
-    """COB-ID of every TPDO → (joint index, PDO, layout)."""
-    return {
-        pdo.cob_base + node: (joint, pdo, pdo.layout)
-        for joint, node in enumerate(nodes)
-        for pdo in (TPDO1, TPDO2, TPDO3)
-    }
 
 
 def host_frames(nodes: tuple[int, ...], host: int) -> dict[int, str]:

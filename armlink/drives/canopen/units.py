@@ -1,9 +1,10 @@
 """Conversion between a joint controller's units (per mille of rated torque, user position units, µN·m) and SI."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from armlink.arm_file import ArmFile
+from armlink.arm_file import LinkJoint
 
 TORQUE_PER_MICRO = 1e-6
 """2100h:01 is in µN·m."""
@@ -18,7 +19,9 @@ class Units:
     torque: float
     """One per mille of the rated torque (6076h) [N·m]."""
     position: float
-    """One user unit [rad]; velocities are in user units a second."""
+    """One user unit [rad]."""
+    velocity: float
+    """One unit of 606Ch [rad/s]; by CiA 402 a user unit a second."""
     encoder_step: float
     """One encoder increment at the joint [rad]: the resolution of position readings."""
 
@@ -41,11 +44,11 @@ def units_from(
     return Units(
         torque=rated_torque_mnm * 1e-6,
         position=2 * math.pi * feed[1] / feed[0],
+        velocity=2 * math.pi * feed[1] / feed[0],
         encoder_step=2 * math.pi / increments_a_turn,
     )
 
 
-def assumed_units(arm: ArmFile) -> tuple[Units, ...]:
+def assumed_units(joints: Sequence[LinkJoint]) -> tuple[Units, ...]:
     """Scales from the arm file's rated torques and USER_UNITS per revolution, for listeners, which read no objects."""
-    joints = arm.require_link().joints
     return tuple(units_from(round(joint.rated_torque * 1e3), (1, 1), (1, 1), (USER_UNITS, 1)) for joint in joints)

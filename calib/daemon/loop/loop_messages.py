@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from armlink.arm_file import ArmFile
 from armlink.bus.can_bus import CanBus
+from armlink.drives.board import Event
 from armlink.link.types import Sample, Stats
 from gcomp.arrays import Array
 
@@ -43,15 +44,15 @@ class Batch:
     age: Array
     """Time since position and torque last arrived (n,) [s]."""
     stats: Stats
-    emergencies: tuple[tuple[int, int, int], ...] = ()
-    """(Joint, code, error register) of emergencies heard while only listening."""
+    emergencies: tuple[Event, ...] = ()
+    """What drives told of themselves while only listening."""
 
     @classmethod
     def of(
         cls,
         rows: list[tuple[float, Sample, Array, Array]],
         stats: Stats,
-        emergencies: tuple[tuple[int, int, int], ...] = (),
+        emergencies: tuple[Event, ...] = (),
     ) -> "Batch":
         """From (t, sample, torque command, position command) of K > 0 cycles."""
         samples = [row[1] for row in rows]

@@ -4,7 +4,6 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
-from armlink.drives.canopen import emcy
 from calib.daemon.loop.loop_messages import Batch
 from calib.daemon.state.event_log import EventLog
 
@@ -48,10 +47,9 @@ class ArmState:
     def heard(self, batch: Batch) -> None:
         """Take samples and the emergencies among them."""
         self.batch, self._heard_at = batch, self._monotonic()
-        for joint, code, register in batch.emergencies:
-            if code:
-                text = f"{self._names[joint]}: emergency {code:04X}h, {emcy.name_of(code)}"
-                self._report("fault", self._names[joint], text, {"code": code, "register": register})
+        for event in batch.emergencies:
+            name = self._names[event.joint]
+            self._report("fault", name, f"{name}: {event.text}", dict(event.evidence))
 
     def up(self) -> None:
         """The joints answer."""

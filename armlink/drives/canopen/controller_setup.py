@@ -1,30 +1,26 @@
 """Set-up of one joint's controller before the cycle starts: identity, units, limits, PDO mapping, read back."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from armlink.arm_file import DeviceIdentity, LinkJoint, LinkSection
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen import pdo
-from armlink.drives.canopen.cia402 import MODE_NAMES, NEEDED_MODES, Mode, state_of, supports
+from armlink.drives.canopen.cia402 import MODE_NAMES, NEEDED_MODES, State, state_of, supports
 from armlink.drives.canopen.eds_file import expected_identity
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import Pdo
+from armlink.drives.canopen.profile import OURS, Profile
 from armlink.drives.canopen.sdo import NodeServices
-from armlink.drives.canopen.units import Units, units_from
-from armlink.errors import BadInput, BusFault, Refused
-from armlink.link.gate import JointLimits
-from armlink.link.gate_limits import milliseconds
-from armlink.link.types import Identity
+from armlink.drives.canopen.units import Units
+from armlink.drives.orders import Limits, Mode
+from armlink.errors import BusFault, Refused
 
 QUICK_STOP_AND_HOLD = 6
 """605Ah: quick stop ramp, then stay in quick stop, power on: the joint holds."""
 ABORT_IS_QUICK_STOP = 3
 """6007h: what a lost host leads to."""
-RATED_TORQUE_TOLERANCE = 1e-3
-_INTERPOLATION_VALUE = Entry(0x60C2, 1, "B", "interpolation time period value")
-_INTERPOLATION_INDEX = Entry(0x60C2, 2, "b", "interpolation time index")
 
 
 @dataclass(frozen=True)
@@ -41,9 +37,32 @@ class Protection:
     """Period of the joint's own heartbeat."""
 
 
-def protection_of(section: LinkSection) -> Protection:
+@dataclass(frozen=True)
+class Identity:
+    """One node as `scan` finds it."""
+
+    joint: str
+    """Joint name of the arm file; empty for a node that the arm file does not know."""
+    node: int
+    present: bool
+    name: str = ""
+    device_type: int = 0
+    vendor: int = 0
+    product: int = 0
+    revision: int = 0
+    serial: int = 0
+    state: State = State.UNKNOWN
+    answers: int = 1
+    """How many answered one request at this node id; more than one is a duplicated id."""
+
+
+def milliseconds(seconds: float) -> int:
+    """Whole milliseconds, at least one."""
+    return max(1, math.ceil(seconds * 1e3 - 1e-9))
+
+
+def protection_of(section: LinkSection, nodes: Collection[int]) -> Protection:
     """Host node (the highest that no joint has) and times from the arm file's deadline."""
-    nodes = {joint.settings.node for joint in section.joints}
     host = next(node for node in range(127, 0, -1) if node not in nodes)
     return Protection(
         host,
@@ -106,24 +125,6 @@ def refused_identity(name: str, node: int, mismatches: list[str]) -> Refused:
     )
 
 
-def read_units(services: NodeServices, joint: LinkJoint) -> Units:
-    """Scales of a joint from its controller; raises BadInput where its rated torque is not the arm file's."""
-    read = services.read
-    rated_mnm = int(read(objects.RATED_TORQUE))
-    if abs(rated_mnm * 1e-3 - joint.rated_torque) > RATED_TORQUE_TOLERANCE * joint.rated_torque:
-        raise BadInput(
-            f"{joint.name} ({joint.settings.address}): rated torque 6076h is {rated_mnm * 1e-3} N·m, the arm file "
-            f"says {joint.rated_torque}: correct link.joints or connect the right arm"
-        )
-    encoder = int(read(objects.ENCODER_INCREMENTS)), int(read(objects.ENCODER_REVOLUTIONS))
-    gear = int(read(objects.GEAR_MOTOR)), int(read(objects.GEAR_SHAFT))
-    feed = int(read(objects.FEED)), int(read(objects.FEED_SHAFT))
-    try:
-        return units_from(rated_mnm, encoder, gear, feed)
-    except ValueError as error:
-        raise BusFault(f"{joint.name} (node {joint.settings.node}): no units: {error}") from None
-
-
 def check_modes(services: NodeServices) -> int:
     """Supported modes (6502h); raises BusFault where cyclic synchronous position or torque mode is not among them."""
     supported = int(services.read(objects.SUPPORTED_MODES))
@@ -136,11 +137,13 @@ def check_modes(services: NodeServices) -> int:
     return supported
 
 
-def configure_pdo(services: NodeServices, each: Pdo, deadline_ms: int) -> None:
+def configure_pdo(services: NodeServices, each: Pdo, deadline_ms: int, profile: Profile = OURS) -> None:
     """Map one PDO of the link and read the mapping back; raises BusFault naming the joint.
 
-    RPDO1 gets the deadline [ms]: a joint that hears none for this long stops by itself.
+    RPDO1 gets the deadline [ms], where the device has one: a joint that hears none for this long stops by itself.
     """
+    is_command, stock = each.communication == pdo.RPDO1.communication, profile is not OURS
+    deadline = deadline_ms if is_command and profile.has(objects.RPDO_DEADLINE) else None if stock else 0
 
     def write(entry: Entry, value: int) -> None:
         services.write(entry, value)
@@ -149,7 +152,7 @@ def configure_pdo(services: NodeServices, each: Pdo, deadline_ms: int) -> None:
         return int(services.read(entry))
 
     try:
-        pdo.configure(each, services.node, write, read, deadline_ms if each is pdo.RPDO1 else 0)
+        pdo.configure(each, services.node, write, read, deadline)
     except pdo.MappingRefused as error:
         raise BusFault(f"{services.joint} (node {services.node}): {error}") from None
 
@@ -158,48 +161,49 @@ def configure(
     services: NodeServices,
     joint: LinkJoint,
     unit: Units,
-    limits: JointLimits,
-    period: float,
+    limits: Limits,
     protection: Protection,
     supported: int,
+    profile: Profile = OURS,
 ) -> None:
     """PDOs, and the limits that hold even without this host: torque, position window, quick stop, who is watched.
 
     All is read back. The torque offset 60B2h, which adds to every target torque and stays latched, is cleared where the
     device has one. `supported` is 6502h. Raises BusFault naming joint and object.
     """
-    for each in pdo.LINK_PDOS:
-        configure_pdo(services, each, protection.deadline_ms)
+    for each in profile.pdos:
+        configure_pdo(services, each, protection.deadline_ms, profile)
     if services.has(objects.TORQUE_OFFSET):
         services.write_checked(objects.TORQUE_OFFSET, 0)
-    for entry, value in settings(joint, unit, limits, period, protection, supported):
+    for entry, value in settings(unit, limits, protection, supported, profile):
         services.write_checked(entry, value)
 
 
 def settings(
-    joint: LinkJoint, unit: Units, limits: JointLimits, period: float, protection: Protection, supported: int
+    unit: Units, limits: Limits, protection: Protection, supported: int, profile: Profile = OURS
 ) -> list[tuple[Entry, int]]:
     """Settings of one controller besides its PDOs, in this order.
 
-    Profile modes, where the device has them (6502h, `supported`), get the arm file's velocity and torque rate.
+    Profile modes, where the device has them (6502h, `supported`), get the arm file's velocity and torque rate. What a
+    device lacks is left out.
     """
-    value, exponent = interpolation(period)
+    value, exponent = interpolation(limits.period)
     held = [
-        (objects.MAX_TORQUE, math.floor(joint.max_torque / unit.torque + 1e-9)),
+        (objects.MAX_TORQUE, math.floor(limits.max_torque / unit.torque + 1e-9)),
         (objects.POSITION_LOWER, math.ceil(limits.lower / unit.position)),
         (objects.POSITION_UPPER, math.floor(limits.upper / unit.position)),
         (objects.QUICK_STOP_OPTION, QUICK_STOP_AND_HOLD),
         (objects.ABORT_OPTION, ABORT_IS_QUICK_STOP),
-        (_INTERPOLATION_VALUE, value),
-        (_INTERPOLATION_INDEX, exponent),
+        (objects.INTERPOLATION_VALUE, value),
+        (objects.INTERPOLATION_INDEX, exponent),
         (objects.HEARTBEAT_PRODUCER, protection.producer_ms),
         (objects.HEARTBEAT_CONSUMER, protection.host << 16 | protection.heartbeat_ms),
     ]
     if supports(supported, Mode.PROFILE_POSITION):
-        held.append((objects.PROFILE_VELOCITY, max(1, math.floor(joint.max_velocity / unit.position))))
+        held.append((objects.PROFILE_VELOCITY, max(1, math.floor(limits.max_velocity / unit.velocity))))
     if supports(supported, Mode.PROFILE_TORQUE):
-        held.append((objects.TORQUE_SLOPE, max(1, math.floor(joint.max_torque_rate / unit.torque))))
-    return held
+        held.append((objects.TORQUE_SLOPE, max(1, math.floor(limits.torque_rate / unit.torque))))
+    return [(entry, value) for entry, value in held if profile.has(entry)]
 
 
 def interpolation(period: float) -> tuple[int, int]:

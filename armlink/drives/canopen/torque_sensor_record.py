@@ -11,10 +11,9 @@ import zlib
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen.sdo import NodeServices
 from armlink.errors import BadInput
-from armlink.link.types import Calibration
+from armlink.torque_calibration import GAIN_RANGE, Calibration
 
 _CONTENT = struct.Struct("<ffII")
-GAIN_RANGE = (0.5, 2.0)
 
 
 def calibration_crc(gain: float, offset: float, record_id: int, date: int) -> int:
@@ -34,6 +33,13 @@ def read_record(services: NodeServices) -> Calibration:
     )
 
 
+def require_record(services: NodeServices) -> None:
+    """Raise BusFault where 2100h is not our record: another maker's device has something else there (the serial number
+    of an EPOS4), and nothing is ever written to it. Every object of ours has four bytes, and a gain is a gain."""
+    if not GAIN_RANGE[0] <= read_record(services).gain <= GAIN_RANGE[1]:
+        raise services.fault(objects.GAIN, "is no gain: 2100h of this device is not the torque sensor record")
+
+
 def write_record(services: NodeServices, calibration: Calibration, store: bool = False) -> Calibration:
     """Make a calibration the controller's active one (`store`: in flash too); returns what the controller then holds.
 
@@ -44,6 +50,7 @@ def write_record(services: NodeServices, calibration: Calibration, store: bool =
         raise BadInput(f"{services.joint}: gain {gain} for the controller: expected {GAIN_RANGE[0]} to {GAIN_RANGE[1]}")
     if not abs(offset) < 1e4:
         raise BadInput(f"{services.joint}: offset {offset} N·m for the controller: expected a finite number")
+    require_record(services)
     crc = calibration_crc(gain, offset, record_id, date)
     services.write_checked(objects.STAGED_GAIN, gain)
     services.write_checked(objects.STAGED_OFFSET, offset)
@@ -56,24 +63,3 @@ def write_record(services: NodeServices, calibration: Calibration, store: bool =
     if store:
         services.write(objects.STORE_MANUFACTURER, objects.STORE_SIGNATURE)
     return read_record(services)
-
-
-class TorqueSensorRecords:
-    """Calibrations of all joints' controllers, by SDO: a part of whatever has `services` for them."""
-
-    @property
-    def services(self) -> tuple[NodeServices, ...]:
-        """SDO access to each joint's controller, in joint order."""
-        raise NotImplementedError
-
-    def read_calibration(self, joint: int) -> Calibration:
-        """The active calibration of joint 0 … n−1; raises BusFault."""
-        return read_record(self.services[joint])
-
-    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
-        """Make a calibration active in joint 0 … n−1 (`store`: in flash too); raises BadInput, BusFault.
-
-        While the joints are enabled, the cycle goes on with the last command. Only
-        `calib.install.journaled_write` calls this.
-        """
-        return write_record(self.services[joint], calibration, store)

@@ -5,10 +5,9 @@ from collections.abc import Callable, Mapping
 
 from armlink.bus.port import Port
 from armlink.clock import Clock
+from armlink.drives.canopen.controller_setup import Identity, identify
 from armlink.drives.canopen.eds_file import bundled
 from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork
-from armlink.link.controller_setup import identify
-from armlink.link.types import Identity
 
 SEARCH_SECONDS = 0.3
 """Wait for responses after the last request of the search [s]."""

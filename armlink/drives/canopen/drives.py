@@ -1,0 +1,504 @@
+"""CiA 402 drives on one bus: orders become RPDOs and SYNC, TPDOs become readings; SDO sets everything up."""
+
+import math
+import struct
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+from armlink.arm_file import ArmFile, LinkJoint
+from armlink.bus.port import Frame
+from armlink.drives.board import NO_STATUS, Board, Event
+from armlink.drives.canopen import controller_setup as device
+from armlink.drives.canopen import emcy, faults, torque_sensor_record
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen.cia402 import Control, State, next_control, set_point_control, state_of, supports
+from armlink.drives.canopen.object_dictionary import Entry
+from armlink.drives.canopen.pdo import RPDO1, RPDO2, TPDO1, TPDO2, TPDO3, host_frames
+from armlink.drives.canopen.profile import examine, profile_of
+from armlink.drives.canopen.scales import read_units
+from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork, joint_services
+from armlink.drives.canopen.units import Units, assumed_units
+from armlink.drives.family import Ask
+from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
+from armlink.drives.traits import Traits
+from armlink.errors import BadInput, BusFault
+from armlink.torque_calibration import Calibration
+
+EMERGENCIES_KEPT = 64
+"""So many emergencies are kept; a storm of them costs no memory."""
+NO_MODE = 0
+"""Stands for the mode display of a joint that has sent none: no mode is active."""
+OFF, PROFILE_POSITION = int(Mode.OFF), int(Mode.PROFILE_POSITION)
+ENABLE, DISABLE_VOLTAGE = int(Control.ENABLE), int(Control.DISABLE_VOLTAGE)
+FAULT_RESET, QUICK_STOP = int(Control.FAULT_RESET), int(Control.QUICK_STOP)
+INT16_MAX, INT32_MAX = 2**15 - 1, 2**31 - 1
+_TARGETS = {Power.ON: State.ENABLED, Power.OFF: State.SWITCH_ON_DISABLED, Power.STOPPED: State.QUICK_STOP}
+_POWERS = {
+    State.ENABLED: Power.ON,
+    State.QUICK_STOP: Power.STOPPED,
+    State.FAULT: Power.FAULT,
+    State.FAULT_REACTION: Power.FAULT,
+    State.SWITCH_ON_DISABLED: Power.OFF,
+    State.NOT_READY: Power.OFF,
+    State.READY: Power.READY,
+    State.SWITCHED_ON: Power.READY,
+}
+_ALL = (-INT32_MAX - 1, INT32_MAX)
+_SYNC: Frame = (objects.SYNC_ID, b"")
+_OPERATIONAL = bytes([objects.OPERATIONAL])
+
+
+class CanopenDrives:
+    """Implements `armlink.drives.family.Drives`, `FillsBoard` and `KeepsCalibration`."""
+
+    def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint], traits: Traits) -> None:
+        """The drives of these joints; `traits` of one with our torque sensor record."""
+        section = arm.require_link()
+        self.arm, self.rows = arm, tuple(joints)
+        self.names = tuple(joint.name for joint in joints)
+        self.nodes = tuple(joint.settings.node for joint in joints)
+        self.m = m = len(self.rows)
+        self.protection = device.protection_of(section, self.nodes)
+        self.profiles = [profile_of(joint.settings) for joint in joints]
+        self.units: list[Units] = list(assumed_units(joints))
+        self.beating = True
+        """Whether the host's heartbeat is sent; not, so that the joints' watching it is put to the test."""
+        self.statuses, self.displays = [NO_STATUS] * m, [NO_MODE] * m
+        """Newest status word (6041h) and mode display (6061h) of each joint."""
+        self.emergencies: deque[tuple[int, int, int]] = deque(maxlen=EMERGENCIES_KEPT)
+        """(joint, code, error register) in the order of arrival, the newest; resets (code 0) are not kept."""
+        self.node_states: dict[int, int] = {}
+        """Joint → NMT state of its newest heartbeat."""
+        self.restarted: set[int] = set()
+        """Joints whose controller has sent its boot-up message."""
+        self._traits, self._deadline = traits, section.deadline
+        self._heartbeat_cycles = max(1, int(section.deadline / 2 * section.rate))
+        self._cycles = 0
+        self._joint_of = {node: joint for joint, node in enumerate(self.nodes)}
+        self._supported = [0] * m
+        self._modes, self._mode_since = [OFF] * m, [-math.inf] * m
+        self._words, self._walking = [FAULT_RESET] * m, [False] * m
+        self._windows = [(-INT32_MAX - 1, INT32_MAX)] * m
+        self._limits: list[Limits] = []
+        self._sent: list[bytes | None] = [None] * m
+        self._command_ids = tuple(RPDO1.cob_base + node for node in self.nodes)
+        self._heartbeat: Frame = (objects.HEARTBEAT_ID + self.protection.host, _OPERATIONAL)
+        self._known = faults.Known(
+            self.names,
+            self.statuses,
+            self.displays,
+            self._mode_since,
+            self.emergencies,
+            self.node_states,
+            self.restarted,
+        )
+        self._board: Board | None = None
+        self._places: Sequence[int] = range(m)
+        self._network: PumpedNetwork | None = None
+        self._services: tuple[NodeServices, ...] = ()
+        self._map()
+
+    def _map(self) -> None:
+        """Layouts of the PDOs by the profiles."""
+        self._layouts: list[dict[str, struct.Struct]] = [
+            {each.name: each.layout for each in profile.pdos} for profile in self.profiles
+        ]
+        self._entries: list[dict[str, tuple[Entry, ...]]] = [
+            {each.name: each.entries for each in profile.pdos} for profile in self.profiles
+        ]
+        self._with_torque = [objects.TARGET_TORQUE in entries[RPDO1.name] for entries in self._entries]
+
+    # ---- what they are
+
+    def traits(self, joint: int) -> Traits:
+        """See Drives."""
+        settings, profile = self.rows[joint].settings, self.profiles[joint]
+        if settings.torque == "record" and settings.calibration is None:
+            return self._traits
+        watched = profile.has(objects.RPDO_DEADLINE) or profile.has(objects.HEARTBEAT_CONSUMER)
+        bounds = [(objects.MAX_TORQUE, "torque"), (objects.POSITION_LOWER, "window")]
+        return Traits(
+            torque="current" if profile.reading is None else "link",
+            calibration=settings.calibration or ("controller" if settings.torque == "record" else "host"),
+            silence="holds" if watched else "keeps on",
+            bounds=tuple(bound for entry, bound in bounds if profile.has(entry)),  # type: ignore[misc]
+            cadence="sync",
+            frame="11",
+        )
+
+    def routes(self) -> Mapping[int, int]:
+        """See Drives."""
+        services = (TPDO1.cob_base, TPDO2.cob_base, TPDO3.cob_base, objects.EMCY_ID, objects.HEARTBEAT_ID, 0x580)
+        return {base + node: joint for joint, node in enumerate(self.nodes) for base in services}
+
+    def commands(self) -> Mapping[int, str]:
+        """See Drives."""
+        return host_frames(self.nodes, self.protection.host)
+
+    def cycle_ids(self) -> frozenset[int]:
+        """See Drives."""
+        return frozenset((objects.SYNC_ID,))
+
+    def services(self, ask: Ask) -> tuple[NodeServices, ...]:
+        """SDO access to each joint's controller."""
+        if self._network is None:
+            self._network = PumpedNetwork(ask.send)
+            self._services = joint_services(self._network, self.arm, self.rows, ask.wait)
+        return self._services
+
+    def missing(self, ask: Ask) -> list[int]:
+        """See Drives."""
+        return [joint for joint, services in enumerate(self.services(ask)) if not services.present()]
+
+    def identify(self, ask: Ask) -> list[DriveIdentity]:
+        """See Drives."""
+        found = []
+        for joint, services in enumerate(self.services(ask)):
+            address = self.rows[joint].settings.address
+            if not services.present():
+                found.append(DriveIdentity(joint, address, present=False))
+                continue
+            told = device.identify(services)
+            serial = f"{told.vendor:x}:{told.product:x}:{told.revision:x}:{told.serial}"
+            power = _POWERS.get(told.state, Power.UNKNOWN)
+            found.append(DriveIdentity(joint, address, True, told.name, serial, power=power))
+        return found
+
+    # ---- set-up
+
+    def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
+        """See Drives: nodes pre-operational, everything set and read back, nodes started (NMT)."""
+        all_services = self.services(ask)
+        for services, row in zip(all_services, self.rows, strict=True):
+            device.check_identity(services, row)
+        for node in self._nmt_targets():
+            self.send_nmt(ask, objects.NMT_PRE_OPERATIONAL, node)
+        found = []
+        self._limits = list(limits)
+        for joint, services in enumerate(all_services):
+            self.profiles[joint] = examine(services, self.rows[joint].settings)
+        self._map()
+        if self._board is not None:
+            self.fill(self._board, self._places)
+        for joint, services in enumerate(all_services):
+            found.append(self._set_up(joint, services, limits[joint]))
+        self._cycles = 0
+        self._words, self._walking, self._modes = [FAULT_RESET] * self.m, [False] * self.m, [OFF] * self.m
+        for node in self.nodes:
+            self.send_nmt(ask, objects.NMT_START, node)
+        return found
+
+    def _nmt_targets(self) -> tuple[int, ...]:
+        return (0,) if all(row.settings.torque == "record" for row in self.rows) else self.nodes
+
+    def _set_up(self, joint: int, services: NodeServices, limits: Limits) -> Setup:
+        row, profile = self.rows[joint], self.profiles[joint]
+        unit = read_units(services, row)
+        check_fits(row.name, limits, unit)
+        supported = device.check_modes(services) if row.settings.torque == "record" else self._offered(services)
+        device.configure(services, row, unit, limits, self.protection, supported, profile)
+        self.units[joint], self._supported[joint] = unit, supported
+        self._windows[joint] = math.ceil(limits.lower / unit.position), math.floor(limits.upper / unit.position)
+        torque = services.read(objects.MOTOR_TORQUE) * unit.torque if profile.has(objects.MOTOR_TORQUE) else math.nan
+        if profile.has(objects.MODE_DISPLAY):
+            self.displays[joint] = services.read(objects.MODE_DISPLAY)
+        self.statuses[joint] = services.read(objects.STATUS_WORD)
+        if self._board is not None:
+            self._board.status[self._places[joint]] = self.statuses[joint]
+        return Setup(
+            position=services.read(objects.POSITION) * unit.position,
+            torque=torque,
+            position_step=max(unit.position, unit.encoder_step),
+            modes=frozenset(int(mode) for mode in Mode if supports(supported, mode)),
+            lost=profile.lost,
+            scales={"torque [N·m]": unit.torque, "position [rad]": unit.position, "velocity [rad/s]": unit.velocity},
+        )
+
+    def _offered(self, services: NodeServices) -> int:
+        """Modes of a stock device as bits of 6502h."""
+        return int(services.read(objects.SUPPORTED_MODES))
+
+    def send_nmt(self, ask: Ask, command: int, node: int = 0) -> None:
+        """An NMT command (CiA 301) to one node, or to all."""
+        ask.send(objects.NMT_ID, bytes([command, node]))
+
+    def recover(self, ask: Ask) -> None:
+        """See Drives: start the nodes that left operation."""
+        for node in self.nodes:
+            self.send_nmt(ask, objects.NMT_START, node)
+
+    # ---- orders to frames
+
+    def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
+        """See Drives: RPDO2 where a mode changes, RPDO1 of every joint, heartbeat when due, SYNC."""
+        modes: list[Frame] = []
+        commands: list[Frame] = []
+        for joint, order in enumerate(orders):
+            if order is None:
+                self._sent[joint] = None
+                continue
+            if order.walk:
+                word = self._step(joint, order, modes, now)
+            else:
+                self._walking[joint] = False
+                if order.power is Power.ON:
+                    word, mode = ENABLE, order.mode
+                    if mode != self._modes[joint] and mode:
+                        self._select(joint, mode, modes, now)
+                    if mode == PROFILE_POSITION:
+                        word = set_point_control(self.statuses[joint])
+                else:
+                    word = QUICK_STOP if order.power is Power.STOPPED else DISABLE_VOLTAGE
+            unit = self.units[joint]
+            limits, position = self._limits[joint], order.position
+            low, high = (
+                self._windows[joint] if limits.lower <= position <= limits.upper else (-INT32_MAX - 1, INT32_MAX)
+            )
+            target = max(low, min(high, round(position / unit.position)))
+            pack = self._layouts[joint]["RPDO1"].pack
+            if self._with_torque[joint]:
+                data = pack(word, int(order.torque / unit.torque), target)
+            else:
+                data = pack(word, target)
+            self._words[joint], self._sent[joint] = word, data
+            commands.append((self._command_ids[joint], data))
+        if modes:
+            commands = modes + commands
+        if self.beating and self._cycles % self._heartbeat_cycles == 0:
+            commands.append(self._heartbeat)
+        self._cycles += 1
+        commands.append(_SYNC)
+        return commands
+
+    def _select(self, joint: int, mode: int, frames: list[Frame], now: float) -> None:
+        self._modes[joint], self._mode_since[joint] = mode, now
+        if RPDO2.name in self._layouts[joint]:
+            frames.append((RPDO2.cob_base + self.nodes[joint], struct.pack("<b", mode)))
+
+    def _step(self, joint: int, order: Order, frames: list[Frame], now: float) -> int:
+        """Control word of the next step towards the power of an order; the first of a walk changes nothing yet, so that
+        the next one is an edge; a joint with power keeps it."""
+        target, state = _TARGETS[order.power], state_of(self.statuses[joint])
+        if not self._walking[joint]:
+            self._walking[joint] = True
+            self._select(joint, order.mode, frames, now)
+            if state is State.QUICK_STOP:
+                return QUICK_STOP
+            return next_control(state, target) if state is State.ENABLED else DISABLE_VOLTAGE
+        reset_again = state is State.FAULT and self._words[joint] == FAULT_RESET
+        return DISABLE_VOLTAGE if reset_again else next_control(state, target)
+
+    def sent(self, joint: int) -> Order | None:
+        """See Drives."""
+        data = self._sent[joint]
+        if data is None:
+            return None
+        return self._decoded(joint, data)
+
+    def _decoded(self, joint: int, data: bytes) -> Order | None:
+        layout, unit = self._layouts[joint]["RPDO1"], self.units[joint]
+        if len(data) != layout.size:
+            return None
+        values = layout.unpack(data)
+        torque = values[1] * unit.torque if self._with_torque[joint] else math.nan
+        word = values[0] & 0x8F
+        power = Power.ON if word == ENABLE else Power.STOPPED if word & 0x86 == QUICK_STOP else Power.OFF
+        return Order(power, False, self._modes[joint], values[-1] * unit.position, 0.0, torque, 0.0, 0.0)
+
+    def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
+        """See Drives."""
+        joint = self._joint_of.get(can_id - RPDO1.cob_base)
+        order = None if joint is None else self._decoded(joint, data)
+        if joint is None or order is None:
+            return None
+        return joint, order._replace(velocity=math.nan, kp=math.nan, kd=math.nan)
+
+    # ---- frames to readings
+
+    def fill(self, board: Board, places: Sequence[int]) -> dict[int, Callable[[bytes], None]]:
+        """See FillsBoard."""
+        self._board, self._places = board, places
+        table: dict[int, Callable[[bytes], None]] = {}
+        for joint, node in enumerate(self.nodes):
+            table[TPDO1.cob_base + node] = partial(self._take_reading, joint, places[joint], board)
+            table[TPDO2.cob_base + node] = partial(self._take_slow, joint, places[joint], board)
+            table[TPDO3.cob_base + node] = partial(self._take_display, joint, places[joint], board)
+        return table
+
+    def _take_reading(self, joint: int, place: int, board: Board, data: bytes) -> None:
+        reading = self._reading(joint, data)
+        if reading is None:
+            board.errors += 1
+        else:
+            board.reading(place, *reading)
+
+    def _reading(self, joint: int, data: bytes) -> tuple[float, float] | None:
+        layout = self._layouts[joint]["TPDO1"]
+        if len(data) != layout.size:
+            return None
+        values = layout.unpack(data)
+        profile, position = self.profiles[joint], values[0] * self.units[joint].position
+        if profile.reading is None:
+            return position, math.nan
+        return position, profile.torque_scale * (values[1] - profile.torque_zero)
+
+    def _take_slow(self, joint: int, place: int, board: Board, data: bytes) -> None:
+        slow = self._slow(joint, data)
+        if slow is None:
+            board.errors += 1
+        else:
+            self.statuses[joint] = board.status[place] = slow[0]
+            board.slow(place, slow[1], slow[2])
+
+    def _slow(self, joint: int, data: bytes) -> tuple[int, float, float] | None:
+        layout = self._layouts[joint]["TPDO2"]
+        if len(data) != layout.size:
+            return None
+        values, unit = layout.unpack(data), self.units[joint]
+        if len(values) == 3:
+            return values[0], values[1] * unit.torque, values[2] * unit.velocity
+        told = dict(zip(self._entries[joint]["TPDO2"], values, strict=True))
+        motor, velocity = told.get(objects.MOTOR_TORQUE, math.nan), told.get(objects.VELOCITY, math.nan)
+        return values[0], motor * unit.torque, velocity * unit.velocity
+
+    def _take_display(self, joint: int, place: int, board: Board, data: bytes) -> None:
+        layout = self._layouts[joint]["TPDO3"]
+        if len(data) != layout.size:
+            board.errors += 1
+            return
+        values = layout.unpack(data)
+        self.statuses[joint] = board.status[place] = values[0]
+        if len(values) == 2:
+            self.displays[joint] = values[1]
+
+    def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
+        """See Drives. The cyclic frames of a link take the way of `fill`; emergencies, heartbeats and SDO come here."""
+        joint, service = self._joint_of.get(can_id & 0x7F), can_id & ~0x7F
+        if joint is None:
+            return None
+        if service == objects.EMCY_ID:
+            self._take_emergency(joint, data)
+            return None
+        if service == objects.HEARTBEAT_ID:
+            self.node_states[joint] = state = data[0] & 0x7F if data else 0
+            if state == 0:
+                self.restarted.add(joint)
+        elif service == 0x580:
+            if self._network is not None:
+                self._network.notify(can_id, bytearray(data), 0.0)
+        elif service == TPDO1.cob_base and (reading := self._reading(joint, data)) is not None:
+            return Reading(joint, reading[0], sensor_torque=reading[1])
+        elif service == TPDO2.cob_base and (slow := self._slow(joint, data)) is not None:
+            self.statuses[joint] = slow[0]
+            return Reading(joint, velocity=slow[2], motor_torque=slow[1], power=self.power(joint))
+        return None
+
+    def _take_emergency(self, joint: int, data: bytes) -> None:
+        code, register = emcy.parse(data)
+        if not code:
+            return
+        self.emergencies.append((joint, code, register))
+        if self._board is not None:
+            evidence = {"code": code, "register": register}
+            self._board.events.append(Event(self._places[joint], f"{code:04X}h", emcy.name_of(code), evidence))
+
+    def details(self, joint: int, sends: bool) -> Mapping[str, Any]:
+        """See Drives: node id and NMT state; only operational nodes send TPDOs."""
+        nmt = objects.OPERATIONAL if sends else self.node_states.get(joint)
+        told = None if nmt is None else objects.NMT_STATES.get(nmt, str(nmt))
+        return {"node": self.nodes[joint], "nmt": told}
+
+    def reading_ids(self) -> Mapping[int, int]:
+        """See Drives: TPDO1."""
+        return {TPDO1.cob_base + node: joint for joint, node in enumerate(self.nodes)}
+
+    def poll(self, first: bool) -> list[Frame]:
+        """See Drives: SYNC, nodes started (NMT) before the first."""
+        start: list[Frame] = [(objects.NMT_ID, bytes([objects.NMT_START, 0]))]
+        return start if first else [_SYNC]
+
+    def replayed(self, first: bool, readings: Sequence[Reading]) -> list[Frame]:
+        """See Replays: SYNC and TPDO1, TPDO2 if its values are there; the joints are enabled, in no mode."""
+        frames = [_SYNC]
+        for reading in readings:
+            joint = reading.joint
+            node, unit, profile = self.nodes[joint], self.units[joint], self.profiles[joint]
+            if math.isfinite(reading.position) and (profile.reading is None or math.isfinite(reading.sensor_torque)):
+                counts = [_whole(reading.position / unit.position, 31)]
+                if profile.reading is not None:
+                    counts.append(_whole(reading.sensor_torque / profile.torque_scale + profile.torque_zero, 31))
+                frames.append((TPDO1.cob_base + node, self._layouts[joint]["TPDO1"].pack(*counts)))
+            if first:
+                frames.append((TPDO3.cob_base + node, TPDO3.layout.pack(faults.ENABLED_BITS, 0)))
+            if math.isfinite(reading.motor_torque) and math.isfinite(reading.velocity):
+                motor = _whole(reading.motor_torque / unit.torque, 15)
+                velocity = _whole(reading.velocity / unit.velocity, 31)
+                frames.append((TPDO2.cob_base + node, TPDO2.layout.pack(faults.ENABLED_BITS, motor, velocity)))
+        return frames
+
+    # ---- states
+
+    def power(self, joint: int) -> Power:
+        """See Drives."""
+        return _POWERS.get(state_of(self.statuses[joint]), Power.UNKNOWN)
+
+    def ready(self, joint: int) -> bool:
+        """See Drives."""
+        told = "TPDO3" not in self._layouts[joint] or len(self._entries[joint]["TPDO3"]) < 2
+        return self.power(joint) is Power.ON and (told or self.displays[joint] == self._modes[joint])
+
+    def alarm(self) -> BusFault | None:
+        """See Drives."""
+        if self.emergencies or self.restarted or self.node_states:
+            return faults.alarm(self._known)
+        return None
+
+    def fault(self, modes: Sequence[int], now: float) -> BusFault | None:
+        """See Drives."""
+        return faults.state_fault(self._known, now, modes, self._deadline)
+
+    def has_restarted(self) -> bool:
+        """See Drives."""
+        return bool(self.restarted)
+
+    def own_stop(self) -> str:
+        """See Drives."""
+        return faults.stopped_itself(self._known)
+
+    def stuck(self, joint: int, target: Power, seconds: float) -> str:
+        """See Drives."""
+        return faults.stuck(self._known, joint, _TARGETS[target], self._modes[joint], seconds)
+
+    def forget(self) -> None:
+        """See Drives."""
+        self.emergencies.clear()
+        self.node_states.clear()
+
+    def temperature(self, joint: int, ask: Ask) -> float:
+        """See Drives."""
+        return device.read_temperature(self.services(ask)[joint])
+
+    # ---- calibration in the controller
+
+    def read_calibration(self, joint: int, ask: Ask) -> Calibration:
+        """See KeepsCalibration."""
+        return torque_sensor_record.read_record(self.services(ask)[joint])
+
+    def write_calibration(self, joint: int, ask: Ask, calibration: Calibration, store: bool = False) -> Calibration:
+        """See KeepsCalibration."""
+        return torque_sensor_record.write_record(self.services(ask)[joint], calibration, store)
+
+
+def check_fits(name: str, limits: Limits, unit: Units) -> None:
+    """Raise BadInput where limits fit no frame."""
+    if limits.max_torque / unit.torque > INT16_MAX:
+        most = INT16_MAX * unit.torque
+        raise BadInput(f"{name}: max_torque {limits.max_torque} N·m: 6071h carries at most {most:.6g} N·m")
+    if max(abs(limits.lower), abs(limits.upper)) / unit.position > INT32_MAX:
+        raise BadInput(f"{name}: its range is more than 607Ah carries at {unit.position:.3g} rad a user unit")
+
+
+def _whole(value: float, bits: int) -> int:
+    return max(-(1 << bits), min((1 << bits) - 1, round(value)))

@@ -1,0 +1,112 @@
+"""Faults that the frames of CiA 402 drives show, in words: which joint, what, and what to do. Pure."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+from armlink.drives.canopen import emcy
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen.cia402 import MODE_NAMES, State, state_of
+from armlink.drives.orders import Mode
+from armlink.errors import BusFault, Stall
+
+OFF = int(Mode.OFF)
+ENABLED_BITS = 0x27
+WATCHDOGS = frozenset({0x8130, 0x8250, 0x8700})
+"""Emergencies of a node that does not hear its host: heartbeat, RPDO deadline, SYNC (CiA 301)."""
+_FAULTS = (State.FAULT, State.FAULT_REACTION)
+
+
+@dataclass
+class Known:
+    """What m joints have told: live views of the buffers."""
+
+    names: Sequence[str]
+    statuses: Sequence[int]
+    """Newest status words (6041h)."""
+    displays: Sequence[int]
+    """Newest mode displays (6061h)."""
+    mode_since: Sequence[float]
+    """When each joint's mode was commanded, by the clock [s]."""
+    emergencies: Collection[tuple[int, int, int]]
+    """(joint, code, error register)."""
+    node_states: Mapping[int, int]
+    """NMT states by joint, of the newest heartbeat."""
+    restarted: Collection[int]
+    """Joints whose controller has sent its boot-up message."""
+
+
+def alarm(known: Known) -> BusFault | None:
+    """The first event: emergency, restart, NMT state; a Stall where a joint did not hear its host."""
+    told = node_fault(known)
+    if told is None:
+        return None
+    watchdog = bool(known.emergencies) and next(iter(known.emergencies))[1] in WATCHDOGS
+    return Stall(told) if watchdog else BusFault(told)
+
+
+def state_fault(known: Known, now: float, modes: Sequence[int], patience: float) -> BusFault | None:
+    """The first fault by status words and mode displays, if every joint with a mode was to be enabled in it.
+
+    A mode must be displayed within `patience` [s].
+    """
+    for joint, (mode, status, display) in enumerate(zip(modes, known.statuses, known.displays, strict=True)):
+        if mode != OFF and display != mode and not now - known.mode_since[joint] <= patience:
+            return BusFault(f"{known.names[joint]}: {refused_mode(mode, display)}")
+        if status & 0x6F == ENABLED_BITS:
+            continue
+        state = state_of(status)
+        if mode != OFF or state in _FAULTS:
+            told = f"{state.value} (status word {status:#06x}), expected operation enabled"
+            return BusFault(f"{known.names[joint]}: {told}")
+    return None
+
+
+def is_own_watchdog(known: Known, joint: int) -> bool:
+    """Whether a joint stopped by itself, as it must when it does not hear its host."""
+    codes = {code for place, code, _ in known.emergencies if place == joint}
+    return bool(codes & WATCHDOGS) or (not codes and state_of(known.statuses[joint]) is State.QUICK_STOP)
+
+
+def stopped_itself(known: Known) -> str:
+    """The first joint that its own watch of the host has stopped, in words; empty if there is none."""
+    for joint, name in enumerate(known.names):
+        if is_own_watchdog(known, joint):
+            codes = [code for place, code, _ in known.emergencies if place == joint and code in WATCHDOGS]
+            why = f" (emergency {codes[0]:04X}h, {emcy.name_of(codes[0])})" if codes else ""
+            return f"{name} stopped itself{why}"
+    return ""
+
+
+def node_fault(known: Known) -> str | None:
+    """The first fault of a node, whatever its drive is doing: emergency, restart, NMT state; or None."""
+    for joint, code, register in known.emergencies:
+        return f"{known.names[joint]}: emergency {code:04X}h, {emcy.name_of(code)} (error register {register:02X}h)"
+    for joint in sorted(known.restarted):
+        return (
+            f"{known.names[joint]}: its controller has restarted (boot-up message): calibration and mode are lost; "
+            "find out why, then start again"
+        )
+    for joint, state in known.node_states.items():
+        if state != objects.OPERATIONAL:
+            found = objects.NMT_STATES.get(state, str(state))
+            return f"{known.names[joint]}: NMT state is {found}, expected operational"
+    return None
+
+
+def refused_mode(mode: int, display: int) -> str:
+    """That a controller does not enter a mode that it was told to."""
+    return (
+        f"refuses mode {mode} ({MODE_NAMES[Mode(mode)]}): its mode display 6061h is {display}; "
+        "look at its error code 603Fh and at what 6502h says it supports"
+    )
+
+
+def stuck(known: Known, joint: int, target: State, mode: int, seconds: float) -> str:
+    """Why a joint did not reach `target` in its `mode` within `seconds`."""
+    name, state = known.names[joint], state_of(known.statuses[joint])
+    if state is target:
+        return f"{name}: {refused_mode(mode, known.displays[joint])}"
+    for place, code, _ in known.emergencies:
+        if place == joint:
+            return f"{name}: {state.value} after emergency {code:04X}h, {emcy.name_of(code)}"
+    return f"{name}: stays in {state.value}, expected {target.value} within {seconds} s"

@@ -1,0 +1,101 @@
+"""What one device has of the objects that the link can use, and which PDOs follow from that."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen import pdo
+from armlink.drives.canopen.object_dictionary import Entry
+from armlink.drives.canopen.pdo import Pdo
+from armlink.drives.canopen.sdo import NodeServices
+from armlink.drives.canopen.settings import TYPES, CanopenSettings, TorqueObject
+from armlink.drives.canopen.units import TORQUE_PER_MICRO
+
+LOST: Mapping[Entry, str] = {
+    objects.RPDO_DEADLINE: "no deadline for commands: the heartbeat alone tells that the host is gone",
+    objects.HEARTBEAT_CONSUMER: "the device does not watch its host",
+    objects.HEARTBEAT_PRODUCER: "a device that leaves the bus is noticed by its readings alone",
+    objects.ABORT_OPTION: "what it does when its host falls silent cannot be set",
+    objects.QUICK_STOP_OPTION: "whether it holds after a quick stop cannot be set",
+    objects.MAX_TORQUE: "the device does not bound torque: the host alone does",
+    objects.POSITION_LOWER: "the device does not bound positions: the host alone does",
+    objects.POSITION_UPPER: "",
+    objects.INTERPOLATION_VALUE: "the device assumes its own period between targets",
+    objects.INTERPOLATION_INDEX: "",
+    objects.TARGET_TORQUE: "no torque control",
+    objects.MOTOR_TORQUE: "no torque reading from the motor's current",
+    objects.VELOCITY: "no velocity reading: no torque control",
+    objects.RATED_TORQUE: "rated torque as the arm file has it",
+    objects.SUPPORTED_MODES: "modes as they are displayed",
+    objects.MODE_DISPLAY: "a refused mode shows by the motion alone",
+    objects.TORQUE_OFFSET: "torque offset: nothing latched to clear",
+    objects.PROFILE_VELOCITY: "profile velocity: no profile position mode",
+    objects.TORQUE_SLOPE: "torque slope: no profile torque mode",
+}
+"""Objects that a stock device may lack → what is lost by it; empty where another line says it."""
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Objects of one device; by default those of one with our torque sensor record, which has all."""
+
+    absent: frozenset[Entry] = field(default_factory=frozenset)
+    reading: Entry | None = objects.TORQUE_READING
+    """Object of the joint torque sensor; None: there is none."""
+    torque_scale: float = TORQUE_PER_MICRO
+    """Torque of one count of it [N·m]."""
+    torque_zero: float = 0.0
+    """Count of it at zero torque."""
+    modes_by_pdo: bool = True
+    """Whether 6060h and 6061h can be mapped, so that the mode can change while cycling."""
+
+    def has(self, entry: Entry) -> bool:
+        """Whether the device has an object."""
+        return entry not in self.absent
+
+    @property
+    def lost(self) -> tuple[str, ...]:
+        """What is lost by what it lacks."""
+        told = tuple(f"{entry}: {LOST[entry]}" for entry in LOST if entry in self.absent and LOST[entry])
+        return told if self.modes_by_pdo else (*told, "6060h cannot be mapped: one mode for the whole session")
+
+    @property
+    def pdos(self) -> tuple[Pdo, ...]:
+        """RPDO1, RPDO2, TPDO1, TPDO2, TPDO3 with the objects that the device has; those without any are left out."""
+        found = []
+        for each in pdo.LINK_PDOS:
+            entries = [self.reading if entry == objects.TORQUE_READING else entry for entry in each.entries]
+            held = tuple(entry for entry in entries if entry is not None and self.has(entry))
+            if not self.modes_by_pdo:
+                held = tuple(entry for entry in held if entry not in (objects.MODE, objects.MODE_DISPLAY))
+            if held:
+                found.append(each.with_entries(held))
+        return tuple(found)
+
+
+OURS = Profile()
+
+
+def profile_of(settings: CanopenSettings) -> Profile:
+    """The profile by the arm file alone, as for listening: every optional object is thought to be there."""
+    if settings.torque == "record":
+        return OURS
+    torque = settings.torque
+    if not isinstance(torque, TorqueObject):
+        return Profile(reading=None)
+    entry = Entry(torque.index, torque.sub, TYPES[torque.type], "torque sensor at an input")
+    return Profile(reading=entry, torque_scale=torque.scale, torque_zero=torque.offset)
+
+
+def examine(services: NodeServices, settings: CanopenSettings) -> Profile:
+    """The profile of a device, by asking it for each object; one with our record must have them all.
+
+    Raises BusFault where it does not answer.
+    """
+    if settings.torque == "record":
+        return OURS
+    absent = frozenset(entry for entry in LOST if not services.has(entry))
+    sheet = services.remote.object_dictionary
+    modes = [sheet.get_variable(entry.index, 0) for entry in (objects.MODE, objects.MODE_DISPLAY)]
+    by_pdo = all(each is None or each.pdo_mappable for each in modes)
+    return replace(profile_of(settings), absent=absent, modes_by_pdo=by_pdo)

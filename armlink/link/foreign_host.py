@@ -1,0 +1,85 @@
+"""What another host on the bus commands, and where its cycles begin: for listening without sending anything."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from armlink.arrays import Array
+from armlink.bus.port import Frame
+from armlink.drives.family import ANY
+from armlink.link.groups import Group
+from armlink.link.joint_values import JointValues
+
+Commands = tuple[Frame, ...]
+"""Newest command frames."""
+
+
+class ForeignHost:
+    """Follows the commands of another host for n joints."""
+
+    def __init__(self, groups: Sequence[Group], values: JointValues) -> None:
+        """The drives of an arm on their buses; `values` turns values of drives into those of joints."""
+        self._groups, self._values = tuple(groups), values
+        self._n = sum([len(group.places) for group in groups])
+        syncs = [can_id | group.tag for group in groups for can_id in group.drives.cycle_ids()]
+        self._sync = min(syncs, default=None)
+        """SYNC of the first bus that has one begins a cycle."""
+        self._ignored = frozenset(syncs)
+        self._group_of = {
+            can_id | group.tag: group
+            for group in groups
+            for can_id in group.drives.commands()
+            if can_id not in group.drives.cycle_ids()
+        }
+        self._unnamed = [group for group in groups if ANY in group.drives.routes()]
+        self._leader: int | None = None
+        """Without SYNC, the joint whose command begins a cycle: the first that was heard."""
+        self._newest: dict[int, Frame] = {}
+
+    def begins(self, can_id: int, data: bytes) -> bool:
+        """Take a frame that no drive sends; whether a cycle begins with it."""
+        if can_id in self._ignored:
+            return can_id == self._sync
+        group = self._group_of.get(can_id)
+        groups = self._unnamed if group is None else (group,)
+        for each in groups:
+            if can_id >> 34 != each.tag >> 34:
+                continue
+            if self._sync is not None and group is not None:
+                self._newest[can_id] = can_id, data
+                return False
+            found = each.drives.command_of(can_id & ~each.tag, data)
+            if found is not None and found[0] >= 0:
+                place = each.places[found[0]]
+                begins = self._sync is None and self._leader in (None, place)
+                self._leader = place if self._leader is None else self._leader
+                self._newest[-1 - place] = can_id, data
+                return begins
+        return False
+
+    def commands(self) -> Commands:
+        """The newest command frames."""
+        return tuple(self._newest.values())
+
+    def forget(self) -> None:
+        """Forget them."""
+        self._newest.clear()
+
+    def decode(self, commands: Commands) -> tuple[Array, Array]:
+        """Target torque [N·m] and position [rad] (n,) of command frames; NaN for a joint without.
+
+        Of a drive with gains the torque is feed-forward alone, as its frame has it.
+        """
+        torque, position = np.full(self._n, np.nan), np.full(self._n, np.nan)
+        for can_id, data in commands:
+            group = self._group_of.get(can_id)
+            for each in self._unnamed if group is None else (group,):
+                found = each.drives.command_of(can_id & ~each.tag, data)
+                if found is not None:
+                    joints = range(len(each.places)) if found[0] < 0 else (found[0],)
+                    for joint in joints:
+                        place = each.places[joint]
+                        order = self._values.ordered(place, found[1])
+                        torque[place], position[place] = order.torque, order.position
+                    break
+        return torque, position

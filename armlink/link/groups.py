@@ -1,0 +1,82 @@
+"""The drives of an arm: one group for each family on each bus, with their places in the arm."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from armlink.arm_file import ArmFile
+from armlink.arrays import Array
+from armlink.bus.can_bus import CanBus
+from armlink.drives.family import Drives, Family
+from armlink.drives.registry import family
+from armlink.drives.traits import Traits
+from armlink.errors import BadInput
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Drives of one family on one bus."""
+
+    family: Family
+    drives: Drives
+    places: tuple[int, ...]
+    """Joints of the arm, in order."""
+    tag: int
+    """Marks identifiers of its bus where there are several, else 0."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mounting:
+    """How each joint's drive is built in (n,): q = direction (p − zero) / gear, τ = direction · gear · τ_drive."""
+
+    direction: Array
+    zero: Array
+    """Drive's reading at joint position 0 [rad]."""
+    gear: Array
+    plain: bool
+    """Whether every drive's output is the joint."""
+
+    @classmethod
+    def of(cls, arm: ArmFile) -> "Mounting":
+        """From the arm file."""
+        settings = [joint.settings for joint in arm.require_link().joints]
+        direction, zero, gear = (
+            np.array([float(getattr(each, key)) for each in settings]) for key in ("direction", "zero", "gear")
+        )
+        plain = bool((direction == 1).all() and (zero == 0).all() and (gear == 1).all())
+        return cls(direction, zero, gear, plain)
+
+
+def make_groups(arm: ArmFile, bus: CanBus | None = None) -> tuple[Group, ...]:
+    """Groups of an arm on an open bus (None: all on one), SYNC's last; raises BadInput where ids clash."""
+    joints = arm.require_link().joints
+    tags: dict[str, int] = getattr(bus, "tags", {})
+    found: dict[tuple[str, int], list[int]] = {}
+    taken: dict[tuple[str, int], str] = {}
+    for place, joint in enumerate(joints):
+        tag = tags.get(joint.bus, 0)
+        address = joint.settings.address
+        other = taken.setdefault((address, tag), joint.name)
+        if other != joint.name:
+            raise BadInput(
+                f"{other} and {joint.name} are both {address} on {bus.channel_info}: ids are unique on a bus"
+            )
+        found.setdefault((joint.settings.family, tag), []).append(place)
+    groups = []
+    for (name, tag), places in found.items():
+        kind = family(name)
+        drives = kind.build(arm, [joints[place] for place in places])
+        groups.append(Group(kind, drives, tuple(places), tag))
+    return tuple(sorted(groups, key=lambda group: group.family.traits.cadence == "sync"))
+
+
+def traits_of(groups: Sequence[Group], n: int) -> list[Traits]:
+    """Traits of every joint, in joint order."""
+    found = {place: group.drives.traits(joint) for group in groups for joint, place in enumerate(group.places)}
+    return [found[place] for place in range(n)]
+
+
+def state_name(arm: ArmFile, joint: int, code: int) -> str:
+    """State of a joint in words, from its code in `Sample.status`."""
+    return family(arm.require_link().joints[joint].settings.family).state_name(code)

@@ -1,0 +1,148 @@
+"""From values of drives to values of joints and back: direction, zero, gear, and calibration in the host."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from armlink.arm_file import ArmFile
+from armlink.arrays import Array
+from armlink.drives.orders import Gains, Limits, Order, Power
+from armlink.link.groups import Group, Mounting, traits_of
+from armlink.torque_calibration import TorqueCalibration
+
+
+class JointValues:
+    """Conversions of n joints. Drive: what the drive reads and is told; joint: what the arm does.
+
+    With v the drive's torque at the joint (direction and gear applied), the host's calibration v = gain · τ + offset
+    corrects the reading and, where the torque is from current, also the command.
+    """
+
+    def __init__(self, mounting: Mounting, from_current: Array) -> None:
+        """`from_current` (n,) bool: joints whose torque reading is the motor's."""
+        self._mounting, self._current = mounting, from_current.astype(bool)
+        self._all_sensors = not self._current.any()
+        n = from_current.size
+        self.calibration = TorqueCalibration(np.ones(n), np.zeros(n))
+        """In force in the host; 1 and 0 for joints without."""
+        self._calibrated = False
+
+    @property
+    def plain(self) -> bool:
+        """Whether orders need no conversion."""
+        return self._mounting.plain and (self._all_sensors or not self._calibrated)
+
+    def calibrate(self, calibration: TorqueCalibration[Array]) -> None:
+        """Put gains and offsets (n,) into force."""
+        self.calibration = calibration
+        self._calibrated = bool((calibration.gain != 1).any() or (calibration.offset != 0).any())
+
+    def position(self, values: Array) -> Array:
+        """Joint positions [rad] of drive positions (n,)."""
+        mount = self._mounting
+        return values if mount.plain else mount.direction * (values - mount.zero) / mount.gear
+
+    def position_of(self, joint: int, value: float) -> float:
+        """Position of one joint [rad]."""
+        mount = self._mounting
+        if mount.plain:
+            return value
+        return float(mount.direction[joint] * (value - mount.zero[joint]) / mount.gear[joint])
+
+    def velocity(self, values: Array) -> Array:
+        """Joint velocities [rad/s] of drive velocities (n,)."""
+        mount = self._mounting
+        return values if mount.plain else mount.direction * values / mount.gear
+
+    def motor(self, values: Array) -> Array:
+        """Motor torques at the joint [N·m] (n,); of joints whose torque is from current as the calibration has them."""
+        mount = self._mounting
+        if not mount.plain:
+            values = mount.direction * mount.gear * values
+        if self._calibrated and not self._all_sensors:
+            values = np.where(self._current, self.calibration.invert(values), values)
+        return values
+
+    def torque(self, sensor: Array, motor: Array) -> Array:
+        """Joint torques [N·m] (n,): of the sensor, or the motor's (as `motor` gives it) where there is none."""
+        mount = self._mounting
+        if not mount.plain:
+            sensor = mount.direction * sensor
+        if self._calibrated:
+            sensor = self.calibration.invert(sensor)
+        return sensor if self._all_sensors else np.where(self._current, motor, sensor)
+
+    def limits(self, joint: int, limits: Limits) -> Limits:
+        """Limits of a joint, at the output of its drive."""
+        mount = self._mounting
+        gear = float(mount.gear[joint])
+        ends = sorted(self._drive_position(joint, end) for end in (limits.lower, limits.upper))
+        return replace(
+            limits,
+            max_torque=limits.max_torque / gear,
+            torque_rate=limits.torque_rate / gear,
+            max_velocity=limits.max_velocity * gear,
+            lower=ends[0],
+            upper=ends[1],
+        )
+
+    @property
+    def gear(self) -> Array:
+        """(n,)."""
+        return self._mounting.gear
+
+    def gains(self, joint: int, gains: Gains | None) -> Gains | None:
+        """Gains at the joint, of those at the output of its drive."""
+        square = float(self._mounting.gear[joint]) ** 2
+        return gains and Gains(*(square * value for value in (gains.kp, gains.kd, gains.max_kp, gains.max_kd)))
+
+    def torque_of(self, joint: int, motor: float) -> float:
+        """Torque of one joint [N·m] from the motor's, NaN if that is not known."""
+        values = np.full(self.gear.size, motor)
+        return float(self.motor(values)[joint])
+
+    def reach(self, joint: int, max_torque: float) -> float:
+        """Greatest torque of a joint for which neither it nor what its drive is told exceeds `max_torque` [N·m]."""
+        if not self._current[joint]:
+            return max_torque
+        gain, offset = abs(float(self.calibration.gain[joint])), abs(float(self.calibration.offset[joint]))
+        return max(0.0, (max_torque - offset) / max(1.0, gain))
+
+    def order(self, joint: int, order: Order) -> Order:
+        """The order for a drive from that for its joint; the calibration corrects torque and gains of a motor."""
+        mount = self._mounting
+        gear, sign = float(mount.gear[joint]), float(mount.direction[joint])
+        gain, offset = 1.0, 0.0
+        if self._current[joint] and order.power is Power.ON:
+            gain, offset = float(self.calibration.gain[joint]), float(self.calibration.offset[joint])
+        return order._replace(
+            position=self._drive_position(joint, order.position),
+            velocity=sign * gear * order.velocity,
+            torque=sign * (gain * order.torque + offset) / gear,
+            kp=gain * order.kp / gear**2,
+            kd=gain * order.kd / gear**2,
+        )
+
+    def ordered(self, joint: int, sent: Order) -> Order:
+        """What a drive was ordered, at the joint; torque as the drive makes it, not corrected."""
+        mount = self._mounting
+        if mount.plain:
+            return sent
+        gear, sign = float(mount.gear[joint]), float(mount.direction[joint])
+        return sent._replace(
+            position=self.position_of(joint, sent.position),
+            velocity=sign * sent.velocity / gear,
+            torque=sign * sent.torque * gear,
+            kp=sent.kp * gear**2,
+            kd=sent.kd * gear**2,
+        )
+
+    def _drive_position(self, joint: int, position: float) -> float:
+        mount = self._mounting
+        return float(mount.direction[joint] * mount.gear[joint] * position + mount.zero[joint])
+
+
+def values_of(arm: ArmFile, groups: tuple[Group, ...]) -> JointValues:
+    """Conversions between the values of an arm's joints and of their drives."""
+    traits = traits_of(groups, len(arm.require_link().joints))
+    return JointValues(Mounting.of(arm), np.array([each.torque == "current" for each in traits]))
