@@ -14,6 +14,14 @@ PRESS_IN = 0.05
 """A target may lie this far behind a stop [rad], so that a joint can be pressed against it."""
 OVERSPEED = 1.5
 """A joint under torque control may turn this many times as fast as max_velocity before it is stopped."""
+SERVO_OVERSPEED = 3.0
+"""A joint under position control may, as it takes up a load, turn this many times as fast as max_velocity."""
+SERVO_SPEED = 3.0
+"""A joint under position control may turn this fast whatever max_velocity is [rad/s]: one that is enabled while it
+sinks is caught at that speed."""
+FOLLOWING = 0.5
+"""A joint under position control may read a position this far from its target before it is stopped [rad]; a motion of
+calib takes a joint for blocked long before."""
 OUTSIDE = 0.1
 """A joint under torque control may read a position this far outside the target window before it is stopped [rad]."""
 
@@ -66,6 +74,8 @@ def gate_limits(
         torque_unit=unit.torque,
         position_unit=unit.position,
         overspeed=OVERSPEED * joint.max_velocity,
+        servo_overspeed=max(SERVO_OVERSPEED * joint.max_velocity, SERVO_SPEED),
+        following=FOLLOWING,
         outside=OUTSIDE,
         max_age=max_age,
     )

@@ -26,6 +26,9 @@ def test_limits_of_one_joint():
     assert (limits.lower, limits.upper) == (-1.5, 2.5)
     assert (limits.torque_unit, limits.position_unit) == (0.04, 1e-5)
     assert limits.overspeed == pytest.approx(1.2)  # the stated margin: half as fast again
+    assert limits.servo_overspeed == 3.0  # a joint that sinks is caught
+    assert gate_limits(joint(max_velocity=2.0), (-1, 1), UNITS, 0.004, 0.1).servo_overspeed == pytest.approx(6.0)
+    assert limits.following == 0.5
     assert limits.outside == 0.1
     assert limits.max_age == 0.1
 
