@@ -100,3 +100,16 @@ def test_what_a_model_lacks_is_named(tmp_path):
     with pytest.raises(BadInput, match=r"arm\.xml: "):
         joint_ranges(model_arm(tmp_path, "<mujoco><nonsense/></mujoco>", "a"))
     assert math.isfinite(joint_ranges(model_arm(tmp_path, MODEL, "a"))[0][0])
+
+
+@pytest.mark.parametrize(
+    ("key", "carried", "says"),
+    [
+        ("max_velocity", (2**32 - 1) * UNITS.position, "6081h carries at most 42949.7 rad/s"),
+        ("max_torque_rate", (2**32 - 1) * UNITS.torque, r"6087h carries at most 1.71799e\+08 N·m/s"),
+    ],
+)
+def test_a_rate_that_no_object_carries_is_refused(key, carried, says):
+    gate_limits(joint(**{key: carried}), (-1, 1), UNITS, 0.004, 0.1)
+    with pytest.raises(BadInput, match=f"elbow: {key} .*: {says}"):
+        gate_limits(joint(**{key: carried * 1.001}), (-1, 1), UNITS, 0.004, 0.1)
