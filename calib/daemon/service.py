@@ -15,8 +15,9 @@ from importlib.metadata import version
 from pathlib import Path
 
 from armlink.arm_file import ArmFile
+from armlink.loop.messages import Answer
 from calib.daemon.environment import Environment
-from calib.daemon.loop.loop_messages import Batch, Down, Message, Progress, Reply, Up
+from calib.daemon.loop.loop_messages import Batch, Down, Message, Progress, Up
 from calib.daemon.observing.active_records import ActiveRecords
 from calib.daemon.observing.observation import Observation
 from calib.daemon.observing.observer_feed import ObserverFeed
@@ -128,8 +129,8 @@ class Service:
             self.arm_state.down(message.reason)
         elif isinstance(message, Progress):
             self.tours.advanced(message)
-        elif isinstance(message, Reply) and message.error is not None:
-            self.tours.refused(message.error)
+        elif isinstance(message, Answer) and message.error is not None:
+            self.tours.refused(str(message.error))
 
     def _tick(self) -> None:
         self.events.tick()

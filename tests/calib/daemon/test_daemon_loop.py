@@ -174,8 +174,8 @@ def no_bus() -> None:
 
 def test_the_bus_process_ends_when_the_service_is_gone() -> None:
     host = LoopProcess(LoopOptions(load_arm("sarcos"), open_bus=no_bus), fork=True)
-    assert host._ours.poll(60.0)
+    host._channel.wait(60.0)
     assert isinstance(host.pump()[0], Down)
-    host._ours.close()  # as the kernel does where the service is killed
+    host._channel.close()  # as the kernel does where the service is killed
     host._process.join(60.0)
     assert host._process.exitcode == 0
