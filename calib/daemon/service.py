@@ -59,7 +59,7 @@ class Service:
         self.hub = Hub()
         self.events = EventLog(self.journal, self.hub, monotonic, wall)
         self.jobs = BusJobs(environment.run, self.journal)
-        self.arm_state = ArmState(arm.joint_names, self.events, monotonic)
+        self.arm_state = ArmState(arm, self.events, monotonic)
         self.recordings = Recordings(directory / "recordings", self.configuration)
         self.storage = ObserverStorage(self.journal, environment)
         self.recalibrations = RecalibrationWorkflow(
@@ -134,6 +134,7 @@ class Service:
 
     def _tick(self) -> None:
         self.events.tick()
+        self.arm_state.tick()
         self.records.tick()
         self.tours.tick()
         observation = self.records.observation
