@@ -11,8 +11,9 @@ from pathlib import Path
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import ArmlinkError, BadInput
+from armlink.loop.messages import Answer
 from calib.daemon.environment import Environment
-from calib.daemon.loop.loop_messages import Down, Reply
+from calib.daemon.loop.loop_messages import Down, Started
 from calib.daemon.loop.loop_process import LoopControllers, LoopProcess
 from calib.daemon.notify import Notifier, watchdog_seconds
 from calib.daemon.options import Options
@@ -114,6 +115,8 @@ class Daemon:
             return
         self._heard = time.monotonic()
         for message in messages:
+            if isinstance(message, Started):
+                log.info(f"bus process: {message.realtime}")
             self.service.take(message)
 
     def _restart(self, why: str) -> None:
@@ -164,10 +167,10 @@ class _CurrentProcess:
     """The service's `Port`: whichever bus process is the present one."""
 
     def __init__(self, process: Callable[[], LoopProcess]) -> None:
-        self.controllers = LoopControllers(lambda request: process().ask(request))
+        self.controllers = LoopControllers(lambda call: process().ask(call))
         self._process = process
 
-    def sweep(self, poses: int, seed: int, /) -> Reply | None:
+    def sweep(self, poses: int, seed: int, /) -> Answer | None:
         """Ask for a tour of poses."""
         return self._process().sweep(poses, seed)
 
