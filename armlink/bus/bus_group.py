@@ -1,22 +1,21 @@
-"""Several buses as one: a frame goes to the bus of its node, or to every bus if it addresses all nodes."""
+"""Several buses as one. The same identifier may be on each: frames carry the number of their bus in the identifier."""
 
 import math
 import select
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from armlink.bus.can_bus import MessageBus
-from armlink.bus.port import Frame, Port, Selectable, Stamped, StampedPort
+from armlink.bus.port import BUS_SHIFT, Frame, Port, Selectable, Stamped, StampedPort
 from armlink.clock import Clock
 
 if TYPE_CHECKING:
     import can
 
-SYNC_ID = 0x80
-"""CANopen's SYNC goes to every bus and is heard on the first."""
 _SLICE = 0.001
 """Longest wait for one bus at a time if the operating system cannot wait for all of them [s]."""
+_ID = (1 << BUS_SHIFT) - 1
 
 
 class BusGroup:
@@ -24,21 +23,21 @@ class BusGroup:
 
     clock: Clock | None = None
 
-    def __init__(self, members: Sequence[MessageBus], route: Mapping[int, int]) -> None:
-        """`route` is node id → index of its bus among `members`."""
-        self.members, self.route = tuple(members), dict(route)
+    def __init__(self, members: Sequence[MessageBus], names: Sequence[str]) -> None:
+        """`names` of the buses in the arm file, as joints have them."""
+        self.members = tuple(members)
+        self.tags = {name: index << BUS_SHIFT for index, name in enumerate(names)}
+        """Name of a bus → what its identifiers have in addition."""
         self.channel_info = " and ".join(member.channel_info for member in self.members)
 
     def open_port(self, as_node: bool = False) -> "GroupPort":
         """See CanBus."""
-        return GroupPort([member.open_port(as_node) for member in self.members], self.route)
+        return GroupPort([member.open_port(as_node) for member in self.members])
 
     def open_listening_port(self) -> "GroupPort":
-        """See CanBus; SYNC is taken from the first bus only."""
+        """See CanBus."""
         ports = [member.open_listening_port() for member in self.members]
-        if all(isinstance(port, StampedPort) for port in ports):
-            return StampedGroup(ports, self.route)
-        return GroupPort(ports, self.route, one_sync=True)
+        return StampedGroup(ports) if all(isinstance(port, StampedPort) for port in ports) else GroupPort(ports)
 
     def recv(self, timeout: float | None = None) -> "can.Message | None":
         """The next message of any bus, or None after `timeout` seconds (None: wait without limit)."""
@@ -62,12 +61,10 @@ class BusGroup:
 class GroupPort:
     """The ports of several buses as one."""
 
-    def __init__(self, members: Sequence[Port], route: Mapping[int, int], one_sync: bool = False) -> None:
-        """`route` is node id → index of its port; `one_sync`: take SYNC from the first bus only."""
+    def __init__(self, members: Sequence[Port]) -> None:
+        """In the order of the buses."""
         self.members = tuple(members)
-        self._of_node: dict[int, Port] = {node: self.members[index] for node, index in route.items()}
         self._numbers = [port.fileno() for port in self.members if isinstance(port, Selectable)]
-        self._one_sync = one_sync
 
     @property
     def errors(self) -> int:
@@ -80,15 +77,13 @@ class GroupPort:
         return sum(port.dropped for port in self.members)
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send one frame to the bus of its node, else to every bus; raises BusFault."""
-        port = self._of_node.get(can_id & 0x7F)
-        for each in self.members if port is None else (port,):
-            each.send(can_id, data)
+        """Send one frame to its bus; raises BusFault."""
+        self.members[can_id >> BUS_SHIFT].send(can_id & _ID, data)
 
     def send_all(self, frames: Sequence[Frame]) -> None:
         """Send the frames in this order, bus by bus; raises BusFault."""
-        for port in self.members:
-            port.send_all([frame for frame in frames if self._of_node.get(frame[0] & 0x7F, port) is port])
+        for index, port in enumerate(self.members):
+            port.send_all([(can_id & _ID, data) for can_id, data in frames if can_id >> BUS_SHIFT == index])
 
     def receive(self, timeout: float) -> Frame | None:
         """The next frame of any bus, or None after `timeout` seconds."""
@@ -112,17 +107,17 @@ class GroupPort:
     def _poll(self, timeout: float) -> Frame | None:
         for index, port in enumerate(self.members):
             frame = port.receive(timeout)
-            if frame is not None and not (index and self._one_sync and frame[0] == SYNC_ID):
-                return frame
+            if frame is not None:
+                return frame[0] | index << BUS_SHIFT, frame[1]
         return None
 
 
 class StampedGroup(GroupPort):
-    """Stamped ports as one, frames in the order of their timestamps; SYNC is taken from the first bus only."""
+    """Stamped ports as one, frames in the order of their timestamps."""
 
-    def __init__(self, members: Sequence[Port], route: Mapping[int, int]) -> None:
+    def __init__(self, members: Sequence[Port]) -> None:
         """`members` are stamped ports."""
-        super().__init__(members, route, one_sync=True)
+        super().__init__(members)
         self._stamped = tuple(port for port in members if isinstance(port, StampedPort))
         self._early: list[Stamped] = []
 
@@ -135,7 +130,6 @@ class StampedGroup(GroupPort):
         end = time.monotonic()
         frames, self._early = self._early, []
         for index, member in enumerate(self._stamped):
-            for frame in member.take_all():
-                if not (index and frame[1] == SYNC_ID):
-                    (frames if frame[0] <= end else self._early).append(frame)
+            for t, can_id, data in member.take_all():
+                (frames if t <= end else self._early).append((t, can_id | index << BUS_SHIFT, data))
         return sorted(frames, key=lambda frame: frame[0])

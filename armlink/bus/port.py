@@ -17,6 +17,9 @@ REMOTE = 0x40000000
 ERROR = 0x20000000
 """Flag in the identifier of an error frame, as in SocketCAN."""
 
+BUS_SHIFT = 34
+"""Where there are several buses, identifiers carry the number of theirs from this bit on."""
+
 
 class InterfaceDown(BusFault):
     """The interface is down; it may come up again."""

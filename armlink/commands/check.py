@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from armlink.arm_file import ArmFile
-    from armlink.selftest.without_power import Result
+    from armlink.drives.findings import Result
 
 SCHEMA = "armlink.check/1"
 HOST_SCHEMA = "armlink.check-host/1"
@@ -51,7 +51,7 @@ def check(
     from armlink.commands.output import write_json
     from armlink.errors import BadInput, BusFault, Refused
     from armlink.link.link import Link
-    from armlink.selftest.without_power import SelfTest
+    from armlink.selftest.self_test import SelfTest
 
     console = Console(stderr=True)
     described = load_arm(arm)
@@ -60,8 +60,8 @@ def check(
     with Link.open(described, bus) as link:
         simulated = link.bus.clock is not None
         if not (passive or yes or simulated):
-            protection = link.protection
-            times = {"deadline": protection.deadline_ms, "heartbeat": protection.heartbeat_ms}
+            deadline = link.section.deadline * 1e3
+            times = {"deadline": deadline, "heartbeat": 2 * deadline}
             console.print(WARNING.format(arm=described.name, **times), highlight=False)
             if not console.is_terminal:
                 raise BadInput("check: nobody to ask: give --yes, or --passive for what needs no power")
@@ -91,7 +91,8 @@ def _check_host(console: "Console", arm: "ArmFile", seconds: float, json: Path |
     """Lateness of this machine's cycle at the arm's rate, and the rate that it holds."""
     from armlink.commands.output import write_json
     from armlink.errors import Refused
-    from armlink.selftest.host import WARN_SHARE, measure_host
+    from armlink.link.lateness import WARN_SHARE
+    from armlink.selftest.host import measure_host
 
     with console.status(f"{arm.name}: cycles at {arm.require_link().rate:g} Hz for {seconds:g} s, with a job beside"):
         report = measure_host(arm, seconds)

@@ -1,9 +1,15 @@
-"""Nodes on the bus with their identity and state; writes nothing to them."""
+"""Drives on the bus with their identity and state; writes nothing to them."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from armlink.arm_file import ArmFile
+
+SEARCHED = "canopen"
+"""Family whose drives can be found on a bus without an arm file."""
 
 
 def scan(
@@ -17,62 +23,50 @@ def scan(
 
     Example: armlink scan sarcos --bus socketcan:vcan0
     """
+    from armlink.arm_file import load_arm
+    from armlink.commands.output import write_json
+    from armlink.drives.registry import family
+    from armlink.errors import BadInput
+
+    if arm is None and bus is None:
+        raise BadInput("scan: give an arm file, or --bus INTERFACE:CHANNEL[@BITRATE]")
+    described = None if arm is None else load_arm(arm)
+    kinds = set() if described is None else {joint.settings.family for joint in described.require_link().joints}
+    search = family(kinds.pop() if len(kinds) == 1 else SEARCHED).search if len(kinds) < 2 else None
+    if search is not None:
+        return search(described, bus, json, write_json)
+    assert described is not None
+    return _ask_all(described, bus, json)
+
+
+def _ask_all(arm: "ArmFile", bus: str | None, json: Path | None) -> int:
+    """The drives of an arm, each asked for its identity."""
     from rich.box import SIMPLE
     from rich.console import Console
     from rich.table import Table
 
-    from armlink.arm_file import Bus, load_arm
-    from armlink.bus.open import open_bus, open_link_bus
-    from armlink.clock import MonotonicClock
     from armlink.commands.output import write_json
-    from armlink.drives.canopen.eds_file import expected_identity, of_joints
-    from armlink.errors import BadInput, BusFault
-    from armlink.link.controller_setup import identity_mismatches, refused_identity
-    from armlink.monitor.scan import describe_type, scan_bus
+    from armlink.errors import BusFault, Refused
+    from armlink.link.groups import traits_of
+    from armlink.link.link import Link
 
-    if arm is None and bus is None:
-        raise BadInput("scan: give an arm file, or --bus INTERFACE:CHANNEL[@BITRATE]")
-    if arm is None:
-        joints, stated = {}, {}
-        opened = open_bus(bus, Bus())
-    else:
-        described = load_arm(arm)
-        link, sheets = described.require_link(), of_joints(described)
-        joints = {joint.settings.node: joint.name for joint in link.joints}
-        stated = {
-            each.settings.node: expected_identity(each, sheet) for each, sheet in zip(link.joints, sheets, strict=True)
-        }
-        opened = open_link_bus(bus, link)
-    try:
-        clock = opened.clock or MonotonicClock()
-        found = scan_bus(opened.open_port(), clock, joints)
-        channel = str(opened.channel_info)
-    finally:
-        opened.shutdown()
-    wrong = {
-        each.node: differs
-        for each in found
-        if each.present and each.node in stated and (differs := identity_mismatches(stated[each.node], vars(each)))
-    }
-    table = Table("node", "joint", "state", "device", "identity", "serial", box=SIMPLE, title=channel)
+    with Link.open(arm, bus) as link:
+        found, channel = link.scan(), str(link.bus.channel_info)
+        traits = traits_of(link.groups, link.n)
+    table = Table("joint", "family", "id", "state", "device", "serial", "firmware", box=SIMPLE, title=channel)
+    nodes = []
     for each in found:
-        if each.present:
-            told = (each.state.value, each.name or describe_type(each.device_type))
-            identity = f"{each.vendor:x}:{each.product:x}:{each.revision:x}"
-            style = "red" if each.node in wrong or each.answers > 1 else ""
-            table.add_row(str(each.node), each.joint, *told, identity, str(each.serial), style=style)
-        else:
-            table.add_row(str(each.node), each.joint, "[red]no answer[/red]")
-    Console(stderr=True).print(table if found else f"{channel}: no node answers")
-    nodes = [{**vars(each), "state": each.state.value, "mismatches": wrong.get(each.node, [])} for each in found]
+        name, kind = link.names[each.joint], link.section.joints[each.joint].settings.family
+        state = each.power.value if each.present else "[red]no answer[/red]"
+        table.add_row(name, kind, each.address, state, each.name, each.serial, each.firmware)
+        node = {**vars(each), "joint": name, "family": kind, "power": each.power.value}
+        nodes.append(node | {"traits": traits[each.joint].as_json()})
+    Console(stderr=True).print(table)
     write_json(json, {"bus": channel, "nodes": nodes})
-    missing = [f"{each.joint} (node {each.node})" for each in found if not each.present]
+    missing = [f"{link.names[each.joint]} ({each.address})" for each in found if not each.present]
     if missing:
         raise BusFault(f"no answer from {', '.join(missing)} on {channel}")
-    twins = [str(each.node) for each in found if each.answers > 1]
-    if twins:
-        raise BusFault(f"{channel}: node id {', '.join(twins)} answers twice: give every node an id of its own")
+    wrong = [f"{link.names[each.joint]} ({each.address}): {each.mismatch}" for each in found if each.mismatch]
     if wrong:
-        node, differs = next(iter(wrong.items()))
-        raise refused_identity(joints[node], node, differs)
+        raise Refused(f"{wrong[0]}: connect the right arm, or correct its drive under link.joints")
     return 0

@@ -7,7 +7,7 @@ from typing import Any
 from armlink.arm_file import LinkJoint
 from armlink.bus.port import Frame
 from armlink.drives.family import Ask
-from armlink.drives.orders import DriveIdentity, Order, Power, Reading
+from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading
 from armlink.drives.traits import Traits
 from armlink.errors import BusFault, Stall
 
@@ -60,6 +60,10 @@ class BasicDrives:
         """See Drives."""
         return self.powers[joint]
 
+    def ask_power(self, joint: int, ask: Ask) -> Power:
+        """See Drives: the newest that it told."""
+        return self.powers[joint]
+
     def ready(self, joint: int) -> bool:
         """See Drives."""
         return self.powers[joint] is Power.ON
@@ -82,9 +86,9 @@ class BasicDrives:
                 return BusFault(f"{self.where(joint)}: power is {power.value}, expected on")
         return None
 
-    def has_restarted(self) -> bool:
+    def has_restarted(self) -> int | None:
         """See Drives: no drive tells."""
-        return False
+        return None
 
     def own_stop(self) -> str:
         """See Drives."""
@@ -100,13 +104,21 @@ class BasicDrives:
         found = self.powers[joint].value
         return f"{self.where(joint)}: power stays {found}, expected {target.value} within {seconds:g} s"
 
-    def forget(self) -> None:
+    def forget(self, restarts: bool = False) -> None:
         """See Drives."""
         self.faults = [""] * self.m
 
     def missing(self, ask: Ask) -> list[int]:
         """See Drives: those that `identify` does not find."""
         return [each.joint for each in self.identify(ask) if not each.present]
+
+    def commands(self) -> Mapping[int, str]:
+        """See Drives."""
+        raise NotImplementedError
+
+    def intrusion(self, can_id: int, data: bytes) -> str:
+        """See Drives: the identifiers of `commands`."""
+        return self.commands().get(can_id, "")
 
     def identify(self, ask: Ask) -> list[DriveIdentity]:
         """See Drives."""
@@ -131,6 +143,9 @@ class BasicDrives:
     def poll(self, first: bool) -> list[Frame]:
         """See Drives: none."""
         return []
+
+    def fits(self, limits: Sequence[Limits]) -> None:
+        """See Drives: nothing to check."""
 
     def recover(self, ask: Ask) -> None:
         """See Drives: nothing to do."""

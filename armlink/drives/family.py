@@ -25,6 +25,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import Frame
 from armlink.drives.board import Board
+from armlink.drives.findings import Result
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup, power_name
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
@@ -89,8 +90,16 @@ class Drives(Protocol):
         """Drives that do not answer. Sets nothing."""
         ...
 
+    def intrusion(self, can_id: int, data: bytes) -> str:
+        """What a frame is that no drive of ours sends, if it can only be of another host that commands; else empty."""
+        ...
+
     def identify(self, ask: Ask) -> list[DriveIdentity]:
         """Ask every drive what it is; one that does not answer is there with `present` false. Sets nothing."""
+        ...
+
+    def fits(self, limits: Sequence[Limits]) -> None:
+        """Raise BadInput where files that the arm file names, or limits, can fit no drive; asks no drive."""
         ...
 
     def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
@@ -123,6 +132,10 @@ class Drives(Protocol):
         """Newest power state of a drive."""
         ...
 
+    def ask_power(self, joint: int, ask: Ask) -> Power:
+        """Power state of a drive that has had no command, asked for without giving one."""
+        ...
+
     def ready(self, joint: int) -> bool:
         """Whether a drive is ON in the mode it was last ordered in."""
         ...
@@ -138,8 +151,8 @@ class Drives(Protocol):
         """
         ...
 
-    def has_restarted(self) -> bool:
-        """Whether a drive has restarted since the set-up, so that its settings are lost."""
+    def has_restarted(self) -> int | None:
+        """A drive that has restarted since the set-up, so that its settings are lost; None if none has."""
         ...
 
     def own_stop(self) -> str:
@@ -150,8 +163,8 @@ class Drives(Protocol):
         """Why a drive is not in `target` after `seconds`, in words that name the joint."""
         ...
 
-    def forget(self) -> None:
-        """Forget alarms of the past: a walk to ON begins, or has succeeded."""
+    def forget(self, restarts: bool = False) -> None:
+        """Forget alarms of the past: a walk to ON begins, or has succeeded; before a set-up also `restarts`."""
         ...
 
     def recover(self, ask: Ask) -> None:
@@ -210,6 +223,17 @@ class KeepsCalibration(Protocol):
 
 
 @runtime_checkable
+class TestsItself(Protocol):
+    """Drives with a self-test of their own, which goes further than the one for all families."""
+
+    def self_test(
+        self, link: Any, limits: Sequence[Limits], power: bool, progress: Callable[[str], None]
+    ) -> list[Result]:
+        """Results for an arm of which all joints are these drives; `link` is its Link, open and not started."""
+        ...
+
+
+@runtime_checkable
 class Replays(Protocol):
     """Drives whose frames can be made again from a recording."""
 
@@ -229,6 +253,8 @@ class Family:
     """Keys of `link.joints[].drive`."""
     build: Callable[[ArmFile, Sequence[LinkJoint]], Drives]
     """`build(arm, joints)`: the drives of these joints of an arm, all on one bus; sends nothing. Raises BadInput."""
+    search: Callable[..., int] | None = None
+    """`search(arm or None, bus or None, json, write)`: `armlink scan` of a whole bus; None: each drive is asked."""
     state_name: Callable[[int], str] = power_name
     """State of a drive in words, from its code in `Sample.status`; by default an index of Power."""
     summary: str = ""

@@ -3,10 +3,10 @@
 from collections.abc import Callable
 from typing import TypeVar
 
-from armlink.bus.port import Frame
+from armlink.bus.port import BUS_SHIFT, Frame
 from armlink.clock import Clock
 from armlink.drives.family import ANSWER, TRIES
-from armlink.link.cyclic_exchange import BUS_BITS, Loop
+from armlink.link.cyclic_exchange import Loop
 
 T = TypeVar("T")
 Pump = Callable[[Callable[[], bool], float], bool]
@@ -32,7 +32,7 @@ class LinkAsk:
         found: list[T] = []
 
         def look(can_id: int, data: bytes) -> None:
-            if not found and can_id >> BUS_BITS == self._tag >> BUS_BITS:
+            if not found and can_id >> BUS_SHIFT == self._tag >> BUS_SHIFT:
                 value = answer(can_id & ~(self._tag), data)
                 if value is not None:
                     found.append(value)

@@ -1,7 +1,5 @@
 """Detects irregular traffic: a second host, a duplicated node id, a babbling node, a restarted controller."""
 
-from collections.abc import Mapping
-
 MOST_FRAMES = 1000
 """Limit of frames taken in at once; a bus at 1 Mbit/s needs 47 ms for them."""
 CROWD_PER_JOINT, CROWD = 5, 30
@@ -18,9 +16,8 @@ itself and catches up."""
 class BusWatch:
     """Counts the readings of the cyclic loop, and frames that are no process data."""
 
-    def __init__(self, joints: int, ours: Mapping[int, str]) -> None:
-        """`ours`: identifiers that only a host sends, and what they are: from another they are a second host."""
-        self._ours = ours
+    def __init__(self, joints: int) -> None:
+        """Nothing was heard."""
         self._crowd = CROWD_PER_JOINT * joints + CROWD
         self._doubled: set[int] = set()
         self._double_cycles = [0] * joints
@@ -56,12 +53,6 @@ class BusWatch:
         self.readings[joint] = max(self.readings[joint], self.syncs - FORGIVEN)
         if self.readings[joint] > self.syncs:
             self._doubled.add(joint)
-
-    def other(self, can_id: int) -> None:
-        """A frame arrived that is no process data of a joint."""
-        self.last_id = can_id
-        if can_id in self._ours and not self.intruder:
-            self.intruder = f"{self._ours[can_id]} ({can_id:03X}h)"
 
     def cycle_ends(self, frames: int) -> None:
         """Evaluate the completed cycle, with the number of frames sent and received in it."""

@@ -82,7 +82,7 @@ class Commander:
             if order.refused:
                 refused = True
         self._commanded = modes
-        sample = self.loop.exchange(passed)
+        sample = self.loop.exchange(passed, math.inf if refused else now + (self.max_age - age))
         sample.late = self.late
         why = refused and refusal(self.names, command, age, passed, seen, self.limits)
         if why:
@@ -150,12 +150,12 @@ class Commander:
                     since[place] = min(since[place], now)
                 else:
                     since[place], reached = math.inf, False
-            if reached and np.isfinite(sample.position).all():
-                told = all(slow >= s for slow, s in zip(loop.slow_seen, since, strict=True))
-                if not on or ((told or self._torque_untold()) and all(each.ready(drive) for each, drive, _ in drives)):
-                    for place, order in enumerate(self.passed):
-                        self.passed[place] = order._replace(walk=False)
-                    return sample
+            reached = reached and bool(np.isfinite(sample.position).all())
+            if reached and on:
+                reached = self._torque_told(since) and all(each.ready(drive) for each, drive, _ in drives)
+            if reached:
+                self.passed[:] = [order._replace(walk=False) for order in self.passed]
+                return sample
             if loop.watch.intruder or self.restarted():
                 break
         raise BusFault(self._stuck(target, drives))
@@ -176,14 +176,12 @@ class Commander:
 
     def restarted(self) -> bool:
         """Whether some drive has restarted."""
-        return any(group.drives.has_restarted() for group in self.loop.groups)
+        return any(group.drives.has_restarted() is not None for group in self.loop.groups)
 
-    def _torque_untold(self) -> bool:
-        """Whether the joints that have not told their torque cannot be ordered to make one."""
-        return all(
-            slow > -math.inf or Mode.TORQUE not in modes
-            for slow, modes in zip(self.loop.slow_seen, self._modes_of, strict=True)
-        )
+    def _torque_told(self, since: list[float]) -> bool:
+        """Whether each joint that has torque control has told its torque since it has power, from time `since` on."""
+        columns = zip(self.loop.slow_seen, since, self._modes_of, strict=True)
+        return all(seen >= on or Mode.TORQUE not in modes for seen, on, modes in columns)
 
     def stop(self) -> None:
         """Stop every joint, repeated until none is ON, as far as the bus still carries it."""

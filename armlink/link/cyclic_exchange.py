@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from armlink.arrays import Array
 from armlink.bus.frame_bits import FIXED_BITS
-from armlink.bus.port import Frame, Port
+from armlink.bus.port import BUS_SHIFT, Frame, Port
 from armlink.clock import Clock
 from armlink.drives.board import Board, Event
 from armlink.drives.family import ANY, FillsBoard
 from armlink.drives.orders import Order, Reading, power_code
+from armlink.errors import Refused
 from armlink.link.bus_watchdog import MOST_FRAMES, BusWatch
 from armlink.link.groups import Group, traits_of
 from armlink.link.joint_values import JointValues
@@ -23,9 +24,7 @@ COLLECT_SHARE = 0.8
 """Share of a period after the commands in which their replies are waited for."""
 OWED_CYCLES = 25
 """A reply that has been owed for this many cycles is lost."""
-BUS_BITS = 34
-"""Identifiers carry the number of their bus from this bit on, where there are several."""
-_UNTAGGED = (1 << BUS_BITS) - 1
+_UNTAGGED = (1 << BUS_SHIFT) - 1
 
 
 class Loop:
@@ -39,7 +38,7 @@ class Loop:
         self.period = period
         self.stats = Stats()
         self.board = board = Board(self.n)
-        self.watch = BusWatch(self.n, _commands(groups))
+        self.watch = BusWatch(self.n)
         board.on_again = self.watch.again
         board.readings = self.watch.readings
         self.withheld: frozenset[int] = frozenset()
@@ -159,10 +158,17 @@ class Loop:
         self._dropped = self._port.dropped
         self.watch.settle()
 
-    def exchange(self, orders: Sequence[Order]) -> Sample:
-        """One cycle: the frames of the orders, then the readings that they bring; raises as `verify`."""
-        board, now = self.board, self._clock.now()
-        frames = self._encode(orders, now)
+    def exchange(self, orders: Sequence[Order], expires: float = math.inf) -> Sample:
+        """One cycle: the frames of the orders, then the readings that they bring; raises as `verify`.
+
+        Raises Refused, and sends nothing, where the frames would leave after `expires`, by the clock [s].
+        """
+        board = self.board
+        frames = self._encode(orders, self._clock.now())
+        now = self._clock.now()
+        if now > expires:
+            late = (now - expires) * 1e3
+            raise Refused(f"gate: the command became too old before its frames left, by {late:.0f} ms: host too slow")
         if self._first is None:
             self._first = now
         board.awaited = self._expected
@@ -248,10 +254,19 @@ class Loop:
             self.watch.last_id = can_id
             take(can_id, data)
             return
-        self.watch.other(can_id)
+        if not self.watch.intruder:
+            self._suspect(can_id, data)
+        self.watch.last_id = can_id
         for take in self._any:
             take(can_id, data)
         self.on_unknown(can_id, data)
+
+    def _suspect(self, can_id: int, data: bytes) -> None:
+        """Whether a frame that no drive of ours sends is another host's."""
+        for group in self.groups:
+            if can_id & ~_UNTAGGED == group.tag and (what := group.drives.intrusion(can_id & _UNTAGGED, data)):
+                self.watch.intruder = f"{what} ({can_id & 0x1FFFFFFF:03X}h)"
+                return
 
     def count(self, frames: int, size: int) -> None:
         """Count frames that went over the bus, with this many bytes of data in all."""
@@ -321,8 +336,3 @@ class Loop:
                 latest[joint] = value
                 came.append(joint)
         return came
-
-
-def _commands(groups: Sequence[Group]) -> dict[int, str]:
-    """Identifiers that only a host sends, of all groups."""
-    return {can_id | group.tag: what for group in groups for can_id, what in group.drives.commands().items()}

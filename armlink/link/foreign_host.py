@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from armlink.arrays import Array
-from armlink.bus.port import Frame
+from armlink.bus.port import BUS_SHIFT, Frame
 from armlink.drives.family import ANY
 from armlink.link.groups import Group
 from armlink.link.joint_values import JointValues
@@ -43,7 +43,7 @@ class ForeignHost:
         group = self._group_of.get(can_id)
         groups = self._unnamed if group is None else (group,)
         for each in groups:
-            if can_id >> 34 != each.tag >> 34:
+            if can_id >> BUS_SHIFT != each.tag >> BUS_SHIFT:
                 continue
             if self._sync is not None and group is not None:
                 self._newest[can_id] = can_id, data

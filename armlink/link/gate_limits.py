@@ -11,6 +11,14 @@ PRESS_IN = 0.05
 """A target may lie this far behind a stop [rad], so that a joint can be pressed against it."""
 OVERSPEED = 1.5
 """A joint under torque control may turn this many times as fast as max_velocity before it is stopped."""
+SERVO_OVERSPEED = 3.0
+"""A joint under position control may, as it takes up a load, turn this many times as fast as max_velocity."""
+SERVO_SPEED = 3.0
+"""A joint under position control may turn this fast whatever max_velocity is [rad/s]: one that is enabled while it
+sinks is caught at that speed."""
+FOLLOWING = 0.5
+"""A joint under position control may read a position this far from its target before it is stopped [rad]; a motion of
+calib takes a joint for blocked long before."""
 OUTSIDE = 0.1
 """A joint under torque control may read a position this far outside the target window before it is stopped [rad]."""
 
@@ -65,6 +73,8 @@ def gate_limits(limits: Limits, gains: Gains | None = None, max_torque: float | 
         lower=limits.lower,
         upper=limits.upper,
         overspeed=OVERSPEED * limits.max_velocity,
+        servo_overspeed=max(SERVO_OVERSPEED * limits.max_velocity, SERVO_SPEED),
+        following=FOLLOWING,
         outside=OUTSIDE,
         max_age=limits.deadline,
         period=limits.period,

@@ -59,9 +59,8 @@ def make_groups(arm: ArmFile, bus: CanBus | None = None) -> tuple[Group, ...]:
         address = joint.settings.address
         other = taken.setdefault((address, tag), joint.name)
         if other != joint.name:
-            raise BadInput(
-                f"{other} and {joint.name} are both {address} on {bus.channel_info}: ids are unique on a bus"
-            )
+            where = "one bus" if bus is None else bus.channel_info
+            raise BadInput(f"{other} and {joint.name} are both {address} on {where}: ids are unique on a bus")
         found.setdefault((joint.settings.family, tag), []).append(place)
     groups = []
     for (name, tag), places in found.items():

@@ -7,7 +7,8 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.drives.orders import Gains, Limits, Order, Power
-from armlink.link.groups import Group, Mounting, traits_of
+from armlink.link.gate_limits import drive_limits, joint_ranges, target_window
+from armlink.link.groups import Group, Mounting, make_groups, traits_of
 from armlink.torque_calibration import TorqueCalibration
 
 
@@ -146,3 +147,14 @@ def values_of(arm: ArmFile, groups: tuple[Group, ...]) -> JointValues:
     """Conversions between the values of an arm's joints and of their drives."""
     traits = traits_of(groups, len(arm.require_link().joints))
     return JointValues(Mounting.of(arm), np.array([each.torque == "current" for each in traits]))
+
+
+def try_limits(arm: ArmFile) -> None:
+    """Raise BadInput where an arm file fits no drives; asks none."""
+    link = arm.require_link()
+    groups = make_groups(arm)
+    rows = zip(link.joints, joint_ranges(arm), strict=True)
+    limits = [drive_limits(row, target_window(*ends), 1.0 / link.rate, link.deadline) for row, ends in rows]
+    values = values_of(arm, groups)
+    for group in groups:
+        group.drives.fits([values.limits(place, limits[place]) for place in group.places])

@@ -168,6 +168,8 @@ class Link(Calibrations):
         """Listen before anything is set; raises BusFault where another host is on the bus."""
         self._loop.drain()
         self._loop.watch.clear()
+        for group in self.groups:
+            group.drives.forget(restarts=True)
         if not self._lock_step:
             self._loop.listen(max(LISTEN_PERIODS * self.period, LISTEN_SECONDS))
         self._alone()
@@ -175,8 +177,10 @@ class Link(Calibrations):
     def _alone(self) -> None:
         """Raise BusFault where another host was heard or a controller has restarted."""
         for group in self.groups:
-            if group.drives.has_restarted():
-                raise group.drives.alarm() or BusFault("a controller has just restarted: start again")
+            joint = group.drives.has_restarted()
+            if joint is not None:
+                name = self.names[group.places[joint]]
+                raise BusFault(f"{name}: its controller has just restarted (boot-up message): start again")
         fault = bus_fault(self.names, self._loop.watch, 0)
         if fault:
             raise BusFault(fault)

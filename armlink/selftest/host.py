@@ -4,6 +4,7 @@ import contextlib
 import os
 import pickle
 import socket
+import struct
 import subprocess
 import sys
 import tempfile
@@ -17,29 +18,33 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.bus.port import Frame
 from armlink.clock import MonotonicClock
-from armlink.drives.canopen.cia402 import Mode
-from armlink.drives.canopen.object_dictionary import SYNC_ID
-from armlink.drives.canopen.pdo import STATUS_DECIMATION, TPDO1, TPDO2, TPDO3
-from armlink.drives.canopen.units import Units
+from armlink.drives.base import BasicDrives
+from armlink.drives.family import Ask, Family
+from armlink.drives.orders import Limits, Mode, Order, Power, Reading, Setup
+from armlink.drives.settings import DriveSettings
+from armlink.drives.traits import Traits
 from armlink.errors import BusFault
+from armlink.link.ask import LinkAsk
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
-from armlink.link.faults import ENABLED_BITS
 from armlink.link.gate import start_from
-from armlink.link.gate_limits import gate_limits, joint_ranges, target_window
+from armlink.link.gate_limits import drive_limits, gate_limits, joint_ranges, target_window
+from armlink.link.groups import Group, Mounting
+from armlink.link.joint_values import JointValues
 from armlink.link.lateness import Lateness
 from armlink.link.types import Command
 from armlink.loop.channel import Channel, Closed
 from armlink.loop.messages import pack
 from armlink.loop.realtime import Realtime, prepare
 
-USER_UNIT = 2 * np.pi / 2**20
 RATES = (1000.0, 800.0, 500.0, 400.0, 250.0, 200.0, 125.0, 100.0, 50.0, 25.0, 20.0, 10.0)
 """Rates that are tried on what was measured [Hz]."""
 HELD = 0.5
 """A rate is held if 99.9 % of the cycles begin within this share of its period."""
-WARN_SHARE = 0.5
-"""Share of `link.deadline` that the lateness of 99.9 % of the cycles should not exceed."""
+
+
+_TRAITS = Traits("current", "host", "holds", (), "reply", "11")
+_VALUES, _ANSWER = struct.Struct("<ff"), 0x100
 
 
 @dataclass(frozen=True)
@@ -61,27 +66,51 @@ class HostReport:
         return next((rate for rate in RATES if late <= HELD / rate and self.busy <= HELD / rate), 0.0)
 
 
-class EchoPort:
-    """A port on which every joint answers each SYNC at once, standing still and enabled."""
+class EchoDrives(BasicDrives):
+    """Drives of no real family, which answer each command at once, standing still: what is measured is the host."""
 
-    def __init__(self, nodes: Sequence[int]) -> None:
-        """For joints at these node ids."""
+    def routes(self) -> dict[int, int]:
+        """See Drives."""
+        return {_ANSWER + joint: joint for joint in range(self.m)}
+
+    def commands(self) -> dict[int, str]:
+        """See Drives."""
+        return {1 + joint: "command" for joint in range(self.m)}
+
+    def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
+        """See Drives."""
+        self.powers = [Power.ON] * self.m
+        return [Setup(0.0, 0.0, 1e-6, frozenset((Mode.POSITION, Mode.TORQUE)))] * self.m
+
+    def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
+        """See Drives."""
+        return [(1 + joint, _VALUES.pack(order.position, order.torque)) for joint, order in enumerate(orders) if order]
+
+    def sent(self, joint: int) -> Order | None:
+        """See Drives."""
+        return None
+
+    def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
+        """See Drives."""
+        position, torque = _VALUES.unpack(data)
+        return self.note(Reading(can_id - _ANSWER, position, 0.0, torque, power=Power.ON))
+
+    def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
+        """See Drives."""
+        return None
+
+
+class EchoPort:
+    """A port on which every joint answers each command at once."""
+
+    def __init__(self) -> None:
+        """Nothing waits."""
         self.errors = self.dropped = 0
-        self._nodes, self._syncs = nodes, 0
         self._waiting: deque[Frame] = deque()
-        status = ENABLED_BITS
-        self._shown = [(TPDO3.cob_base + node, TPDO3.layout.pack(status, Mode.POSITION)) for node in nodes]
-        self._read = [(TPDO1.cob_base + node, TPDO1.layout.pack(0, 0)) for node in nodes]
-        self._slow = [(TPDO2.cob_base + node, TPDO2.layout.pack(status, 0, 0)) for node in nodes]
 
     def send(self, can_id: int, data: bytes) -> None:
         """Take one frame."""
-        if can_id != SYNC_ID:
-            return
-        self._waiting.extend(self._read)
-        if self._syncs % STATUS_DECIMATION == 0:
-            self._waiting.extend(self._shown if self._syncs == 0 else self._slow)
-        self._syncs += 1
+        self._waiting.append((can_id - 1 + _ANSWER, data))
 
     def send_all(self, frames: Sequence[Frame]) -> None:
         """Take the frames of a cycle."""
@@ -132,24 +161,23 @@ def cycles(arm: ArmFile, seconds: float, channel: Channel) -> HostReport:
     """The link's cycle on an EchoPort, each sample sent to the job."""
     section = arm.require_link()
     n, period = len(section.joints), 1.0 / section.rate
-    nodes = tuple(range(1, n + 1))
     clock, realtime = MonotonicClock(), prepare()
-    loop = Loop(EchoPort(nodes), clock, nodes, 127, period, lock_step=False)
-    units = [Units(joint.rated_torque * 1e-3, USER_UNIT, USER_UNIT) for joint in section.joints]
-    loop.set_units(tuple(units))
+    drives = EchoDrives(section.joints, _TRAITS)
+    groups = (Group(Family("echo", _TRAITS, DriveSettings, lambda arm, joints: drives), drives, tuple(range(n)), 0),)
+    values = JointValues(Mounting.of(arm), np.zeros(n, bool))
+    loop = Loop(EchoPort(), clock, groups, values, period, lock_step=False)
     windows = [target_window(*limits) for limits in joint_ranges(arm)]
-    limits = [
-        gate_limits(joint, window, unit, period, section.deadline)
-        for joint, window, unit in zip(section.joints, windows, units, strict=True)
-    ]
+    pairs = zip(section.joints, windows, strict=True)
+    limits = [drive_limits(joint, window, period, section.deadline) for joint, window in pairs]
     names = tuple(joint.name for joint in section.joints)
     commander = Commander(loop, clock, names, period, np.inf, lock_step=False)
-    commander.begin(limits, [start_from(limit, 0.0, 0.0) for limit in limits], [0] * n)
-    loop.statuses[:], loop.displays[:] = [ENABLED_BITS] * n, [int(Mode.POSITION)] * n
+    setups = drives.set_up(LinkAsk(loop, clock, lambda done, timeout: False), limits)
+    gates = [gate_limits(limit) for limit in limits]
+    commander.begin(gates, [start_from(gate, 0.0, 0.0) for gate in gates], [each.modes for each in setups])
     hold, nothing = Command.hold(np.zeros(n)), np.zeros(n)
     count, begin, busy = 0, clock.now(), time.process_time()
     for _ in range(3):  # every joint has answered, and memory is warm
-        commander.stand([0] * n)
+        commander.stand([Power.OFF] * n)
     loop.stats.lateness = Lateness()
     while clock.now() - begin < seconds:
         sample = commander.command(hold)

@@ -7,7 +7,7 @@ from types import FrameType
 
 from armlink.bus.bus_group import BusGroup, GroupPort
 from armlink.bus.can_bus import CanBus
-from armlink.bus.port import Frame, InterfaceDown, Port
+from armlink.bus.port import BUS_SHIFT, Frame, InterfaceDown, Port
 from armlink.drives.canopen.object_dictionary import NMT_ID, SYNC_ID
 from armlink.errors import BusFault
 from sim_bus.bus.control_pipe import ControlPipe
@@ -51,9 +51,13 @@ class Server:
         """The last of several buses provides SYNC: a host sends to them in order."""
         self._of_port: dict[Port, set[int]] = {port: set() for port in ports}
         """Nodes on each of several buses."""
+        self._tags: dict[int, int] = {}
+        """Node → what the identifiers of its bus have in addition."""
         if isinstance(bus, BusGroup):
-            for node, place in bus.route.items():
-                self._of_port[ports[place]].add(node)
+            for joint in arm.arm.require_link().joints:
+                node, tag = joint.settings.node, bus.tags[joint.bus]
+                self._tags[node] = tag
+                self._of_port[ports[tag >> BUS_SHIFT]].add(node)
         self._line: Line = arm
         self._control, self._injector = control, None if control is None and not faults else Injector(arm)
         if self._injector is not None:
@@ -149,7 +153,9 @@ class Server:
     def _flush(self) -> None:
         outbox = self._line.outbox
         if outbox:
-            frames = list(outbox)
+            frames = (
+                [(can_id | self._tags[can_id & 0x7F], data) for can_id, data in outbox] if self._tags else list(outbox)
+            )
             outbox.clear()
             try:
                 self._port.send_all(frames)

@@ -19,6 +19,8 @@ from armlink.errors import BusFault, Refused
 
 QUICK_STOP_AND_HOLD = 6
 """605Ah: quick stop ramp, then stay in quick stop, power on: the joint holds."""
+DISPLAY_READS = 5
+"""A mode that was written is displayed within this many reads."""
 ABORT_IS_QUICK_STOP = 3
 """6007h: what a lost host leads to."""
 
@@ -137,6 +139,32 @@ def check_modes(services: NodeServices) -> int:
     return supported
 
 
+def offered_modes(services: NodeServices) -> int:
+    """Modes of a stock device as bits of 6502h, each of those that the link uses tried: a mode's own display is
+    believed, 6502h where there is none. The device is left in a position mode. Raises BusFault without one."""
+    told = int(services.read(objects.SUPPORTED_MODES)) if services.has(objects.SUPPORTED_MODES) else 0
+    offered = 0
+    for mode in (Mode.PROFILE_TORQUE, Mode.TORQUE, Mode.PROFILE_POSITION, Mode.POSITION):
+        needed = objects.TARGET_TORQUE if mode in (Mode.TORQUE, Mode.PROFILE_TORQUE) else objects.TARGET_POSITION
+        if services.has(needed) and _enters(services, mode, supports(told, mode)):
+            offered |= 1 << (mode - 1)
+    if not (supports(offered, Mode.POSITION) or supports(offered, Mode.PROFILE_POSITION)):
+        raise BusFault(
+            f"{services.joint} (node {services.node}): enters neither mode 8 nor mode 1 (positions): 6502h is {told:#x}"
+        )
+    return offered
+
+
+def _enters(services: NodeServices, mode: Mode, told: bool) -> bool:
+    try:
+        services.write(objects.MODE, int(mode))
+    except BusFault:
+        return False
+    if not services.has(objects.MODE_DISPLAY):
+        return told
+    return any(int(services.read(objects.MODE_DISPLAY)) == mode for _ in range(DISPLAY_READS))
+
+
 def configure_pdo(services: NodeServices, each: Pdo, deadline_ms: int, profile: Profile = OURS) -> None:
     """Map one PDO of the link and read the mapping back; raises BusFault naming the joint.
 
@@ -157,6 +185,27 @@ def configure_pdo(services: NodeServices, each: Pdo, deadline_ms: int, profile: 
         raise BusFault(f"{services.joint} (node {services.node}): {error}") from None
 
 
+def disable_other_rpdos(services: NodeServices) -> None:
+    """Set every RPDO invalid that is not the link's, as another program could move the joint through it.
+
+    Raises BusFault naming joint and object.
+    """
+
+    def write(entry: Entry, value: int) -> None:
+        services.write(entry, value)
+
+    def read(entry: Entry) -> int:
+        return int(services.read(entry))
+
+    for index in pdo.foreign_rpdos(services.remote.object_dictionary):
+        if not services.has(Entry(index, 1, "I", "RPDO COB-ID")):
+            continue
+        try:
+            pdo.disable(index, write, read)
+        except pdo.MappingRefused as error:
+            raise BusFault(f"{services.joint} (node {services.node}): {error}") from None
+
+
 def configure(
     services: NodeServices,
     joint: LinkJoint,
@@ -166,11 +215,12 @@ def configure(
     supported: int,
     profile: Profile = OURS,
 ) -> None:
-    """PDOs, and the limits that hold even without this host: torque, position window, quick stop, who is watched.
+    """PDOs, the link's and no others, and limits that hold even without this host: torque, window, quick stop, watch.
 
     All is read back. The torque offset 60B2h, which adds to every target torque and stays latched, is cleared where the
     device has one. `supported` is 6502h. Raises BusFault naming joint and object.
     """
+    disable_other_rpdos(services)
     for each in profile.pdos:
         configure_pdo(services, each, protection.deadline_ms, profile)
     if services.has(objects.TORQUE_OFFSET):

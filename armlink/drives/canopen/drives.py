@@ -14,6 +14,7 @@ from armlink.drives.canopen import controller_setup as device
 from armlink.drives.canopen import emcy, faults, torque_sensor_record
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen.cia402 import Control, State, next_control, set_point_control, state_of, supports
+from armlink.drives.canopen.eds_file import of_joints
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import RPDO1, RPDO2, TPDO1, TPDO2, TPDO3, host_frames
 from armlink.drives.canopen.profile import examine, profile_of
@@ -21,6 +22,7 @@ from armlink.drives.canopen.scales import read_units
 from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork, joint_services
 from armlink.drives.canopen.units import Units, assumed_units
 from armlink.drives.family import Ask
+from armlink.drives.findings import Result
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
 from armlink.drives.traits import Traits
 from armlink.errors import BadInput, BusFault
@@ -33,7 +35,7 @@ NO_MODE = 0
 OFF, PROFILE_POSITION = int(Mode.OFF), int(Mode.PROFILE_POSITION)
 ENABLE, DISABLE_VOLTAGE = int(Control.ENABLE), int(Control.DISABLE_VOLTAGE)
 FAULT_RESET, QUICK_STOP = int(Control.FAULT_RESET), int(Control.QUICK_STOP)
-INT16_MAX, INT32_MAX = 2**15 - 1, 2**31 - 1
+INT16_MAX, INT32_MAX, UINT32_MAX = 2**15 - 1, 2**31 - 1, 2**32 - 1
 _TARGETS = {Power.ON: State.ENABLED, Power.OFF: State.SWITCH_ON_DISABLED, Power.STOPPED: State.QUICK_STOP}
 _POWERS = {
     State.ENABLED: Power.ON,
@@ -46,6 +48,10 @@ _POWERS = {
     State.SWITCHED_ON: Power.READY,
 }
 _ALL = (-INT32_MAX - 1, INT32_MAX)
+_DOWNLOADS = (1, 6)
+"""Command specifiers of SDO requests that write: initiate download, block download (CiA 301, 7.2.4.3)."""
+_HARMLESS_WRITES = (0x1010, 0x2100)
+"""Objects that another program may write: they store settings or hold the torque sensor's calibration."""
 _SYNC: Frame = (objects.SYNC_ID, b"")
 _OPERATIONAL = bytes([objects.OPERATIONAL])
 
@@ -63,6 +69,7 @@ class CanopenDrives:
         self.protection = device.protection_of(section, self.nodes)
         self.profiles = [profile_of(joint.settings) for joint in joints]
         self.units: list[Units] = list(assumed_units(joints))
+        self._host_frames = host_frames(self.nodes, self.protection.host)
         self.beating = True
         """Whether the host's heartbeat is sent; not, so that the joints' watching it is put to the test."""
         self.statuses, self.displays = [NO_STATUS] * m, [NO_MODE] * m
@@ -135,7 +142,17 @@ class CanopenDrives:
 
     def commands(self) -> Mapping[int, str]:
         """See Drives."""
-        return host_frames(self.nodes, self.protection.host)
+        return self._host_frames
+
+    def intrusion(self, can_id: int, data: bytes) -> str:
+        """See Drives: what only a host sends, and SDO requests that write, but of settings and calibration."""
+        if can_id in self._host_frames:
+            return self._host_frames[can_id]
+        joint = self._joint_of.get(can_id - objects.SDO_REQUEST_ID)
+        if joint is None or len(data) < 4 or data[0] >> 5 not in _DOWNLOADS:
+            return ""
+        index = int.from_bytes(data[1:3], "little")
+        return "" if index in _HARMLESS_WRITES else f"SDO write of {index:04X}h to node {self.nodes[joint]}"
 
     def cycle_ids(self) -> frozenset[int]:
         """See Drives."""
@@ -168,12 +185,18 @@ class CanopenDrives:
 
     # ---- set-up
 
+    def fits(self, limits: Sequence[Limits]) -> None:
+        """See Drives: data sheets are read, limits tried with the usual units."""
+        of_joints(self.arm, self.rows)
+        for row, limit, unit in zip(self.rows, limits, assumed_units(self.rows), strict=True):
+            check_fits(row.name, limit, unit)
+
     def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
         """See Drives: nodes pre-operational, everything set and read back, nodes started (NMT)."""
         all_services = self.services(ask)
         for services, row in zip(all_services, self.rows, strict=True):
             device.check_identity(services, row)
-        for node in self._nmt_targets():
+        for node in self.nmt_targets():
             self.send_nmt(ask, objects.NMT_PRE_OPERATIONAL, node)
         found = []
         self._limits = list(limits)
@@ -190,14 +213,15 @@ class CanopenDrives:
             self.send_nmt(ask, objects.NMT_START, node)
         return found
 
-    def _nmt_targets(self) -> tuple[int, ...]:
+    def nmt_targets(self) -> tuple[int, ...]:
+        """Whom NMT commands go to: all, or these nodes where others may be on the bus."""
         return (0,) if all(row.settings.torque == "record" for row in self.rows) else self.nodes
 
     def _set_up(self, joint: int, services: NodeServices, limits: Limits) -> Setup:
         row, profile = self.rows[joint], self.profiles[joint]
         unit = read_units(services, row)
         check_fits(row.name, limits, unit)
-        supported = device.check_modes(services) if row.settings.torque == "record" else self._offered(services)
+        supported = self.offered(services, joint)
         device.configure(services, row, unit, limits, self.protection, supported, profile)
         self.units[joint], self._supported[joint] = unit, supported
         self._windows[joint] = math.ceil(limits.lower / unit.position), math.floor(limits.upper / unit.position)
@@ -216,9 +240,19 @@ class CanopenDrives:
             scales={"torque [N·m]": unit.torque, "position [rad]": unit.position, "velocity [rad/s]": unit.velocity},
         )
 
-    def _offered(self, services: NodeServices) -> int:
-        """Modes of a stock device as bits of 6502h."""
-        return int(services.read(objects.SUPPORTED_MODES))
+    def offered(self, services: NodeServices, joint: int) -> int:
+        """Modes of a device as bits of 6502h; raises BusFault where one that the link needs is not among them."""
+        if self.rows[joint].settings.torque == "record":
+            return device.check_modes(services)
+        return device.offered_modes(services)
+
+    def self_test(
+        self, link: Any, limits: Sequence[Limits], power: bool, progress: Callable[[str], None]
+    ) -> list[Result]:
+        """See TestsItself."""
+        from armlink.drives.canopen.check.self_test import SelfTest
+
+        return SelfTest(link, self, limits, progress).run(power)
 
     def send_nmt(self, ask: Ask, command: int, node: int = 0) -> None:
         """An NMT command (CiA 301) to one node, or to all."""
@@ -237,7 +271,7 @@ class CanopenDrives:
         commands: list[Frame] = []
         for joint, order in enumerate(orders):
             if order is None:
-                self._sent[joint] = None
+                self._sent[joint], self._walking[joint] = None, False
                 continue
             if order.walk:
                 word = self._step(joint, order, modes, now)
@@ -444,6 +478,11 @@ class CanopenDrives:
         """See Drives."""
         return _POWERS.get(state_of(self.statuses[joint]), Power.UNKNOWN)
 
+    def ask_power(self, joint: int, ask: Ask) -> Power:
+        """See Drives."""
+        self.statuses[joint] = int(self.services(ask)[joint].read(objects.STATUS_WORD))
+        return self.power(joint)
+
     def ready(self, joint: int) -> bool:
         """See Drives."""
         told = "TPDO3" not in self._layouts[joint] or len(self._entries[joint]["TPDO3"]) < 2
@@ -459,9 +498,9 @@ class CanopenDrives:
         """See Drives."""
         return faults.state_fault(self._known, now, modes, self._deadline)
 
-    def has_restarted(self) -> bool:
+    def has_restarted(self) -> int | None:
         """See Drives."""
-        return bool(self.restarted)
+        return min(self.restarted, default=None)
 
     def own_stop(self) -> str:
         """See Drives."""
@@ -471,8 +510,11 @@ class CanopenDrives:
         """See Drives."""
         return faults.stuck(self._known, joint, _TARGETS[target], self._modes[joint], seconds)
 
-    def forget(self) -> None:
+    def forget(self, restarts: bool = False) -> None:
         """See Drives."""
+        if restarts:
+            self.restarted.clear()
+        self._walking = [False] * self.m
         self.emergencies.clear()
         self.node_states.clear()
 
@@ -492,10 +534,16 @@ class CanopenDrives:
 
 
 def check_fits(name: str, limits: Limits, unit: Units) -> None:
-    """Raise BadInput where limits fit no frame."""
+    """Raise BadInput where limits fit no frame and no object."""
     if limits.max_torque / unit.torque > INT16_MAX:
         most = INT16_MAX * unit.torque
         raise BadInput(f"{name}: max_torque {limits.max_torque} N·m: 6071h carries at most {most:.6g} N·m")
+    if limits.max_velocity / unit.velocity > UINT32_MAX:
+        fastest = UINT32_MAX * unit.velocity
+        raise BadInput(f"{name}: max_velocity {limits.max_velocity} rad/s: 6081h carries at most {fastest:.6g} rad/s")
+    if limits.torque_rate / unit.torque > UINT32_MAX:
+        most = UINT32_MAX * unit.torque
+        raise BadInput(f"{name}: max_torque_rate {limits.torque_rate} N·m/s: 6087h carries at most {most:.6g} N·m/s")
     if max(abs(limits.lower), abs(limits.upper)) / unit.position > INT32_MAX:
         raise BadInput(f"{name}: its range is more than 607Ah carries at {unit.position:.3g} rad a user unit")
 

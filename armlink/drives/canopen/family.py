@@ -1,6 +1,7 @@
 """CANopen drives with the CiA 402 profile."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.drives.board import NO_STATUS
@@ -27,6 +28,13 @@ def build(arm: ArmFile, joints: Sequence[LinkJoint]) -> Drives:
     return CanopenDrives(arm, joints, TRAITS)
 
 
+def search(arm: ArmFile | None, bus: str | None, json: Path | None, write: Callable[..., None]) -> int:
+    """All nodes of a bus; see `armlink.drives.canopen.check.scan_report`."""
+    from armlink.drives.canopen.check.scan_report import scan_report
+
+    return scan_report(arm, bus, json, write)
+
+
 def state_name(code: int) -> str:
     """State in words, from the status word (6041h)."""
     return "unknown" if code == NO_STATUS else state_of(code).value
@@ -37,6 +45,7 @@ FAMILY = Family(
     traits=TRAITS,
     settings=CanopenSettings,
     build=build,
+    search=search,
     state_name=state_name,
     summary="CiA 402 (CANopen), with or without our torque sensor object 2100h",
 )

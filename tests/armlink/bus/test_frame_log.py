@@ -121,14 +121,14 @@ def test_content_that_is_none_is_said_in_one_line(arm_of, tmp_path):
 
 def test_only_what_joints_send_is_played_onto_a_bus_and_only_a_virtual_one(arm_of, tmp_path):
     record(arm_of(2), tmp_path / "run.log")
-    assert {can_id for _, can_id, _ in frames_of_log(tmp_path / "run.log")} == {0x80, 0x181, 0x182, 0x281}
+    assert {can_id for _, can_id, _ in frames_of_log(arm_of(2), tmp_path / "run.log")} == {0x80, 0x181, 0x182, 0x281}
     recording = recording_of_log(arm_of(2), tmp_path / "run.log")
     with pytest.raises(BadInput, match="virtual bus only"):
         play_onto(arm_of(2), tmp_path / "run.log", recording, "socketcan:can0", 0.0)
     with can.Bus(interface="virtual", channel="replayed") as listener:
         count = play_onto(arm_of(2), tmp_path / "run.log", recording, "virtual:replayed", 0.0)
         heard = [listener.recv(0) for _ in range(count)]
-    assert [bytes(m.data) for m in heard] == [data for _, _, data in frames_of_log(tmp_path / "run.log")]
+    assert [bytes(m.data) for m in heard] == [data for _, _, data in frames_of_log(arm_of(2), tmp_path / "run.log")]
 
 
 def test_a_recording_goes_onto_a_bus_as_the_frames_that_joints_would_have_sent(arm_of, tmp_path):

@@ -11,6 +11,7 @@ from armlink.arm_file import Bus
 from armlink.bus.bus_group import BusGroup, GroupPort
 from armlink.bus.message_port import MessagePort
 from armlink.bus.open import open_bus, open_link_bus
+from armlink.bus.port import BUS_SHIFT
 from armlink.bus.sockets import datagram_port
 from armlink.bus.sockets.datagram_port import BATCH
 from armlink.bus.sockets.socket_port import SocketPort
@@ -142,7 +143,9 @@ def group(arm_of):
     group.shutdown()
 
 
-def test_a_frame_goes_to_the_bus_of_its_node_and_one_for_all_to_every_bus(group):
+def test_frames_go_to_the_bus_that_their_identifier_names_and_come_back_with_it(group):
+    assert group.tags == {"": 0, "wrist": 1 << BUS_SHIFT}
+    wrist_tag = group.tags["wrist"]
     assert isinstance(group, BusGroup)
     with (
         can.Bus(interface="virtual", channel="base") as base,
@@ -150,20 +153,20 @@ def test_a_frame_goes_to_the_bus_of_its_node_and_one_for_all_to_every_bus(group)
     ):
         port = group.open_port()
         assert isinstance(port, GroupPort)
-        port.send_all([(0x201, b"1"), (0x203, b"3"), (0x77F, b"\x05"), (0x80, b"")])
+        port.send_all([(0x201, b"1"), (0x201 | wrist_tag, b"3"), (0x80, b""), (0x80 | wrist_tag, b"")])
         port.send(0x000, b"\x01\x00")
-        port.send(0x603, b"x")
+        port.send(0x603 | wrist_tag, b"x")
         heard = {bus: [] for bus in (base, wrist)}
         for bus, frames in heard.items():
             while (message := bus.recv(0)) is not None:
                 frames.append(message.arbitration_id)
-        assert heard[base] == [0x201, 0x77F, 0x80, 0x000]
-        assert heard[wrist] == [0x203, 0x77F, 0x80, 0x000, 0x603]
-        wrist.send(can.Message(arbitration_id=0x183, data=b"w", is_extended_id=False))
+        assert heard[base] == [0x201, 0x80, 0x000]
+        assert heard[wrist] == [0x201, 0x80, 0x603]
+        wrist.send(can.Message(arbitration_id=0x181, data=b"w", is_extended_id=False))
         base.send(can.Message(arbitration_id=0x181, data=b"b", is_extended_id=False))
-        assert sorted(filter(None, (port.receive(0.1) for _ in range(2)))) == [(0x181, b"b"), (0x183, b"w")]
+        assert sorted(filter(None, (port.receive(0.1) for _ in range(2)))) == [(0x181, b"b"), (0x181 | wrist_tag, b"w")]
         assert port.receive(0.0) is None
-        wrist.send(can.Message(arbitration_id=0x183, data=b"w", is_extended_id=False))
+        wrist.send(can.Message(arbitration_id=0x181, data=b"w", is_extended_id=False))
         assert group.recv(0.1).arbitration_id == 0x183
         assert group.recv(0.0) is None
 

@@ -1,4 +1,4 @@
-"""The gate: whatever comes, no wire value exceeds a limit, and what is not known is refused."""
+"""The gate: whatever comes, no order exceeds a limit, and what is not known is refused."""
 
 import math
 from dataclasses import replace
@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from armlink.drives.orders import Order, Power
 from armlink.link import gate as g
-from armlink.link.gate import OFF, JointLimits, Passed, Seen, is_fresh, pass_gate, start_from
+from armlink.link.gate import OFF, JointLimits, Seen, beyond, hold_at, is_fresh, pass_gate, start_from
 
 POSITION, TORQUE, PROFILE_POSITION, PROFILE_TORQUE = 8, 10, 1, 4
-INT16, INT32 = 2**15, 2**31
 anything = st.floats(allow_nan=True, allow_infinity=True, width=64)
 modes = st.sampled_from([OFF, POSITION, TORQUE, PROFILE_POSITION, PROFILE_TORQUE, 9, -1])
 ages = st.one_of(st.sampled_from([0.0, 0.05, 0.1, 0.1001, -1e-9, math.nan, math.inf]), st.floats(-1, 1))
@@ -20,7 +20,6 @@ ages = st.one_of(st.sampled_from([0.0, 0.05, 0.1, 0.1001, -1e-9, math.nan, math.
 @st.composite
 def limits(draw):
     rated = draw(st.floats(0.5, 500))
-    unit = rated / 1000
     lower = draw(st.floats(-7, 6.9))
     return JointLimits(
         max_torque=rated * draw(st.floats(0.01, 3)),
@@ -28,9 +27,9 @@ def limits(draw):
         position_step=draw(st.floats(1e-6, 0.1)),
         lower=lower,
         upper=lower + draw(st.floats(0.01, 7)),
-        torque_unit=unit,
-        position_unit=2 * math.pi / draw(st.sampled_from([2**20, 2**16, 360_000])),
         overspeed=draw(st.floats(0.01, 10)),
+        servo_overspeed=draw(st.floats(0.01, 30)),
+        following=draw(st.floats(0.01, 20)),
         outside=draw(st.floats(0.0, 1.0)),
         max_age=0.1,
     )
@@ -52,6 +51,11 @@ def may_pass(limits, mode, torque, position, age, held, now):
         inside = limits.lower - limits.outside <= now.position <= limits.upper + limits.outside
         entered = held.mode in (TORQUE, PROFILE_TORQUE) or math.isfinite(now.torque)
         return inside and entered and -limits.overspeed <= now.velocity <= limits.overspeed
+    if mode in (POSITION, PROFILE_POSITION):
+        follows = held.mode not in (POSITION, PROFILE_POSITION) or (
+            -limits.following <= held.position - now.position <= limits.following
+        )
+        return follows and (math.isnan(now.velocity) or abs(now.velocity) <= limits.servo_overspeed)
     return True
 
 
@@ -61,29 +65,26 @@ def test_no_frame_exceeds_a_limit_whoever_calls(limits, torque, position, cycles
     held = start_from(limits, torque, position)
     for mode, wanted_torque, wanted_position, age, now in cycles:
         passed = pass_gate(limits, mode, wanted_torque, wanted_position, age, held, now)
-        assert abs(passed.torque_wire) * limits.torque_unit <= limits.max_torque * (1 + 1e-12)
-        assert -INT32 <= passed.position_wire < INT32
         assert bool(passed.refused) != may_pass(limits, mode, wanted_torque, wanted_position, age, held, now)
         assert abs(passed.torque) <= limits.max_torque
         if passed.mode in (TORQUE, PROFILE_TORQUE) and held.mode in (TORQUE, PROFILE_TORQUE):
-            change = abs(passed.torque_wire - held.torque_wire) * limits.torque_unit
-            assert change <= limits.torque_step + limits.torque_unit * (1 + 1e-9)
+            assert abs(passed.torque - held.torque) <= limits.torque_step * (1 + 1e-9)
         elif passed.mode in (TORQUE, PROFILE_TORQUE):
             produced = max(-limits.max_torque, min(limits.max_torque, now.torque))
             assert abs(passed.torque - produced) <= limits.torque_step * (1 + 1e-9)
         if passed.mode in (POSITION, PROFILE_POSITION):
             start = held.position if held.mode in (POSITION, PROFILE_POSITION) else now.position
-            moved = abs(passed.position_wire * limits.position_unit - start)
-            assert moved <= limits.position_step + limits.position_unit
-            target = passed.position_wire * limits.position_unit
-            slack = 1e-9 * limits.position_unit
-            assert min(limits.lower, start) - slack <= target + limits.position_unit * (start < limits.lower)
-            assert target - limits.position_unit * (start > limits.upper) <= max(limits.upper, start) + slack
+            slack = 1e-12 * (1 + abs(start))
+            assert abs(passed.position - start) <= limits.position_step + slack
+            assert min(limits.lower, start) - slack <= passed.position <= max(limits.upper, start) + slack
+        assert not beyond(limits, passed, passed, now)
         assert passed.mode == (0 if passed.refused else mode)
+        stands = {True: Power.STOPPED, False: Power.ON if mode else Power.OFF}
+        assert passed.power is stands[bool(passed.refused)]
         held = passed
 
 
-LIMITS = JointLimits(30.0, 0.8, 0.004, -2.0, 2.0, 0.04, 2 * math.pi / 2**20, 1.5, 0.1, 0.1)
+LIMITS = JointLimits(30.0, 0.8, 0.004, -2.0, 2.0, 1.5, 3.0, 0.5, 0.1, 0.1)
 START = start_from(LIMITS, 8.0, 0.5)
 
 
@@ -104,6 +105,10 @@ def gate(
     return pass_gate(limits, mode, torque, position, command_age, held, now)
 
 
+def targets(order):
+    return order.torque, order.position
+
+
 TORQUE_MODES = pytest.mark.parametrize("mode", [TORQUE, PROFILE_TORQUE])
 POSITION_MODES = pytest.mark.parametrize("mode", [POSITION, PROFILE_POSITION])
 
@@ -112,26 +117,24 @@ POSITION_MODES = pytest.mark.parametrize("mode", [POSITION, PROFILE_POSITION])
 def test_the_first_torque_frame_is_one_step_from_the_torque_now_produced(mode):
     passed = gate(mode, torque=-30.0)
     assert passed.torque == pytest.approx(7.2)
-    assert passed.torque_wire == 180
     assert gate(mode, torque=30.0).torque == pytest.approx(8.8)
-    assert gate(mode, torque=8.3).torque_wire == 207  # within the rate: taken as it is, rounded towards zero
-    assert gate(mode, torque=-8.3, produced=-8.0).torque_wire == -207
+    assert gate(mode, torque=8.3).torque == 8.3  # within the rate: taken as it is
+    assert gate(mode, torque=-8.3, produced=-8.0).torque == -8.3
     again = gate(mode, torque=-30.0, held=passed, produced=25.0)  # from what was sent, not from what lags
     assert again.torque == pytest.approx(6.4)
     assert gate(mode, torque=-30.0, held=gate(POSITION, position=0.5), produced=5.0).torque == pytest.approx(4.2)
 
 
 def test_torque_is_clipped_at_the_limit_even_where_more_is_produced():
-    assert gate(TORQUE, torque=100.0, produced=40.0).torque_wire == 750
-    assert gate(TORQUE, torque=-100.0, produced=-40.0).torque_wire == -750
-    assert start_from(LIMITS, 99.0, 0.0).torque_wire == 750
+    assert gate(TORQUE, torque=100.0, produced=40.0).torque == 30.0
+    assert gate(TORQUE, torque=-100.0, produced=-40.0).torque == -30.0
+    assert start_from(LIMITS, 99.0, 0.0).torque == 30.0
 
 
 @POSITION_MODES
 def test_target_position_moves_at_the_velocity_limit(mode):
     passed = gate(mode, position=1.0)
     assert passed.position == pytest.approx(0.504)
-    assert passed.position_wire == round(0.504 / LIMITS.position_unit)
     again = gate(mode, position=1.0, held=passed, measured=0.4)  # from the target, not from where the joint lags
     assert again.position == pytest.approx(0.508)
     assert gate(mode, position=0.5001, held=passed).position == 0.5001
@@ -139,18 +142,10 @@ def test_target_position_moves_at_the_velocity_limit(mode):
 
 
 @POSITION_MODES
-def test_the_window_ends_the_way_and_rounding_stays_inside(mode):
+def test_the_window_ends_the_way(mode):
     near = start_from(LIMITS, 0.0, 1.999)
-    passed = gate(mode, position=9.0, held=near, measured=1.999)
-    assert passed.position == 2.0
-    assert passed.position_wire == math.floor(2.0 / LIMITS.position_unit)
-    low = gate(mode, position=-9.0, measured=-1.999)
-    assert low.position == -2.0
-    assert low.position_wire == math.ceil(-2.0 / LIMITS.position_unit)
-    # at the very ends too, whose nearest user unit lies outside
-    odd = replace(LIMITS, lower=1.4 * LIMITS.position_unit, upper=2.6 * LIMITS.position_unit)
-    assert start_from(odd, 0.0, odd.lower).position_wire == 2
-    assert start_from(odd, 0.0, odd.upper).position_wire == 2
+    assert gate(mode, position=9.0, held=near, measured=1.999).position == 2.0
+    assert gate(mode, position=-9.0, measured=-1.999).position == -2.0
 
 
 def test_a_joint_outside_the_window_is_led_back_at_the_velocity_limit():
@@ -160,15 +155,10 @@ def test_a_joint_outside_the_window_is_led_back_at_the_velocity_limit():
     assert passed.position == pytest.approx(-2.096)
 
 
-def test_positions_beyond_what_a_frame_carries_are_clipped():
-    assert start_from(LIMITS, 0.0, 1e6).position_wire == INT32 - 1
-    assert start_from(LIMITS, 0.0, -1e6).position_wire == -INT32
-
-
 def test_the_idle_target_follows_what_is():
     assert gate(POSITION, position=0.5, produced=5.0).torque == 5.0
     assert gate(TORQUE, torque=1.0, measured=0.7).position == 0.7
-    assert gate(OFF, measured=0.7)[:3] == (0.0, 0.7, 0)
+    assert targets(gate(OFF, measured=0.7)) == (0.0, 0.7)
     held = gate(TORQUE, torque=8.0)
     assert gate(POSITION, position=0.5, held=held, produced=5.0).torque == 5.0
     assert gate(POSITION, position=0.5, held=held, measured=0.7).position == pytest.approx(0.696)
@@ -179,7 +169,7 @@ def test_a_lost_torque_keeps_what_was_sent():
     held = gate(POSITION, position=0.502)
     assert gate(POSITION, position=0.502, held=held, produced=math.nan).torque == 8.0
     held = gate(TORQUE, torque=8.0)
-    assert gate(TORQUE, torque=8.0, held=held, produced=math.nan)[:2] == (8.0, 0.5)
+    assert targets(gate(TORQUE, torque=8.0, held=held, produced=math.nan)) == (8.0, 0.5)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
@@ -224,24 +214,36 @@ def test_nothing_but_the_gate_bounds_a_joint_under_torque_control(mode):
 
 
 @POSITION_MODES
-def test_the_servo_bounds_a_joint_under_position_control(mode):
-    assert not gate(mode, velocity=9.0, measured=3.0, produced=math.nan).refused
+def test_a_joint_under_position_control_must_follow_its_target_at_a_bounded_speed(mode):
+    for velocity in (3.0, -3.0):
+        assert not gate(mode, velocity=velocity, measured=3.0, produced=math.nan).refused
+        assert gate(mode, velocity=velocity * 1.001).refused == g.VELOCITY
     assert not gate(mode, velocity=math.nan).refused
+    held = gate(mode, position=0.5)
+    for measured in (0.0, 1.0):
+        assert not gate(mode, position=0.5, held=held, measured=measured).refused
+        assert gate(mode, position=0.5, held=held, measured=measured + (measured - 0.5) * 0.01).refused == g.FOLLOWING
+    assert not gate(mode, position=0.5, held=gate(TORQUE, torque=8.0), measured=1.5).refused  # starts where it is
+    assert not gate(TORQUE, torque=8.0, held=held, measured=1.5).refused
+    assert not gate(OFF, held=held, measured=1.5, velocity=9.0).refused
 
 
 def test_a_refused_command_moves_nothing():
     held = gate(TORQUE, torque=8.0)
     passed = gate(TORQUE, torque=20.0, held=held, healthy=False, produced=3.0, measured=0.6)
-    assert passed[:2] == (8.0, 0.6)
+    assert targets(passed) == (8.0, 0.6)
     assert passed.mode == OFF
     held = gate(POSITION, position=0.502)
-    assert gate(POSITION, position=1.0, held=held, healthy=False, produced=3.0)[:2] == (3.0, 0.502)
+    assert targets(gate(POSITION, position=1.0, held=held, healthy=False, produced=3.0)) == (3.0, 0.502)
     held = gate(POSITION, position=0.502)
-    assert gate(POSITION, position=1.0, held=held, age=1.0, produced=math.nan, measured=math.nan)[:2] == (8.0, 0.502)
+    assert targets(gate(POSITION, position=1.0, held=held, age=1.0, produced=math.nan, measured=math.nan)) == (
+        8.0,
+        0.502,
+    )
 
 
 def test_what_the_first_cycle_starts_from():
-    assert Passed(8.0, 0.5, 200, round(0.5 / LIMITS.position_unit), "", OFF) == START
+    assert Order(Power.OFF, False, OFF, 0.5, 0.0, 8.0, 0.0, 0.0) == START
     assert start_from(LIMITS, math.nan, 0.5).torque == 0.0
     assert start_from(LIMITS, math.inf, 0.5).torque == 0.0
 
@@ -253,3 +255,59 @@ def test_freshness():
     assert not is_fresh(-1e-9, 0.1)
     assert not is_fresh(math.nan, 0.1)
     assert not is_fresh(math.inf, 0.1)
+
+
+GAINS = replace(LIMITS, period=0.004, kp=40.0, kd=1.5)
+
+
+def pull(order, measured=0.5, velocity=0.0):
+    """What a drive with gains makes of an order, as its joint is now."""
+    return order.kp * (order.position - measured) + order.kd * (order.velocity - velocity) + order.torque
+
+
+@settings(max_examples=400, deadline=None)
+@given(
+    st.floats(-500, 500), st.floats(-20, 20), st.floats(-2.5, 2.5), st.floats(-3, 3), st.floats(-3, 3), st.booleans()
+)
+def test_gains_targets_and_feed_forward_together_are_on_a_leash(torque, position, start, measured, velocity, known):
+    now = Seen(0.0, measured, velocity if known else math.nan, 0.0, True)
+    held = start_from(GAINS, 0.0, start)._replace(mode=POSITION)
+    passed = pass_gate(GAINS, POSITION, torque, position, 0.0, held, now)
+    if passed.refused:
+        return
+    assert abs(pull(passed, measured, velocity if known else 0.0)) <= 30.0 * (1 + 1e-9)
+    assert 0 <= passed.kp <= 40.0
+    assert 0 <= passed.kd <= 1.5
+    assert abs(passed.velocity) <= 0.004 / 0.004 * (1 + 1e-9)
+    assert not beyond(GAINS, passed, passed, now)
+
+
+def test_a_drive_with_gains_gets_rate_and_feed_forward():
+    held = start_from(GAINS, 0.0, 0.5)._replace(mode=POSITION)
+    passed = gate(POSITION, torque=7.0, position=0.502, held=held, limits=GAINS)
+    assert (passed.position, passed.torque, passed.kp, passed.kd) == (0.502, 7.0, 40.0, 1.5)
+    assert passed.velocity == pytest.approx(0.002 / 0.004)
+    assert gate(TORQUE, torque=8.1, limits=GAINS)[5:8] == (8.1, 0.0, 0.0)
+    assert pull(hold_at(GAINS, 29.0, 0.6, Seen(0.0, 0.5, 0.0, 0.0, True))) == pytest.approx(0.97 * 30.0)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"position": 2.01},
+        {"position": -2.01},
+        {"torque": 30.1},
+        {"torque": -31.1},
+        {"kp": 400.0, "position": 0.6},
+        {"kd": 60.0, "velocity": 0.6},
+    ],
+)
+def test_bytes_that_say_something_else_do_not_leave(changed):
+    now = Seen(0.0, 0.5, 0.0, 0.0, True)
+    passed = gate(POSITION, position=0.502, held=start_from(GAINS, 0.0, 0.5)._replace(mode=POSITION), limits=GAINS)
+    assert not beyond(GAINS, passed, passed, now)
+    assert beyond(GAINS, passed, passed._replace(**changed), now)
+    assert not beyond(GAINS, passed, passed._replace(power=Power.OFF, **changed), now)
+    torque = gate(TORQUE, torque=8.1)
+    assert not beyond(LIMITS, torque, torque, now)
+    assert beyond(LIMITS, torque, torque._replace(torque=30.1), now)

@@ -1,4 +1,4 @@
-"""The gate's limits come from the arm file and the controllers' units, exactly."""
+"""The gate's limits come from the arm file, exactly; what no frame of CiA 402 carries is refused."""
 
 import math
 from pathlib import Path
@@ -7,25 +7,36 @@ import numpy as np
 import pytest
 
 from armlink.arm_file import LinkJoint, load_arm, parse_arm
+from armlink.drives.canopen.controller_setup import milliseconds
+from armlink.drives.canopen.drives import check_fits
 from armlink.drives.canopen.units import Units
 from armlink.errors import BadInput
-from armlink.link.gate_limits import gate_limits, joint_ranges, milliseconds, target_window
+from armlink.link.gate_limits import drive_limits, gate_limits, joint_ranges, target_window
 
-UNITS = Units(torque=0.04, position=1e-5, encoder_step=1e-6)
+UNITS = Units(torque=0.04, position=1e-5, velocity=1e-5, encoder_step=1e-6)
 
 
 def joint(**keys):
     return LinkJoint(name="elbow", node=3, **{"rated_torque": 40.0, "max_torque": 30.0, **keys})
 
 
+def tried(row, window, units=UNITS):
+    """Limits of a joint, tried on frames with these units."""
+    limits = drive_limits(row, window, 0.004, 0.1)
+    check_fits(row.name, limits, units)
+    return gate_limits(limits)
+
+
 def test_limits_of_one_joint():
-    limits = gate_limits(joint(max_torque_rate=100.0, max_velocity=0.8), (-1.5, 2.5), UNITS, 0.004, 0.1)
+    limits = tried(joint(max_torque_rate=100.0, max_velocity=0.8), (-1.5, 2.5))
     assert limits.max_torque == 30.0
     assert limits.torque_step == pytest.approx(0.4)
     assert limits.position_step == pytest.approx(0.0032)
     assert (limits.lower, limits.upper) == (-1.5, 2.5)
-    assert (limits.torque_unit, limits.position_unit) == (0.04, 1e-5)
     assert limits.overspeed == pytest.approx(1.2)  # the stated margin: half as fast again
+    assert limits.servo_overspeed == 3.0  # a joint that sinks is caught
+    assert tried(joint(max_velocity=2.0), (-1, 1)).servo_overspeed == pytest.approx(6.0)
+    assert limits.following == 0.5
     assert limits.outside == 0.1
     assert limits.max_age == 0.1
 
@@ -40,20 +51,20 @@ def test_the_window_has_room_for_the_sensor_and_for_pressing():
 
 def test_a_torque_that_no_frame_carries_is_refused():
     most = 32767 * UNITS.torque
-    assert gate_limits(joint(max_torque=most), (-1, 1), UNITS, 0.004, 0.1).max_torque == most
+    assert tried(joint(max_torque=most), (-1, 1)).max_torque == most
     with pytest.raises(BadInput, match=r"elbow: max_torque 1310\.7\d* N·m: 6071h carries at most 1310\.68 N·m"):
-        gate_limits(joint(max_torque=most + 0.05), (-1, 1), UNITS, 0.004, 0.1)
+        tried(joint(max_torque=most + 0.05), (-1, 1))
 
 
 @pytest.mark.parametrize("side", [-1, 1])
 def test_a_window_that_no_frame_carries_is_refused(side):
     far = side * (2**31 - 1) * 0.5
     window = (min(far, 0.0), max(far, 0.0))
-    units = Units(0.04, 0.5, 1e-6)
-    assert gate_limits(joint(), window, units, 0.004, 0.1).lower == window[0]
+    units = Units(0.04, 0.5, 0.5, 1e-6)
+    assert tried(joint(), window, units).lower == window[0]
     beyond = (window[0] + min(side, 0) * 0.5, window[1] + max(side, 0) * 0.5)  # one user unit more
     with pytest.raises(BadInput, match=r"elbow: its range is more than 607Ah carries at 0\.5 rad a user unit"):
-        gate_limits(joint(), beyond, units, 0.004, 0.1)
+        tried(joint(), beyond, units)
 
 
 def test_milliseconds_are_rounded_up_and_never_zero():
@@ -97,3 +108,16 @@ def test_what_a_model_lacks_is_named(tmp_path):
     with pytest.raises(BadInput, match=r"arm\.xml: "):
         joint_ranges(model_arm(tmp_path, "<mujoco><nonsense/></mujoco>", "a"))
     assert math.isfinite(joint_ranges(model_arm(tmp_path, MODEL, "a"))[0][0])
+
+
+@pytest.mark.parametrize(
+    ("key", "carried", "says"),
+    [
+        ("max_velocity", (2**32 - 1) * UNITS.position, "6081h carries at most 42949.7 rad/s"),
+        ("max_torque_rate", (2**32 - 1) * UNITS.torque, r"6087h carries at most 1.71799e\+08 N·m/s"),
+    ],
+)
+def test_a_rate_that_no_object_carries_is_refused(key, carried, says):
+    tried(joint(**{key: carried}), (-1, 1))
+    with pytest.raises(BadInput, match=f"elbow: {key} .*: {says}"):
+        tried(joint(**{key: carried * 1.001}), (-1, 1))

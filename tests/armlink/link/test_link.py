@@ -5,6 +5,7 @@ import struct
 import numpy as np
 import pytest
 
+from armlink.drives.orders import Power
 from armlink.errors import BadInput, BusFault, Refused
 from armlink.link.link import Link
 from armlink.link.types import Calibration, Command
@@ -29,11 +30,9 @@ def sdo_writes(bus, node):
 def test_scan_tells_who_is_there(link, bus):
     bus.nodes[2].silent = True
     first, second, third = link.scan()
-    assert (first.joint, first.node, first.vendor, first.product, first.revision, first.serial) == (
-        ("joint_1", 1, 0x11, 0x22, 0x33, 101)
-    )
-    assert first.state.value == "switch on disabled"
-    assert not second.present
+    assert (first.joint, first.address, first.present, first.serial) == (0, "node 1", True, "11:22:33:101")
+    assert first.power is Power.OFF
+    assert (second.joint, second.address, second.present) == (1, "node 2", False)
     assert third.present
 
 

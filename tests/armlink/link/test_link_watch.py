@@ -121,7 +121,7 @@ def test_a_joint_that_does_not_display_position_control_is_not_enabled(link, bus
 
 def test_a_mode_that_a_controller_does_not_have_is_refused_before_it_is_sent(enabled, bus):
     bus.sent.clear()
-    with pytest.raises(Refused, match=r"gate: joint_1: mode 4 is not supported: 6502h is 0x280"):
+    with pytest.raises(Refused, match=r"gate: joint_1: mode 4 is not supported: its drive has 8, 10"):
         enabled.cycle(command(PROFILE_TORQUE))
     assert not [data for can_id, data in bus.sent if can_id & 0x780 == 0x300]
     assert all_stopped(bus)
@@ -145,7 +145,7 @@ def run_simulated(mode, torque=None, position=None, seconds=1.0):
             sample = link.cycle(given)
             if np.isfinite(sample.velocity[6]):
                 largest = max(largest, abs(sample.velocity[6]))
-        displays = link.commander.loop.displays[6]
+        displays = link.groups[0].drives.displays[6]
         return sample.position[6] - start, largest, displays, arm.require_link().joints[6]
 
 
@@ -212,6 +212,11 @@ def test_the_simulated_arm_restarting_under_way_is_noticed():
         (0x202, bytes(8), "RPDO1 of node 2 (202h)"),
         (0x303, b"\x08", "RPDO2 of node 3 (303h)"),
         (0x77F, b"\x05", "heartbeat of the host (77Fh)"),
+        (0x402, bytes(8), "RPDO3 of node 2 (402h)"),
+        (0x503, b"\x0f\x00", "RPDO4 of node 3 (503h)"),
+        (0x602, b"\x2b\x40\x60\x00\x0f\x00\x00\x00", "SDO write of 6040h to node 2 (602h)"),
+        (0x603, b"\xc2\x7a\x60\x00\x04\x00\x00\x00", "SDO write of 607Ah to node 3 (603h)"),
+        (0x7E5, b"\x11\x05\x00\x00\x00\x00\x00\x00", "LSS command (7E5h)"),
     ],
 )
 def test_a_second_host_stops_all_in_the_cycle_in_which_it_is_heard(enabled, bus, can_id, data, what):
@@ -230,6 +235,58 @@ def test_reading_along_is_not_commanding(enabled, bus):
         bus.out.append((0x600 + node, b"\x40\x00\x10\x00\x00\x00\x00\x00"))
     for _ in range(20):
         enabled.cycle(command(POSITION))
+
+
+def test_a_torque_calibration_may_be_written_by_another_program(enabled, bus):
+    bus.out.append((0x602, b"\x23\x00\x21\x04\x00\x00\x80\x3f"))
+    bus.out.append((0x602, b"\x23\x10\x10\x04save"))
+    for _ in range(5):
+        enabled.cycle(command(POSITION))
+
+
+def test_rpdos_that_are_not_ours_are_disabled(arm_of, bus):
+    valid = {index: 0x80 * (index - 0x13FC) for index in (0x1402, 0x1403)}
+    for node in bus.nodes.values():
+        node.values |= {(index, 1): struct.pack("<I", base + node.node) for index, base in valid.items()}
+    with Link(arm_of(), bus) as link:
+        link.start()
+    for node in bus.nodes.values():
+        for index, base in valid.items():
+            assert struct.unpack("<I", node.values[index, 1])[0] == 0x80000000 | base + node.node
+
+
+def test_an_rpdo_that_stays_valid_is_refused(arm_of, bus):
+    class Stubborn(dict):
+        def __setitem__(self, key, value):
+            if key != (0x1402, 1):
+                super().__setitem__(key, value)
+
+    bus.nodes[2].values = Stubborn(bus.nodes[2].values | {(0x1402, 1): struct.pack("<I", 0x402)})
+    with (
+        Link(arm_of(), bus) as link,
+        pytest.raises(BusFault, match=r"joint_2 \(node 2\): 1402h:01 RPDO3 COB-ID: stays valid"),
+    ):
+        link.start()
+
+
+@pytest.mark.parametrize(("age", "delay"), [(None, 0.05), (0.06, 0.02)])
+def test_a_command_that_ages_between_gate_and_bus_does_not_leave(enabled, bus, age, delay):
+    """As where the host is suspended for a while just before it sends: `delay` for each of three frames [s]."""
+    drives = enabled.groups[0].drives
+    frames = drives.frames
+
+    def slow(orders, now):
+        bus.clock.time += 3 * delay
+        return frames(orders, now)
+
+    given = command(POSITION)
+    given.t = None if age is None else bus.clock.time - age
+    drives.frames = slow
+    bus.sent.clear()
+    with pytest.raises(Refused, match=r"gate: the command became too old before its frames left, by \d+ ms"):
+        enabled.cycle(given)
+    words = [struct.unpack("<Hhi", data)[0] for can_id, data in bus.sent if can_id & 0x780 == 0x200]
+    assert set(words) == {0x02}
 
 
 def test_a_node_id_given_twice_is_found_after_three_cycles(enabled, bus):
@@ -301,7 +358,7 @@ def test_a_storm_of_emergencies_is_one_fault_and_costs_no_memory(enabled, bus):
     cycle, says = cycles_until_fault(enabled, command(POSITION))
     assert cycle == 0
     assert says.startswith("joint_2: emergency 73")
-    assert len(enabled.commander.loop.emergencies) <= 64
+    assert len(enabled.groups[0].drives.emergencies) <= 64
     assert all_stopped(bus)
 
 

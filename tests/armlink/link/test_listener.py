@@ -57,5 +57,5 @@ def test_emergencies_and_restarts_are_kept(arm_of):
     frames = [(100.0, 0x80, b""), (100.001, 0x81, struct.pack("<HB5x", 0x4310, 1)), (100.002, 0x702, b"\0")]
     listener = Listener(arm_of(2), Tap(frames))
     listener.next(0.1)
-    assert [(joint, code) for joint, code, _ in listener.emergencies] == [(0, 0x4310)]
-    assert listener.node_states == {1: 0}
+    assert [(each.joint, each.code) for each in listener.emergencies] == [(0, "4310h")]
+    assert listener.groups[0].drives.node_states == {1: 0}

@@ -226,7 +226,9 @@ def test_the_joints_stop_when_job_or_loop_is_killed(tmp_path: Path, who: str) ->
 
         link = arm.require_link()
         with Listener(arm, open_link_bus(bus, link)) as listener:
-            states = [state_of(int(services.read(STATUS))) for services in listener.services]
+            states = [
+                state_of(int(services.read(STATUS))) for services in listener.groups[0].drives.services(listener.ask)
+            ]
     assert all(state is not State.ENABLED for state in states), states
 
 

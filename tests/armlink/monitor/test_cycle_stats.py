@@ -2,11 +2,14 @@
 
 import numpy as np
 import pytest
+from fake_joints import make_arm
 
 from armlink.bus.frame_bits import frame_bits
+from armlink.link.groups import make_groups
 from armlink.monitor.cycle_stats import CycleStats
 
 DATA = bytes(range(8))
+GROUPS = make_groups(make_arm(2))
 
 
 def feed(stats, latencies, period=0.004, lost_sync=()):
@@ -25,7 +28,7 @@ def feed(stats, latencies, period=0.004, lost_sync=()):
 
 def test_latencies_are_those_that_were_put_in():
     latencies = np.random.default_rng(0).uniform(0.0008, 0.0035, 2000)
-    report = feed(CycleStats((1, 2), 0.004, 1_000_000), latencies)
+    report = feed(CycleStats(GROUPS, 0.004, 1_000_000), latencies)
     assert (report.cycles, report.missed) == (2000, 0)
     assert report.period_ms == pytest.approx(4.0)
     assert report.jitter_ms < 1e-6
@@ -40,21 +43,21 @@ def test_latencies_are_those_that_were_put_in():
 
 
 def test_missing_readings_and_missing_syncs_are_missed_cycles():
-    report = feed(CycleStats((1, 2), 0.004, 1_000_000), [0.001] * 5 + [None] * 3 + [0.001] * 5, lost_sync=(10,))
+    report = feed(CycleStats(GROUPS, 0.004, 1_000_000), [0.001] * 5 + [None] * 3 + [0.001] * 5, lost_sync=(10,))
     assert report.missed == 4
     assert report.longest_period_ms == pytest.approx(8.0)
     assert report.latency_p50_ms == pytest.approx(1.0)
 
 
 def test_the_load_is_that_of_the_bits_on_the_wire():
-    report = feed(CycleStats((1, 2), 0.004, 500_000), [0.001] * 100)
+    report = feed(CycleStats(GROUPS, 0.004, 500_000), [0.001] * 100)
     bits = frame_bits(0x80, b"") + frame_bits(0x181, DATA) + frame_bits(0x182, DATA)
     assert report.bus_ms_per_cycle == pytest.approx(bits / 500)
     assert report.load == pytest.approx(bits / 500_000 / 0.004)
 
 
 def test_without_a_whole_cycle_there_are_no_figures():
-    stats = CycleStats((1,), 0.004, 1_000_000)
+    stats = CycleStats(GROUPS, 0.004, 1_000_000)
     stats.take(1.0, 0x80, b"")
     report = stats.report()
     assert report.cycles == 0

@@ -10,9 +10,9 @@ import yaml
 
 from armlink.arm_file import bundled_arms, parse_arm
 from armlink.cli import run
+from armlink.drives.canopen.check.power_test import PowerTest
 from armlink.link.link import Link
-from armlink.selftest.with_power import PowerTest
-from armlink.selftest.without_power import SelfTest
+from armlink.selftest.self_test import SelfTest
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.node import supervision
 from sim_bus.node.drives import Drives

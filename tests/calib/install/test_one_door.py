@@ -22,7 +22,7 @@ from calib.records.store import RecordStore
 ROOT = Path(__file__).parents[3]
 PACKAGES = ("armlink", "calib", "gcomp", "sim_bus", "sim_gap")
 DOOR, GATES = "calib/install/journaled_write.py", "calib/install/plausibility.py"
-WIRE = "armlink/link/torque_sensor_record.py"
+WIRE = "armlink.drives.canopen.torque_sensor_record.py"
 OBJECTS = ("STAGED_GAIN", "STAGED_OFFSET", "ACTIVATE")
 """Of 2100h, without which no calibration becomes active."""
 

@@ -58,7 +58,9 @@ def test_a_hot_drive_is_named() -> None:
 def test_a_drive_without_a_thermometer_is_not_judged() -> None:
     simulated = SimulatedArm(ARM, Truth.of(ARM), 1)
     with enabled(simulated) as link:
-        del link.services[0].remote.object_dictionary[0x2101]  # the sheet that both joints have
+        del (
+            link.groups[0].drives.services(link.ask)[0].remote.object_dictionary[0x2101]
+        )  # the sheet that both joints have
         found = listen(link, ARM)
     assert np.isnan(found.temperature).all()
 

@@ -107,7 +107,7 @@ def test_the_joints_of_both_buses_move_as_one_arm(path):
     arm = SimulatedArm(described, Truth.of(described))
     nodes, host = (open_link_bus(None, described.require_link()) for _ in range(2))
     server = Server(arm, nodes, lockstep=True, now=lambda: 0.0)
-    pumped = BusGroup([Pumped(bus, server.turn) for bus in host.members], host.route)
+    pumped = BusGroup([Pumped(bus, server.turn) for bus in host.members], list(host.tags))
     pumped.clock = ArmTime(arm)
     with Link(described, pumped) as link:
         link.start()

@@ -43,14 +43,14 @@ def test_a_joints_own_sheet_is_used_and_the_others_keep_ours(arm_of, sheet):
             "link": arm.link.model_copy(update={"joints": (first, arm.link.joints[1].model_copy(update={"eds": None}))})
         }
     )
-    names = [each.device_information.product_name for each in data_sheet.of_joints(mixed)]
+    names = [each.device_information.product_name for each in data_sheet.of_joints(mixed, mixed.link.joints)]
     assert names == ["Torquer 3", "armlink joint"]
 
 
 def test_a_path_is_taken_from_the_arm_file(arm_of, tmp_path, sheet):
     sheet()
     arm = arm_of(joint={"eds": "maker.eds"}).model_copy(update={"path": tmp_path / "arm.yaml"})
-    assert data_sheet.of_joints(arm)[0].get_variable(0x2100, 1).name
+    assert data_sheet.of_joints(arm, arm.link.joints)[0].get_variable(0x2100, 1).name
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,7 @@ def test_vendor_and_product_of_the_sheet_are_expected_unless_the_arm_file_says_o
 ):
     path = sheet(vendor=("VendorNumber=0\n", "VendorNumber=0x11\n"), product=("0x41524D4C", "0x22"))
     arm = arm_of(joint={"eds": path, "identity": stated})
-    found = data_sheet.expected_identity(arm.link.joints[0], data_sheet.of_joints(arm)[0])
+    found = data_sheet.expected_identity(arm.link.joints[0], data_sheet.of_joints(arm, arm.link.joints)[0])
     assert found.model_dump(exclude_none=True) == expected
 
 
@@ -102,13 +102,14 @@ def test_a_sheet_of_the_right_product_starts_the_link(arm_of, bus, sheet):
 def test_what_a_sheet_lacks_is_named(arm_of, sheet, changes, complaint):
     arm = arm_of(joint={"eds": sheet(**changes)})
     with pytest.raises(BadInput, match=complaint) as caught:
-        data_sheet.of_joints(arm)
+        data_sheet.of_joints(arm, arm.link.joints)
     assert "joint_1: data sheet" in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_an_object_that_a_controller_may_lack_may_be_missing(arm_of, sheet):
-    data_sheet.of_joints(arm_of(joint={"eds": sheet(gone=(section_of(0x60B2), ""))}))
+    arm = arm_of(joint={"eds": sheet(gone=(section_of(0x60B2), ""))})
+    data_sheet.of_joints(arm, arm.link.joints)
 
 
 @pytest.mark.parametrize(("name", "complaint"), [("none.eds", "No such file"), ("sheet.txt", "ends in .eds or .dcf")])

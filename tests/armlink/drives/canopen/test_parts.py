@@ -9,10 +9,10 @@ from armlink.bus.open import open_bus, parse_bus
 from armlink.drives.canopen import eds_file as data_sheet
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen import pdo
+from armlink.drives.canopen.controller_setup import interpolation
 from armlink.drives.canopen.emcy import name_of, parse
 from armlink.drives.canopen.units import units_from
 from armlink.errors import BadInput, BusFault
-from armlink.link.controller_setup import interpolation
 
 
 def test_units_of_a_geared_joint():
@@ -96,7 +96,7 @@ def test_mapping_entries():
 
 def test_every_object_that_the_link_uses_is_in_the_data_sheet_with_its_size():
     dictionary = data_sheet.bundled()
-    entries = [value for value in vars(objects).values() if isinstance(value, objects.Entry)]
+    entries = data_sheet.used_objects()
     assert len(entries) > 30
     for entry in entries:
         variable = dictionary.get_variable(entry.index, entry.sub)

@@ -7,11 +7,11 @@ import numpy as np
 
 from armlink.drives.canopen import emcy
 from armlink.drives.canopen import object_dictionary as objects
-from armlink.drives.canopen.cia402 import Control, Mode, State, state_of
+from armlink.drives.canopen.cia402 import State, state_of
+from armlink.drives.canopen.drives import CanopenDrives
+from armlink.drives.canopen.pdo import RPDO2
+from armlink.drives.orders import Mode, Power
 from armlink.errors import ArmlinkError, BusFault
-from armlink.link.faults import bus_fault
-from armlink.link.link import Link
-from armlink.link.types import Sample
 
 CYCLES = 50
 """SYNCs that are sent to see whether each is answered."""
@@ -40,9 +40,11 @@ class PowerTest:
         "heartbeat of the host",
     )
 
-    def __init__(self, link: Link, add: Callable[..., None], progress: Callable[[str], None]) -> None:
-        """`add(joint, check, outcome, found, seconds)` takes results."""
-        self.link, self.commander, self.loop = link, link.commander, link.commander.loop
+    def __init__(
+        self, link: Any, drives: CanopenDrives, add: Callable[..., None], progress: Callable[[str], None]
+    ) -> None:
+        """`link`: the Link of an arm with these joints; `add(joint, check, outcome, found, seconds)` takes results."""
+        self.link, self.drives, self.commander, self.loop = link, drives, link.commander, link.commander.loop
         self._add, self._progress = add, progress
         self._harmed = ""
         self._reached: dict[str, set[str]] = {check: set() for check in self.CHECKS}
@@ -65,9 +67,9 @@ class PowerTest:
         except ArmlinkError as error:
             reason = str(error)
         finally:
-            self.loop.withheld, self.loop.beating = frozenset(), True
+            self.loop.withheld, self.drives.beating = frozenset(), True
             if self.commander.passed:
-                self.commander.quick_stop()
+                self.commander.stop()
         told = False
         for check, joints in self._reached.items():
             for name in self.link.names:
@@ -80,31 +82,35 @@ class PowerTest:
         self._reached[check].add(name)
         self._add(name, check, "passed" if passed else "failed", found, seconds)
 
-    def _cycle(self, control: list[int], tested: int | None = None) -> Sample:
+    def _cycle(self, power: list[Power], tested: int | None = None) -> Any:
         """One cycle; raises BusFault where a joint that is not being tested has a fault, or one moves."""
-        sample = self.commander.stand(control)
+        sample = self.commander.stand(power)
         self._last = sample.t
         names, watch = self.link.names, self.loop.watch
-        fault = bus_fault(names, watch, 0)
-        if fault or watch.restarted:
-            raise BusFault(fault or f"{names[min(watch.restarted)]}: its controller has restarted")
+        if watch.intruder or self.drives.restarted:
+            where = self.drives.restarted and names[min(self.drives.restarted)]
+            raise BusFault(
+                f"another host is on this bus: it sends {watch.intruder}: stop it, only one program may command an arm"
+                if watch.intruder
+                else f"{where}: its controller has restarted"
+            )
         moved = np.abs(sample.position - self._standing)
         if (moved > MOVED).any():
             joint = int(np.nanargmax(moved))
             raise BusFault(f"{names[joint]}: moved by {moved[joint]:.3f} rad while it should hold: test ended")
         if tested is not None:
-            for joint, code, _ in self.loop.emergencies:
+            for joint, code, _ in self.drives.emergencies:
                 if joint != tested:
                     raise BusFault(f"{names[joint]}: emergency {code:04X}h, {emcy.name_of(code)}, while it only held")
         return sample
 
     def _without_torque(self) -> None:
         """Cycles without power: readings in every one, the device's own heartbeat, the mode that is displayed."""
-        link, loop = self.link, self.loop
+        link = self.link
         self._progress("readings, heartbeats and modes, without power")
-        off, came = [int(Control.DISABLE_VOLTAGE)] * link.n, np.zeros(link.n, int)
-        loop.node_states.clear()
-        beat = 2 * link.protection.producer_ms * 1e-3
+        off, came = [Power.OFF] * link.n, np.zeros(link.n, int)
+        self.drives.node_states.clear()
+        beat = 2 * self.drives.protection.producer_ms * 1e-3
         cycles = max(CYCLES, int(np.ceil(beat / link.period)) + 1)
         for _ in range(cycles):
             came += np.isfinite(self._cycle(off).position)
@@ -115,30 +121,34 @@ class PowerTest:
                 bool(came[joint] >= ANSWERED * cycles),
                 f"{came[joint]} of {cycles} SYNCs answered",
             )
-            heard = joint in loop.node_states
+            heard = joint in self.drives.node_states
             found = (
-                f"heard, period {link.protection.producer_ms} ms" if heard else f"not heard within {beat * 1e3:.0f} ms"
+                f"heard, period {self.drives.protection.producer_ms} ms"
+                if heard
+                else f"not heard within {beat * 1e3:.0f} ms"
             )
             self._tell(joint, "heartbeat of the device", heard, found)
         since = {mode: self._time_modes(mode, off) for mode in (Mode.TORQUE, Mode.POSITION)}
         for joint in range(link.n):
-            slow = [f"{int(mode)} (displays {loop.displays[joint]})" for mode in since if since[mode][joint] is None]
+            slow = [
+                f"{int(mode)} (displays {self.drives.displays[joint]})" for mode in since if since[mode][joint] is None
+            ]
             times = [seconds for mode in since if (seconds := since[mode][joint]) is not None]
             found = f"does not enter mode {', '.join(slow)}" if slow else "follows 6060h"
             self._tell(joint, "mode display", not slow, found, max(times) if times else None)
 
-    def _time_modes(self, mode: Mode, off: list[int]) -> list[float | None]:
+    def _time_modes(self, mode: Mode, off: list[Power]) -> list[float | None]:
         """Time until each joint displays a mode, None where it does not within the deadline."""
         link, start = self.link, self.link.clock.now()
         times: list[float | None] = [None] * link.n
         for joint in range(link.n):
-            self.loop.send_mode(joint, mode)
+            self.loop.send(RPDO2.cob_base + self.drives.nodes[joint], bytes([mode]))
         while None in times and link.clock.now() - start <= link.section.deadline:
             self._cycle(off)
             now = link.clock.now() - start
             times = [
                 now if time is None and shown == mode else time
-                for time, shown in zip(times, self.loop.displays, strict=True)
+                for time, shown in zip(times, self.drives.displays, strict=True)
             ]
         return times
 
@@ -146,12 +156,12 @@ class PowerTest:
         link = self.link
         self._progress("enable, and hold")
         start = link.clock.now()
-        sample = self.commander.walk(State.ENABLED)
+        sample = self.commander.walk(Power.ON)
         self._standing, self._last = sample.position.copy(), sample.t
-        self.loop.emergencies.clear()
+        self.drives.emergencies.clear()
         seconds = link.clock.now() - start
         for _ in range(self._cycles(HOLD_SECONDS)):
-            sample = self._cycle([int(Control.ENABLE)] * link.n, tested=-1)
+            sample = self._cycle([Power.ON] * link.n, tested=-1)
         moved = np.abs(sample.position - self._standing)
         for joint in range(link.n):
             self._tell(
@@ -160,20 +170,20 @@ class PowerTest:
 
     def _again(self) -> None:
         """Everything back to enabled."""
-        loop = self.loop
-        loop.withheld, loop.beating = frozenset(), True
-        for joint, state in loop.node_states.items():
+        drives = self.drives
+        self.loop.withheld, drives.beating = frozenset(), True
+        for joint, state in drives.node_states.items():
             if state != objects.OPERATIONAL:
-                self.link.send_nmt(objects.NMT_START, self.link.nodes[joint])
-        loop.node_states.clear()
-        self._last = self.commander.walk(State.ENABLED).t
-        loop.emergencies.clear()
+                drives.send_nmt(self.link.ask, objects.NMT_START, drives.nodes[joint])
+        drives.node_states.clear()
+        self._last = self.commander.walk(Power.ON).t
+        drives.emergencies.clear()
 
     def _quick_stop(self, joint: int) -> None:
         """The command quick stop: reached, kept, and the joint holds."""
         self._progress(f"{self.link.names[joint]}: quick stop")
-        control = [int(Control.ENABLE)] * self.link.n
-        control[joint] = int(Control.QUICK_STOP)
+        control = [Power.ON] * self.link.n
+        control[joint] = Power.STOPPED
         state, seconds = self._reaction(joint, control, self.link.section.deadline)
         kept = state is State.QUICK_STOP and self._stays(joint, control)
         found = "stops and holds" if kept else f"{state.value}, then {self._state(joint).value}"
@@ -182,27 +192,27 @@ class PowerTest:
 
     def _silence(self, joint: int) -> None:
         """No RPDO1 for one joint, all others commanded as before."""
-        link, limit = self.link, self.link.protection.deadline_ms * 1e-3
+        link, limit = self.link, self.drives.protection.deadline_ms * 1e-3
         self._progress(f"{link.names[joint]}: no commands for {limit * 1e3:.0f} ms")
         self.loop.withheld = frozenset([joint])
-        state, seconds = self._reaction(joint, [int(Control.ENABLE)] * link.n, PATIENCE * limit)
+        state, seconds = self._reaction(joint, [Power.ON] * link.n, PATIENCE * limit)
         self._judge(joint, "RPDO deadline", state, seconds, limit)
         self._again()
 
     def _no_heartbeat(self) -> None:
         """No heartbeat of the host for all joints, which are commanded as before."""
-        link, limit = self.link, self.link.protection.heartbeat_ms * 1e-3
+        link, limit = self.link, self.drives.protection.heartbeat_ms * 1e-3
         if self._harmed:
             return
         self._progress(f"all joints: no heartbeat of the host for {limit * 1e3:.0f} ms")
-        self.loop.send(objects.HEARTBEAT_ID + link.protection.host, bytes([objects.OPERATIONAL]))
-        self.loop.beating = False
+        self.loop.send(objects.HEARTBEAT_ID + self.drives.protection.host, bytes([objects.OPERATIONAL]))
+        self.drives.beating = False
         start, seconds = self._last, 0.0
         after: list[tuple[State, float] | None] = [None] * link.n
         while None in after and seconds < PATIENCE * limit:
-            seconds = self._cycle([int(Control.ENABLE)] * link.n).t - start + link.period
+            seconds = self._cycle([Power.ON] * link.n).t - start + link.period
             for joint, each in enumerate(after):
-                left = self.loop.node_states.get(joint, objects.OPERATIONAL) != objects.OPERATIONAL
+                left = self.drives.node_states.get(joint, objects.OPERATIONAL) != objects.OPERATIONAL
                 state = self._read(joint) if left and each is None else self._state(joint)  # it sends no status then
                 if each is None and state is not State.ENABLED:
                     after[joint] = (state, seconds)
@@ -210,7 +220,7 @@ class PowerTest:
             self._judge(joint, "heartbeat of the host", *(each or (self._read(joint), seconds)), limit)
         self._again()
 
-    def _reaction(self, joint: int, control: list[int], patience: float) -> tuple[State, float]:
+    def _reaction(self, joint: int, control: list[Power], patience: float) -> tuple[State, float]:
         """State that a joint goes to, and by the end of which cycle it shows it; its state after `patience` seconds."""
         start, seconds = self._last, 0.0
         while seconds < patience:
@@ -219,7 +229,7 @@ class PowerTest:
                 return self._state(joint), seconds
         return self._read(joint), seconds
 
-    def _stays(self, joint: int, control: list[int]) -> bool:
+    def _stays(self, joint: int, control: list[Power]) -> bool:
         for _ in range(self._cycles(HOLD_SECONDS)):
             self._cycle(control, tested=joint)
         return self._state(joint) is State.QUICK_STOP
@@ -227,9 +237,9 @@ class PowerTest:
     def _judge(self, joint: int, check: str, state: State, seconds: float, limit: float) -> None:
         """Quick stop in time passes; anything else is told as what the device does."""
         allowed = limit * (1 + LATE_SHARE) + LATE_SECONDS + 2 * self.link.period
-        codes = [code for place, code, _ in self.loop.emergencies if place == joint]
+        codes = [code for place, code, _ in self.drives.emergencies if place == joint]
         why = f", emergency {codes[0]:04X}h" if codes else ", no emergency"
-        nmt = self.loop.node_states.get(joint, objects.OPERATIONAL)
+        nmt = self.drives.node_states.get(joint, objects.OPERATIONAL)
         left = "" if nmt == objects.OPERATIONAL else f", NMT {objects.NMT_STATES.get(nmt, nmt)} (1029h:01)"
         timing = f"after {seconds * 1e3:.0f} ms (told {limit * 1e3:.0f} ms){why}{left}"
         if state is State.ENABLED:
@@ -243,11 +253,11 @@ class PowerTest:
             self._harmed = f"not run: {self.link.names[joint]} lost its power in the check of its {check}"
 
     def _state(self, joint: int) -> State:
-        return state_of(self.loop.statuses[joint])
+        return state_of(self.drives.statuses[joint])
 
     def _read(self, joint: int) -> State:
-        status: Any = self.link.services[joint].read(objects.STATUS_WORD)
+        status: Any = self.drives.services(self.link.ask)[joint].read(objects.STATUS_WORD)
         return state_of(int(status))
 
     def _cycles(self, seconds: float) -> int:
-        return max(1, round(seconds / self.link.period))
+        return max(1, round(seconds / float(self.link.period)))

@@ -5,46 +5,40 @@ each in turn is quick-stopped, and left without commands; then all are left with
 device does, and how long it takes, is measured, not believed.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Callable, Sequence
+from typing import Any
 
 from armlink.arm_file import LinkJoint
+from armlink.drives.canopen import controller_setup as device
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen import pdo
-from armlink.drives.canopen.cia402 import MODE_NAMES, Mode, supports
+from armlink.drives.canopen import torque_sensor_record as calibration
+from armlink.drives.canopen.check.power_test import PowerTest
+from armlink.drives.canopen.cia402 import MODE_NAMES, supports
+from armlink.drives.canopen.drives import CanopenDrives, check_fits
 from armlink.drives.canopen.eds_file import OPTIONAL, expected_identity, used_objects
 from armlink.drives.canopen.object_dictionary import Entry
+from armlink.drives.canopen.profile import OURS, Profile, examine
+from armlink.drives.canopen.scales import read_units
 from armlink.drives.canopen.sdo import NodeServices
+from armlink.drives.findings import Outcome, Result
+from armlink.drives.orders import Limits, Mode
 from armlink.errors import ArmlinkError
-from armlink.link import controller_setup as device
-from armlink.link import torque_sensor_record as calibration
-from armlink.link.gate_limits import gate_limits
-from armlink.link.link import Link
-from armlink.selftest.with_power import PowerTest
 
-Outcome = Literal["passed", "failed", "absent", "not run"]
-
-
-@dataclass(frozen=True)
-class Result:
-    """One check of one joint."""
-
-    joint: str
-    check: str
-    """`GROUP` or `GROUP: PART`."""
-    outcome: Outcome
-    found: str
-    seconds: float | None = None
-    """How long the device took, where that was measured [s]."""
+NEEDED = (objects.CONTROL_WORD, objects.STATUS_WORD, objects.MODE, objects.POSITION)
+"""Objects without which nothing goes."""
 
 
 class SelfTest:
     """Runs the checks on an arm's controllers; the link must not be started. Results gather in `results`."""
 
-    def __init__(self, link: Link, progress: Callable[[str], None] = lambda text: None) -> None:
-        """`progress` is told what is being done."""
-        self.link, self.progress = link, progress
+    def __init__(
+        self, link: Any, drives: CanopenDrives, limits: Sequence[Limits], progress: Callable[[str], None]
+    ) -> None:
+        """`link` is the Link of an arm whose joints these drives are; `progress` is told what is being done."""
+        self.link, self.drives, self.limits, self.progress = link, drives, limits, progress
+        self.services = drives.services(link.ask)
+        self.profiles = [OURS] * drives.m
         self.results: list[Result] = []
 
     def run(self, power: bool) -> list[Result]:
@@ -53,22 +47,37 @@ class SelfTest:
         Raises BusFault where another host is on the bus.
         """
         link = self.link
-        missing = [each.joint for each in link.services if not each.present()]
+        missing = [each.joint for each in self.services if not each.present()]
         link.require_alone()
-        for services, row in zip(link.services, link.section.joints, strict=True):
+        for services, row in zip(self.services, self.drives.rows, strict=True):
             self.progress(f"{services.joint}: identity, objects, settings")
             if services.joint in missing:
                 self._add(services.joint, "answers", "failed", f"no answer at node {services.node}")
             elif self._identity(services, row):
-                self._objects(services)
-                self._modes(services)
-                self._calibration(services)
+                self._look_at(services, row)
         if all(each.outcome != "failed" for each in self.results):
-            link.send_nmt(objects.NMT_PRE_OPERATIONAL)
-            for joint, services in enumerate(link.services):
+            for node in self.drives.nmt_targets():
+                self.drives.send_nmt(link.ask, objects.NMT_PRE_OPERATIONAL, node)
+            for joint, services in enumerate(self.services):
                 self._settings(services, joint)
         self._with_power(power)
         return self.results
+
+    def _look_at(self, services: NodeServices, row: LinkJoint) -> None:
+        """Objects, modes and calibration of a device; of a stock one what it lacks, and what is lost by that."""
+        if row.settings.torque == "record":
+            self._objects(services)
+            self._modes(services)
+            self._calibration(services)
+            return
+        profile = examine(services, row.settings)
+        self.profiles[self.drives.rows.index(row)] = profile
+        for lost in profile.lost:
+            self._add(services.joint, f"objects: {lost.partition(' ')[0]}", "absent", lost)
+        needed = [entry for entry in NEEDED if not services.has(entry)]
+        found = ", ".join(f"{entry}: the device lacks it" for entry in needed)
+        self._add(services.joint, "objects", "failed" if needed else "passed", found or "what the link needs is there")
+        self._modes(services)
 
     def _with_power(self, power: bool) -> None:
         failed = [each for each in self.results if each.outcome == "failed"]
@@ -78,7 +87,7 @@ class SelfTest:
                 for name in self.link.names:
                     self._add(name, check, "not run", reason)
             return
-        PowerTest(self.link, self._add, self.progress).run()
+        PowerTest(self.link, self.drives, self._add, self.progress).run()
 
     def _add(self, joint: str, check: str, outcome: Outcome, found: str, seconds: float | None = None) -> None:
         self.results.append(Result(joint, check, outcome, found, seconds))
@@ -121,7 +130,7 @@ class SelfTest:
 
     def _modes(self, services: NodeServices) -> None:
         def work() -> str:
-            supported = device.check_modes(services)
+            supported = self.drives.offered(services, self.drives.names.index(services.joint))
             for mode in (Mode.PROFILE_POSITION, Mode.PROFILE_TORQUE):
                 if not supports(supported, mode):
                     self._add(services.joint, f"modes: {int(mode)}", "absent", f"no {MODE_NAMES[mode]} mode")
@@ -142,13 +151,19 @@ class SelfTest:
 
     def _settings(self, services: NodeServices, joint: int) -> None:
         """Configure as start() does, but go on where something is refused."""
-        link, row = self.link, self.link.section.joints[joint]
-        for each in pdo.LINK_PDOS:
-            self._try(services.joint, f"PDO mapping: {each.name}", lambda each=each: self._mapping(services, each))  # type: ignore[misc]
+        row, profile, limits = self.drives.rows[joint], self.profiles[joint], self.limits[joint]
+        self._try(services.joint, "settings: other RPDOs", lambda: self._others(services))
+        for each in profile.pdos:
+            self._try(
+                services.joint,
+                f"PDO mapping: {each.name}",
+                lambda each=each: self._mapping(services, each, profile),  # type: ignore[misc]
+            )
         try:
-            unit = device.read_units(services, row)
-            limits = gate_limits(row, link.windows[joint], unit, link.period, link.section.deadline)
-            settings = device.settings(row, unit, limits, link.period, link.protection, device.check_modes(services))
+            unit = read_units(services, row)
+            check_fits(row.name, limits, unit)
+            supported = self.drives.offered(services, joint)
+            settings = device.settings(unit, limits, self.drives.protection, supported, profile)
         except ArmlinkError as error:
             self._add(services.joint, "units", "failed", str(error))
             return
@@ -158,9 +173,15 @@ class SelfTest:
         for entry, value in settings:
             self._try(services.joint, f"settings: {entry}", lambda e=entry, v=value: _written(services, e, v))  # type: ignore[misc]
 
-    def _mapping(self, services: NodeServices, each: pdo.Pdo) -> str:
-        device.configure_pdo(services, each, self.link.protection.deadline_ms)
-        deadline = f", deadline {self.link.protection.deadline_ms} ms" if each is pdo.RPDO1 else ""
+    def _others(self, services: NodeServices) -> str:
+        device.disable_other_rpdos(services)
+        return "off: no other program can command the joint through them"
+
+    def _mapping(self, services: NodeServices, each: pdo.Pdo, profile: Profile) -> str:
+        milliseconds = self.drives.protection.deadline_ms
+        device.configure_pdo(services, each, milliseconds, profile)
+        is_command = each.name == pdo.RPDO1.name and profile.has(objects.RPDO_DEADLINE)
+        deadline = f", deadline {milliseconds} ms" if is_command else ""
         return f"{len(each.entries)} objects, read back{deadline}"
 
 

@@ -7,6 +7,7 @@ from armlink.bus.port import Port
 from armlink.clock import Clock
 from armlink.drives.canopen.controller_setup import Identity, identify
 from armlink.drives.canopen.eds_file import bundled
+from armlink.drives.canopen.object_dictionary import SDO_REQUEST_ID
 from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork
 
 SEARCH_SECONDS = 0.3
@@ -53,7 +54,7 @@ def _search(port: Port, pump: Callable[[Callable[[], bool], float], bool], netwo
 
     for node in range(1, 128):
         network.subscribe(0x580 + node, answered)
-        port.send(0x600 + node, _READ_DEVICE_TYPE)
+        port.send(SDO_REQUEST_ID + node, _READ_DEVICE_TYPE)
         pump(lambda: False, 0.0)
     pump(lambda: False, SEARCH_SECONDS)
     for node in range(1, 128):

@@ -1,0 +1,184 @@
+"""The self-test of an arm's drives: what they are, what they hold, and what they do when their host falls silent.
+
+A family may have one of its own, for an arm that has no other drives; this one is for all families. What each device
+does, and how long it takes, is measured, not believed.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from armlink.drives.family import TestsItself
+from armlink.drives.findings import Outcome, Result
+from armlink.drives.orders import Power
+from armlink.drives.traits import Silence
+from armlink.errors import ArmlinkError, BusFault
+from armlink.link.faults import bus_fault
+from armlink.link.gate_limits import drive_limits
+from armlink.link.groups import traits_of
+from armlink.link.link import Link
+from armlink.link.types import Sample
+
+CHECKS = ("set-up", "answers", "enables and holds", "silence")
+CYCLES = 50
+"""Cycles without power, to see whether each is answered."""
+ANSWERED = 0.9
+"""Share of them whose answer must come in its cycle; a busy host misses some."""
+HOLD_SECONDS = 0.5
+HELD = 0.05
+"""A joint that moves further than this while it should hold ends the test [rad]."""
+FELL = 0.5
+"""A joint whose drive falls free may move this far in the test of its silence [rad]."""
+PATIENCE = 3.0
+"""So many deadlines are waited for a reaction."""
+EXPECTED: dict[Silence, tuple[Power, ...]] = {
+    "holds": (Power.STOPPED,),
+    "damps": (Power.STOPPED, Power.FAULT),
+    "falls": (Power.OFF, Power.FAULT),
+    "keeps on": (),
+}
+"""What a drive may be in after its host was silent, by its trait."""
+
+
+class SelfTest:
+    """Runs the checks on an arm's drives; the link must not be started. Results gather in `results`."""
+
+    def __init__(self, link: Link, progress: Callable[[str], None] = lambda text: None) -> None:
+        """`progress` is told what is being done."""
+        self.link, self.progress = link, progress
+        self.results: list[Result] = []
+        self._reached: set[tuple[str, str]] = set()
+
+    def run(self, power: bool) -> list[Result]:
+        """All checks; those with power only where `power`, and where all before them passed.
+
+        Raises BusFault where another host is on the bus.
+        """
+        link = self.link
+        if len(link.groups) == 1 and isinstance(link.groups[0].drives, TestsItself):
+            pairs = zip(link.section.joints, link.windows, strict=True)
+            limits = [drive_limits(row, window, link.period, link.section.deadline) for row, window in pairs]
+            return link.groups[0].drives.self_test(link, limits, power, self.progress)
+        reason = "not asked for"
+        try:
+            if not self._identified():
+                reason = "a drive does not answer, or is another"
+            elif self._started() and power:
+                self._with_power()
+        except ArmlinkError as error:
+            reason = str(error)
+            if self.results and all(each.outcome != "failed" for each in self.results):
+                self._add(link.names[0], "answers", "failed", reason)
+        finally:
+            if link.commander.passed:
+                link.commander.stop()
+        for check in CHECKS:
+            for name in link.names:
+                if (name, check) not in self._reached:
+                    self._add(name, check, "not run", reason)
+        return self.results
+
+    def _add(self, joint: str, check: str, outcome: Outcome, found: str, seconds: float | None = None) -> None:
+        self._reached.add((joint, check))
+        self.results.append(Result(joint, check, outcome, found, seconds))
+
+    def _identified(self) -> bool:
+        """Each drive answers and is the one that the arm file states."""
+        self.progress("identity")
+        good = True
+        for each in self.link.scan():
+            name = self.link.names[each.joint]
+            if not each.present:
+                self._add(name, "answers", "failed", f"no answer of {each.address}")
+            elif each.mismatch:
+                self._add(name, "identity", "failed", each.mismatch)
+            else:
+                told = " ".join(part for part in (each.name, each.serial, each.firmware) if part)
+                self._add(name, "identity", "passed", told or each.address)
+                continue
+            good = False
+        return good
+
+    def _started(self) -> bool:
+        """The set-up, with all that is read back, and readings in every cycle without power."""
+        link = self.link
+        self.progress("set-up")
+        try:
+            link.start()
+        except BusFault as error:
+            who = next((name for name in link.names if str(error).startswith(name)), link.names[0])
+            self._add(who, "set-up", "failed", str(error))
+            return False
+        for name, setup in zip(link.names, link.setups, strict=True):
+            scales = ", ".join(f"{what} {value:.6g}" for what, value in setup.scales.items())
+            self._add(name, "set-up", "passed", "; ".join((*setup.notes, scales)) or "read back")
+            for lost in setup.lost:
+                self._add(name, f"lacks: {lost.partition(':')[0]}", "absent", lost)
+        came = np.zeros(link.n, int)
+        for _ in range(CYCLES):
+            came += np.isfinite(link.commander.stand([Power.OFF] * link.n).position)
+        for joint, name in enumerate(link.names):
+            good = bool(came[joint] >= ANSWERED * CYCLES)
+            self._add(name, "answers", "passed" if good else "failed", f"{came[joint]} of {CYCLES} cycles answered")
+        return bool((came >= ANSWERED * CYCLES).all())
+
+    def _with_power(self) -> None:
+        link = self.link
+        self.progress("enable, and hold")
+        start = link.clock.now()
+        standing = link.enable().position
+        seconds = link.clock.now() - start
+        on = [Power.ON] * link.n
+        sample = self._cycle(on, standing, HELD)
+        for _ in range(self._cycles(HOLD_SECONDS)):
+            sample = self._cycle(on, standing, HELD)
+        moved = np.abs(sample.position - standing)
+        for joint, name in enumerate(link.names):
+            found = f"moved by {moved[joint]:.4f} rad in {HOLD_SECONDS} s"
+            self._add(name, "enables and holds", "passed", found, seconds)
+        for joint in range(link.n):
+            self._silence(joint)
+
+    def _silence(self, joint: int) -> None:
+        """No command for one joint, all others commanded as before: what does its drive do, and is that its trait?"""
+        link = self.link
+        name, limit = link.names[joint], link.section.deadline
+        group = next(group for group in link.groups if joint in group.places)
+        drive, trait = group.places.index(joint), traits_of(link.groups, link.n)[joint].silence
+        self.progress(f"{name}: no commands for {limit * 1e3:.0f} ms")
+        standing = np.array(link.commander.loop.latest_position)
+        link.commander.loop.withheld = frozenset([joint])
+        found, seconds = Power.ON, 0.0
+        start = link.clock.now()
+        try:
+            while found is Power.ON and seconds < PATIENCE * limit:
+                self._cycle([Power.ON] * link.n, standing, FELL)
+                seconds = link.clock.now() - start
+                found = group.drives.power(drive)
+            if found is Power.ON:  # a drive that answers commands alone is asked
+                found = group.drives.ask_power(drive, link.ask.on(group.tag))
+        finally:
+            link.commander.loop.withheld = frozenset()
+        good = found in EXPECTED[trait]
+        what = "keeps on" if found is Power.ON else found.value
+        told = f"power is {what} after {seconds * 1e3:.0f} ms without a command, by its trait it {trait}"
+        if trait == "keeps on" or found is Power.ON:
+            told += ": nothing stops this joint when its host dies: do not drive it"
+        self._add(name, "silence", "passed" if good else "failed", told, seconds)
+        link.recover()
+
+    def _cycle(self, power: list[Power], standing: np.typing.NDArray[np.float64], most: float) -> Sample:
+        """One cycle; raises BusFault where the bus has a fault or a joint moves too far."""
+        link = self.link
+        sample = link.commander.stand(power)
+        fault = bus_fault(link.names, link.commander.loop.watch, 0)
+        if fault:
+            raise BusFault(fault)
+        moved = np.abs(np.array(link.commander.loop.latest_position) - standing)
+        if (moved > most).any():
+            joint = int(np.nanargmax(moved))
+            raise BusFault(f"{link.names[joint]}: moved by {moved[joint]:.3f} rad while it should hold: test ended")
+        return sample
+
+    def _cycles(self, seconds: float) -> int:
+        return max(1, round(seconds / self.link.period))
