@@ -41,7 +41,9 @@ class Loop:
         self, port: Port, clock: Clock, nodes: tuple[int, ...], host: int, period: float, lock_step: bool
     ) -> None:
         self.nodes, self.n = nodes, len(nodes)
-        self.period, self.heartbeat_cycles = period, 1
+        self.period = period
+        self.beat_every = 0.0
+        """Time from one heartbeat of the host to the next [s]; 0 is one in every cycle."""
         self.stats = Stats()
         self.emergencies: deque[tuple[int, int, int]] = deque(maxlen=EMERGENCIES_KEPT)
         """(joint index, code, error register) in the order of arrival, the newest; resets (code 0) are not kept."""
@@ -64,6 +66,7 @@ class Loop:
         self._command = RPDO1.layout.pack
         self._command_ids = tuple(RPDO1.cob_base + node for node in nodes)
         self._heartbeat_id = objects.HEARTBEAT_ID + host
+        self._beat = -math.inf
         self._position: list[float] = [math.nan] * self.n
         self._torque: list[float] = [math.nan] * self.n
         self._motor: list[float] = [math.nan] * self.n
@@ -171,6 +174,11 @@ class Loop:
         self._dropped = self._port.dropped
         self.watch.settle()
 
+    def beat(self) -> None:
+        """The host's heartbeat, at once."""
+        self.send(self._heartbeat_id, _OPERATIONAL)
+        self._beat = self._clock.now()
+
     def exchange(self, control: list[int], torque_wire: list[int], position_wire: list[int]) -> Sample:
         """One cycle: RPDO1 of every joint, heartbeat when due, SYNC, then the TPDOs that it brings."""
         command = self._command
@@ -179,10 +187,11 @@ class Loop:
             for joint, can_id in enumerate(self._command_ids)
             if joint not in self.withheld
         ]
-        if self.beating and self.stats.cycles % self.heartbeat_cycles == 0:
-            frames.append((self._heartbeat_id, _OPERATIONAL))
-        frames.append(_SYNC)
         now = self._clock.now()
+        if self.beating and now - self._beat > self.beat_every - 0.5 * self.period:
+            frames.append((self._heartbeat_id, _OPERATIONAL))
+            self._beat = now
+        frames.append(_SYNC)
         if self._first is None:
             self._first = now
         self._awaited = self.n
