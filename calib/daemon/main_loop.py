@@ -91,7 +91,7 @@ class Daemon:
         while True:
             now = time.monotonic()
             self.view.publish()
-            why = self.service.arm_state.fault or self.service.records.detail
+            why = self.service.trouble or self.service.arm_state.fault or self.service.records.detail
             status = f"STATUS={self.service.state} {why}".strip()
             if status != notified:
                 notified = status
