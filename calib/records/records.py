@@ -11,8 +11,9 @@ import numpy.typing as npt
 import yaml
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
-from armlink.arm_file import ArmFile, describe
+from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
+from armlink.key_errors import describe
 from armlink.torque_calibration import UNKNOWN, TorqueCalibration
 from gcomp.arrays import Array
 
