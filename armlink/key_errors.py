@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pydantic import BaseModel, ValidationError
 
 UNIT = re.compile(r"\s*[-+]?[\d.]+(?:[eE][-+]?\d+)?\s*([^\d\s].*)")
-REWORDED = ("Input should be ", "expected "), ("Field required", "is missing; add it"), ("Value error, ", "")
+REWORDED = ("Field required", "Field required: add it"), ("Value error, ", "")
 
 
 def describe(error: ValidationError, within: str = "", of: type[BaseModel] | None = None) -> str:
@@ -28,8 +28,8 @@ def meant(word: str, known: Iterable[str]) -> str:
     """`; did you mean …?` where a known word is close, else `; there are …`."""
     words = sorted(known)
     folded = {each.casefold(): each for each in words}
-    close = difflib.get_close_matches(word.casefold(), folded, n=1, cutoff=0.6)
-    close = close or [each for each in folded if sorted(each.split("_")) == sorted(word.casefold().split("_"))]
+    swapped = [each for each in folded if sorted(each.split("_")) == sorted(word.casefold().split("_"))]
+    close = swapped or difflib.get_close_matches(word.casefold(), folded, n=1, cutoff=0.6)
     if close:
         return f"; did you mean {folded[close[0]]}?"
     return f"; there are {', '.join(words)}" if words else ""

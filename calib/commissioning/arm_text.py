@@ -11,7 +11,7 @@ def arm_text(draft: Draft, out: Path) -> str:
     """The YAML text of the draft, to stand at `out`: the model's path is relative to it."""
     lines = [
         f"# {draft.name}, from {draft.model.name} by armlink new.",
-        "# What was assumed says so: check it before a real arm moves.",
+        "# Comments mark what was guessed: check it before a real arm moves, then remove the comment.",
         f"name: {_scalar(draft.name)}",
         f"serial: {_scalar(draft.serial)}",
         "kinematics:",
