@@ -140,6 +140,11 @@ class SimulatedArm:
         """Remove the attached mass."""
         self.plant.detach_mass()
 
+    def turn_by_hand(self, joint: int | str, angle: float) -> None:
+        """Put a joint at the true angle [rad], kept within its stops, as a person does while it has no power."""
+        self.plant.place(self._place(joint), angle)
+        self._sample()
+
     def drift(self, joint: int | str, gain: float, offset: float) -> None:
         """Change a torque sensor from now on: multiply its gain by `gain`, add `offset` [N·m]."""
         self.sensors.drift(self._place(joint), gain, offset)

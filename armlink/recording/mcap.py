@@ -40,9 +40,9 @@ _NANO = 1_000_000_000
 class RecordingWriter:
     """Writes rows one by one; a context manager that completes the file."""
 
-    def __init__(self, path: Path, names: tuple[str, ...]) -> None:
+    def __init__(self, path: str | Path, names: tuple[str, ...]) -> None:
         """Create the file for joints with these names."""
-        self._stream = path.open("wb")
+        self._stream = Path(path).open("wb")
         self._names, self._n = names, len(names)
         self._writer = Writer(self._stream)
         self._writer.start(profile=Profile.ROS2, library="armlink")

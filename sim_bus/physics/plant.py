@@ -81,6 +81,12 @@ class Plant:
             self._gears.settle(data.qpos, torque)
             self._gears.settle_speed(data.qvel)
 
+    def place(self, joint: int, angle: float) -> None:
+        """Put one joint at a true angle [rad], kept within its stops, at rest: as a hand turns it."""
+        position, velocity = self.data.qpos[self._dof].copy(), self.data.qvel[self._dof].copy()
+        position[joint], velocity[joint] = np.clip(angle, self.lower[joint], self.upper[joint]), 0.0
+        self._enter(position, velocity, np.zeros(self.n))
+
     # ---- properties
 
     def set_imperfections(self, imperfections: Imperfections) -> None:

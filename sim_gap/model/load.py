@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from armlink.errors import BadInput
+from armlink.model_file import one_line, read_model
 from sim_gap.model.rigid_body import RigidArm, Tendons, inertial_of
 
 
@@ -63,13 +64,11 @@ def compiled(path: Path) -> Any:
     try:
         return read_spec(path).compile()
     except ValueError as error:
-        raise BadInput(f"{path}: MuJoCo cannot compile it: {_line(error)}") from None
+        raise BadInput(f"{path}: MuJoCo cannot compile it: {one_line(error)}") from None
 
 
 def read_spec(path: Path) -> Any:
     """Read an MJCF, URDF or arm file (by path or bundled name) as a `mujoco.MjSpec`. Raises BadInput."""
-    import mujoco
-
     from armlink.arm_file import bundled_arms
 
     if path.suffix in (".yaml", ".yml") or str(path) in bundled_arms():
@@ -81,15 +80,7 @@ def read_spec(path: Path) -> Any:
         path = nominal
     if not path.is_file():
         raise BadInput(f"no model file {path}: give an MJCF, URDF or arm file")
-    try:
-        return mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
-        raise BadInput(f"{path}: MuJoCo cannot read it: {_line(error)}") from None
-
-
-def _line(error: ValueError) -> str:
-    """MuJoCo's message, which spans several lines, in one."""
-    return " ".join(str(error).split())
+    return read_model(path).spec
 
 
 def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:
