@@ -91,7 +91,8 @@ def _check_host(console: "Console", arm: "ArmFile", seconds: float, json: Path |
     """Lateness of this machine's cycle at the arm's rate, and the rate that it holds."""
     from armlink.commands.output import write_json
     from armlink.errors import Refused
-    from armlink.selftest.host import WARN_SHARE, measure_host
+    from armlink.link.lateness import WARN_SHARE
+    from armlink.selftest.host import measure_host
 
     with console.status(f"{arm.name}: cycles at {arm.require_link().rate:g} Hz for {seconds:g} s, with a job beside"):
         report = measure_host(arm, seconds)

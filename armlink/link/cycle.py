@@ -89,7 +89,9 @@ class Commander:
                 if mode == PROFILE_POSITION:
                     control[joint] = set_point_control(loop.statuses[joint])
         self._commanded = modes
-        sample = loop.exchange(control, [each.torque_wire for each in passed], [each.position_wire for each in passed])
+        torque_wire, position_wire = [each.torque_wire for each in passed], [each.position_wire for each in passed]
+        expires = math.inf if stopped else now + (self.max_age - age)
+        sample = loop.exchange(control, torque_wire, position_wire, expires)
         sample.late = self.late
         why = stopped and refusal(self.names, command, age, passed, seen, self.limits)
         if why:

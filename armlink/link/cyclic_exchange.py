@@ -17,6 +17,7 @@ from armlink.canopen import object_dictionary as objects
 from armlink.canopen.pdo import RPDO1, RPDO2, TPDO1, TPDO2, decoding_table
 from armlink.canopen.units import TORQUE_PER_MICRO, Units
 from armlink.clock import Clock
+from armlink.errors import Refused
 from armlink.link.types import Sample, Stats
 
 COLLECT_SHARE = 0.8
@@ -171,8 +172,13 @@ class Loop:
         self._dropped = self._port.dropped
         self.watch.settle()
 
-    def exchange(self, control: list[int], torque_wire: list[int], position_wire: list[int]) -> Sample:
-        """One cycle: RPDO1 of every joint, heartbeat when due, SYNC, then the TPDOs that it brings."""
+    def exchange(
+        self, control: list[int], torque_wire: list[int], position_wire: list[int], expires: float = math.inf
+    ) -> Sample:
+        """One cycle: RPDO1 of every joint, heartbeat when due, SYNC, then the TPDOs that it brings.
+
+        Raises Refused, and sends nothing, where the frames would leave after `expires`, by the clock [s].
+        """
         command = self._command
         frames = [
             (can_id, command(control[joint], torque_wire[joint], position_wire[joint]))
@@ -183,6 +189,9 @@ class Loop:
             frames.append((self._heartbeat_id, _OPERATIONAL))
         frames.append(_SYNC)
         now = self._clock.now()
+        if now > expires:
+            late = (now - expires) * 1e3
+            raise Refused(f"gate: the command became too old before its frames left, by {late:.0f} ms: host too slow")
         if self._first is None:
             self._first = now
         self._awaited = self.n
@@ -262,7 +271,7 @@ class Loop:
         self.bits += FIXED_BITS * frames + 8 * size
 
     def _take_other(self, can_id: int, data: bytes) -> None:
-        self.watch.other(can_id)
+        self.watch.other(can_id, data)
         joint = self._joint_of.get(can_id & 0x7F)
         service = can_id & 0x780
         if joint is not None and service == objects.EMCY_ID:

@@ -6,7 +6,6 @@ joints are under torque control, they are held where they stand; under position 
 """
 
 import pickle
-import signal
 import socket
 import sys
 import time
@@ -22,6 +21,7 @@ from armlink.link.guard import Crossed
 from armlink.link.link import Link
 from armlink.link.types import Command, Controller, Sample, Setpoints
 from armlink.loop.channel import Channel, Closed
+from armlink.loop.ending import Ending
 from armlink.loop.messages import Alive, Answer, Call, Cut, Open, Play, Run, Stopped, pack
 from armlink.loop.realtime import prepare
 
@@ -51,9 +51,9 @@ class DriveLoop:
         """A controller that is on its way."""
         self._heard = time.monotonic()
 
-    def run(self) -> None:
+    def run(self, ending: Ending) -> None:
         """Until the job has gone."""
-        while True:
+        while not ending.due:
             for message in self._channel.receive():
                 self._heard = time.monotonic()
                 self._handle(message)
@@ -152,8 +152,7 @@ class DriveLoop:
 
 def main(number: int) -> None:
     """Serve the job at the other end of socket `number`; the joints are safe at the end, however that comes."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the whole group: the job ends us
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    ending = Ending()
     channel = Channel(socket.socket(fileno=number))
     try:
         (first,) = _first(channel)
@@ -166,7 +165,7 @@ def main(number: int) -> None:
         with link:
             channel.put(Answer(0, prepare()))
             sys.setswitchinterval(SWITCH)
-            DriveLoop(channel, link).run()
+            DriveLoop(channel, link).run(ending)
     except Closed:
         return
 

@@ -38,8 +38,6 @@ RATES = (1000.0, 800.0, 500.0, 400.0, 250.0, 200.0, 125.0, 100.0, 50.0, 25.0, 20
 """Rates that are tried on what was measured [Hz]."""
 HELD = 0.5
 """A rate is held if 99.9 % of the cycles begin within this share of its period."""
-WARN_SHARE = 0.5
-"""Share of `link.deadline` that the lateness of 99.9 % of the cycles should not exceed."""
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,9 @@ from pathlib import Path
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import ArmlinkError, BadInput
+from armlink.loop.messages import Answer
 from calib.daemon.environment import Environment
-from calib.daemon.loop.loop_messages import Down, Reply
+from calib.daemon.loop.loop_messages import Down, Started
 from calib.daemon.loop.loop_process import LoopControllers, LoopProcess
 from calib.daemon.notify import Notifier, watchdog_seconds
 from calib.daemon.options import Options
@@ -114,6 +115,8 @@ class Daemon:
             return
         self._heard = time.monotonic()
         for message in messages:
+            if isinstance(message, Started):
+                log.info(f"bus process: {message.realtime}")
             self.service.take(message)
 
     def _restart(self, why: str) -> None:
@@ -127,32 +130,47 @@ class Daemon:
         self._loop.add_reader(self.process.fileno(), self._messages)
 
     def _reload(self) -> None:
-        """SIGHUP: read the arm file and the records again; an unusable file changes nothing."""
+        """SIGHUP: read the arm file and the records again; a file that cannot be used whole changes nothing."""
         self._notify("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
         try:
-            arm = load_arm(self.options.arm)
-            if arm.name != self.arm.name or arm.serial != self.arm.serial or arm.kinematics != self.arm.kinematics:
-                raise BadInput(f"{arm.path}: another arm, serial or kinematics: restart the daemon for that")
-        except (ArmlinkError, OSError) as error:
-            self.service.events.say("refused", None, f"configuration not reloaded: {error}", {})
+            before = self.service.configuration.settings
+            arm = self._tried()
+            settings = self.options.settings(arm)
+            self.service.reload(arm, settings)
+        except (ArmlinkError, OSError, ValueError, ArithmeticError) as error:
+            text = f"configuration not reloaded: {error}"
+            self.service.journal.guard(lambda: self.service.events.say("refused", None, text, {}))
         else:
-            before, settings = self.service.configuration.settings, self.options.settings(arm)
             bus_changed = arm.link != self.arm.link or settings.work != before.work
             self.arm = arm
-            self.service.reload(arm, settings)
             if bus_changed:
                 self._restart("the arm file's link section or the work has changed")
-        self._notify("READY=1")
+        finally:
+            self._notify("READY=1")
+
+    def _tried(self) -> ArmFile:
+        """The arm file, with all that the bus process will need of it tried; raises BadInput, OSError."""
+        from armlink.bus.open import resolve_bus  # for a reload alone: they take memory
+        from armlink.canopen.eds_file import of_joints
+        from armlink.link.gate_limits import try_limits
+
+        arm = load_arm(self.options.arm)
+        if arm.name != self.arm.name or arm.serial != self.arm.serial or arm.kinematics != self.arm.kinematics:
+            raise BadInput(f"{arm.path}: another arm, serial or kinematics: restart the daemon for that")
+        resolve_bus(self.options.bus, arm.require_link().bus)
+        of_joints(arm)
+        try_limits(arm)
+        return arm
 
 
 class _CurrentProcess:
     """The service's `Port`: whichever bus process is the present one."""
 
     def __init__(self, process: Callable[[], LoopProcess]) -> None:
-        self.controllers = LoopControllers(lambda request: process().ask(request))
+        self.controllers = LoopControllers(lambda call: process().ask(call))
         self._process = process
 
-    def sweep(self, poses: int, seed: int, /) -> Reply | None:
+    def sweep(self, poses: int, seed: int, /) -> Answer | None:
         """Ask for a tour of poses."""
         return self._process().sweep(poses, seed)
 

@@ -15,8 +15,9 @@ from importlib.metadata import version
 from pathlib import Path
 
 from armlink.arm_file import ArmFile
+from armlink.loop.messages import Answer
 from calib.daemon.environment import Environment
-from calib.daemon.loop.loop_messages import Batch, Down, Message, Progress, Reply, Up
+from calib.daemon.loop.loop_messages import Batch, Down, Message, Progress, Up
 from calib.daemon.observing.active_records import ActiveRecords
 from calib.daemon.observing.observation import Observation
 from calib.daemon.observing.observer_feed import ObserverFeed
@@ -58,7 +59,7 @@ class Service:
         self.hub = Hub()
         self.events = EventLog(self.journal, self.hub, monotonic, wall)
         self.jobs = BusJobs(environment.run, self.journal)
-        self.arm_state = ArmState(arm.joint_names, self.events, monotonic)
+        self.arm_state = ArmState(arm, self.events, monotonic)
         self.recordings = Recordings(directory / "recordings", self.configuration)
         self.storage = ObserverStorage(self.journal, environment)
         self.recalibrations = RecalibrationWorkflow(
@@ -93,13 +94,21 @@ class Service:
         self.journal.guard(self._tick)
 
     def reload(self, arm: ArmFile, settings: DaemonSection) -> None:
-        """Use another configuration of the same arm from now on; the observer's state is kept."""
-        before, self.configuration.settings = self.configuration.settings, settings
-        self.configuration.arm = arm
+        """Use another configuration of the same arm from now on; the observer's state is kept.
+
+        Where an observer cannot be made with it, that error is raised and the configuration before stays in use.
+        """
+        configuration = self.configuration
+        before = configuration.arm, configuration.settings
+        configuration.arm, configuration.settings = arm, settings
+        try:
+            if settings.observer != before[1].observer:
+                self.journal.guard(self._renew)
+        except Exception:
+            configuration.arm, configuration.settings = before
+            raise
         evidence = {"policy": settings.policy}
         self.journal.guard(lambda: self.events.say("configuration", None, "configuration reloaded", evidence))
-        if settings.observer != before.observer:
-            self.journal.guard(self._renew)
         self.journal.guard(self.records.load)
 
     def save(self, history: bool = False) -> None:
@@ -128,11 +137,12 @@ class Service:
             self.arm_state.down(message.reason)
         elif isinstance(message, Progress):
             self.tours.advanced(message)
-        elif isinstance(message, Reply) and message.error is not None:
-            self.tours.refused(message.error)
+        elif isinstance(message, Answer) and message.error is not None:
+            self.tours.refused(str(message.error))
 
     def _tick(self) -> None:
         self.events.tick()
+        self.arm_state.tick()
         self.records.tick()
         self.tours.tick()
         observation = self.records.observation

@@ -274,6 +274,26 @@ def test_a_joint_that_falls_silent_is_a_fault(tmp_path: Path) -> None:
     assert daemon.view.joints()[3].sample_age_s == pytest.approx(1.7)
 
 
+def test_a_host_near_the_deadline_is_said_once_and_not_of_few_cycles(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon.run(5)
+    stats = daemon.service.arm_state.batch.stats
+    for _ in range(5000):
+        stats.lateness.add(1e-4)
+    for _ in range(10):
+        stats.lateness.add(0.06)  # of 100 ms
+    stats.cycles = 5010
+    daemon.service.tick()
+    assert not daemon.of_kind("late")
+    stats.cycles = 10_000
+    for _ in range(3):
+        daemon.service.tick()
+    (event,) = daemon.of_kind("late")
+    assert "60 ms late in 99.9 % of the cycles, near link.deadline (100 ms)" in event.text
+    assert event.evidence["late_ms"]["p50"] < 0.2
+    assert daemon.view.status().state is State.OBSERVING
+
+
 def test_without_records_it_waits_and_begins_when_they_come(tmp_path: Path) -> None:
     daemon = FastDaemon(tmp_path, 1, settings(), records=False)
     daemon.run(10)
