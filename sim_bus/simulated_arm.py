@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
-from armlink.canopen.object_dictionary import SYNC_ID
+from armlink.drives.canopen.object_dictionary import SYNC_ID
 from armlink.errors import BadInput
 from sim_bus.effects.effect import EffectSetting
 from sim_bus.effects.registry import imperfections
@@ -48,7 +48,7 @@ class SimulatedArm:
         self.drives = Drives(arm, self.plant, self.sensors, self._signals)
         self._sampled = 0.0
         self._synchronous = self._watching = False
-        self.nodes = [Node(j, joint.node, self._signals, self._send) for j, joint in enumerate(link.joints)]
+        self.nodes = [Node(j, joint.settings.node, self._signals, self._send) for j, joint in enumerate(link.joints)]
         self.place_of = {node.node_id: node.place for node in self.nodes}
         self._sdo = {0x600 + node.node_id: node for node in self.nodes}
         self.supervision = Supervision(self.nodes, self.drives, self._send)

@@ -3,7 +3,7 @@
 import math
 
 from armlink.arm_file import ArmFile, LinkJoint
-from armlink.canopen.units import Units
+from armlink.drives.canopen.units import Units
 from armlink.errors import BadInput
 from armlink.link.gate import JointLimits
 

@@ -8,8 +8,8 @@ become the active ones. Nothing is stored to flash unless asked for (1010h:04), 
 import struct
 import zlib
 
-from armlink.canopen import object_dictionary as objects
-from armlink.canopen.sdo import NodeServices
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen.sdo import NodeServices
 from armlink.errors import BadInput
 from armlink.link.types import Calibration
 

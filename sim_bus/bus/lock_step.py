@@ -8,7 +8,7 @@ import can
 from armlink.arm_file import load_arm
 from armlink.bus.in_process import InProcessBus
 from armlink.bus.port import Frame
-from armlink.canopen.object_dictionary import SYNC_ID
+from armlink.drives.canopen.object_dictionary import SYNC_ID
 from armlink.errors import BusFault
 from sim_bus.bus.fault_injector import BUS_OFF, ERROR_FLAG, HOST_REFUSES, Injector
 from sim_bus.bus.fault_kinds import Fault, parse_fault

@@ -8,7 +8,7 @@ from types import FrameType
 from armlink.bus.bus_group import BusGroup, GroupPort
 from armlink.bus.can_bus import CanBus
 from armlink.bus.port import Frame, InterfaceDown, Port
-from armlink.canopen.object_dictionary import NMT_ID, SYNC_ID
+from armlink.drives.canopen.object_dictionary import NMT_ID, SYNC_ID
 from armlink.errors import BusFault
 from sim_bus.bus.control_pipe import ControlPipe
 from sim_bus.bus.effect_options import Drift

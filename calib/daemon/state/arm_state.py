@@ -4,7 +4,7 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
-from armlink.canopen import emcy
+from armlink.drives.canopen import emcy
 from calib.daemon.loop.loop_messages import Batch
 from calib.daemon.state.event_log import EventLog
 

@@ -14,8 +14,8 @@ import pytest
 import yaml
 
 from armlink.arm_file import ArmFile, load_arm
-from armlink.canopen.cia402 import State, state_of
-from armlink.canopen.object_dictionary import STATUS_WORD as STATUS
+from armlink.drives.canopen.cia402 import State, state_of
+from armlink.drives.canopen.object_dictionary import STATUS_WORD as STATUS
 from armlink.errors import BusFault, HostLate, Silence, Stall
 from armlink.link.guard import Crossed, Guard
 from armlink.link.listener import Listener

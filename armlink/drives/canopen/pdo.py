@@ -4,13 +4,16 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from armlink.canopen.object_dictionary import (
+from armlink.drives.canopen.object_dictionary import (
     CONTROL_WORD,
+    HEARTBEAT_ID,
     MODE,
     MODE_DISPLAY,
     MOTOR_TORQUE,
+    NMT_ID,
     POSITION,
     STATUS_WORD,
+    SYNC_ID,
     TARGET_POSITION,
     TARGET_TORQUE,
     TORQUE_READING,
@@ -110,6 +113,17 @@ def decoding_table(nodes: tuple[int, ...]) -> dict[int, tuple[int, Pdo, struct.S
         pdo.cob_base + node: (joint, pdo, pdo.layout)
         for joint, node in enumerate(nodes)
         for pdo in (TPDO1, TPDO2, TPDO3)
+    }
+
+
+def host_frames(nodes: tuple[int, ...], host: int) -> dict[int, str]:
+    """COB-IDs that only the host of these nodes sends, and what they are; `host` is its own node id."""
+    return {
+        NMT_ID: "NMT command",
+        SYNC_ID: "SYNC",
+        HEARTBEAT_ID + host: "heartbeat of the host",
+        **{RPDO1.cob_base + node: f"RPDO1 of node {node}" for node in nodes},
+        **{RPDO2.cob_base + node: f"RPDO2 of node {node}" for node in nodes},
     }
 
 

@@ -1,7 +1,6 @@
 """Detects irregular traffic: a second host, a duplicated node id, a babbling node, a restarted controller."""
 
-from armlink.canopen.object_dictionary import HEARTBEAT_ID, NMT_ID, SYNC_ID
-from armlink.canopen.pdo import RPDO1, RPDO2
+from collections.abc import Mapping
 
 MOST_FRAMES = 1000
 """Limit of frames taken in at once; a bus at 1 Mbit/s needs 47 ms for them."""
@@ -19,23 +18,17 @@ itself and catches up."""
 class BusWatch:
     """Counts the readings of the cyclic loop, and frames that are no process data."""
 
-    def __init__(self, nodes: tuple[int, ...], host: int) -> None:
-        """`nodes` are the joints' node ids, `host` our own, whose heartbeat nobody else may send."""
-        self._ours = {
-            NMT_ID: "NMT command",
-            SYNC_ID: "SYNC",
-            HEARTBEAT_ID + host: "heartbeat of the host",
-            **{RPDO1.cob_base + node: f"RPDO1 of node {node}" for node in nodes},
-            **{RPDO2.cob_base + node: f"RPDO2 of node {node}" for node in nodes},
-        }
-        self._crowd = CROWD_PER_JOINT * len(nodes) + CROWD
+    def __init__(self, joints: int, ours: Mapping[int, str]) -> None:
+        """`ours`: identifiers that only a host sends, and what they are: from another they are a second host."""
+        self._ours = ours
+        self._crowd = CROWD_PER_JOINT * joints + CROWD
         self._doubled: set[int] = set()
-        self._double_cycles = [0] * len(nodes)
+        self._double_cycles = [0] * joints
         self._crowded_cycles = 0
         self._last: int | None = None
         self.syncs = 0
         """SYNCs sent."""
-        self.readings = [0] * len(nodes)
+        self.readings = [0] * joints
         """Readings received from each joint."""
         self.restarted: set[int] = set()
         """Joints whose controller has sent its boot-up message."""
