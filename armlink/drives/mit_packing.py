@@ -6,7 +6,10 @@ Each field is an unsigned number of steps from the lower end of its range; the r
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
+
+from armlink.drives.orders import Limits
 
 
 class Ranges(NamedTuple):
@@ -108,3 +111,45 @@ def unpack_feedback(data: bytes, ranges: Ranges) -> MitFeedback:
 def unwrap(position: float, near: float, span: float) -> float:
     """The position that differs from the packed one by whole `span`s and is nearest to `near` [rad]."""
     return position + span * round((near - position) / span)
+
+
+def round_within(
+    command: MitCommand,
+    coded: Callable[[MitCommand], MitCommand],
+    ranges: Ranges,
+    torque_quantum: float,
+    limits: Limits,
+    position: float,
+    velocity: float,
+) -> MitCommand:
+    """The command, moved by as few steps as it takes to stay within `limits` after rounding.
+
+    `coded` gives a command as its bytes tell it. `position` and `velocity` are the newest readings (NaN if there are
+    none), by which the sum of the law is bounded; the torque alone and the target position are bounded in any case.
+    """
+    most = limits.max_torque
+    torque = max(-most, min(most, command.torque))
+    command = command._replace(torque=torque)
+    told = coded(command)
+    if told.kp > 0 and limits.lower <= command.position <= limits.upper:
+        command = command._replace(position=_inwards(told.position, limits, ranges.position_quantum))
+        told = coded(command)
+    total = told.torque
+    if math.isfinite(position) and math.isfinite(velocity):
+        total += told.kp * (told.position - position) + told.kd * (told.velocity - velocity)
+    beyond = max(total - most, told.torque - most, 0.0) or min(total + most, told.torque + most, 0.0)
+    if beyond:
+        steps = math.copysign(math.ceil(abs(beyond) / torque_quantum), beyond)
+        lowest = told.torque - steps * torque_quantum
+        command = command._replace(torque=max(-most, min(most, lowest)))
+        told = coded(command)
+        if abs(told.torque) > most:  # the limit lies between two steps
+            command = command._replace(torque=told.torque - math.copysign(torque_quantum, told.torque))
+    return command
+
+
+def _inwards(position: float, limits: Limits, quantum: float) -> float:
+    """A coded position, a step back where rounding led out of the window."""
+    if position > limits.upper:
+        return position - quantum
+    return position + quantum if position < limits.lower else position

@@ -3,7 +3,7 @@
 import struct
 from collections.abc import Callable
 
-from armlink.bus.port import EXTENDED, FD, REMOTE
+from armlink.bus.port import EXTENDED, REMOTE
 from armlink.drives.damiao.frames import (
     INTEGER_REGISTERS,
     MIT_MODE,
@@ -85,26 +85,25 @@ class DamiaoDrive(SimulatedDrive):
         """A command, or a register request that names this drive."""
         if len(data) != 8:
             return
-        kind = can_id & FD
-        if can_id & 0x7FF == REGISTERS_ID:
-            self._register(data, kind)
+        if can_id == REGISTERS_ID:
+            self._register(data)
             return
         special = special_of(data)
         if special is not None:
             self._obey(special)
-        elif can_id & 0x7FF == self.registers[Register.COMMAND_ID] and self.registers[10] == MIT_MODE:
+        elif can_id == self.registers[Register.COMMAND_ID] and self.registers[10] == MIT_MODE:
             self.command = unpack_command(data, self.coding)
         self.heard = self.now
         if self.state is State.ENABLED:
             self._follow()
-        self._reply(kind)
+        self._reply()
 
     def _obey(self, special: Special) -> None:
         if special is Special.ENABLE and self.state is State.DISABLED:
             self.state, self.command = State.ENABLED, NO_COMMAND
-        elif special is Special.DISABLE and self.state is State.ENABLED:
-            self._stop(State.DISABLED)
-        elif special is Special.CLEAR_ERROR and self.state is not State.ENABLED and not self.latched:
+        elif (special is Special.DISABLE and self.state is State.ENABLED) or (
+            special is Special.CLEAR_ERROR and self.state is not State.ENABLED and not self.latched
+        ):
             self._stop(State.DISABLED)
 
     def _follow(self) -> None:
@@ -117,22 +116,22 @@ class DamiaoDrive(SimulatedDrive):
         self.state, self.command = state, NO_COMMAND
         self.motor.free()
 
-    def _reply(self, kind: int) -> None:
+    def _reply(self) -> None:
         if "feedback.lost" in self.faults:
             return
         motor, coding = self.motor, self.coding
         feedback = MitFeedback(_wrapped(motor.position, coding.position), motor.velocity, motor.torque)
         drive = int(self.registers[Register.COMMAND_ID])
         reply = Reply(drive, self.state, feedback, int(STAGE_TEMPERATURE), int(MOTOR_TEMPERATURE))
-        self.answer(int(self.registers[Register.REPLY_ID]) | kind, pack_reply(reply, coding))
+        self.answer(int(self.registers[Register.REPLY_ID]), pack_reply(reply, coding))
 
-    def _register(self, data: bytes, kind: int) -> None:
+    def _register(self, data: bytes) -> None:
         drive, request, register = struct.unpack_from("<HBB", data)
         if drive != self.registers[Register.COMMAND_ID]:
             return
         reply_id = int(self.registers[Register.REPLY_ID])
         if request == REFRESH:
-            self._reply(kind)
+            self._reply()
         elif request == STORE:
             self.flash_writes += 1
             self._stored = dict(self.registers)
@@ -140,7 +139,7 @@ class DamiaoDrive(SimulatedDrive):
             if request == WRITE and register in WRITABLE:
                 self._write(register, unpack_value(register, data[4:]))
             value = pack_value(register, self.registers[register])
-            self.answer(reply_id | kind, struct.pack("<HBB4s", drive, request, register, value))
+            self.answer(reply_id, struct.pack("<HBB4s", drive, request, register, value))
 
     def _write(self, register: int, value: float) -> None:
         if register in INTEGER_REGISTERS:
@@ -191,11 +190,10 @@ class DamiaoFront:
         """A frame from the bus."""
         if can_id & (EXTENDED | REMOTE):
             return
-        place = can_id & 0x7FF
-        if place == REGISTERS_ID:
+        if can_id == REGISTERS_ID:
             for drive in self.drives:
                 drive.on_frame(can_id, data)
-        elif (addressed := self._commanded.get(place)) is not None:
+        elif (addressed := self._commanded.get(can_id)) is not None:
             addressed.on_frame(can_id, data)
 
 

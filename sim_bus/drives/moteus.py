@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 
-from armlink.bus.port import EXTENDED, FD, REMOTE
+from armlink.bus.port import EXTENDED, REMOTE
 from armlink.drives.moteus.frames import (
     FLOAT,
     INT32,
@@ -90,7 +90,7 @@ class MoteusDrive(SimulatedDrive):
         except ValueError:  # more than a frame holds: the controller sends none
             return
         answer = identifier(self.drive, source)
-        self.answer(answer | FD | EXTENDED * (answer > 0x7FF), content)
+        self.answer(answer | EXTENDED * (answer > 0x7FF), content)
 
     # ---- registers
 
@@ -132,7 +132,9 @@ class MoteusDrive(SimulatedDrive):
         if value is None:
             return Subframe(READ_ERROR, asked.register, NO_REGISTER)
         whole = asked.register in (Register.MODEL, Register.FIRMWARE, Register.SERIAL1)
-        return Subframe(REPLY, asked.register, value, INT32 if whole and asked.resolution == FLOAT else asked.resolution)
+        return Subframe(
+            REPLY, asked.register, value, INT32 if whole and asked.resolution == FLOAT else asked.resolution
+        )
 
     def _shown(self, quantity: str) -> float:
         return 1.0 / self.scale(quantity)
@@ -222,8 +224,8 @@ class MoteusFront:
         self._addressed = {drive.drive: drive for drive in drives}
 
     def on_frame(self, can_id: int, data: bytes) -> None:
-        """A frame from the bus; a classical one is not understood."""
-        if can_id & REMOTE or not can_id & FD:
+        """A frame from the bus."""
+        if can_id & REMOTE:
             return
         number = can_id & 0x1FFFFFFF
         if number & 0x7F == 0x7F:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 
-from armlink.bus.port import EXTENDED, FD, REMOTE
+from armlink.bus.port import EXTENDED, REMOTE
 from armlink.drives.odrive.frames import (
     INPUT_FEED_FORWARD,
     PASSTHROUGH,
@@ -25,6 +25,12 @@ HEARTBEAT_PERIOD = 0.1
 TORQUE_CONSTANT = 0.083
 """8.27/KV as its user typed it in [N·m/A]."""
 RATES = {Message.HEARTBEAT: HEARTBEAT_PERIOD, Message.TEMPERATURE: 0.5}
+
+
+def cyclic_periods(cycle: float) -> dict[Message, float]:
+    """Periods [s] as they are to be set for a host with this cycle: estimates and torques once a cycle, in whole ms."""
+    period = max(int(cycle * 1000 + 1e-9), 1) / 1000
+    return {Message.ESTIMATES: period, Message.TORQUES: period}
 
 
 class ODriveAxis(SimulatedDrive):
@@ -213,7 +219,7 @@ class ODriveFront:
 
     def on_frame(self, can_id: int, data: bytes) -> None:
         """A frame from the bus."""
-        if can_id & (EXTENDED | FD):
+        if can_id & EXTENDED:
             return
         drive = self._addressed.get((can_id & 0x7FF) >> 5)
         if drive is not None:

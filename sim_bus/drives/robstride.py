@@ -38,9 +38,7 @@ READ_ONLY = frozenset((Parameter.POSITION, Parameter.CURRENT, Parameter.VELOCITY
 class RobStrideDrive(SimulatedDrive):
     """One drive with id `drive`."""
 
-    def __init__(
-        self, motor: Motor, send: Callable[[int, bytes], None], drive: int, model: str, serial: int
-    ) -> None:
+    def __init__(self, motor: Motor, send: Callable[[int, bytes], None], drive: int, model: str, serial: int) -> None:
         """As the maker delivers it: deadman off, motion mode."""
         super().__init__(motor, send)
         self.drive, self.serial = drive, serial
@@ -151,7 +149,7 @@ class RobStrideDrive(SimulatedDrive):
             Parameter.CURRENT: self.motor.torque,
             Parameter.BUS_VOLTAGE: BUS_VOLTAGE,
         }
-        value = (live | self.parameters).get(parameter)  # type: ignore[operator]
+        value = (live | self.parameters).get(parameter)
         unknown = NEVER_READ << 8 if value is None else 0
         head = identifier(Type.READ, unknown | self.drive, self._host)
         content = bytes(4) if value is None else pack_value(parameter, value)

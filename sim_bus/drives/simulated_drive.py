@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable
 
-from armlink.bus.port import FD
 from sim_bus.drives.motor import Motor
 
 STAGE_TEMPERATURE, MOTOR_TEMPERATURE = 31.0, 33.0
@@ -44,11 +43,8 @@ class SimulatedDrive:
 
     def answer(self, can_id: int, data: bytes) -> None:
         """Send a frame, but from an unplugged drive."""
-        if self.unplugged:
-            return
-        if "drive.classic" in self.faults:
-            can_id &= ~FD
-        self._send(can_id, data)
+        if not self.unplugged:
+            self._send(can_id, data)
 
     # ---- time
 

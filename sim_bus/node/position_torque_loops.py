@@ -60,6 +60,8 @@ class Loops:
         self._given = np.zeros((3, self.n))
         """Stiffness, damping and limit of joints whose drive gives them; 0 for the others."""
         self._given_anew = False
+        self.imagined = np.zeros(self.n)
+        """Offset of a drive's current sensor, as torque [N·m]: so much less is made than the drive asks for."""
         self._fresh: dict[int, NDArray[np.bool_]] = {
             index: np.zeros(self.n, bool) for index in (0x6071, 0x607A, 0x60FF)
         }
@@ -101,12 +103,12 @@ class Loops:
         """Motor torque `drive − stiffness·q − damping·q̇` within ±limit, from the next step on (true motor angle)."""
         if self.kind[joint] != IMPEDANCE:
             self.start(joint, IMPEDANCE, 0)
-        self._torque[joint] = drive - self._offset(joint)
+        self._torque[joint] = drive - self.imagined[joint]
         self._given[:, joint] = stiffness, damping, limit
         self._given_anew = True
 
     def tuned(self, joint: int) -> tuple[float, float, float]:
-        """Stiffness, damping and integral gain of the position loop that suits a joint [N·m/rad, N·m·s/rad, N·m/rad/s]."""
+        """Stiffness, damping and integral gain of the position loop that suits a joint, in SI units."""
         bandwidth, inertia = float(self._stable_bandwidth()[joint]), float(self._inertia[joint])
         stiffness = inertia * bandwidth**2
         return stiffness, 2 * self._damping_ratio * inertia * bandwidth, INTEGRAL_SHARE * bandwidth * stiffness
@@ -115,10 +117,6 @@ class Loops:
         """Take the power from a joint under impede()."""
         self._given[:, joint] = 0.0
         self.start(joint, OFF, 0)
-
-    def _offset(self, joint: int) -> float:
-        """Part of a drive's torque that its current sensor only imagines [N·m]."""
-        return float(self._sensors.offset[joint])
 
     def stop(self, joint: int) -> None:
         """Decelerate a joint to rest (quick stop deceleration) and hold it there."""
