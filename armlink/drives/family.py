@@ -11,9 +11,9 @@ position control for drives that have none, calibration in the host, direction, 
 
 **Order of calls.** `Family.build` makes one `Drives` for the joints of this family on one bus; nothing is sent.
 `identify` (scan, check) may come at any time before cycles. `set_up` comes once at the start, after which every cycle
-is: `frames(orders, now)`, then `sent(joint)` for each joint, then the frames leave, then `take` for each frame that
-comes. `take` is also called for frames that come while an `Ask` waits, and before `set_up`: a family that does not know
-a scale yet returns None.
+is: `frames(orders, now)`, `sent(joint)` for each joint, then the frames leave, `take` for each frame that comes,
+`alarm` and `fault`. `take` is also called for frames that come while an `Ask` waits, and before `set_up`: a family that
+does not know a scale yet returns None.
 
 Everything runs in one thread. No method may block, but those that get an `Ask`.
 """
@@ -22,9 +22,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
-from armlink.arm_file import LinkJoint, LinkSection
+from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import Frame
-from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup
+from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup, power_name
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
 from armlink.errors import BusFault
@@ -32,7 +32,9 @@ from armlink.errors import BusFault
 T = TypeVar("T")
 
 BROADCAST = -1
-"""Stands for the joint of a frame to all of them."""
+"""Stands for the joint of a frame to all of them, or of any of them."""
+ANY = -1
+"""Stands for every identifier in `Drives.routes`."""
 ANSWER, TRIES = 0.1, 3
 """Default patience for an answer [s], and how often a request is sent."""
 
@@ -61,21 +63,24 @@ class Ask(Protocol):
 
 
 class Drives(Protocol):
-    """The drives of one family on one bus. `joint` is always an index among these drives: 0 … m−1, in arm order."""
+    """The drives of one family on one bus. `joint` is always an index among these drives: 0 … m−1, in arm order.
+
+    `armlink.drives.base.BasicDrives` implements all that does not depend on the protocol; a family derives from it.
+    """
 
     def traits(self, joint: int) -> Traits:
         """Traits of one drive; they may depend on its keys in the arm file, and after `set_up` on what it has."""
         ...
 
     def routes(self) -> Mapping[int, int]:
-        """Identifiers (with flags) that the drives send → joint; only these frames reach `take`.
+        """Identifiers (with flags) that the drives send → joint or BROADCAST; only these frames reach `take`.
 
-        A family whose identifiers do not tell the joint, or that takes any, gives BROADCAST as the joint.
+        With the key ANY it also gets frames that no family on this bus has named, for identifiers that carry data.
         """
         ...
 
-    def commands(self) -> Mapping[int, int]:
-        """Identifiers that only a host sends → joint or BROADCAST: heard from another, they are a second host."""
+    def commands(self) -> Mapping[int, str]:
+        """Identifiers that only a host sends, and what they are: heard from another, they are a second host."""
         ...
 
     def identify(self, ask: Ask) -> list[DriveIdentity]:
@@ -90,8 +95,8 @@ class Drives(Protocol):
         """
         ...
 
-    def frames(self, orders: Sequence[Order], now: float) -> list[Frame]:
-        """Frames of one cycle at time `now`, one order a joint, in this order on the bus.
+    def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
+        """Frames of one cycle at time `now`, one order a joint, in this order on the bus; None: no frame for a joint.
 
         An order whose `power` is not reached is answered with the step that leads there (see Order.walk). Values beyond
         what a frame can carry are limited to it, and rounding never leads out of `Limits`; zero torque is rounded to
@@ -99,9 +104,9 @@ class Drives(Protocol):
         """
         ...
 
-    def sent(self, joint: int) -> Order:
-        """What the bytes of the newest `frames` tell this drive, decoded from the bytes: the gate checks it before
-        they leave. A drive that is not told any target in them has NaN there and `power` other than ON."""
+    def sent(self, joint: int) -> Order | None:
+        """What the bytes of the newest `frames` order this drive, decoded from the bytes: the gate checks it before
+        they leave. None where they carry no target (they switch it, ask it, stop it)."""
         ...
 
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
@@ -112,15 +117,39 @@ class Drives(Protocol):
         """Newest power state of a drive."""
         ...
 
-    def fault(self, joint: int, wanted_on: bool, now: float) -> BusFault | None:
-        """What is wrong with a drive by its frames, if it should be ON (`wanted_on`) or not; None if nothing.
+    def ready(self, joint: int) -> bool:
+        """Whether a drive is ON in the mode it was last ordered in."""
+        ...
 
-        A `Stall` where the drive stopped by itself because it did not hear its host. Silence is not this one's concern.
+    def alarm(self) -> BusFault | None:
+        """The first event of a fault that a drive has told of itself since `forget`; None if there is none."""
+        ...
+
+    def fault(self, modes: Sequence[int], now: float) -> BusFault | None:
+        """The first fault by the drives' states, where each joint with a mode was to be ON; None if there is none.
+
+        A `Stall` where the drive stopped by itself because it did not hear its host. Silence is the link's concern.
         """
         ...
 
-    def forget(self, joint: int) -> None:
-        """Forget faults and events of the past: a new walk to ON begins."""
+    def own_stop(self) -> str:
+        """The first drive that stopped by itself because it did not hear its host, in words; empty if none."""
+        ...
+
+    def stuck(self, joint: int, target: Power, seconds: float) -> str:
+        """Why a drive is not in `target` after `seconds`, in words that name the joint."""
+        ...
+
+    def forget(self) -> None:
+        """Forget alarms of the past: a walk to ON begins, or has succeeded."""
+        ...
+
+    def recover(self, ask: Ask) -> None:
+        """After a Stall: bring drives back that left the communication; for most there is nothing to do."""
+        ...
+
+    def temperature(self, joint: int, ask: Ask) -> float:
+        """Temperature of a drive [°C], NaN if it has none."""
         ...
 
     def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
@@ -140,7 +169,9 @@ class Family:
     """Of a drive with the default keys; for `armlink drives`."""
     settings: type[DriveSettings]
     """Keys of `link.joints[].drive`."""
-    build: Callable[[Sequence[LinkJoint], LinkSection], Drives]
-    """`build(joints, section)`: the drives of these joints, all on one bus; sends nothing. Raises BadInput."""
+    build: Callable[[ArmFile, Sequence[LinkJoint]], Drives]
+    """`build(arm, joints)`: the drives of these joints of an arm, all on one bus; sends nothing. Raises BadInput."""
+    state_name: Callable[[int], str] = power_name
+    """State of a drive in words, from its code in `Sample.status`; by default an index of Power."""
     summary: str = ""
     """Which devices these are, in a line."""

@@ -37,6 +37,19 @@ class Power(Enum):
     FAULT = "fault"
 
 
+POWERS = tuple(Power)
+
+
+def power_code(power: Power) -> int:
+    """Code of a power state in `Sample.status`."""
+    return POWERS.index(power)
+
+
+def power_name(code: int) -> str:
+    """A power state in words, from its code."""
+    return POWERS[code].value if 0 <= code < len(POWERS) else Power.UNKNOWN.value
+
+
 class Order(NamedTuple):
     """What one drive is to do in one cycle."""
 
@@ -57,6 +70,8 @@ class Order(NamedTuple):
     """[N·m/rad]; 0 for a drive with a position controller of its own, and under torque control."""
     kd: float
     """[N·m·s/rad]; likewise."""
+    refused: str = ""
+    """Why the gate refused the command, so that `power` is STOPPED; for the link alone."""
 
 
 class Reading(NamedTuple):

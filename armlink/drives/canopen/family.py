@@ -2,14 +2,14 @@
 
 from collections.abc import Sequence
 
-from armlink.arm_file import LinkJoint, LinkSection
+from armlink.arm_file import ArmFile, LinkJoint
 from armlink.drives.canopen.settings import CanopenSettings
 from armlink.drives.family import Drives, Family
 from armlink.drives.traits import Traits
 from armlink.errors import BusFault
 
 
-def build(joints: Sequence[LinkJoint], section: LinkSection) -> Drives:
+def build(arm: ArmFile, joints: Sequence[LinkJoint]) -> Drives:
     """Drives of these joints."""
     raise BusFault("the link still drives CANopen by its own cycle")
 
