@@ -11,6 +11,9 @@ from typing import NamedTuple
 
 from armlink.drives.orders import Limits
 
+DAMPING_SHARE = 0.9
+"""Damping takes at most this share of the torque limit; the rest is for rounding."""
+
 
 class Ranges(NamedTuple):
     """Ends of the packed ranges: ±position [rad], ±velocity [rad/s], ±torque [N·m], 0 to kp and 0 to kd."""
@@ -146,6 +149,13 @@ def round_within(
         if abs(told.torque) > most:  # the limit lies between two steps
             command = command._replace(torque=told.torque - math.copysign(torque_quantum, told.torque))
     return command
+
+
+def damping(kd: float, position: float, velocity: float, most: float) -> MitCommand:
+    """A command that damps with at most `kd`, and with no more torque than `most` [N·m] at the present velocity."""
+    if abs(velocity) * kd > DAMPING_SHARE * most:
+        kd = DAMPING_SHARE * most / abs(velocity)
+    return MitCommand(position if math.isfinite(position) else 0.0, 0.0, 0.0, kd, 0.0)
 
 
 def _inwards(position: float, limits: Limits, quantum: float) -> float:

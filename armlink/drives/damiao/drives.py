@@ -2,15 +2,16 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from armlink.arm_file import LinkJoint, LinkSection
+from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import Frame
+from armlink.drives.base import BasicDrives, no_order
 from armlink.drives.damiao import frames
 from armlink.drives.damiao.frames import Register, Special, State
 from armlink.drives.damiao.set_up import prepare, read_registers
-from armlink.drives.family import BROADCAST, Ask, Drives
-from armlink.drives.mit_packing import MitCommand, Ranges, pack_command, round_within, unpack_command, unwrap
+from armlink.drives.family import BROADCAST, Ask
+from armlink.drives.mit_packing import MitCommand, Ranges, damping, pack_command, round_within, unpack_command, unwrap
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
 from armlink.drives.traits import Traits
 from armlink.errors import BusFault, Stall
@@ -25,10 +26,8 @@ FAULTS = {
     State.OVERCURRENT: "overcurrent",
     State.MOSFET_HOT: "power stage too hot",
     State.ROTOR_HOT: "motor too hot",
-    State.LOST_COMMUNICATION: "lost communication: its TIMEOUT ran out, the torque is off",
     State.OVERLOAD: "overload",
 }
-NOTHING = Order(Power.UNKNOWN, False, Mode.OFF, *[math.nan] * 5)
 
 
 @dataclass
@@ -44,33 +43,31 @@ class _Known:
     velocity: float = math.nan
     damping: bool = False
     """The newest frame damps, whatever was ordered."""
-    sent: Order = field(default=NOTHING)
+    sent: Order | None = None
 
 
-class DamiaoDrives(Drives):
+class DamiaoDrives(BasicDrives):
     """The drives of one bus; see `Drives`."""
 
-    def __init__(self, joints: Sequence[LinkJoint], section: LinkSection) -> None:
+    def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
         """Nothing is sent."""
-        self._names = [joint.name for joint in joints]
+        super().__init__(joints, TRAITS)
         self._settings = [joint.settings for joint in joints]
         self._known = [_Known() for _ in joints]
         self._joint_of = {settings.id: joint for joint, settings in enumerate(self._settings)}
-
-    def traits(self, joint: int) -> Traits:
-        """See Drives."""
-        return TRAITS
 
     def routes(self) -> Mapping[int, int]:
         """Reply ids; drives that share one are told apart by the id in their replies."""
         replies = [settings.reply for settings in self._settings]
         return {reply: joint if replies.count(reply) == 1 else BROADCAST for joint, reply in enumerate(replies)}
 
-    def commands(self) -> Mapping[int, int]:
+    def commands(self) -> Mapping[int, str]:
         """See Drives."""
-        found = {frames.REGISTERS_ID: BROADCAST}
+        found = {frames.REGISTERS_ID: "register request"}
         for drive, joint in self._joint_of.items():
-            found |= dict.fromkeys((drive, *(drive + offset for offset in OTHER_MODES)), joint)
+            name = self.names[joint]
+            found[drive] = f"MIT command to {name}"
+            found |= {drive + offset: f"{mode} command to {name}" for offset, mode in OTHER_MODES.items()}
         return found
 
     # ---- set-up
@@ -105,7 +102,7 @@ class DamiaoDrives(Drives):
         """See Drives."""
         found = []
         for joint, (known, settings, limit) in enumerate(zip(self._known, self._settings, limits, strict=True)):
-            known.ranges, result = prepare(ask, self._names[joint], settings, limit)
+            known.ranges, result = prepare(ask, self.names[joint], settings, limit)
             known.limits, known.state = limit, None
             found.append(result)
             known.position = result.position
@@ -113,9 +110,9 @@ class DamiaoDrives(Drives):
 
     # ---- cycle
 
-    def frames(self, orders: Sequence[Order], now: float) -> list[Frame]:
+    def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
         """See Drives."""
-        return [self._frame(joint, order) for joint, order in enumerate(orders)]
+        return [self._frame(joint, order) for joint, order in enumerate(orders) if order is not None]
 
     def _frame(self, joint: int, order: Order) -> Frame:
         known, drive = self._known[joint], self._settings[joint].id
@@ -125,12 +122,11 @@ class DamiaoDrives(Drives):
             return self._command(joint, order)
         if order.power is Power.STOPPED and on:
             return self._damp(joint)
-        known.sent = NOTHING._replace(power=Power.OFF)
+        known.sent = None
         if order.power is Power.OFF and on:
             return drive, frames.special(Special.DISABLE)
         if order.power is Power.ON and order.walk:
             if known.state == State.DISABLED:
-                known.sent = NOTHING._replace(power=Power.READY)
                 return drive, frames.special(Special.ENABLE)
             if known.state is not None:
                 return drive, frames.special(Special.CLEAR_ERROR)
@@ -140,7 +136,7 @@ class DamiaoDrives(Drives):
         known = self._known[joint]
         ranges, limits = known.ranges, known.limits
         if ranges is None or limits is None:
-            raise BusFault(f"{self._names[joint]}: a command before the set-up")
+            raise BusFault(f"{self.names[joint]}: a command before the set-up")
         stiff = order.mode == Mode.POSITION
         asked = MitCommand(
             order.position, order.velocity, order.kp if stiff else 0.0, order.kd if stiff else 0.0, order.torque
@@ -159,15 +155,17 @@ class DamiaoDrives(Drives):
         return self._settings[joint].id, data
 
     def _damp(self, joint: int) -> Frame:
-        """No stiffness, no torque: the joint sinks slowly."""
+        """No stiffness, no torque: the joint sinks slowly, and no torque leaves the limit on the way."""
         known = self._known[joint]
         assert known.ranges is not None
+        assert known.limits is not None
         known.damping = True
-        data = pack_command(MitCommand(known.position, 0.0, 0.0, self._settings[joint].kd, 0.0), known.ranges)
+        command = damping(self._settings[joint].kd, known.position, known.velocity, known.limits.max_torque)
+        data = pack_command(command, known.ranges)
         known.sent = _order_of(unpack_command(data, known.ranges))._replace(power=Power.STOPPED)
         return self._settings[joint].id, data
 
-    def sent(self, joint: int) -> Order:
+    def sent(self, joint: int) -> Order | None:
         """See Drives."""
         return self._known[joint].sent
 
@@ -187,14 +185,16 @@ class DamiaoDrives(Drives):
         if math.isfinite(known.position):
             position = unwrap(position, known.position, 2 * known.ranges.position)
         known.position, known.velocity = position, reply.feedback.velocity
-        return Reading(
-            joint,
-            position,
-            reply.feedback.velocity,
-            reply.feedback.torque,
-            temperature=float(max(reply.stage_temperature, reply.rotor_temperature)),
-            power=self.power(joint),
-            fault=self._fault_text(reply.state),
+        return self.note(
+            Reading(
+                joint,
+                position,
+                reply.feedback.velocity,
+                reply.feedback.torque,
+                temperature=float(max(reply.stage_temperature, reply.rotor_temperature)),
+                power=self._power(known),
+                fault=_fault_text(reply.state),
+            )
         )
 
     def _joint_of_reply(self, can_id: int, data: bytes) -> int | None:
@@ -207,35 +207,24 @@ class DamiaoDrives(Drives):
         ]
         return places[0] if places else None
 
-    def power(self, joint: int) -> Power:
-        """See Drives."""
-        known = self._known[joint]
-        if known.state is None:
-            return Power.UNKNOWN
+    @staticmethod
+    def _power(known: _Known) -> Power:
         if known.state == State.ENABLED:
             return Power.STOPPED if known.damping else Power.ON
-        return Power.OFF if known.state == State.DISABLED else Power.FAULT
+        powers: dict[int | None, Power] = {State.DISABLED: Power.OFF, State.LOST_COMMUNICATION: Power.STOPPED}
+        return powers.get(known.state, Power.FAULT)
 
-    def fault(self, joint: int, wanted_on: bool, now: float) -> BusFault | None:
+    def fault(self, modes: Sequence[int], now: float) -> BusFault | None:
         """See Drives."""
-        state, name = self._known[joint].state, self._names[joint]
-        if state is None or state == State.ENABLED:
-            return None
-        text = self._fault_text(state)
-        if text:
-            return (Stall if state == State.LOST_COMMUNICATION else BusFault)(f"{name}: {text}")
-        return BusFault(f"{name}: the drive is disabled, and its host did not do that") if wanted_on else None
+        lost = self.own_stop()
+        return Stall(lost) if lost else super().fault(modes, now)
 
-    @staticmethod
-    def _fault_text(state: int) -> str:
-        if state in (State.DISABLED, State.ENABLED):
-            return ""
-        words = FAULTS[State(state)] if state in FAULTS else "unknown state"
-        return f"{words} (state {state:X}h)"
-
-    def forget(self, joint: int) -> None:
-        """See Drives; the state itself is that of the newest reply."""
-        self._known[joint].damping = False
+    def own_stop(self) -> str:
+        """See Drives."""
+        for joint, known in enumerate(self._known):
+            if known.state == State.LOST_COMMUNICATION:
+                return f"{self.where(joint)}: lost communication (state Dh): its TIMEOUT ran out, the torque is off"
+        return ""
 
     # ---- listening
 
@@ -247,9 +236,16 @@ class DamiaoDrives(Drives):
         special = frames.special_of(data)
         if special is not None:
             power = {Special.ENABLE: Power.ON, Special.DISABLE: Power.OFF}.get(special)
-            return None if power is None else (joint, NOTHING._replace(power=power))
+            return None if power is None else (joint, no_order()._replace(power=power))
         ranges = self._known[joint].ranges
         return None if ranges is None else (joint, _order_of(unpack_command(data, ranges)))
+
+
+def _fault_text(state: int) -> str:
+    if state in (State.DISABLED, State.ENABLED, State.LOST_COMMUNICATION):
+        return ""
+    words = FAULTS[State(state)] if state in FAULTS else "unknown state"
+    return f"{words} (state {state:X}h)"
 
 
 def _order_of(command: MitCommand) -> Order:

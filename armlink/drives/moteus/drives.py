@@ -4,11 +4,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from armlink.arm_file import LinkJoint, LinkSection
+from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import EXTENDED, Frame
-from armlink.drives.family import Ask, Drives
+from armlink.drives.base import BasicDrives, no_order
+from armlink.drives.family import Ask
 from armlink.drives.moteus import frames
 from armlink.drives.moteus.frames import READ_ERROR, REPLY, WRITE, Register
+from armlink.drives.moteus.settings import MoteusSettings
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
 from armlink.drives.traits import Traits
 from armlink.errors import BadInput, BusFault, Stall
@@ -30,7 +32,6 @@ FAULTS = {
 }  # fmt: skip
 """Fault codes; 96 to 104 only tell what limits the torque at present."""
 LIMITING = 96
-NOTHING = Order(Power.UNKNOWN, False, Mode.OFF, *[math.nan] * 5)
 STOPS = {frames.Mode.STOPPED: Power.OFF, frames.Mode.FAULT: Power.FAULT, frames.Mode.POSITION: Power.ON}
 STOPPED_MODES = (frames.Mode.TIMEOUT, frames.Mode.ZERO_VELOCITY, frames.Mode.BRAKE)
 
@@ -43,34 +44,32 @@ class _Known:
     mode: int | None = None
     fault: int = 0
     position: float = math.nan
-    sent: Order = NOTHING
+    sent: Order | None = None
 
 
-class MoteusDrives(Drives):
+class MoteusDrives(BasicDrives):
     """The controllers of one bus; see `Drives`."""
 
-    def __init__(self, joints: Sequence[LinkJoint], section: LinkSection) -> None:
+    def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
         """Nothing is sent. Raises BadInput for a bus without CAN FD."""
-        self._names = [joint.name for joint in joints]
+        super().__init__(joints, TRAITS)
         self._settings = [joint.settings for joint in joints]
         self._known = [_Known() for _ in joints]
+        self._joint_of = {_reply_id(settings): joint for joint, settings in enumerate(self._settings)}
+        section = arm.require_link()
         bus = section.buses[joints[0].bus] if joints[0].bus else section.bus
         if not bus.fd:
-            raise BadInput(f"{joints[0].name}: moteus controllers need CAN FD: set fd: true at the bus of the arm file")
-
-    def traits(self, joint: int) -> Traits:
-        """See Drives."""
-        return TRAITS
+            raise BadInput(f"{arm.path}: {joints[0].name}: moteus controllers need CAN FD: set fd: true at their bus")
 
     def routes(self) -> Mapping[int, int]:
         """See Drives."""
-        return {_flagged(settings.id << 8 | settings.source): joint for joint, settings in enumerate(self._settings)}
+        return self._joint_of
 
-    def commands(self) -> Mapping[int, int]:
+    def commands(self) -> Mapping[int, str]:
         """Frames to our controllers, from any source, with or without a wish for a reply."""
         return {
-            _flagged(head << 8 | settings.id): joint
-            for joint, settings in enumerate(self._settings)
+            _flagged(head << 8 | settings.id): f"command to {name}"
+            for settings, name in zip(self._settings, self.names, strict=True)
             for head in range(0x100)
         }
 
@@ -97,7 +96,7 @@ class MoteusDrives(Drives):
         """See Drives: stopped, and referenced to its output; torque and watchdog go with every command."""
         found = []
         for joint, (known, limit) in enumerate(zip(self._known, limits, strict=True)):
-            name, asked = self._names[joint], (*QUERY, Register.HOME_STATE)
+            name, asked = self.names[joint], (*QUERY, Register.HOME_STATE)
             values = self._ask(ask, joint, {Register.MODE: frames.Mode.STOPPED}, asked)
             if values is None:
                 address = self._settings[joint].address
@@ -126,7 +125,7 @@ class MoteusDrives(Drives):
     def _ask(self, ask: Ask, joint: int, writes: Mapping[int, float], asked: Sequence[int]) -> dict[int, float] | None:
         """Values of the registers that came, or None without an answer."""
         settings = self._settings[joint]
-        reply_id = _flagged(settings.id << 8 | settings.source)
+        reply_id = _reply_id(settings)
 
         def answer(can_id: int, data: bytes) -> dict[int, float] | None:
             if can_id != reply_id:
@@ -142,14 +141,17 @@ class MoteusDrives(Drives):
 
     # ---- cycle
 
-    def frames(self, orders: Sequence[Order], now: float) -> list[Frame]:
+    def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
         """See Drives."""
         found = []
         for joint, order in enumerate(orders):
+            if order is None:
+                continue
             settings = self._settings[joint]
             writes = self._writes(joint, order)
             data = frames.pack(writes, QUERY)
-            self._known[joint].sent = _order_of(data)
+            told = _order_of(data)
+            self._known[joint].sent = told if told is not None and told.power is Power.ON else None
             found.append((_flagged(frames.identifier(settings.source, settings.id, True)), data))
         return found
 
@@ -170,9 +172,9 @@ class MoteusDrives(Drives):
     def _command(self, joint: int, order: Order) -> dict[int, float]:
         limits = self._known[joint].limits
         if limits is None:
-            raise BusFault(f"{self._names[joint]}: a command before the set-up")
+            raise BusFault(f"{self.names[joint]}: a command before the set-up")
         if not all(math.isfinite(value) for value in (order.position, order.velocity, order.torque)):
-            raise ValueError(f"{self._names[joint]}: an order that is not finite: {order}")
+            raise ValueError(f"{self.names[joint]}: an order that is not finite: {order}")
         stiff = float(order.mode == Mode.POSITION)
         most = limits.max_torque
         return {
@@ -188,13 +190,13 @@ class MoteusDrives(Drives):
             Register.COMMAND_ILIMIT_SCALE: stiff,
         }
 
-    def sent(self, joint: int) -> Order:
+    def sent(self, joint: int) -> Order | None:
         """See Drives."""
         return self._known[joint].sent
 
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
         """See Drives."""
-        joint = self.routes().get(can_id)
+        joint = self._joint_of.get(can_id)
         if joint is None:
             return None
         values = {each.register: each.value for each in frames.unpack(data) if each.kind == REPLY}
@@ -209,49 +211,29 @@ class MoteusDrives(Drives):
         if not abs(position) < LARGEST_POSITION:
             position = math.nan
         known.position = position * TURN
-        return Reading(
-            joint,
-            position * TURN,
-            _finite(values.get(Register.VELOCITY, math.nan)) * TURN,
-            _finite(values.get(Register.TORQUE, math.nan)),
-            temperature=_finite(values.get(Register.TEMPERATURE, math.nan)),
-            power=self.power(joint),
-            fault=self._fault_text(known),
+        return self.note(
+            Reading(
+                joint,
+                position * TURN,
+                _finite(values.get(Register.VELOCITY, math.nan)) * TURN,
+                _finite(values.get(Register.TORQUE, math.nan)),
+                temperature=_finite(values.get(Register.TEMPERATURE, math.nan)),
+                power=_power(known),
+                fault=_fault_text(known),
+            )
         )
 
-    def power(self, joint: int) -> Power:
+    def fault(self, modes: Sequence[int], now: float) -> BusFault | None:
         """See Drives."""
-        mode = self._known[joint].mode
-        if mode is None:
-            return Power.UNKNOWN
-        if mode in STOPPED_MODES:
-            return Power.STOPPED
-        return STOPS[frames.Mode(mode)] if mode in STOPS else Power.READY
+        lost = self.own_stop()
+        return Stall(lost) if lost else super().fault(modes, now)
 
-    def fault(self, joint: int, wanted_on: bool, now: float) -> BusFault | None:
+    def own_stop(self) -> str:
         """See Drives."""
-        known, name = self._known[joint], self._names[joint]
-        if known.mode is None or known.mode == frames.Mode.POSITION:
-            return None
-        text = self._fault_text(known)
-        if known.mode == frames.Mode.TIMEOUT:
-            return Stall(f"{name}: {text}")
-        if text:
-            return BusFault(f"{name}: {text}")
-        return (
-            BusFault(f"{name}: the controller is in mode {known.mode}, expected 10 (position)") if wanted_on else None
-        )
-
-    @staticmethod
-    def _fault_text(known: _Known) -> str:
-        if known.mode == frames.Mode.TIMEOUT:
-            return "its watchdog ran out: it damps until it is stopped (mode 11)"
-        if known.mode == frames.Mode.FAULT:
-            return f"{FAULTS.get(known.fault, 'unknown fault')} (fault {known.fault})"
+        for joint, known in enumerate(self._known):
+            if known.mode == frames.Mode.TIMEOUT:
+                return f"{self.where(joint)}: its watchdog ran out: it damps until it is stopped (mode 11)"
         return ""
-
-    def forget(self, joint: int) -> None:
-        """See Drives; mode and fault are those of the newest reply."""
 
     # ---- listening
 
@@ -260,8 +242,24 @@ class MoteusDrives(Drives):
         for joint, settings in enumerate(self._settings):
             if can_id & 0xFF == settings.id and can_id & 0x1FFFFFFF < 0x10000 and _flagged(can_id & 0xFFFF) == can_id:
                 order = _order_of(data)
-                return None if order is NOTHING else (joint, order)
+                return None if order is None else (joint, order)
         return None
+
+
+def _power(known: _Known) -> Power:
+    if known.mode in STOPPED_MODES:
+        return Power.STOPPED
+    return STOPS[frames.Mode(known.mode)] if known.mode in STOPS else Power.READY
+
+
+def _fault_text(known: _Known) -> str:
+    if known.mode == frames.Mode.FAULT:
+        return f"{FAULTS.get(known.fault, 'unknown fault')} (fault {known.fault})"
+    return ""
+
+
+def _reply_id(settings: MoteusSettings) -> int:
+    return _flagged(settings.id << 8 | settings.source)
 
 
 def _flagged(number: int) -> int:
@@ -269,15 +267,15 @@ def _flagged(number: int) -> int:
     return number | EXTENDED * (number > 0x7FF)
 
 
-def _order_of(data: bytes) -> Order:
-    """The order that the bytes of a frame give; NOTHING if they command no mode."""
+def _order_of(data: bytes) -> Order | None:
+    """The order that the bytes of a frame give; None if they command no mode."""
     values = {each.register: each.value for each in frames.unpack(data) if each.kind == WRITE}
     mode = values.get(Register.MODE)
     if mode is None:
-        return NOTHING
+        return None
     if mode != frames.Mode.POSITION:
         power = {0: Power.OFF, 12: Power.STOPPED, 15: Power.STOPPED}.get(int(mode) if math.isfinite(mode) else 0)
-        return NOTHING._replace(power=power or Power.UNKNOWN)
+        return no_order()._replace(power=power or Power.UNKNOWN)
     stiff = values.get(Register.COMMAND_KP_SCALE, 1.0) > 0
     position = values.get(Register.COMMAND_POSITION, math.nan) * TURN
     velocity = values.get(Register.COMMAND_VELOCITY, 0.0) * TURN

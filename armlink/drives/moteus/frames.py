@@ -102,7 +102,8 @@ def pack(writes: Mapping[int, float], reads: Sequence[int], resolution: int = FL
     Raises ValueError for more than 64 bytes.
     """
     data = b"".join(
-        _head(WRITE, _form(run[0], resolution), run) + b"".join(pack_value(r, writes[r], resolution) for r in run)
+        _head(WRITE, _form(run[0], resolution), run)
+        + b"".join(pack_value(r, writes[r], _form(r, resolution)) for r in run)
         for run in _runs(sorted(writes), resolution)
     )
     data += b"".join(_head(READ, _form(run[0], resolution), run) for run in _runs(sorted(reads), resolution))

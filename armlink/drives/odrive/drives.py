@@ -7,9 +7,10 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from armlink.arm_file import LinkJoint, LinkSection
+from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import REMOTE, Frame
-from armlink.drives.family import Ask, Drives
+from armlink.drives.base import BasicDrives, no_order
+from armlink.drives.family import Ask
 from armlink.drives.odrive import frames
 from armlink.drives.odrive.frames import (
     INPUT_FEED_FORWARD,
@@ -44,7 +45,6 @@ PATIENCE = 0.5
 """Longest wait for heartbeat, estimates and torques at the start [s]."""
 LARGEST_POSITION = 1e5
 """No motor's position is larger [rev]; a larger one is no reading."""
-NOTHING = Order(Power.UNKNOWN, False, Mode.OFF, *[math.nan] * 5)
 
 
 @dataclass
@@ -61,33 +61,34 @@ class _Known:
     """Messages that have come."""
     mode: int = 0
     """Control mode that it was last told; 0: none."""
-    asked: float = -math.inf
-    """When a state was last asked for [s]."""
-    was_on: bool = False
-    sent: Order = NOTHING
+    asked: tuple[int, float] = (0, -math.inf)
+    """Message or state that was last asked for, and when [s]."""
+    sent: Order | None = None
+    stopping: bool = False
+    """The newest input holds it where it stood, whatever was ordered."""
 
 
-class ODriveDrives(Drives):
+class ODriveDrives(BasicDrives):
     """The axes of one bus; see `Drives`."""
 
-    def __init__(self, joints: Sequence[LinkJoint], section: LinkSection) -> None:
+    def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
         """Nothing is sent."""
-        self._names = [joint.name for joint in joints]
+        super().__init__(joints, TRAITS)
         self._settings = [joint.settings for joint in joints]
         self._known = [_Known() for _ in joints]
         self._joint_of = {settings.node: joint for joint, settings in enumerate(self._settings)}
-
-    def traits(self, joint: int) -> Traits:
-        """See Drives."""
-        return TRAITS
 
     def routes(self) -> Mapping[int, int]:
         """See Drives."""
         return {identifier(node, message): joint for node, joint in self._joint_of.items() for message in FROM_DRIVE}
 
-    def commands(self) -> Mapping[int, int]:
+    def commands(self) -> Mapping[int, str]:
         """See Drives."""
-        return {identifier(node, message): joint for node, joint in self._joint_of.items() for message in FROM_HOST}
+        return {
+            identifier(node, message): f"{message.name.lower().replace('_', ' ')} to {self.names[joint]}"
+            for node, joint in self._joint_of.items()
+            for message in FROM_HOST
+        }
 
     # ---- set-up
 
@@ -129,7 +130,7 @@ class ODriveDrives(Drives):
         return [self._result(joint, limit) for joint, limit in enumerate(limits)]
 
     def _result(self, joint: int, limit: Limits) -> Setup:
-        known, name, address = self._known[joint], self._names[joint], self._settings[joint].address
+        known, name, address = self._known[joint], self.names[joint], self._settings[joint].address
         if Message.HEARTBEAT not in known.came:
             raise BusFault(f"{name}: no heartbeat from {address}: is it powered, its node id and bit rate right?")
         if Message.ESTIMATES not in known.came or not math.isfinite(known.position):
@@ -141,7 +142,7 @@ class ODriveDrives(Drives):
         if Message.TORQUES not in known.came:
             lost = ("torques (1Ch) do not come: no torque reading; set axis0.config.can.torques_msg_rate_ms",)
             modes.discard(int(Mode.TORQUE))
-        known.limits, known.mode, known.was_on = limit, 0, False
+        known.limits, known.mode = limit, 0
         return Setup(
             position=known.position,
             torque=0.0,
@@ -153,59 +154,56 @@ class ODriveDrives(Drives):
 
     # ---- cycle
 
-    def frames(self, orders: Sequence[Order], now: float) -> list[Frame]:
+    def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
         """See Drives."""
-        return [frame for joint, order in enumerate(orders) for frame in self._frames(joint, order, now)]
+        return [
+            frame
+            for joint, order in enumerate(orders)
+            if order is not None
+            for frame in self._frames(joint, order, now)
+        ]
 
     def _frames(self, joint: int, order: Order, now: float) -> list[Frame]:
         known = self._known[joint]
         state = known.heartbeat.state if known.heartbeat else AxisState.UNDEFINED
         on = state == AxisState.CLOSED_LOOP
-        known.sent = NOTHING._replace(power=Power.OFF)
+        held, known.sent, known.stopping = known.sent, None, False
         if order.power is Power.ON and on:
-            known.was_on = True
             return self._input(joint, order)
         if order.power is Power.ON and order.walk and known.heartbeat is not None:
             return self._towards_on(joint, order, now)
         if order.power is Power.STOPPED and on:
             # no state in which it holds without its host: hold by input, where it stands now
-            return self._input(joint, self._standing(joint))
-        if order.power is not Power.ON and (on or state == AxisState.UNDEFINED) and self._may_ask(known, now):
+            known.stopping = True
+            at = held.position if held is not None and held.power is Power.STOPPED else known.position
+            return self._input(joint, Order(Power.STOPPED, False, Mode.POSITION, at, 0.0, 0.0, 0.0, 0.0))
+        if (
+            order.power is not Power.ON
+            and (on or state == AxisState.UNDEFINED)
+            and _may_ask(known, AxisState.IDLE, now)
+        ):
             return [self._message(joint, Message.AXIS_STATE, AxisState.IDLE)]
         return []
 
     def _towards_on(self, joint: int, order: Order, now: float) -> list[Frame]:
         known = self._known[joint]
-        known.sent = NOTHING._replace(power=Power.READY)
         found: list[Frame] = []
         if known.heartbeat is not None and known.heartbeat.error:
-            if self._may_ask(known, now):
+            if _may_ask(known, -Message.CLEAR_ERRORS, now):
                 found = [self._message(joint, Message.CLEAR_ERRORS, 0)]
             return found
         known.mode = 0
         fed = self._input(joint, order)
-        known.sent = NOTHING._replace(power=Power.READY)
-        if self._may_ask(known, now):
+        known.sent = None
+        if _may_ask(known, AxisState.CLOSED_LOOP, now):
             return [*fed, self._message(joint, Message.AXIS_STATE, AxisState.CLOSED_LOOP)]
         return fed
-
-    def _may_ask(self, known: _Known, now: float) -> bool:
-        """Whether a state may be asked for: not before the last request has had time to show."""
-        if now - known.asked < ASK_AGAIN:
-            return False
-        known.asked = now
-        return True
-
-    def _standing(self, joint: int) -> Order:
-        known = self._known[joint]
-        held = known.sent.position if known.sent.power is Power.STOPPED else known.position
-        return Order(Power.STOPPED, False, Mode.POSITION, held, 0.0, 0.0, 0.0, 0.0)
 
     def _input(self, joint: int, order: Order) -> list[Frame]:
         """Control mode where it changes, and the input."""
         known = self._known[joint]
         if known.limits is None:
-            raise BusFault(f"{self._names[joint]}: a command before the set-up")
+            raise BusFault(f"{self.names[joint]}: a command before the set-up")
         control = TORQUE_CONTROL if order.mode == Mode.TORQUE else POSITION_CONTROL
         if control == TORQUE_CONTROL:
             most = known.limits.max_torque * (1 - 2.0**-23)
@@ -225,7 +223,7 @@ class ODriveDrives(Drives):
     def _message(self, joint: int, message: Message, *values: int) -> Frame:
         return identifier(self._settings[joint].node, message), pack(message, *values)
 
-    def sent(self, joint: int) -> Order:
+    def sent(self, joint: int) -> Order | None:
         """See Drives."""
         return self._known[joint].sent
 
@@ -240,7 +238,7 @@ class ODriveDrives(Drives):
         known.came.add(message)
         if message == Message.HEARTBEAT:
             known.heartbeat = frames.heartbeat(data)
-            return Reading(joint, power=self.power(joint), fault=self._fault_text(known))
+            return self.note(Reading(joint, power=_power(known), fault=_fault_text(known)))
         if message == Message.ESTIMATES:
             position, velocity = values
             if not abs(position) < LARGEST_POSITION or not math.isfinite(velocity):
@@ -251,43 +249,27 @@ class ODriveDrives(Drives):
             known.torque = values[1]
             return Reading(joint, motor_torque=values[1])
         if message == Message.TEMPERATURE and all(math.isfinite(value) for value in values):
-            return Reading(joint, temperature=max(values))
+            return self.note(Reading(joint, temperature=max(values)))
         return None
 
-    def power(self, joint: int) -> Power:
-        """See Drives. The state counts, not the error: that can be 0 after a disarm."""
-        known = self._known[joint]
-        if known.heartbeat is None:
-            return Power.UNKNOWN
-        if known.heartbeat.state == AxisState.CLOSED_LOOP:
-            return Power.STOPPED if known.sent.power is Power.STOPPED else Power.ON
-        if known.heartbeat.error:
-            return Power.FAULT
-        return Power.OFF if known.heartbeat.state == AxisState.IDLE else Power.READY
-
-    def fault(self, joint: int, wanted_on: bool, now: float) -> BusFault | None:
+    def fault(self, modes: Sequence[int], now: float) -> BusFault | None:
         """See Drives."""
-        known, name = self._known[joint], self._names[joint]
-        if known.heartbeat is None or known.heartbeat.state == AxisState.CLOSED_LOOP:
-            return None
-        text = self._fault_text(known)
-        if text:
-            watchdog = known.heartbeat.error & AxisError.WATCHDOG
-            return (Stall if watchdog else BusFault)(f"{name}: {text}")
-        if wanted_on:
-            state = known.heartbeat.state
-            return BusFault(f"{name}: the axis is in state {state} without telling an error, expected 8 (closed loop)")
-        return None
+        lost = self.own_stop()
+        return Stall(lost) if lost else super().fault(modes, now)
 
-    @staticmethod
-    def _fault_text(known: _Known) -> str:
-        error = known.heartbeat.error if known.heartbeat else 0
-        return f"{error_names(error)} (axis error {error:#x})" if error else ""
+    def own_stop(self) -> str:
+        """See Drives."""
+        for joint, known in enumerate(self._known):
+            beat = known.heartbeat
+            if beat is not None and beat.state != AxisState.CLOSED_LOOP and beat.error & AxisError.WATCHDOG:
+                return f"{self.where(joint)}: its watchdog ran out: idle, the torque is off"
+        return ""
 
-    def forget(self, joint: int) -> None:
+    def forget(self) -> None:
         """See Drives; the next request goes out at once."""
-        self._known[joint].asked = -math.inf
-        self._known[joint].was_on = False
+        super().forget()
+        for known in self._known:
+            known.asked = (0, -math.inf)
 
     # ---- listening
 
@@ -300,17 +282,44 @@ class ODriveDrives(Drives):
         return None if order is None else (joint, order)
 
 
+def _may_ask(known: _Known, what: int, now: float) -> bool:
+    """Whether something may be asked for: not again before the last request for it has had time to show."""
+    if known.asked[0] == what and now - known.asked[1] < ASK_AGAIN:
+        return False
+    known.asked = (what, now)
+    return True
+
+
+def _power(known: _Known) -> Power:
+    """The state counts, not the error: that can be 0 after a disarm."""
+    beat = known.heartbeat
+    if beat is None:
+        return Power.UNKNOWN
+    if beat.state == AxisState.CLOSED_LOOP:
+        return Power.STOPPED if known.stopping else Power.ON
+    if beat.error & AxisError.WATCHDOG:
+        return Power.STOPPED
+    if beat.error:
+        return Power.FAULT
+    return Power.OFF if beat.state == AxisState.IDLE else Power.READY
+
+
+def _fault_text(known: _Known) -> str:
+    error = known.heartbeat.error & ~AxisError.WATCHDOG if known.heartbeat else 0
+    return f"{error_names(error)} (axis error {error:#x})" if error else ""
+
+
 def _order_of(can_id: int, data: bytes) -> Order | None:
     """The order that a host's message gives, or None."""
     message = can_id & 0x1F
     values = unpack(message, data)
     if message == Message.ESTOP:
-        return NOTHING._replace(power=Power.OFF)
+        return no_order()._replace(power=Power.OFF)
     if values is None:
         return None
     if message == Message.AXIS_STATE:
         power: dict[float, Power] = {AxisState.IDLE: Power.OFF, AxisState.CLOSED_LOOP: Power.ON}
-        return NOTHING._replace(power=power[values[0]]) if values[0] in power else None
+        return no_order()._replace(power=power[values[0]]) if values[0] in power else None
     if message == Message.INPUT_TORQUE:
         return Order(Power.ON, False, Mode.TORQUE, math.nan, math.nan, values[0], 0.0, 0.0)
     if message == Message.INPUT_POSITION:

@@ -1,13 +1,14 @@
 """RobStride drives on one bus, in the private protocol: one motion command and one feedback a cycle."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from armlink.arm_file import LinkJoint, LinkSection
+from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import EXTENDED, Frame
-from armlink.drives.family import Ask, Drives
-from armlink.drives.mit_packing import MitCommand, Ranges, round_within
+from armlink.drives.base import BasicDrives, no_order
+from armlink.drives.family import ANY, BROADCAST, Ask
+from armlink.drives.mit_packing import MitCommand, Ranges, damping, round_within
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
 from armlink.drives.robstride import frames
 from armlink.drives.robstride.frames import RANGES, Type, fault_names
@@ -18,7 +19,6 @@ from armlink.errors import BusFault, Stall
 TRAITS = Traits(torque="current", calibration="host", silence="falls", bounds=(), cadence="reply", frame="29")
 HOST_TYPES = frozenset((Type.MOTION, Type.ENABLE, Type.STOP, Type.SET_ZERO, Type.SET_ID, Type.WRITE, Type.SAVE))
 """Frames that change something, which one host alone may send."""
-NOTHING = Order(Power.UNKNOWN, False, Mode.OFF, *[math.nan] * 5)
 
 
 @dataclass
@@ -34,56 +34,27 @@ class _Known:
     damping: bool = False
     was_on: bool = False
     """It has been on since forget()."""
-    sent: Order = NOTHING
+    sent: Order | None = None
 
 
-class CommandIds(Mapping[int, int]):
-    """Identifiers of a host's commands → joint: the torque of a motion command is part of its identifier."""
-
-    def __init__(self, joint_of: Mapping[int, int]) -> None:
-        """`joint_of`: motor id → joint."""
-        self._joint_of = joint_of
-
-    def __getitem__(self, can_id: int) -> int:
-        if not can_id & EXTENDED or frames.kind_of(can_id) not in HOST_TYPES:
-            raise KeyError(can_id)
-        return self._joint_of[can_id & 0xFF]
-
-    def __iter__(self) -> Iterator[int]:
-        """One identifier of each type and drive."""
-        return (frames.identifier(kind, 0, drive) | EXTENDED for drive in self._joint_of for kind in HOST_TYPES)
-
-    def __len__(self) -> int:
-        """Number of types and drives."""
-        return len(self._joint_of) * len(HOST_TYPES)
-
-
-class RobStrideDrives(Drives):
+class RobStrideDrives(BasicDrives):
     """The drives of one bus; see `Drives`."""
 
-    def __init__(self, joints: Sequence[LinkJoint], section: LinkSection) -> None:
+    def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
         """Nothing is sent."""
-        self._names = [joint.name for joint in joints]
+        super().__init__(joints, TRAITS)
         self._settings = [joint.settings for joint in joints]
         self._known = [_Known(RANGES[settings.model]) for settings in self._settings]
         self._joint_of = {settings.id: joint for joint, settings in enumerate(self._settings)}
-
-    def traits(self, joint: int) -> Traits:
-        """See Drives."""
-        return TRAITS
+        self._intruder = ""
 
     def routes(self) -> Mapping[int, int]:
-        """Feedback and reports, with all modes and faults that their identifiers may tell."""
-        found = {}
-        for joint, settings in enumerate(self._settings):
-            for kind in (Type.FEEDBACK, Type.REPORT):
-                for head in range(0x100):
-                    found[frames.identifier(kind, head << 8 | settings.id, settings.host) | EXTENDED] = joint
-        return found
+        """Any: the identifiers carry mode and faults, and another host's carry torques."""
+        return {ANY: BROADCAST}
 
-    def commands(self) -> Mapping[int, int]:
-        """See Drives."""
-        return CommandIds(self._joint_of)
+    def commands(self) -> Mapping[int, str]:
+        """None by identifier, for a motion command's tells its torque: alarm() names another host."""
+        return {}
 
     # ---- set-up
 
@@ -109,20 +80,17 @@ class RobStrideDrives(Drives):
         """See Drives."""
         found = []
         for joint, (known, settings, limit) in enumerate(zip(self._known, self._settings, limits, strict=True)):
-            result = prepare(ask, self._names[joint], settings, limit, known.ranges)
+            result = prepare(ask, self.names[joint], settings, limit, known.ranges)
             known.limits, known.mode, known.position, known.was_on = limit, None, result.position, False
             found.append(result)
         return found
 
     # ---- cycle
 
-    def frames(self, orders: Sequence[Order], now: float) -> list[Frame]:
+    def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
         """See Drives."""
-        found = []
-        for joint, order in enumerate(orders):
-            can_id, data = self._frame(joint, order)
-            found.append((can_id | EXTENDED, data))
-        return found
+        found = [self._frame(joint, order) for joint, order in enumerate(orders) if order is not None]
+        return [(can_id | EXTENDED, data) for can_id, data in found]
 
     def _frame(self, joint: int, order: Order) -> Frame:
         known, settings = self._known[joint], self._settings[joint]
@@ -133,18 +101,19 @@ class RobStrideDrives(Drives):
             return self._command(joint, order)
         if on and order.power is Power.STOPPED:
             known.damping = True
-            quiet = MitCommand(known.position, 0.0, 0.0, settings.kd, 0.0)
+            assert known.limits is not None
+            quiet = damping(settings.kd, known.position, known.velocity, known.limits.max_torque)
             return self._motion(joint, quiet, Power.STOPPED)
-        known.sent = NOTHING._replace(power=Power.OFF)
+        known.sent = None
+        known.was_on = known.was_on and order.power is Power.ON
         if order.power is Power.ON and order.walk and known.mode is not None and not known.faults:
-            known.sent = NOTHING._replace(power=Power.READY)
             return frames.enable_frame(settings.id, settings.host)
         return frames.stop_frame(settings.id, settings.host, clear_fault=order.walk and bool(known.faults))
 
     def _command(self, joint: int, order: Order) -> Frame:
         known = self._known[joint]
         if known.limits is None:
-            raise BusFault(f"{self._names[joint]}: a command before the set-up")
+            raise BusFault(f"{self.names[joint]}: a command before the set-up")
         stiff = order.mode == Mode.POSITION
         asked = MitCommand(
             order.position, order.velocity, order.kp if stiff else 0.0, order.kd if stiff else 0.0, order.torque
@@ -167,14 +136,19 @@ class RobStrideDrives(Drives):
         known.sent = _order_of(frames.unpack_motion(*frame, known.ranges))._replace(power=power)
         return frame
 
-    def sent(self, joint: int) -> Order:
+    def sent(self, joint: int) -> Order | None:
         """See Drives."""
         return self._known[joint].sent
 
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
         """See Drives."""
+        if not can_id & EXTENDED:
+            return None
+        if frames.kind_of(can_id) in HOST_TYPES and (addressed := self._joint_of.get(can_id & 0xFF)) is not None:
+            kind = Type(frames.kind_of(can_id)).name.lower().replace("_", " ")
+            self._intruder = f"{self.where(addressed)}: another host sends {kind} ({can_id & 0x1FFFFFFF:08X}h)"
         joint = self._joint_of.get(frames.data_of(can_id) & 0xFF)
-        if joint is None or not can_id & EXTENDED or can_id & 0xFF != self._settings[joint].host:
+        if joint is None or can_id & 0xFF != self._settings[joint].host:
             return None
         known = self._known[joint]
         feedback = frames.unpack_feedback(can_id, data, known.ranges)
@@ -182,42 +156,46 @@ class RobStrideDrives(Drives):
             return None
         known.mode, known.faults = feedback.mode, feedback.faults
         known.position, known.velocity = feedback.motion.position, feedback.motion.velocity
-        return Reading(
-            joint,
-            feedback.motion.position,
-            feedback.motion.velocity,
-            feedback.motion.torque,
-            temperature=feedback.temperature,
-            power=self.power(joint),
-            fault=fault_names(feedback.faults),
+        return self.note(
+            Reading(
+                joint,
+                feedback.motion.position,
+                feedback.motion.velocity,
+                feedback.motion.torque,
+                temperature=feedback.temperature,
+                power=_power(known),
+                fault=_fault_text(feedback.faults),
+            )
         )
 
-    def power(self, joint: int) -> Power:
-        """See Drives."""
-        known = self._known[joint]
-        if known.mode is None:
-            return Power.UNKNOWN
-        if known.faults:
-            return Power.FAULT
-        if known.mode == frames.Mode.RUN:
-            return Power.STOPPED if known.damping else Power.ON
-        return Power.OFF if known.mode == frames.Mode.RESET else Power.READY
+    def alarm(self) -> BusFault | None:
+        """See Drives: another host."""
+        return BusFault(self._intruder) if self._intruder else None
 
-    def fault(self, joint: int, wanted_on: bool, now: float) -> BusFault | None:
+    def fault(self, modes: Sequence[int], now: float) -> BusFault | None:
         """See Drives. A watchdog that ran out shows as mode reset alone."""
-        known, name = self._known[joint], self._names[joint]
-        if known.faults:
-            return BusFault(f"{name}: {fault_names(known.faults)} (fault bits {known.faults:02X}h)")
-        if wanted_on and known.mode is not None and known.mode != frames.Mode.RUN:
-            text = f"{name}: the drive went to mode {known.mode} (reset) by itself"
-            if known.was_on:
-                return Stall(f"{text}: its canTimeout ran out, the torque is off")
-            return BusFault(f"{text}, expected run")
-        return None
+        for joint, mode in enumerate(modes):
+            if mode and self._stopped_itself(joint):
+                return Stall(f"{self.where(joint)}: went to mode reset: its canTimeout ran out, the torque is off")
+        return super().fault(modes, now)
 
-    def forget(self, joint: int) -> None:
-        """See Drives; mode and faults are those of the newest feedback."""
-        self._known[joint].damping = self._known[joint].was_on = False
+    def own_stop(self) -> str:
+        """See Drives."""
+        for joint, name in enumerate(self.names):
+            if self._stopped_itself(joint):
+                return f"{name} stopped itself (mode reset)"
+        return ""
+
+    def _stopped_itself(self, joint: int) -> bool:
+        known = self._known[joint]
+        return known.was_on and known.mode == frames.Mode.RESET and not known.faults
+
+    def forget(self) -> None:
+        """See Drives."""
+        super().forget()
+        self._intruder = ""
+        for known in self._known:
+            known.damping = known.was_on = False
 
     # ---- listening
 
@@ -231,7 +209,19 @@ class RobStrideDrives(Drives):
             return joint, _order_of(frames.unpack_motion(can_id, data, self._known[joint].ranges))
         powers: dict[int, Power] = {Type.ENABLE: Power.ON, Type.STOP: Power.OFF}
         power = powers.get(kind)
-        return None if power is None else (joint, NOTHING._replace(power=power))
+        return None if power is None else (joint, no_order()._replace(power=power))
+
+
+def _power(known: _Known) -> Power:
+    if known.faults:
+        return Power.FAULT
+    if known.mode == frames.Mode.RUN:
+        return Power.STOPPED if known.damping else Power.ON
+    return Power.OFF if known.mode == frames.Mode.RESET else Power.READY
+
+
+def _fault_text(bits: int) -> str:
+    return f"{fault_names(bits)} (fault bits {bits:02X}h)" if bits else ""
 
 
 def _order_of(command: MitCommand) -> Order:
