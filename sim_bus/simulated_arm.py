@@ -80,9 +80,9 @@ class SimulatedArm:
         motors = [Motor(j, joint, self.drives.loops, self.sensors, readings) for j, joint in enumerate(link.joints)]
         self.fronts = build_fronts(arm, motors, self._sender)
         """Bus and drives of every family but CANopen."""
-        self._drive_at = {drive.joint: drive for _, front in self.fronts for drive in front.drives}
+        self.drive_at = {drive.joint: drive for _, front in self.fronts for drive in front.drives}
         self._set_torque_constants()
-        for drive in self._drive_at.values():
+        for drive in self.drive_at.values():
             drive.pass_time(0.0)
 
     # ---- bus
@@ -118,13 +118,13 @@ class SimulatedArm:
         remaining = duration
         while remaining > 1e-9:
             piece = min(remaining, self.period)
-            for drive in self._drive_at.values():
+            for drive in self.drive_at.values():
                 drive.control(piece)
             self.drives.loops.advance(piece, self._synchronous)
             self._synchronous = False
             self.time += piece
             remaining -= piece
-            for drive in self._drive_at.values():
+            for drive in self.drive_at.values():
                 drive.pass_time(self.time)
             if self.supervision.due <= self.time:
                 self.supervision.check(self.time)
@@ -140,21 +140,27 @@ class SimulatedArm:
         if joint in self._node_at:
             self._nmt.command(self._node_at[joint], RESET_NODE, self.time)
         else:
-            self._drive_at[joint].reboot()
+            self.drive_at[joint].reboot()
 
     def device(self, joint: int) -> Node | SimulatedDrive:
         """What stands for a joint on the bus: its CANopen node, or its drive of another family."""
-        return self._node_at.get(joint) or self._drive_at[joint]
+        return self._node_at.get(joint) or self.drive_at[joint]
+
+    def joint_of(self, can_id: int) -> int | None:
+        """Joint whose device sends frames of this identifier, or None."""
+        if can_id < 0x800 and (place := self.place_of.get(can_id & 0x7F)) is not None and can_id >= 0x80:
+            return place
+        return next((joint for _, front in self.fronts if (joint := front.joint_of(can_id)) is not None), None)
 
     @property
     def due(self) -> float:
         """When a device next acts by itself [s]."""
-        return min([self.supervision.due, *(drive.due for drive in self._drive_at.values())])
+        return min([self.supervision.due, *(drive.due for drive in self.drive_at.values())])
 
     def postpone(self, seconds: float) -> None:
         """Postpone all deadlines for the host [s], because the simulated arm itself was late."""
         self.supervision.postpone(seconds)
-        for drive in self._drive_at.values():
+        for drive in self.drive_at.values():
             drive.postpone(seconds)
 
     @property
@@ -214,7 +220,7 @@ class SimulatedArm:
     def _set_torque_constants(self) -> None:
         """A drive without a torque sensor makes as much torque too little as its reading is too large."""
         current = np.zeros(self.n, bool)
-        current[list(self._drive_at)] = True
+        current[list(self.drive_at)] = True
         self.plant.torque_constant = np.where(current, self.sensors.gain, 1.0)
         self.drives.loops.imagined = np.where(current, self.sensors.offset, 0.0)
         self.drives.loops.reconfigure()

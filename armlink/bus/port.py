@@ -18,12 +18,16 @@ ERROR = 0x20000000
 """Flag in the identifier of an error frame, as in SocketCAN."""
 
 
+CLASSICAL = 1 << 33
+"""Flag of a frame that leaves as classical CAN on a port that sends CAN FD; never in the identifier of one that came."""
+
+
 class InterfaceDown(BusFault):
     """The interface is down; it may come up again."""
 
 
 class Port(Protocol):
-    """Frames with 11-bit identifiers; error frames are counted, extended and remote frames are dropped."""
+    """Frames with their flags; error frames are counted."""
 
     @property
     def errors(self) -> int:

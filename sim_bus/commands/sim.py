@@ -74,9 +74,10 @@ def sim(
     try:
         pipe = None if control is None else ControlPipe(control)
         console = Console(stderr=True)
+        addresses = [joint.settings.address for joint in described.require_link().joints]
         console.print(
-            f"{described.name}: {simulated.n} joints, nodes {', '.join(str(node.node_id) for node in simulated.nodes)} "
-            f"on {endpoint.channel_info}; stop with Ctrl-C"
+            f"{described.name}: {simulated.n} joints, {', '.join(addresses)} on {endpoint.channel_info}; "
+            f"stop with Ctrl-C"
         )
         server = Server(simulated, endpoint, drifts, lockstep, faults=faults, control=pipe)
         server.on_wrong = lambda wrong: console.print(f"sim: {wrong}", markup=False)

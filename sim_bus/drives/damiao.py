@@ -196,6 +196,11 @@ class DamiaoFront:
         elif (addressed := self._commanded.get(can_id)) is not None:
             addressed.on_frame(can_id, data)
 
+    def joint_of(self, can_id: int) -> int | None:
+        """See Front; None where several drives share a reply id."""
+        found = [drive.joint for drive in self.drives if drive.registers[Register.REPLY_ID] == can_id]
+        return found[0] if len(found) == 1 else None
+
 
 def _wrapped(position: float, largest: float) -> float:
     """Position as the drive shows it, within ±largest."""

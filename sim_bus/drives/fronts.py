@@ -29,6 +29,10 @@ class Front(Protocol):
         """A frame from the bus."""
         ...
 
+    def joint_of(self, can_id: int) -> int | None:
+        """Joint whose drive sends frames of this identifier, or None."""
+        ...
+
 
 def _damiao(arm: ArmFile, joints: Sequence[Joint], send: Send) -> Front:
     drives = []

@@ -233,3 +233,8 @@ class MoteusFront:
                 drive.on_frame(number, data)
         elif number >> 16 == 0 and (drive_at := self._addressed.get(number & 0x7F)) is not None:
             drive_at.on_frame(number, data)
+
+    def joint_of(self, can_id: int) -> int | None:
+        """See Front."""
+        drive = self._addressed.get(can_id >> 8 & 0x7F) if can_id & 0x1FFFFFFF < 0x10000 else None
+        return None if drive is None else drive.joint

@@ -224,3 +224,8 @@ class ODriveFront:
         drive = self._addressed.get((can_id & 0x7FF) >> 5)
         if drive is not None:
             drive.on_frame(can_id & (0x7FF | REMOTE), data)
+
+    def joint_of(self, can_id: int) -> int | None:
+        """See Front."""
+        drive = self._addressed.get(can_id >> 5) if can_id < 0x800 else None
+        return None if drive is None else drive.joint

@@ -208,3 +208,8 @@ class RobStrideFront:
         drive = self._addressed.get(can_id & 0xFF)
         if drive is not None:
             drive.on_frame(can_id & 0x1FFFFFFF, data)
+
+    def joint_of(self, can_id: int) -> int | None:
+        """See Front."""
+        drive = self._addressed.get(can_id >> 8 & 0xFF) if can_id & EXTENDED else None
+        return None if drive is None else drive.joint

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 
+from armlink.bus.port import CLASSICAL
 from sim_bus.drives.motor import Motor
 
 STAGE_TEMPERATURE, MOTOR_TEMPERATURE = 31.0, 33.0
@@ -44,7 +45,7 @@ class SimulatedDrive:
     def answer(self, can_id: int, data: bytes) -> None:
         """Send a frame, but from an unplugged drive."""
         if not self.unplugged:
-            self._send(can_id, data)
+            self._send(can_id | CLASSICAL * ("drive.classic" in self.faults), data)
 
     # ---- time
 

@@ -97,7 +97,9 @@ class Bench:
         self.listen()
         return sent
 
-    def order(self, joint: int, mode: int = Mode.POSITION, torque: float = 0.0, position=None, power=Power.ON, walk=False):
+    def order(
+        self, joint: int, mode: int = Mode.POSITION, torque: float = 0.0, position=None, power=Power.ON, walk=False
+    ):
         settings = self.link.joints[joint].settings
         stiff = mode == Mode.POSITION
         kp, kd = (getattr(settings, "kp", 0.0), getattr(settings, "kd", 0.0)) if stiff else (0.0, 0.0)
