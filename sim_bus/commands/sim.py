@@ -1,9 +1,12 @@
 """Runs a simulated arm on a CAN bus, in real time, until stopped."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from armlink.arm_file import ArmFile
 
 
 def sim(
@@ -74,9 +77,8 @@ def sim(
     try:
         pipe = None if control is None else ControlPipe(control)
         console = Console(stderr=True)
-        addresses = [joint.settings.address for joint in described.require_link().joints]
         console.print(
-            f"{described.name}: {simulated.n} joints, {', '.join(addresses)} on {endpoint.channel_info}; "
+            f"{described.name}: {simulated.n} joints, {_addresses(described)} on {endpoint.channel_info}; "
             f"stop with Ctrl-C"
         )
         server = Server(simulated, endpoint, drifts, lockstep, faults=faults, control=pipe)
@@ -86,3 +88,12 @@ def sim(
         if pipe is not None:
             pipe.close()
         endpoint.shutdown()
+
+
+def _addresses(arm: "ArmFile") -> str:
+    """Ids of the drives: `nodes 1, 2`, or each with its word where they differ."""
+    parts = [joint.settings.address.rpartition(" ") for joint in arm.require_link().joints]
+    words = {word for word, _, _ in parts}
+    if len(words) == 1:
+        return f"{words.pop()}s {', '.join(number for _, _, number in parts)}"
+    return ", ".join("".join(part) for part in parts)

@@ -28,7 +28,7 @@ DEFAULT_TIMEOUT = 0.1
 """servo.default_timeout_s [s]."""
 TIMEOUT_TORQUE = 5.0
 """servo.timeout_max_torque_Nm: largest torque of the zero-velocity mode [N·m]."""
-ENCODER_FAULT = 34
+ENCODER_FAULT = 35
 NO_REGISTER = 1
 HOME_OUTPUT = 2
 """Home state: positions are those of the output."""

@@ -17,4 +17,4 @@ class ODriveSettings(DriveSettings):
     @property
     def address(self) -> str:
         """Its id on the bus."""
-        return f"axis {self.node}"
+        return f"node {self.node}"
