@@ -24,14 +24,27 @@ HOMED_AT_OUTPUT = 2
 LARGEST_POSITION = 1e4
 """No joint's position is larger [rev]; a larger one is no reading."""
 FAULTS = {
-    32: "calibration fault", 33: "motor driver", 34: "overvoltage", 35: "encoder", 36: "motor not configured",
-    37: "control loop overrun", 38: "power stage too hot", 39: "start outside of the position limits",
-    40: "undervoltage", 41: "configuration changed", 42: "theta invalid", 43: "position invalid",
-    44: "driver enable", 45: "stop position deprecated", 46: "timing violation", 47: "no auxiliary encoder",
-    48: "limit of phase current", 49: "motor too hot",
-}  # fmt: skip
-"""Fault codes; 96 to 104 only tell what limits the torque at present."""
-LIMITING = 96
+    32: "calibration fault",
+    33: "motor driver",
+    34: "overvoltage",
+    35: "encoder",
+    36: "motor not configured",
+    37: "control loop overrun",
+    38: "too hot",
+    39: "start outside of servopos.position_min and position_max",
+    40: "undervoltage",
+    41: "configuration changed",
+    42: "no valid commutation encoder",
+    43: "no valid output encoder",
+    44: "gate driver could not be enabled",
+    45: "stop position with limits",
+    46: "timing violation",
+    47: "back-EMF feed-forward without an acceleration limit",
+    48: "invalid position limits",
+    49: "position error too large",
+    50: "velocity error too large",
+}
+"""Fault codes of mode 1; in other modes 96 to 105 tell what limits the torque at present."""
 STOPS = {frames.Mode.STOPPED: Power.OFF, frames.Mode.FAULT: Power.FAULT, frames.Mode.POSITION: Power.ON}
 STOPPED_MODES = (frames.Mode.TIMEOUT, frames.Mode.ZERO_VELOCITY, frames.Mode.BRAKE)
 
