@@ -19,7 +19,7 @@ ERROR = 0x20000000
 
 
 CLASSICAL = 1 << 33
-"""Flag of a frame that leaves as classical CAN on a port that sends CAN FD; never in the identifier of one that came."""
+"""Flag of a frame that leaves as classical CAN on a port that sends CAN FD; a frame that came never has it."""
 
 
 class InterfaceDown(BusFault):

@@ -129,7 +129,11 @@ def round_within(
 
     `coded` gives a command as its bytes tell it. `position` and `velocity` are the newest readings (NaN if there are
     none), by which the sum of the law is bounded; the torque alone and the target position are bounded in any case.
+
+    Raises ValueError for numbers that are not finite.
     """
+    if not all(math.isfinite(value) for value in command):
+        raise ValueError(f"{command} cannot be packed: expected finite numbers")
     most = limits.max_torque
     torque = max(-most, min(most, command.torque))
     command = command._replace(torque=torque)

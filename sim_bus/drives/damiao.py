@@ -38,6 +38,8 @@ MODELS = {
     "DM6248P": (12.566, 20.0, 120.0),
 }
 """Registers PMAX, VMAX, TMAX as the maker delivers each model."""
+LEAST_RANGE = 1e-3
+"""A range register of 0 counts as this."""
 STORE = 0xAA
 OTHER_MODES = 0x100, 0x200, 0x300
 """Offsets of the command ids of the position, velocity and force modes."""
@@ -69,11 +71,9 @@ class DamiaoDrive(SimulatedDrive):
     @property
     def coding(self) -> Ranges:
         """Ranges by which it really codes and decodes."""
-        registers = self.registers
+        position, velocity, torque = (max(self.registers[number], LEAST_RANGE) for number in (21, 22, 23))
         return Ranges(
-            registers[Register.POSITION_RANGE] * self.scale("position"),
-            registers[Register.VELOCITY_RANGE] * self.scale("velocity"),
-            registers[Register.TORQUE_RANGE] * self.scale("torque"),
+            position * self.scale("position"), velocity * self.scale("velocity"), torque * self.scale("torque")
         )
 
     @property

@@ -99,8 +99,8 @@ class ODriveDrives(BasicDrives):
             version = self._request(ask, joint, Message.VERSION)
             if version is None:
                 known = self._known[joint]
-                ask.wait(lambda known=known: known.heartbeat is not None, PATIENCE)  # type: ignore[misc]
-                there = known.heartbeat is not None
+                known.came.discard(Message.HEARTBEAT)
+                there = ask.wait(lambda known=known: Message.HEARTBEAT in known.came, PATIENCE)  # type: ignore[misc]
                 found.append(DriveIdentity(joint, settings.address, there, "ODrive" if there else ""))
                 continue
             _, product, major, minor, *firmware, _ = (int(value) for value in version)

@@ -107,6 +107,8 @@ class RobStrideDrives(BasicDrives):
         known.sent = None
         known.was_on = known.was_on and order.power is Power.ON
         if order.power is Power.ON and order.walk and known.mode is not None and not known.faults:
+            if known.limits is None:
+                raise BusFault(f"{self.names[joint]}: a command before the set-up")
             return frames.enable_frame(settings.id, settings.host)
         return frames.stop_frame(settings.id, settings.host, clear_fault=order.walk and bool(known.faults))
 

@@ -31,6 +31,8 @@ class Bench:
         self.routes, self.latest = self.drives.routes(), [Reading(joint) for joint in range(self.arm.n)]
         self.log: list[tuple[int, bytes]] = []
         """Frames that the host sent."""
+        self.heard: list[tuple[int, bytes]] = []
+        """The last frames of the drives."""
 
     # ---- Ask
 
@@ -71,7 +73,9 @@ class Bench:
 
     def _received(self):
         while self.arm.outbox:
-            yield self.arm.outbox.popleft()
+            frame = self.arm.outbox.popleft()
+            self.heard = [*self.heard[-60:], frame]
+            yield frame
 
     def hear(self, can_id: int, data: bytes) -> None:
         if can_id in self.routes or -1 in self.routes:
