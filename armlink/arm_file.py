@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from functools import cached_property
+from functools import cache, cached_property
 from importlib.metadata import entry_points
 from importlib.resources import files
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from armlink.arrays import Array
 from armlink.errors import BadInput
@@ -109,6 +109,25 @@ class Bus(Section):
     """Further options of python-can's interface, such as data_bitrate or serial."""
 
 
+def _parse_drive(keys: Any) -> Any:
+    """Validate `link.joints[].drive` by its family's own model (entry-point group `armlink.drives`)."""
+    if keys is None or isinstance(keys, Section):
+        return keys
+    if not isinstance(keys, dict) or not isinstance(keys.get("family"), str):
+        raise ValueError("expected a mapping with the key family")
+    return _drive_settings(keys["family"]).model_validate(keys)
+
+
+@cache
+def _drive_settings(family: str) -> type[Section]:
+    points = entry_points(group="armlink.drives", name=family)
+    if not points:
+        known = ", ".join(sorted({point.name for point in entry_points(group="armlink.drives")}))
+        raise ValueError(f"no drive family {family!r}; there are {known}")
+    settings: type[Section] = next(iter(points)).load().settings
+    return settings
+
+
 U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 
 
@@ -122,10 +141,13 @@ class DeviceIdentity(Section):
 
 
 class LinkJoint(Section):
-    """One joint controller: its node and the limits that no frame may exceed."""
+    """One joint controller: its drive and the limits that no frame may exceed."""
 
     name: str
-    node: Annotated[int, Field(ge=1, le=127)]
+    node: Annotated[int, Field(ge=1, le=127)] | None = None
+    """Short for `drive: {family: canopen, node: …}`: CiA 402 with our own torque sensor object 2100h."""
+    drive: Annotated[Any, BeforeValidator(_parse_drive)] = None
+    """Family of the drive and the keys of that family (docs/drives.md)."""
     rated_torque: Positive
     """Torque that 1000 ‰ stands for (6076h) [N·m]."""
     max_torque: Positive
@@ -141,13 +163,24 @@ class LinkJoint(Section):
     bus: str = ""
     """Name of its bus in link.buses; empty: link.bus."""
 
+    @model_validator(mode="after")
+    def _one_drive(self) -> "LinkJoint":
+        if (self.node is None) == (self.drive is None):
+            raise ValueError(f"{self.name}: give either drive ({{family: …}}) or node, and not both")
+        return self
+
+    @property
+    def settings(self) -> Any:
+        """Keys of its drive: the settings model of its family."""
+        return self.drive if self.node is None else _parse_drive({"family": "canopen", "node": self.node})
+
 
 class LinkSection(Section):
     """The link: bus, rate and joint controllers in joint order."""
 
     bus: Bus = Bus()
     buses: dict[str, Bus] = {}
-    """Further buses by name, for joints that name one; node ids are unique over all of them."""
+    """Further buses by name, for joints that name one; ids are unique on each bus."""
     rate: Annotated[FiniteFloat, Field(gt=0, le=1000)] = 250.0
     """SYNC rate [Hz]."""
     deadline: Annotated[FiniteFloat, Field(ge=0.01, le=10)] = 0.1
@@ -162,7 +195,7 @@ class LinkSection(Section):
     @model_validator(mode="after")
     def _nodes_are_unique(self) -> "LinkSection":
         _no_twins([joint.name for joint in self.joints])
-        _no_twins([joint.node for joint in self.joints])
+        _no_twins([f"{joint.settings.address}{joint.bus and ' on bus '}{joint.bus}" for joint in self.joints])
         for joint in self.joints:
             if joint.bus and joint.bus not in self.buses:
                 known = ", ".join(self.buses) or "none"

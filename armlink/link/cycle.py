@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from armlink.canopen.cia402 import Control, Mode, State, next_control, set_point_control, state_of, supports
-from armlink.canopen.pdo import STATUS_DECIMATION
 from armlink.clock import Clock
+from armlink.drives.canopen.cia402 import Control, Mode, State, next_control, set_point_control, state_of, supports
+from armlink.drives.canopen.pdo import STATUS_DECIMATION
 from armlink.errors import BusFault, HostLate, Refused, Silence
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.faults import Known, bus_fault, find_fault, node_fault, refusal, stopped_itself, stuck

@@ -9,15 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armlink.arrays import Array
-from armlink.bus.bus_watchdog import MOST_FRAMES, BusWatch
 from armlink.bus.frame_bits import FIXED_BITS
 from armlink.bus.port import Port
-from armlink.canopen import emcy
-from armlink.canopen import object_dictionary as objects
-from armlink.canopen.pdo import RPDO1, RPDO2, TPDO1, TPDO2, decoding_table
-from armlink.canopen.units import TORQUE_PER_MICRO, Units
 from armlink.clock import Clock
+from armlink.drives.canopen import emcy
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen.host_frames import HostFrames
+from armlink.drives.canopen.pdo import RPDO1, RPDO2, TPDO1, TPDO2, decoding_table
+from armlink.drives.canopen.units import TORQUE_PER_MICRO, Units
 from armlink.errors import HostLate
+from armlink.link.bus_watchdog import MOST_FRAMES, BusWatch
 from armlink.link.types import Sample, Stats
 
 COLLECT_SHARE = 0.8
@@ -50,7 +51,7 @@ class Loop:
         """(joint index, code, error register) in the order of arrival, the newest; resets (code 0) are not kept."""
         self.node_states: dict[int, int] = {}
         """Joint index → NMT state of its newest heartbeat; only those received while cycling."""
-        self.watch = BusWatch(nodes, host)
+        self.watch = BusWatch(len(nodes), HostFrames(nodes, host))
         self.withheld: frozenset[int] = frozenset()
         """Joints that get no RPDO1, so that their own deadline is put to the test."""
         self.beating = True

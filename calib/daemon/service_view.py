@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from armlink.canopen.cia402 import state_of
+from armlink.drives.canopen.cia402 import state_of
 from calib.daemon.observing.observation import Observation
 from calib.daemon.service import Service
 from calib.daemon.view.api_models import (

@@ -6,8 +6,8 @@ import pytest
 import yaml
 
 from armlink.arm_file import bundled_arms
-from armlink.canopen import eds_file as data_sheet
 from armlink.cli import run
+from armlink.drives.canopen import eds_file as data_sheet
 from armlink.errors import BadInput, Refused
 from armlink.link.link import Link
 

@@ -4,7 +4,7 @@ import struct
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from armlink.canopen.object_dictionary import (
+from armlink.drives.canopen.object_dictionary import (
     CONTROL_WORD,
     MODE,
     MODE_DISPLAY,

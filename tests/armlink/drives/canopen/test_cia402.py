@@ -2,7 +2,7 @@
 
 import pytest
 
-from armlink.canopen.cia402 import (
+from armlink.drives.canopen.cia402 import (
     MODE_NAMES,
     NEEDED_MODES,
     Control,

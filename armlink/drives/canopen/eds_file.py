@@ -8,9 +8,9 @@ from typing import Any
 import canopen
 
 from armlink.arm_file import ArmFile, DeviceIdentity, LinkJoint
-from armlink.canopen import object_dictionary
-from armlink.canopen.object_dictionary import Entry
-from armlink.canopen.pdo import LINK_PDOS
+from armlink.drives.canopen import object_dictionary
+from armlink.drives.canopen.object_dictionary import Entry
+from armlink.drives.canopen.pdo import LINK_PDOS
 from armlink.errors import BadInput
 
 SUFFIXES = (".eds", ".dcf")
@@ -31,7 +31,7 @@ def used_objects() -> Iterable[Entry]:
 
 def bundled_path() -> str:
     """Path of the bundled data sheet."""
-    return str(files("armlink.canopen").joinpath("eds/joint.eds"))
+    return str(files("armlink.drives.canopen").joinpath("eds/joint.eds"))
 
 
 def bundled() -> Any:
@@ -58,7 +58,7 @@ def read_sheet(path: Path, joint: LinkJoint) -> Any:
     if path.suffix.lower() not in SUFFIXES:
         raise BadInput(f"{where}: expected a file that ends in {' or '.join(SUFFIXES)}")
     try:
-        sheet = canopen.import_od(str(path), joint.node)
+        sheet = canopen.import_od(str(path), joint.settings.node)
     except OSError as error:
         raise BadInput(f"{where}: {error.strerror or error}: correct eds of this joint under link.joints") from None
     except Exception as error:  # configparser and canopen raise many kinds

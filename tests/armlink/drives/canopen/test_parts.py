@@ -6,11 +6,11 @@ import pytest
 
 from armlink.arm_file import Bus
 from armlink.bus.open import open_bus, parse_bus
-from armlink.canopen import eds_file as data_sheet
-from armlink.canopen import object_dictionary as objects
-from armlink.canopen import pdo
-from armlink.canopen.emcy import name_of, parse
-from armlink.canopen.units import units_from
+from armlink.drives.canopen import eds_file as data_sheet
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen import pdo
+from armlink.drives.canopen.emcy import name_of, parse
+from armlink.drives.canopen.units import units_from
 from armlink.errors import BadInput, BusFault
 from armlink.link.controller_setup import interpolation
 

@@ -11,8 +11,8 @@ import canopen
 from canopen.sdo.exceptions import SdoAbortedError, SdoError
 
 from armlink.arm_file import ArmFile
-from armlink.canopen import eds_file
-from armlink.canopen.object_dictionary import DEVICE_TYPE, Entry
+from armlink.drives.canopen import eds_file
+from armlink.drives.canopen.object_dictionary import DEVICE_TYPE, Entry
 from armlink.errors import BusFault
 
 logging.getLogger("canopen").addHandler(logging.NullHandler())
@@ -169,7 +169,7 @@ class NodeServices:
 def joint_services(network: PumpedNetwork, arm: ArmFile, pump: Pump) -> tuple[NodeServices, ...]:
     """SDO access to every joint's controller, in joint order; raises BadInput for a wrong data sheet."""
     pairs = zip(arm.require_link().joints, eds_file.of_joints(arm), strict=True)
-    return tuple(NodeServices(network, joint.name, joint.node, sheet, pump) for joint, sheet in pairs)
+    return tuple(NodeServices(network, joint.name, joint.settings.node, sheet, pump) for joint, sheet in pairs)
 
 
 def no_answer(error: SdoError) -> str:
