@@ -14,6 +14,7 @@ from armlink.errors import BadInput
 from armlink.recording.recording import COLUMNS, Recording, channel_column
 
 ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180.0, "turn": 2.0 * math.pi}
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 TORQUE_UNITS = {"N·m": 1.0, "Nm": 1.0, "mN·m": 1e-3, "mNm": 1e-3}
 _ANGLES = ("q", "dq", "q_cmd")
 _TORQUES = ("tau", "tau_motor", "tau_cmd")
@@ -41,7 +42,7 @@ class Corrections:
     """Topic of a bag that holds the joint states."""
 
     def states(self, kind: str, column: str) -> bool:
-        """Whether the user has stated `kind` (`sign`, `units`, `zero`, `clock`) of a column, by itself or by channel."""
+        """Whether the user stated a correction of this kind (`sign`, `units`, …) for a column or its channel."""
         stated: Mapping[str, object] = getattr(self, kind)
         return column in stated or column.rpartition("_")[0] in stated
 
@@ -50,23 +51,32 @@ class Corrections:
         channels = {COLUMNS[name]: values.copy() for name, values in recording.channels().items()}
         before = {prefix: values.copy() for prefix, values in channels.items()}
         for column, other in self.columns.items():
+            if channel_column(other) is None:
+                continue  # a table's own column name: taken as it was read
             (channel, to), (source_channel, of) = (_place(before, name, source, "--map") for name in (column, other))
             channels[channel][:, to] = before[source_channel][:, of]
         for column, factor in self.sign.items():
             _scale(channels, column, (factor,), source, "--sign")
-        for column, factors in self.units.items():
+        units = {column: factors for column, factors in self.units.items() if column != "t"}
+        for column, factors in units.items():
             _scale(channels, column, factors, source, "--units")
         for column, angle in self.zero.items():
             channel, joints = _place(channels, column, source, "--zero")
             channels[channel][:, joints] += angle
         for channel, shift in self.clock.items():
+            if channel == "t":
+                continue  # the times as they stand
             _place(channels, channel, source, "--clock")
             channels[channel] = _shifted(recording.t, channels[channel], shift)
         if self.effort == "motor" and "tau" in channels and "tau_motor" not in channels:
             channels["tau_motor"] = channels.pop("tau")
         if self.effort == "link" and "tau_motor" in channels and "tau" not in channels:
             channels["tau"] = channels.pop("tau_motor")
-        return replace(recording, **{name: channels.get(prefix) for name, prefix in COLUMNS.items()})  # type: ignore[arg-type]
+        t = recording.t * self.units["t"][0] if "t" in self.units else recording.t
+        return replace(recording, t=t, **{name: channels.get(prefix) for name, prefix in COLUMNS.items()})  # type: ignore[arg-type]
+
+
+AS_IT_IS = Corrections()
 
 
 def parse_corrections(
@@ -135,10 +145,16 @@ def _factors(column: str, text: str) -> tuple[float, ...]:
         if any(number == 0.0 for number in numbers):
             raise BadInput(f"--units {column}={text}: expected numbers other than 0")
         return tuple(2.0 * math.pi / number for number in numbers) if unit == "counts" else numbers
+    if column == "t":
+        if unit not in TIME_UNITS or values:
+            raise BadInput(f"--units t={text}: expected {', '.join(TIME_UNITS)}")
+        return (TIME_UNITS[unit],)
     known = ANGLE_UNITS if _channel(column) in _ANGLES else TORQUE_UNITS if _channel(column) in _TORQUES else {}
     if unit not in known or values:
         others = "counts:N" if known is ANGLE_UNITS else "A:N·m-per-A"
-        raise BadInput(f"--units {column}={text}: expected {', '.join(known) or 'a position or torque column'}, {others}")
+        raise BadInput(
+            f"--units {column}={text}: expected {', '.join(known) or 'a position or torque column'}, {others}"
+        )
     return (known[unit],)
 
 

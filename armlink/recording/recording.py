@@ -71,9 +71,9 @@ class Recording:
                 expected = (self.t.size, len(self.names))
                 raise BadInput(f"{source}: channel {name} has shape {values.shape}, expected {expected}")
             _check_finite_or_nan(values, COLUMNS[name], source)
-        if not any(getattr(self, name) is not None for name in TORQUE_CHANNELS):
+        if not any(getattr(self, name) is not None for name in (*TORQUE_CHANNELS, "position_command")):
             wanted = ", ".join(f"{COLUMNS[name]}_1" for name in TORQUE_CHANNELS)
-            raise BadInput(f"{source}: no torque channel: at least one of {wanted} … is required")
+            raise BadInput(f"{source}: no torque channel: at least one of {wanted} …, or q_cmd_1 …, is required")
         return self
 
 

@@ -3,9 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, Literal
 
-Kind = Literal[
-    "order", "sign", "scale", "zero", "unsigned", "effort_source", "clock", "jitter", "filter", "duplicate"
-]
+Kind = Literal["order", "sign", "scale", "zero", "unsigned", "effort_source", "clock", "jitter", "filter", "duplicate"]
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ negative. A wrong sign, order or unit leaves most of the reading unexplained; wr
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from gcomp.arrays import Array
@@ -59,7 +60,7 @@ class RigidFit:
         return np.asarray(np.log(1.0 - np.clip(self.explained, 0.0, 1.0) + FLOOR))
 
     @property
-    def strong(self) -> Array:
+    def strong(self) -> NDArray[np.bool_]:
         """Whether the model says much of a joint's reading, (n,)."""
         share = self.own_share * np.maximum(self.scale, 1.0)
         return np.asarray((share > STRONG_SHARE) & (np.abs(self.correlation) > STRONG_CORRELATION))
@@ -109,4 +110,4 @@ def _joint(model: Array, motion: Motion, j: int) -> tuple[float, ...]:
 
 def changed(motion: Motion, **values: Array) -> Motion:
     """The motion with some of its channels replaced."""
-    return replace(motion, **values)
+    return replace(motion, **values)  # type: ignore[arg-type]

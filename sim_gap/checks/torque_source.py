@@ -12,8 +12,8 @@ from sim_gap.model.rigid_body import RigidArm
 from sim_gap.residuals.preprocess import Signals
 
 SCALE = 0.42, 2.4
-"""Median coefficient of the model's torque, weighted by that torque, outside which a channel is taken for another unit; loads and wrong torque
-constants of real arms stay between 0.65 and 1.9."""
+"""Median coefficient of the model's torque, weighted by that torque, outside which a channel is in another unit; with
+loads and wrong torque constants it stays between 0.65 and 1.9 on real arms."""
 GEAR_FRICTION = 0.13
 """Friction over torque (root sum of squares over the joints) from which a channel is a motor's: link sensors of two
 real arms show 0.04 to 0.07, motors of four others 0.26 to 0.6."""
@@ -110,5 +110,3 @@ def _delayed_cost(model: Array, motion: Motion, rows: int) -> float:
         reading=motion.reading[behind : behind + n],
     )
     return float(fit_model(model[ahead : ahead + n], moved).cost.sum())
-
-

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armlink.recording.corrections import Corrections
 from armlink.recording.recording import Recording
@@ -74,7 +75,9 @@ def _findings(recording: Recording, velocity: Array, stated: Corrections) -> lis
     for kind, (joints, what) in wrong.items():
         names = [j for j in moves[joints] if not stated.states("sign" if kind == "sign" else "units", f"dq_{j + 1}")]
         if names:
-            evidence = f"{what} ({_listed(kind, names, moves, best, scale, recording.names)}): left out of the diagnosis"
+            evidence = (
+                f"{what} ({_listed(kind, names, moves, best, scale, recording.names)}): left out of the diagnosis"
+            )
             joint = "all" if len(names) == len(moves) else recording.names[names[0]]
             found.append(Finding(kind, "dq", joint, evidence, _option(kind, names, moves, best), True))  # type: ignore[arg-type]
     if not found and own.any() and not stated.states("units", "dq_1"):
@@ -85,14 +88,16 @@ def _findings(recording: Recording, velocity: Array, stated: Corrections) -> lis
     return found
 
 
-def _listed(kind: str, joints: list[int], moves: Array, best: Array, scale: Array, names: tuple[str, ...]) -> str:
+def _listed(
+    kind: str, joints: list[int], moves: NDArray[np.int_], best: NDArray[np.int_], scale: Array, names: tuple[str, ...]
+) -> str:
     place = {int(j): i for i, j in enumerate(moves)}
     if kind == "order":
         return ", ".join(f"{names[j]} holds {names[int(moves[best[place[j]]])]}" for j in joints)
     return ", ".join(f"{names[j]} {scale[place[j]]:.3g} times" for j in joints)
 
 
-def _option(kind: str, joints: list[int], moves: Array, best: Array) -> str:
+def _option(kind: str, joints: list[int], moves: NDArray[np.int_], best: NDArray[np.int_]) -> str:
     place = {int(j): i for i, j in enumerate(moves)}
     if kind == "order":
         return "--map " + ",".join(f"dq_{int(moves[best[place[j]]]) + 1}=dq_{j + 1}" for j in joints)
@@ -105,9 +110,7 @@ def _delay(recording: Recording, rate: Array, velocity: Array) -> float:
     """Delay of the velocity behind the position's derivative [s], 0 where it is too short to matter."""
     period = float(np.median(np.diff(recording.t)))
     longest = max(2, min(len(rate) // 4, round(0.3 / period)))
-    match = [
-        float((rate[: len(rate) - k] * velocity[k:]).sum(0) @ (1.0 / (rate**2).sum(0))) for k in range(longest)
-    ]
+    match = [float((rate[: len(rate) - k] * velocity[k:]).sum(0) @ (1.0 / (rate**2).sum(0))) for k in range(longest)]
     rows = int(np.argmax(match))
     late = rows * period
     return late if rows > LATE_ROWS and late > LATE_S else 0.0

@@ -34,12 +34,10 @@ def load_model(source: Any, names: tuple[str, ...] = (), count: int | None = Non
     `names` are the recording's joint names if it has any; `count` is its number of joints. Joints are matched by name
     if the model has all of them, else in order. Raises BadInput if the model cannot be read or does not fit.
     """
-    import mujoco
-
     path = Path(source) if isinstance(source, str | Path) else None
-    model = source if path is None else compiled(path)
-    hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
-    known = {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, j): j for j in hinges}
+    model = load_compiled(source)
+    known = _hinges(model)
+    hinges = list(known.values())
     label = str(path or "the model")
     if names and all(name in known for name in names):
         joints = [known[name] for name in names]
@@ -57,6 +55,23 @@ def load_model(source: Any, names: tuple[str, ...] = (), count: int | None = Non
         raise BadInput(f"{label}: joints {', '.join(arm.names)} do not run from base to tip: reorder them")
     _check(model, joints, arm, label)
     return SimModel(model, tuple(joints), arm, path)
+
+
+def load_compiled(source: Any) -> Any:
+    """The `mujoco.MjModel` of a path, or the one given. Raises BadInput."""
+    return compiled(Path(source)) if isinstance(source, str | Path) else source
+
+
+def hinge_names(model: Any) -> list[str]:
+    """Names of a compiled model's hinges in its order, base to tip along every branch."""
+    return list(_hinges(model))
+
+
+def _hinges(model: Any) -> dict[str, int]:
+    import mujoco
+
+    hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
+    return {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, j) or f"joint {j + 1}": j for j in hinges}
 
 
 def compiled(path: Path) -> Any:
