@@ -23,7 +23,8 @@ from sim_gap.checks.check import check_recordings
 from sim_gap.checks.finding import Finding
 from sim_gap.checks.joints import match_joints
 from sim_gap.effects.registry import library_without
-from sim_gap.model.load import SimModel, hinge_names, load_compiled, load_model
+from sim_gap.model.arm_joints import hinges_of
+from sim_gap.model.load import SimModel, load_compiled, load_model
 from sim_gap.residuals.preprocess import prepare, require_length
 from sim_gap.residuals.residual_set import ResidualSet, residual_sets
 from sim_gap.search.estimate import Estimate
@@ -87,7 +88,7 @@ def _checked(
 ) -> tuple[SimModel, list[Recording], tuple[Finding, ...]]:
     """The model, the recordings with joints, units and clocks as they should be, and what was found in them."""
     compiled_model = load_compiled(source)
-    hinges = hinge_names(compiled_model)
+    hinges = list(hinges_of(compiled_model))
     matched, findings = [], []
     for recording, label in zip(recordings, labels, strict=False):
         require_length(recording, label)

@@ -9,6 +9,7 @@ import numpy as np
 
 from armlink.errors import BadInput
 from armlink.model_file import one_line, read_model
+from sim_gap.model.arm_joints import arm_hinges, hinges_of
 from sim_gap.model.rigid_body import RigidArm, Tendons, inertial_of
 
 
@@ -32,16 +33,19 @@ def load_model(source: Any, names: tuple[str, ...] = (), count: int | None = Non
     """Compile a model from a path (.xml, .urdf, .yaml arm file), or take a compiled `mujoco.MjModel`.
 
     `names` are the recording's joint names if it has any; `count` is its number of joints. Joints are matched by name
-    if the model has all of them, else in order. Raises BadInput if the model cannot be read or does not fit.
+    if the model has all of them, else in order; if there are too many, those of a hand and coupled ones are locked.
+    Raises BadInput if the model cannot be read or does not fit.
     """
     path = Path(source) if isinstance(source, str | Path) else None
     model = load_compiled(source)
-    known = _hinges(model)
+    known = hinges_of(model)
     hinges = list(known.values())
     label = str(path or "the model")
     if names and all(name in known for name in names):
         joints = [known[name] for name in names]
     else:
+        if count is not None and count != len(hinges):
+            hinges = list(arm_hinges(model, known).values())
         if count is not None and count != len(hinges):
             raise BadInput(
                 f"{label}: has {len(hinges)} hinge joints ({', '.join(map(str, known))}), the recording {count}: "
@@ -60,18 +64,6 @@ def load_model(source: Any, names: tuple[str, ...] = (), count: int | None = Non
 def load_compiled(source: Any) -> Any:
     """The `mujoco.MjModel` of a path, or the one given. Raises BadInput."""
     return compiled(Path(source)) if isinstance(source, str | Path) else source
-
-
-def hinge_names(model: Any) -> list[str]:
-    """Names of a compiled model's hinges in its order, base to tip along every branch."""
-    return list(_hinges(model))
-
-
-def _hinges(model: Any) -> dict[str, int]:
-    import mujoco
-
-    hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
-    return {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, j) or f"joint {j + 1}": j for j in hinges}
 
 
 def compiled(path: Path) -> Any:
