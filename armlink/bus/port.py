@@ -21,12 +21,16 @@ BUS_SHIFT = 34
 """Where there are several buses, identifiers carry the number of theirs from this bit on."""
 
 
+CLASSICAL = 1 << 33
+"""Flag of a frame that leaves as classical CAN on a port that sends CAN FD; a frame that came never has it."""
+
+
 class InterfaceDown(BusFault):
     """The interface is down; it may come up again."""
 
 
 class Port(Protocol):
-    """Frames with 11-bit identifiers; error frames are counted, extended and remote frames are dropped."""
+    """Frames with their flags; error frames are counted."""
 
     @property
     def errors(self) -> int:

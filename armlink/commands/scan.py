@@ -47,7 +47,7 @@ def _ask_all(arm: "ArmFile", bus: str | None, json: Path | None) -> int:
 
     from armlink.commands.output import write_json
     from armlink.errors import BusFault, Refused
-    from armlink.link.groups import traits_of
+    from armlink.link.joints.groups import traits_of
     from armlink.link.link import Link
 
     with Link.open(arm, bus) as link:

@@ -81,9 +81,12 @@ class Commander:
             passed[joint] = order
             if order.refused:
                 refused = True
-        self._commanded = modes
-        sample = self.loop.exchange(passed, math.inf if refused else now + (self.max_age - age))
+        self._commanded, sent = modes, self.loop.synced
+        sample = self.loop.exchange(passed, math.inf if refused else now - age, self.max_age)
         sample.late = self.late
+        if not self._lock_step:  # this process may have stood still at any line
+            self._note_gap(self.loop.synced - sent, self.loop.synced)
+            self._note_gap(self.clock.now() - self.loop.synced, now)
         why = refused and refusal(self.names, command, age, passed, seen, self.limits)
         if why:
             raise Refused(f"gate: {why}")
@@ -270,6 +273,12 @@ class Commander:
         """The first joint that stopped itself since it did not hear its host, in words; empty if none."""
         return next((stop for group in self.loop.groups if (stop := group.drives.own_stop())), "")
 
+    def _note_gap(self, seconds: float, now: float) -> None:
+        """No commands were sent for so long before `now` [s]; the longest of late is kept."""
+        gap = seconds - self.period
+        if gap > self.period and math.isfinite(gap) and (gap >= self._gap or now > self._gap_at + MEMORY):
+            self._gap, self._gap_at = gap, now
+
     def settle(self) -> None:
         """Restart after an interruption: what came meanwhile, and how late the host was, is forgotten."""
         self.loop.settle()
@@ -283,8 +292,6 @@ class Commander:
             self.late = now - self._due
             stats.late += self.late > 0.1 * self.period
             stats.lateness.add(self.late)
-            gap = now - self.loop.synced - self.period
-            if gap > self.period and math.isfinite(gap) and (gap >= self._gap or now > self._gap_at + MEMORY):
-                self._gap, self._gap_at = gap, now
+            self._note_gap(now - self.loop.synced, now)
             self._due = max(self._due, now - self.period) + self.period
         self.loop.drain()

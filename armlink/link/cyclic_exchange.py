@@ -14,10 +14,10 @@ from armlink.clock import Clock
 from armlink.drives.board import Board, Event
 from armlink.drives.family import ANY, FillsBoard
 from armlink.drives.orders import Order, Reading, power_code
-from armlink.errors import Refused
+from armlink.errors import HostLate
 from armlink.link.bus_watchdog import MOST_FRAMES, BusWatch
-from armlink.link.groups import Group, traits_of
-from armlink.link.joint_values import JointValues
+from armlink.link.joints.groups import Group, traits_of
+from armlink.link.joints.values import JointValues
 from armlink.link.types import Sample, Stats
 
 COLLECT_SHARE = 0.8
@@ -158,17 +158,16 @@ class Loop:
         self._dropped = self._port.dropped
         self.watch.settle()
 
-    def exchange(self, orders: Sequence[Order], expires: float = math.inf) -> Sample:
+    def exchange(self, orders: Sequence[Order], decided: float = math.inf, max_age: float = math.inf) -> Sample:
         """One cycle: the frames of the orders, then the readings that they bring; raises as `verify`.
 
-        Raises Refused, and sends nothing, where the frames would leave after `expires`, by the clock [s].
+        Raises HostLate, and sends nothing, if the frames would leave more than `max_age` [s] after `decided` (clock).
         """
         board = self.board
         frames = self._encode(orders, self._clock.now())
         now = self._clock.now()
-        if now > expires:
-            late = (now - expires) * 1e3
-            raise Refused(f"gate: the command became too old before its frames left, by {late:.0f} ms: host too slow")
+        if now - decided > max_age:
+            raise HostLate(now - decided, max_age, "the command grew too old before its frames left")
         if self._first is None:
             self._first = now
         board.awaited = self._expected

@@ -13,18 +13,18 @@ from armlink.bus.adapters import as_bus
 from armlink.bus.can_bus import CanBus
 from armlink.clock import Clock, MonotonicClock
 from armlink.drives.orders import DriveIdentity, Order, Power, Setup
-from armlink.errors import BusFault
-from armlink.link.ask import LinkAsk
-from armlink.link.calibrations import Calibrations
+from armlink.errors import BusFault, Silence
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.faults import bus_fault
 from armlink.link.gate import start_from
 from armlink.link.gate_limits import drive_limits, gate_limits, joint_ranges, target_window
-from armlink.link.groups import Group, make_groups
 from armlink.link.guard import Crossed
-from armlink.link.joint_values import values_of
-from armlink.link.types import Command, Controller, Sample, Samples, Setpoints, Stats
+from armlink.link.joints.ask import LinkAsk
+from armlink.link.joints.calibrations import Calibrations
+from armlink.link.joints.groups import Group, make_groups
+from armlink.link.joints.values import values_of
+from armlink.link.types import Command, Controller, Sample, Samples, Setpoints, Stats, Tell
 
 if TYPE_CHECKING:
     import can
@@ -36,6 +36,8 @@ LISTEN_PERIODS, LISTEN_SECONDS = 2, 0.1
 since a host on a busy computer may pause for some 0.05 s."""
 
 
+ANSWER_SECONDS = 5.0
+"""After a stall a controller may take so long to answer [s]."""
 R = TypeVar("R")
 P = ParamSpec("P")
 
@@ -222,9 +224,22 @@ class Link(Calibrations):
     def recover(self) -> Sample:
         """After a Stall: bring drives back that left the communication, and enable every joint where it stands."""
         self._require_start()
+        self._await_answers()
         for group in self.groups:
             group.drives.recover(self._ask(group))
         return self.enable()
+
+    def _await_answers(self) -> None:
+        """Wait until every drive has answered what it was sent before; raises Silence.
+
+        One that stood still works off what has piled up, and its replies show it as it was before it was stopped.
+        """
+        end = self.clock.now() + ANSWER_SECONDS
+        for group in self.groups:
+            while missing := group.drives.missing(self._ask(group)):
+                if self.clock.now() > end:
+                    name = self.names[group.places[missing[0]]]
+                    raise Silence(f"{name}: no answer for {ANSWER_SECONDS:g} s")
 
     def _forget(self) -> None:
         self._loop.board.events.clear()
@@ -294,9 +309,11 @@ class Link(Calibrations):
         self._enabled = False
         self.commander.stop()
 
-    def inside(self, function: "Callable[Concatenate[Link, P], R]", *args: P.args, **kwargs: P.kwargs) -> R:
-        """Call `function(link, ...)`: in the process that makes the cycles, which is this one."""
-        return function(self, *args, **kwargs)
+    def inside(
+        self, function: "Callable[Concatenate[Link, Tell, P], R]", tell: Tell, *args: P.args, **kw: P.kwargs
+    ) -> R:
+        """Call `function(link, tell, ...)` in the process that makes the cycles, which is this one."""
+        return function(self, tell, *args, **kw)
 
     def _pump(self, done: Callable[[], bool], timeout: float) -> bool:
         """Run the loop until `done` or the time is over; enabled joints get their last command in every cycle."""

@@ -19,12 +19,12 @@ from armlink.bus.can_bus import CanBus
 from armlink.bus.port import StampedPort
 from armlink.clock import Clock, MonotonicClock
 from armlink.drives.board import Event
-from armlink.link.ask import LinkAsk
-from armlink.link.calibrations import Calibrations
 from armlink.link.cyclic_exchange import Loop
-from armlink.link.foreign_host import Commands, ForeignHost
-from armlink.link.groups import make_groups
-from armlink.link.joint_values import values_of
+from armlink.link.joints.ask import LinkAsk
+from armlink.link.joints.calibrations import Calibrations
+from armlink.link.joints.foreign_host import Commands, ForeignHost
+from armlink.link.joints.groups import make_groups
+from armlink.link.joints.values import values_of
 from armlink.link.types import Sample, Stats
 
 if TYPE_CHECKING:

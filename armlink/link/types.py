@@ -1,6 +1,6 @@
 """Input and output of a cycle of the link, in SI units: commands, samples, counters."""
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -92,7 +92,7 @@ class Sample:
     motor_torque: Array
     """Torque actual value 6077h [N·m], (n,); each fourth cycle (TPDO2), NaN in the others."""
     status: NDArray[np.int64]
-    """Newest state code of each drive, (n,), by its family (`armlink.link.groups.state_name` has the words)."""
+    """Newest state code of each drive, (n,), by its family (`armlink.link.joints.groups.state_name` has the words)."""
     age: Array
     """Time since position and torque last came [s], (n,); 0 where they came in this cycle, inf before the first."""
     timely: NDArray[np.bool_] | None = None
@@ -134,5 +134,7 @@ class Stats:
     """Share of the bus that the frames take at its bit rate, without stuff bits, which are a tenth more."""
 
 
+Tell = Callable[[str], None]
+"""Called with what is being done."""
 Samples = Generator[Sample, None, None]
 """Samples as they come; close it to end what brings them."""

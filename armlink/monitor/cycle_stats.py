@@ -12,7 +12,7 @@ import numpy as np
 
 from armlink.arrays import Array
 from armlink.bus.frame_bits import frame_bits
-from armlink.link.groups import Group
+from armlink.link.joints.groups import Group
 
 KEPT = 1_000_000
 """Maximum number of cycles whose times are kept; more than an hour at 250 Hz."""

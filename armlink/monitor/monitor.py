@@ -15,9 +15,9 @@ from armlink.clock import Clock, MonotonicClock
 from armlink.drives.board import NO_STATUS
 from armlink.errors import BadInput
 from armlink.link.cyclic_exchange import Loop
-from armlink.link.foreign_host import ForeignHost
-from armlink.link.groups import make_groups
-from armlink.link.joint_values import values_of
+from armlink.link.joints.foreign_host import ForeignHost
+from armlink.link.joints.groups import make_groups
+from armlink.link.joints.values import values_of
 from armlink.link.types import Sample
 from armlink.monitor.cycle_stats import CycleStats
 

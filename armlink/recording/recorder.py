@@ -7,9 +7,9 @@ from armlink.arrays import Array
 from armlink.bus.can_bus import CanBus, TimedBus
 from armlink.clock import Clock, MonotonicClock
 from armlink.link.cyclic_exchange import Loop
-from armlink.link.foreign_host import ForeignHost
-from armlink.link.groups import make_groups
-from armlink.link.joint_values import values_of
+from armlink.link.joints.foreign_host import ForeignHost
+from armlink.link.joints.groups import make_groups
+from armlink.link.joints.values import values_of
 
 WAIT_SECONDS = 0.1
 Row = tuple[float, dict[str, Array]]

@@ -16,7 +16,7 @@ from armlink.clock import Clock, MonotonicClock
 from armlink.drives.family import Replays
 from armlink.drives.orders import Reading
 from armlink.errors import BadInput
-from armlink.link.groups import make_groups
+from armlink.link.joints.groups import make_groups
 from armlink.recording.recorder import Recorder
 from armlink.recording.recording import Recording
 

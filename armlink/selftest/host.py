@@ -17,20 +17,20 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.bus.port import Frame
-from armlink.clock import MonotonicClock
+from armlink.clock import Clock, MonotonicClock
 from armlink.drives.base import BasicDrives
 from armlink.drives.family import Ask, Family
 from armlink.drives.orders import Limits, Mode, Order, Power, Reading, Setup
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
 from armlink.errors import BusFault
-from armlink.link.ask import LinkAsk
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.gate import start_from
 from armlink.link.gate_limits import drive_limits, gate_limits, joint_ranges, target_window
-from armlink.link.groups import Group, Mounting
-from armlink.link.joint_values import JointValues
+from armlink.link.joints.ask import LinkAsk
+from armlink.link.joints.groups import Group, Mounting
+from armlink.link.joints.values import JointValues
 from armlink.link.lateness import Lateness
 from armlink.link.types import Command
 from armlink.loop.channel import Channel, Closed
@@ -45,6 +45,8 @@ HELD = 0.5
 
 _TRAITS = Traits("current", "host", "holds", (), "reply", "11")
 _VALUES, _ANSWER = struct.Struct("<ff"), 0x100
+STOPPED = 0x200
+"""With the joint's index, identifier by which an echoing drive says that it has stopped itself."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ class EchoDrives(BasicDrives):
 
     def routes(self) -> dict[int, int]:
         """See Drives."""
-        return {_ANSWER + joint: joint for joint in range(self.m)}
+        return {base + joint: joint for joint in range(self.m) for base in (_ANSWER, STOPPED)}
 
     def commands(self) -> dict[int, str]:
         """See Drives."""
@@ -92,8 +94,10 @@ class EchoDrives(BasicDrives):
 
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
         """See Drives."""
+        if can_id >= STOPPED:
+            return self.note(Reading(can_id - STOPPED, power=Power.STOPPED))
         position, torque = _VALUES.unpack(data)
-        return self.note(Reading(can_id - _ANSWER, position, 0.0, torque, power=Power.ON))
+        return Reading(can_id - _ANSWER, position, 0.0, torque)
 
     def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
         """See Drives."""
@@ -157,28 +161,35 @@ def _work(random: np.random.Generator, file: int) -> None:
     time.sleep(0.005)
 
 
-def cycles(arm: ArmFile, seconds: float, channel: Channel) -> HostReport:
-    """The link's cycle on an EchoPort, each sample sent to the job."""
+def echo_commander(arm: ArmFile, port: EchoPort, clock: Clock) -> Commander:
+    """The link's cycle for an arm whose joints are all on and answer on an EchoPort; no reading is too old."""
     section = arm.require_link()
     n, period = len(section.joints), 1.0 / section.rate
-    clock, realtime = MonotonicClock(), prepare()
     drives = EchoDrives(section.joints, _TRAITS)
     groups = (Group(Family("echo", _TRAITS, DriveSettings, lambda arm, joints: drives), drives, tuple(range(n)), 0),)
     values = JointValues(Mounting.of(arm), np.zeros(n, bool))
-    loop = Loop(EchoPort(), clock, groups, values, period, lock_step=False)
+    loop = Loop(port, clock, groups, values, period, lock_step=False)
     windows = [target_window(*limits) for limits in joint_ranges(arm)]
     pairs = zip(section.joints, windows, strict=True)
     limits = [drive_limits(joint, window, period, section.deadline) for joint, window in pairs]
-    names = tuple(joint.name for joint in section.joints)
-    commander = Commander(loop, clock, names, period, np.inf, lock_step=False)
+    commander = Commander(loop, clock, arm.joint_names, period, np.inf, lock_step=False)
     setups = drives.set_up(LinkAsk(loop, clock, lambda done, timeout: False), limits)
     gates = [gate_limits(limit) for limit in limits]
     commander.begin(gates, [start_from(gate, 0.0, 0.0) for gate in gates], [each.modes for each in setups])
+    return commander
+
+
+def cycles(arm: ArmFile, seconds: float, channel: Channel) -> HostReport:
+    """The link's cycle on an EchoPort, each sample sent to the job."""
+    rate, n = arm.require_link().rate, len(arm.joint_names)
+    clock, realtime = MonotonicClock(), prepare()
+    commander = echo_commander(arm, EchoPort(), clock)
     hold, nothing = Command.hold(np.zeros(n)), np.zeros(n)
     count, begin, busy = 0, clock.now(), time.process_time()
     for _ in range(3):  # every joint has answered, and memory is warm
         commander.stand([Power.OFF] * n)
-    loop.stats.lateness = Lateness()
+    stats = commander.loop.stats
+    stats.lateness = Lateness()
     while clock.now() - begin < seconds:
         sample = commander.command(hold)
         channel.put((0, count, pack(sample, nothing, nothing)), True)
@@ -186,7 +197,7 @@ def cycles(arm: ArmFile, seconds: float, channel: Channel) -> HostReport:
         channel.receive()
         count += 1
     busy = (time.process_time() - busy) / max(count, 1)
-    return HostReport(section.rate, seconds, loop.stats.lateness, busy, realtime)
+    return HostReport(rate, seconds, stats.lateness, busy, realtime)
 
 
 def main(number: int) -> None:

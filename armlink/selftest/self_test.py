@@ -15,9 +15,9 @@ from armlink.drives.traits import Silence
 from armlink.errors import ArmlinkError, BusFault
 from armlink.link.faults import bus_fault
 from armlink.link.gate_limits import drive_limits
-from armlink.link.groups import traits_of
+from armlink.link.joints.groups import traits_of
 from armlink.link.link import Link
-from armlink.link.types import Sample
+from armlink.link.types import Sample, Tell
 
 CHECKS = ("set-up", "answers", "enables and holds", "silence")
 CYCLES = 50
@@ -38,6 +38,11 @@ EXPECTED: dict[Silence, tuple[Power, ...]] = {
     "keeps on": (),
 }
 """What a drive may be in after its host was silent, by its trait."""
+
+
+def self_test(link: Link, tell: Tell, power: bool) -> tuple[list[Result], str]:
+    """Run the checks on a link that is open and not started; results, and the bus's name. Raises BusFault."""
+    return SelfTest(link, tell).run(power), str(link.bus.channel_info)
 
 
 class SelfTest:

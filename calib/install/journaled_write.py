@@ -3,7 +3,7 @@
 In this order, so that a process killed at any moment leaves either the old record in force or the new one, and a
 journal of what the controllers held: the gates were passed (`Admitted`), the record is kept, the journal line is on
 disk, each controller's calibration is staged, read back bit for bit and made active
-(`armlink.drives.canopen.torque_sensor_record`), the check is made, flash is written if that was asked for, the record becomes
+(2100h), the check is made, flash is written if that was asked for, the record becomes
 current and the journal line ends, both in one transaction. If any step fails, every controller gets back what it held.
 """
 

@@ -15,12 +15,12 @@ from armlink.drives.canopen import emcy, faults, torque_sensor_record
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen.cia402 import Control, State, next_control, set_point_control, state_of, supports
 from armlink.drives.canopen.eds_file import of_joints
+from armlink.drives.canopen.host_frames import HostFrames
 from armlink.drives.canopen.object_dictionary import Entry
-from armlink.drives.canopen.pdo import RPDO1, RPDO2, TPDO1, TPDO2, TPDO3, host_frames
+from armlink.drives.canopen.pdo import RPDO1, RPDO2, TPDO1, TPDO2, TPDO3
 from armlink.drives.canopen.profile import examine, profile_of
-from armlink.drives.canopen.scales import read_units
 from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork, joint_services
-from armlink.drives.canopen.units import Units, assumed_units
+from armlink.drives.canopen.units import Units, assumed_units, read_units
 from armlink.drives.family import Ask
 from armlink.drives.findings import Result
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
@@ -48,10 +48,6 @@ _POWERS = {
     State.SWITCHED_ON: Power.READY,
 }
 _ALL = (-INT32_MAX - 1, INT32_MAX)
-_DOWNLOADS = (1, 6)
-"""Command specifiers of SDO requests that write: initiate download, block download (CiA 301, 7.2.4.3)."""
-_HARMLESS_WRITES = (0x1010, 0x2100)
-"""Objects that another program may write: they store settings or hold the torque sensor's calibration."""
 _SYNC: Frame = (objects.SYNC_ID, b"")
 _OPERATIONAL = bytes([objects.OPERATIONAL])
 
@@ -69,7 +65,7 @@ class CanopenDrives:
         self.protection = device.protection_of(section, self.nodes)
         self.profiles = [profile_of(joint.settings) for joint in joints]
         self.units: list[Units] = list(assumed_units(joints))
-        self._host_frames = host_frames(self.nodes, self.protection.host)
+        self._host_frames = HostFrames(self.nodes, self.protection.host)
         self.beating = True
         """Whether the host's heartbeat is sent; not, so that the joints' watching it is put to the test."""
         self.statuses, self.displays = [NO_STATUS] * m, [NO_MODE] * m
@@ -81,8 +77,9 @@ class CanopenDrives:
         self.restarted: set[int] = set()
         """Joints whose controller has sent its boot-up message."""
         self._traits, self._deadline = traits, section.deadline
-        self._heartbeat_cycles = max(1, int(section.deadline / 2 * section.rate))
-        self._cycles = 0
+        self.beat_every, self._period = section.deadline / 2, 1.0 / section.rate
+        """Time from one heartbeat of the host to the next [s]."""
+        self._beat = -math.inf
         self._joint_of = {node: joint for joint, node in enumerate(self.nodes)}
         self._supported = [0] * m
         self._modes, self._mode_since = [OFF] * m, [-math.inf] * m
@@ -142,17 +139,11 @@ class CanopenDrives:
 
     def commands(self) -> Mapping[int, str]:
         """See Drives."""
-        return self._host_frames
+        return self._host_frames.by_id
 
     def intrusion(self, can_id: int, data: bytes) -> str:
         """See Drives: what only a host sends, and SDO requests that write, but of settings and calibration."""
-        if can_id in self._host_frames:
-            return self._host_frames[can_id]
-        joint = self._joint_of.get(can_id - objects.SDO_REQUEST_ID)
-        if joint is None or len(data) < 4 or data[0] >> 5 not in _DOWNLOADS:
-            return ""
-        index = int.from_bytes(data[1:3], "little")
-        return "" if index in _HARMLESS_WRITES else f"SDO write of {index:04X}h to node {self.nodes[joint]}"
+        return self._host_frames(can_id, data)
 
     def cycle_ids(self) -> frozenset[int]:
         """See Drives."""
@@ -207,7 +198,7 @@ class CanopenDrives:
             self.fill(self._board, self._places)
         for joint, services in enumerate(all_services):
             found.append(self._set_up(joint, services, limits[joint]))
-        self._cycles = 0
+        self._beat = -math.inf
         self._words, self._walking, self._modes = [FAULT_RESET] * self.m, [False] * self.m, [OFF] * self.m
         for node in self.nodes:
             self.send_nmt(ask, objects.NMT_START, node)
@@ -258,8 +249,14 @@ class CanopenDrives:
         """An NMT command (CiA 301) to one node, or to all."""
         ask.send(objects.NMT_ID, bytes([command, node]))
 
+    def beat(self, ask: Ask) -> None:
+        """The host's heartbeat, at once."""
+        ask.send(*self._heartbeat)
+        self._beat = ask.now()
+
     def recover(self, ask: Ask) -> None:
         """See Drives: start the nodes that left operation."""
+        self.beat(ask)  # their watches have run on
         for node in self.nodes:
             self.send_nmt(ask, objects.NMT_START, node)
 
@@ -300,9 +297,9 @@ class CanopenDrives:
             commands.append((self._command_ids[joint], data))
         if modes:
             commands = modes + commands
-        if self.beating and self._cycles % self._heartbeat_cycles == 0:
+        if self.beating and now - self._beat > self.beat_every - 0.5 * self._period:
             commands.append(self._heartbeat)
-        self._cycles += 1
+            self._beat = now
         commands.append(_SYNC)
         return commands
 

@@ -6,15 +6,11 @@ from dataclasses import dataclass, replace
 
 from armlink.drives.canopen.object_dictionary import (
     CONTROL_WORD,
-    HEARTBEAT_ID,
-    LSS_ID,
     MODE,
     MODE_DISPLAY,
     MOTOR_TORQUE,
-    NMT_ID,
     POSITION,
     STATUS_WORD,
-    SYNC_ID,
     TARGET_POSITION,
     TARGET_TORQUE,
     TORQUE_READING,
@@ -133,17 +129,6 @@ def disable(index: int, write: Write, read: Read) -> None:
         write(cob_id, held | _INVALID)
         if not read(cob_id) & _INVALID:
             raise MappingRefused(f"{cob_id}: stays valid, so another program could command this joint through it")
-
-
-def host_frames(nodes: tuple[int, ...], host: int) -> dict[int, str]:
-    """COB-IDs that only the host of these nodes sends, and what they are; `host` is its own node id."""
-    return {
-        NMT_ID: "NMT command",
-        SYNC_ID: "SYNC",
-        HEARTBEAT_ID + host: "heartbeat of the host",
-        LSS_ID: "LSS command",
-        **{base + node: f"RPDO{number} of node {node}" for number, base in enumerate(RPDO_BASES, 1) for node in nodes},
-    }
 
 
 def _same(entry: Entry, written: int, held: int) -> None:

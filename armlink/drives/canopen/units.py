@@ -1,13 +1,24 @@
-"""Conversion between a joint controller's units (per mille of rated torque, user position units, µN·m) and SI."""
+"""A joint controller's units (per mille of rated torque, user position units, µN·m) in SI, from it or the arm file."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from armlink.arm_file import LinkJoint
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen.object_dictionary import Entry
+from armlink.drives.canopen.sdo import NodeServices
+from armlink.drives.canopen.settings import CanopenSettings
+from armlink.errors import BadInput, BusFault
 
 TORQUE_PER_MICRO = 1e-6
 """2100h:01 is in µN·m."""
+RATED_TORQUE_TOLERANCE = 1e-3
+INCREMENTS, REVOLUTIONS, RADIANS, DEGREES = 0xB5, 0xB4, 0x10, 0x41
+"""Units in 60A8h and 60A9h (CiA 303-2): bits 16 to 23; of a velocity bits 8 to 15 are the time; a power of ten is in
+bits 24 to 31 of both."""
+SECOND, MINUTE = 0x03, 0x47
+
 USER_UNITS = 1 << 20
 """User units per joint revolution, assumed if 6092h is not read from the controllers."""
 
@@ -52,3 +63,92 @@ def units_from(
 def assumed_units(joints: Sequence[LinkJoint]) -> tuple[Units, ...]:
     """Scales from the arm file's rated torques and USER_UNITS per revolution, for listeners, which read no objects."""
     return tuple(units_from(round(joint.rated_torque * 1e3), (1, 1), (1, 1), (USER_UNITS, 1)) for joint in joints)
+
+
+def read_units(services: NodeServices, joint: LinkJoint) -> Units:
+    """Scales of a joint at the output of its drive.
+
+    Raises BadInput where the rated torque is not the arm file's or a scale is told by nobody, BusFault.
+    """
+    settings: CanopenSettings = joint.settings
+    if settings.torque != "record":
+        return _stock_units(services, joint, settings)
+    read = services.read
+    rated_mnm = int(read(objects.RATED_TORQUE))
+    _require_rated(joint, rated_mnm * 1e-3, joint.rated_torque)
+    encoder = int(read(objects.ENCODER_INCREMENTS)), int(read(objects.ENCODER_REVOLUTIONS))
+    gear = int(read(objects.GEAR_MOTOR)), int(read(objects.GEAR_SHAFT))
+    feed = int(read(objects.FEED)), int(read(objects.FEED_SHAFT))
+    try:
+        return units_from(rated_mnm, encoder, gear, feed)
+    except ValueError as error:
+        raise BusFault(f"{joint.name} (node {settings.node}): no units: {error}") from None
+
+
+def _stock_units(services: NodeServices, joint: LinkJoint, settings: CanopenSettings) -> Units:
+    """Scales of a stock device. The rated torque of the arm file is the joint's, that of the device at its output."""
+    rated = joint.rated_torque / settings.gear
+    told = _optional(services, objects.RATED_TORQUE)
+    if told and not math.isclose(told * 1e-6, rated, rel_tol=RATED_TORQUE_TOLERANCE):  # some makers have it in µN·m
+        _require_rated(joint, told * 1e-3, rated)
+    position = settings.position_unit or _position_unit(services)
+    if position is None:
+        raise BadInput(
+            f"{joint.name} ({settings.address}): 6092h, 608Fh and 60A8h do not tell the unit of 6064h: "
+            "give drive.position_unit, radians of one count"
+        )
+    velocity = settings.velocity_unit or _velocity_unit(services, position)
+    return Units(rated * 1e-3, position, velocity, position)
+
+
+def _position_unit(services: NodeServices) -> float | None:
+    """Radians at the output of one count of 6064h: by 6092h, else by 60A8h, else by 608Fh and 6091h."""
+    feed, shaft = _optional(services, objects.FEED), _optional(services, objects.FEED_SHAFT) or 1
+    if feed:
+        return 2 * math.pi * shaft / feed
+    told = _optional(services, objects.POSITION_SI_UNIT)
+    if told and (turn := _angle(told)) is not None:
+        return turn
+    increments = _optional(services, objects.ENCODER_INCREMENTS)
+    if not increments:
+        return None
+    turns = _optional(services, objects.ENCODER_REVOLUTIONS) or 1
+    motor, gear = _optional(services, objects.GEAR_MOTOR) or 1, _optional(services, objects.GEAR_SHAFT) or 1
+    return 2 * math.pi * turns / increments * gear / motor
+
+
+def _velocity_unit(services: NodeServices, position: float) -> float:
+    """Radians a second at the output of one count of 606Ch: by 60A9h, else counts of 6064h a second (CiA 402)."""
+    told = _optional(services, objects.VELOCITY_SI_UNIT)
+    time = {SECOND: 1.0, MINUTE: 60.0}.get(told >> 8 & 0xFF)
+    if not told or time is None:
+        return position
+    angle = _angle(told)
+    if angle is None:
+        return position / time * _power(told)
+    motor, gear = _optional(services, objects.GEAR_MOTOR) or 1, _optional(services, objects.GEAR_SHAFT) or 1
+    return angle / time * gear / motor
+
+
+def _angle(told: int) -> float | None:
+    """Radians of the unit in 60A8h or 60A9h; None for increments and what is no angle."""
+    angle = {REVOLUTIONS: 2 * math.pi, RADIANS: 1.0, DEGREES: math.pi / 180}.get(told >> 16 & 0xFF)
+    return None if angle is None else angle * _power(told)
+
+
+def _power(told: int) -> float:
+    exponent = told >> 24 & 0xFF
+    return float(10.0 ** (exponent - 256 if exponent > 127 else exponent))
+
+
+def _optional(services: NodeServices, entry: Entry) -> int:
+    """Value of an object, 0 where the device lacks it."""
+    return int(services.read(entry)) if services.has(entry) else 0
+
+
+def _require_rated(joint: LinkJoint, found: float, stated: float) -> None:
+    if abs(found - stated) > RATED_TORQUE_TOLERANCE * stated:
+        raise BadInput(
+            f"{joint.name} ({joint.settings.address}): rated torque 6076h is {found} N·m, the arm file says "
+            f"{stated}: correct link.joints or connect the right arm"
+        )

@@ -5,7 +5,7 @@ import pytest
 from fake_joints import make_arm
 
 from armlink.bus.frame_bits import frame_bits
-from armlink.link.groups import make_groups
+from armlink.link.joints.groups import make_groups
 from armlink.monitor.cycle_stats import CycleStats
 
 DATA = bytes(range(8))

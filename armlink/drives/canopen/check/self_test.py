@@ -19,8 +19,8 @@ from armlink.drives.canopen.drives import CanopenDrives, check_fits
 from armlink.drives.canopen.eds_file import OPTIONAL, expected_identity, used_objects
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.profile import OURS, Profile, examine
-from armlink.drives.canopen.scales import read_units
 from armlink.drives.canopen.sdo import NodeServices
+from armlink.drives.canopen.units import read_units
 from armlink.drives.findings import Outcome, Result
 from armlink.drives.orders import Limits, Mode
 from armlink.errors import ArmlinkError

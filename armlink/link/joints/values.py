@@ -8,7 +8,7 @@ from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.drives.orders import Gains, Limits, Order, Power
 from armlink.link.gate_limits import drive_limits, joint_ranges, target_window
-from armlink.link.groups import Group, Mounting, make_groups, traits_of
+from armlink.link.joints.groups import Group, Mounting, make_groups, traits_of
 from armlink.torque_calibration import TorqueCalibration
 
 

@@ -5,8 +5,8 @@ import numpy as np
 from armlink.arrays import Array
 from armlink.drives.family import KeepsCalibration
 from armlink.errors import BadInput
-from armlink.link.ask import LinkAsk
-from armlink.link.groups import Group
+from armlink.link.joints.ask import LinkAsk
+from armlink.link.joints.groups import Group
 from armlink.torque_calibration import Calibration
 
 

@@ -7,8 +7,8 @@ import numpy as np
 from armlink.arrays import Array
 from armlink.bus.port import BUS_SHIFT, Frame
 from armlink.drives.family import ANY
-from armlink.link.groups import Group
-from armlink.link.joint_values import JointValues
+from armlink.link.joints.groups import Group
+from armlink.link.joints.values import JointValues
 
 Commands = tuple[Frame, ...]
 """Newest command frames."""
