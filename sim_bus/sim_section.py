@@ -1,6 +1,6 @@
 """The arm file's `sim` section: true parameters of the simulated arm, which no fit may read."""
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
@@ -107,6 +107,8 @@ class SimSection(Section):
     links: tuple[LinkBody, ...] | None = None
     sensors: Sensors = Sensors()
     effects: tuple[EffectEntry, ...] = ()
+    device: Literal["ours", "cia402", "epos4", "nanotec", "copley", "sample"] | None = None
+    """Which CiA 402 devices the joints have; default: ours, or a stock one if the arm file reads torque elsewhere."""
     realism: Realism = Realism(level=0.0)
     """Small troubles of a real arm, on top of `effects`."""
     servo: Servo = Servo()

@@ -20,6 +20,7 @@ from sim_bus.effects.registry import imperfections
 from sim_bus.effects.state import Imperfections
 from sim_bus.node.cia402 import State
 from sim_bus.node.controller_settings import APPLIED, bring_into_force, power_on_values
+from sim_bus.node.devices import device_of
 from sim_bus.node.drives import Drives
 from sim_bus.node.nmt import RESET_NODE, NetworkManagement
 from sim_bus.node.node import Node
@@ -69,12 +70,14 @@ class SimulatedArm:
         self._pdos = PdoTable(self._signals, self._operational, self._send)
         for node in self.nodes:
             joint = link.joints[node.place]
-            node.identity = power_on_values(arm, joint, int(self.sensors.increments[node.place]))
+            node.device = device_of(joint, section.device)
+            node.identity = power_on_values(arm, joint, int(self.sensors.increments[node.place]), node.device)
             node.reset()
             node.on_write = lambda key, node=node: self._written(node, key)  # type: ignore[misc]
             node.on_pdo_change = self._compile
             self._apply(node)
         self._compile()
+        self.drives.set_devices([node.device for node in self.nodes], [node.place for node in self.nodes])
         self.drives.on_state, self.drives.on_fault = self._state_changed, self._faulted
         self.drives.take_commands()
         self.drives.sample(0.0, 0.0)

@@ -223,17 +223,6 @@ class KeepsCalibration(Protocol):
 
 
 @runtime_checkable
-class TestsItself(Protocol):
-    """Drives with a self-test of their own, which goes further than the one for all families."""
-
-    def self_test(
-        self, link: Any, limits: Sequence[Limits], power: bool, progress: Callable[[str], None]
-    ) -> list[Result]:
-        """Results for an arm of which all joints are these drives; `link` is its Link, open and not started."""
-        ...
-
-
-@runtime_checkable
 class Replays(Protocol):
     """Drives whose frames can be made again from a recording."""
 
@@ -253,6 +242,9 @@ class Family:
     """Keys of `link.joints[].drive`."""
     build: Callable[[ArmFile, Sequence[LinkJoint]], Drives]
     """`build(arm, joints)`: the drives of these joints of an arm, all on one bus; sends nothing. Raises BadInput."""
+    self_test: Callable[..., list[Result]] | None = None
+    """`self_test(link, drives, limits, power, progress)` of an arm with these drives alone, open and not started, where
+    it goes further than the one for all families."""
     search: Callable[..., int] | None = None
     """`search(arm or None, bus or None, json, write)`: `armlink scan` of a whole bus; None: each drive is asked."""
     state_name: Callable[[int], str] = power_name

@@ -220,9 +220,8 @@ class Commander:
     def _seen(self, now: float, healthy: bool) -> list[Seen]:
         loop, seen = self.loop, []
         for joint in range(self.n):
-            known = now - loop.slow_seen[joint] <= self._slow_age
-            torque = loop.latest_motor_torque[joint] if known else math.nan
-            velocity = loop.latest_velocity[joint] if known else math.nan
+            torque = loop.latest_motor_torque[joint] if now - loop.slow_seen[joint] <= self._slow_age else math.nan
+            velocity = loop.latest_velocity[joint] if now - loop.speed_seen[joint] <= self._slow_age else math.nan
             seen.append(Seen(torque, loop.latest_position[joint], velocity, now - loop.seen[joint], healthy))
         return seen
 

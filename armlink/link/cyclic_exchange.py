@@ -80,7 +80,9 @@ class Loop:
         self.latest_velocity = [math.nan] * self.n
         """Newest velocity of each joint whenever it came [rad/s]; for the gate, never for a sample."""
         self.slow_seen = [-math.inf] * self.n
-        """When motor torque and velocity of each joint last came, by the clock [s]."""
+        """When the motor torque of each joint last came, by the clock [s]."""
+        self.speed_seen = [-math.inf] * self.n
+        """When the velocity of each joint last came, by the clock [s]."""
         self.synced = -math.inf
         """When the last commands left, by the clock [s]."""
         self._owed_for = 0
@@ -286,8 +288,10 @@ class Loop:
         board = self.board
         if reading.position == reading.position:  # not NaN
             board.reading(joint, reading.position, reading.sensor_torque)
-        if reading.motor_torque == reading.motor_torque or reading.velocity == reading.velocity:
-            board.slow(joint, reading.motor_torque, reading.velocity)
+        if reading.motor_torque == reading.motor_torque:
+            board.motor[joint], board.slow_came = reading.motor_torque, True
+        if reading.velocity == reading.velocity:
+            board.velocity[joint], board.slow_came = reading.velocity, True
         if reading.power is not None:
             board.status[joint] = power_code(reading.power)
         if reading.fault:
@@ -324,7 +328,8 @@ class Loop:
         velocity = self.values.velocity(np.array(self.board.velocity))
         for joint in self._keep(motor, self.latest_motor_torque):
             self.slow_seen[joint] = now
-        self._keep(velocity, self.latest_velocity)
+        for joint in self._keep(velocity, self.latest_velocity):
+            self.speed_seen[joint] = now
         return motor, velocity
 
     def _keep(self, values: Array, latest: list[float]) -> list[int]:

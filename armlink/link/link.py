@@ -12,12 +12,12 @@ from armlink.arrays import Array
 from armlink.bus.adapters import as_bus
 from armlink.bus.can_bus import CanBus
 from armlink.clock import Clock, MonotonicClock
-from armlink.drives.orders import DriveIdentity, Order, Power, Setup
+from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Setup
 from armlink.errors import BusFault, Silence
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.faults import bus_fault
-from armlink.link.gate import start_from
+from armlink.link.gate import JointLimits, start_from
 from armlink.link.gate_limits import drive_limits, gate_limits, joint_ranges, target_window
 from armlink.link.guard import Crossed
 from armlink.link.joints.ask import LinkAsk
@@ -64,6 +64,7 @@ class Link(Calibrations):
         self.commander = Commander(self._loop, self.clock, self.names, self.period, section.deadline, self._lock_step)
         self.ask = LinkAsk(self._loop, self.clock, self._pump)
         """Requests to drives, outside of cycles or between them."""
+        self.calibrate_host(simulated=self._lock_step)
         self.setups: list[Setup] = []
         """What start() found, in joint order."""
         self._cycling = self._enabled = False
@@ -71,6 +72,7 @@ class Link(Calibrations):
         self.position_step = np.full(self.n, np.inf)
         """Smallest change that each position reading can show (n,) [rad]; inf before start()."""
         self._last: Command | None = None
+        self._limits: list[Limits] = []
 
     @classmethod
     def open(cls, arm: ArmFile, bus: str | None = None) -> "Link":
@@ -198,14 +200,22 @@ class Link(Calibrations):
             found |= dict(zip(group.places, group.drives.set_up(self._ask(group), own), strict=True))
         self.setups = [found[joint] for joint in range(self.n)]
         self.position_step = np.array([each.position_step for each in self.setups]) / self.values.gear
-        limits, passed = [], []
-        for joint, setup in enumerate(self.setups):
-            gains = self.values.gains(joint, setup.gains)
-            limit = gate_limits(wanted[joint], gains, self.values.reach(joint, wanted[joint].max_torque))
+        self._limits, passed = wanted, []
+        limits = [self._gate_limits(joint) for joint in range(self.n)]
+        for joint, (setup, limit) in enumerate(zip(self.setups, limits, strict=True)):
             torque = self.values.torque_of(joint, setup.torque)
             passed.append(start_from(limit, torque, self.values.position_of(joint, setup.position)))
-            limits.append(limit)
         self.commander.begin(limits, passed, [each.modes for each in self.setups])
+
+    def _gate_limits(self, joint: int) -> JointLimits:
+        wanted = self._limits[joint]
+        gains = self.values.gains(joint, self.setups[joint].gains)
+        return gate_limits(wanted, gains, self.values.reach(joint, wanted.max_torque))
+
+    def calibration_changed(self, joint: int) -> None:
+        """What the gate lets pass follows the host's calibration."""
+        if self.setups:
+            self.commander.limits[joint] = self._gate_limits(joint)
 
     def enable(self) -> Sample:
         """Walk every joint to ON, under position control where it stands, and return the last sample.

@@ -52,6 +52,7 @@ class Listener(Calibrations):
         self._loop = Loop(self._port, self.clock, self.groups, self.values, self.period, lock_step)
         self._loop.on_unknown = self._take_unknown
         self.ask = LinkAsk(self._loop, self.clock, self._pump)
+        self.calibrate_host(simulated=lock_step)
         self._host = ForeignHost(self.groups, self.values)
         self._ready: deque[tuple[Sample, Commands]] = deque()
         self._sent: Commands = ()

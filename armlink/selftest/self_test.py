@@ -8,7 +8,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from armlink.drives.family import TestsItself
 from armlink.drives.findings import Outcome, Result
 from armlink.drives.orders import Power
 from armlink.drives.traits import Silence
@@ -60,10 +59,11 @@ class SelfTest:
         Raises BusFault where another host is on the bus.
         """
         link = self.link
-        if len(link.groups) == 1 and isinstance(link.groups[0].drives, TestsItself):
+        own = link.groups[0].family.self_test if len(link.groups) == 1 else None
+        if own is not None:
             pairs = zip(link.section.joints, link.windows, strict=True)
             limits = [drive_limits(row, window, link.period, link.section.deadline) for row, window in pairs]
-            return link.groups[0].drives.self_test(link, limits, power, self.progress)
+            return own(link, link.groups[0].drives, limits, power, self.progress)
         reason = "not asked for"
         try:
             if not self._identified():

@@ -5,6 +5,7 @@ from zlib import crc32
 import numpy as np
 
 from armlink.arm_file import ArmFile, LinkJoint
+from sim_bus.node.devices import Device
 from sim_bus.node.drives import SUPPORTED_MODES, UNWATCHED, Drives
 from sim_bus.node.node import Node
 from sim_bus.node.object_arrays import Key
@@ -18,7 +19,7 @@ TEMPERATURE = 310
 """Temperature of every drive [0.1 °C]."""
 
 
-def power_on_values(arm: ArmFile, joint: LinkJoint, increments: int) -> dict[Key, int | str]:
+def power_on_values(arm: ArmFile, joint: LinkJoint, increments: int, device: Device) -> dict[Key, int | str]:
     """Objects of one joint that differ from the EDS's defaults; `increments` of the encoder per joint revolution."""
     link, servo = arm.require_link(), sim_section(arm).servo
     deceleration = round(servo.quick_stop_deceleration / UNIT)
@@ -34,7 +35,8 @@ def power_on_values(arm: ArmFile, joint: LinkJoint, increments: int) -> dict[Key
         (0x608F, 1): increments,
         (0x6092, 1): FEED,
         (0x60C2, 1): min(max(round(1000 / link.rate), 1), 255),
-        (0x6502, 0): SUPPORTED_MODES,
+        (0x6502, 0): SUPPORTED_MODES & ~device.hidden_modes,
+        **device.values,
     }
 
 

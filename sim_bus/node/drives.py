@@ -1,12 +1,14 @@
 """The joints' drives (CiA 402): states, modes and readings, for all joints at once."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.drives.canopen.settings import TorqueObject
 from sim_bus.node.cia402 import STATUS, State, command, next_state
-from sim_bus.node.object_arrays import Signals
+from sim_bus.node.devices import Device
+from sim_bus.node.object_arrays import INPUT, Signals
 from sim_bus.node.position_torque_loops import (
     CSP,
     CST,
@@ -62,7 +64,21 @@ class Drives:
         self._seen_words, self._seen_modes = self._word_in.copy(), self._mode_in.copy()
         self._seen_limit = self._limit_in.copy()
         self._user_per_count = FEED / sensors.increments
+        self._velocity_per_count = self._user_per_count.copy()
+        self._input_out, self._input_scale = signals[INPUT, 1], np.full(n, np.inf)
+        self._input_zero = np.zeros(n)
+        for joint, row in enumerate(arm.require_link().joints):
+            wired = row.settings.torque if row.settings.family == "canopen" else None
+            if isinstance(wired, TorqueObject) and wired.index == INPUT:
+                self._input_scale[joint], self._input_zero[joint] = wired.scale, wired.offset
+        self._with_inputs = bool(np.isfinite(self._input_scale).any())
         self._last_elapsed, self._share = 0.0, 0.0
+
+    def set_devices(self, devices: Sequence[Device], places: Sequence[int]) -> None:
+        """What stock devices show differently."""
+        for place, device in zip(places, devices, strict=True):
+            if device.rpm:
+                self._velocity_per_count[place] = 60.0 / self._sensors.increments[place]
 
     # ---- readings
 
@@ -75,11 +91,14 @@ class Drives:
                 self._last_elapsed, self._share = elapsed, float(1.0 - np.exp(-elapsed / VELOCITY_FILTER))
             self._velocity += self._share * ((counts - self._counts) / elapsed - self._velocity)
             self._counts = counts
-            self._velocity_out[:] = np.rint(self._velocity * self._user_per_count)
+            self._velocity_out[:] = np.rint(self._velocity * self._velocity_per_count)
         torque = (self._sensors.torque(plant.link_torque, time) - self.offset) / self.gain
         motor = plant.drive_torque
         self._position_out[:] = np.rint(counts * self._user_per_count)
         self._reading_out[:] = np.rint(torque * 1e6)
+        if self._with_inputs:
+            counts_in = torque / self._input_scale + self._input_zero
+            self._input_out[:] = np.clip(np.rint(counts_in), -32768, 32767)
         self._motor_out[:] = np.rint(motor * (1000 / self.rated))
         limited = np.abs(motor) >= self.loops.limit
         self._status_out[:] = (

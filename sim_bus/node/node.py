@@ -9,6 +9,7 @@ from canopen.objectdictionary import ODVariable
 from canopen.sdo import SdoServer
 from canopen.sdo.exceptions import SdoAbortedError
 
+from sim_bus.node.devices import Device
 from sim_bus.node.object_arrays import DTYPES, Key, Signals, data_sheet, variable
 from sim_bus.node.pdo import INVALID, Frame, PdoParameters, layout
 from sim_bus.node.torque_sensor_record import TorqueRecord
@@ -26,6 +27,8 @@ class Node:
         """A node that has not booted yet: call reset()."""
         self.place, self.node_id = place, node_id
         self.object_dictionary = data_sheet()
+        self.device = Device()
+        """What it lacks, and has differently."""
         self.identity: dict[Key, int | str] = {}
         """Values that differ from the EDS's defaults, kept when defaults are restored."""
         self.record = TorqueRecord()
@@ -78,7 +81,7 @@ class Node:
         if (index, sub) in self._signals:
             return bytes(self._signals[index, sub][self.place].tobytes())
         if index == 0x2100:
-            return self.record.read(sub)
+            return bytes(8) if self.device.wide_2100 else self.record.read(sub)
         if index == 0x1003:
             return self._error_history(sub)
         return self._values[index, sub]
@@ -97,6 +100,8 @@ class Node:
     def set_data(self, index: int, subindex: int, data: bytes, check_writable: bool = False) -> None:
         """SDO download. Raises SdoAbortedError."""
         entry, key = self._entry(index, subindex), (index, subindex)
+        if self.device.fixed_exponent and key == (0x60C2, 2) and bytes(data) != b"\xfd":
+            raise SdoAbortedError(WRONG_VALUE)
         if not entry.writable:
             raise SdoAbortedError(READ_ONLY)
         code = DTYPES.get(entry.data_type)
@@ -121,6 +126,11 @@ class Node:
 
     def _entry(self, index: int, sub: int) -> ODVariable:
         entry = variable(index, sub)
+        absent = self.device.absent
+        if entry is not None and (index, sub) in absent:
+            raise SdoAbortedError(NO_SUB_INDEX if sub else NO_OBJECT)
+        if index in absent or (self.device.wide_2100 and index == 0x2100 and sub > 1):
+            raise SdoAbortedError(NO_OBJECT)
         if entry is None:
             raise SdoAbortedError(NO_SUB_INDEX if index in data_sheet() else NO_OBJECT)
         return entry
@@ -180,7 +190,9 @@ class Node:
             raise SdoAbortedError(PDO_TOO_LONG)
         receive = index < 0x1800
         for entry in entries:
-            item = variable(entry >> 16, entry >> 8 & 0xFF)
+            item, mapped = variable(entry >> 16, entry >> 8 & 0xFF), (entry >> 16, entry >> 8 & 0xFF)
+            if mapped in self.device.unmappable or mapped[0] in self.device.absent or mapped in self.device.absent:
+                raise SdoAbortedError(NOT_MAPPABLE)
             if item is not None and receive and not item.writable:
                 raise SdoAbortedError(NOT_MAPPABLE)
 

@@ -22,7 +22,6 @@ from armlink.drives.canopen.profile import examine, profile_of
 from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork, joint_services
 from armlink.drives.canopen.units import Units, assumed_units, read_units
 from armlink.drives.family import Ask
-from armlink.drives.findings import Result
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
 from armlink.drives.traits import Traits
 from armlink.errors import BadInput, BusFault
@@ -48,6 +47,7 @@ _POWERS = {
     State.SWITCHED_ON: Power.READY,
 }
 _ALL = (-INT32_MAX - 1, INT32_MAX)
+_NO_LIMITS = Limits(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 _SYNC: Frame = (objects.SYNC_ID, b"")
 _OPERATIONAL = bytes([objects.OPERATIONAL])
 
@@ -84,8 +84,7 @@ class CanopenDrives:
         self._supported = [0] * m
         self._modes, self._mode_since = [OFF] * m, [-math.inf] * m
         self._words, self._walking = [FAULT_RESET] * m, [False] * m
-        self._windows = [(-INT32_MAX - 1, INT32_MAX)] * m
-        self._limits: list[Limits] = []
+        self._limits = [_NO_LIMITS] * m
         self._sent: list[bytes | None] = [None] * m
         self._command_ids = tuple(RPDO1.cob_base + node for node in self.nodes)
         self._heartbeat: Frame = (objects.HEARTBEAT_ID + self.protection.host, _OPERATIONAL)
@@ -113,6 +112,20 @@ class CanopenDrives:
             {each.name: each.entries for each in profile.pdos} for profile in self.profiles
         ]
         self._with_torque = [objects.TARGET_TORQUE in entries[RPDO1.name] for entries in self._entries]
+        self._compile()
+
+    def _compile(self) -> None:
+        """What each cycle needs of layouts, units and windows, in one place."""
+        self._compiled: list[tuple[int, Callable[..., bytes], float, float, float, float, int, int]] = []
+        self._read: list[tuple[int, Callable[[bytes], tuple[int, ...]], float, float, float]] = []
+        for joint, (layouts, unit, limits) in enumerate(zip(self._layouts, self.units, self._limits, strict=True)):
+            low, high = math.ceil(limits.lower / unit.position), math.floor(limits.upper / unit.position)
+            torque = unit.torque if self._with_torque[joint] else 0.0
+            window = (limits.lower, limits.upper, low, high)
+            self._compiled.append((self._command_ids[joint], layouts[RPDO1.name].pack, torque, unit.position, *window))
+            profile, layout = self.profiles[joint], layouts[TPDO1.name]
+            scale = 0.0 if profile.reading is None else profile.torque_scale
+            self._read.append((layout.size, layout.unpack, unit.position, scale, profile.torque_zero))
 
     # ---- what they are
 
@@ -194,10 +207,9 @@ class CanopenDrives:
         for joint, services in enumerate(all_services):
             self.profiles[joint] = examine(services, self.rows[joint].settings)
         self._map()
-        if self._board is not None:
-            self.fill(self._board, self._places)
         for joint, services in enumerate(all_services):
             found.append(self._set_up(joint, services, limits[joint]))
+        self._compile()
         self._beat = -math.inf
         self._words, self._walking, self._modes = [FAULT_RESET] * self.m, [False] * self.m, [OFF] * self.m
         for node in self.nodes:
@@ -215,7 +227,6 @@ class CanopenDrives:
         supported = self.offered(services, joint)
         device.configure(services, row, unit, limits, self.protection, supported, profile)
         self.units[joint], self._supported[joint] = unit, supported
-        self._windows[joint] = math.ceil(limits.lower / unit.position), math.floor(limits.upper / unit.position)
         torque = services.read(objects.MOTOR_TORQUE) * unit.torque if profile.has(objects.MOTOR_TORQUE) else math.nan
         if profile.has(objects.MODE_DISPLAY):
             self.displays[joint] = services.read(objects.MODE_DISPLAY)
@@ -236,14 +247,6 @@ class CanopenDrives:
         if self.rows[joint].settings.torque == "record":
             return device.check_modes(services)
         return device.offered_modes(services)
-
-    def self_test(
-        self, link: Any, limits: Sequence[Limits], power: bool, progress: Callable[[str], None]
-    ) -> list[Result]:
-        """See TestsItself."""
-        from armlink.drives.canopen.check.self_test import SelfTest
-
-        return SelfTest(link, self, limits, progress).run(power)
 
     def send_nmt(self, ask: Ask, command: int, node: int = 0) -> None:
         """An NMT command (CiA 301) to one node, or to all."""
@@ -266,35 +269,31 @@ class CanopenDrives:
         """See Drives: RPDO2 where a mode changes, RPDO1 of every joint, heartbeat when due, SYNC."""
         modes: list[Frame] = []
         commands: list[Frame] = []
+        rows = self._compiled
         for joint, order in enumerate(orders):
             if order is None:
                 self._sent[joint], self._walking[joint] = None, False
                 continue
-            if order.walk:
+            power, walk, mode, position, _, torque, _, _, _ = order
+            if walk:
                 word = self._step(joint, order, modes, now)
             else:
                 self._walking[joint] = False
-                if order.power is Power.ON:
-                    word, mode = ENABLE, order.mode
+                if power is Power.ON:
+                    word = ENABLE
                     if mode != self._modes[joint] and mode:
                         self._select(joint, mode, modes, now)
                     if mode == PROFILE_POSITION:
                         word = set_point_control(self.statuses[joint])
                 else:
-                    word = QUICK_STOP if order.power is Power.STOPPED else DISABLE_VOLTAGE
-            unit = self.units[joint]
-            limits, position = self._limits[joint], order.position
-            low, high = (
-                self._windows[joint] if limits.lower <= position <= limits.upper else (-INT32_MAX - 1, INT32_MAX)
-            )
-            target = max(low, min(high, round(position / unit.position)))
-            pack = self._layouts[joint]["RPDO1"].pack
-            if self._with_torque[joint]:
-                data = pack(word, int(order.torque / unit.torque), target)
-            else:
-                data = pack(word, target)
+                    word = QUICK_STOP if power is Power.STOPPED else DISABLE_VOLTAGE
+            can_id, pack, torque_unit, position_unit, lower, upper, low, high = rows[joint]
+            if not lower <= position <= upper:
+                low, high = -INT32_MAX - 1, INT32_MAX
+            target = max(low, min(high, round(position / position_unit)))
+            data = pack(word, int(torque / torque_unit), target) if torque_unit else pack(word, target)
             self._words[joint], self._sent[joint] = word, data
-            commands.append((self._command_ids[joint], data))
+            commands.append((can_id, data))
         if modes:
             commands = modes + commands
         if self.beating and now - self._beat > self.beat_every - 0.5 * self._period:
@@ -359,21 +358,21 @@ class CanopenDrives:
         return table
 
     def _take_reading(self, joint: int, place: int, board: Board, data: bytes) -> None:
-        reading = self._reading(joint, data)
-        if reading is None:
+        size, unpack, unit, scale, zero = self._read[joint]
+        if len(data) != size:
             board.errors += 1
+        elif scale:
+            position, torque = unpack(data)
+            board.reading(place, position * unit, (torque - zero) * scale)
         else:
-            board.reading(place, *reading)
+            board.reading(place, unpack(data)[0] * unit, math.nan)
 
     def _reading(self, joint: int, data: bytes) -> tuple[float, float] | None:
-        layout = self._layouts[joint]["TPDO1"]
-        if len(data) != layout.size:
+        size, unpack, unit, scale, zero = self._read[joint]
+        if len(data) != size:
             return None
-        values = layout.unpack(data)
-        profile, position = self.profiles[joint], values[0] * self.units[joint].position
-        if profile.reading is None:
-            return position, math.nan
-        return position, profile.torque_scale * (values[1] - profile.torque_zero)
+        values = unpack(data)
+        return values[0] * unit, (values[1] - zero) * scale if scale else math.nan
 
     def _take_slow(self, joint: int, place: int, board: Board, data: bytes) -> None:
         slow = self._slow(joint, data)

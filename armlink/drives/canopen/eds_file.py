@@ -72,6 +72,8 @@ def read_sheet(path: Path, joint: LinkJoint) -> Any:
         raise BadInput(f"{where}: {error.strerror or error}: correct eds of this joint under link.joints") from None
     except Exception as error:  # configparser and canopen raise many kinds
         raise BadInput(f"{where}: not a valid EDS (CiA 306): {' '.join(str(error).split())}") from None
+    if joint.settings.torque != "record":  # a stock device is asked what it has
+        return sheet
     for entry in used_objects():
         found = sheet.get_variable(entry.index, entry.sub)
         if found is None and entry not in OPTIONAL:

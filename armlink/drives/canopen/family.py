@@ -2,12 +2,15 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.drives.board import NO_STATUS
 from armlink.drives.canopen.cia402 import state_of
 from armlink.drives.canopen.settings import CanopenSettings
 from armlink.drives.family import Drives, Family
+from armlink.drives.findings import Result
+from armlink.drives.orders import Limits
 from armlink.drives.traits import Traits
 
 TRAITS = Traits(
@@ -35,6 +38,15 @@ def search(arm: ArmFile | None, bus: str | None, json: Path | None, write: Calla
     return scan_report(arm, bus, json, write)
 
 
+def self_test(
+    link: Any, drives: Any, limits: Sequence[Limits], power: bool, progress: Callable[[str], None]
+) -> list[Result]:
+    """The self-test of CiA 402 controllers; see `armlink.drives.canopen.check.self_test`."""
+    from armlink.drives.canopen.check.self_test import SelfTest
+
+    return SelfTest(link, drives, limits, progress).run(power)
+
+
 def state_name(code: int) -> str:
     """State in words, from the status word (6041h)."""
     return "unknown" if code == NO_STATUS else state_of(code).value
@@ -45,6 +57,7 @@ FAMILY = Family(
     traits=TRAITS,
     settings=CanopenSettings,
     build=build,
+    self_test=self_test,
     search=search,
     state_name=state_name,
     summary="CiA 402 (CANopen), with or without our torque sensor object 2100h",

@@ -28,9 +28,9 @@ LOST: Mapping[Entry, str] = {
     objects.RATED_TORQUE: "rated torque as the arm file has it",
     objects.SUPPORTED_MODES: "modes as they are displayed",
     objects.MODE_DISPLAY: "a refused mode shows by the motion alone",
-    objects.TORQUE_OFFSET: "torque offset: nothing latched to clear",
-    objects.PROFILE_VELOCITY: "profile velocity: no profile position mode",
-    objects.TORQUE_SLOPE: "torque slope: no profile torque mode",
+    objects.TORQUE_OFFSET: "nothing latched to clear",
+    objects.PROFILE_VELOCITY: "no profile position mode",
+    objects.TORQUE_SLOPE: "no profile torque mode",
 }
 """Objects that a stock device may lack → what is lost by it; empty where another line says it."""
 

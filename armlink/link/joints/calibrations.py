@@ -1,22 +1,74 @@
-"""Temperatures, and the calibrations in force: in the drives that keep one, in the host for the others."""
+"""Temperatures, and the calibrations in force: in the drives that keep one, in the host for the others.
+
+A calibration in the host is in force by record: what the entry-point group `armlink.calibrations` tells of an arm
+(`calib.records.in_force`) is taken when its drives are opened, and said to be missing where there is none.
+"""
+
+import logging
+from collections.abc import Callable, Sequence
+from importlib.metadata import entry_points
 
 import numpy as np
 
+from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.drives.family import KeepsCalibration
 from armlink.errors import BadInput
 from armlink.link.joints.ask import LinkAsk
-from armlink.link.joints.groups import Group
-from armlink.torque_calibration import Calibration
+from armlink.link.joints.groups import Group, traits_of
+from armlink.link.joints.values import JointValues
+from armlink.torque_calibration import GAIN_RANGE, Calibration, per_joint
+
+BLANK = Calibration(1.0, 0.0)
+"""Of a drive that was never calibrated."""
+Provider = Callable[[ArmFile], Sequence[Calibration | None]]
+log = logging.getLogger("armlink")
+
+
+def calibrations_by_record(arm: ArmFile) -> list[Calibration | None]:
+    """What the records of an arm say, joint by joint; None where no record is in force."""
+    for point in entry_points(group="armlink.calibrations"):
+        provide: Provider = point.load()
+        return list(provide(arm))
+    return [None] * len(arm.require_link().joints)
 
 
 class Calibrations:
     """A part of whatever has drives and can ask them."""
 
+    arm: ArmFile
     names: tuple[str, ...]
     n: int
     groups: tuple[Group, ...]
+    values: JointValues
     ask: LinkAsk
+    _in_host: dict[int, Calibration]
+
+    def calibrate_host(self, simulated: bool) -> None:
+        """Put the host's calibrations into force; of an arm that is simulated in this process, and new, there are none.
+
+        Raises Refused where the record in force is of another arm.
+        """
+        traits = traits_of(self.groups, self.n)
+        hosted = [joint for joint in range(self.n) if traits[joint].calibration == "host"]
+        found = calibrations_by_record(self.arm) if hosted and not simulated else [None] * self.n
+        self._in_host = {joint: found[joint] or BLANK for joint in hosted}
+        missing = [self.names[joint] for joint in hosted if found[joint] is None]
+        if missing and not simulated:
+            log.warning(
+                "%s: no calibration record is in force for %s: torque is what the drives take it for",
+                self.arm.name,
+                ", ".join(missing),
+            )
+        self._apply_host()
+
+    @property
+    def uncalibrated(self) -> tuple[str, ...]:
+        """Joints that the host is to calibrate, and has no calibration for."""
+        return tuple(self.names[joint] for joint, held in self._in_host.items() if held.is_blank)
+
+    def _apply_host(self) -> None:
+        self.values.calibrate(per_joint([self._in_host.get(joint, BLANK) for joint in range(self.n)]))
 
     def _ask(self, group: Group) -> LinkAsk:
         return self.ask.on(group.tag)
@@ -30,22 +82,37 @@ class Calibrations:
         return found
 
     def read_calibration(self, joint: int) -> Calibration:
-        """The calibration that is in force for joint 0 … n−1; raises BusFault."""
+        """The calibration that is in force for joint 0 … n−1, in its drive or in the host; raises BusFault."""
+        if joint in self._in_host:
+            return self._in_host[joint]
         group, drive = self._drive(joint)
-        if isinstance(group.drives, KeepsCalibration) and group.drives.traits(drive).calibration == "controller":
-            return group.drives.read_calibration(drive, self._ask(group))
-        raise BadInput(f"{self.names[joint]}: its drive keeps no calibration")
+        assert isinstance(group.drives, KeepsCalibration)
+        return group.drives.read_calibration(drive, self._ask(group))
 
     def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
-        """Make a calibration active in joint 0 … n−1 (`store`: in flash too); raises BadInput, BusFault.
+        """Put a calibration into force for joint 0 … n−1 (`store`: in a drive's flash too); raises BadInput, BusFault.
 
-        While the joints are enabled, the cycle goes on with the last command. Only
-        `calib.install.journaled_write` calls this.
+        While the joints are enabled, the cycle goes on with the last command. In the host it is in force until this is
+        closed; the record that is current then is taken at the next opening. Only `calib.install.journaled_write`
+        calls this.
         """
+        if joint in self._in_host:
+            gain, offset = calibration.gain, calibration.offset
+            if not (GAIN_RANGE[0] <= gain <= GAIN_RANGE[1] and abs(offset) < 1e4):
+                raise BadInput(
+                    f"{self.names[joint]}: gain {gain} and offset {offset} N·m: expected a gain of {GAIN_RANGE[0]} to "
+                    f"{GAIN_RANGE[1]} and a finite offset"
+                )
+            self._in_host[joint] = calibration
+            self._apply_host()
+            self.calibration_changed(joint)
+            return calibration
         group, drive = self._drive(joint)
-        if isinstance(group.drives, KeepsCalibration) and group.drives.traits(drive).calibration == "controller":
-            return group.drives.write_calibration(drive, self._ask(group), calibration, store)
-        raise BadInput(f"{self.names[joint]}: its drive keeps no calibration")
+        assert isinstance(group.drives, KeepsCalibration)
+        return group.drives.write_calibration(drive, self._ask(group), calibration, store)
+
+    def calibration_changed(self, joint: int) -> None:
+        """Called where the host's calibration of a joint has changed."""
 
     def _drive(self, joint: int) -> tuple[Group, int]:
         return next((group, group.places.index(joint)) for group in self.groups if joint in group.places)

@@ -21,7 +21,7 @@ def drives(lower=-2.0, upper=2.0, unit=UNIT):
     found = CanopenDrives(arm, arm.link.joints, TRAITS)
     found.units[0] = unit
     found._limits = [Limits(30.0, 200.0, 1.0, lower, upper, 0.1, 0.004)]
-    found._windows = [(math.ceil(lower / unit.position), math.floor(upper / unit.position))]
+    found._compile()
     return found
 
 
