@@ -22,7 +22,8 @@ from calib.records.store import RecordStore
 ROOT = Path(__file__).parents[3]
 PACKAGES = ("armlink", "calib", "gcomp", "sim_bus", "sim_gap")
 DOOR, GATES = "calib/install/journaled_write.py", "calib/install/plausibility.py"
-WIRE = "armlink.drives.canopen.torque_sensor_record.py"
+WIRE = "armlink/drives/canopen/torque_sensor_record.py"
+DRIVES = "armlink/drives/canopen/drives.py"
 OBJECTS = ("STAGED_GAIN", "STAGED_OFFSET", "ACTIVATE")
 """Of 2100h, without which no calibration becomes active."""
 
@@ -80,7 +81,7 @@ def test_only_a_forwarder_asks_the_bus_process_to_write() -> None:
 
 
 def test_only_write_calibration_uses_the_wire_format() -> None:
-    assert users("write_record") == {(WIRE, "write_calibration")}
+    assert users("write_record") == {(DRIVES, "write_calibration")}
     for name in OBJECTS:
         uses = {use for use in users(name) if not use[0].endswith("object_dictionary.py")}
         assert uses == {(WIRE, "write_record")}
