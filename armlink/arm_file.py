@@ -10,12 +10,16 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from armlink.arrays import Array
 from armlink.errors import BadInput
 
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
+
+
+Positive = Annotated[FiniteFloat, Field(gt=0)]
+"""A limit, or another number that is neither infinite nor zero nor less."""
 
 
 class Section(BaseModel):
@@ -78,7 +82,7 @@ class Bus(Section):
     bitrate: Annotated[int, Field(gt=0)] = 1_000_000
     fd: bool = False
     """Frames go as CAN FD with bit-rate switch, where the interface has it; the load is counted as classical CAN's."""
-    options: dict[str, str | int | float | bool] = {}
+    options: dict[str, str | int | FiniteFloat | bool] = {}
     """Further options of python-can's interface, such as data_bitrate or serial."""
 
 
@@ -99,13 +103,13 @@ class LinkJoint(Section):
 
     name: str
     node: Annotated[int, Field(ge=1, le=127)]
-    rated_torque: PositiveFloat
+    rated_torque: Positive
     """Torque that 1000 ‰ stands for (6076h) [N·m]."""
-    max_torque: PositiveFloat
+    max_torque: Positive
     """No command exceeds it [N·m]."""
-    max_torque_rate: PositiveFloat = 200.0
+    max_torque_rate: Positive = 200.0
     """[N·m/s]."""
-    max_velocity: PositiveFloat = 1.0
+    max_velocity: Positive = 1.0
     """[rad/s]."""
     identity: DeviceIdentity = DeviceIdentity()
     """Another controller than this one at the joint's node is refused at the start."""

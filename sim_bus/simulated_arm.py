@@ -10,7 +10,9 @@ from armlink.arrays import Array
 from armlink.canopen.object_dictionary import SYNC_ID
 from armlink.errors import BadInput
 from sim_bus.effects.effect import EffectSetting
+from sim_bus.effects.realism import add_realism
 from sim_bus.effects.registry import imperfections
+from sim_bus.effects.state import Imperfections
 from sim_bus.node.cia402 import State
 from sim_bus.node.controller_settings import APPLIED, bring_into_force, power_on_values
 from sim_bus.node.drives import Drives
@@ -41,7 +43,7 @@ class SimulatedArm:
         self.default_period = 1.0 / link.rate
         self._entries: tuple[EffectSetting, ...] = section.effects
         with self._effects_checked():
-            state = imperfections(self.names, self._entries)
+            state = self._imperfections()
             self.plant = Plant(arm, state)
         self.sensors = Sensors(arm, truth, state, seed)
         self._signals = Signals(self.n)
@@ -144,12 +146,15 @@ class SimulatedArm:
 
     def set_effects(self, entries: Iterable[EffectSetting]) -> None:
         """Replace the arm's imperfections while it runs. Raises BadInput."""
-        wanted = tuple(entries)
-        with self._effects_checked():
-            state = imperfections(self.names, wanted)
-            self.plant.set_imperfections(state)
+        before, self._entries = self._entries, tuple(entries)
+        try:
+            with self._effects_checked():
+                state = self._imperfections()
+                self.plant.set_imperfections(state)
+        except BadInput:
+            self._entries = before
+            raise
         self.sensors.set_imperfections(state)
-        self._entries = wanted
         self.drives.loops.reconfigure()
 
     @property
@@ -162,13 +167,24 @@ class SimulatedArm:
         """True sensor parameters at present, drifts and effects included."""
         sensors, truth = self.sensors, self.truth
         return Truth(
-            sensors.gain, sensors.offset, sensors.position_gain, sensors.position_offset, attachment=truth.attachment
+            sensors.gain,
+            sensors.offset + sensors.cold_zero(self.time),
+            sensors.position_gain,
+            sensors.position_offset,
+            attachment=truth.attachment,
         )
 
     # ---- internals
 
     def _send(self, frame: Frame) -> None:
         self.outbox.append(frame)
+
+    def _imperfections(self) -> Imperfections:
+        """Current effects and the arm file's realism as one state."""
+        state, realism = imperfections(self.names, self._entries), sim_section(self.arm).realism
+        rated = self.arm.require_link().rated_torques
+        add_realism(state, rated, realism.level, realism.seed)
+        return state
 
     @contextmanager
     def _effects_checked(self) -> Iterator[None]:

@@ -1,7 +1,7 @@
 """Detects irregular traffic: a second host, a duplicated node id, a babbling node, a restarted controller."""
 
-from armlink.canopen.object_dictionary import HEARTBEAT_ID, NMT_ID, SYNC_ID
-from armlink.canopen.pdo import RPDO1, RPDO2
+from armlink.canopen.object_dictionary import HEARTBEAT_ID, LSS_ID, NMT_ID, SDO_REQUEST_ID, SYNC_ID
+from armlink.canopen.pdo import RPDO_BASES
 
 MOST_FRAMES = 1000
 """Limit of frames taken in at once; a bus at 1 Mbit/s needs 47 ms for them."""
@@ -14,6 +14,10 @@ DOUBLE_CYCLES = 3
 FORGIVEN = 250
 """Missed readings that may still arrive, several per cycle: one second of SYNCs at 250 Hz, from an arm that was late
 itself and catches up."""
+_DOWNLOADS = (1, 6)
+"""Command specifiers of SDO requests that write: initiate download, block download (CiA 301, 7.2.4.3)."""
+_HARMLESS_WRITES = (0x1010, 0x2100)
+"""Objects that another program may write: they store settings or hold the torque sensor's calibration."""
 
 
 class BusWatch:
@@ -24,10 +28,15 @@ class BusWatch:
         self._ours = {
             NMT_ID: "NMT command",
             SYNC_ID: "SYNC",
+            LSS_ID: "LSS command",
             HEARTBEAT_ID + host: "heartbeat of the host",
-            **{RPDO1.cob_base + node: f"RPDO1 of node {node}" for node in nodes},
-            **{RPDO2.cob_base + node: f"RPDO2 of node {node}" for node in nodes},
+            **{
+                base + node: f"RPDO{number} of node {node}"
+                for number, base in enumerate(RPDO_BASES, 1)
+                for node in nodes
+            },
         }
+        self._sdo = {SDO_REQUEST_ID + node: node for node in nodes}
         self._crowd = CROWD_PER_JOINT * len(nodes) + CROWD
         self._doubled: set[int] = set()
         self._double_cycles = [0] * len(nodes)
@@ -63,11 +72,21 @@ class BusWatch:
         if self.readings[joint] > self.syncs:
             self._doubled.add(joint)
 
-    def other(self, can_id: int) -> None:
+    def other(self, can_id: int, data: bytes) -> None:
         """A frame arrived that is no process data of a joint."""
         self._last = can_id
-        if can_id in self._ours and not self.intruder:
-            self.intruder = f"{self._ours[can_id]} ({can_id:03X}h)"
+        if self.intruder:
+            return
+        what = self._ours.get(can_id) or (can_id in self._sdo and self._written(can_id, data))
+        if what:
+            self.intruder = f"{what} ({can_id:03X}h)"
+
+    def _written(self, can_id: int, data: bytes) -> str:
+        """Description of an SDO request that writes to a joint's controller; empty for one that reads."""
+        if len(data) < 4 or data[0] >> 5 not in _DOWNLOADS:
+            return ""
+        index = int.from_bytes(data[1:3], "little")
+        return "" if index in _HARMLESS_WRITES else f"SDO write of {index:04X}h to node {self._sdo[can_id]}"
 
     def cycle_ends(self, frames: int) -> None:
         """Evaluate the completed cycle, with the number of frames sent and received in it."""

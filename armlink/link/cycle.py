@@ -10,7 +10,7 @@ from armlink.canopen.cia402 import Control, Mode, State, next_control, set_point
 from armlink.canopen.pdo import STATUS_DECIMATION
 from armlink.clock import Clock
 from armlink.errors import BusFault, HostLate, Refused, Silence
-from armlink.link.cyclic_exchange import Loop
+from armlink.link.cyclic_exchange import Expired, Loop
 from armlink.link.faults import Known, bus_fault, find_fault, node_fault, refusal, stopped_itself, stuck
 from armlink.link.gate import JointLimits, Passed, Seen, pass_gate, start_from
 from armlink.link.types import Command, Sample
@@ -89,7 +89,12 @@ class Commander:
                 if mode == PROFILE_POSITION:
                     control[joint] = set_point_control(loop.statuses[joint])
         self._commanded, synced = modes, loop.synced
-        sample = loop.exchange(control, [each.torque_wire for each in passed], [each.position_wire for each in passed])
+        torque_wire, position_wire = [each.torque_wire for each in passed], [each.position_wire for each in passed]
+        expires = math.inf if stopped else now + (self.max_age - age)
+        try:
+            sample = loop.exchange(control, torque_wire, position_wire, expires)
+        except Expired:
+            raise HostLate(self.clock.now() - now + age, self.max_age, "the command was not sent") from None
         sample.late = self.late
         if not self._lock_step:  # this process may have stood still at any line
             self._note_gap(loop.synced - synced, loop.synced)

@@ -34,6 +34,10 @@ _SYNC = (objects.SYNC_ID, b"")
 _OPERATIONAL = bytes([objects.OPERATIONAL])
 
 
+class Expired(Exception):
+    """A command became too old before its frames left."""
+
+
 class Loop:
     """Frames of one cycle out and in, for n joints; knows no states, no limits and no faults, only keeps them."""
 
@@ -179,8 +183,13 @@ class Loop:
         self.send(self._heartbeat_id, _OPERATIONAL)
         self._beat = self._clock.now()
 
-    def exchange(self, control: list[int], torque_wire: list[int], position_wire: list[int]) -> Sample:
-        """One cycle: RPDO1 of every joint, heartbeat when due, SYNC, then the TPDOs that it brings."""
+    def exchange(
+        self, control: list[int], torque_wire: list[int], position_wire: list[int], expires: float = math.inf
+    ) -> Sample:
+        """One cycle: RPDO1 of every joint, heartbeat when due, SYNC, then the TPDOs that it brings.
+
+        Raises Expired, and sends nothing, where the frames would leave after `expires`, by the clock [s].
+        """
         command = self._command
         frames = [
             (can_id, command(control[joint], torque_wire[joint], position_wire[joint]))
@@ -188,6 +197,8 @@ class Loop:
             if joint not in self.withheld
         ]
         now = self._clock.now()
+        if now > expires:
+            raise Expired
         if self.beating and now - self._beat > self.beat_every - 0.5 * self.period:
             frames.append((self._heartbeat_id, _OPERATIONAL))
             self._beat = now
@@ -271,7 +282,7 @@ class Loop:
         self.bits += FIXED_BITS * frames + 8 * size
 
     def _take_other(self, can_id: int, data: bytes) -> None:
-        self.watch.other(can_id)
+        self.watch.other(can_id, data)
         joint = self._joint_of.get(can_id & 0x7F)
         service = can_id & 0x780
         if joint is not None and service == objects.EMCY_ID:

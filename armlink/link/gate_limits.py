@@ -3,17 +3,25 @@
 import math
 
 from armlink.arm_file import ArmFile, LinkJoint
-from armlink.canopen.units import Units
+from armlink.canopen.units import Units, assumed_units
 from armlink.errors import BadInput
 from armlink.link.gate import JointLimits
 
-INT16_MAX, INT32_MAX = 2**15 - 1, 2**31 - 1
+INT16_MAX, INT32_MAX, UINT32_MAX = 2**15 - 1, 2**31 - 1, 2**32 - 1
 POSITION_GAIN_ERROR = 0.02
 """A position sensor may read so much more of its range than is true: the stops are found beyond their nominal place."""
 PRESS_IN = 0.05
 """A target may lie this far behind a stop [rad], so that a joint can be pressed against it."""
 OVERSPEED = 1.5
 """A joint under torque control may turn this many times as fast as max_velocity before it is stopped."""
+SERVO_OVERSPEED = 3.0
+"""A joint under position control may, as it takes up a load, turn this many times as fast as max_velocity."""
+SERVO_SPEED = 3.0
+"""A joint under position control may turn this fast whatever max_velocity is [rad/s]: one that is enabled while it
+sinks is caught at that speed."""
+FOLLOWING = 0.5
+"""A joint under position control may read a position this far from its target before it is stopped [rad]; a motion of
+calib takes a joint for blocked long before."""
 OUTSIDE = 0.1
 """A joint under torque control may read a position this far outside the target window before it is stopped [rad]."""
 
@@ -55,6 +63,12 @@ def gate_limits(
     if joint.max_torque / unit.torque > INT16_MAX:
         most = INT16_MAX * unit.torque
         raise BadInput(f"{joint.name}: max_torque {joint.max_torque} N·m: 6071h carries at most {most:.6g} N·m")
+    if joint.max_velocity / unit.position > UINT32_MAX:
+        most, speed = UINT32_MAX * unit.position, joint.max_velocity
+        raise BadInput(f"{joint.name}: max_velocity {speed} rad/s: 6081h carries at most {most:.6g} rad/s")
+    if joint.max_torque_rate / unit.torque > UINT32_MAX:
+        most, rate = UINT32_MAX * unit.torque, joint.max_torque_rate
+        raise BadInput(f"{joint.name}: max_torque_rate {rate} N·m/s: 6087h carries at most {most:.6g} N·m/s")
     if max(map(abs, window)) / unit.position > INT32_MAX:
         raise BadInput(f"{joint.name}: its range is more than 607Ah carries at {unit.position:.3g} rad a user unit")
     return JointLimits(
@@ -66,9 +80,19 @@ def gate_limits(
         torque_unit=unit.torque,
         position_unit=unit.position,
         overspeed=OVERSPEED * joint.max_velocity,
+        servo_overspeed=max(SERVO_OVERSPEED * joint.max_velocity, SERVO_SPEED),
+        following=FOLLOWING,
         outside=OUTSIDE,
         max_age=max_age,
     )
+
+
+def try_limits(arm: ArmFile) -> None:
+    """Raise BadInput where the limits of an arm file fit no controller with the usual units; asks no controller."""
+    link = arm.require_link()
+    rows = zip(link.joints, joint_ranges(arm), assumed_units(arm), strict=True)
+    for joint, (lower, upper), unit in rows:
+        gate_limits(joint, target_window(lower, upper), unit, 1.0 / link.rate, link.deadline)
 
 
 def milliseconds(seconds: float) -> int:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 
 from armlink.bus.port import Port
 from armlink.canopen.eds_file import bundled
+from armlink.canopen.object_dictionary import SDO_REQUEST_ID
 from armlink.canopen.sdo import NodeServices, PumpedNetwork
 from armlink.clock import Clock
 from armlink.link.controller_setup import identify
@@ -54,7 +55,7 @@ def _search(port: Port, pump: Callable[[Callable[[], bool], float], bool], netwo
 
     for node in range(1, 128):
         network.subscribe(0x580 + node, answered)
-        port.send(0x600 + node, _READ_DEVICE_TYPE)
+        port.send(SDO_REQUEST_ID + node, _READ_DEVICE_TYPE)
         pump(lambda: False, 0.0)
     pump(lambda: False, SEARCH_SECONDS)
     for node in range(1, 128):

@@ -130,22 +130,37 @@ class Daemon:
         self._loop.add_reader(self.process.fileno(), self._messages)
 
     def _reload(self) -> None:
-        """SIGHUP: read the arm file and the records again; an unusable file changes nothing."""
+        """SIGHUP: read the arm file and the records again; a file that cannot be used whole changes nothing."""
         self._notify("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
         try:
-            arm = load_arm(self.options.arm)
-            if arm.name != self.arm.name or arm.serial != self.arm.serial or arm.kinematics != self.arm.kinematics:
-                raise BadInput(f"{arm.path}: another arm, serial or kinematics: restart the daemon for that")
-        except (ArmlinkError, OSError) as error:
-            self.service.events.say("refused", None, f"configuration not reloaded: {error}", {})
+            before = self.service.configuration.settings
+            arm = self._tried()
+            settings = self.options.settings(arm)
+            self.service.reload(arm, settings)
+        except (ArmlinkError, OSError, ValueError, ArithmeticError) as error:
+            text = f"configuration not reloaded: {error}"
+            self.service.journal.guard(lambda: self.service.events.say("refused", None, text, {}))
         else:
-            before, settings = self.service.configuration.settings, self.options.settings(arm)
             bus_changed = arm.link != self.arm.link or settings.work != before.work
             self.arm = arm
-            self.service.reload(arm, settings)
             if bus_changed:
                 self._restart("the arm file's link section or the work has changed")
-        self._notify("READY=1")
+        finally:
+            self._notify("READY=1")
+
+    def _tried(self) -> ArmFile:
+        """The arm file, with all that the bus process will need of it tried; raises BadInput, OSError."""
+        from armlink.bus.open import resolve_bus  # for a reload alone: they take memory
+        from armlink.canopen.eds_file import of_joints
+        from armlink.link.gate_limits import try_limits
+
+        arm = load_arm(self.options.arm)
+        if arm.name != self.arm.name or arm.serial != self.arm.serial or arm.kinematics != self.arm.kinematics:
+            raise BadInput(f"{arm.path}: another arm, serial or kinematics: restart the daemon for that")
+        resolve_bus(self.options.bus, arm.require_link().bus)
+        of_joints(arm)
+        try_limits(arm)
+        return arm
 
 
 class _CurrentProcess:

@@ -94,13 +94,21 @@ class Service:
         self.journal.guard(self._tick)
 
     def reload(self, arm: ArmFile, settings: DaemonSection) -> None:
-        """Use another configuration of the same arm from now on; the observer's state is kept."""
-        before, self.configuration.settings = self.configuration.settings, settings
-        self.configuration.arm = arm
+        """Use another configuration of the same arm from now on; the observer's state is kept.
+
+        Where an observer cannot be made with it, that error is raised and the configuration before stays in use.
+        """
+        configuration = self.configuration
+        before = configuration.arm, configuration.settings
+        configuration.arm, configuration.settings = arm, settings
+        try:
+            if settings.observer != before[1].observer:
+                self.journal.guard(self._renew)
+        except Exception:
+            configuration.arm, configuration.settings = before
+            raise
         evidence = {"policy": settings.policy}
         self.journal.guard(lambda: self.events.say("configuration", None, "configuration reloaded", evidence))
-        if settings.observer != before.observer:
-            self.journal.guard(self._renew)
         self.journal.guard(self.records.load)
 
     def save(self, history: bool = False) -> None:

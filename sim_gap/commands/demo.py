@@ -9,6 +9,12 @@ import typer
 def demo(
     arm: Annotated[str, typer.Option(help="Bundled arm's name or path of an arm file with a sim section.")] = "sarcos",
     seed: Annotated[int, typer.Option(min=0, help="Draws another hidden truth.")] = 0,
+    realism: Annotated[
+        float | None,
+        typer.Option(
+            min=0, help="All small troubles of a real arm: 1 a good one's, 3 a bad one's; default: the arm's."
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option(help="Folder for report.html, summary.json and the data.")] = Path(
         "armlink-demo"
     ),
@@ -22,4 +28,4 @@ def demo(
 
     from sim_gap.demo.run import run_demo
 
-    run_demo(arm, seed=seed, out=out, json_path=json, console=Console(stderr=True))
+    run_demo(arm, seed=seed, realism=realism, out=out, json_path=json, console=Console(stderr=True))

@@ -5,6 +5,7 @@ import shutil
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from calib.records.store import RecordStore
 from calib.sweep.dataset import SweepData
 from calib.sweep.run import run_sweep
 from calib.sweep.verify import run_verify
+from sim_bus.sim_section import with_realism
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.demo.bench import Bench, check_gravity
@@ -40,9 +42,13 @@ TRAIN_SECONDS, HELDOUT_SECONDS = 40.0, 25.0
 BY = "armlink demo"
 
 
-def run_demo(arm_name: str, *, seed: int, out: Path, json_path: Path | None, console: Console) -> DemoResult:
+def run_demo(
+    arm_name: str, *, seed: int, out: Path, json_path: Path | None, console: Console, realism: float | None = None
+) -> DemoResult:
     """Run it, write `report.html`, `summary.json` and the data into `out`; raises BadInput, Refused, BusFault."""
     arm = load_arm(arm_name)
+    if realism is not None:
+        arm = with_realism(arm, realism, seed)
     arm.require_link()
     data_folder = _fresh(out)
     teller = Narrator(console)
@@ -76,6 +82,7 @@ def _work(
     link.enable()
     teller.say(f"{link.n} nodes found on the bus, mapped and enabled; SYNC at {link.rate:g} Hz")
     data = _sweeps(bench, folder, seed, teller)
+    bench = replace(bench, truth=bench.simulated.true_sensors)  # zeros move as the arm warms up
     with teller.stage("fitting sensors and mass moments, all joints together"):
         sensors = fit_sensors(arm, data)
     gravity = identify_gravity(arm, data, sensors)
