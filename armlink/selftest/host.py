@@ -62,14 +62,20 @@ class HostReport:
 class EchoPort:
     """A port on which every joint answers each SYNC at once, standing still and enabled."""
 
-    def __init__(self, nodes: Sequence[int]) -> None:
-        """For joints at these node ids."""
+    def __init__(self, arm: ArmFile) -> None:
+        """For the joints of this arm, in the middle of their ranges."""
+        self.standing = np.array([(lower + upper) / 2 for lower, upper in joint_ranges(arm)])
+        """(n,) [rad]."""
+        nodes = range(1, len(self.standing) + 1)
         self.errors = self.dropped = 0
         self.nodes, self._syncs = tuple(nodes), 0
         self._waiting: deque[Frame] = deque()
         status = ENABLED_BITS
         self._shown = [(TPDO3.cob_base + node, TPDO3.layout.pack(status, Mode.POSITION)) for node in nodes]
-        self._read = [(TPDO1.cob_base + node, TPDO1.layout.pack(0, 0)) for node in nodes]
+        wire = np.round(self.standing / USER_UNIT).astype(int).tolist()
+        self._read = [
+            (TPDO1.cob_base + node, TPDO1.layout.pack(place, 0)) for node, place in zip(nodes, wire, strict=True)
+        ]
         self._slow = [(TPDO2.cob_base + node, TPDO2.layout.pack(status, 0, 0)) for node in nodes]
 
     def send(self, can_id: int, data: bytes) -> None:
@@ -140,7 +146,9 @@ def echo_commander(arm: ArmFile, port: EchoPort, clock: Clock) -> Commander:
     ]
     names = tuple(joint.name for joint in section.joints)
     commander = Commander(loop, clock, names, period, np.inf, lock_step=False)
-    commander.begin(limits, [start_from(limit, 0.0, 0.0) for limit in limits], [0] * n)
+    commander.begin(
+        limits, [start_from(limit, 0.0, place) for limit, place in zip(limits, port.standing, strict=True)], [0] * n
+    )
     loop.statuses[:], loop.displays[:] = [ENABLED_BITS] * n, [int(Mode.POSITION)] * n
     return commander
 
@@ -149,8 +157,9 @@ def cycles(arm: ArmFile, seconds: float, channel: Channel) -> HostReport:
     """The link's cycle on an EchoPort, each sample sent to the job."""
     rate, n = arm.require_link().rate, len(arm.joint_names)
     clock, realtime = MonotonicClock(), prepare()
-    commander = echo_commander(arm, EchoPort(tuple(range(1, n + 1))), clock)
-    hold, nothing = Command.hold(np.zeros(n)), np.zeros(n)
+    port = EchoPort(arm)
+    commander = echo_commander(arm, port, clock)
+    hold, nothing = Command.hold(port.standing), np.zeros(n)
     count, begin, busy = 0, clock.now(), time.process_time()
     for _ in range(3):  # every joint has answered, and memory is warm
         commander.stand([0] * n)
