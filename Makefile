@@ -5,7 +5,7 @@ export PYTHON
 CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host daemon_days daemon_kills fuzz_frames web
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint format bench soak realtime stalls blind mutants docs constraints clean
+.PHONY: help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean
 
 help: ## Say what can be done
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
@@ -51,6 +51,9 @@ stalls: .venv/.dev ## Long campaign outside make test: sweeps while job, loop an
 
 blind: .venv/.dev ## Long campaign outside make test: the diagnosis against sealed cases (ARGS="--cases 20")
 	$(BIN)/armlink gap bench $(ARGS)
+
+corruptions: .venv/.dev ## Long campaign outside make test: wrong columns, units and clocks in real recordings (ARGS="--draws 200")
+	$(BIN)/python tests/campaigns/corrupted_recordings.py $(ARGS)
 
 mutants: .venv/.dev ## Long campaign outside make test: each change of the gate's source must make a test fail
 	$(BIN)/python tests/campaigns/mutants.py $(ARGS)

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from armlink.canopen.cia402 import Control, Mode, State, next_control, set_point_control, state_of, supports
-from armlink.canopen.pdo import STATUS_DECIMATION
 from armlink.clock import Clock
+from armlink.drives.canopen.cia402 import Control, Mode, State, next_control, set_point_control, state_of, supports
+from armlink.drives.canopen.pdo import STATUS_DECIMATION
 from armlink.errors import BusFault, HostLate, Refused, Silence
-from armlink.link.cyclic_exchange import Expired, Loop
+from armlink.link.cyclic_exchange import Loop
 from armlink.link.faults import Known, bus_fault, find_fault, node_fault, refusal, stopped_itself, stuck
 from armlink.link.gate import JointLimits, Passed, Seen, pass_gate, start_from
 from armlink.link.types import Command, Sample
@@ -90,11 +90,8 @@ class Commander:
                     control[joint] = set_point_control(loop.statuses[joint])
         self._commanded, synced = modes, loop.synced
         torque_wire, position_wire = [each.torque_wire for each in passed], [each.position_wire for each in passed]
-        expires = math.inf if stopped else now + (self.max_age - age)
-        try:
-            sample = loop.exchange(control, torque_wire, position_wire, expires)
-        except Expired:
-            raise HostLate(self.clock.now() - now + age, self.max_age, "the command was not sent") from None
+        decided = math.inf if stopped else now - age
+        sample = loop.exchange(control, torque_wire, position_wire, decided, self.max_age)
         sample.late = self.late
         if not self._lock_step:  # this process may have stood still at any line
             self._note_gap(loop.synced - synced, loop.synced)

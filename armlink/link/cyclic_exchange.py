@@ -9,14 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armlink.arrays import Array
-from armlink.bus.bus_watchdog import MOST_FRAMES, BusWatch
 from armlink.bus.frame_bits import FIXED_BITS
 from armlink.bus.port import Port
-from armlink.canopen import emcy
-from armlink.canopen import object_dictionary as objects
-from armlink.canopen.pdo import RPDO1, RPDO2, TPDO1, TPDO2, decoding_table
-from armlink.canopen.units import TORQUE_PER_MICRO, Units
 from armlink.clock import Clock
+from armlink.drives.canopen import emcy
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen.host_frames import HostFrames
+from armlink.drives.canopen.pdo import RPDO1, RPDO2, TPDO1, TPDO2, decoding_table
+from armlink.drives.canopen.units import TORQUE_PER_MICRO, Units
+from armlink.errors import HostLate
+from armlink.link.bus_watchdog import MOST_FRAMES, BusWatch
 from armlink.link.types import Sample, Stats
 
 COLLECT_SHARE = 0.8
@@ -34,10 +36,6 @@ _SYNC = (objects.SYNC_ID, b"")
 _OPERATIONAL = bytes([objects.OPERATIONAL])
 
 
-class Expired(Exception):
-    """A command became too old before its frames left."""
-
-
 class Loop:
     """Frames of one cycle out and in, for n joints; knows no states, no limits and no faults, only keeps them."""
 
@@ -53,7 +51,7 @@ class Loop:
         """(joint index, code, error register) in the order of arrival, the newest; resets (code 0) are not kept."""
         self.node_states: dict[int, int] = {}
         """Joint index → NMT state of its newest heartbeat; only those received while cycling."""
-        self.watch = BusWatch(nodes, host)
+        self.watch = BusWatch(len(nodes), HostFrames(nodes, host))
         self.withheld: frozenset[int] = frozenset()
         """Joints that get no RPDO1, so that their own deadline is put to the test."""
         self.beating = True
@@ -184,11 +182,16 @@ class Loop:
         self._beat = self._clock.now()
 
     def exchange(
-        self, control: list[int], torque_wire: list[int], position_wire: list[int], expires: float = math.inf
+        self,
+        control: list[int],
+        torque_wire: list[int],
+        position_wire: list[int],
+        decided: float = math.inf,
+        max_age: float = math.inf,
     ) -> Sample:
         """One cycle: RPDO1 of every joint, heartbeat when due, SYNC, then the TPDOs that it brings.
 
-        Raises Expired, and sends nothing, where the frames would leave after `expires`, by the clock [s].
+        Raises HostLate, and sends nothing, if the frames would leave more than `max_age` [s] after `decided` (clock).
         """
         command = self._command
         frames = [
@@ -197,8 +200,8 @@ class Loop:
             if joint not in self.withheld
         ]
         now = self._clock.now()
-        if now > expires:
-            raise Expired
+        if now - decided > max_age:
+            raise HostLate(now - decided, max_age, "the command grew too old before its frames left")
         if self.beating and now - self._beat > self.beat_every - 0.5 * self.period:
             frames.append((self._heartbeat_id, _OPERATIONAL))
             self._beat = now

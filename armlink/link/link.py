@@ -11,9 +11,9 @@ from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.bus.adapters import as_bus
 from armlink.bus.can_bus import CanBus
-from armlink.canopen import object_dictionary as objects
-from armlink.canopen.cia402 import State
 from armlink.clock import Clock, MonotonicClock
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen.cia402 import State
 from armlink.errors import BusFault, Silence
 from armlink.link import controller_setup as device
 from armlink.link.cycle import Commander
@@ -52,7 +52,7 @@ class Link(TorqueSensorRecords):
         self.arm, self.bus = arm, as_bus(bus)
         self.section = section = arm.require_link()
         self.names = tuple(joint.name for joint in section.joints)
-        self.nodes = tuple(joint.node for joint in section.joints)
+        self.nodes = tuple(joint.settings.node for joint in section.joints)
         self.n, self.rate, self.period = len(self.names), section.rate, 1.0 / section.rate
         self._lock_step = self.bus.clock is not None
         self.clock: Clock = clock or self.bus.clock or MonotonicClock()

@@ -19,10 +19,10 @@ from armlink.arrays import Array
 from armlink.bus.adapters import as_bus
 from armlink.bus.can_bus import CanBus
 from armlink.bus.port import StampedPort
-from armlink.canopen import object_dictionary as objects
-from armlink.canopen.pdo import RPDO1
-from armlink.canopen.units import assumed_units
 from armlink.clock import Clock, MonotonicClock
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen.pdo import RPDO1
+from armlink.drives.canopen.units import assumed_units
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.torque_sensor_record import TorqueSensorRecords
 from armlink.link.types import Sample, Stats
@@ -47,7 +47,7 @@ class Listener(TorqueSensorRecords):
         self.arm, self.bus = arm, as_bus(bus)
         self.section = section = arm.require_link()
         self.names = tuple(joint.name for joint in section.joints)
-        self.nodes = tuple(joint.node for joint in section.joints)
+        self.nodes = tuple(joint.settings.node for joint in section.joints)
         self.n, self.period = len(self.names), 1.0 / section.rate
         self.clock: Clock = self.bus.clock or MonotonicClock()
         self._port = self.bus.open_listening_port()

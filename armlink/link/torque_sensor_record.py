@@ -11,8 +11,8 @@ from collections.abc import Callable
 from functools import cached_property
 
 from armlink.arm_file import ArmFile
-from armlink.canopen import object_dictionary as objects
-from armlink.canopen.sdo import NodeServices, PumpedNetwork, joint_services
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork, joint_services
 from armlink.errors import BadInput
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.types import Calibration

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armlink.arrays import Array
-from armlink.canopen.cia402 import Mode, State
+from armlink.drives.canopen.cia402 import Mode, State
 from armlink.link.guard import Guard
 from armlink.link.lateness import Lateness
 from armlink.torque_calibration import TorqueCalibration

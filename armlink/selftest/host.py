@@ -16,11 +16,11 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.bus.port import Frame
-from armlink.canopen.cia402 import Mode
-from armlink.canopen.object_dictionary import SYNC_ID
-from armlink.canopen.pdo import STATUS_DECIMATION, TPDO1, TPDO2, TPDO3
-from armlink.canopen.units import Units
 from armlink.clock import Clock, MonotonicClock
+from armlink.drives.canopen.cia402 import Mode
+from armlink.drives.canopen.object_dictionary import SYNC_ID
+from armlink.drives.canopen.pdo import STATUS_DECIMATION, TPDO1, TPDO2, TPDO3
+from armlink.drives.canopen.units import Units
 from armlink.errors import BusFault
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop

@@ -5,9 +5,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from armlink.canopen import emcy
-from armlink.canopen import object_dictionary as objects
-from armlink.canopen.cia402 import Control, Mode, State, state_of
+from armlink.drives.canopen import emcy
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen.cia402 import Control, Mode, State, state_of
 from armlink.errors import ArmlinkError, BusFault
 from armlink.link.faults import bus_fault
 from armlink.link.link import Link

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from armlink.canopen.cia402 import state_of
+from armlink.drives.canopen.cia402 import state_of
 from calib.daemon.observing.observation import Observation
 from calib.daemon.service import Service
 from calib.daemon.view.api_models import (
@@ -46,7 +46,7 @@ class ServiceView:
         arm_state, configuration, now = service.arm_state, service.configuration, service.environment.monotonic()
         return Status(
             state=service.state,
-            detail=service.journal.trouble or arm_state.fault or service.records.detail or arm_state.silent,
+            detail=service.trouble or arm_state.fault or service.records.detail or arm_state.silent,
             arm=configuration.arm.name,
             serial=configuration.arm.serial,
             version=self._version,
@@ -62,7 +62,9 @@ class ServiceView:
             ),
             held=observation is not None and observation.feed.observer.held,
             rows=0 if observation is None else observation.feed.observer.rows,
-            pending_proposals=sum(row.state == "pending" for row in service.journal.proposals()),
+            pending_proposals=service.journal.pending(),
+            store_fault=service.records.store_fault or None,
+            journal_fault=service.journal.trouble or None,
             last_event=service.journal.last_event,
             report=_newest_report(service.directory),
         )
@@ -158,8 +160,11 @@ class ServiceView:
 
 
 def _newest_report(directory: Path) -> Path | None:
-    reports = [path for path in directory.glob("*.html") if path.is_file()]
-    return max(reports, key=lambda path: path.stat().st_mtime, default=None)
+    try:
+        reports = [path for path in directory.glob("*.html") if path.is_file()]
+        return max(reports, key=lambda path: path.stat().st_mtime, default=None)
+    except OSError:  # removed meanwhile, or the disk fails
+        return None
 
 
 def _number(value: float) -> float | None:

@@ -6,6 +6,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gcomp.arrays import Array
+from sim_gap.checks.finding import Finding
 from sim_gap.residuals.where import Location
 from sim_gap.search.estimate import Value
 
@@ -86,6 +87,8 @@ class Diagnosis:
     """Description of the held-out data."""
     rollout: Rollout | None = None
     notes: tuple[str, ...] = ()
+    checks: tuple[Finding, ...] = ()
+    """Findings on mapping, units and clocks of the recordings."""
     internals: Any = field(default=None, repr=False, compare=False)
     """Fit and data behind the result (`answer.Internals`), for report and export."""
 
@@ -126,6 +129,7 @@ class Diagnosis:
             },
             "unexplained": _round(self.unexplained),
             "notes": list(self.notes),
+            "checks": [finding.to_json() for finding in self.checks],
         }
 
 

@@ -16,8 +16,8 @@ import yaml
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.bus.open import open_link_bus
-from armlink.canopen.cia402 import State, state_of
-from armlink.canopen.object_dictionary import STATUS_WORD as STATUS
+from armlink.drives.canopen.cia402 import State, state_of
+from armlink.drives.canopen.object_dictionary import STATUS_WORD as STATUS
 from armlink.errors import BusFault, HostLate, Silence
 from armlink.link.guard import Crossed, Guard
 from armlink.link.link import Link
