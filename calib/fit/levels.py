@@ -11,9 +11,11 @@ from gcomp.arrays import Array
 ROUNDS = 40
 SETTLED = 0.02
 """Largest relative change of a level at which the iteration ends."""
-GUESS, WEIGHT = 0.1, 1.0
-"""What a level is beforehand, and how many coefficients that is worth: a family that hardly shows keeps a small level
-instead of none, which would make the intervals certain of what the readings do not tell."""
+LEAST, WEIGHT, FEW = 0.1, 2.0, 5.0
+"""Beforehand a level is the arm's common one, at least LEAST, and that is worth WEIGHT coefficients: an arm is good or
+bad in all that it is, and a family that hardly shows keeps a level instead of none, which would make the intervals
+certain of what the readings do not tell. The common level is the mean of the logarithms, in which a family counts as
+much as it has coefficients that the readings tell, and at most FEW."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +71,12 @@ def learn(effects: Effects, start: Array) -> Levels:
     criterion = np.inf
     for _ in range(ROUNDS):
         spread, solution, criterion = _solved(effects, level)
-        before = level.copy()
+        before, counts = level.copy(), np.clip(freedom, 0.1, FEW)
+        common = max(LEAST, float(np.exp(counts @ np.log(level) / counts.sum())))
         for family, at in enumerate(places):
             if len(at):
                 freedom[family] = len(at) - spread[at].sum() / level[family] ** 2
-                told = solution[at] @ solution[at] + WEIGHT * GUESS**2
+                told = solution[at] @ solution[at] + WEIGHT * common**2
                 level[family] = np.sqrt(told / (max(freedom[family], 0.0) + WEIGHT))
         if np.abs(level / before - 1).max() < SETTLED:
             break

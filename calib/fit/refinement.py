@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scipy import linalg
 
 from calib.fit.levels import Effects, Levels, learn
-from calib.fit.small_troubles import FAMILIES, Setting, Troubles, troubles
+from calib.fit.small_troubles import FAMILIES, HELD, UNITS, Setting, Troubles, troubles
 from calib.fit.sweep_readings import SweepReadings
 from gcomp.arrays import Array
 from gcomp.identify.global_fit import GlobalFit
@@ -171,7 +171,9 @@ class _Problem:
         """Solve the problem linearised at a parameter vector (6n + 3,), noise times factor (n,)."""
         readings, free = self.readings, int(self.free.sum())
         modelled, jacobian, slope = predict_and_jacobian(self.arm, Parameters.from_vector(vector, self.arm.n), readings)
-        sigma = readings.sigma[readings.counted] * factor[self.joint]
+        lag = HELD * level[FAMILIES.index("direction")] * UNITS["direction"][0] * self.setting.rated[self.joint]
+        own = self.rows.swept[self.row] == self.joint
+        sigma = np.hypot(readings.sigma[readings.counted], np.where(own, 0.0, lag)) * factor[self.joint]
         rounding = _rounding_columns(readings, self.resolution, slope / sigma[:, None])
         found = troubles(self.setting, self.rows, Parameters.from_vector(vector, self.arm.n))
         informed = np.flatnonzero(np.isfinite(self.std))

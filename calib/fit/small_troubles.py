@@ -33,6 +33,11 @@ UNITS = {
 FAMILIES = tuple(UNITS)
 BASE = 2.0
 """Tilt of the base over the tilt of one axis against the next."""
+REST = 0.2
+"""Where a cable is at rest: standard deviation from the middle of the range [rad]."""
+HELD = 0.8
+"""Standard deviation, in levels of `direction`, of what a sensor and a cable lag while their joint is held: anywhere
+between both sides, each of them (twice 0.58²)."""
 WAVES = 5
 """Terms of the drift in time."""
 
@@ -127,10 +132,14 @@ def _dense(setting: Setting, rows: SweepReadings, parameters: Parameters) -> Ite
         for other in {joint - 1, joint, joint + 1} & set(range(n)):
             bent = readings.position[:, other, None] - middle[other]
             yield "spring", joint, arm.names[other], here * gain[joint] * rated[joint] * bent
+        yield "spring", joint, "rest", here * gain[joint] * rated[joint] * REST * np.ones((len(angle), 1))
         side = np.where(rows.swept == joint, readings.direction[:, joint], 0.0)[:, None]
         rising = np.sign(np.einsum("kd,kd->k", turned[:, joint], frames.lever[:, joint]))[:, None]
         yield "direction", joint, "position", here * rated[joint] * side
         yield "direction", joint, "torque", here * rated[joint] * side * rising
+        share = (readings.position[:, joint] - middle[joint])[:, None] / ((arm.upper - arm.lower)[joint] / 2)
+        for bend in (share, 1.5 * share**2 - 0.5, 2.5 * share**3 - 1.5 * share):
+            yield "direction", joint, "bend", here * rated[joint] * side * bend
         for number, wave in enumerate(since):
             yield "drift", joint, f"{number}", here * gain[joint] * rated[joint] * wave[:, None]
 
