@@ -9,9 +9,11 @@ import numpy.typing as npt
 from calib.fit.findings import Finding, effect_finding, encoder_findings, outlier_findings, scatter_findings
 from calib.fit.position_field import PositionField
 from calib.fit.refinement import Extra, Refined, refine
+from calib.fit.remaining_doubt import remaining_doubt
 from calib.fit.small_troubles import Setting
 from calib.fit.sweep_readings import SweepReadings
 from calib.fit.unmodelled_effects import Effect, size_of, strongest_effect
+from calib.records.records import Discrepancy
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
 from gcomp.identify.global_fit import GlobalFit
@@ -57,6 +59,8 @@ class Goodness:
     outliers: Mask
     """Readings left out as outliers (K, n)."""
     left_out: tuple[LeftOut, ...]
+    discrepancy: tuple[Discrepancy, ...]
+    """What the fit still doubts at a new pose, joint by joint."""
 
 
 def examine(
@@ -96,7 +100,8 @@ def examine(
     findings += outlier_findings(kinematics.names, rows, outliers)
     findings += scatter_findings(kinematics.names, refined, rated, {finding.joint for finding in findings})
     final = encoders or findings  # a wrong position causes the others
-    return Goodness(refined, tuple(final), outliers, leave_out(refined, rows))
+    doubt = remaining_doubt(setting, rows, refined)
+    return Goodness(refined, tuple(final), outliers, leave_out(refined, rows), doubt)
 
 
 def _setting(kinematics: Arm, rows: SweepReadings, rated: Array) -> Setting:

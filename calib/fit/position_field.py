@@ -52,4 +52,5 @@ def kernel(one: Array, other: Array, length: float) -> Array:
 def squared_distance(one: Array, other: Array) -> Array:
     """Squared distance (K, M) of poses: Σ_l (2 sin(Δ_l/2))² = 2 Σ_l (1 − cos Δ_l), a turn of a joint being none."""
     cos, sin = np.cos(one) @ np.cos(other).T, np.sin(one) @ np.sin(other).T
-    return np.maximum(2 * (one.shape[1] - cos - sin), 0.0)
+    distance: Array = np.maximum(2 * (one.shape[1] - cos - sin), 0.0)
+    return distance

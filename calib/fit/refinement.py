@@ -58,6 +58,13 @@ class Linear:
     residual: Array
     """Residuals of the readings in standard deviations (P,)."""
 
+    precision: Array
+    """Inverse covariance (P, P) of the readings in standard deviations, rounding and small troubles included."""
+    design: Array
+    """Columns of the fit's parameters, in standard deviations (P, p)."""
+    effects: Array
+    """Columns of the small troubles, each at its level, in standard deviations (P, m)."""
+
     @property
     def leverage(self) -> Array:
         """Leverage of each reading on its own prediction (P,), 0 to 1."""
@@ -200,7 +207,17 @@ class _Problem:
         inverse = linalg.solve_triangular(root, np.eye(count), lower=True)
         part = inverse.T @ left[:count, keep]
         residual = inverse.T @ (whitened[:, -1] - whitened[:, :-1] @ solution)
-        linear = Linear(self.row, self.joint, sigma, inverse.T @ inverse - part @ part.T, residual)
+        precision = inverse.T @ inverse
+        linear = Linear(
+            self.row,
+            self.joint,
+            sigma,
+            precision - part @ part.T,
+            residual,
+            precision,
+            design[:count, :free],
+            random[:, rounding.shape[1] :],
+        )
         triangle: Array = np.asarray(np.linalg.qr(rest, mode="r"), dtype=np.float64)
         return _Step(solution, free, triangle, self.scale, linear, levels, found)
 

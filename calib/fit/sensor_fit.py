@@ -133,9 +133,13 @@ class SensorFit:
         joints = tuple(
             JointCalibration(
                 name=name,
-                **{parameter: _number(self.value(parameter)[joint]) for parameter in PARAMETERS},
+                gain=_number(self.value("gain")[joint]),
+                offset=_number(self.value("offset")[joint]),
+                position_gain=_number(self.value("position_gain")[joint]),
+                position_offset=_number(self.value("position_offset")[joint]),
                 not_identifiable={p: self.reasons[name, p] for p in PARAMETERS if (name, p) in self.reasons},
                 residual_std=_number(residual[joint]),
+                discrepancy=self.goodness.discrepancy[joint],
             )
             for joint, name in enumerate(self.names)
         )

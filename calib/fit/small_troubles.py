@@ -13,7 +13,7 @@ import numpy.typing as npt
 from calib.fit.position_field import PositionField
 from calib.fit.sweep_readings import SweepReadings
 from gcomp.arm.arm import Arm, bar_frames
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 from gcomp.gravity.torque import composite_moments
 from gcomp.identify.parameters import Parameters
 from gcomp.identify.sensor_model import joint_positions, row_moments
@@ -54,6 +54,8 @@ class Troubles:
     """Joint that each coefficient belongs to (m,)."""
     label: tuple[str, ...]
     """Neighbouring joint, axis or term of each coefficient (m,); for people."""
+    kept: Mask
+    """Which of all columns these are: those that change some reading."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +71,11 @@ class Setting:
     """First and last time of the readings [s]."""
 
 
-def troubles(setting: Setting, rows: SweepReadings, parameters: Parameters) -> Troubles:
-    """All small troubles at the counted readings of `rows`, linearised at parameters."""
+def troubles(setting: Setting, rows: SweepReadings, parameters: Parameters, keep: Mask | None = None) -> Troubles:
+    """All small troubles at the counted readings of `rows`, linearised at parameters.
+
+    `keep` chooses columns; default: those that change some reading.
+    """
     counted = rows.readings.counted
     found = [_one_column(counted, *each) for each in _dense(setting, rows, parameters)]
     for joint, field in enumerate(setting.fields):
@@ -78,16 +83,19 @@ def troubles(setting: Setting, rows: SweepReadings, parameters: Parameters) -> T
         values = np.zeros((*counted.shape, field.root.shape[0]))
         values[here, joint] = setting.rated[joint] * field.columns(rows.readings.position[here])
         found += [("field", joint, f"{k}", column) for k, column in enumerate(values[counted].T * UNITS["field"][0])]
-    kept = [each for each in found if np.abs(each[3]).max(initial=0.0) > 0]
+    if keep is None:
+        keep = np.array([np.abs(each[3]).max(initial=0.0) > 0 for each in found])
+    kept = [each for each, wanted in zip(found, keep, strict=True) if wanted]
     return Troubles(
         np.column_stack([np.zeros((int(counted.sum()), 0)), *(each[3] for each in kept)]),
         np.array([FAMILIES.index(each[0]) for each in kept], dtype=np.int64),
         np.array([each[1] for each in kept], dtype=np.int64),
         tuple(each[2] for each in kept),
+        keep,
     )
 
 
-def _one_column(counted: Array, family: str, joint: int, label: str, values: Array) -> tuple[str, int, str, Array]:
+def _one_column(counted: Mask, family: str, joint: int, label: str, values: Array) -> tuple[str, int, str, Array]:
     return family, joint, label, values[counted] * UNITS[family][0]
 
 
@@ -105,7 +113,8 @@ def _dense(setting: Setting, rows: SweepReadings, parameters: Parameters) -> Ite
         """Change of true torque as all from a joint on turns about an axis (K, 3) [N·m/rad]."""
         beyond = np.einsum("kd,kid->ki", np.cross(axis, arm.gravity), turned)
         before = np.einsum("kid,kd->ki", frames.lever, np.cross(axis, composite[:, joint]))
-        return np.where(np.arange(n) >= joint, beyond, before)
+        change: Array = np.where(np.arange(n) >= joint, beyond, before)
+        return change
 
     for joint in range(n):
         for label, axis in zip("xy", _crossing(arm, frames.rotation, joint), strict=True):
@@ -115,16 +124,15 @@ def _dense(setting: Setting, rows: SweepReadings, parameters: Parameters) -> Ite
         yield "eccentricity", joint, "sin", stiffness * np.sin(angle)[:, None]
         yield "eccentricity", joint, "cos", stiffness * np.cos(angle)[:, None]
         yield "sag", joint, "", stiffness * felt[:, joint, None] / rated[joint]
-        if joint < n - 1 and readings.load.any():
-            for axis in range(3):  # a length: where the load hangs beyond this link
-                shift = np.einsum("kid,kd->ki", frames.lever, frames.rotation[:, joint, :, axis])
+        if joint < n - 1:
+            for across in range(3):  # a length: where the load hangs beyond this link
+                shift = np.einsum("kid,kd->ki", frames.lever, frames.rotation[:, joint, :, across])
                 reach = np.where(np.arange(n) <= joint, shift, 0.0) * readings.load[:, None]
-                yield "axes", joint, f"length {'xyz'[axis]}", gain * reach
-    own = np.eye(n)
+                yield "axes", joint, f"length {'xyz'[across]}", gain * reach
+    own, bare = np.eye(n), np.ones((len(torque), 1))
     middle = (arm.lower + arm.upper) / 2
     since = _waves(rows.time, setting.span)
-    for joint in range(n):
-        here = own[joint]
+    for joint, here in enumerate(own):
         for other in {joint - 1, joint + 1} & set(range(n)):
             yield "crosstalk", joint, arm.names[other], here * gain[joint] * felt[:, other, None]
         share = torque[:, joint, None] / rated[joint]
@@ -132,7 +140,7 @@ def _dense(setting: Setting, rows: SweepReadings, parameters: Parameters) -> Ite
         for other in {joint - 1, joint, joint + 1} & set(range(n)):
             bent = readings.position[:, other, None] - middle[other]
             yield "spring", joint, arm.names[other], here * gain[joint] * rated[joint] * bent
-        yield "spring", joint, "rest", here * gain[joint] * rated[joint] * REST * np.ones((len(angle), 1))
+        yield "spring", joint, "rest", here * gain[joint] * rated[joint] * REST * bare
         side = np.where(rows.swept == joint, readings.direction[:, joint], 0.0)[:, None]
         rising = np.sign(np.einsum("kd,kd->k", turned[:, joint], frames.lever[:, joint]))[:, None]
         yield "direction", joint, "position", here * rated[joint] * side
