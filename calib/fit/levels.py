@@ -17,6 +17,9 @@ bad in all that it is, and a family that hardly shows keeps a level instead of n
 certain of what the readings do not tell. The common level is the mean of the logarithms, in which a family counts as
 much as it has coefficients that the readings tell, and at most FEW."""
 
+LARGEST = 5.0
+"""Largest level: bad arms have 3. A trouble that asks for more is not small: it stands out, is named and taken out."""
+
 
 @dataclass(frozen=True, eq=False)
 class Effects:
@@ -77,7 +80,7 @@ def learn(effects: Effects, start: Array) -> Levels:
             if len(at):
                 freedom[family] = len(at) - spread[at].sum() / level[family] ** 2
                 told = solution[at] @ solution[at] + WEIGHT * common**2
-                level[family] = np.sqrt(told / (max(freedom[family], 0.0) + WEIGHT))
+                level[family] = min(np.sqrt(told / (max(freedom[family], 0.0) + WEIGHT)), LARGEST)
         if np.abs(level / before - 1).max() < SETTLED:
             break
     return Levels(level, freedom, criterion)

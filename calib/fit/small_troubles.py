@@ -24,7 +24,7 @@ UNITS = {
     "sag": (3e-4, "rad at rated torque"),
     "crosstalk": (2.5e-3, "1"),
     "nonlinear": (2.5e-4, "at rated torque"),
-    "spring": (1e-3, "of rated torque per rad"),
+    "spring": (1.5e-3, "of rated torque per rad"),
     "direction": (5e-4, "of rated torque"),
     "drift": (1e-3, "of rated torque"),
     "field": (1e-3, "of rated torque"),
