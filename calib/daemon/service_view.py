@@ -89,7 +89,7 @@ class ServiceView:
         if self._observation is None:
             return ()
         feed, last_accepted = self._observation.feed, self._observation.last_accepted
-        estimate = feed.observer.estimate()
+        estimate, limits = feed.observer.estimate(), feed.observer.limits()
         gain, offset = (feed.calibration.values(name) for name in ("gain", "offset"))
         return tuple(
             JointEstimate(
@@ -102,6 +102,9 @@ class ServiceView:
                 last_accepted=last_accepted.get(name),
                 installed_gain=_number(gain[j]),
                 installed_offset=_number(offset[j]),
+                gain_limit=_number(limits.gain[j]),
+                offset_limit=_number(limits.offset[j]),
+                limit_rests=limits.rests,
             )
             for j, name in enumerate(feed.names)
         )
