@@ -285,3 +285,18 @@ def test_odrive_readings_by_the_published_file():
 
 def test_feedback_is_a_tuple_of_si_values():
     assert unpack_feedback(bytes(5), DM4340) == MitFeedback(-12.5, -10.0, -28.0)
+
+
+def test_the_cycles_payload_is_what_the_general_way_packs():
+    from armlink.drives.moteus.drives import COMMAND, CYCLE_COMMAND, CYCLE_REPLY, QUERY
+
+    values = {register: float(place) for place, register in enumerate(COMMAND)} | {0: 10}
+    data = CYCLE_COMMAND.pack(values)
+    assert data == moteus.pack(values, QUERY)
+    assert CYCLE_COMMAND.unpack(data) == values
+    assert CYCLE_COMMAND.unpack(data[:-1] + b"\1") is None
+    assert CYCLE_REPLY.unpack(data) is None
+    reply = moteus.pack_reply(
+        [moteus.Subframe(moteus.REPLY, r, 1.0, moteus.INT8 if r in moteus.SMALL else moteus.FLOAT) for r in QUERY]
+    )
+    assert CYCLE_REPLY.unpack(reply) == dict.fromkeys(sorted(QUERY), 1.0)
