@@ -278,7 +278,7 @@ def told(name, bench, joint, frames):
                 found.append((values[0x22], values[0x20] * 2 * math.pi, 0.0, 0.0, 0.0, values[0x25]))
         elif name == "six-odrive" and can_id >> 5 == row.node:
             if can_id & 0x1F == 0x0E:
-                found.append((struct.unpack("<f", data)[0], NAN, 0.0, 0.0, 0.0, math.inf))
+                found.append((struct.unpack_from("<f", data)[0], NAN, 0.0, 0.0, 0.0, math.inf))
             elif can_id & 0x1F == 0x0C:
                 position, _, ahead = struct.unpack("<fhh", data)
                 found.append((ahead / 1000, position * 2 * math.pi, 0.0, 0.0, 0.0, math.inf))
