@@ -2,9 +2,10 @@
 
 from dataclasses import dataclass, replace
 
+from armlink.recording.recording import Recording
 from sim_gap.attribution.causes import left_over
 from sim_gap.attribution.confidence import HINT
-from sim_gap.attribution.diagnosis import Cause, Diagnosis, Verdict
+from sim_gap.attribution.diagnosis import Cause, Diagnosis, Rollout, Verdict
 from sim_gap.attribution.notes import notes
 from sim_gap.attribution.rollout import roll_out
 from sim_gap.attribution.verdict import share_left, verdict
@@ -23,6 +24,10 @@ class Internals:
     heldout: ResidualSet
     estimate: Estimate | None
     """None if there is no gap."""
+    recordings: tuple[Recording, ...] = ()
+    """Held-out recordings."""
+    nominal: Estimate | None = None
+    """The fit even if there is no gap."""
 
 
 def answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: str) -> Diagnosis:
@@ -49,10 +54,17 @@ def answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: 
         unexplained=share_left(judge, left),
         margin=combined(judge, judge.margin),
         heldout_is=heldout_is,
-        rollout=roll_out(made.model, judge, estimate),
+        rollout=_rolled(made, found),
         notes=notes(found, stuck, estimate, fit, judge, left),
         internals=made,
     )
+
+
+def _rolled(made: Internals, found: list[Cause]) -> Rollout | None:
+    """Roll-outs of the exported files along the held-out recordings."""
+    if made.nominal is None or not made.recordings:
+        return None
+    return roll_out(made.model, made.heldout.layout, made.recordings, made.estimate, found, made.nominal)
 
 
 def _hints(found: list[Cause]) -> list[Cause]:

@@ -17,7 +17,8 @@ from sim_gap.effects.registry import effects
 from sim_gap.residuals.layout import Layout, Row
 from sim_gap.residuals.residual_set import RELEVANT_NM, ResidualSet
 from sim_gap.search.estimate import Estimate, Value
-from sim_gap.search.normal_equations import ColumnStore, NormalEquations, Term
+from sim_gap.search.normal_equations import NormalEquations
+from sim_gap.search.term import Term
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ FLOOR_KNOWN = 1.05
 class _Scorer:
     def __init__(self, estimate: Estimate, heldout: ResidualSet) -> None:
         self.estimate, self.heldout = estimate, heldout
-        self.normal = NormalEquations(ColumnStore(heldout), estimate.terms)
+        self.normal = NormalEquations(estimate.on(heldout), estimate.terms)
         self.joint = np.array([row[1] for row in self.normal.rows])
         self.counts = self.normal.count.sum(0) > 0
 

@@ -19,9 +19,9 @@ from sim_gap.effects.registry import library_without
 from sim_gap.model.load import load_model
 from sim_gap.residuals.preprocess import prepare, require_length
 from sim_gap.residuals.residual_set import ResidualSet, residual_sets
+from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import Estimate
 from sim_gap.search.model_selection import select_model
-from sim_gap.search.normal_equations import ColumnStore
 
 OWN_HELDOUT = 0.3
 """Share at the end of each training recording that is held out if no held-out recording is given."""
@@ -66,12 +66,12 @@ def diagnose(
     _require_motion(fit)
     store = ColumnStore(fit)
     search = select_model(store, library_without(withhold))
-    estimate = Estimate(store, search.active)
+    estimate = Estimate(search.normal.store, search.active)
     quiet = not fit.impacts and is_quiet(judge) and is_quiet(fit)
     found, minor = causes(estimate, judge, Rivals(search), sim.arm.names, quiet=quiet)
     if quiet and not found:
-        return answer(Internals(sim, fit, judge, None), [], [], heldout_is)
-    return answer(Internals(sim, fit, judge, estimate), found, minor, heldout_is)
+        return answer(Internals(sim, fit, judge, None, tuple(heldout), estimate), [], [], heldout_is)
+    return answer(Internals(sim, fit, judge, estimate, tuple(heldout), estimate), found, minor, heldout_is)
 
 
 def _names(recording: Recording) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from gcomp.arrays import Array
 from sim_gap.residuals.where import Location
 from sim_gap.search.estimate import Value
 
-SCHEMA = "armlink.gap/1"
+SCHEMA = "armlink.gap/2"
 Verdict = Literal["no_gap", "explained", "ambiguous", "unexplained"]
 
 
@@ -62,6 +62,19 @@ class Rollout:
     horizon_s: float
     before: Array
     after: Array
+    effects: "tuple[EffectRollout, ...]" = ()
+    """Those whose absence costs most first."""
+    closed_loop: bool = False
+
+
+@dataclass(frozen=True)
+class EffectRollout:
+    """Position gap with one effect added to the nominal model alone, and with all effects but this one [rad], (n,)."""
+
+    effect: str
+    joints: tuple[str, ...]
+    alone: Array
+    without: Array
 
 
 @dataclass(frozen=True)
@@ -90,7 +103,7 @@ class Diagnosis:
     """Fit and data behind the result (`answer.Internals`), for report and export."""
 
     def to_json(self) -> dict[str, Any]:
-        """The dictionary of schema armlink.gap/1."""
+        """The dictionary of schema armlink.gap/2."""
         roll = self.rollout
         return {
             "schema": SCHEMA,
@@ -121,8 +134,18 @@ class Diagnosis:
             "rollout": {
                 "unit": "rad",
                 "horizon_s": roll.horizon_s if roll else None,
+                "closed_loop": roll.closed_loop if roll else False,
                 "before": _list(roll.before) if roll else [],
                 "after": _list(roll.after) if roll else [],
+                "effects": [
+                    {
+                        "effect": each.effect,
+                        "joints": list(each.joints),
+                        "alone": _list(each.alone),
+                        "without": _list(each.without),
+                    }
+                    for each in (roll.effects if roll else ())
+                ],
             },
             "unexplained": _round(self.unexplained),
             "notes": list(self.notes),

@@ -64,7 +64,11 @@ def _bound(estimate: Estimate | None, data: ResidualSet) -> tuple[str, ...]:
     """A note for effects in one recording alone, and for a payload that includes model errors of the links."""
     terms = () if estimate is None else estimate.terms
     labels = {s.number: s.label for s in data.signals}
-    lines = [f"{term.effect} is present in {labels[term.bound]} alone" for term in terms if term.bound]
+    lines = [
+        f"{term.effect} is present in {' and '.join(labels[number] for number in term.bound)} alone"
+        for term in terms
+        if term.bound
+    ]
     if any(term.effect == "link.payload" and not term.bound for term in terms):
         lines.append(
             "link.payload: includes mass errors of the links themselves; to separate them, add recordings of the arm "

@@ -29,12 +29,12 @@ INDISTINCT = (
     {"position.offset", "position.eccentricity"},
     {"position.gain", "position.eccentricity"},
 )
-"""Effects that are not drawn together at one joint (or at the last one and the tip): slow motion cannot separate them."""
+"""Effects not drawn together at one joint (or at the last one and the tip): slow motion cannot separate them."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """One case before it is drawn: its effects by id, none, one or two; or the number of effects of a `several` case."""
+    """One case before it is drawn: its effects by id; or the number of effects of a `several` case."""
 
     name: str
     effects: tuple[str, ...]

@@ -8,6 +8,7 @@ import pytest
 
 from armlink.errors import BadInput, Refused
 from sim_gap.blind.bench import _answers, run_bench
+from sim_gap.blind.cases.recipe import draw, recipes
 from sim_gap.blind.cases.seal import MANIFEST, open_labels, seal, verify, write_answer
 from sim_gap.blind.judging.judge import judge
 from sim_gap.blind.judging.score import answer_name, score
