@@ -11,6 +11,7 @@ from typing import Any
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording, default_names, slice_rows
 from sim_gap.attribution.answer import Internals, answer
+from sim_gap.attribution.bodies import groups_of, placed
 from sim_gap.attribution.causes import causes
 from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.attribution.rivals import Rivals
@@ -36,6 +37,7 @@ def diagnose(
     *,
     labels: Sequence[str] = (),
     withhold: Sequence[str] = (),
+    groups: Sequence[str] = (),
 ) -> Diagnosis:
     """Explain the gap between a simulation model and recordings of the real arm.
 
@@ -44,6 +46,7 @@ def diagnose(
         train: recordings to fit.
         heldout: recordings to judge on, not used in the fit; without any, the end of each training recording is.
         labels: names of the recordings for messages, train first.
+        groups: `NAME=REC[,REC…]`: recordings (by label) that share a body; without any, it is found which do.
         withhold: ids of effects to leave out of the library (blind check).
 
     Raises BadInput if the recordings cannot be used with the model.
@@ -55,18 +58,20 @@ def diagnose(
     for recording, label in zip([*train, *heldout], labels, strict=False):
         require_length(recording, label)
     heldout_is = "the recordings given" if heldout else f"the last {OWN_HELDOUT:.0%} of each training recording"
-    numbers = [*range(1, len(train) + 1), *([0] * len(heldout))]
+    numbers = list(range(1, len(train) + len(heldout) + 1))
+    named = groups_of(groups, labels)
     if not heldout:
-        train, heldout, labels, numbers = *_split(train), labels * 2, numbers * 2
+        train, heldout, labels, numbers, named = *_split(train), labels * 2, numbers * 2, named * 2
     ready = [
-        prepare(recording, sim.arm, label, number)
-        for recording, label, number in zip([*train, *heldout], labels, numbers, strict=False)
+        prepare(recording, sim.arm, label, number, names)
+        for recording, label, number, names in zip([*train, *heldout], labels, numbers, named, strict=False)
     ]
     fit, judge = residual_sets(ready[: len(train)], ready[len(train) :])
     _require_motion(fit)
     store = ColumnStore(fit)
     search = select_model(store, library_without(withhold))
     estimate = Estimate(search.normal.store, search.active)
+    judge = placed(estimate, judge)
     quiet = not fit.impacts and is_quiet(judge) and is_quiet(fit)
     found, minor = causes(estimate, judge, Rivals(search), sim.arm.names, quiet=quiet)
     if quiet and not found:

@@ -97,6 +97,8 @@ class Diagnosis:
     """RMS per joint from which it is a gap [N·m], (n,)."""
     heldout_is: str
     """Description of the held-out data."""
+    left_out: float = 0.0
+    """Share of the held-out samples that no row judges."""
     rollout: Rollout | None = None
     notes: tuple[str, ...] = ()
     internals: Any = field(default=None, repr=False, compare=False)
@@ -116,6 +118,7 @@ class Diagnosis:
                     "rms": _round(place.rms),
                     "noise": _round(place.noise),
                     "share": _round(place.share),
+                    **({} if place.hz is None else {"hz": _round(place.hz)}),
                 }
                 for place in self.where
             ],
@@ -148,6 +151,7 @@ class Diagnosis:
                 ],
             },
             "unexplained": _round(self.unexplained),
+            "left_out": _round(self.left_out),
             "notes": list(self.notes),
         }
 

@@ -103,10 +103,10 @@ class Rivals:
         terms = self.search.with_beneath(other, rest)
         store = self.search.normal.store
         nominal, start = store.nominal or store, store.values
-        values, kept = converged(nominal, terms, {term: c for term, c in start.items() if term in rest})
+        about, kept = converged(nominal, terms, {term: c for term, c in start.items() if term in rest})
         if other.key not in {term.key for term in kept}:
             return float("inf")
-        again = Search(NormalEquations(nominal.at(values), kept), kept)
+        again = Search(NormalEquations(about, kept), kept)
         return again.score - self.search.score
 
 

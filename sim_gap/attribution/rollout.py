@@ -18,8 +18,8 @@ from sim_gap.better_model.effects_module import joint_effects
 from sim_gap.better_model.export import Written, written
 from sim_gap.better_model.with_effects import with_effects
 from sim_gap.model.load import SimModel
-from sim_gap.residuals.layout import Layout
 from sim_gap.residuals.preprocess import CHANNELS
+from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.estimate import Estimate
 from sim_gap.search.term import Term
 
@@ -33,33 +33,43 @@ NAME = "model.xml"
 class RollOuts:
     """Simulations of the exported files along held-out recordings."""
 
-    def __init__(self, sim: SimModel, layout: Layout, recordings: Sequence[Recording], estimate: Estimate) -> None:
+    def __init__(
+        self, sim: SimModel, heldout: ResidualSet, recordings: Sequence[Recording], estimate: Estimate
+    ) -> None:
         self.sim, self.recordings, self.estimate = sim, recordings, estimate
-        self.channel = CHANNELS[layout.motor_side]
-        self.source = {"tau_motor": "motor", "tau_cmd": "command", "tau": "sensor"}[layout.motor_side]
+        self.numbers = [s.number for s in heldout.signals]
+        self.channel = CHANNELS[heldout.layout.motor_side]
+        self.source = {"tau_motor": "motor", "tau_cmd": "command", "tau": "sensor"}[heldout.layout.motor_side]
 
     def of(self, terms: Sequence[Term], windows: int) -> Array:
         """Deviation per joint with these terms [rad], RMS over the windows of all recordings, (n,)."""
-        if self.sim.path is None:  # a compiled model has no file to write
-            corrected = with_effects(self.sim, self.estimate, terms)
-            names = self.sim.arm.names
-            model, module = corrected.model, forward_effects
-            effects = module.Effects(model, joint_effects(self.sim, self.estimate, corrected.not_held), names)
-        else:
-            files = written(self.sim, self.estimate, NAME, terms)
-            model, module = _compiled(files), _loaded(files)
-            effects = module.Effects(model, module.EFFECTS or (), module.JOINTS or self.sim.arm.names)
-        share = max(1, windows // len(self.recordings))
-        squares = [
-            module.roll_out(model, effects, r.t, r.position, getattr(r, self.channel), self.source, windows=share) ** 2
-            for r in self.recordings
-        ]
+        share, squares = max(1, windows // len(self.recordings)), []
+        bodies = any(term.effect == "link.payload" for term in terms)
+        made: dict[int, tuple[Any, ModuleType, Any]] = {}
+        for r, number in zip(self.recordings, self.numbers, strict=True):
+            number = number if bodies else 0
+            if number not in made:
+                made[number] = self._files(terms, number)
+            model, module, effects = made[number]
+            torque = getattr(r, self.channel)
+            squares.append(module.roll_out(model, effects, r.t, r.position, torque, self.source, windows=share) ** 2)
         return np.asarray(np.sqrt(np.nanmean(squares, axis=0)))
+
+    def _files(self, terms: Sequence[Term], number: int) -> tuple[Any, ModuleType, Any]:
+        """Model, module and effects with these terms as they are written for one recording."""
+        if self.sim.path is None:  # a compiled model has no file to write
+            corrected = with_effects(self.sim, self.estimate, terms, number)
+            entries = joint_effects(self.sim, self.estimate, corrected.not_held)
+            own = forward_effects.Effects(corrected.model, entries, self.sim.arm.names)
+            return corrected.model, forward_effects, own
+        files = written(self.sim, self.estimate, NAME, terms, number)
+        model, module = _compiled(files), _loaded(files)
+        return model, module, module.Effects(model, module.EFFECTS, module.JOINTS or self.sim.arm.names)
 
 
 def roll_out(
     sim: SimModel,
-    layout: Layout,
+    heldout: ResidualSet,
     recordings: Sequence[Recording],
     estimate: Estimate | None,
     causes: Sequence[Cause],
@@ -69,7 +79,7 @@ def roll_out(
 
     `estimate` is None if there is no gap; `nominal` stands for it then. Effects whose absence costs most come first.
     """
-    runs = RollOuts(sim, layout, recordings, estimate or nominal)
+    runs = RollOuts(sim, heldout, recordings, estimate or nominal)
     horizon, windows = forward_effects.HORIZON_S, forward_effects.WINDOWS
     before = runs.of((), windows)
     if estimate is None:
@@ -78,8 +88,6 @@ def roll_out(
     out = []
     for cause in causes[:MOST_EFFECTS]:
         own = [term for term in estimate.terms if term.effect == cause.effect]
-        if any(term.bound for term in own):
-            continue
         rest = [term for term in estimate.terms if term not in own and not {t.key for t in own} & {*term.beneath}]
         needed = [term for term in estimate.terms if any(term.key in t.beneath for t in own)]
         alone, without = (runs.of(terms, FEW_WINDOWS) for terms in ([*needed, *own], rest))

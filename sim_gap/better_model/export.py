@@ -32,10 +32,15 @@ class Written:
     """What the module holds."""
 
 
-def written(sim: SimModel, estimate: Estimate | None, name: str, terms: Sequence[Term] | None = None) -> Written:
-    """The files of the model with the effects of an estimate, or with some of its terms; `name` is the MJCF's."""
+def written(
+    sim: SimModel, estimate: Estimate | None, name: str, terms: Sequence[Term] | None = None, number: int = 0
+) -> Written:
+    """The files of the model with the effects of an estimate, or with some of its terms; `name` is the MJCF's.
+
+    A body that only some recordings have is left out, except for the one with this `number`.
+    """
     chosen = () if estimate is None else estimate.terms if terms is None else tuple(terms)
-    spec, corrected = spec_of(sim), with_effects(sim, estimate, chosen)
+    spec, corrected = spec_of(sim), with_effects(sim, estimate, chosen, number)
     for body in list(spec.bodies)[1:]:
         _set_inertial(body, corrected.model)
     for joint in spec.joints:

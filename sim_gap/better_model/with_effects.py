@@ -14,6 +14,7 @@ from sim_gap.effects.base import tilted
 from sim_gap.effects.inertials import pseudo_inertia
 from sim_gap.model.load import SimModel, read_spec
 from sim_gap.model.rigid_body import inertial_of
+from sim_gap.residuals.preprocess import ABSENT
 from sim_gap.search.about import inertial_change
 from sim_gap.search.estimate import Estimate
 from sim_gap.search.term import Term
@@ -48,8 +49,13 @@ class CorrectedModel:
     """Joints whose link is not the one that was fitted, which cannot exist, but one close to it."""
 
 
-def with_effects(sim: SimModel, estimate: Estimate | None, terms: Sequence[Term] | None = None) -> CorrectedModel:
-    """A copy of the compiled model with the estimate's effects in it, or with some of its terms."""
+def with_effects(
+    sim: SimModel, estimate: Estimate | None, terms: Sequence[Term] | None = None, number: int = 0
+) -> CorrectedModel:
+    """A copy of the compiled model with the estimate's effects in it, or with some of its terms.
+
+    A body that only some recordings have is left out, except for the one with this `number`.
+    """
     if estimate is None:
         return CorrectedModel(copy.copy(sim.mujoco_model), (), ())
     chosen = estimate.terms if terms is None else tuple(terms)
@@ -57,9 +63,9 @@ def with_effects(sim: SimModel, estimate: Estimate | None, terms: Sequence[Term]
     held = tuple(
         term
         for term in chosen
-        if term.effect in HELD and not term.bound and (coupled or term.effect != "transmission.coupling")
+        if term.effect in HELD and in_model(term, number) and (coupled or term.effect != "transmission.coupling")
     )
-    changed = _set_links(model, sim, [(term, estimate.of(term)) for term in held])
+    changed = _set_links(model, sim, [(term, estimate.of(term)) for term in held], number)
     for term in held:
         c, joint = estimate.of(term), sim.joints[term.place]
         if term.effect == "base.tilt":
@@ -69,11 +75,11 @@ def with_effects(sim: SimModel, estimate: Estimate | None, terms: Sequence[Term]
     return CorrectedModel(model, held, tuple(term for term in chosen if term not in held), changed)
 
 
-def _set_links(model: Any, sim: SimModel, terms: Sequence[tuple[Term, Array]]) -> tuple[str, ...]:
+def _set_links(model: Any, sim: SimModel, terms: Sequence[tuple[Term, Array]], number: int) -> tuple[str, ...]:
     """Put the terms that change links into the model; the joints whose link could not be made as fitted."""
     inertial = sim.arm.inertial.copy()
     for term, c in terms:
-        change = inertial_change(term, c, inertial, 0)
+        change = inertial_change(term, c, inertial, number)
         if change is not None:
             inertial[sim.n - 1 if term.effect == "link.payload" else term.place] += change
     moved = np.flatnonzero(np.any(inertial != sim.arm.inertial, axis=1)).tolist()
@@ -147,6 +153,11 @@ def mujoco_quaternion(out: Array, axes: Array) -> None:
 def exists(inertial: Array) -> bool:
     """Whether a body with these ten parameters can exist."""
     return bool(inertial[0] > 0.0 and np.linalg.eigvalsh(pseudo_inertia(inertial)).min() > 0.0)
+
+
+def in_model(term: Term, number: int) -> bool:
+    """Whether a term belongs to the arm, or to the recording with this number."""
+    return (not term.bound and number != ABSENT) or term.form.signature.present(term.shape, number)
 
 
 def _base(sim: SimModel, motors: list[CoupledMotor]) -> tuple[Any, bool]:

@@ -18,6 +18,14 @@ def diagnose(
         list[Path] | None,
         typer.Option(help="Held-out recording to judge on; may be repeated. Default: the end of each --train."),
     ] = None,
+    group: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=REC[,REC…]",
+            help="Recordings (held-out ones too) with a common body such as a payload; may be repeated. "
+            "Default: found by itself.",
+        ),
+    ] = None,
     json: Annotated[Path | None, typer.Option(help="Write the result here; - is standard output.")] = None,
     report: Annotated[Path | None, typer.Option(help="Write a self-contained HTML report here.")] = None,
     out_model: Annotated[
@@ -47,7 +55,8 @@ def diagnose(
         recordings = [load_recording(path) for path in paths]
     count = len(train)
     with console.status("fitting effects to the gap"):
-        answer = diagnosis.diagnose(sim, recordings[:count], recordings[count:], labels=[str(path) for path in paths])
+        labels = [str(path) for path in paths]
+        answer = diagnosis.diagnose(sim, recordings[:count], recordings[count:], labels=labels, groups=group or ())
     for path, recording in zip(paths, recordings, strict=True):
         if recording.warning:
             console.print(f"{path}: {recording.warning}", style="yellow")

@@ -14,7 +14,7 @@ import numpy as np
 from armlink.effect_catalogue import CATALOGUE
 from gcomp.arrays import Array
 from sim_gap.residuals.layout import Columns, Layout
-from sim_gap.residuals.preprocess import Signals
+from sim_gap.residuals.preprocess import ABSENT, Signals
 
 Shape = tuple[float, ...]
 """Nonlinear parameters of an effect, such as its Stribeck velocity."""
@@ -58,7 +58,7 @@ class Signature:
     def present(self, shape: Shape, number: int) -> bool:
         """Whether recording `number` has it."""
         numbers = self.recordings(shape)
-        return not numbers or number in numbers
+        return number != ABSENT and (not numbers or number in numbers)
 
     def places(self, layout: Layout) -> range:
         """Joints or links at which it may be; empty if these channels cannot show it."""

@@ -9,7 +9,7 @@ from gcomp.arrays import Array
 from sim_gap.effects.effect import Beneath, Effect, Key, Plausibility, SearchHints, Shape, Signature
 from sim_gap.effects.inertials import moment_to_inertia, point_slopes
 from sim_gap.residuals.layout import Columns, Layout
-from sim_gap.residuals.preprocess import Signals
+from sim_gap.residuals.preprocess import ABSENT, Signals
 
 LEVER = 0.15
 """Plausible shift of a link's centre of mass [m], and radius of gyration of added mass [m]."""
@@ -21,6 +21,8 @@ FEW = 4
 """With up to this number, in any of them."""
 SHOWS = 0.3
 """A mass moment's own torque must be at least this share of the torque of the inertia that comes with it."""
+TAKEN = 0.98
+"""Largest share of the last link's mass that a missing body may have."""
 FARTHEST = 0.6
 """Largest distance of a payload's centre of mass from the last joint [m]."""
 
@@ -54,15 +56,19 @@ def _payload(signals: Signals, layout: Layout, _place: int, shape: Shape) -> Col
     If only some of the recordings were made with it, the shape holds their numbers as bits, the first as 1.
     """
     tip = signals.n - 1
-    present = not shape or signals.number in numbers(shape)
-    return _rows(signals, layout, tip, signals.regressor[:, :, tip, :4] * present)
+    return _rows(signals, layout, tip, signals.regressor[:, :, tip, :4] * _has(signals, shape))
 
 
 def _payload_slopes(signals: Signals, layout: Layout, shape: Shape, c: Array) -> Columns:
     """The same about a fitted payload: a point mass, whose inertia changes with it."""
     tip = signals.n - 1
-    present = not shape or signals.number in numbers(shape)
-    return _rows(signals, layout, tip, signals.regressor[:, :, tip] @ point_slopes(float(c[0]), c[1:]) * present)
+    slopes = signals.regressor[:, :, tip] @ point_slopes(float(c[0]), c[1:])
+    return _rows(signals, layout, tip, slopes * _has(signals, shape))
+
+
+def _has(signals: Signals, shape: Shape) -> bool:
+    """Whether a recording was made with the body of this shape."""
+    return signals.number != ABSENT and (not shape or signals.number in numbers(shape))
 
 
 def numbers(shape: Shape) -> tuple[int, ...]:
@@ -77,7 +83,10 @@ def shape_of(chosen: Iterable[int]) -> Shape:
 
 
 def _recordings(signals: Sequence[Signals], _place: int) -> tuple[Shape, ...]:
-    """In all recordings, in one of several, or (of a few) in any of them but not all."""
+    """In all recordings, in those of a group, or without groups in one of several or (of a few) in any but not all."""
+    groups = {name: {s.number for s in signals if name in s.groups} for s in signals for name in s.groups}
+    if groups:
+        return ((), *dict.fromkeys(shape_of(each) for each in groups.values()))
     known = sorted({s.number for s in signals} - {0})
     most = len(known) - 1 if len(known) <= FEW else 1
     some = most if 1 < len(known) <= SEVERAL else 0
@@ -92,9 +101,11 @@ def _all_mass_moments(layout: Layout, _place: int, _shape: Shape) -> tuple[Key, 
     return tuple(("link.mass_moment", link) for link in range(layout.n))
 
 
-def _near_the_tip(coefficients: Array, _shape: Shape, _beneath: Beneath) -> bool:
+def _near_the_tip(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
+    """A body at the last link; if the arm lacks it, it is no heavier than what the model has there."""
     mass = float(coefficients[0])
-    return mass > 0.0 and float(np.linalg.norm(coefficients[1:])) < FARTHEST * mass
+    most = TAKEN * float(beneath["tip"][0])
+    return mass > -most and mass != 0.0 and float(np.linalg.norm(coefficients[1:])) < FARTHEST * abs(mass)
 
 
 def _mass_and_centre(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:

@@ -34,6 +34,8 @@ PAD_S = 1.0
 TRIM_S = 0.3
 """Length cut off at both ends after filtering [s]."""
 SHORTEST_S = 3.0
+ABSENT = -1
+"""Number of a recording without the body that training recordings have."""
 CHANNELS = {"tau": "torque", "tau_motor": "motor_torque", "tau_cmd": "torque_command"}
 
 
@@ -60,7 +62,10 @@ class Signals:
     arm: RigidArm
     temperature: Array | None = None
     number: int = 0
-    """Number from 1 of the training recording that this is (a part of); 0 for others."""
+    """Number from 1 of the recording that this is (a part of), training recordings first; 0 if it has none, ABSENT if
+    it is known to lack the body that others have."""
+    groups: tuple[str, ...] = ()
+    """Names of the groups of recordings with a common body that it belongs to."""
     stuck: tuple[Stuck, ...] = ()
     """Channels that are stuck for some time, in which they are not `known`."""
     found: "Found | None" = None
@@ -223,7 +228,9 @@ def require_length(recording: Recording, label: str) -> None:
         )
 
 
-def prepare(recording: Recording, arm: RigidArm, label: str = "recording", number: int = 0) -> Signals:
+def prepare(
+    recording: Recording, arm: RigidArm, label: str = "recording", number: int = 0, groups: tuple[str, ...] = ()
+) -> Signals:
     """Prepare a recording for the comparison with `arm`. Raises BadInput if it cannot be used, with the reason."""
     if recording.n != arm.n:
         raise BadInput(f"{label}: has {recording.n} joints, the model {arm.n}: give the model of the recorded arm")
@@ -255,6 +262,7 @@ def prepare(recording: Recording, arm: RigidArm, label: str = "recording", numbe
         raise BadInput(f"{label}: no torque channel holds a number: at least one of tau, tau_motor, tau_cmd is needed")
     clock = times - times[0]
     signals = Signals(label, rate, band, clock, q, v, a, reading, known, noise, arm, recording.temperature, number)
+    signals = replace(signals, groups=groups)
     return _without_stuck(signals, recording)
 
 

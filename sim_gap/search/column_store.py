@@ -27,15 +27,22 @@ UNAFFECTED = frozenset(
 class ColumnStore:
     """Columns of terms: derivatives of the predicted readings at the estimate `values`, else at the nominal model."""
 
-    def __init__(self, data: ResidualSet, values: Values | None = None, nominal: "ColumnStore | None" = None) -> None:
-        """`nominal` is the store about the nominal model, of which columns that the estimate does not change are."""
-        self.data, self.values, self.nominal = data, dict(values or {}), nominal
+    def __init__(
+        self,
+        data: ResidualSet,
+        values: Values | None = None,
+        nominal: "ColumnStore | None" = None,
+        pins: Values | None = None,
+    ) -> None:
+        """`nominal` is the store about the nominal model, of which columns that the estimate does not change are;
+        `pins` are coefficients that every fit on these columns keeps."""
+        self.data, self.values, self.nominal, self.pins = data, dict(values or {}), nominal, dict(pins or {})
         self._columns: dict[Term, Columns] = {}
         self._offsets: dict[Term, Columns] = {}
 
-    def at(self, values: Values) -> "ColumnStore":
+    def at(self, values: Values, pins: Values | None = None) -> "ColumnStore":
         """The columns about other values."""
-        return ColumnStore(self.data, values, self.nominal or self)
+        return ColumnStore(self.data, values, self.nominal or self, pins)
 
     @cached_property
     def _link_as_nominal(self) -> bool:

@@ -100,7 +100,7 @@ class Estimate:
         for weight, x, residual, block in self._jacobian:
             bread += weight * x.T @ x
             np.add.at(scores, block, weight * x * residual[:, None])
-        bread[np.arange(self.normal.size), np.arange(self.normal.size)] += self.normal.prior
+        bread[np.arange(self.normal.size), np.arange(self.normal.size)] += self.normal.free
         scale = 1.0 / np.sqrt(np.maximum(np.diag(bread), 1e-300))
         inverse = np.linalg.pinv(bread * scale * scale[:, None], hermitian=True, rcond=1e-10) * scale * scale[:, None]
         blocks = max(len(scores), 2)

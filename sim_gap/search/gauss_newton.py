@@ -6,6 +6,7 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.search.column_store import ColumnStore
+from sim_gap.search.feasible import pins
 from sim_gap.search.normal_equations import NormalEquations
 from sim_gap.search.stepwise import Search
 from sim_gap.search.term import Term
@@ -21,15 +22,18 @@ HALVED = 3
 Values = dict[Term, Array]
 
 
-def converged(nominal: ColumnStore, terms: Sequence[Term], start: Values | None = None) -> tuple[Values, list[Term]]:
-    """Coefficients of the terms with their columns evaluated about themselves, and the terms that remain plausible.
+def converged(
+    nominal: ColumnStore, terms: Sequence[Term], start: Values | None = None
+) -> tuple[ColumnStore, list[Term]]:
+    """Columns of the terms about their own coefficients (`values` of the store), and the terms that remain plausible.
 
     `nominal` has the columns about the nominal model. `start` holds coefficients to begin with; without it the first
     step is about the nominal model.
     """
     terms = [term.start for term in terms]
     values = {term: c for term, c in (start or {}).items() if term in terms}
-    best, kept = np.inf, values
+    best, kept, held = np.inf, values, Values()
+    arm = nominal.data.signals[0].arm
     for _ in range(STEPS):
         store = nominal.at(values)
         search = Search(NormalEquations(store, terms), terms)
@@ -42,10 +46,14 @@ def converged(nominal: ColumnStore, terms: Sequence[Term], start: Values | None 
             now, halved = score(store, values, search.normal), halved + 1
         if values:
             best, kept = now, values
+        held = pins(search, arm)
+        if held:
+            search.normal.pin(held)
+            search.reweigh()
         terms, values = _step(search)
         if kept and set(terms) == set(kept) and _agree(search, kept, values):
             break
-    return values, terms
+    return nominal.at(values, {term: c for term, c in held.items() if term in values}), terms
 
 
 def _step(search: Search) -> tuple[list[Term], Values]:

@@ -34,11 +34,10 @@ def select_model(store: ColumnStore, library: Sequence[str]) -> Search:
 def about_itself(nominal: ColumnStore, chosen: list[Term], offered: Sequence[Term], start: Values) -> Search:
     """The chosen terms and their rivals with columns evaluated about the fit of the chosen ones, from coefficients
     `start` on."""
-    values, chosen = converged(nominal, chosen, start)
-    refined = refine(nominal.at(values), chosen)
+    store, chosen = converged(nominal, chosen, start)
+    refined = refine(store, chosen)
     if refined != chosen:
-        values, chosen = converged(nominal, refined, values)
-    store = nominal.at(values)
+        store, chosen = converged(nominal, refined, store.values)
     keys = {term.key for term in chosen}
     rivals = relinearised_in_place(store, chosen, [term for term in offered if term.key not in keys])
     return Search(NormalEquations(store, [*chosen, *rivals]), chosen)

@@ -1,6 +1,6 @@
 """Normal equations of all candidate terms, by row and fold: any subset of terms is fitted in microseconds."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -29,6 +29,7 @@ class NormalEquations:
         self.terms = [term for term in terms if store.columns(term)]
         self.rows, self.layout = data.rows, data.layout
         self.known_friction = data.signals[0].arm.frictionloss
+        self.tip_mass = data.signals[0].arm.inertial[-1, :1]
         widths = [next(iter(store.columns(term).values())).shape[1] for term in self.terms]
         ends = np.cumsum([0, *widths])
         self.at = {term: np.arange(ends[i], ends[i + 1]) for i, term in enumerate(self.terms)}
@@ -59,6 +60,18 @@ class NormalEquations:
         )
         means = [np.full(w, term.form.plausibility.prior_mean) for term, w in zip(self.terms, widths, strict=True)]
         self.pull = self.prior * np.concatenate([*means, np.ones(len(held))])
+
+        self.free = self.prior.copy()
+        """The prior without the coefficients that are kept."""
+        self.pin({term: c for term, c in store.pins.items() if term in self.at})
+
+    def pin(self, kept: Mapping[Term, Array]) -> None:
+        """Keep coefficients in every fit."""
+        power = sum((b.diagonal(self.size) for b in self.blocks), np.zeros(self.size))
+        for term, c in kept.items():
+            at = self.at[term]
+            self.prior[at] = PINNED * (1.0 + power[at] / float(self.floor.min(initial=1.0)) ** 2)
+            self.pull[at] = self.prior[at] * c
 
     @property
     def price(self) -> float:
@@ -159,6 +172,12 @@ class _Block:
     gram: Array
     side: Array
     """(F, p, p) and (F, p)."""
+
+    def diagonal(self, size: int) -> Array:
+        """Sums of squares of all columns, (P,)."""
+        out = np.zeros(size)
+        out[self.index] = np.diagonal(self.whole)
+        return out
 
     @cached_property
     def whole(self) -> Array:

@@ -69,6 +69,7 @@ class Search:
         for term in terms:
             beneath = {name: values[name, place] for name, place in term.beneath}
             beneath["nominal"] = self.normal.known_friction[term.place, None]
+            beneath["tip"] = self.normal.tip_mass
             if not term.form.plausibility.allows(values[term.key], term.shape, beneath):
                 return term
         return None
