@@ -241,20 +241,6 @@ class Journal:
                 (_iso(time), t, record, json.dumps(estimate)),
             )
 
-    def history(
-        self, since: datetime | None, until: datetime | None, most: int
-    ) -> list[tuple[datetime, float, str | None, dict[str, Any]]]:
-        """Estimates of a time span, oldest first, thinned evenly to at most `most`; always includes the newest."""
-        span = (_iso(since) if since else "", _iso(until) if until else "9999")
-        count = int(self._db.execute("SELECT COUNT(*) FROM history WHERE time >= ? AND time <= ?", span).fetchone()[0])
-        step = max(1, -(-count // max(most, 1)))
-        rows = self._db.execute(
-            "SELECT time, t, record, estimate FROM (SELECT *, ROW_NUMBER() OVER (ORDER BY id DESC) AS place "
-            "FROM history WHERE time >= ? AND time <= ?) WHERE (place - 1) % ? = 0 ORDER BY id",
-            (*span, step),
-        )
-        return [(datetime.fromisoformat(time), t, record, json.loads(found)) for time, t, record, found in rows]
-
     def thin_history(self, before: datetime, keep_every: int) -> None:
         """Keep one in `keep_every` of the estimates before a time."""
         with self.transaction():
