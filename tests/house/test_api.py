@@ -71,7 +71,7 @@ def test_every_name_has_a_docstring_and_stands_on_a_page(name):
 
 def test_an_unknown_name_says_what_there_is():
     with pytest.raises(AttributeError, match=r"no attribute 'calibarte'; it offers .*calibrate"):
-        armlink.calibarte
+        _ = armlink.calibarte
 
 
 @pytest.mark.parametrize("kind", [str, Path])
