@@ -20,8 +20,12 @@ def describe(error: ValidationError, within: str = "", of: type[BaseModel] | Non
 
 
 def describe_all(error: ValidationError, within: str = "", of: type[BaseModel] | None = None) -> list[tuple[str, str]]:
-    """(Key, what is wrong with it) of all findings; `of` is the model that was validated, for likely keys."""
-    return [_finding(found, within, of) for found in error.errors(include_url=False)]
+    """(Key, what is wrong with it) of all findings; `of` is the model that was validated, for likely keys.
+
+    Unknown keys come first: a misspelt key is missing under its own name too.
+    """
+    order = sorted(error.errors(include_url=False), key=lambda found: found["type"] != "extra_forbidden")
+    return [_finding(found, within, of) for found in order]
 
 
 def meant(word: str, known: Iterable[str]) -> str:

@@ -43,7 +43,8 @@ class RecordingWriter:
 
     def __init__(self, path: str | Path, names: tuple[str, ...]) -> None:
         """Create the file for joints with these names."""
-        self._stream = Path(path).open("wb")  # noqa: SIM115 - closed by __exit__
+        path = Path(path)
+        self._stream = path.open("wb")
         self._names, self._n = names, len(names)
         self._writer = Writer(self._stream)
         self._writer.start(profile=Profile.ROS2, library="armlink")

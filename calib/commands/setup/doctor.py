@@ -1,5 +1,6 @@
 """Says what is missing or doubtful between an arm file, this machine and its bus, first things first."""
 
+import shlex
 from typing import Annotated
 
 import typer
@@ -36,6 +37,6 @@ def doctor(
     if errors:
         console.print(f"{errors} {'error' if errors == 1 else 'errors'} to deal with first")
     else:
-        console.print(f"no errors; next: armlink check {arm}")
+        console.print(f"no errors; next: {shlex.join(['armlink', 'check', arm])}")
     write_json(json_file, {"schema": "armlink.doctor/1", "arm": arm, "findings": [each.to_json() for each in findings]})
     return 1 if errors else 0
