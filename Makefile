@@ -5,7 +5,7 @@ export PYTHON
 CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host daemon_days daemon_kills fuzz_frames web
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean
+.PHONY: help venv demo test lint format bench soak realtime stalls walk blind corruptions mutants docs constraints clean
 
 help: ## Say what can be done
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
@@ -48,6 +48,9 @@ realtime: .venv/.dev ## Long campaign outside make test: the whole job between p
 
 stalls: .venv/.dev ## Long campaign outside make test: sweeps while job, loop and arm are stopped, and on a busy machine
 	$(BIN)/python tests/campaigns/stalls.py $(ARGS)
+
+walk: .venv/.dev ## Long campaign outside make test: every command of first-run, sweeps, … in order, in real time, on a short arm
+	$(BIN)/python tests/campaigns/docs_walk.py $(ARGS)
 
 blind: .venv/.dev ## Long campaign outside make test: the diagnosis against sealed cases (ARGS="--cases 20")
 	$(BIN)/armlink gap bench $(ARGS)
