@@ -5,7 +5,7 @@ export PYTHON
 CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host daemon_days daemon_kills fuzz_frames fuzz_drives kill_drives web
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism
+.PHONY: help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk
 
 help: ## Say what can be done
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
@@ -51,6 +51,9 @@ stalls: .venv/.dev ## Long campaign outside make test: sweeps while job, loop an
 
 realism: .venv/.dev ## Long campaign outside make test: sensor fits of realistic arms, good and bad (ARGS="--seeds 1 5 --full")
 	$(BIN)/python tests/campaigns/realism.py $(ARGS)
+
+walk: .venv/.dev ## Long campaign outside make test: every command of first-run, sweeps, … in order, in real time, on a short arm
+	$(BIN)/python tests/campaigns/docs_walk.py $(ARGS)
 
 blind: .venv/.dev ## Long campaign outside make test: the diagnosis against sealed cases (ARGS="--cases 20")
 	$(BIN)/armlink gap bench $(ARGS)
