@@ -52,7 +52,7 @@ def sweep(
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
-    from armlink.loop.open import open_arm
+    from calib.api import open_link
     from calib.arm.sweep_section import with_hold
     from calib.commands.screen import SweepScreen, confirm, warn_late
     from calib.sweep.dataset import require_vacant
@@ -66,7 +66,8 @@ def sweep(
     require_vacant(out, resume)
     if not dry_run and not yes:
         confirm(f"{arm_file.name} will move through its whole range, {reference_mass:g} kg attached. Is it clear?")
-    with _dry_link(arm_file, reference_mass) if dry_run else open_arm(arm_file, bus) as link:
+    load = reference_mass if dry_run else 0.0
+    with open_link(arm_file, None if dry_run else bus, simulated=dry_run, load=load) as link:
         link.start()
         with SweepScreen(f"{arm_file.name}, {reference_mass:g} kg attached") as screen:
             found, data = _run(
@@ -168,13 +169,3 @@ def _answer(arm_file: "ArmFile", data: "SweepData") -> dict[str, Any]:
         "recommended_reference_mass": data.plan.reference_mass,
         "plan": data.plan.model_dump(mode="json"),
     }
-
-
-def _dry_link(arm_file: "ArmFile", reference_mass: float) -> "ArmDriver":
-    """The simulated arm that the arm file describes, in this process, with the mass attached."""
-    from armlink.arm_file import Bus
-    from armlink.loop.open import open_arm
-
-    bus = Bus(interface="armlink_sim", channel=str(arm_file.path), options={"load": reference_mass})
-    link = arm_file.require_link().model_copy(update={"bus": bus, "buses": {}})
-    return open_arm(arm_file.model_copy(update={"link": link}))

@@ -11,8 +11,6 @@ if TYPE_CHECKING:
     from gcomp.arm.arm import Arm
     from gcomp.arrays import Array
 
-MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
-
 
 def torque(
     arm: Annotated[str, typer.Argument(help="Bundled arm, path of an arm file, or a URDF or MJCF file.")],
@@ -53,7 +51,7 @@ def _model(arm: str, tip: str | None, record: str | None, store: str | None) -> 
     """The arm, its mass moments (2n,) [kg·m], and their origin in words; raises BadInput, Refused."""
     import numpy as np
 
-    from armlink.arm_file import load_arm
+    from armlink.arm_file import MODEL_SUFFIXES, load_arm
     from armlink.errors import BadInput, Refused
     from calib.arm.kinematics import gcomp_arm, model_arm
     from calib.records.records import GravityRecord

@@ -7,7 +7,9 @@ import typer
 
 
 def demo(
-    arm: Annotated[str, typer.Option(help="Bundled arm's name or path of an arm file with a sim section.")] = "sarcos",
+    arm: Annotated[
+        str, typer.Option(help="Bundled arm's name, path of an arm file with a sim section, or a URDF or MJCF model.")
+    ] = "sarcos",
     seed: Annotated[int, typer.Option(min=0, help="Draws another hidden truth.")] = 0,
     realism: Annotated[
         float | None,
@@ -21,6 +23,8 @@ def demo(
     json: Annotated[Path | None, typer.Option(help="Also write the summary here; - is standard output.")] = None,
 ) -> None:
     """Run the whole job on a simulated arm on an in-process CAN bus and write report.html and summary.json.
+
+    Of a model (armlink demo --arm my-arm.urdf) an arm file is made first, as armlink new does; it lies in the folder.
 
     Example: armlink demo --arm sarcos --seed 1 --out armlink-demo
     """
