@@ -78,6 +78,10 @@ class Status(Answer):
     pending_proposals: int = 0
     last_event: int = 0
     """Id of the newest event; 0 if there is none."""
+    store_fault: str | None = None
+    """Why the record store cannot be read, in one line; the records in force stay in force."""
+    journal_fault: str | None = None
+    """Why the journal cannot be written, in one line; events wait until it can."""
     report: Path | None = None
     """The newest report (HTML) of a sweep, if there is one."""
 
