@@ -48,6 +48,7 @@ realtime: .venv/.dev ## Long campaign outside make test: the whole job between p
 
 observer: .venv/.dev ## Long campaign outside make test: the observer on arms that are not perfect (ARGS="--draws 20 --only drifts")
 	$(BIN)/python tests/campaigns/observer_arms.py $(ARGS)
+
 stalls: .venv/.dev ## Long campaign outside make test: sweeps while job, loop and arm are stopped, and on a busy machine
 	$(BIN)/python tests/campaigns/stalls.py $(ARGS)
 
