@@ -265,9 +265,9 @@ class ODriveDrives(BasicDrives):
                 return f"{self.where(joint)}: its watchdog ran out: idle, the torque is off"
         return ""
 
-    def forget(self) -> None:
+    def forget(self, restarts: bool = False) -> None:
         """See Drives; the next request goes out at once."""
-        super().forget()
+        super().forget(restarts)
         for known in self._known:
             known.asked = (0, -math.inf)
 

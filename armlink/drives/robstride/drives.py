@@ -192,9 +192,9 @@ class RobStrideDrives(BasicDrives):
         known = self._known[joint]
         return known.was_on and known.mode == frames.Mode.RESET and not known.faults
 
-    def forget(self) -> None:
+    def forget(self, restarts: bool = False) -> None:
         """See Drives."""
-        super().forget()
+        super().forget(restarts)
         self._intruder = ""
         for known in self._known:
             known.damping = known.was_on = False
