@@ -10,21 +10,20 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import yaml
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    FiniteFloat,
-    PositiveFloat,
-    ValidationError,
-    model_validator,
-)
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from armlink.arrays import Array
 from armlink.errors import BadInput
+from armlink.key_errors import describe, describe_all, meant
 
+SIMULATED = "armlink_sim"
+"""Interface of a simulated arm in this process; its channel is an arm file."""
+MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
+
+
+Positive = Annotated[FiniteFloat, Field(gt=0)]
+"""A limit, or another number that is neither infinite nor zero nor less."""
 
 
 class Section(BaseModel):
@@ -34,6 +33,15 @@ class Section(BaseModel):
 
 
 S = TypeVar("S", bound=Section)
+
+
+class BadKeys(BadInput):
+    """Keys of an arm file that cannot be used; the message names the first."""
+
+    def __init__(self, path: Path, first: str, keys: list[tuple[str, str]]) -> None:
+        """`keys` are (key, what is wrong with it), all of them."""
+        super().__init__(f"{path}: {first}")
+        self.keys = keys
 
 
 class DhJoint(Section):
@@ -60,6 +68,9 @@ class DhJoint(Section):
         return self
 
 
+Range = Annotated[tuple[FiniteFloat, ...], Field(min_length=2, max_length=2)]
+
+
 class Kinematics(Section):
     """Where the joints are: Denavit-Hartenberg rows from base to tip, or a URDF or MJCF model."""
 
@@ -70,12 +81,19 @@ class Kinematics(Section):
     """URDF or MJCF file instead of `joints`, relative to the arm file."""
     tip: str | None = None
     """Body of the model that the chain ends in; by default its last."""
+    stops: dict[str, Range] = {}
+    """Mechanical stops (lower, upper) [rad] of joints of the model by name, instead of the model's own limits."""
 
     @model_validator(mode="after")
     def _one_description(self) -> "Kinematics":
         if bool(self.joints) == (self.model is not None):
             raise ValueError("give either joints (Denavit-Hartenberg rows) or model (URDF or MJCF), and not both")
         _no_twins([joint.name for joint in self.joints])
+        if self.stops and self.joints:
+            raise ValueError("stops is for a model: Denavit-Hartenberg rows have lower and upper")
+        for name, (lower, upper) in self.stops.items():
+            if lower >= upper:
+                raise ValueError(f"stops: joint {name}: lower {lower} must be less than upper {upper} [rad]")
         return self
 
 
@@ -87,7 +105,7 @@ class Bus(Section):
     bitrate: Annotated[int, Field(gt=0)] = 1_000_000
     fd: bool = False
     """Frames go as CAN FD with bit-rate switch, where the interface has it; the load is counted as classical CAN's."""
-    options: dict[str, str | int | float | bool] = {}
+    options: dict[str, str | int | FiniteFloat | bool] = {}
     """Further options of python-can's interface, such as data_bitrate or serial."""
 
 
@@ -130,13 +148,13 @@ class LinkJoint(Section):
     """Short for `drive: {family: canopen, node: …}`: CiA 402 with our own torque sensor object 2100h."""
     drive: Annotated[Any, BeforeValidator(_parse_drive)] = None
     """Family of the drive and the keys of that family (docs/drives.md)."""
-    rated_torque: PositiveFloat
+    rated_torque: Positive
     """Torque that 1000 ‰ stands for (6076h) [N·m]."""
-    max_torque: PositiveFloat
+    max_torque: Positive
     """No command exceeds it [N·m]."""
-    max_torque_rate: PositiveFloat = 200.0
+    max_torque_rate: Positive = 200.0
     """[N·m/s]."""
-    max_velocity: PositiveFloat = 1.0
+    max_velocity: Positive = 1.0
     """[rad/s]."""
     identity: DeviceIdentity = DeviceIdentity()
     """Another controller than this one at the joint's node is refused at the start."""
@@ -218,7 +236,8 @@ class ArmFile(Section):
     @cached_property
     def description_hash(self) -> str:
         """SHA-256 (hex) of the kinematics, model file included: results of another description are refused."""
-        content = json.dumps(self.kinematics.model_dump(mode="json"), sort_keys=True).encode()
+        unset = set() if self.kinematics.stops else {"stops"}  # results of before the key existed keep their hash
+        content = json.dumps(self.kinematics.model_dump(mode="json", exclude=unset), sort_keys=True).encode()
         if self.model_path is not None:
             content += self.model_path.read_bytes()
         return hashlib.sha256(content).hexdigest()
@@ -255,43 +274,56 @@ def load_arm(arm: str | Path) -> ArmFile:
     """
     path = bundled_arms().get(str(arm), Path(arm))
     if not path.is_file():
-        raise BadInput(f"no arm file {arm}: give a path, or a bundled arm ({', '.join(sorted(bundled_arms()))})")
+        raise BadInput(_no_arm_file(path))
+    if path.suffix.lower() in MODEL_SUFFIXES:
+        raise BadInput(f"{path}: is a model, not an arm file: make one of it with armlink new {path}")
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise BadInput(f"{path}: not YAML: {error}") from None
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be read: {error.strerror}") from None
     if not isinstance(content, dict):
-        raise BadInput(f"{path}: expected a mapping with keys name, kinematics, link, not {type(content).__name__}")
+        kind = "nothing" if content is None else type(content).__name__
+        raise BadInput(f"{path}: expected a mapping with keys name, kinematics, link, not {kind}")
     return parse_arm(content, path)
+
+
+def _no_arm_file(path: Path) -> str:
+    bundled, folder = sorted(bundled_arms()), path.parent
+    beside = [str(each) for each in folder.glob("*.y*ml")] if folder.is_dir() else []
+    close = meant(str(path), [*bundled, *beside])
+    hint = close if "mean" in close else ""
+    if path.is_dir():
+        return f"{path}: is a folder: give the arm file in it, or a bundled arm ({', '.join(bundled)})"
+    return f"no arm file {path}: give a path, or a bundled arm ({', '.join(bundled)}){hint}"
 
 
 def parse_arm(content: dict[str, Any], path: Path) -> ArmFile:
     """Validate an arm file's content; `path` is where it (would have) stood. Raises BadInput."""
     if "path" in content:
         raise BadInput(f"{path}: key path: not a key of the arm file; remove it")
-    content, section = dict(content), ""
+    content, section, model = _with_simulated_bus(dict(content), path), "", ArmFile
     try:
         for point in entry_points(group="armlink.sections"):
-            section = point.name
-            if content.get(section) is not None:
-                content[section] = point.load().model_validate(content[section])
-        section = ""
+            if content.get(point.name) is not None:
+                section, model = point.name, point.load()
+                content[section] = model.model_validate(content[section])
+        section, model = "", ArmFile
         return ArmFile.model_validate({**content, "path": path.resolve()})
     except ValidationError as error:
-        raise BadInput(f"{path}: {describe(error, section)}") from None
+        raise BadKeys(path, describe(error, section, model), describe_all(error, section, model)) from None
 
 
-def describe(error: ValidationError, within: str = "") -> str:
-    """The first of pydantic's findings as one line: key, what is wrong, the value, how many more there are."""
-    findings = error.errors(include_url=False)
-    first = findings[0]
-    key = ".".join([within] * bool(within) + [str(part) for part in first["loc"]]) or "file"
-    message = first["msg"].removeprefix("Value error, ")
-    if first["type"] == "extra_forbidden":
-        message = "unknown key; remove it or correct its spelling"
-    value = "" if isinstance(first["input"], dict | list | tuple | Section) else f" (value {first['input']!r})"
-    more = f"; {len(findings) - 1} more" if len(findings) > 1 else ""
-    return f"key {key}: {message}{value}{more}"
+def _with_simulated_bus(content: dict[str, Any], path: Path) -> dict[str, Any]:
+    """The content, with the channel of a simulated bus that lies beside the arm file as an absolute path."""
+    link = content.get("link")
+    bus = link.get("bus") if isinstance(link, dict) else None
+    if isinstance(link, dict) and isinstance(bus, dict) and bus.get("interface") == SIMULATED:
+        beside = path.resolve().parent / str(bus.get("channel"))
+        if beside.is_file():
+            content["link"] = {**link, "bus": {**bus, "channel": str(beside)}}
+    return content
 
 
 def _no_twins(values: list[Any]) -> None:

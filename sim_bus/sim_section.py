@@ -2,10 +2,11 @@
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
-from armlink.arm_file import ArmFile, Section
+from armlink.arm_file import ArmFile, Positive, Section
 from armlink.errors import BadInput
+from armlink.key_errors import describe
 from sim_bus.effects.registry import check_entry
 
 Vector3 = Annotated[tuple[FiniteFloat, ...], Field(min_length=3, max_length=3)]
@@ -17,7 +18,7 @@ NOISE_SHARE = 0.002
 class LinkBody(Section):
     """One link as a rigid body, in the frame that turns with its joint, origin on the joint's axis (bar frame)."""
 
-    mass: PositiveFloat
+    mass: Positive
     """[kg]."""
     com: Vector3
     """Centre of mass in the bar frame [m]."""
@@ -53,13 +54,13 @@ class Sensors(Section):
 class Servo(Section):
     """Position loop and ramps of the drives."""
 
-    bandwidth: PositiveFloat = 40.0
+    bandwidth: Positive = 40.0
     """Natural frequency of the position loop with the arm's own inertia [rad/s]."""
-    damping: PositiveFloat = 1.0
+    damping: Positive = 1.0
     """Damping ratio of the position loop."""
-    deadband: PositiveFloat = 2e-4
+    deadband: Positive = 2e-4
     """Dead band of the integrator, against hunting under stiction [rad]."""
-    quick_stop_deceleration: PositiveFloat = 5.0
+    quick_stop_deceleration: Positive = 5.0
     """[rad/s²]."""
     brake: bool = True
     """Whether a holding brake closes while the drive is not enabled."""
@@ -68,7 +69,7 @@ class Servo(Section):
 class Stops(Section):
     """Mechanical stops."""
 
-    time_constant: PositiveFloat = 0.004
+    time_constant: Positive = 0.004
     """Time constant of the contact's critically damped spring and damper [s]."""
 
 
@@ -91,18 +92,38 @@ class EffectEntry(BaseModel):
         return dict(self.model_extra or {})
 
 
+class Realism(Section):
+    """All small troubles of a real arm at once, drawn at published levels (`sim_bus.effects.realism`)."""
+
+    level: Annotated[FiniteFloat, Field(ge=0, le=10)] = 1.0
+    """0 none, 1 what good arms have after calibration, 3 what bad ones have."""
+    seed: Annotated[int, Field(ge=0)] = 0
+    """Draws another arm."""
+
+
 class SimSection(Section):
     """The `sim` section. `links` may be absent if `kinematics.model` (URDF or MJCF) has the inertial parameters."""
 
     links: tuple[LinkBody, ...] | None = None
     sensors: Sensors = Sensors()
     effects: tuple[EffectEntry, ...] = ()
+    realism: Realism = Realism(level=0.0)
+    """Small troubles of a real arm, on top of `effects`."""
     servo: Servo = Servo()
     stops: Stops = Stops()
     step: Annotated[FiniteFloat, Field(gt=0, le=0.005)] = 0.001
     """Maximum time step of the physics [s]; the SYNC period is a whole number of steps."""
     start: tuple[FiniteFloat, ...] | None = None
     """Joint angles at power-on [rad]; default: middle of each joint's range."""
+
+
+def with_realism(arm: ArmFile, level: float, seed: int = 0) -> ArmFile:
+    """The arm with the small troubles of a real one. Raises BadInput."""
+    try:
+        realism = Realism(level=level, seed=seed)
+    except ValidationError as error:
+        raise BadInput(f"realism {level:g}: {describe(error)}") from None
+    return arm.model_copy(update={"sim": sim_section(arm).model_copy(update={"realism": realism})})
 
 
 def sim_section(arm: ArmFile) -> SimSection:

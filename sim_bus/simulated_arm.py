@@ -15,7 +15,9 @@ from sim_bus.drives.fronts import build_fronts
 from sim_bus.drives.motor import Motor, Readings
 from sim_bus.drives.simulated_drive import SimulatedDrive
 from sim_bus.effects.effect import EffectSetting
+from sim_bus.effects.realism import add_realism
 from sim_bus.effects.registry import imperfections
+from sim_bus.effects.state import Imperfections
 from sim_bus.node.cia402 import State
 from sim_bus.node.controller_settings import APPLIED, bring_into_force, power_on_values
 from sim_bus.node.drives import Drives
@@ -46,7 +48,7 @@ class SimulatedArm:
         self.default_period = self._period = 1.0 / link.rate
         self._entries: tuple[EffectSetting, ...] = section.effects
         with self._effects_checked():
-            state = imperfections(self.names, self._entries)
+            state = self._imperfections()
             self.plant = Plant(arm, state)
         self.sensors = Sensors(arm, truth, state, seed)
         self._signals = Signals(self.n)
@@ -187,6 +189,11 @@ class SimulatedArm:
         """Remove the attached mass."""
         self.plant.detach_mass()
 
+    def turn_by_hand(self, joint: int | str, angle: float) -> None:
+        """Put a joint at the true angle [rad], kept within its stops, as a person does while it has no power."""
+        self.plant.place(self._place(joint), angle)
+        self._sample()
+
     def drift(self, joint: int | str, gain: float, offset: float) -> None:
         """Change a torque sensor from now on: multiply its gain by `gain`, add `offset` [N·m]."""
         self.sensors.drift(self._place(joint), gain, offset)
@@ -194,12 +201,16 @@ class SimulatedArm:
 
     def set_effects(self, entries: Iterable[EffectSetting]) -> None:
         """Replace the arm's imperfections while it runs. Raises BadInput."""
-        wanted = tuple(entries)
-        with self._effects_checked():
-            state = imperfections(self.names, wanted)
-            self.plant.set_imperfections(state)
+        before, self._entries = self._entries, tuple(entries)
+        try:
+            with self._effects_checked():
+                state = self._imperfections()
+                self.plant.set_imperfections(state)
+        except BadInput:
+            self._entries = before
+            raise
         self.sensors.set_imperfections(state)
-        self._entries = wanted
+        self.drives.loops.reconfigure()
         self._set_torque_constants()
 
     @property
@@ -212,7 +223,11 @@ class SimulatedArm:
         """True sensor parameters at present, drifts and effects included."""
         sensors, truth = self.sensors, self.truth
         return Truth(
-            sensors.gain, sensors.offset, sensors.position_gain, sensors.position_offset, attachment=truth.attachment
+            sensors.gain,
+            sensors.offset + sensors.cold_zero(self.time),
+            sensors.position_gain,
+            sensors.position_offset,
+            attachment=truth.attachment,
         )
 
     # ---- internals
@@ -231,6 +246,13 @@ class SimulatedArm:
 
     def _send(self, frame: Frame) -> None:
         self.outbox.append(frame)
+
+    def _imperfections(self) -> Imperfections:
+        """Current effects and the arm file's realism as one state."""
+        state, realism = imperfections(self.names, self._entries), sim_section(self.arm).realism
+        rated = self.arm.require_link().rated_torques
+        add_realism(state, rated, realism.level, realism.seed)
+        return state
 
     @contextmanager
     def _effects_checked(self) -> Iterator[None]:

@@ -1,6 +1,6 @@
 """Detects irregular traffic: a second host, a duplicated node id, a babbling node, a restarted controller."""
 
-from collections.abc import Mapping
+from collections.abc import Callable
 
 MOST_FRAMES = 1000
 """Limit of frames taken in at once; a bus at 1 Mbit/s needs 47 ms for them."""
@@ -18,9 +18,9 @@ itself and catches up."""
 class BusWatch:
     """Counts the readings of the cyclic loop, and frames that are no process data."""
 
-    def __init__(self, joints: int, ours: Mapping[int, str]) -> None:
-        """`ours`: identifiers that only a host sends, and what they are: from another they are a second host."""
-        self._ours = ours
+    def __init__(self, joints: int, of_a_host: Callable[[int, bytes], str]) -> None:
+        """`of_a_host` describes a frame that only a host sends, by identifier and data: here from a second one."""
+        self._of_a_host = of_a_host
         self._crowd = CROWD_PER_JOINT * joints + CROWD
         self._doubled: set[int] = set()
         self._double_cycles = [0] * joints
@@ -56,11 +56,14 @@ class BusWatch:
         if self.readings[joint] > self.syncs:
             self._doubled.add(joint)
 
-    def other(self, can_id: int) -> None:
+    def other(self, can_id: int, data: bytes) -> None:
         """A frame arrived that is no process data of a joint."""
         self._last = can_id
-        if can_id in self._ours and not self.intruder:
-            self.intruder = f"{self._ours[can_id]} ({can_id:03X}h)"
+        if self.intruder:
+            return
+        what = self._of_a_host(can_id, data)
+        if what:
+            self.intruder = f"{what} ({can_id:03X}h)"
 
     def cycle_ends(self, frames: int) -> None:
         """Evaluate the completed cycle, with the number of frames sent and received in it."""

@@ -154,6 +154,27 @@ def configure_pdo(services: NodeServices, each: Pdo, deadline_ms: int) -> None:
         raise BusFault(f"{services.joint} (node {services.node}): {error}") from None
 
 
+def disable_other_rpdos(services: NodeServices) -> None:
+    """Set every RPDO invalid that is not the link's, as another program could move the joint through it.
+
+    Raises BusFault naming joint and object.
+    """
+
+    def write(entry: Entry, value: int) -> None:
+        services.write(entry, value)
+
+    def read(entry: Entry) -> int:
+        return int(services.read(entry))
+
+    for index in pdo.foreign_rpdos(services.remote.object_dictionary):
+        if not services.has(Entry(index, 1, "I", "RPDO COB-ID")):
+            continue
+        try:
+            pdo.disable(index, write, read)
+        except pdo.MappingRefused as error:
+            raise BusFault(f"{services.joint} (node {services.node}): {error}") from None
+
+
 def configure(
     services: NodeServices,
     joint: LinkJoint,
@@ -163,11 +184,12 @@ def configure(
     protection: Protection,
     supported: int,
 ) -> None:
-    """PDOs, and the limits that hold even without this host: torque, position window, quick stop, who is watched.
+    """PDOs, the link's and no others, and limits that hold even without this host: torque, window, quick stop, watch.
 
     All is read back. The torque offset 60B2h, which adds to every target torque and stays latched, is cleared where the
     device has one. `supported` is 6502h. Raises BusFault naming joint and object.
     """
+    disable_other_rpdos(services)
     for each in pdo.LINK_PDOS:
         configure_pdo(services, each, protection.deadline_ms)
     if services.has(objects.TORQUE_OFFSET):

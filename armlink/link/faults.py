@@ -137,6 +137,16 @@ def refusal(
             return f"{name}: target position is {command.position[joint]}, expected a finite number"
         if why == gate.VELOCITY and math.isnan(now.velocity):
             return f"{name}: no velocity (606Ch, TPDO2) has come of late, and torque control needs to know it"
+        if why == gate.VELOCITY and command.mode[joint] in gate.POSITION_MODES:
+            return (
+                f"{name}: turns at {now.velocity:.3g} rad/s under position control, limit {limit.servo_overspeed:.3g} "
+                "(max_velocity and its margin): something else moves it, or its servo is unstable"
+            )
+        if why == gate.FOLLOWING:
+            return (
+                f"{name}: reads {now.position:.4g} rad, more than {limit.following:g} rad from its target "
+                f"{passed[joint].position:.4g}: it is blocked, too weak, or something else moves it"
+            )
         if why == gate.VELOCITY:
             return (
                 f"{name}: turns at {now.velocity:.3g} rad/s under torque control, limit {limit.overspeed:.3g} "

@@ -11,8 +11,10 @@ and raises:
 
 - an unknown mode, a number that is not finite where the mode needs it, a command that is too old or of the future;
 - a reading that is too old or missing, a fault of bus, node or drive;
-- under torque control, where nothing else bounds the motion: a joint that turns faster than its limit allows with the
-  stated margin, or reads a position beyond the window and its margin, or whose velocity is not known;
+- a joint that turns faster than its limit allows with the margin stated for its mode;
+- under torque control, where nothing else bounds the motion: a joint that reads a position beyond the window and its
+  margin, or whose velocity is not known;
+- under position control: a joint that is further from its target than the following error allowed;
 - entering torque control where the torque now produced is not known: zero would drop the load.
 
 A joint under torque control follows its measured position with the target position, and a joint under position control
@@ -34,7 +36,7 @@ LOWEST_WIRE, HIGHEST_WIRE = -(2**31), 2**31 - 1
 
 BAD_MODE, BAD_NUMBER, COMMAND_AGE = "mode", "number", "command age"
 SAMPLE_AGE, STATE = "sample age", "state"
-VELOCITY, WINDOW, ENTRY = "velocity", "window", "entry"
+VELOCITY, WINDOW, ENTRY, FOLLOWING = "velocity", "window", "entry", "following error"
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +59,10 @@ class JointLimits:
     """One user unit [rad]."""
     overspeed: float
     """A joint under torque control that turns faster is refused [rad/s]."""
+    servo_overspeed: float
+    """A joint under position control that turns faster is refused [rad/s]."""
+    following: float
+    """A joint under position control that reads a position further from its target is refused [rad]."""
     outside: float
     """A joint under torque control that reads a position further outside the window is refused [rad]."""
     max_age: float
@@ -152,7 +158,9 @@ def _refusal(
         return SAMPLE_AGE
     if not seen.healthy:
         return STATE
-    if mode not in TORQUE_MODES:
+    if mode in POSITION_MODES:
+        return _servo_refusal(limits, held, seen)
+    if mode == OFF:
         return ""
     if not abs(seen.velocity) <= limits.overspeed:
         return VELOCITY
@@ -160,6 +168,15 @@ def _refusal(
         return WINDOW
     if held.mode not in TORQUE_MODES and not math.isfinite(seen.torque):
         return ENTRY
+    return ""
+
+
+def _servo_refusal(limits: JointLimits, held: Passed, seen: Seen) -> str:
+    """Why a joint under position control must be stopped; a velocity that is not known is no reason."""
+    if abs(seen.velocity) > limits.servo_overspeed:
+        return VELOCITY
+    if held.mode in POSITION_MODES and not abs(held.position - seen.position) <= limits.following:
+        return FOLLOWING
     return ""
 
 

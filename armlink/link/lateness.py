@@ -8,6 +8,8 @@ UNIT = 1e-5
 PER_OCTAVE = 16
 BINS = 24 * PER_OCTAVE
 """The last bin begins at `UNIT * 2**24`, some 170 s."""
+WARN_SHARE = 0.5
+"""Share of `link.deadline` that the lateness of 99.9 % of the cycles should not exceed."""
 
 
 @dataclass
@@ -35,6 +37,16 @@ class Lateness:
             if rest <= 0 and count:
                 return min(float(UNIT * (2.0 ** ((index + 1) / PER_OCTAVE) - 1.0)), self.longest)
         return self.longest
+
+    def near(self, deadline: float, arm: str) -> str:
+        """What to say of a host whose lateness comes near `link.deadline` [s] of an arm; empty if it does not."""
+        late = self.percentile(0.999)
+        if late <= WARN_SHARE * deadline:
+            return ""
+        return (
+            f"this host was up to {late * 1e3:.0f} ms late in 99.9 % of the cycles, near link.deadline"
+            f" ({deadline * 1e3:.0f} ms): see armlink check {arm} --host"
+        )
 
     def in_ms(self) -> dict[str, float]:
         """Percentiles and the longest [ms]."""

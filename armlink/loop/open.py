@@ -10,11 +10,14 @@ IN_PROCESS = ("armlink_sim", "virtual")
 """Interfaces of python-can whose bus another process cannot open."""
 
 
-def open_arm(arm: ArmFile, bus: str | None = None) -> ArmDriver:
-    """The arm on bus `INTERFACE:CHANNEL[@BITRATE]`, by default the arm file's; raises BadInput, BusFault."""
+def is_in_process(arm: ArmFile, bus: str | None = None) -> bool:
+    """Whether this bus of an arm is one of this process; raises BadInput."""
     section = arm.require_link()
     if bus is None and section.buses:
-        return RemoteLink(arm, bus)
-    if resolve_bus(bus, section.bus).interface in IN_PROCESS:
-        return Link.open(arm, bus)
-    return RemoteLink(arm, bus)
+        return False
+    return resolve_bus(bus, section.bus).interface in IN_PROCESS
+
+
+def open_arm(arm: ArmFile, bus: str | None = None) -> ArmDriver:
+    """The arm on bus `INTERFACE:CHANNEL[@BITRATE]`, by default the arm file's; raises BadInput, BusFault."""
+    return Link.open(arm, bus) if is_in_process(arm, bus) else RemoteLink(arm, bus)

@@ -6,7 +6,6 @@ joints are under torque control, they are held where they stand; under position 
 """
 
 import pickle
-import signal
 import socket
 import sys
 import time
@@ -22,7 +21,8 @@ from armlink.link.guard import Crossed
 from armlink.link.link import Link
 from armlink.link.types import Command, Controller, Sample, Setpoints
 from armlink.loop.channel import Channel, Closed
-from armlink.loop.messages import Alive, Answer, Call, Cut, Open, Play, Run, Stopped, pack
+from armlink.loop.ending import Ending
+from armlink.loop.messages import Alive, Answer, Call, Cut, Open, Play, Run, Stopped, Told, pack
 from armlink.loop.realtime import prepare
 
 IDLE = 0.05
@@ -51,9 +51,9 @@ class DriveLoop:
         """A controller that is on its way."""
         self._heard = time.monotonic()
 
-    def run(self) -> None:
+    def run(self, ending: Ending) -> None:
         """Until the job has gone."""
-        while True:
+        while not ending.due:
             for message in self._channel.receive():
                 self._heard = time.monotonic()
                 self._handle(message)
@@ -92,16 +92,20 @@ class DriveLoop:
         try:
             kwargs = dict(call.kwargs)
             if callable(call.what):
-                answer = Answer(call.id, call.what(link, *call.args, **kwargs))
+                answer = Answer(call.id, call.what(link, lambda text: self._tell(call.id, text), *call.args, **kwargs))
             else:
                 found = getattr(link, call.what)
                 answer = Answer(call.id, found(*call.args, **kwargs) if callable(found) else found)
         except ArmlinkError as error:
             answer = Answer(call.id, error=error)
-        if call.what in ENABLING and answer.error is None:
+        if link.enabled and (callable(call.what) or call.what in ENABLING):
             self._begin(0)
-            self._last = Command.hold(link.position_sent)
+            self._last = link.last
         self._channel.put(answer)
+        self._channel.flush()
+
+    def _tell(self, id: int, text: str) -> None:
+        self._channel.put(Told(id, text))
         self._channel.flush()
 
     def _cycle(self) -> None:
@@ -152,8 +156,7 @@ class DriveLoop:
 
 def main(number: int) -> None:
     """Serve the job at the other end of socket `number`; the joints are safe at the end, however that comes."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the whole group: the job ends us
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    ending = Ending()
     channel = Channel(socket.socket(fileno=number))
     try:
         (first,) = _first(channel)
@@ -166,7 +169,7 @@ def main(number: int) -> None:
         with link:
             channel.put(Answer(0, prepare()))
             sys.setswitchinterval(SWITCH)
-            DriveLoop(channel, link).run()
+            DriveLoop(channel, link).run(ending)
     except Closed:
         return
 

@@ -1,7 +1,7 @@
 """Recordings: an arm's channels over time, and their columns in tables."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,9 +71,9 @@ class Recording:
                 expected = (self.t.size, len(self.names))
                 raise BadInput(f"{source}: channel {name} has shape {values.shape}, expected {expected}")
             _check_finite_or_nan(values, COLUMNS[name], source)
-        if not any(getattr(self, name) is not None for name in TORQUE_CHANNELS):
+        if not any(getattr(self, name) is not None for name in (*TORQUE_CHANNELS, "position_command")):
             wanted = ", ".join(f"{COLUMNS[name]}_1" for name in TORQUE_CHANNELS)
-            raise BadInput(f"{source}: no torque channel: at least one of {wanted} … is required")
+            raise BadInput(f"{source}: no torque channel: at least one of {wanted} …, or q_cmd_1 …, is required")
         return self
 
 
@@ -121,6 +121,12 @@ def is_channel(column: str) -> bool:
     return column == "t" or _joint_index(column) is not None
 
 
+def take_joints(recording: Recording, order: Sequence[int], names: tuple[str, ...] = ()) -> Recording:
+    """Some of a recording's joints, in another order; `names` replaces theirs."""
+    channels = {name: values[:, list(order)] for name, values in recording.channels().items()}
+    return replace(recording, names=names or tuple(recording.names[i] for i in order), **channels)  # type: ignore[arg-type]
+
+
 def slice_rows(recording: Recording, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Recording:
     """Some rows of a recording, with their times unchanged."""
     values = {field.name: getattr(recording, field.name) for field in fields(recording)}
@@ -130,10 +136,16 @@ def slice_rows(recording: Recording, rows: slice | NDArray[np.bool_] | NDArray[n
     return Recording(**values)
 
 
-def _joint_index(column: str) -> int | None:
+def channel_column(column: str) -> tuple[str, int] | None:
+    """Channel prefix and joint number from 1 of a column's name, or None if it is not that of a channel."""
     prefix, _, index = column.rpartition("_")
-    known = prefix in COLUMNS.values() and index.isdigit() and not index.startswith("0")
-    return int(index) if known else None
+    known = prefix in COLUMNS.values() and index.isascii() and index.isdigit() and not index.startswith("0")
+    return (prefix, int(index)) if known else None
+
+
+def _joint_index(column: str) -> int | None:
+    place = channel_column(column)
+    return place[1] if place else None
 
 
 def _check_time(t: Array, source: str) -> None:

@@ -4,8 +4,10 @@ import csv
 import gzip
 import json
 import zlib
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,8 +17,10 @@ import pyarrow.parquet as pa_parquet
 
 from armlink.arrays import Array
 from armlink.errors import BadInput
+from armlink.recording.column_names import suggested_map
 from armlink.recording.recording import (
     Recording,
+    channel_column,
     channels_of,
     columns_of,
     default_names,
@@ -29,11 +33,13 @@ NAMES_KEY = b"armlink.names"
 """Parquet schema metadata: joint names as JSON."""
 
 
-def load_csv(path: Path) -> Recording:
-    """Load `.csv` or `.csv.gz` with a header row (docs/formats.md), up to a truncation; raises BadInput."""
+def load_csv(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> Recording:
+    """Load `.csv` or `.csv.gz` with a header row (docs/formats.md), up to a truncation; raises BadInput.
+
+    `columns`: column of docs/formats.md → the file's name for it.
+    """
     content, cut = _content(path)
-    header = _header(path, content)
-    joint_count(header, str(path))
+    header = _renamed(_header(path, content), columns, path)
     wanted = [column for column in header if is_channel(column)]
     try:
         table = pa_csv.read_csv(
@@ -52,11 +58,12 @@ def load_csv(path: Path) -> Recording:
     return loaded
 
 
-def load_parquet(path: Path) -> Recording:
+def load_parquet(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> Recording:
     """Load Parquet with the columns of docs/formats.md, joint names from the schema's metadata; raises BadInput."""
     try:
         table = pa_parquet.read_table(path)
-        header = list(table.column_names)
+        header = _renamed(list(table.column_names), columns, path)
+        table = table.rename_columns(header).replace_schema_metadata(table.schema.metadata)
         wanted = [column for column in header if is_channel(column)]
         metadata = table.schema.metadata or {}
         table = table.select(wanted).cast(pa.schema([(column, pa.float64()) for column in wanted]))
@@ -64,6 +71,26 @@ def load_parquet(path: Path) -> Recording:
         raise BadInput(f"{path}: {_first_line(error)}") from None
     names = tuple(json.loads(metadata[NAMES_KEY])) if NAMES_KEY in metadata else ()
     return _recording(table, header, str(path), names)
+
+
+def _renamed(header: list[str], columns: Mapping[str, str], path: Path) -> list[str]:
+    """The header with the file's own names replaced; raises BadInput, with a `--map` to paste if channels lack."""
+    foreign = {other: column for column, other in columns.items() if channel_column(other) is None}
+    missing = [name for name in foreign if name not in header]
+    if missing:
+        raise BadInput(f"{path}: --map {foreign[missing[0]]}={missing[0]}: no such column; it has {', '.join(header)}")
+    header = [foreign.get(name, name) for name in header]
+    twins = sorted({column for column in header if header.count(column) > 1})
+    if twins:
+        raise BadInput(f"{path}: column {twins[0]!r} occurs twice in the header row or after --map")
+    try:
+        joint_count(header, str(path))
+    except BadInput as error:
+        suggestion = suggested_map(header) if not foreign else ""
+        if not suggestion:
+            raise
+        raise BadInput(f"{error}; if its columns have other names, try {suggestion}") from None
+    return header
 
 
 def save_csv(recording: Recording, path: Path) -> None:

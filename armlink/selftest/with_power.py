@@ -195,7 +195,7 @@ class PowerTest:
         if self._harmed:
             return
         self._progress(f"all joints: no heartbeat of the host for {limit * 1e3:.0f} ms")
-        self.loop.send(objects.HEARTBEAT_ID + link.protection.host, bytes([objects.OPERATIONAL]))
+        self.loop.beat()
         self.loop.beating = False
         start, seconds = self._last, 0.0
         after: list[tuple[State, float] | None] = [None] * link.n

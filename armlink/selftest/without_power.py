@@ -39,6 +39,11 @@ class Result:
     """How long the device took, where that was measured [s]."""
 
 
+def self_test(link: Link, tell: Callable[[str], None], power: bool) -> tuple[list[Result], str]:
+    """Run the checks on a link that is open and not started; results, and the bus's name. Raises BusFault."""
+    return SelfTest(link, tell).run(power), str(link.bus.channel_info)
+
+
 class SelfTest:
     """Runs the checks on an arm's controllers; the link must not be started. Results gather in `results`."""
 

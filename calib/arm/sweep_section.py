@@ -3,9 +3,9 @@
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, FiniteFloat, PositiveFloat, model_validator
+from pydantic import Field, FiniteFloat, model_validator
 
-from armlink.arm_file import ArmFile, Section
+from armlink.arm_file import ArmFile, Positive, Section
 from armlink.errors import BadInput
 from gcomp.identify.parameters import Prior
 
@@ -25,13 +25,13 @@ class SweepSection(Section):
     """Resting joints are pressed on their stops (only the swept joint's sensor counts) or servo-held (all count)."""
     range_margin: Annotated[FiniteFloat, Field(gt=0)] = 0.06
     """Distance that the steps of a sweep keep from the mechanical stops [rad]."""
-    approach_speed: PositiveFloat = 0.1
+    approach_speed: Positive = 0.1
     """Speed at which a joint is brought against its stop [rad/s]."""
     travel_speed: Share = 0.9
     """Speed of travel as a share of each joint's max_velocity."""
-    acceleration: PositiveFloat = 3.0
+    acceleration: Positive = 3.0
     """Peak acceleration of travel and of steps [rad/s²]."""
-    bias_torque: tuple[PositiveFloat, ...] | None = None
+    bias_torque: tuple[Positive, ...] | None = None
     """Torque that presses each joint against its stop [N·m]; by default from the scout's rough gravity model."""
     bias_margin: Share = 0.05
     """Margin of the bias torque over gravity, friction and model error, as a share of max_torque."""
@@ -39,13 +39,13 @@ class SweepSection(Section):
     """Allowance for friction of the drives, as a share of rated torque."""
     gain_tolerance: Share = 0.15
     """Allowance for the error of the torque scale before calibration."""
-    settle_window: PositiveFloat = 0.15
+    settle_window: Positive = 0.15
     """Window over which velocity and torque scatter are judged [s]."""
-    settle_velocity: PositiveFloat = 0.001
+    settle_velocity: Positive = 0.001
     """Speed over the window below which a joint is at rest [rad/s]."""
-    settle_scatter: PositiveFloat = 1.2
+    settle_scatter: Positive = 1.2
     """Torque has settled if its scatter over the window is below this multiple of the sensor's own noise."""
-    settle_timeout: PositiveFloat = 4.0
+    settle_timeout: Positive = 4.0
     """Time after which a step that has not settled is read all the same, and marked [s]."""
     standard_error: Share = 0.00035
     """Standard error of the torque averages, as a share of rated torque; smaller if `gain_std` requires it."""
@@ -53,12 +53,12 @@ class SweepSection(Section):
     """Standard deviation of the torque gains to reach: if the plan predicts more, it averages longer."""
     max_samples: Annotated[int, Field(ge=10)] = 200
     """Largest number of samples in an average."""
-    reference_mass: PositiveFloat | None = None
+    reference_mass: Positive | None = None
     """Mass attached for the second pass [kg]; by default chosen from the torque limits."""
     reference_point: tuple[FiniteFloat, FiniteFloat, FiniteFloat] | None = None
     """Centre of the mass, if measured: in the frame that turns with the last joint, origin on its axis, z along it and
     x along `a` [m]; by default it is fitted. It determines the gains' common scale if all axes nearly meet."""
-    reference_point_std: PositiveFloat = 0.001
+    reference_point_std: Positive = 0.001
     """Standard deviation of `reference_point` [m]."""
     position_offset_std: Annotated[FiniteFloat, Field(ge=0)] = 0.005
     """Standard deviation of the position sensors' zero beforehand [rad]; 0 for exact."""

@@ -1,4 +1,4 @@
-"""Gravity-compensated float: the arm stays where a hand leaves it."""
+"""Floats the arm: gravity is compensated, and it stays where a hand leaves it."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -29,11 +29,15 @@ def hold_afloat(
 
     Example: armlink float sarcos --bus socketcan:can0
     """
+    from contextlib import suppress
+
     from rich.console import Console
 
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
+    from armlink.errors import ArmlinkError
     from armlink.loop.open import open_arm
+    from calib.commands.screen import warn_late
     from calib.floating.run import run_float
 
     arm_file = load_arm(arm)
@@ -43,7 +47,12 @@ def hold_afloat(
         link.start()
         link.enable()
         screen.print(f"{arm_file.name}: floating by {source}; Ctrl-C ends it, the joints hold then")
-        result = run_float(link, arm_file, beta, calibration, seconds=seconds or float("inf"))
+        try:
+            result = run_float(link, arm_file, beta, calibration, seconds=seconds or float("inf"))
+        finally:  # Ctrl-C is its usual end
+            with suppress(ArmlinkError):
+                lateness = link.stats.lateness
+                warn_late(arm_file, lateness)
     screen.print(f"floated {result.seconds:.1f} s; the joints hold")
     write_json(
         json_file,
@@ -55,6 +64,7 @@ def hold_afloat(
             "largest_torque": result.largest_torque.tolist(),
             "largest_speed": result.largest_speed.tolist(),
             "moved": result.moved.tolist(),
+            "late_ms": lateness.in_ms(),
         },
     )
 

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from calib.sweep.dataset import SweepData
     from calib.sweep.preflight import Preflight
 
-LATE_SHARE = 0.5
-"""Share of link.deadline from which on a host is called late."""
 _CONSOLE = Console(stderr=True, markup=False)  # units stand in brackets
 
 
@@ -150,15 +148,8 @@ def stalls_said(data: "SweepData") -> list[str]:
 
 def warn_late(arm: ArmFile, lateness: Lateness) -> None:
     """A line if this machine was late enough to come near the arm's deadline."""
-    late, deadline = lateness.percentile(0.999), arm.require_link().deadline
-    if late > LATE_SHARE * deadline:
-        print_lines(
-            [
-                f"this host was up to {late * 1e3:.0f} ms late in 99.9 % of the cycles, near link.deadline"
-                f" ({deadline * 1e3:.0f} ms): see armlink check {arm.name} --host"
-            ],
-            "yellow",
-        )
+    warning = lateness.near(arm.require_link().deadline, arm.name)
+    print_lines([warning] if warning else [], "yellow")
 
 
 def _short(names: tuple[str, ...]) -> list[str]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Protocol, TypeVar
 
-from calib.daemon.loop.loop_messages import Reply
+from armlink.loop.messages import Answer
 from calib.install.journaled_write import Controllers
 
 T = TypeVar("T")
@@ -27,7 +27,7 @@ class Port(Protocol):
         """Reads and writes object 2100h of every joint; waits for the answer, so only for work that runs aside."""
         ...
 
-    def sweep(self, poses: int, seed: int, /) -> Reply | None:
+    def sweep(self, poses: int, seed: int, /) -> Answer | None:
         """Ask for a tour of poses; the reply comes as a message unless it is returned."""
         ...
 

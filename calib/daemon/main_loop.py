@@ -11,8 +11,9 @@ from pathlib import Path
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import ArmlinkError, BadInput
+from armlink.loop.messages import Answer
 from calib.daemon.environment import Environment
-from calib.daemon.loop.loop_messages import Down, Reply
+from calib.daemon.loop.loop_messages import Down, Started
 from calib.daemon.loop.loop_process import LoopControllers, LoopProcess
 from calib.daemon.notify import Notifier, watchdog_seconds
 from calib.daemon.options import Options
@@ -24,6 +25,10 @@ from calib.records.store import RecordStore
 SNAPSHOT_SECONDS = 0.1
 SILENT_SECONDS = 15.0
 """A bus process that sends nothing for this time hangs: it is killed and started again [s]."""
+PAUSE_SECONDS = 2.0
+"""A timer of this process that is later than this says nothing of the bus process [s]."""
+AGAIN_SECONDS = 5.0
+"""Time to the next attempt where the system gives no process [s]."""
 BEGIN_SECONDS = 30.0
 """Time for a new bus process to send its first message [s]."""
 log = logging.getLogger("armlink.daemon")
@@ -90,7 +95,7 @@ class Daemon:
         while True:
             now = time.monotonic()
             self.view.publish()
-            why = self.service.arm_state.fault or self.service.records.detail
+            why = self.service.trouble or self.service.arm_state.fault or self.service.records.detail
             status = f"STATUS={self.service.state} {why}".strip()
             if status != notified:
                 notified = status
@@ -98,13 +103,21 @@ class Daemon:
             if now - ticked >= 1.0:
                 ticked = now
                 self.service.tick()
-                if now - self._heard > SILENT_SECONDS:
-                    self._restart("the bus loop's process hangs")
+                self._judge(now, stood_still=now - due)
             if self._watchdog is not None and now - kept_alive >= self._watchdog / 3:
                 kept_alive = now
                 self._notify("WATCHDOG=1")
             due = max(due + SNAPSHOT_SECONDS, now)
             await asyncio.sleep(due - now)
+
+    def _judge(self, now: float, stood_still: float) -> None:
+        """Replace a bus process that hangs; not because this process itself stood still (stopped, say) [s]."""
+        if stood_still > PAUSE_SECONDS:
+            self._heard = max(self._heard, now)
+        if now - self._heard > SILENT_SECONDS:
+            self._messages()  # what waits here is a sign of life too
+        if now - self._heard > SILENT_SECONDS:
+            self._restart("the bus loop's process hangs")
 
     def _messages(self) -> None:
         try:
@@ -112,47 +125,71 @@ class Daemon:
         except EOFError as error:
             self._restart(str(error))
             return
-        self._heard = time.monotonic()
+        if messages:
+            self._heard = max(self._heard, time.monotonic())
         for message in messages:
+            if isinstance(message, Started):
+                log.info(f"bus process: {message.realtime}")
             self.service.take(message)
 
     def _restart(self, why: str) -> None:
         """Replace the bus process; meanwhile the joints' own deadlines hold them."""
         log.error(why)
-        self._loop.remove_reader(self.process.fileno())
+        if self.process.fileno() >= 0:
+            self._loop.remove_reader(self.process.fileno())
         self.process.close()
         self.service.take(Down(why))
-        self.process = LoopProcess(self.options.loop(self.arm))
+        try:
+            self.process = LoopProcess(self.options.loop(self.arm))
+        except OSError as error:
+            log.error(f"no bus process: {error}")
+            self._heard = time.monotonic() - SILENT_SECONDS + AGAIN_SECONDS
+            return
         self._heard = time.monotonic() + BEGIN_SECONDS
         self._loop.add_reader(self.process.fileno(), self._messages)
 
     def _reload(self) -> None:
-        """SIGHUP: read the arm file and the records again; an unusable file changes nothing."""
+        """SIGHUP: read the arm file and the records again; a file that cannot be used whole changes nothing."""
         self._notify("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
         try:
-            arm = load_arm(self.options.arm)
-            if arm.name != self.arm.name or arm.serial != self.arm.serial or arm.kinematics != self.arm.kinematics:
-                raise BadInput(f"{arm.path}: another arm, serial or kinematics: restart the daemon for that")
-        except (ArmlinkError, OSError) as error:
-            self.service.events.say("refused", None, f"configuration not reloaded: {error}", {})
+            before = self.service.configuration.settings
+            arm = self._tried()
+            settings = self.options.settings(arm)
+            self.service.reload(arm, settings)
+        except (ArmlinkError, OSError, ValueError, ArithmeticError) as error:
+            text = f"configuration not reloaded: {error}"
+            self.service.journal.guard(lambda: self.service.events.say("refused", None, text, {}))
         else:
-            before, settings = self.service.configuration.settings, self.options.settings(arm)
             bus_changed = arm.link != self.arm.link or settings.work != before.work
             self.arm = arm
-            self.service.reload(arm, settings)
             if bus_changed:
                 self._restart("the arm file's link section or the work has changed")
-        self._notify("READY=1")
+        finally:
+            self._notify("READY=1")
+
+    def _tried(self) -> ArmFile:
+        """The arm file, with all that the bus process will need of it tried; raises BadInput, OSError."""
+        from armlink.bus.open import resolve_bus  # for a reload alone: they take memory
+        from armlink.drives.canopen.eds_file import of_joints
+        from armlink.link.gate_limits import try_limits
+
+        arm = load_arm(self.options.arm)
+        if arm.name != self.arm.name or arm.serial != self.arm.serial or arm.kinematics != self.arm.kinematics:
+            raise BadInput(f"{arm.path}: another arm, serial or kinematics: restart the daemon for that")
+        resolve_bus(self.options.bus, arm.require_link().bus)
+        of_joints(arm)
+        try_limits(arm)
+        return arm
 
 
 class _CurrentProcess:
     """The service's `Port`: whichever bus process is the present one."""
 
     def __init__(self, process: Callable[[], LoopProcess]) -> None:
-        self.controllers = LoopControllers(lambda request: process().ask(request))
+        self.controllers = LoopControllers(lambda call: process().ask(call))
         self._process = process
 
-    def sweep(self, poses: int, seed: int, /) -> Reply | None:
+    def sweep(self, poses: int, seed: int, /) -> Answer | None:
         """Ask for a tour of poses."""
         return self._process().sweep(poses, seed)
 

@@ -15,8 +15,9 @@ from importlib.metadata import version
 from pathlib import Path
 
 from armlink.arm_file import ArmFile
+from armlink.loop.messages import Answer
 from calib.daemon.environment import Environment
-from calib.daemon.loop.loop_messages import Batch, Down, Message, Progress, Reply, Up
+from calib.daemon.loop.loop_messages import Batch, Down, Message, Progress, Up
 from calib.daemon.observing.active_records import ActiveRecords
 from calib.daemon.observing.observation import Observation
 from calib.daemon.observing.observer_feed import ObserverFeed
@@ -54,11 +55,11 @@ class Service:
         self.configuration = Configuration(arm, settings, listen_only)
         self.environment, self.directory, self._store = environment, directory, store
         self.started = monotonic()
-        self.journal = Journal(directory / "journal.db")
+        self.journal = Journal(directory / "journal.db", monotonic)
         self.hub = Hub()
         self.events = EventLog(self.journal, self.hub, monotonic, wall)
         self.jobs = BusJobs(environment.run, self.journal)
-        self.arm_state = ArmState(arm.joint_names, self.events, monotonic)
+        self.arm_state = ArmState(arm, self.events, monotonic)
         self.recordings = Recordings(directory / "recordings", self.configuration)
         self.storage = ObserverStorage(self.journal, environment)
         self.recalibrations = RecalibrationWorkflow(
@@ -84,22 +85,38 @@ class Service:
             return State.FAULT
         return State.OBSERVING if self.tours.progress is None else State.SWEEPING
 
+    @property
+    def trouble(self) -> str:
+        """What the service lacks itself, the arm apart: its journal or its record store; empty if nothing."""
+        return self.journal.trouble or self.records.store_fault
+
     def take(self, message: Message) -> None:
         """Route one message of the bus loop; a disk that fails is shown in the status and stops nothing."""
         self.journal.guard(lambda: self._take(message))
 
     def tick(self) -> None:
-        """Do what is due."""
-        self.journal.guard(self._tick)
+        """Do what is due; what fails on its part does not keep the rest from being done."""
+        self.journal.probe()
+        parts = (self.events, self.arm_state, self.records, self.recalibrations, self.tours)
+        for act in (*(part.tick for part in parts), self._save_due):
+            self.journal.guard(act)
 
     def reload(self, arm: ArmFile, settings: DaemonSection) -> None:
-        """Use another configuration of the same arm from now on; the observer's state is kept."""
-        before, self.configuration.settings = self.configuration.settings, settings
-        self.configuration.arm = arm
+        """Use another configuration of the same arm from now on; the observer's state is kept.
+
+        Where an observer cannot be made with it, that error is raised and the configuration before stays in use.
+        """
+        configuration = self.configuration
+        before = configuration.arm, configuration.settings
+        configuration.arm, configuration.settings = arm, settings
+        try:
+            if settings.observer != before[1].observer:
+                self.journal.guard(self._renew)
+        except Exception:
+            configuration.arm, configuration.settings = before
+            raise
         evidence = {"policy": settings.policy}
         self.journal.guard(lambda: self.events.say("configuration", None, "configuration reloaded", evidence))
-        if settings.observer != before.observer:
-            self.journal.guard(self._renew)
         self.journal.guard(self.records.load)
 
     def save(self, history: bool = False) -> None:
@@ -128,13 +145,10 @@ class Service:
             self.arm_state.down(message.reason)
         elif isinstance(message, Progress):
             self.tours.advanced(message)
-        elif isinstance(message, Reply) and message.error is not None:
-            self.tours.refused(message.error)
+        elif isinstance(message, Answer) and message.error is not None:
+            self.tours.refused(str(message.error))
 
-    def _tick(self) -> None:
-        self.events.tick()
-        self.records.tick()
-        self.tours.tick()
+    def _save_due(self) -> None:
         observation = self.records.observation
         self.storage.tick(None if observation is None else observation.feed)
 
@@ -147,7 +161,7 @@ class Service:
         configuration, before = self.configuration, self.records.observation
         arm = configuration.arm
         feed = ObserverFeed(arm, calibration, gravity, configuration.settings.observer_config())
-        recalibrator = Recalibrator(arm, self.environment.port.controllers, self._store, "propose")
+        recalibrator = Recalibrator(arm, self.environment.port.controllers, self._store, "propose", calibration)
 
         def installed(record: CalibrationRecord, finding: Finding) -> None:
             feed.install(record, finding)

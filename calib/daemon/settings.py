@@ -3,11 +3,12 @@
 from dataclasses import dataclass, fields
 from typing import Annotated, Literal
 
-from pydantic import Field, FiniteFloat, PositiveFloat, field_validator
+from pydantic import Field, FiniteFloat, field_validator
 
-from armlink.arm_file import ArmFile, Section
+from armlink.arm_file import ArmFile, Positive, Section
 from calib.observer.config import ObserverConfig
 
+_WHOLE = frozenset(field.name for field in fields(ObserverConfig) if field.type == "int" or field.type is int)
 Policy = Literal["observe", "propose", "apply"]
 
 
@@ -17,9 +18,9 @@ class RecordingSettings(Section):
     enabled: bool = True
     rate: Annotated[FiniteFloat, Field(gt=0, le=1000)] = 25.0
     """Rows per second [Hz], at most the SYNC rate."""
-    minutes: PositiveFloat = 10.0
+    minutes: Positive = 10.0
     """Length of one file [min]."""
-    quota_mb: PositiveFloat = 2000.0
+    quota_mb: Positive = 2000.0
     """All files together [MB]."""
 
 
@@ -28,13 +29,13 @@ class DaemonSection(Section):
 
     policy: Policy = "propose"
     """Reaction to a drift: an event only, a proposal, or a new record written to the controller."""
-    rest_between_writes: PositiveFloat = 600.0
+    rest_between_writes: Positive = 600.0
     """At most one recalibration of a joint in this time [s]."""
     writes_per_day: Annotated[int, Field(ge=1)] = 24
     """Limit for recalibrations of the arm that the daemon decides on itself."""
     sweep_when_undecided: bool = False
     """Whether the daemon may sweep the arm if watching cannot decide; only if it drives the bus."""
-    sweep_every_hours: PositiveFloat | None = None
+    sweep_every_hours: Positive | None = None
     """Time between sweeps [h]; only if the daemon drives the bus."""
     work: bool = False
     """Whether the daemon, if it drives the bus, moves the arm among random poses, in place of ordinary work."""
@@ -49,13 +50,16 @@ class DaemonSection(Section):
         for name in given:
             if name not in known:
                 raise ValueError(f"no threshold {name!r}; there are {', '.join(known)}")
+        for name, value in given.items():
+            if value < (1 if name in _WHOLE else 0):
+                least = "a whole number from 1" if name in _WHOLE else "a number from 0"
+                raise ValueError(f"threshold {name} is {value:g}, expected {least}")
         return given
 
     def observer_config(self) -> ObserverConfig:
         """The observer's thresholds; integers stay integers."""
-        whole = {field.name for field in fields(ObserverConfig) if field.type == "int" or field.type is int}
         return ObserverConfig(
-            **{name: int(value) if name in whole else value for name, value in self.observer.items()}  # type: ignore[arg-type]
+            **{name: int(value) if name in _WHOLE else value for name, value in self.observer.items()}  # type: ignore[arg-type]
         )
 
 

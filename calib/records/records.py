@@ -9,10 +9,20 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 import numpy.typing as npt
 import yaml
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from pydantic import (
+    AwareDatetime,
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    PositiveFloat,
+    ValidationError,
+    model_validator,
+)
 
-from armlink.arm_file import ArmFile, describe
+from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
+from armlink.key_errors import describe
 from armlink.torque_calibration import UNKNOWN, TorqueCalibration
 from gcomp.arrays import Array
 
@@ -76,6 +86,23 @@ class Record(_Frozen):
         return yaml.safe_dump({"id": self.id, **self.model_dump(mode="json")}, sort_keys=False, allow_unicode=True)
 
 
+class Discrepancy(_Frozen):
+    """What one joint's calibrated torque and the gravity model still disagree by, as a field over position.
+
+    Calibrated torque (v - offset)/gain minus model torque, without noise, is at poses q, q' a Gaussian field of mean 0
+    and covariance level² exp(-|q - q'|²/(2 length²)), where |q - q'| is the root of the sum over all joints of
+    (2 sin((q_l - q'_l)/2))² [rad]. More readings of one pose do not make it smaller. It holds for the record's gains
+    and offsets with the mass moments of the same fit, and comes on top of their covariances (docs/theory.md, 4.6).
+    """
+
+    level: Annotated[FiniteFloat, Field(ge=0)]
+    """Standard deviation over the poses of the joints' range [N·m]."""
+    level_std: Annotated[FiniteFloat, Field(ge=0)]
+    """Standard deviation of `level` [N·m]."""
+    length: PositiveFloat
+    """Distance in position over which it is alike [rad]."""
+
+
 class JointCalibration(_Frozen):
     """Sensor parameters of one joint: v = gain·τ + offset, θ = position_gain·φ + position_offset.
 
@@ -92,6 +119,9 @@ class JointCalibration(_Frozen):
     not_identifiable: dict[Parameter, str] = {}
     residual_std: FiniteFloat | None = None
     """Standard deviation of the fit's torque residual at one stop [N·m]."""
+    discrepancy: Annotated[Discrepancy | None, Field(exclude_if=lambda value: value is None)] = None
+    """What the fit doubts beyond its covariance; None, and not written, in records made without an estimate of it, so
+    that these keep their content and with it their id."""
 
     @model_validator(mode="after")
     def _none_has_a_reason(self) -> Self:
@@ -153,6 +183,11 @@ class CalibrationRecord(Record):
         """Whether controllers that hold `held`, joint by joint, hold this record, as REAL32 keeps it."""
         pairs = zip(self.joints, held, strict=True)
         return all(joint.torque_calibration(now).matches(now) for joint, now in pairs)
+
+    def discrepancy(self, key: Literal["level", "level_std", "length"], missing: float = 0.0) -> Array:
+        """One number of the discrepancy of all joints (n,); `missing` where the record has none."""
+        found = [each.discrepancy for each in self.joints]
+        return np.array([missing if each is None else getattr(each, key) for each in found])
 
     def std(self, parameter: Parameter) -> Array:
         """Standard deviations of one parameter of all joints (n,); NaN for those not estimated."""

@@ -33,6 +33,10 @@ def sim(
     seed: Annotated[
         int | None, typer.Option(help="Draw the true sensor parameters from this seed; default: from the arm file.")
     ] = None,
+    realism: Annotated[
+        float | None,
+        typer.Option(min=0, help="All small troubles of a real arm: 1 a good one's, 3 a bad one's; --seed draws them."),
+    ] = None,
     lockstep: Annotated[
         bool, typer.Option(help="Each SYNC advances the physics by one period, independent of real time.")
     ] = False,
@@ -53,6 +57,7 @@ def sim(
     from sim_bus.bus.effect_options import parse_drift, parse_effect
     from sim_bus.bus.fault_kinds import parse_fault
     from sim_bus.bus.server import Server
+    from sim_bus.sim_section import with_realism
     from sim_bus.simulated_arm import SimulatedArm
     from sim_bus.truth import Truth
 
@@ -60,6 +65,8 @@ def sim(
     # each is a system call and made a step forty times as long.
     mujoco.set_mjcb_time(lambda: 0.0)
     described = load_arm(arm)
+    if realism is not None:
+        described = with_realism(described, realism, seed or 0)
     entries = [parse_effect(text, described.joint_names) for text in effect or ()]
     drifts = [parse_drift(text, described.joint_names) for text in drift or ()]
     faults = [parse_fault(text, described.joint_names) for text in fault or ()]

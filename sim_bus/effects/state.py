@@ -72,6 +72,22 @@ class Imperfections:
     """Mass [kg] and centre of mass in the last bar frame [m] (4,)."""
     tilt: Array = field(init=False)
     """Rotation of the base about its x and y axes [rad] (2,)."""
+    cubic: Array = field(init=False)
+    """Deviation of the torque sensor at full scale that grows with the cube of torque, as a share of full scale."""
+    warm_up: Array = field(init=False)
+    """How much lower the torque sensor's zero is when cold [N·m], and the time constant of warming up [s] (n, 2)."""
+    cable: Array = field(init=False)
+    """Stiffness [N·m/rad], bend per turn of the next joint [1], rest from mid-range [rad], pull that lags [N·m] and
+    the bend over which it does [rad] (n, 5)."""
+    compliance: Array = field(init=False)
+    """Turn of the link against its position sensor per transmitted torque [rad/(N·m)]."""
+    frame_turn: Array = field(init=False)
+    """Rotation of each joint's frame against the drawing, about its own x, y and z axes [rad] (n, 3)."""
+    frame_shift: Array = field(init=False)
+    """Place of each joint's frame against the drawing, along its own axes [m] (n, 3)."""
+    uneven: Array = field(init=False)
+    """Coulomb friction: amplitude over a turn as a share and its phase [rad], friction per transmitted torque, and the
+    share by which it is higher when cold (n, 4)."""
 
     def __post_init__(self) -> None:
         """Start with a perfect arm."""
@@ -85,6 +101,11 @@ class Imperfections:
             "mass_moment": (n, 3),
             "inertia": (n, 6),
             "payload": (4,),
+            "warm_up": pair,
+            "cable": (n, 5),
+            "frame_turn": (n, 3),
+            "frame_shift": (n, 3),
+            "uneven": (n, 4),
         }
         initial = {"stribeck_velocity": 0.01, "actuator_gain": 1.0, "torque_gain": 1.0, "position_gain": 1.0}
         initial |= {"actuator_saturation": np.inf, "torque_saturation": np.inf, "elasticity": np.inf}

@@ -15,3 +15,18 @@ def dry_friction(state: Imperfections, velocity: Array, load: Array, motor_torqu
     level = level + state.load_friction * np.abs(load)
     heading = np.where(np.abs(velocity) < RESTING, np.sign(motor_torque - load), np.sign(velocity))
     return np.asarray(np.maximum(level * (1.0 + state.asymmetry * heading), 0.0))
+
+
+def unevenness(state: Imperfections, position: Array, load: Array, time: float) -> Array:
+    """Friction (n,) [N·m] added by position [rad], transmitted torque `load` [N·m] and a cold gear at `time` [s]."""
+    amplitude, phase, by_load, cold = state.uneven.T
+    factor = (1 + amplitude * np.sin(position + phase)) * (1 + cold * coldness(state, time))
+    added: Array = state.coulomb * (factor - 1) + by_load * np.abs(load)
+    return added
+
+
+def coldness(state: Imperfections, time: float) -> Array:
+    """How cold each joint still is (n,), 1 at power-on and 0 when warm."""
+    constant = state.warm_up[:, 1]
+    cold: Array = np.exp(-time / np.where(constant > 0, constant, np.inf))
+    return np.where(constant > 0, cold, 0.0)

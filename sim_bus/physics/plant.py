@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from sim_bus.effects.state import Imperfections
-from sim_bus.physics.friction import dry_friction
+from sim_bus.physics.cables import Cables
+from sim_bus.physics.frames import Frames
+from sim_bus.physics.friction import dry_friction, unevenness
 from sim_bus.physics.gravity import gravity_torque, inertia, tilt
 from sim_bus.physics.inertials import Inertials
 from sim_bus.physics.mjcf import build_model
@@ -41,7 +43,8 @@ class Plant:
         self._servo = (np.zeros(n), np.zeros(n), np.zeros(n))
         self.torque_constant = np.ones(n)
         """Torque that each drive believes to make for one that it makes: its nominal by its true torque constant."""
-        self._lost = np.zeros(n)
+        self._lost, self._sag = np.zeros(n), np.zeros(n)
+        self._cables: Cables | None = None
         self._build(Imperfections(arm.joint_names))
         self._joint_inertia = np.diag(self.inertia((self.lower + self.upper) / 2)).copy()
         start = (self.lower + self.upper) / 2 if self._section.start is None else np.array(self._section.start)
@@ -65,6 +68,7 @@ class Plant:
             self._dof = slice(0, self.n)
         self.lower, self.upper = self.model.jnt_range[joints].T.copy()
         self._inertials = Inertials(self.model, list(built.bodies), built.payload_body)
+        self._frames = Frames(self.model, list(built.bodies))
         self._gravity: Array = self.model.opt.gravity.copy()
         self._armature = self.model.dof_armature[self._dof].copy()
         self._damping = self.model.dof_damping[self._dof].copy()
@@ -78,6 +82,12 @@ class Plant:
         if self._gears is not None:
             self._gears.settle(data.qpos, torque)
             self._gears.settle_speed(data.qvel)
+
+    def place(self, joint: int, angle: float) -> None:
+        """Put one joint at a true angle [rad], kept within its stops, at rest: as a hand turns it."""
+        position, velocity = self.data.qpos[self._dof].copy(), self.data.qvel[self._dof].copy()
+        position[joint], velocity[joint] = np.clip(angle, self.lower[joint], self.upper[joint]), 0.0
+        self._enter(position, velocity, np.zeros(self.n))
 
     # ---- properties
 
@@ -111,15 +121,21 @@ class Plant:
         self.model.opt.gravity[:] = tilt(imperfections.tilt).T @ self._gravity
         self.model.jnt_stiffness[self._joints] = imperfections.spring[:, 0]
         self.model.qpos_spring[self._dof] = imperfections.spring[:, 1]
+        self._frames.apply(imperfections)
         self._inertials.apply(self._imperfections, self._attached)
+        self._cables = None
+        if imperfections.cable.any():
+            self._cables = Cables(imperfections, (self.lower + self.upper) / 2, self.position)
+        self._changing = bool(imperfections.uneven.any() or imperfections.compliance.any()) or self._cables is not None
         self._steady_friction = imperfections.steady_friction
         self._motors = None if imperfections.prompt_motors else LateMotors(imperfections, self.motor_torque)
         self._plain = self._steady_friction and self._motors is None and self._gears is None
-        self._lost = np.zeros(self.n)
+        self._lost, self._uneven = np.zeros(self.n), np.zeros(self.n)
         self.data.qfrc_applied[:] = 0.0
         self._set_friction()
         self.set_servo(*self._servo)
         mujoco.mj_forward(self.model, self.data)
+        self._change()
 
     def attach_mass(self, mass: float, point: Array) -> None:
         """Attach a point mass [kg] at `point` of the last link's bar frame [m], in place of an earlier one."""
@@ -154,7 +170,8 @@ class Plant:
     @property
     def motor_position(self) -> Array:
         """Motor angles referred to the joints, which position sensors measure."""
-        return self.position if self._gears is None else self._gears.shown(self._positions)
+        position = self.position if self._gears is None else self._gears.shown(self._positions)
+        return position + self._sag
 
     @property
     def motor_velocity(self) -> Array:
@@ -194,7 +211,7 @@ class Plant:
         if self._has_rotors:
             torque -= self._rotor_inertia * self._accelerations[dof]
         if self._motors is not None:
-            torque += data.qfrc_applied[dof]
+            torque -= self._lost
         torque[self._friction_rows()] += data.efc_force[data.ne : data.ne + data.nf]
         return torque
 
@@ -221,6 +238,8 @@ class Plant:
         count = max(1, int(np.ceil(duration / self.step_time - 1e-9)))
         model, data = self.model, self.data
         model.opt.timestep = duration / count
+        if self._changing:
+            self._change()
         if start is end and self._plain:
             data.ctrl[:] = end
             mujoco.mj_step(model, data, count)
@@ -233,6 +252,7 @@ class Plant:
                 self._set_friction()
             if gears is not None:
                 data.qfrc_applied[:] = gears.forces(data, self._lost)
+                data.qfrc_applied[self._dof] += self._pulled
             mujoco.mj_step(model, data)
             level = level + slope
 
@@ -244,10 +264,21 @@ class Plant:
         wanted = level - stiffness * position - damping * self.motor_velocity
         amplitude, cycles, phase = self._imperfections.ripple.T
         self._lost = amplitude * np.sin(cycles * position + phase)
-        self.data.qfrc_applied[self._dof] = -self._lost
+        self.data.qfrc_applied[self._dof] = self._pulled - self._lost
         return self._motors.torque(np.clip(wanted, -limit, limit), duration)
 
     # ---- internals
+
+    def _change(self) -> None:
+        """Bring cables, sag and uneven friction up to date; once a step, as they change slowly."""
+        position, torque = self.position, self.link_torque
+        self._pulled = np.zeros(self.n) if self._cables is None else self._cables.torque(position)
+        if self._gears is None:
+            self.data.qfrc_applied[self._dof] = self._pulled - self._lost
+        self._sag = self._imperfections.compliance * torque
+        if self._imperfections.uneven.any():
+            self._uneven = unevenness(self._imperfections, position, torque, self.data.time)
+            self._set_friction()
 
     def _set_friction(self) -> None:
         """Set dry friction for the present velocity and load, or the brake's."""
@@ -256,7 +287,7 @@ class Plant:
         if not state.steady_friction:
             velocity = self.velocity if self._gears is None else self._gears.turned(self._velocities)
             level = dry_friction(state, velocity, self.link_torque, self._motor_torques)
-        self._seat("frictionloss", np.where(self._braked, self._brake_torque, level))
+        self._seat("frictionloss", np.where(self._braked, self._brake_torque, np.maximum(level + self._uneven, 0.0)))
 
     def _seat(self, quantity: str, values: Array) -> None:
         """Set friction, damping or inertia of the motors."""

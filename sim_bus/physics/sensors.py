@@ -5,6 +5,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from sim_bus.effects.state import Imperfections
+from sim_bus.physics.friction import coldness
 from sim_bus.sim_section import NOISE_SHARE, sim_section
 from sim_bus.truth import Truth
 
@@ -47,6 +48,8 @@ class Sensors:
             or state.hysteresis.any()
             or state.deadband.any()
             or state.torque_drift.any()
+            or state.cubic.any()
+            or state.warm_up.any()
             or np.isfinite(state.torque_saturation).any()
         )
         self._delayed = bool(state.torque_delay.any())
@@ -66,7 +69,7 @@ class Sensors:
             link_torque = self._bend(link_torque)
         reading = self.gain * link_torque + self.offset
         if self._bent:
-            reading += self._imperfections.torque_drift * time
+            reading += self._imperfections.torque_drift * time + self.cold_zero(time)
         if self._next == NOISE_BLOCK:
             self._block = self.noise * self._random.standard_normal(self._block.shape)
             self._next = 0
@@ -75,6 +78,11 @@ class Sensors:
         np.maximum(np.minimum(reading, self.torque_limit, out=reading), -self.torque_limit, out=reading)
         counts: Array = np.rint(reading / self.torque_step)
         return counts * self.torque_step
+
+    def cold_zero(self, time: float) -> Array:
+        """Shift of the torque sensors' zero (n,) at `time` [s], which vanishes as they warm up [N·m]."""
+        shift: Array = -self._imperfections.warm_up[:, 0] * coldness(self._imperfections, time)
+        return shift
 
     def position_counts(self, angle: Array) -> Array:
         """Readings `φ` of true angles in whole encoder increments."""
@@ -101,6 +109,7 @@ class Sensors:
     def _bend(self, torque: Array) -> Array:
         state = self._imperfections
         torque = torque + state.crosstalk @ torque
+        torque = torque * (1 + state.cubic * (torque / self.torque_limit) ** 2)
         self._play = np.clip(self._play, torque - state.hysteresis, torque + state.hysteresis)
         torque = np.where(state.hysteresis > 0, self._play, torque)
         torque = np.sign(torque) * np.maximum(np.abs(torque) - state.deadband, 0.0)

@@ -25,7 +25,7 @@ class Bench:
     arm: ArmFile
     described: Arm
     truth: Truth
-    """The sensors as they are when the demo begins, effects of the arm file included."""
+    """The sensors as they are after the sweeps, effects of the arm file included."""
     simulated: SimulatedArm
     link: Link
 

@@ -5,16 +5,18 @@ import shutil
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
 from rich.console import Console
 
-from armlink.arm_file import ArmFile, load_arm
+from armlink.arm_file import MODEL_SUFFIXES, ArmFile, load_arm
 from armlink.errors import BadInput
 from armlink.recording.files import save_recording
 from armlink.recording.recording import Recording
 from calib.arm.kinematics import gcomp_arm
+from calib.commissioning.new_arm import new_arm
 from calib.fit.gravity_fit import identify_gravity
 from calib.fit.sensor_fit import fit_sensors
 from calib.install.apply import Apply, admit_sweeps
@@ -24,6 +26,7 @@ from calib.records.store import RecordStore
 from calib.sweep.dataset import SweepData
 from calib.sweep.run import run_sweep
 from calib.sweep.verify import run_verify
+from sim_bus.sim_section import with_realism
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.demo.bench import Bench, check_gravity
@@ -40,12 +43,18 @@ TRAIN_SECONDS, HELDOUT_SECONDS = 40.0, 25.0
 BY = "armlink demo"
 
 
-def run_demo(arm_name: str, *, seed: int, out: Path, json_path: Path | None, console: Console) -> DemoResult:
+def run_demo(
+    arm_name: str, *, seed: int, out: Path, json_path: Path | None, console: Console, realism: float | None = None
+) -> DemoResult:
     """Run it, write `report.html`, `summary.json` and the data into `out`; raises BadInput, Refused, BusFault."""
+    teller = Narrator(console)
+    if Path(arm_name).suffix.lower() in MODEL_SUFFIXES:
+        arm_name = str(_from_model(Path(arm_name), out, teller))
     arm = load_arm(arm_name)
+    if realism is not None:
+        arm = with_realism(arm, realism, seed)
     arm.require_link()
     data_folder = _fresh(out)
-    teller = Narrator(console)
     teller.say(f"arm [bold]{arm.name}[/bold], hidden truth of seed {seed}, results in {out}")
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as other_core:
         bench = Bench.build(arm, gcomp_arm(arm), seed)
@@ -76,6 +85,7 @@ def _work(
     link.enable()
     teller.say(f"{link.n} nodes found on the bus, mapped and enabled; SYNC at {link.rate:g} Hz")
     data = _sweeps(bench, folder, seed, teller)
+    bench = replace(bench, truth=bench.simulated.true_sensors)  # zeros move as the arm warms up
     with teller.stage("fitting sensors and mass moments, all joints together"):
         sensors = fit_sensors(arm, data)
     gravity = identify_gravity(arm, data, sensors)
@@ -155,6 +165,16 @@ def _record(
 def _diagnose(arm_path: Path, recordings: tuple[Recording, Recording]) -> Diagnosis:
     """In the other process: the recordings against the arm's nominal model."""
     return diagnose(compiled(arm_path), recordings[:1], recordings[1:], labels=["train", "heldout"])
+
+
+def _from_model(model: Path, out: Path, teller: Narrator) -> Path:
+    """The arm file made of a URDF or MJCF model, in the demo's folder; raises BadInput, Refused."""
+    path = out / f"{model.stem}.yaml"
+    teller.say(f"making an arm file of {model}")
+    made = new_arm(model, path)
+    made.write()
+    teller.say(f"{path}: {len(made.draft.joints)} joints, {len(made.draft.assumed)} assumed values, each says so there")
+    return path
 
 
 def _fresh(out: Path) -> Path:

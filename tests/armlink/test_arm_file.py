@@ -1,6 +1,7 @@
 """Malformed arm files: one line that names the key, the value and what was expected."""
 
 import copy
+import math
 
 import pytest
 import yaml
@@ -60,8 +61,8 @@ def test_defaults_are_those_of_the_contract(tmp_path):
     [
         (("colour",), "red", "key colour: unknown key"),
         (("link", "joints", 0, "torque_max"), 3.0, "key link.joints.0.torque_max: unknown key"),
-        (("name",), REMOVE, "key name: Field required"),
-        (("kinematics", "joints", 1, "upper"), REMOVE, "key kinematics.joints.1.upper: Field required"),
+        (("name",), REMOVE, "key name: Field required: add it"),
+        (("kinematics", "joints", 1, "upper"), REMOVE, "key kinematics.joints.1.upper: Field required: add it"),
         (("kinematics", "joints", 1, "upper"), -2.0, "joint joint_2: lower -1.0 must be less than upper -2.0 [rad]"),
         (("kinematics", "joints", 0, "a"), "long", "key kinematics.joints.0.a: "),
         (("kinematics", "joints", 0, "a"), float("nan"), "key kinematics.joints.0.a: Input should be a finite number"),
@@ -79,6 +80,8 @@ def test_defaults_are_those_of_the_contract(tmp_path):
             -3,
             "key link.joints.0.max_torque: Input should be greater than 0 (value -3)",
         ),
+        (("link", "joints", 0, "max_velocity"), math.inf, "key link.joints.0.max_velocity: Input should be a finite"),
+        (("link", "joints", 0, "max_torque_rate"), math.inf, "max_torque_rate: Input should be a finite number"),
         (("link", "joints", 1, "name"), "wrist", "same names, same order"),
         (("link", "rate"), 0, "key link.rate: Input should be greater than 0 (value 0)"),
         (("link", "rate"), 4000, "key link.rate: Input should be less than or equal to 1000"),

@@ -12,8 +12,9 @@ from fast_arm import PERIOD, FastArm
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import BusFault
 from armlink.link.types import Calibration, Stats
+from armlink.loop.messages import Answer
 from calib.daemon.environment import Environment
-from calib.daemon.loop.loop_messages import Batch, Progress, Reply, Up
+from calib.daemon.loop.loop_messages import Batch, Progress, Up
 from calib.daemon.service import Service
 from calib.daemon.service_view import ServiceView
 from calib.daemon.settings import DaemonSection
@@ -40,13 +41,14 @@ class FastDaemon:
         arm: str = "sarcos",
         listen_only: bool = False,
         records: bool = True,
+        store: str | None = None,
     ) -> None:
         self.arm = slow(load_arm(arm))
         self.fast = FastArm(self.arm, seed)
         self.directory, self.listen_only = directory, listen_only
         self.settings = settings or DaemonSection(policy="apply", recording=QUIET)
         self.wall_shift, self.clock_shift = timedelta(), 0.0
-        self.store = RecordStore(str(directory / "records.db"))
+        self.store = RecordStore(store or str(directory / "records.db"))
         self.controllers, self.port = self, self
         self.ids, self.dates = [0] * self.fast.n, [0] * self.fast.n
         self.sdo: list[str] = []
@@ -105,7 +107,7 @@ class FastDaemon:
         self.ids[joint], self.dates[joint] = calibration.record_id, calibration.date
         return self.read_calibration(joint)
 
-    def sweep(self, poses: int, seed: int) -> Reply | None:
+    def sweep(self, poses: int, seed: int) -> Answer | None:
         self.touring, self.job_after, self.fast.job = poses, self.fast.job, None
         return None
 

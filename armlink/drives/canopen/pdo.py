@@ -1,19 +1,16 @@
 """Process data objects: the link's mapping, its configuration with read-back, and the decoding table."""
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from armlink.drives.canopen.object_dictionary import (
     CONTROL_WORD,
-    HEARTBEAT_ID,
     MODE,
     MODE_DISPLAY,
     MOTOR_TORQUE,
-    NMT_ID,
     POSITION,
     STATUS_WORD,
-    SYNC_ID,
     TARGET_POSITION,
     TARGET_TORQUE,
     TORQUE_READING,
@@ -76,6 +73,10 @@ TPDO2 = Pdo(
 )
 TPDO3 = Pdo("TPDO3", 0x380, 0x1802, 0x1A02, (STATUS_WORD, MODE_DISPLAY), EVENT_TYPE)
 LINK_PDOS = (RPDO1, RPDO2, TPDO1, TPDO2, TPDO3)
+RPDO_BASES = (0x200, 0x300, 0x400, 0x500)
+"""COB-IDs of the predefined RPDOs without the node id (CiA 301, 7.3.3)."""
+_RPDOS = range(0x1400, 0x1600)
+_ALWAYS_LOOKED_FOR = (0x1402, 0x1403)
 
 Write = Callable[[Entry, int], None]
 Read = Callable[[Entry], int]
@@ -107,23 +108,28 @@ def configure(pdo: Pdo, node: int, write: Write, read: Read, deadline_ms: int = 
     _same(cob_id, value & ~_NO_REMOTE, read(cob_id) & ~_NO_REMOTE)
 
 
+def foreign_rpdos(described: Iterable[int]) -> list[int]:
+    """Communication records of RPDOs that the link does not use: the predefined ones and those in a data sheet."""
+    ours = {RPDO1.communication, RPDO2.communication}
+    return sorted({*_ALWAYS_LOOKED_FOR, *(index for index in described if index in _RPDOS)} - ours)
+
+
+def disable(index: int, write: Write, read: Read) -> None:
+    """Set the RPDO whose communication record is `index` invalid; raises MappingRefused if it stays valid."""
+    cob_id = Entry(index, 1, "I", f"RPDO{index - _RPDOS.start + 1} COB-ID")
+    held = read(cob_id)
+    if not held & _INVALID:
+        write(cob_id, held | _INVALID)
+        if not read(cob_id) & _INVALID:
+            raise MappingRefused(f"{cob_id}: stays valid, so another program could command this joint through it")
+
+
 def decoding_table(nodes: tuple[int, ...]) -> dict[int, tuple[int, Pdo, struct.Struct]]:
     """COB-ID of every TPDO → (joint index, PDO, layout)."""
     return {
         pdo.cob_base + node: (joint, pdo, pdo.layout)
         for joint, node in enumerate(nodes)
         for pdo in (TPDO1, TPDO2, TPDO3)
-    }
-
-
-def host_frames(nodes: tuple[int, ...], host: int) -> dict[int, str]:
-    """COB-IDs that only the host of these nodes sends, and what they are; `host` is its own node id."""
-    return {
-        NMT_ID: "NMT command",
-        SYNC_ID: "SYNC",
-        HEARTBEAT_ID + host: "heartbeat of the host",
-        **{RPDO1.cob_base + node: f"RPDO1 of node {node}" for node in nodes},
-        **{RPDO2.cob_base + node: f"RPDO2 of node {node}" for node in nodes},
     }
 
 

@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from armlink.bus.arm_hold import ArmHold
 from armlink.errors import ArmlinkError, BusFault, Refused
 from armlink.link.link import Link
 from armlink.link.listener import Listener
 from armlink.link.types import Calibration, Command, Sample
+from armlink.loop.messages import Answer, Call
 from calib.arm.kinematics import gcomp_arm
-from calib.daemon.loop.loop_messages import Batch, Down, LoopOptions, Message, Progress, Reply, Request, Up
+from calib.daemon.loop.loop_messages import Batch, Down, LoopOptions, Message, Progress, Up
 from calib.motion.random_work import WorkMotion, work_pieces
 from gcomp.arrays import Array
 
@@ -27,7 +29,7 @@ SILENCE_SECONDS = 0.5
 
 
 class ArmLoop:
-    """`run()` runs the cycles of a tenth of a second and returns messages; `handle` carries out a request.
+    """`run()` runs the cycles of a tenth of a second and returns messages; `handle` carries out a call.
 
     A fault of bus or joint is a message, never an exception: the bus is opened again until that succeeds.
     """
@@ -37,6 +39,7 @@ class ArmLoop:
         self._tour: list[int] | None = None
         self._reported = -1
         self._source: Link | Listener | None = None
+        self._hold: ArmHold | None = None
         self._targets: Iterator[Array] | None = None
         self._shift = 0.0
         self._reason: str | None = None
@@ -71,28 +74,28 @@ class ArmLoop:
             except (ArmlinkError, OSError):
                 return  # the bus is gone already: the joints' own deadlines stop them
 
-    def handle(self, request: Request) -> Reply:
-        """Carry out a request; every failure is in the reply."""
+    def handle(self, call: Call) -> Answer:
+        """Carry out a call; every failure is in the answer."""
         source = self._source
         if source is None:
-            return Reply(request.id, error=self._reason or "the bus is not open", status=BusFault.exit_status)
+            return Answer(call.id, error=BusFault(self._reason or "the bus is not open"))
         try:
-            return Reply(request.id, self._do(source, request))
+            return Answer(call.id, self._do(source, call))
         except BusFault as error:
             self.close()
-            return Reply(request.id, error=str(error), status=error.exit_status)
+            return Answer(call.id, error=error)
         except ArmlinkError as error:
-            return Reply(request.id, error=str(error), status=error.exit_status)
+            return Answer(call.id, error=error)
 
-    def _do(self, source: Link | Listener, request: Request) -> Any:
-        arguments = request.arguments
-        if request.what == "read":
-            return source.read_calibration(arguments["joint"])
-        if request.what == "write":
-            return source.write_calibration(**arguments)
-        if request.what == "sweep":
-            return self._sweep(source, arguments["poses"], arguments["seed"])
-        raise BusFault(f"the loop knows no request {request.what!r}")
+    def _do(self, source: Link | Listener, call: Call) -> Any:
+        match call.what:
+            case "read_calibration":
+                return source.read_calibration(*call.args)
+            case "write_calibration":
+                return source.write_calibration(*call.args)
+            case "sweep":
+                return self._sweep(source, *call.args)
+        raise BusFault(f"the loop knows no call {call.what!r}")
 
     def _sweep(self, source: Link | Listener, poses: int, seed: int) -> int:
         """Begin a tour of `poses` poses over the whole range, then hold; `run` reports the progress."""
@@ -114,6 +117,7 @@ class ArmLoop:
             return self._up(None)
         link = Link(options.arm, bus)
         self._source = link
+        self._hold = self._hold or ArmHold(bus, link.nodes)  # for good: through a passing fault too
         link.start()
         held = [link.read_calibration(joint) for joint in range(link.n)]  # before SDO has to wait for cycles
         sample = link.enable()

@@ -1,8 +1,7 @@
-"""Messages between the bus loop and the service: samples in batches, requests and replies."""
+"""Messages of the bus loop to the service, beside the answers to its calls: samples in batches, state of the bus."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +9,8 @@ from numpy.typing import NDArray
 from armlink.arm_file import ArmFile
 from armlink.bus.can_bus import CanBus
 from armlink.link.types import Sample, Stats
+from armlink.loop.messages import Alive, Answer
+from armlink.loop.realtime import Realtime
 from gcomp.arrays import Array
 
 CHANNELS = ("position", "velocity", "torque", "motor_torque", "torque_command", "position_command")
@@ -70,6 +71,13 @@ class Batch:
 
 
 @dataclass(frozen=True)
+class Started:
+    """The first message of a loop in a process of its own that drives or hears a bus in real time."""
+
+    realtime: Realtime
+
+
+@dataclass(frozen=True)
 class Up:
     """The bus is open and the joints answer."""
 
@@ -85,26 +93,6 @@ class Down:
 
 
 @dataclass(frozen=True)
-class Request:
-    """A request of the service to the loop."""
-
-    id: int
-    what: Literal["read", "write", "sweep", "stop"]
-    arguments: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Reply:
-    """The reply to a request; `error` is one line if it failed."""
-
-    id: int
-    value: Any = None
-    error: str | None = None
-    status: int = 0
-    """Exit status of the error: 1 refused, 2 bad input, 3 bus fault."""
-
-
-@dataclass(frozen=True)
 class Progress:
     """Progress of a tour of poses."""
 
@@ -113,9 +101,4 @@ class Progress:
     """Poses."""
 
 
-@dataclass(frozen=True)
-class Alive:
-    """Sign of life when there is nothing else to send."""
-
-
-Message = Alive | Batch | Up | Down | Reply | Progress
+Message = Alive | Started | Batch | Up | Down | Answer | Progress

@@ -36,9 +36,9 @@ class PoseTours:
             return
         self.progress, self._last = Progress(0, TOUR_POSES), self._environment.monotonic()
         self._events.say("sweep", None, f"sweeping {TOUR_POSES} poses: {why}", {"poses": TOUR_POSES})
-        reply = self._environment.port.sweep(TOUR_POSES, int(self._last))
-        if reply is not None and reply.error is not None:
-            self.refused(reply.error)
+        answer = self._environment.port.sweep(TOUR_POSES, int(self._last))
+        if answer is not None and answer.error is not None:
+            self.refused(str(answer.error))
 
     def wish(self, why: str) -> None:
         """Begin a tour if the configuration lets the daemon decide on one."""

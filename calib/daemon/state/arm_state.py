@@ -4,6 +4,7 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
+from armlink.arm_file import ArmFile
 from armlink.drives.canopen import emcy
 from calib.daemon.loop.loop_messages import Batch
 from calib.daemon.state.event_log import EventLog
@@ -13,14 +14,17 @@ STALE = 1.0
 FAULT_EVENTS_AN_HOUR = 20
 """Further faults within the hour go to the process's log only, so that a loose plug does not fill the journal."""
 
+JUDGED_CYCLES = 10_000
+"""The host's lateness is judged after so many cycles: 99.9 % of fewer hang on a single one."""
+
 log = logging.getLogger("armlink.daemon")
 
 
 class ArmState:
     """Holds what the bus loop reports of bus and joints; turns its faults into events."""
 
-    def __init__(self, names: tuple[str, ...], events: EventLog, monotonic: Callable[[], float]) -> None:
-        self._names, self._events, self._monotonic = names, events, monotonic
+    def __init__(self, arm: ArmFile, events: EventLog, monotonic: Callable[[], float]) -> None:
+        self._arm, self._names, self._events, self._monotonic = arm, arm.joint_names, events, monotonic
         self.connected: bool | None = None
         """Whether the joints answer; None until the bus loop has reported for the first time."""
         self.fault = ""
@@ -29,6 +33,7 @@ class ArmState:
         """The newest samples."""
         self._heard_at = -float("inf")
         self._fault_times: list[float] = []
+        self._told_late = False
 
     @property
     def late(self) -> float:
@@ -53,8 +58,19 @@ class ArmState:
                 text = f"{self._names[joint]}: emergency {code:04X}h, {emcy.name_of(code)}"
                 self._report("fault", self._names[joint], text, {"code": code, "register": register})
 
+    def tick(self) -> None:
+        """Report once per connection that the host is nearly too late for the arm."""
+        stats = None if self.batch is None else self.batch.stats
+        if stats is None or self._told_late or stats.cycles < JUDGED_CYCLES:
+            return
+        warning = stats.lateness.near(self._arm.require_link().deadline, self._arm.name)
+        if warning:
+            self._told_late = True
+            self._report("late", None, warning, {"late_ms": stats.lateness.in_ms()})
+
     def up(self) -> None:
         """The joints answer."""
+        self._told_late = False
         back = self.connected is False
         self.connected, self.fault, self._heard_at = True, "", self._monotonic()
         if back:

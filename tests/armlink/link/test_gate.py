@@ -31,6 +31,8 @@ def limits(draw):
         torque_unit=unit,
         position_unit=2 * math.pi / draw(st.sampled_from([2**20, 2**16, 360_000])),
         overspeed=draw(st.floats(0.01, 10)),
+        servo_overspeed=draw(st.floats(0.01, 30)),
+        following=draw(st.floats(0.01, 20)),
         outside=draw(st.floats(0.0, 1.0)),
         max_age=0.1,
     )
@@ -52,6 +54,11 @@ def may_pass(limits, mode, torque, position, age, held, now):
         inside = limits.lower - limits.outside <= now.position <= limits.upper + limits.outside
         entered = held.mode in (TORQUE, PROFILE_TORQUE) or math.isfinite(now.torque)
         return inside and entered and -limits.overspeed <= now.velocity <= limits.overspeed
+    if mode in (POSITION, PROFILE_POSITION):
+        follows = held.mode not in (POSITION, PROFILE_POSITION) or (
+            -limits.following <= held.position - now.position <= limits.following
+        )
+        return follows and (math.isnan(now.velocity) or abs(now.velocity) <= limits.servo_overspeed)
     return True
 
 
@@ -83,7 +90,7 @@ def test_no_frame_exceeds_a_limit_whoever_calls(limits, torque, position, cycles
         held = passed
 
 
-LIMITS = JointLimits(30.0, 0.8, 0.004, -2.0, 2.0, 0.04, 2 * math.pi / 2**20, 1.5, 0.1, 0.1)
+LIMITS = JointLimits(30.0, 0.8, 0.004, -2.0, 2.0, 0.04, 2 * math.pi / 2**20, 1.5, 3.0, 0.5, 0.1, 0.1)
 START = start_from(LIMITS, 8.0, 0.5)
 
 
@@ -224,9 +231,18 @@ def test_nothing_but_the_gate_bounds_a_joint_under_torque_control(mode):
 
 
 @POSITION_MODES
-def test_the_servo_bounds_a_joint_under_position_control(mode):
-    assert not gate(mode, velocity=9.0, measured=3.0, produced=math.nan).refused
+def test_a_joint_under_position_control_must_follow_its_target_at_a_bounded_speed(mode):
+    for velocity in (3.0, -3.0):
+        assert not gate(mode, velocity=velocity, measured=3.0, produced=math.nan).refused
+        assert gate(mode, velocity=velocity * 1.001).refused == g.VELOCITY
     assert not gate(mode, velocity=math.nan).refused
+    held = gate(mode, position=0.5)
+    for measured in (0.0, 1.0):
+        assert not gate(mode, position=0.5, held=held, measured=measured).refused
+        assert gate(mode, position=0.5, held=held, measured=measured + (measured - 0.5) * 0.01).refused == g.FOLLOWING
+    assert not gate(mode, position=0.5, held=gate(TORQUE, torque=8.0), measured=1.5).refused  # starts where it is
+    assert not gate(TORQUE, torque=8.0, held=held, measured=1.5).refused
+    assert not gate(OFF, held=held, measured=1.5, velocity=9.0).refused
 
 
 def test_a_refused_command_moves_nothing():

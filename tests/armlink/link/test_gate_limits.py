@@ -26,6 +26,9 @@ def test_limits_of_one_joint():
     assert (limits.lower, limits.upper) == (-1.5, 2.5)
     assert (limits.torque_unit, limits.position_unit) == (0.04, 1e-5)
     assert limits.overspeed == pytest.approx(1.2)  # the stated margin: half as fast again
+    assert limits.servo_overspeed == 3.0  # a joint that sinks is caught
+    assert gate_limits(joint(max_velocity=2.0), (-1, 1), UNITS, 0.004, 0.1).servo_overspeed == pytest.approx(6.0)
+    assert limits.following == 0.5
     assert limits.outside == 0.1
     assert limits.max_age == 0.1
 
@@ -97,3 +100,16 @@ def test_what_a_model_lacks_is_named(tmp_path):
     with pytest.raises(BadInput, match=r"arm\.xml: "):
         joint_ranges(model_arm(tmp_path, "<mujoco><nonsense/></mujoco>", "a"))
     assert math.isfinite(joint_ranges(model_arm(tmp_path, MODEL, "a"))[0][0])
+
+
+@pytest.mark.parametrize(
+    ("key", "carried", "says"),
+    [
+        ("max_velocity", (2**32 - 1) * UNITS.position, "6081h carries at most 42949.7 rad/s"),
+        ("max_torque_rate", (2**32 - 1) * UNITS.torque, r"6087h carries at most 1.71799e\+08 N·m/s"),
+    ],
+)
+def test_a_rate_that_no_object_carries_is_refused(key, carried, says):
+    gate_limits(joint(**{key: carried}), (-1, 1), UNITS, 0.004, 0.1)
+    with pytest.raises(BadInput, match=f"elbow: {key} .*: {says}"):
+        gate_limits(joint(**{key: carried * 1.001}), (-1, 1), UNITS, 0.004, 0.1)

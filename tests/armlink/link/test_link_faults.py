@@ -124,8 +124,8 @@ def test_frames_of_a_wrong_length_are_counted_and_dropped(enabled, bus, data):
 
 def test_frames_of_strangers_are_ignored(enabled, bus):
     rng = np.random.default_rng(5)
-    bases = (0x80, 0x180, 0x200, 0x280, 0x300, 0x380, 0x580, 0x700)
-    ours = {0x000, 0x080, 0x77F, *(base + node for base in bases for node in (1, 2, 3))}
+    bases = (0x80, 0x180, 0x200, 0x280, 0x300, 0x380, 0x400, 0x500, 0x580, 0x600, 0x700)
+    ours = {0x000, 0x080, 0x77F, 0x7E5, *(base + node for base in bases for node in (1, 2, 3))}
     strangers = sorted(set(range(0x800)) - ours)
     for start in range(0, len(strangers), 20):
         for can_id in strangers[start : start + 20]:

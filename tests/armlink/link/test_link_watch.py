@@ -9,7 +9,7 @@ import yaml
 
 from armlink.arm_file import bundled_arms, load_arm
 from armlink.cli import run
-from armlink.errors import BadInput, BusFault, Refused
+from armlink.errors import BadInput, BusFault, HostLate, Refused
 from armlink.link.link import Link
 from armlink.link.types import Command
 from sim_bus.bus.lock_step import LockStepBus
@@ -212,6 +212,11 @@ def test_the_simulated_arm_restarting_under_way_is_noticed():
         (0x202, bytes(8), "RPDO1 of node 2 (202h)"),
         (0x303, b"\x08", "RPDO2 of node 3 (303h)"),
         (0x77F, b"\x05", "heartbeat of the host (77Fh)"),
+        (0x402, bytes(8), "RPDO3 of node 2 (402h)"),
+        (0x503, b"\x0f\x00", "RPDO4 of node 3 (503h)"),
+        (0x602, b"\x2b\x40\x60\x00\x0f\x00\x00\x00", "SDO write of 6040h to node 2 (602h)"),
+        (0x603, b"\xc2\x7a\x60\x00\x04\x00\x00\x00", "SDO write of 607Ah to node 3 (603h)"),
+        (0x7E5, b"\x11\x05\x00\x00\x00\x00\x00\x00", "LSS command (7E5h)"),
     ],
 )
 def test_a_second_host_stops_all_in_the_cycle_in_which_it_is_heard(enabled, bus, can_id, data, what):
@@ -230,6 +235,57 @@ def test_reading_along_is_not_commanding(enabled, bus):
         bus.out.append((0x600 + node, b"\x40\x00\x10\x00\x00\x00\x00\x00"))
     for _ in range(20):
         enabled.cycle(command(POSITION))
+
+
+def test_a_torque_calibration_may_be_written_by_another_program(enabled, bus):
+    bus.out.append((0x602, b"\x23\x00\x21\x04\x00\x00\x80\x3f"))
+    bus.out.append((0x602, b"\x23\x10\x10\x04save"))
+    for _ in range(5):
+        enabled.cycle(command(POSITION))
+
+
+def test_rpdos_that_are_not_ours_are_disabled(arm_of, bus):
+    valid = {index: 0x80 * (index - 0x13FC) for index in (0x1402, 0x1403)}
+    for node in bus.nodes.values():
+        node.values |= {(index, 1): struct.pack("<I", base + node.node) for index, base in valid.items()}
+    with Link(arm_of(), bus) as link:
+        link.start()
+    for node in bus.nodes.values():
+        for index, base in valid.items():
+            assert struct.unpack("<I", node.values[index, 1])[0] == 0x80000000 | base + node.node
+
+
+def test_an_rpdo_that_stays_valid_is_refused(arm_of, bus):
+    class Stubborn(dict):
+        def __setitem__(self, key, value):
+            if key != (0x1402, 1):
+                super().__setitem__(key, value)
+
+    bus.nodes[2].values = Stubborn(bus.nodes[2].values | {(0x1402, 1): struct.pack("<I", 0x402)})
+    with (
+        Link(arm_of(), bus) as link,
+        pytest.raises(BusFault, match=r"joint_2 \(node 2\): 1402h:01 RPDO3 COB-ID: stays valid"),
+    ):
+        link.start()
+
+
+@pytest.mark.parametrize(("age", "delay"), [(None, 0.05), (0.06, 0.02)])
+def test_a_command_that_ages_between_gate_and_bus_does_not_leave(enabled, bus, age, delay):
+    """As where the host is suspended for a while just before it sends: `delay` for each of three frames [s]."""
+    pack = enabled.commander.loop._command
+
+    def slow(*words):
+        bus.clock.time += delay
+        return pack(*words)
+
+    given = command(POSITION)
+    given.t = None if age is None else bus.clock.time - age
+    enabled.commander.loop._command = slow
+    bus.sent.clear()
+    with pytest.raises(HostLate, match=r"the host was \d+ ms late .*; the command grew too old before its frames left"):
+        enabled.cycle(given)
+    words = [struct.unpack("<Hhi", data)[0] for can_id, data in bus.sent if can_id & 0x780 == 0x200]
+    assert set(words) == {0x02}
 
 
 def test_a_node_id_given_twice_is_found_after_three_cycles(enabled, bus):

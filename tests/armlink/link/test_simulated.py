@@ -1,5 +1,7 @@
 """The link on the simulated arm: physics, frames and controllers as `armlink demo` uses them."""
 
+import struct
+
 import numpy as np
 import pytest
 import yaml
@@ -132,3 +134,44 @@ def test_a_joint_of_a_model_file_gets_its_range_from_the_model(tmp_path):
     )
     ranges = joint_ranges(load_arm(tmp_path / "arm.yaml"))
     np.testing.assert_allclose(np.degrees(ranges), [[-10, 10], [-90, 45]])
+
+
+@pytest.mark.parametrize("number", [3, 4])
+def test_an_rpdo_that_another_program_has_mapped_cannot_move_a_joint(link, simulated, number):
+    """A second program mapped an RPDO of its own before the link came, and sends to it while the link holds."""
+    moved = simulated.nodes[6]
+    cob_id = 0x100 * (number + 1) + moved.node_id
+    communication, mapping = 0x1400 + number - 1, 0x1600 + number - 1
+    for entry in ((mapping, 1, struct.pack("<I", 0x60400010)), (mapping, 2, struct.pack("<I", 0x607A0020))):
+        moved.set_data(*entry)
+    moved.set_data(mapping, 0, b"\2")
+    moved.set_data(communication, 2, b"\x01")
+    moved.set_data(communication, 1, struct.pack("<I", cob_id))
+    link.start()
+    sample = link.enable()
+    run(link, Command.hold(sample.position), 0.5)
+    before = simulated.plant.position[6]
+    command = struct.pack("<Hi", 0x0F, int((sample.position[6] - 1.0) / (2 * np.pi) * (1 << 20)))
+    for _ in range(100):
+        simulated.on_frame(cob_id, command)
+        link.commander.stand([0x0F] * link.n)
+    assert abs(simulated.plant.position[6] - before) < 1e-3
+
+
+def test_a_joint_under_position_control_that_something_else_moves_is_stopped(link, simulated):
+    """Its target is changed in its controller behind the link's back: unseen by the watch of the bus."""
+    command = Command.hold(link.enable().position)
+    run(link, command, 0.2)
+    loops = simulated.drives.loops
+    last, advance = link.n - 1, loops.advance
+
+    def driven(duration, synchronous):
+        loops._position_in[last] -= round(0.02 / (2 * np.pi) * (1 << 20)) * pushes[0]
+        pushes[0] += 1
+        advance(duration, synchronous)
+
+    pushes = [1]
+    loops.advance = driven
+    with pytest.raises(Refused, match=r"gate: joint_7: (turns at|reads) .* something else moves it"):
+        run(link, command, 2.0)
+    assert np.abs(link.latest_position - command.position).max() < 1.0

@@ -1,5 +1,9 @@
 """The daemon's bus loop, with frames, physics and the link: driving, listening, faults, and the process that it has."""
 
+import os
+import signal
+import threading
+import time
 from collections import deque
 from pathlib import Path
 
@@ -16,6 +20,7 @@ from armlink.errors import BadInput, BusFault
 from armlink.link.link import Link
 from armlink.link.listener import Listener
 from armlink.link.types import Calibration, Command
+from armlink.loop.messages import Answer, Call
 from calib.arm.kinematics import gcomp_arm
 from calib.daemon.loop.arm_loop import ArmLoop
 from calib.daemon.loop.loop_messages import Batch, Down, LoopOptions, Up
@@ -58,6 +63,29 @@ def test_a_fault_of_a_joint_is_a_message_and_the_bus_is_opened_again(tmp_path: P
     assert isinstance(reply[0], Down)
     bench.run(1)
     assert bench.view.status().state is State.OBSERVING
+
+
+def test_through_a_fault_no_other_program_may_take_the_arm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from calib.daemon.loop import arm_loop
+
+    holds = []
+
+    class Hold:
+        def __init__(self, bus: object, nodes: object) -> None:
+            holds.append(self)
+
+        def release(self) -> None:
+            holds.remove(self)
+
+    monkeypatch.setattr(arm_loop, "ArmHold", Hold)
+    bench = DaemonBench(tmp_path, settings=settings("observe"), work=False)
+    bench.run(0.5)
+    bench.host.loop.source.stop()
+    bench.host.loop.run()
+    assert bench.host.loop.source is None
+    assert len(holds) == 1
+    bench.run(0.5)
+    assert len(holds) == 1
 
 
 def test_errors_of_the_bus_loop_come_back_as_what_they_are(tmp_path: Path) -> None:
@@ -172,10 +200,27 @@ def no_bus() -> None:
     raise BusFault("bus socketcan:can9: cannot open it: No such device")
 
 
+def test_sigterm_to_the_whole_group_is_left_to_the_service() -> None:
+    host = LoopProcess(LoopOptions(load_arm("sarcos"), open_bus=no_bus), fork=True)
+    host._channel.wait(60.0)
+    assert host.pid is not None
+    os.kill(host.pid, signal.SIGTERM)
+    answer: list[Answer] = []
+    asking = threading.Thread(target=lambda: answer.append(host.ask(Call(1, "read_calibration", (0,)))))
+    asking.start()
+    end = time.monotonic() + 60.0
+    while asking.is_alive() and time.monotonic() < end:
+        host._channel.wait(0.1)
+        host.pump()  # the process is there: this does not raise
+    assert "can9" in str(answer[0].error)
+    host.close()
+    assert host._process.exitcode == 0
+
+
 def test_the_bus_process_ends_when_the_service_is_gone() -> None:
     host = LoopProcess(LoopOptions(load_arm("sarcos"), open_bus=no_bus), fork=True)
-    assert host._ours.poll(60.0)
+    host._channel.wait(60.0)
     assert isinstance(host.pump()[0], Down)
-    host._ours.close()  # as the kernel does where the service is killed
+    host._channel.close()  # as the kernel does where the service is killed
     host._process.join(60.0)
     assert host._process.exitcode == 0

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from armlink.errors import BadInput, Refused
 from calib.records.database import default_url
-from calib.records.records import CalibrationRecord, GravityRecord, JointCalibration, parse_record
+from calib.records.records import CalibrationRecord, Discrepancy, GravityRecord, JointCalibration, parse_record
 from calib.records.store import RecordStore, export_yaml
 
 
@@ -38,6 +38,19 @@ def test_a_missing_value_needs_a_reason_and_a_reason_a_missing_value() -> None:
         JointCalibration(**values | {"gain": None})
     with pytest.raises(ValidationError, match="give a reason"):
         JointCalibration(**values, not_identifiable={"gain": "because"})
+
+
+def test_a_record_with_a_discrepancy_comes_back_and_one_without_keeps_its_content(store: RecordStore) -> None:
+    plain = calibration()
+    assert "discrepancy" not in plain.model_dump_json()
+    assert plain.discrepancy("level").tolist() == [0.0, 0.0]
+    doubt = Discrepancy(level=0.12, level_std=0.02, length=0.8)
+    first = plain.joints[0].model_copy(update={"discrepancy": doubt})
+    record = plain.model_copy(update={"joints": (first, *plain.joints[1:])})
+    assert record.id != plain.id
+    assert store.get(store.add(record)) == record
+    assert parse_record(yaml.safe_load(record.to_yaml()), "yaml") == record
+    assert record.discrepancy("length", missing=1.0).tolist() == [0.8, 1.0]
 
 
 def test_sizes_are_checked() -> None:

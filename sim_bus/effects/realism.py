@@ -1,0 +1,109 @@
+"""A realistic arm: all small troubles of a real one at once, each drawn at its published level (`sim.realism`).
+
+`LEVELS` are the levels at `level` 1, what good arms have after calibration; each grows in proportion to `level`, and
+3 is what bad ones have. Encoder, clock and noise stay as the arm file has them.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from armlink.arrays import Array
+from sim_bus.effects.state import Imperfections
+
+
+@dataclass(frozen=True)
+class Level:
+    """Size of one trouble at level 1."""
+
+    size: float
+    unit: str
+    source: str
+
+
+LEVELS = {
+    "eccentricity": Level(
+        3e-4,
+        "rad",
+        "encoder disc of 65 mm off centre by 10 µm: 412.5 e/D arc seconds (Celera Motion, on scale eccentricity)",
+    ),
+    "cubic": Level(
+        1e-3, "of full scale, at full scale", "0.083 % (arXiv 2603.16040) to 0.5 % of full scale (strain gauges)"
+    ),
+    "hysteresis": Level(5e-4, "of rated torque", "torque sensors of accuracy class 0.05 (VDI/VDE 2646)"),
+    "crosstalk": Level(
+        2.5e-3, "1", "0.79 % of a bending moment without cross-roller bearings (SSRN 10.2139/ssrn.4216744), 0.2 % with"
+    ),
+    "warm_up": Level(
+        1e-3, "of rated torque", "zero of class 0.05 per 10 K (VDI/VDE 2646), a joint that warms by 20 K in an hour"
+    ),
+    "cable": Level(
+        1e-3,
+        "of rated torque per rad",
+        "Lin et al. 2019, gravity compensation of the dVRK's master arms: cables pull by per cents of gravity there",
+    ),
+    "cable_lag": Level(5e-4, "of rated torque", "the same: half of a cable's pull depends on where it comes from"),
+    "sag": Level(
+        3e-4, "rad at rated torque", "1 mrad of a gear of 3 to 6·10⁴ N·m/rad (Harmonic Drive CSG-25), encoder behind it"
+    ),
+    "axis": Level(
+        1e-3, "rad", "Nubiola and Bonev 2013: an uncalibrated ABB IRB 1600 is off by 1 mm (mean) to 2.2 mm at the tool"
+    ),
+    "length": Level(1e-3, "m", "the same"),
+    "tilt": Level(2e-3, "rad", "a base set up by spirit level, 0.1°"),
+    "friction_position": Level(
+        0.1, "of Coulomb friction", "Bittencourt and Gunnarsson 2012, static friction in a robot joint: joint angle"
+    ),
+    "friction_load": Level(5e-3, "1", "the same: load torque"),
+    "friction_warm_up": Level(0.3, "of Coulomb friction", "the same: 30 to 80 °C"),
+}
+"""What each trouble is at level 1, and from where."""
+SMALLEST, LARGEST = 0.5, 1.5
+"""Range of a drawn size, as a share of its level."""
+COLD = 1200.0
+"""Mean time constant of warming up [s]."""
+BEND = 0.5
+"""Mean turn of a cable's bend per turn of the neighbouring joint."""
+
+
+def add_realism(state: Imperfections, rated: Array, level: float, seed: int) -> None:
+    """Add all troubles at a level to `state`, drawn from `seed`; rated torques (n,) [N·m]."""
+    if level == 0:
+        return
+    n, random = len(rated), np.random.default_rng([seed, 41])
+
+    def drawn(name: str, shape: int | tuple[int, ...] = n) -> Array:
+        size = level * LEVELS[name].size * random.uniform(SMALLEST, LARGEST, shape)
+        signed: Array = size * random.choice([-1.0, 1.0], shape)
+        return signed
+
+    turn = 2 * np.pi
+    own = np.column_stack([np.abs(drawn("eccentricity")), random.uniform(0, turn, n)])
+    state.eccentricity[:] = np.where(state.eccentricity[:, :1] > 0, state.eccentricity, own)
+    state.cubic += drawn("cubic")
+    state.hysteresis += np.abs(drawn("hysteresis")) * rated
+    for joint in range(n):
+        for neighbour in {joint - 1, joint + 1} & set(range(n)):
+            state.crosstalk[joint, neighbour] += drawn("crosstalk", 1)[0]
+    state.warm_up[:] = np.column_stack([drawn("warm_up") * rated, COLD * random.uniform(SMALLEST, LARGEST, n)])
+    state.cable[:] = np.column_stack(
+        [
+            np.abs(drawn("cable")) * rated,
+            BEND * random.uniform(-LARGEST, LARGEST, n),
+            random.uniform(-0.3, 0.3, n),
+            np.abs(drawn("cable_lag")) * rated,
+            random.uniform(0.1, 0.4, n),
+        ]
+    )
+    state.compliance += np.abs(drawn("sag")) / rated
+    state.frame_turn += random.uniform(-1, 1, (n, 3)) * level * LEVELS["axis"].size
+    state.frame_shift += random.uniform(-1, 1, (n, 3)) * level * LEVELS["length"].size
+    state.tilt += random.uniform(-1, 1, 2) * level * LEVELS["tilt"].size
+    state.uneven[:] = np.column_stack(
+        [
+            np.minimum(np.abs(drawn("friction_position")), 0.9),
+            random.uniform(0, turn, n),
+            np.abs(drawn("friction_load")),
+            np.abs(drawn("friction_warm_up")),
+        ]
+    )
