@@ -90,6 +90,10 @@ class ODriveDrives(BasicDrives):
             for message in FROM_HOST
         }
 
+    def reading_ids(self) -> Mapping[int, int]:
+        """See Drives."""
+        return {identifier(node, Message.ESTIMATES): joint for node, joint in self._joint_of.items()}
+
     # ---- set-up
 
     def identify(self, ask: Ask) -> list[DriveIdentity]:
