@@ -31,10 +31,14 @@ class Section(BaseModel):
 S = TypeVar("S", bound=Section)
 
 
+Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f\x7f/\\]*$")]
+"""A name that goes into file names and reports: one line, no path."""
+
+
 class DhJoint(Section):
     """One revolute joint in standard Denavit-Hartenberg form; `lower` and `upper` are its mechanical stops."""
 
-    name: str
+    name: Name
     a: FiniteFloat = 0.0
     """Link length [m]."""
     alpha: FiniteFloat = 0.0
@@ -101,7 +105,7 @@ class DeviceIdentity(Section):
 class LinkJoint(Section):
     """One joint controller: its node and the limits that no frame may exceed."""
 
-    name: str
+    name: Name
     node: Annotated[int, Field(ge=1, le=127)]
     rated_torque: Positive
     """Torque that 1000 ‰ stands for (6076h) [N·m]."""
@@ -150,14 +154,21 @@ class LinkSection(Section):
 class ArmFile(Section):
     """A whole arm file. `sweep`, `sim`, `daemon` hold the models that packages registered in `armlink.sections`."""
 
-    name: str
-    serial: str = "unknown"
+    name: Name
+    serial: Name = "unknown"
     kinematics: Kinematics
     link: LinkSection | None = None
     sweep: Any = None
     sim: Any = None
     daemon: Any = None
     path: Path
+
+    @model_validator(mode="after")
+    def _name_is_no_folder(self) -> "ArmFile":
+        for key, value in (("name", self.name), ("serial", self.serial)):
+            if value in (".", ".."):
+                raise ValueError(f"{key} is {value!r}, expected a name that can be part of a file's name")
+        return self
 
     @model_validator(mode="after")
     def _same_joints_everywhere(self) -> "ArmFile":
@@ -219,12 +230,22 @@ def load_arm(arm: str | Path) -> ArmFile:
     if not path.is_file():
         raise BadInput(f"no arm file {arm}: give a path, or a bundled arm ({', '.join(sorted(bundled_arms()))})")
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise BadInput(f"{path}: not YAML: {error}") from None
+        content = read_yaml(path)
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be read: {error.strerror}") from None
     if not isinstance(content, dict):
         raise BadInput(f"{path}: expected a mapping with keys name, kinematics, link, not {type(content).__name__}")
     return parse_arm(content, path)
+
+
+def read_yaml(path: Path) -> Any:
+    """Content of a YAML file; raises BadInput, in one line, where it is none, OSError where it cannot be read."""
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except RecursionError:
+        raise BadInput(f"{path}: not YAML that can be used: nested too deeply") from None
+    except (yaml.YAMLError, ValueError, OverflowError) as error:  # a date or number that does not exist, for example
+        raise BadInput(f"{path}: not YAML: {' '.join(str(error).split())}") from None
 
 
 def parse_arm(content: dict[str, Any], path: Path) -> ArmFile:
@@ -251,9 +272,17 @@ def describe(error: ValidationError, within: str = "") -> str:
     message = first["msg"].removeprefix("Value error, ")
     if first["type"] == "extra_forbidden":
         message = "unknown key; remove it or correct its spelling"
-    value = "" if isinstance(first["input"], dict | list | tuple | Section) else f" (value {first['input']!r})"
+    value = "" if isinstance(first["input"], dict | list | tuple | Section) else f" (value {_short(first['input'])})"
     more = f"; {len(findings) - 1} more" if len(findings) > 1 else ""
     return f"key {key}: {message}{value}{more}"
+
+
+def _short(value: Any) -> str:
+    try:
+        text = repr(value)
+    except ValueError:  # a number of more digits than Python writes
+        return "a number of very many digits"
+    return text if len(text) <= 100 else f"{text[:100]}…"
 
 
 def _no_twins(values: list[Any]) -> None:

@@ -37,8 +37,7 @@ def write_model(sim: SimModel, estimate: Estimate | None, path: Path) -> list[st
     ]
     lines = [] if estimate is None else [_line(sim, estimate, term) for term in left]
     module = module_path(path)
-    text = "".join(f"  {line}\n" for line in lines)
-    comment = f"<!-- Effects that MJCF cannot hold ({module.name} applies them):\n{text}-->\n" if lines else ""
+    comment = xml_comment([f"Effects that MJCF cannot hold ({module.name} applies them):", *lines]) if lines else ""
     try:
         path.write_text(comment + spec.to_xml(), encoding="utf-8")
         if lines and estimate is not None:
@@ -46,6 +45,14 @@ def write_model(sim: SimModel, estimate: Estimate | None, path: Path) -> list[st
     except OSError as error:
         raise BadInput(f"{error.filename}: cannot be written: {error.strerror}") from None
     return lines
+
+
+def xml_comment(lines: list[str]) -> str:
+    """Lines as an XML comment; two hyphens, which would end it, are parted."""
+    text = "\n  ".join(lines)
+    while "--" in text:
+        text = text.replace("--", "- -")
+    return f"<!-- {text}\n-->\n"
 
 
 def _gains(sim: SimModel, estimate: Estimate | None) -> dict[str, float]:
