@@ -1,7 +1,8 @@
 """Refinement of the sensor fit: effects beyond the sensor model, as extra linear columns (docs/theory.md, section 5.4).
 
 A rounded position has the same error in every reading taken there, so the rounding of each distinct position is an
-unknown of its own, with a prior. Other effects (hysteresis, a spring) enter in the same way, without a prior.
+unknown of its own, with a prior. So are the small troubles of a real arm, whose levels are learned from the readings
+(section 4.6). Effects that stand out against these (hysteresis, a spring) enter in the same way, without a prior.
 Gauss-Newton from the global fit; each joint's noise is scaled to the scatter found.
 """
 
@@ -113,7 +114,8 @@ def refine(
     found = analyse(step.triangle, step.scale)
     inner, behind = slice(0, step.parameters), slice(step.parameters, None)
     residual = np.full(readings.torque.shape, np.nan)
-    residual[readings.counted] = step.linear.residual * step.linear.sigma
+    troubled = step.linear.effects @ (step.linear.effects.T @ step.linear.residual)
+    residual[readings.counted] = (step.linear.residual + troubled) * step.linear.sigma
     determined, covariance = found.determined[inner], found.covariance[inner, inner]
     deviation = np.zeros(len(vector))
     deviation[problem.free] = np.where(determined, np.sqrt(np.abs(np.diag(covariance))), np.inf)
