@@ -8,7 +8,9 @@ from calib.observer.investigation import Investigation
 from calib.observer.tracking.tracking import Tracking
 
 DOUBTED = 2
-"""Windows in a row that nothing explains after which the level of the discrepancy is adapted to them."""
+"""Windows in a row that nothing explains after which the level of the discrepancy is adapted to them.
+
+An alarm is open, or the first epoch of the reference."""
 
 
 def audit(tracking: Tracking, state: Investigation, config: ObserverConfig) -> None:
@@ -21,11 +23,13 @@ def audit(tracking: Tracking, state: Investigation, config: ObserverConfig) -> N
     verdict = tracking.cause_test(window).verdict()
     if verdict.cause == "unknown":
         state.doubtful += 1
-        if state.doubtful >= DOUBTED:  # an alarm would be open if it were a contact
+        # longer than a change takes to fill the window; an alarm would be open if it were a contact
+        patience = DOUBTED if tracking.belief.is_first else config.longest_window // config.audit_rows + 1
+        if state.doubtful >= patience:
             tracking.adapt(window)
             verdict = tracking.cause_test(window).verdict()
+    state.doubtful = state.doubtful if verdict.cause == "unknown" else 0
     if verdict.cause == "none":
-        state.doubtful = 0
         tracking.learn(state.settled(tracking.belief.is_first))
         return
     del state.window[: -config.longest_window]

@@ -55,9 +55,11 @@ class Observer:
         self._position_gain = np.ones(arm.n) if position_gain is None else position_gain
         self._position_offset = np.zeros(arm.n) if position_offset is None else position_offset
         self._rest = RestDetector(arm.n, self.config)
-        expected = level or Level.expected(self.config.discrepancy_share / self.config.noise_share * np.asarray(sigma))
+        rated, settings = np.asarray(sigma, dtype=float) / self.config.noise_share, self.config
+        expected = level or Level.expected(settings.discrepancy_share * rated)
+        wander = settings.zero_wander * rated
         belief = GravityBelief(
-            arm, beta, beta_covariance, self.config.position_std, expected, self.config.baseline_rows
+            arm, beta, beta_covariance, settings.position_std, expected, settings.baseline_rows, wander
         )
         self._tracking = Tracking(belief, sigma, self.config)
         self._investigation = Investigation(arm.n, self.config)
