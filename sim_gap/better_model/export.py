@@ -56,8 +56,7 @@ def written(
     lines = [] if estimate is None else [_line(sim, estimate, term) for term in left]
     lines += [f"{name}: its link as fitted cannot exist; the file has one that can" for name in corrected.changed]
     module = module_path(Path(name)).name
-    text = "".join(f"  {line}\n" for line in lines)
-    comment = f"<!-- Effects that MJCF cannot hold ({module} applies them):\n{text}-->\n" if lines else ""
+    comment = xml_comment([f"Effects that MJCF cannot hold ({module} applies them):", *lines]) if lines else ""
     effects = [] if estimate is None else joint_effects(sim, estimate, left)
     effects += [(GEARED, joint, {"gain": gain}) for joint, gain in gains.items() if joint in driven]
     source = module_text(sim, effects, name) if effects else ""
@@ -78,6 +77,14 @@ def write_model(sim: SimModel, estimate: Estimate | None, path: Path) -> list[st
     except OSError as error:
         raise BadInput(f"{error.filename}: cannot be written: {error.strerror}") from None
     return files.lines
+
+
+def xml_comment(lines: list[str]) -> str:
+    """Lines as an XML comment; two hyphens, which would end it, are parted."""
+    text = "\n  ".join(lines)
+    while "--" in text:
+        text = text.replace("--", "- -")
+    return f"<!-- {text}\n-->\n"
 
 
 def _gains(sim: SimModel, estimate: Estimate | None, terms: Sequence[Term]) -> dict[str, float]:
