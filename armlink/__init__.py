@@ -1,1 +1,39 @@
-"""The wire: CAN frames to samples in SI units and limited commands back; arm file and recordings."""
+"""The wire: CAN frames to samples in SI units and limited commands back; arm file and recordings.
+
+The names in `__all__` are the whole procedure for programs and notebooks (docs/reference/api.md). Each is loaded when
+it is first used, by way of the entry points `armlink.api`: the packages above this one contribute theirs, as they do
+commands.
+"""
+
+from typing import Any
+
+__all__ = [
+    "ArmFile",
+    "ArmlinkError",
+    "Recording",
+    "calibrate",
+    "diagnose",
+    "identify",
+    "load_arm",
+    "load_recording",
+    "observe",
+    "open_link",
+    "sweep",
+    "verify",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, loaded at first use."""
+    if name in __all__:
+        from importlib.metadata import entry_points
+
+        for point in entry_points(group="armlink.api", name=name):
+            globals()[name] = point.load()
+            return globals()[name]
+    raise AttributeError(f"module 'armlink' has no attribute {name!r}; it offers {', '.join(__all__)}")
+
+
+def __dir__() -> list[str]:
+    """Modules that are loaded, and the public names."""
+    return sorted({*globals(), *__all__})

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from functools import cached_property
+from functools import cache, cached_property
 from importlib.metadata import entry_points
 from importlib.resources import files
 from pathlib import Path
@@ -10,11 +10,15 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from armlink.arrays import Array
 from armlink.errors import BadInput
+from armlink.key_errors import describe, describe_all, meant
 
+SIMULATED = "armlink_sim"
+"""Interface of a simulated arm in this process; its channel is an arm file."""
+MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
 
 
@@ -33,6 +37,15 @@ S = TypeVar("S", bound=Section)
 
 Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f\x7f/\\]*$")]
 """A name that goes into file names and reports: one line, no path."""
+
+
+class BadKeys(BadInput):
+    """Keys of an arm file that cannot be used; the message names the first."""
+
+    def __init__(self, path: Path, first: str, keys: list[tuple[str, str]]) -> None:
+        """`keys` are (key, what is wrong with it), all of them."""
+        super().__init__(f"{path}: {first}")
+        self.keys = keys
 
 
 class DhJoint(Section):
@@ -59,6 +72,9 @@ class DhJoint(Section):
         return self
 
 
+Range = Annotated[tuple[FiniteFloat, ...], Field(min_length=2, max_length=2)]
+
+
 class Kinematics(Section):
     """Where the joints are: Denavit-Hartenberg rows from base to tip, or a URDF or MJCF model."""
 
@@ -69,12 +85,19 @@ class Kinematics(Section):
     """URDF or MJCF file instead of `joints`, relative to the arm file."""
     tip: str | None = None
     """Body of the model that the chain ends in; by default its last."""
+    stops: dict[str, Range] = {}
+    """Mechanical stops (lower, upper) [rad] of joints of the model by name, instead of the model's own limits."""
 
     @model_validator(mode="after")
     def _one_description(self) -> "Kinematics":
         if bool(self.joints) == (self.model is not None):
             raise ValueError("give either joints (Denavit-Hartenberg rows) or model (URDF or MJCF), and not both")
         _no_twins([joint.name for joint in self.joints])
+        if self.stops and self.joints:
+            raise ValueError("stops is for a model: Denavit-Hartenberg rows have lower and upper")
+        for name, (lower, upper) in self.stops.items():
+            if lower >= upper:
+                raise ValueError(f"stops: joint {name}: lower {lower} must be less than upper {upper} [rad]")
         return self
 
 
@@ -90,6 +113,25 @@ class Bus(Section):
     """Further options of python-can's interface, such as data_bitrate or serial."""
 
 
+def _parse_drive(keys: Any) -> Any:
+    """Validate `link.joints[].drive` by its family's own model (entry-point group `armlink.drives`)."""
+    if keys is None or isinstance(keys, Section):
+        return keys
+    if not isinstance(keys, dict) or not isinstance(keys.get("family"), str):
+        raise ValueError("expected a mapping with the key family")
+    return _drive_settings(keys["family"]).model_validate(keys)
+
+
+@cache
+def _drive_settings(family: str) -> type[Section]:
+    points = entry_points(group="armlink.drives", name=family)
+    if not points:
+        known = ", ".join(sorted({point.name for point in entry_points(group="armlink.drives")}))
+        raise ValueError(f"no drive family {family!r}; there are {known}")
+    settings: type[Section] = next(iter(points)).load().settings
+    return settings
+
+
 U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 
 
@@ -103,10 +145,13 @@ class DeviceIdentity(Section):
 
 
 class LinkJoint(Section):
-    """One joint controller: its node and the limits that no frame may exceed."""
+    """One joint controller: its drive and the limits that no frame may exceed."""
 
     name: Name
-    node: Annotated[int, Field(ge=1, le=127)]
+    node: Annotated[int, Field(ge=1, le=127)] | None = None
+    """Short for `drive: {family: canopen, node: …}`: CiA 402 with our own torque sensor object 2100h."""
+    drive: Annotated[Any, BeforeValidator(_parse_drive)] = None
+    """Family of the drive and the keys of that family (docs/drives.md)."""
     rated_torque: Positive
     """Torque that 1000 ‰ stands for (6076h) [N·m]."""
     max_torque: Positive
@@ -122,13 +167,24 @@ class LinkJoint(Section):
     bus: str = ""
     """Name of its bus in link.buses; empty: link.bus."""
 
+    @model_validator(mode="after")
+    def _one_drive(self) -> "LinkJoint":
+        if (self.node is None) == (self.drive is None):
+            raise ValueError(f"{self.name}: give either drive ({{family: …}}) or node, and not both")
+        return self
+
+    @property
+    def settings(self) -> Any:
+        """Keys of its drive: the settings model of its family."""
+        return self.drive if self.node is None else _parse_drive({"family": "canopen", "node": self.node})
+
 
 class LinkSection(Section):
     """The link: bus, rate and joint controllers in joint order."""
 
     bus: Bus = Bus()
     buses: dict[str, Bus] = {}
-    """Further buses by name, for joints that name one; node ids are unique over all of them."""
+    """Further buses by name, for joints that name one; ids are unique on each bus."""
     rate: Annotated[FiniteFloat, Field(gt=0, le=1000)] = 250.0
     """SYNC rate [Hz]."""
     deadline: Annotated[FiniteFloat, Field(ge=0.01, le=10)] = 0.1
@@ -143,7 +199,7 @@ class LinkSection(Section):
     @model_validator(mode="after")
     def _nodes_are_unique(self) -> "LinkSection":
         _no_twins([joint.name for joint in self.joints])
-        _no_twins([joint.node for joint in self.joints])
+        _no_twins([f"{joint.settings.address}{joint.bus and ' on bus '}{joint.bus}" for joint in self.joints])
         for joint in self.joints:
             if joint.bus and joint.bus not in self.buses:
                 known = ", ".join(self.buses) or "none"
@@ -191,7 +247,8 @@ class ArmFile(Section):
     @cached_property
     def description_hash(self) -> str:
         """SHA-256 (hex) of the kinematics, model file included: results of another description are refused."""
-        content = json.dumps(self.kinematics.model_dump(mode="json"), sort_keys=True).encode()
+        unset = set() if self.kinematics.stops else {"stops"}  # results of before the key existed keep their hash
+        content = json.dumps(self.kinematics.model_dump(mode="json", exclude=unset), sort_keys=True).encode()
         if self.model_path is not None:
             content += self.model_path.read_bytes()
         return hashlib.sha256(content).hexdigest()
@@ -228,13 +285,16 @@ def load_arm(arm: str | Path) -> ArmFile:
     """
     path = bundled_arms().get(str(arm), Path(arm))
     if not path.is_file():
-        raise BadInput(f"no arm file {arm}: give a path, or a bundled arm ({', '.join(sorted(bundled_arms()))})")
+        raise BadInput(_no_arm_file(path))
+    if path.suffix.lower() in MODEL_SUFFIXES:
+        raise BadInput(f"{path}: is a model, not an arm file: make one of it with armlink new {path}")
     try:
         content = read_yaml(path)
     except OSError as error:
         raise BadInput(f"{path}: cannot be read: {error.strerror}") from None
     if not isinstance(content, dict):
-        raise BadInput(f"{path}: expected a mapping with keys name, kinematics, link, not {type(content).__name__}")
+        kind = "nothing" if content is None else type(content).__name__
+        raise BadInput(f"{path}: expected a mapping with keys name, kinematics, link, not {kind}")
     return parse_arm(content, path)
 
 
@@ -248,41 +308,41 @@ def read_yaml(path: Path) -> Any:
         raise BadInput(f"{path}: not YAML: {' '.join(str(error).split())}") from None
 
 
+def _no_arm_file(path: Path) -> str:
+    bundled, folder = sorted(bundled_arms()), path.parent
+    beside = [str(each) for each in folder.glob("*.y*ml")] if folder.is_dir() else []
+    close = meant(str(path), [*bundled, *beside])
+    hint = close if "mean" in close else ""
+    if path.is_dir():
+        return f"{path}: is a folder: give the arm file in it, or a bundled arm ({', '.join(bundled)})"
+    return f"no arm file {path}: give a path, or a bundled arm ({', '.join(bundled)}){hint}"
+
+
 def parse_arm(content: dict[str, Any], path: Path) -> ArmFile:
     """Validate an arm file's content; `path` is where it (would have) stood. Raises BadInput."""
     if "path" in content:
         raise BadInput(f"{path}: key path: not a key of the arm file; remove it")
-    content, section = dict(content), ""
+    content, section, model = _with_simulated_bus(dict(content), path), "", ArmFile
     try:
         for point in entry_points(group="armlink.sections"):
-            section = point.name
-            if content.get(section) is not None:
-                content[section] = point.load().model_validate(content[section])
-        section = ""
+            if content.get(point.name) is not None:
+                section, model = point.name, point.load()
+                content[section] = model.model_validate(content[section])
+        section, model = "", ArmFile
         return ArmFile.model_validate({**content, "path": path.resolve()})
     except ValidationError as error:
-        raise BadInput(f"{path}: {describe(error, section)}") from None
+        raise BadKeys(path, describe(error, section, model), describe_all(error, section, model)) from None
 
 
-def describe(error: ValidationError, within: str = "") -> str:
-    """The first of pydantic's findings as one line: key, what is wrong, the value, how many more there are."""
-    findings = error.errors(include_url=False)
-    first = findings[0]
-    key = ".".join([within] * bool(within) + [str(part) for part in first["loc"]]) or "file"
-    message = first["msg"].removeprefix("Value error, ")
-    if first["type"] == "extra_forbidden":
-        message = "unknown key; remove it or correct its spelling"
-    value = "" if isinstance(first["input"], dict | list | tuple | Section) else f" (value {_short(first['input'])})"
-    more = f"; {len(findings) - 1} more" if len(findings) > 1 else ""
-    return f"key {key}: {message}{value}{more}"
-
-
-def _short(value: Any) -> str:
-    try:
-        text = repr(value)
-    except ValueError:  # a number of more digits than Python writes
-        return "a number of very many digits"
-    return text if len(text) <= 100 else f"{text[:100]}…"
+def _with_simulated_bus(content: dict[str, Any], path: Path) -> dict[str, Any]:
+    """The content, with the channel of a simulated bus that lies beside the arm file as an absolute path."""
+    link = content.get("link")
+    bus = link.get("bus") if isinstance(link, dict) else None
+    if isinstance(link, dict) and isinstance(bus, dict) and bus.get("interface") == SIMULATED:
+        beside = path.resolve().parent / str(bus.get("channel"))
+        if beside.is_file():
+            content["link"] = {**link, "bus": {**bus, "channel": str(beside)}}
+    return content
 
 
 def _no_twins(values: list[Any]) -> None:

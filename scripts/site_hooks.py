@@ -21,7 +21,15 @@ from mkdocs.structure.pages import Page
 from armlink import cli
 
 ROOT = Path(__file__).parent.parent
-OUTSIDE = ("CHANGELOG.md", "CONTRIBUTING.md", "LICENSE", "CITATION.cff", "examples/*.*", "packaging/*.service")
+OUTSIDE = (
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+    "LICENSE",
+    "CITATION.cff",
+    "examples/*.*",
+    "notebooks/*.ipynb",
+    "packaging/*.service",
+)
 """Files of the site that lie outside docs/."""
 HOME = {"README.md": "index.md"}
 """Pages that are not in the site, and the page that a link to them leads to instead."""

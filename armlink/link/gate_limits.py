@@ -3,9 +3,10 @@
 import math
 
 from armlink.arm_file import ArmFile, LinkJoint
-from armlink.canopen.units import Units, assumed_units
+from armlink.drives.canopen.units import Units, assumed_units
 from armlink.errors import BadInput
 from armlink.link.gate import JointLimits
+from armlink.model_file import compile_model
 
 INT16_MAX, INT32_MAX, UINT32_MAX = 2**15 - 1, 2**31 - 1, 2**32 - 1
 POSITION_GAIN_ERROR = 0.02
@@ -32,18 +33,19 @@ def joint_ranges(arm: ArmFile) -> tuple[tuple[float, float], ...]:
         return tuple((joint.lower, joint.upper) for joint in arm.kinematics.joints)
     import mujoco
 
-    try:
-        model = mujoco.MjModel.from_xml_path(str(arm.model_path))
-    except ValueError as error:
-        raise BadInput(f"{arm.model_path}: {error}") from None
-    ranges = []
+    assert arm.model_path is not None
+    model, ranges = compile_model(arm.model_path), []
     for joint in arm.require_link().joints:
         index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, joint.name)
         if index < 0:
             raise BadInput(f"{arm.path}: link.joints names {joint.name}, which {arm.model_path} has not")
-        if not model.jnt_limited[index]:
-            raise BadInput(f"{arm.model_path}: joint {joint.name} has no range: give its stops [rad]")
-        ranges.append((float(model.jnt_range[index][0]), float(model.jnt_range[index][1])))
+        if joint.name not in arm.kinematics.stops and not model.jnt_limited[index]:
+            raise BadInput(
+                f"{arm.model_path}: joint {joint.name} has no range: give its stops [rad] in the arm file, as"
+                f" kinematics: {{stops: {{{joint.name}: [-3.0, 3.0]}}}}"
+            )
+        lower, upper = arm.kinematics.stops.get(joint.name, model.jnt_range[index])
+        ranges.append((float(lower), float(upper)))
     return tuple(ranges)
 
 

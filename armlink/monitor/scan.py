@@ -4,10 +4,10 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 
 from armlink.bus.port import Port
-from armlink.canopen.eds_file import bundled
-from armlink.canopen.object_dictionary import SDO_REQUEST_ID
-from armlink.canopen.sdo import NodeServices, PumpedNetwork
 from armlink.clock import Clock
+from armlink.drives.canopen.eds_file import bundled
+from armlink.drives.canopen.object_dictionary import SDO_REQUEST_ID
+from armlink.drives.canopen.sdo import NodeServices, Pump, PumpedNetwork
 from armlink.link.controller_setup import identify
 from armlink.link.types import Identity
 
@@ -16,11 +16,8 @@ SEARCH_SECONDS = 0.3
 _READ_DEVICE_TYPE = b"\x40\x00\x10\x00\x00\x00\x00\x00"
 
 
-def scan_bus(port: Port, clock: Clock, joints: Mapping[int, str]) -> list[Identity]:
-    """Every node that answers a read of its device type, and the nodes of `joints` (node id → joint name) that do not.
-
-    Sorted by node id. Raises BusFault if a node that answered stops answering.
-    """
+def reading_network(port: Port, clock: Clock) -> tuple[PumpedNetwork, Pump]:
+    """A network for SDO reads over a port, and the function that waits for their answers."""
     network = PumpedNetwork(port.send)
 
     def pump(done: Callable[[], bool], timeout: float) -> bool:
@@ -32,6 +29,15 @@ def scan_bus(port: Port, clock: Clock, joints: Mapping[int, str]) -> list[Identi
             network.notify(frame[0], bytearray(frame[1]), 0.0)
         return True
 
+    return network, pump
+
+
+def scan_bus(port: Port, clock: Clock, joints: Mapping[int, str]) -> list[Identity]:
+    """Every node that answers a read of its device type, and the nodes of `joints` (node id → joint name) that do not.
+
+    Sorted by node id. Raises BusFault if a node that answered stops answering.
+    """
+    network, pump = reading_network(port, clock)
     found = _search(port, pump, network)
     dictionary = bundled()
     identities = []
@@ -46,7 +52,7 @@ def scan_bus(port: Port, clock: Clock, joints: Mapping[int, str]) -> list[Identi
     return identities
 
 
-def _search(port: Port, pump: Callable[[Callable[[], bool], float], bool], network: PumpedNetwork) -> Counter[int]:
+def _search(port: Port, pump: Pump, network: PumpedNetwork) -> Counter[int]:
     """Node id → number of responses to one request."""
     found: Counter[int] = Counter()
 

@@ -6,7 +6,7 @@ temperatures go as effort on `/joint_temperatures` [°C].
 """
 
 import struct
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import IO, Any, Self
 import numpy as np
 from lz4.frame import LZ4FrameDecompressor
 from mcap.exceptions import McapError
+from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Footer, Message, Schema
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
@@ -44,8 +45,9 @@ _NANO = 1_000_000_000
 class RecordingWriter:
     """Writes rows one by one; a context manager that completes the file."""
 
-    def __init__(self, path: Path, names: tuple[str, ...]) -> None:
+    def __init__(self, path: str | Path, names: tuple[str, ...]) -> None:
         """Create the file for joints with these names."""
+        path = Path(path)
         self._stream = path.open("wb")
         self._names, self._n = names, len(names)
         self._writer = Writer(self._stream)
@@ -98,14 +100,21 @@ def load_mcap(path: Path) -> Recording:
     """Load a recording or a ROS 2 bag in MCAP; a truncated file loads as far as it goes, noted in `warning`.
 
     Time is that of `/joint_states` from its first message; other topics' messages go to the row nearest in time, if
-    nearer than half the median period, and are NaN elsewhere. Joints are those of the first `/joint_states` message.
+    nearer than half the median period, and are NaN elsewhere. Joints are those of the most frequent `/joint_states`
+    message.
     """
     messages, cut = _read(path)
     states = messages.pop("/joint_states", [])
     if not states:
         raise BadInput(f"{path}: no {SCHEMA_NAME} on /joint_states{f'; {cut}' if cut else ''}")
     stamps = np.array([state.stamp for state in states], dtype=np.int64)
-    names = states[0].names
+    counts = Counter(state.names for state in states)
+    names = max(counts, key=lambda each: counts[each] * len(each))
+    alone = sorted({name for each in counts if not set(names) <= set(each) for name in each} - set(names))
+    if alone:
+        cut = "; ".join(filter(None, (cut, f"joints in messages of their own, left out: {', '.join(alone)}")))
+        states = [state for state in states if set(names) <= set(state.names)]
+        stamps = np.array([state.stamp for state in states], dtype=np.int64)
     if len(names) > MOST_JOINTS:
         raise BadInput(f"{path}: {len(names)} joints in /joint_states, expected at most {MOST_JOINTS}")
     channels = _channels_of("/joint_states", states, names, str(path))
@@ -117,6 +126,23 @@ def load_mcap(path: Path) -> Recording:
     if "position" not in channels:
         raise BadInput(f"{path}: /joint_states carry no position")
     return Recording(t=(stamps - stamps[0]) / _NANO, names=names, warning=cut, **channels)
+
+
+def has_our_topics(path: Path) -> bool:
+    """Whether a file's joint states are where this module looks, or cannot be told because it is cut."""
+    try:
+        with path.open("rb") as stream:
+            summary = make_reader(stream).get_summary()
+    except (McapError, ValueError, OSError, struct.error, ZstdError, MemoryError):
+        return True
+    if summary is None or not summary.channels:
+        return True
+    kinds = {
+        channel.topic: summary.schemas[channel.schema_id].name
+        for channel in summary.channels.values()
+        if channel.schema_id in summary.schemas
+    }
+    return "/joint_states" in kinds and all(kinds.get(topic, SCHEMA_NAME) == SCHEMA_NAME for topic in TOPICS)
 
 
 def _read(path: Path) -> tuple[dict[str, list[JointState]], str]:

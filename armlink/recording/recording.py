@@ -1,8 +1,8 @@
 """Recordings: an arm's channels over time, and their columns in tables."""
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,10 +79,20 @@ class Recording:
                 expected = (self.t.size, len(self.names))
                 raise BadInput(f"{source}: channel {name} has shape {values.shape}, expected {expected}")
             _check_finite_or_nan(values, COLUMNS[name], source)
-        if not any(getattr(self, name) is not None for name in TORQUE_CHANNELS):
+        if not any(getattr(self, name) is not None for name in (*TORQUE_CHANNELS, "position_command")):
             wanted = ", ".join(f"{COLUMNS[name]}_1" for name in TORQUE_CHANNELS)
-            raise BadInput(f"{source}: no torque channel: at least one of {wanted} … is required")
+            raise BadInput(f"{source}: no torque channel: at least one of {wanted} …, or q_cmd_1 …, is required")
         return self
+
+
+def require_width(columns: Sequence[str], source: str) -> int:
+    """The highest joint number of the columns, at least 1; raises BadInput where no recording has so many."""
+    if len(columns) > MOST_COLUMNS:
+        raise BadInput(f"{source}: {len(columns)} columns, expected at most {MOST_COLUMNS}")
+    n = max((index for column in columns if (index := _joint_index(column)) is not None), default=1)
+    if n > MOST_JOINTS:
+        raise BadInput(f"{source}: a column is of joint {n}, expected at most {MOST_JOINTS} joints")
+    return n
 
 
 def require_size(size: int, source: str) -> None:
@@ -116,12 +126,7 @@ def channels_of(columns: Mapping[str, Array], source: str) -> dict[str, Array | 
 
 def joint_count(columns: list[str], source: str) -> int:
     """Number of joints that the column names describe; raises BadInput that names a missing column."""
-    if len(columns) > MOST_COLUMNS:
-        raise BadInput(f"{source}: {len(columns)} columns, expected at most {MOST_COLUMNS}")
-    indices = [index for column in columns if (index := _joint_index(column)) is not None]
-    n = max(indices, default=1)
-    if n > MOST_JOINTS:
-        raise BadInput(f"{source}: a column is of joint {n}, expected at most {MOST_JOINTS} joints")
+    n = require_width(columns, source)
     present = set(columns)
     for name, prefix in COLUMNS.items():
         wanted = [f"{prefix}_{i}" for i in range(1, n + 1)]
@@ -139,6 +144,12 @@ def is_channel(column: str) -> bool:
     return column == "t" or _joint_index(column) is not None
 
 
+def take_joints(recording: Recording, order: Sequence[int], names: tuple[str, ...] = ()) -> Recording:
+    """Some of a recording's joints, in another order; `names` replaces theirs."""
+    channels = {name: values[:, list(order)] for name, values in recording.channels().items()}
+    return replace(recording, names=names or tuple(recording.names[i] for i in order), **channels)  # type: ignore[arg-type]
+
+
 def slice_rows(recording: Recording, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Recording:
     """Some rows of a recording, with their times unchanged."""
     values = {field.name: getattr(recording, field.name) for field in fields(recording)}
@@ -148,10 +159,16 @@ def slice_rows(recording: Recording, rows: slice | NDArray[np.bool_] | NDArray[n
     return Recording(**values)
 
 
-def _joint_index(column: str) -> int | None:
+def channel_column(column: str) -> tuple[str, int] | None:
+    """Channel prefix and joint number from 1 of a column's name, or None if it is not that of a channel."""
     prefix, _, index = column.rpartition("_")
     known = prefix in COLUMNS.values() and _INDEX.fullmatch(index) is not None
-    return int(index) if known else None
+    return (prefix, int(index)) if known else None
+
+
+def _joint_index(column: str) -> int | None:
+    place = channel_column(column)
+    return place[1] if place else None
 
 
 def _check_time(t: Array, source: str) -> None:

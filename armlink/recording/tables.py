@@ -5,8 +5,10 @@ import gzip
 import json
 import zlib
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -16,14 +18,17 @@ import pyarrow.parquet as pa_parquet
 
 from armlink.arrays import Array
 from armlink.errors import BadInput
+from armlink.recording.column_names import suggested_map
 from armlink.recording.recording import (
     Recording,
+    channel_column,
     channels_of,
     columns_of,
     default_names,
     is_channel,
     joint_count,
     require_size,
+    require_width,
 )
 
 _LOOK_BACK = 20_000  # bytes at the end of a CSV file that show how long its numbers are
@@ -35,12 +40,16 @@ NAMES_KEY = b"armlink.names"
 """Parquet schema metadata: joint names as JSON."""
 
 
-def load_csv(path: Path) -> Recording:
-    """Load `.csv` or `.csv.gz` with a header row (docs/formats.md), up to a truncation; raises BadInput."""
+def load_csv(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> Recording:
+    """Load `.csv` or `.csv.gz` with a header row (docs/formats.md), up to a truncation; raises BadInput.
+
+    `columns`: column of docs/formats.md → the file's name for it.
+    """
     _require_header(path)
     content, cut = _content(path)
     header = _header(path, content)
-    joint_count(header, str(path))
+    require_width(header, str(path))
+    header = _renamed(header, columns, path)
     wanted = [column for column in header if is_channel(column)]
     try:
         table = pa_csv.read_csv(
@@ -59,16 +68,16 @@ def load_csv(path: Path) -> Recording:
     return loaded
 
 
-def load_parquet(path: Path) -> Recording:
+def load_parquet(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> Recording:
     """Load Parquet with the columns of docs/formats.md, joint names from the schema's metadata; raises BadInput."""
     try:
         schema = pa_parquet.read_schema(path)
-        header = list(schema.names)
-        joint_count(header, str(path))
-        wanted = [column for column in header if is_channel(column)]
+        require_width(schema.names, str(path))
+        header = _renamed(list(schema.names), columns, path)
+        wanted = {column: name for column, name in zip(header, schema.names, strict=True) if is_channel(column)}
         require_size(8 * len(wanted) * pa_parquet.read_metadata(path).num_rows, str(path))
-        table = pa_parquet.read_table(path, columns=wanted)
-        table = table.select(wanted).cast(pa.schema([(column, pa.float64()) for column in wanted]))
+        table = pa_parquet.read_table(path, columns=list(wanted.values())).select(list(wanted.values()))
+        table = table.rename_columns(list(wanted)).cast(pa.schema([(column, pa.float64()) for column in wanted]))
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise BadInput(f"{path}: {_first_line(error)}") from None
     return _recording(table, header, str(path), _names((schema.metadata or {}).get(NAMES_KEY), str(path)))
@@ -85,6 +94,26 @@ def _names(content: bytes | None, source: str) -> tuple[str, ...]:
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise BadInput(f"{source}: the schema's metadata {NAMES_KEY.decode()} is no JSON list of joint names")
     return tuple(names)
+
+
+def _renamed(header: list[str], columns: Mapping[str, str], path: Path) -> list[str]:
+    """The header with the file's own names replaced; raises BadInput, with a `--map` to paste if channels lack."""
+    foreign = {other: column for column, other in columns.items() if channel_column(other) is None}
+    missing = [name for name in foreign if name not in header]
+    if missing:
+        raise BadInput(f"{path}: --map {foreign[missing[0]]}={missing[0]}: no such column; it has {', '.join(header)}")
+    header = [foreign.get(name, name) for name in header]
+    twins = sorted({column for column in header if header.count(column) > 1})
+    if twins:
+        raise BadInput(f"{path}: column {twins[0]!r} occurs twice in the header row or after --map")
+    try:
+        joint_count(header, str(path))
+    except BadInput as error:
+        suggestion = suggested_map(header) if not foreign else ""
+        if not suggestion:
+            raise
+        raise BadInput(f"{error}; if its columns have other names, try {suggestion}") from None
+    return header
 
 
 def save_csv(recording: Recording, path: Path) -> None:

@@ -1,5 +1,7 @@
 """The arm file's kinematics as gcomp's arm, whether given as Denavit-Hartenberg rows or as a model file."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from armlink.arm_file import ArmFile
@@ -51,4 +53,15 @@ def model_arm(arm_file: ArmFile) -> ModelArm:
             f"{arm_file.path}: link.joints are {list(arm_file.joint_names)}, but the model's chain has "
             f"{list(model.arm.names)}: same names, same order"
         )
-    return model
+    return replace(model, arm=_with_stops(arm_file, model.arm)) if kinematics.stops else model
+
+
+def _with_stops(arm_file: ArmFile, arm: Arm) -> Arm:
+    """The arm with the arm file's stops where it has any; raises BadInput."""
+    stops = arm_file.kinematics.stops
+    for name in stops:
+        if name not in arm.names:
+            known = ", ".join(arm.names)
+            raise BadInput(f"{arm_file.path}: key kinematics.stops.{name}: no joint of that name; there are {known}")
+    limits = [stops.get(name, own) for name, *own in zip(arm.names, arm.lower, arm.upper, strict=True)]
+    return replace(arm, lower=np.array([low for low, _ in limits]), upper=np.array([high for _, high in limits]))

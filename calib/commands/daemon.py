@@ -1,4 +1,4 @@
-"""The long-running service: watches the arm, keeps its torque sensors true, serves a page and an API."""
+"""Runs the service that watches the arm, keeps its torque sensors true, and serves a page and an API."""
 
 from enum import StrEnum
 from pathlib import Path

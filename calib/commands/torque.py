@@ -1,4 +1,4 @@
-"""Gravity torque at poses, from a model's own inertials or an identified gravity record."""
+"""Computes gravity torque at poses, from a model's own inertials or an identified gravity record."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,8 +10,6 @@ from calib.commands.options import JsonFile, Store
 if TYPE_CHECKING:
     from gcomp.arm.arm import Arm
     from gcomp.arrays import Array
-
-MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
 
 
 def torque(
@@ -53,7 +51,7 @@ def _model(arm: str, tip: str | None, record: str | None, store: str | None) -> 
     """The arm, its mass moments (2n,) [kg·m], and their origin in words; raises BadInput, Refused."""
     import numpy as np
 
-    from armlink.arm_file import load_arm
+    from armlink.arm_file import MODEL_SUFFIXES, load_arm
     from armlink.errors import BadInput, Refused
     from calib.arm.kinematics import gcomp_arm, model_arm
     from calib.records.records import GravityRecord

@@ -170,7 +170,7 @@ class Daemon:
     def _tried(self) -> ArmFile:
         """The arm file, with all that the bus process will need of it tried; raises BadInput, OSError."""
         from armlink.bus.open import resolve_bus  # for a reload alone: they take memory
-        from armlink.canopen.eds_file import of_joints
+        from armlink.drives.canopen.eds_file import of_joints
         from armlink.link.gate_limits import try_limits
 
         arm = load_arm(self.options.arm)

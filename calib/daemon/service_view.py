@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from armlink.canopen.cia402 import state_of
+from armlink.drives.canopen.cia402 import state_of
 from calib.daemon.observing.observation import Observation
 from calib.daemon.service import Service
 from calib.daemon.state.history_reader import HistoryReader
@@ -92,7 +92,7 @@ class ServiceView:
         if self._observation is None:
             return ()
         feed, last_accepted = self._observation.feed, self._observation.last_accepted
-        estimate = feed.observer.estimate()
+        estimate, limits = feed.observer.estimate(), feed.observer.limits()
         gain, offset = (feed.calibration.values(name) for name in ("gain", "offset"))
         return tuple(
             JointEstimate(
@@ -105,6 +105,9 @@ class ServiceView:
                 last_accepted=last_accepted.get(name),
                 installed_gain=_number(gain[j]),
                 installed_offset=_number(offset[j]),
+                gain_limit=_number(limits.gain[j]),
+                offset_limit=_number(limits.offset[j]),
+                limit_rests=limits.rests,
             )
             for j, name in enumerate(feed.names)
         )

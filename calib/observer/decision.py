@@ -85,15 +85,18 @@ def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig
     beside = verdict.other(joint)
     change, covariance = test.drift(joint, cause, beside)
     weak_lever = test.lever_share(joint) < config.lever_share
-    if cause != "offset" and (weak_lever or covariance[0, 0] > config.gain_std**2):
-        std = f"gain known to {np.sqrt(covariance[0, 0]):.2%} only, {config.gain_std:.2%} is required: sweep this joint"
+    of_model = test.belief.level.total[joint]  # no worse than what the arm has anyway
+    gain_std = float(np.hypot(config.gain_std, of_model / test.belief.kernel.typical[joint]))
+    offset_std = float(np.hypot(config.offset_std, of_model))
+    if cause != "offset" and (weak_lever or covariance[0, 0] > gain_std**2):
+        std = f"gain known to {np.sqrt(covariance[0, 0]):.2%} only, {gain_std:.2%} is required: sweep this joint"
         if test.loss(joint, "offset", cause, beside) < config.evidence:
             cause = "offset"  # explained as well without the gain, which keeps its value
             change, covariance = test.drift(joint, cause, beside)
         else:
             refused.append("gravity's lever too short for a gain" if weak_lever else std)
-    if covariance[1, 1] > config.offset_std**2:
-        refused.append(f"offset known to {np.sqrt(covariance[1, 1]):.3f} N·m only, {config.offset_std} is required")
+    if covariance[1, 1] > offset_std**2:
+        refused.append(f"offset known to {np.sqrt(covariance[1, 1]):.3f} N·m only, {offset_std:.3g} is required")
     if _distance(change, covariance) < config.significance:
         refused.append(f"change is less than {config.significance:g} standard deviations")
     if len(set(np.sign(test.window.direction[:, joint])) - {0.0}) < 2:

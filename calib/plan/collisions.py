@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
+from armlink.model_file import compile_model, read_model
 from calib.plan.types import Sweep, SweepPlan
 from gcomp.arrays import Array
 
@@ -39,11 +40,11 @@ class Geometry:
         import mujoco
 
         from calib.arm.kinematics import gcomp_arm
-        from gcomp.arm.load import compile_model
 
         assert arm_file.model_path is not None
         self._mujoco = mujoco
         kinematics = gcomp_arm(arm_file)  # checks the chain, with errors in terms of the arm file
+        self.absent = read_model(arm_file.model_path).absent
         self.model = compile_model(arm_file.model_path)
         self.data = mujoco.MjData(self.model)
         self._places = [int(self.model.joint(name).qposadr[0]) for name in kinematics.names]
@@ -84,6 +85,8 @@ def check_plan(arm_file: ArmFile, plan: SweepPlan) -> str:
         return "collisions not checked: the arm file has no kinematics.model with geometry"
     geometry = Geometry(arm_file)
     if geometry.model.ngeom == 0:
+        if geometry.absent:
+            return f"collisions not checked: {len(geometry.absent)} meshes not found, such as {geometry.absent[0]}"
         return "collisions not checked: the model has no geometry"
     count = 0
     for place, pose in poses_along(plan):
@@ -96,7 +99,8 @@ def check_plan(arm_file: ArmFile, plan: SweepPlan) -> str:
                 f" {' '.join(f'{angle:.3f}' for angle in pose)} rad: narrow lower and upper of these joints in the arm"
                 " file, or clear the workspace"
             )
-    return f"no collision at {count} poses along the way"
+    without = f", without {len(geometry.absent)} meshes that were not found" if geometry.absent else ""
+    return f"no collision at {count} poses along the way{without}"
 
 
 def poses_along(plan: SweepPlan) -> Iterator[tuple[str, Array]]:

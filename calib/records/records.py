@@ -20,8 +20,9 @@ from pydantic import (
     model_validator,
 )
 
-from armlink.arm_file import ArmFile, describe
+from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
+from armlink.key_errors import describe
 from armlink.torque_calibration import UNKNOWN, TorqueCalibration
 from gcomp.arrays import Array
 

@@ -14,8 +14,9 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from armlink.arm_file import ArmFile, describe, load_arm
+from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import BadInput, Refused
+from armlink.key_errors import describe
 from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration
 from calib.motion.static_reading import StaticReading, stack
 from calib.plan.types import SweepPlan

@@ -67,7 +67,10 @@ def place_chain(path: Path, *, tip: str | None = None, gravity: ArrayLike | None
 
 
 def compile_model(path: Path) -> "mujoco.MjModel":
-    """The file compiled by MuJoCo, a URDF without its meshes, which gravity does not need. Raises BadModel."""
+    """The file compiled by MuJoCo without the meshes that are not there, a URDF without any; raises BadModel.
+
+    Gravity needs the inertials alone.
+    """
     import mujoco
 
     try:
@@ -76,17 +79,24 @@ def compile_model(path: Path) -> "mujoco.MjModel":
         raise BadModel(f"{path}: not a URDF or MJCF file: {error}") from None
     try:
         if root.tag == "robot":
-            return mujoco.MjModel.from_xml_string(_plain_urdf(root, path))
-        return mujoco.MjModel.from_xml_path(str(path))
+            return mujoco.MjModel.from_xml_string(_plain_urdf(root))
+        spec = mujoco.MjSpec.from_file(str(path))
+        _drop_absent_meshes(spec, path.parent / spec.compiler.meshdir)
+        return spec.compile()
     except ValueError as error:
         raise BadModel(f"{path}: MuJoCo refuses it: {error}") from None
 
 
-def _plain_urdf(root: ET.Element, path: Path) -> str:
+def _drop_absent_meshes(spec: "mujoco.MjSpec", folder: Path) -> None:
+    for mesh in list(spec.meshes):
+        if mesh.file and not (folder / mesh.file).is_file():
+            for geom in [each for each in spec.geoms if each.meshname == mesh.name]:
+                spec.delete(geom)
+            spec.delete(mesh)
+
+
+def _plain_urdf(root: ET.Element) -> str:
     """The URDF with only links, joints and inertials, for MuJoCo's compiler."""
-    for joint in root.iter("joint"):
-        if joint.find("mimic") is not None:
-            raise BadModel(f"{path}: joint {joint.get('name')} mimics another: a serial arm has one drive per joint")
     for link in root.iter("link"):
         for shape in [*link.findall("visual"), *link.findall("collision")]:
             link.remove(shape)
@@ -114,6 +124,7 @@ def _chain(model: "mujoco.MjModel", path: Path, tip: str | None) -> list[int]:
         last = model.body_parentid[last]
         ancestors.add(int(last))
     chain = [joint for joint in joints if model.jnt_bodyid[joint] in ancestors]
+    _refuse_couplings(model, joints if tip is None else chain, path)
     aside = [joint for joint in joints if joint not in chain]
     for joint in chain if aside and tip is not None else joints:
         if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
@@ -125,7 +136,6 @@ def _chain(model: "mujoco.MjModel", path: Path, tip: str | None) -> list[int]:
         raise BadModel(f"{path}: joint {name} branches off the chain: name the body at the chain's end with tip")
     if not chain:
         raise BadModel(f"{path}: no joint between the base and tip {tip!r}")
-    _refuse_couplings(model, chain, path)
     return chain
 
 

@@ -8,6 +8,7 @@
 | `fault ID:JOINT:VALUE` | injects a fault |
 | `faults none` | ends all faults |
 | `mass KG`, `mass 0` | attaches a mass to the flange, removes it |
+| `hand JOINT:ANGLE` | turns a joint without power to a true angle [rad], kept within its stops |
 """
 
 import os
@@ -19,7 +20,10 @@ from sim_bus.bus.effect_options import parse_drift, parse_effect
 from sim_bus.bus.fault_injector import Injector
 from sim_bus.bus.fault_kinds import parse_fault
 
-WORDS = "effect ID:JOINT:VALUE, effects none, drift JOINT:GAIN:OFFSET, fault ID:JOINT:VALUE, faults none or mass KG"
+WORDS = (
+    "effect ID:JOINT:VALUE, effects none, drift JOINT:GAIN:OFFSET, fault ID:JOINT:VALUE, faults none, mass KG or "
+    "hand JOINT:ANGLE"
+)
 
 
 def obey(line: str, injector: Injector) -> None:
@@ -39,6 +43,8 @@ def obey(line: str, injector: Injector) -> None:
         injector.clear()
     elif word == "mass":
         arm.attach_mass(_mass(text))
+    elif word == "hand":
+        arm.turn_by_hand(*_turn(text))
     else:
         raise BadInput(f"{line.strip()!r}: expected {WORDS}")
 
@@ -51,6 +57,16 @@ def _mass(text: str) -> float:
     except ValueError:
         raise BadInput(f"mass {text!r}: expected a number of kilograms, 0 or more") from None
     return mass
+
+
+def _turn(text: str) -> tuple[str, float]:
+    joint, colon, angle = text.rpartition(":")
+    try:
+        if not colon:
+            raise ValueError
+        return joint, float(angle)
+    except ValueError:
+        raise BadInput(f"hand {text!r}: expected JOINT:ANGLE in rad, such as hand joint_2:0.5") from None
 
 
 class ControlPipe:

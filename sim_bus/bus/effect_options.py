@@ -6,8 +6,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from armlink.arm_file import describe
 from armlink.errors import BadInput
+from armlink.key_errors import describe
 from sim_bus.effects.registry import effects
 from sim_bus.sim_section import EffectEntry
 

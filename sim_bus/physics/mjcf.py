@@ -8,6 +8,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
+from armlink.model_file import read_model
 from sim_bus.effects.state import Imperfections
 from sim_bus.physics.transmission import rotor_name, tendon_name
 from sim_bus.sim_section import LinkBody, SimSection, sim_section
@@ -16,6 +17,7 @@ STOP_IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)
 FRICTION_IMPEDANCE = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """Solver impedance, close enough to 1 that creep under stiction is a few µrad/s."""
 TINY_INERTIA = 1e-9
+DEGREE = np.pi / 180
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ def build_model(arm: ArmFile, state: Imperfections) -> BuiltModel:
 
 def _from_denavit_hartenberg(arm: ArmFile, section: SimSection) -> Any:
     spec = mujoco.MjSpec()
-    spec.compiler.degree = False
+    spec.compiler.degree = spec.compiler.balanceinertia = False
     body, position, twist = spec.worldbody, [0.0, 0.0, 0.0], 0.0
     assert section.links is not None
     for row, link in zip(arm.kinematics.joints, section.links, strict=True):
@@ -77,10 +79,8 @@ def _from_denavit_hartenberg(arm: ArmFile, section: SimSection) -> Any:
 def _from_model(arm: ArmFile, section: SimSection) -> Any:
     """The model file's chain, other joints frozen, without contacts and actuators."""
     path = arm.model_path
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
-        raise BadInput(f"{path}: not a model that MuJoCo reads: {error}") from None
+    assert path is not None
+    spec = read_model(path).spec
     names = set(arm.joint_names)
     missing = names - {joint.name for joint in spec.joints}
     if missing or not names:
@@ -91,6 +91,8 @@ def _from_model(arm: ArmFile, section: SimSection) -> Any:
         if joint.name not in names:
             spec.delete(joint)
     for joint in spec.joints:
+        if joint.name in arm.kinematics.stops:
+            joint.range = np.array(arm.kinematics.stops[joint.name]) / (DEGREE if joint.compiler.degree else 1.0)
         if joint.type != mujoco.mjtJoint.mjJNT_HINGE or joint.range[0] >= joint.range[1]:
             raise BadInput(f"{path}: joint {joint.name}: expected a hinge with a range")
     if section.links is not None:
@@ -108,7 +110,6 @@ def _set_options(spec: Any, arm: ArmFile, section: SimSection) -> None:
     option.iterations, option.ls_iterations = 50, 50
     option.tolerance, option.ls_tolerance = 1e-12, 1e-6  # looser tolerances make stiction chatter
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-    spec.compiler.balanceinertia = False
     spec.compiler.fusestatic = False
 
 

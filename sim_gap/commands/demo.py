@@ -1,4 +1,4 @@
-"""The whole job on a simulated arm: sweep, calibrate, identify, verify, drift and recalibration, gap diagnosis."""
+"""Runs the whole job on a simulated arm: sweep, calibrate, identify, verify, drift and recalibration, gap diagnosis."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,7 +7,13 @@ import typer
 
 
 def demo(
-    arm: Annotated[str, typer.Option(help="Bundled arm's name or path of an arm file with a sim section.")] = "sarcos",
+    target: Annotated[
+        str | None, typer.Argument(metavar="[ARM]", help="The same as --arm.", show_default=False)
+    ] = None,
+    arm: Annotated[
+        str | None,
+        typer.Option(help="Bundled arm, arm file with a sim section, or URDF or MJCF model; default: sarcos."),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Draws another hidden truth.")] = 0,
     realism: Annotated[
         float | None,
@@ -22,10 +28,17 @@ def demo(
 ) -> None:
     """Run the whole job on a simulated arm on an in-process CAN bus and write report.html and summary.json.
 
+    Of a model (armlink demo --arm my-arm.urdf) an arm file is made first, as armlink new does; it lies in the folder.
+
     Example: armlink demo --arm sarcos --seed 1 --out armlink-demo
     """
     from rich.console import Console
 
+    from armlink.errors import BadInput
     from sim_gap.demo.run import run_demo
 
-    run_demo(arm, seed=seed, realism=realism, out=out, json_path=json, console=Console(stderr=True))
+    if target is not None and arm is not None and target != arm:
+        raise BadInput(f"demo: two arms, {target} and --arm {arm}: give one")
+    run_demo(
+        target or arm or "sarcos", seed=seed, realism=realism, out=out, json_path=json, console=Console(stderr=True)
+    )

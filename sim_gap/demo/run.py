@@ -11,11 +11,12 @@ from pathlib import Path
 
 from rich.console import Console
 
-from armlink.arm_file import ArmFile, load_arm
+from armlink.arm_file import MODEL_SUFFIXES, ArmFile, load_arm
 from armlink.errors import BadInput
 from armlink.recording.files import save_recording
 from armlink.recording.recording import Recording
 from calib.arm.kinematics import gcomp_arm
+from calib.commissioning.new_arm import new_arm
 from calib.fit.gravity_fit import identify_gravity
 from calib.fit.sensor_fit import fit_sensors
 from calib.install.apply import Apply, admit_sweeps
@@ -46,12 +47,14 @@ def run_demo(
     arm_name: str, *, seed: int, out: Path, json_path: Path | None, console: Console, realism: float | None = None
 ) -> DemoResult:
     """Run it, write `report.html`, `summary.json` and the data into `out`; raises BadInput, Refused, BusFault."""
+    teller = Narrator(console)
+    if Path(arm_name).suffix.lower() in MODEL_SUFFIXES:
+        arm_name = str(_from_model(Path(arm_name), out, teller))
     arm = load_arm(arm_name)
     if realism is not None:
         arm = with_realism(arm, realism, seed)
     arm.require_link()
     data_folder = _fresh(out)
-    teller = Narrator(console)
     teller.say(f"arm [bold]{arm.name}[/bold], hidden truth of seed {seed}, results in {out}")
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as other_core:
         bench = Bench.build(arm, gcomp_arm(arm), seed)
@@ -162,6 +165,16 @@ def _record(
 def _diagnose(arm_path: Path, recordings: tuple[Recording, Recording]) -> Diagnosis:
     """In the other process: the recordings against the arm's nominal model."""
     return diagnose(compiled(arm_path), recordings[:1], recordings[1:], labels=["train", "heldout"])
+
+
+def _from_model(model: Path, out: Path, teller: Narrator) -> Path:
+    """The arm file made of a URDF or MJCF model, in the demo's folder; raises BadInput, Refused."""
+    path = out / f"{model.stem}.yaml"
+    teller.say(f"making an arm file of {model}")
+    made = new_arm(model, path)
+    made.write()
+    teller.say(f"{path}: {len(made.draft.joints)} joints, {len(made.draft.assumed)} assumed values, each says so there")
+    return path
 
 
 def _fresh(out: Path) -> Path:

@@ -13,7 +13,9 @@ from calib.motion.trajectory import trajectory
 from sim_gap.experiment.excitation import ACCELERATION, PACE
 
 
-def collect(link: ArmDriver, target: Array, out: Path, progress: Callable[[int, int], None] = lambda k, n: None) -> int:
+def collect(
+    link: ArmDriver, target: Array, out: str | Path, progress: Callable[[int, int], None] = lambda k, n: None
+) -> int:
     """Move to the first target, follow all targets under position control, record each cycle; returns the row count.
 
     The caller starts and enables the link, which stops the joints safely in every case. A kill loses at most the last

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from armlink.errors import BadInput
+from armlink.model_file import one_line, read_model
+from sim_gap.model.arm_joints import arm_hinges, hinges_of
 from sim_gap.model.rigid_body import RigidArm, Tendons, inertial_of
 
 
@@ -31,18 +33,19 @@ def load_model(source: Any, names: tuple[str, ...] = (), count: int | None = Non
     """Compile a model from a path (.xml, .urdf, .yaml arm file), or take a compiled `mujoco.MjModel`.
 
     `names` are the recording's joint names if it has any; `count` is its number of joints. Joints are matched by name
-    if the model has all of them, else in order. Raises BadInput if the model cannot be read or does not fit.
+    if the model has all of them, else in order; if there are too many, those of a hand and coupled ones are locked.
+    Raises BadInput if the model cannot be read or does not fit.
     """
-    import mujoco
-
     path = Path(source) if isinstance(source, str | Path) else None
-    model = source if path is None else compiled(path)
-    hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
-    known = {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, j): j for j in hinges}
+    model = load_compiled(source)
+    known = hinges_of(model)
+    hinges = list(known.values())
     label = str(path or "the model")
     if names and all(name in known for name in names):
         joints = [known[name] for name in names]
     else:
+        if count is not None and count != len(hinges):
+            hinges = list(arm_hinges(model, known).values())
         if count is not None and count != len(hinges):
             raise BadInput(
                 f"{label}: has {len(hinges)} hinge joints ({', '.join(map(str, known))}), the recording {count}: "
@@ -58,18 +61,21 @@ def load_model(source: Any, names: tuple[str, ...] = (), count: int | None = Non
     return SimModel(model, tuple(joints), arm, path)
 
 
+def load_compiled(source: Any) -> Any:
+    """The `mujoco.MjModel` of a path, or the one given. Raises BadInput."""
+    return compiled(Path(source)) if isinstance(source, str | Path) else source
+
+
 def compiled(path: Path) -> Any:
     """Compile an MJCF, URDF or arm file (by path or bundled name) to a `mujoco.MjModel`. Raises BadInput."""
     try:
         return read_spec(path).compile()
     except ValueError as error:
-        raise BadInput(f"{path}: MuJoCo cannot compile it: {_line(error)}") from None
+        raise BadInput(f"{path}: MuJoCo cannot compile it: {one_line(error)}") from None
 
 
 def read_spec(path: Path) -> Any:
     """Read an MJCF, URDF or arm file (by path or bundled name) as a `mujoco.MjSpec`. Raises BadInput."""
-    import mujoco
-
     from armlink.arm_file import bundled_arms
 
     if path.suffix in (".yaml", ".yml") or str(path) in bundled_arms():
@@ -81,15 +87,7 @@ def read_spec(path: Path) -> Any:
         path = nominal
     if not path.is_file():
         raise BadInput(f"no model file {path}: give an MJCF, URDF or arm file")
-    try:
-        return mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
-        raise BadInput(f"{path}: MuJoCo cannot read it: {_line(error)}") from None
-
-
-def _line(error: ValueError) -> str:
-    """MuJoCo's message, which spans several lines, in one."""
-    return " ".join(str(error).split())
+    return read_model(path).spec
 
 
 def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:

@@ -61,15 +61,15 @@ def test_defaults_are_those_of_the_contract(tmp_path):
     [
         (("colour",), "red", "key colour: unknown key"),
         (("link", "joints", 0, "torque_max"), 3.0, "key link.joints.0.torque_max: unknown key"),
-        (("name",), REMOVE, "key name: Field required"),
-        (("kinematics", "joints", 1, "upper"), REMOVE, "key kinematics.joints.1.upper: Field required"),
+        (("name",), REMOVE, "key name: Field required: add it"),
+        (("kinematics", "joints", 1, "upper"), REMOVE, "key kinematics.joints.1.upper: Field required: add it"),
         (("kinematics", "joints", 1, "upper"), -2.0, "joint joint_2: lower -1.0 must be less than upper -2.0 [rad]"),
         (("kinematics", "joints", 0, "a"), "long", "key kinematics.joints.0.a: "),
         (("kinematics", "joints", 0, "a"), float("nan"), "key kinematics.joints.0.a: Input should be a finite number"),
         (("kinematics", "gravity"), [0.0, -9.8], "key kinematics.gravity: "),
         (("kinematics", "model"), "arm.xml", "give either joints"),
         (("kinematics", "joints", 1, "name"), "joint_1", "'joint_1' stands twice"),
-        (("link", "joints", 1, "node"), 1, "1 stands twice"),
+        (("link", "joints", 1, "node"), 1, "'node 1' stands twice"),
         (
             ("link", "joints", 1, "node"),
             128,

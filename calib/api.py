@@ -1,0 +1,241 @@
+"""The procedure for programs and notebooks: sweep, calibrate, identify, verify, observe. `import armlink` offers it.
+
+Arms and data are given as objects or as paths; every function raises armlink.ArmlinkError with one line that says what
+is wrong and how to put it right.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+from armlink.arm_file import SIMULATED, ArmFile, Bus, load_arm
+from armlink.errors import BadInput
+from armlink.loop.driver import ArmDriver
+from armlink.loop.open import open_arm
+from armlink.recording.files import load_recording
+from armlink.recording.recording import Recording
+from calib.arm.kinematics import gcomp_arm
+from calib.fit.gravity_fit import GravityFit, identify_gravity
+from calib.fit.sensor_fit import SensorFit, fit_sensors
+from calib.observer.config import ObserverConfig
+from calib.observer.events import Event
+from calib.observer.observer import Observer
+from calib.records.records import CalibrationRecord, GravityRecord
+from calib.sweep.dataset import SweepData, load_data
+from calib.sweep.run import Progress, run_sweep
+from calib.sweep.verify import Verification, run_verify
+from gcomp.arrays import Array
+
+ArmLike: TypeAlias = ArmFile | str | Path
+"""An arm file: loaded, its path, or the name of a bundled arm."""
+SweepLike: TypeAlias = SweepData | str | Path
+"""The data set of a pass of sweeps: loaded, or its folder."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """What the observer found in a recording."""
+
+    names: tuple[str, ...]
+    """Joints, base to tip."""
+    events: list[Event]
+    """Alarms and findings in the order of time."""
+    gain: Array
+    """Gain of each torque sensor against the calibration at the end (n,); 1 for no change."""
+    gain_std: Array
+    """(n,)"""
+    offset: Array
+    """Offset likewise (n,) [N·m]."""
+    offset_std: Array
+    """(n,) [N·m]"""
+    rests: int
+    """Rests of the arm that the estimate is made of."""
+
+
+def open_link(arm: ArmLike, bus: str | None = None, *, simulated: bool = False, load: float = 0.0) -> ArmDriver:
+    """Open the link to an arm's joint controllers; use it in a `with` block, which leaves the joints holding.
+
+    Args:
+        arm: arm file, its path, or a bundled arm's name.
+        bus: INTERFACE:CHANNEL[@BITRATE] instead of the arm file's.
+        simulated: the simulated arm of the arm file's `sim` section, in this process, instead of a bus.
+        load: mass at the simulated arm's tip [kg].
+
+    Nothing moves before `start()` and `enable()`. Raises BadInput, BusFault.
+    """
+    arm_file = _arm(arm)
+    if not simulated:
+        if load:
+            raise BadInput(f"open_link: load {load:g} kg: only a simulated arm can be given a load")
+        return open_arm(arm_file, bus)
+    if bus is not None:
+        raise BadInput(f"open_link: bus {bus}: a simulated arm needs none: leave bus or simulated out")
+    own = Bus(interface=SIMULATED, channel=str(arm_file.path), options={"load": load})
+    link = arm_file.require_link().model_copy(update={"bus": own, "buses": {}})
+    return open_arm(arm_file.model_copy(update={"link": link}))
+
+
+def sweep(
+    arm: ArmLike,
+    out: str | Path,
+    *,
+    bus: str | None = None,
+    simulated: bool = False,
+    reference_mass: float = 0.0,
+    resume: bool = False,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> SweepData:
+    """Sweep every joint, tip to base, into the folder `out`. **The arm moves through its whole range.**
+
+    Args:
+        arm: arm file, its path, or a bundled arm's name.
+        out: folder for the data set; each reading is on disk before the next is made.
+        bus: INTERFACE:CHANNEL[@BITRATE] instead of the arm file's.
+        simulated: sweep the simulated arm of the arm file's `sim` section.
+        reference_mass: mass attached to the flange [kg]; the simulated arm is given it.
+        resume: go on after the last reading in `out`.
+        seed: of the plan's search.
+        progress: called with (readings done, readings in all, seconds left, what is being done).
+
+    Raises BadInput, Refused where the arm cannot be swept, BusFault.
+    """
+    arm_file = _arm(arm)
+    with open_link(arm_file, bus, simulated=simulated, load=reference_mass if simulated else 0.0) as link:
+        link.start()
+        link.enable()
+        return run_sweep(
+            link, arm_file, Path(out), reference_mass=reference_mass, resume=resume, seed=seed, progress=progress
+        )
+
+
+def calibrate(*sweeps: SweepLike, arm: ArmLike | None = None) -> SensorFit:
+    """Gains and offsets of all torque and position sensors, with intervals, from passes of sweeps.
+
+    Args:
+        sweeps: data sets of `sweep`, or their folders; one pass without and one with a reference mass.
+        arm: the arm file, if it is no longer where the sweeps found it.
+
+    Nothing is stored or written to controllers: `record(arm)` of the result makes a record, `armlink calibrate --apply`
+    writes one. Raises BadInput, Refused.
+    """
+    data = _sweeps("calibrate", sweeps)
+    return fit_sensors(_arm_of(data, arm), data)
+
+
+def identify(*sweeps: SweepLike, arm: ArmLike | None = None, sensors: SensorFit | None = None) -> GravityFit:
+    """The mass moments of the arm's gravity model, with intervals, from the same sweeps.
+
+    Args:
+        sweeps: data sets of `sweep`, or their folders.
+        arm: the arm file, if it is no longer where the sweeps found it.
+        sensors: what `calibrate` found in these sweeps; by default it is called here.
+
+    Raises BadInput, Refused.
+    """
+    data = _sweeps("identify", sweeps)
+    arm_file = _arm_of(data, arm)
+    return identify_gravity(arm_file, data, sensors or fit_sensors(arm_file, data))
+
+
+def verify(
+    arm: ArmLike,
+    gravity: GravityFit | GravityRecord,
+    sensors: SensorFit | CalibrationRecord | None = None,
+    *,
+    bus: str | None = None,
+    simulated: bool = False,
+    poses: int = 24,
+    seed: int = 0,
+) -> Verification:
+    """Compare model and sensors at random poses that no fit has seen. **The arm moves through its whole range.**
+
+    Args:
+        arm: arm file, its path, or a bundled arm's name.
+        gravity: what `identify` found, or a gravity record.
+        sensors: what `calibrate` found, or a calibration record; by default what the controllers hold.
+        bus: INTERFACE:CHANNEL[@BITRATE] instead of the arm file's.
+        simulated: the simulated arm of the arm file's `sim` section.
+        poses: how many.
+        seed: draws other poses.
+
+    Raises BadInput, Refused, BusFault.
+    """
+    arm_file = _arm(arm)
+    calibration = sensors.record(arm_file) if isinstance(sensors, SensorFit) else sensors
+    model = gravity.record(arm_file, calibration) if isinstance(gravity, GravityFit) else gravity
+    with open_link(arm_file, bus, simulated=simulated) as link:
+        link.start()
+        link.enable()
+        return run_verify(link, arm_file, model, calibration, poses=poses, seed=seed)
+
+
+def observe(
+    arm: ArmLike,
+    recording: Recording | str | Path,
+    gravity: GravityFit | GravityRecord,
+    sensors: SensorFit | CalibrationRecord,
+    *,
+    config: ObserverConfig | None = None,
+) -> Observation:
+    """Whether a torque sensor drifted while the arm worked: alarms, findings, and the estimate at the end.
+
+    Args:
+        arm: arm file, its path, or a bundled arm's name.
+        recording: ordinary work with rests, with torque sensor readings as the calibrated controllers send them.
+        gravity: what `identify` found, or a gravity record.
+        sensors: what `calibrate` found, or a calibration record.
+        config: thresholds of the observer.
+
+    Raises BadInput where the recording is of another arm or has no torque sensor readings.
+    """
+    arm_file, run = _arm(arm), _recording(recording)
+    if run.torque is None:
+        raise BadInput("observe: the recording has no torque sensor readings (tau_1 …)")
+    names = arm_file.joint_names or gcomp_arm(arm_file).names
+    if run.n != len(names):
+        raise BadInput(f"observe: the recording has {run.n} joints, but {arm_file.name} has {len(names)}")
+    calibration = sensors.record(arm_file) if isinstance(sensors, SensorFit) else sensors.require(arm_file)
+    model = gravity.record(arm_file, calibration) if isinstance(gravity, GravityFit) else gravity.require(arm_file)
+    rated = arm_file.require_link().rated_torques
+    observer = Observer.of_records(gcomp_arm(arm_file), calibration, model, rated, config)
+    events: list[Event] = []
+    for t, position, torque in zip(run.t, run.position, run.torque, strict=True):
+        events += observer.handle(float(t), position, torque)
+    found = observer.estimate()
+    return Observation(names, events, found.gain, found.gain_std, found.offset, found.offset_std, observer.rows)
+
+
+def _arm(arm: object) -> ArmFile:
+    if isinstance(arm, ArmFile):
+        return arm
+    if isinstance(arm, str | Path):
+        return load_arm(arm)
+    raise BadInput(f"arm: expected an ArmFile, a path or a bundled arm's name, not {type(arm).__name__}")
+
+
+def _sweeps(function: str, sweeps: tuple[object, ...]) -> list[SweepData]:
+    if not sweeps:
+        raise BadInput(f"{function}: give the data sets of sweep, or their folders")
+    found = []
+    for each in sweeps:
+        if isinstance(each, SweepData):
+            found.append(each)
+        elif isinstance(each, str | Path):
+            found.append(load_data(Path(each)))
+        else:
+            kind = type(each).__name__
+            raise BadInput(f"{function}: expected data sets of sweep or their folders, one argument each, not {kind}")
+    return found
+
+
+def _arm_of(data: list[SweepData], arm: ArmLike | None) -> ArmFile:
+    return data[0].load_arm(None) if arm is None else _arm(arm)
+
+
+def _recording(recording: object) -> Recording:
+    if isinstance(recording, Recording):
+        return recording
+    if isinstance(recording, str | Path):
+        return load_recording(recording)
+    raise BadInput(f"recording: expected a Recording or the path of one, not {type(recording).__name__}")

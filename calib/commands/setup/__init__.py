@@ -1,0 +1,1 @@
+"""Sub-commands of `armlink` that set up an arm."""

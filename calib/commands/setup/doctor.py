@@ -1,0 +1,42 @@
+"""Says what is missing or doubtful between an arm file, this machine and its bus, first things first."""
+
+import shlex
+from typing import Annotated
+
+import typer
+
+from calib.commands.options import JsonFile
+
+COLOURS = {"error": "red", "warning": "yellow", "hint": "cyan"}
+
+
+def doctor(
+    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
+    bus: Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")] = None,
+    offline: Annotated[bool, typer.Option("--offline", help="Leave the bus alone.")] = False,
+    json_file: JsonFile = None,
+) -> int:
+    """Examine an arm file, its model, the sweeps that it allows, and the drives on its bus, which are only read.
+
+    Findings come in the order in which to deal with them; each names its remedy. Exit status 1 where there is an error.
+
+    Example: armlink doctor sarcos --json -
+    """
+    from rich.console import Console
+
+    from armlink.commands.output import write_json
+    from calib.commissioning.doctor import examine
+
+    console = Console(stderr=True, markup=False, highlight=False, soft_wrap=True)
+    with console.status(f"examining {arm}"):
+        findings = examine(arm, bus, offline)
+    for found in findings:
+        console.print(found.level, style=COLOURS[found.level], end=": ")
+        console.print(str(found))
+    errors = sum(found.level == "error" for found in findings)
+    if errors:
+        console.print(f"{errors} {'error' if errors == 1 else 'errors'} to deal with first")
+    else:
+        console.print(f"no errors; next: {shlex.join(['armlink', 'check', arm])}")
+    write_json(json_file, {"schema": "armlink.doctor/1", "arm": arm, "findings": [each.to_json() for each in findings]})
+    return 1 if errors else 0

@@ -1,0 +1,220 @@
+"""Makes an arm file from a URDF or MJCF model, and finds its drives on a bus."""
+
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from calib.commands.options import JsonFile
+
+if TYPE_CHECKING:
+    from armlink.bus.can_bus import CanBus
+    from calib.commissioning.drive_match import Ask
+    from calib.commissioning.finding import SetupFinding
+    from calib.commissioning.new_arm import NewArm
+
+SCHEMA = "armlink.new/1"
+
+
+def new(
+    model: Annotated[Path, typer.Argument(help="URDF or MJCF model; with --bus also an arm file.", metavar="MODEL")],
+    out: Annotated[
+        Path | None, typer.Option(help="Arm file to write; default: the model's name with .yaml, here.")
+    ] = None,
+    tip: Annotated[
+        str | None, typer.Option(help="Body that the arm ends in; default: the end of the longest chain.")
+    ] = None,
+    stops: Annotated[
+        list[str] | None, typer.Option(help="JOINT:LOWER:UPPER [rad], instead of the model's limits; may be repeated.")
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the arm; default: the model's.")] = None,
+    bus: Annotated[
+        str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE]: find the drives there, and write them down.")
+    ] = None,
+    by_hand: Annotated[
+        bool | None,
+        typer.Option(
+            help="With --bus: find each joint's drive, direction and gear by turning the joint by hand, without power;"
+            " else the drives are taken in the order of their node ids. Default: ask.",
+            show_default=False,
+        ),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
+    json_file: JsonFile = None,
+) -> int:
+    """Write an arm file that demo, sweep and check take as it is.
+
+    The arm is the longest chain of revolute joints; gripper, mimic and prismatic joints at its end are set aside.
+    Limits and torques are the model's. What the model does not state is asked on a terminal, else assumed; every
+    assumed value says so in a comment. Drives on the bus are only read. Exit status 1 where a joint turns the other
+    way or has another gear than the model.
+
+    Example: armlink new arm.urdf --out arm.yaml
+    """
+    from rich.console import Console
+
+    from armlink.arm_file import MODEL_SUFFIXES
+    from armlink.commands.output import write_json
+    from armlink.errors import BadInput
+    from calib.commands.setup.terminal import Terminal, hand, parse_stops
+    from calib.commissioning.new_arm import new_arm
+
+    console = Console(stderr=True, markup=False, highlight=False)
+    interactive = sys.stdin is not None and sys.stdin.isatty()
+    is_arm_file = model.suffix.lower() in (".yaml", ".yml")
+    if is_arm_file and bus is None:
+        raise BadInput(f"{model}: is an arm file already: give --bus to find its drives, or armlink doctor {model}")
+    if is_arm_file and (tip or stops or name):
+        raise BadInput(f"{model}: --tip, --stops and --name are for a model: change the arm file itself")
+    if not is_arm_file and model.suffix.lower() not in MODEL_SUFFIXES:
+        raise BadInput(f"{model}: expected a URDF or MJCF model ({', '.join(MODEL_SUFFIXES)}), or an arm file (.yaml)")
+    if bus is None and by_hand:
+        raise BadInput("--by-hand: needs --bus, on which the drives are")
+    out = out or Path(f"{model.stem}.yaml")
+    _require_free(out, force, interactive)
+    if is_arm_file:
+        return _rewire(console, model, out, str(bus), hand(by_hand, interactive), json_file)
+    with console.status(f"reading {model} and looking for collisions"):
+        asked = Terminal(console) if interactive else None
+        made = new_arm(model, out, tip=tip, stops=parse_stops(stops or []), name=name, questions=asked)
+    if bus is not None:
+        from armlink.monitor.drives import Drives
+        from calib.commissioning.new_arm import match_drives
+
+        opened = _open(bus)
+        try:
+            match_drives(made, Drives(opened), str(opened.channel_info), hand(by_hand, interactive))
+        finally:
+            opened.shutdown()
+        made.draft.bus = _bus_keys(bus, out)
+    made.parsed()
+    made.write()
+    _show(console, made)
+    step = shlex.join(["armlink", *(["demo", "--arm"] if bus is None else ["check"]), str(out)])
+    console.print(f"next: {step}", style="bold")
+    write_json(json_file, _answer(made, step))
+    return 1 if any(found.level == "error" for found in made.findings) else 0
+
+
+def _rewire(console: Any, model: Path, out: Path, bus: str, ask: "Ask | None", json_file: Path | None) -> int:
+    """An arm file with the drives of a bus."""
+    import yaml
+
+    from armlink.arm_file import load_arm, parse_arm
+    from armlink.commands.output import write_json
+    from armlink.monitor.drives import Drives
+    from calib.arm.kinematics import gcomp_arm
+    from calib.commissioning.drive_match import TurnedJoint, match_by_hand, match_in_order
+    from calib.commissioning.new_arm import rewired
+
+    arm = load_arm(model)
+    arm.require_link()
+    findings: list[SetupFinding] = []
+    opened = _open(bus)
+    try:
+        drives, channel = Drives(opened), str(opened.channel_info)
+        if ask is None:
+            matches = match_in_order(arm.joint_names, drives, channel)
+        else:
+            known = gcomp_arm(arm)
+            turned = [TurnedJoint(*each) for each in zip(known.names, known.lower, known.upper, strict=True)]
+            matches, findings = match_by_hand(turned, drives, channel, ask)
+    finally:
+        opened.shutdown()
+    content = rewired(yaml.safe_load(arm.path.read_text(encoding="utf-8")), matches, _bus_keys(bus, out))
+    if arm.model_path is not None:
+        import os
+
+        content["kinematics"]["model"] = os.path.relpath(arm.model_path, out.resolve().parent)
+    parse_arm(dict(content), out)
+    text = f"# {arm.name} with the drives on {channel}, from {model.name} by armlink new.\n"
+    out.write_text(text + yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
+    for found in findings:
+        console.print(str(found), style="red")
+    step = shlex.join(["armlink", "check", str(out)])
+    console.print(f"{out}: nodes {', '.join(str(match.drive.node) for match in matches)}")
+    console.print(f"next: {step}", style="bold")
+    joints = [{"name": match.joint, "node": match.drive.node, "by_hand": match.by_hand} for match in matches]
+    answer = {"out": str(out), "name": arm.name, "joints": joints, "next": step}
+    write_json(json_file, {"schema": SCHEMA, **answer, "findings": [found.to_json() for found in findings]})
+    return 1 if findings else 0
+
+
+def _require_free(out: Path, force: bool, interactive: bool) -> None:
+    from armlink.errors import BadInput
+
+    if out.suffix.lower() not in (".yaml", ".yml"):
+        raise BadInput(f"--out {out}: expected a file that ends in .yaml")
+    if not out.exists() or force:
+        return
+    if not interactive:
+        raise BadInput(f"{out}: exists already: choose another --out, or --force to replace it")
+    typer.confirm(f"{out} exists. Replace it?", abort=True, err=True)
+
+
+def _open(bus: str) -> "CanBus":
+    from armlink.arm_file import Bus
+    from armlink.bus.open import open_bus
+
+    return open_bus(bus, Bus())
+
+
+def _bus_keys(bus: str, out: Path) -> dict[str, str | int]:
+    """Keys of link.bus for a bus given on the command line; the arm file of a simulated one relative to `out`."""
+    import os
+
+    from armlink.bus.open import parse_bus
+
+    parsed = parse_bus(bus)
+    channel = parsed.channel
+    if Path(channel).is_file():
+        channel = os.path.relpath(Path(channel).resolve(), out.resolve().parent)
+    return {"interface": parsed.interface, "channel": channel, "bitrate": parsed.bitrate}
+
+
+def _show(console: Any, made: "NewArm") -> None:
+    from rich.table import Table
+
+    draft = made.draft
+    table = Table("joint", "node", "stops [rad]", "rated [N·m]", "largest [N·m]", title=f"{draft.name}: {made.out}")
+    for joint in draft.joints:
+        stops = "the model's" if joint.stops is None else f"{joint.stops[0]:+.2f} {joint.stops[1]:+.2f}"
+        table.add_row(joint.name, str(joint.node), stops, f"{joint.rated_torque:g}", f"{joint.max_torque:g}")
+    console.print(table)
+    for name, why in draft.aside:
+        console.print(f"{name} {why}: set aside")
+    for note in draft.notes:
+        console.print(note, style="yellow")
+    if draft.servo is not None:
+        console.print(f"resting joints are held by their servos: {draft.servo}", style="yellow")
+    for found in made.findings:
+        console.print(str(found), style="red" if found.level == "error" else "yellow")
+    console.print(f"{made.out} written; {len(draft.assumed)} values are assumed, each says so in the file")
+
+
+def _answer(made: "NewArm", step: str) -> dict[str, Any]:
+    draft = made.draft
+    return {
+        "schema": SCHEMA,
+        "out": str(made.out),
+        "name": draft.name,
+        "model": str(draft.model),
+        "tip": draft.tip,
+        "joints": [
+            {
+                "name": joint.name,
+                "node": joint.node,
+                "rated_torque": joint.rated_torque,
+                "max_torque": joint.max_torque,
+                "max_velocity": joint.max_velocity,
+                "stops": joint.stops,
+            }
+            for joint in draft.joints
+        ],
+        "aside": [{"joint": name, "why": why} for name, why in draft.aside],
+        "assumed": draft.assumed,
+        "findings": [found.to_json() for found in made.findings],
+        "next": step,
+    }

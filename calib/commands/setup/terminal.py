@@ -1,0 +1,68 @@
+"""What `armlink new` asks a person at a terminal, and reads from its options."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import typer
+
+from armlink.errors import BadInput
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from calib.commissioning.chain import Chain
+    from calib.commissioning.drive_match import Ask
+
+
+def parse_stops(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Stops [rad] by joint from texts JOINT:LOWER:UPPER; raises BadInput."""
+    found = {}
+    for text in texts:
+        joint, lower, upper = ["", *text.rsplit(":", 2)][-3:]
+        try:
+            low, high = float(lower), float(upper)
+        except ValueError:
+            joint = ""
+        if not joint or not low < high:
+            raise BadInput(f"--stops {text}: expected JOINT:LOWER:UPPER in rad, such as elbow:-2.1:2.1")
+        found[joint] = (low, high)
+    return found
+
+
+def hand(by_hand: bool | None, interactive: bool) -> "Ask | None":
+    """How a person is asked to turn a joint; None where drives are taken in order. Raises BadInput."""
+    if by_hand and not interactive:
+        raise BadInput("--by-hand: nobody to ask: run it on a terminal, or leave it out")
+    if by_hand is None and interactive:
+        by_hand = typer.confirm("Find each joint's drive by turning the joint by hand?", default=True, err=True)
+    if not by_hand:
+        return None
+    typer.echo("The drives must have no power at the motors: release the brakes, and hold the arm.", err=True)
+    return lambda text: typer.prompt(f"{text}, then press Enter", default="", show_default=False, err=True)
+
+
+class Terminal:
+    """Asks a person."""
+
+    def __init__(self, console: "Console") -> None:
+        self._console = console
+
+    def which(self, chains: "Sequence[Chain]") -> "Chain":
+        """Which of several arms in a model is meant."""
+        for number, chain in enumerate(chains, start=1):
+            names = ", ".join(joint.name for joint in chain.joints)
+            self._console.print(f"{number}: ends in {chain.tip}: {names}")
+        number = int(typer.prompt("The model has several arms. Which one?", type=int, default=1, err=True))
+        return chains[min(max(number, 1), len(chains)) - 1]
+
+    def stops(self, joint: str) -> tuple[float, float] | None:
+        """Stops [rad] of a joint without limits; None where it has none."""
+        text = typer.prompt(
+            f"{joint} has no limits in the model. Its lower and upper stop [rad], as -2.9 2.9; Enter: it has none",
+            default="",
+            show_default=False,
+            err=True,
+        )
+        if not text.strip():
+            return None
+        return parse_stops([f"{joint}:{':'.join(text.replace(',', ' ').split())}"])[joint]

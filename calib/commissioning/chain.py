@@ -1,0 +1,82 @@
+"""Which joints of a model are the arm: the longest chain of driven revolute joints, without its gripper."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from armlink.errors import BadInput
+from calib.commissioning.model_joints import ModelJoint
+
+HAND = re.compile(r"grip|finger|hand|jaw|thumb|claw", re.IGNORECASE)
+"""Names of joints that grasp rather than move the arm."""
+
+
+@dataclass(frozen=True)
+class Chain:
+    """The joints of an arm, base to tip."""
+
+    joints: tuple[ModelJoint, ...]
+    aside: tuple[tuple[str, str], ...]
+    """(Joint, why it is not a joint of the arm); each keeps the model's position."""
+
+    @property
+    def tip(self) -> str:
+        """Body that the chain ends in."""
+        return self.joints[-1].body
+
+
+def find_chains(joints: Sequence[ModelJoint], path: Path, tip: str | None = None) -> list[Chain]:
+    """The chains that an arm may be, best first: more than one for a model of several arms.
+
+    With `tip`, the one that ends in that body. Raises BadInput where there is none, naming the joint in the way.
+    """
+    if tip is not None:
+        ends = [place for place, joint in enumerate(joints) if joint.body == tip]
+        if not ends:
+            moving = ", ".join(dict.fromkeys(joint.body for joint in joints))
+            raise BadInput(f"{path}: --tip {tip}: no joint moves that body; moving are {moving}")
+        return [_chain(joints, [*joints[ends[-1]].parents, ends[-1]], path)]
+    inner = {parent for joint in joints for parent in joint.parents}
+    ways = []
+    for leaf in (place for place in range(len(joints)) if place not in inner):
+        way = [*joints[leaf].parents, leaf]
+        while way and _aside(joints[way[-1]]):
+            way.pop()
+        if way and way not in ways:
+            ways.append(way)
+    if not ways:
+        reasons = "; ".join(f"{joint.name} {_aside(joint)}" for joint in joints)
+        raise BadInput(f"{path}: no joint of an arm in this model: {reasons}")
+    longest = max(map(len, ways))
+    return [_chain(joints, way, path) for way in ways if len(way) == longest]
+
+
+def _aside(joint: ModelJoint) -> str | None:
+    """Why a joint at the end of a chain is not one of the arm's, or None."""
+    if joint.kind != "revolute":
+        return f"is {joint.kind}"
+    if joint.partner is not None:
+        return f"moves together with {joint.partner}"
+    return "belongs to the hand by its name" if HAND.search(joint.name) else None
+
+
+def _chain(joints: Sequence[ModelJoint], way: list[int], path: Path) -> Chain:
+    chain = [joints[place] for place in way]
+    for number, joint in enumerate(chain, start=1):
+        if joint.kind != "revolute":
+            raise BadInput(
+                f"{path}: joint {joint.name or number} is {joint.kind} and lies between the base and the arm: fix it in"
+                ' the model (URDF: type="fixed"; MJCF: remove the joint)'
+            )
+        if not joint.name:
+            raise BadInput(
+                f"{path}: joint {number} of the chain (body {joint.body!r}) has no name: name it in the model"
+            )
+    others = [joint for place, joint in enumerate(joints) if place not in way]
+    aside = tuple((joint.name, _aside(joint) or "is not on the chain") for joint in others)
+    if aside and not chain[-1].body:
+        raise BadInput(
+            f"{path}: the body of joint {chain[-1].name} has no name: name it, so that the chain can end there"
+        )
+    return Chain(tuple(chain), aside)

@@ -1,0 +1,70 @@
+"""Examines an arm file, its model, this machine and the bus; says what is missing or doubtful, first things first."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from armlink.arm_file import ArmFile, BadKeys, bundled_arms, load_arm
+from armlink.errors import ArmlinkError
+from calib.commissioning.bus_checks import bus_findings
+from calib.commissioning.finding import ORDER, SetupFinding
+from calib.commissioning.model_checks import model_findings
+from calib.commissioning.motion_checks import motion_findings
+from gcomp.errors import GcompError
+
+FORMATS = "docs/formats.md has every key with its unit and range"
+
+
+def examine(arm: str, bus: str | None = None, offline: bool = False) -> list[SetupFinding]:
+    """All findings, errors first, then in the order in which they are to be dealt with.
+
+    `bus` replaces the arm file's; `offline` leaves the bus alone. The drives are only read.
+    """
+    return sorted(_all(arm, bus, offline), key=lambda found: ORDER[found.level])
+
+
+def _all(arm: str, bus: str | None, offline: bool) -> Iterator[SetupFinding]:
+    try:
+        arm_file = load_arm(arm)
+    except BadKeys as error:
+        for key, message in error.keys:
+            what, _, hint = message.partition("; did you mean ")
+            remedy = f"did you mean {hint} Rename it" if hint else f"correct it in the arm file: {FORMATS}"
+            yield SetupFinding("error", what, f"{arm}: {key}", remedy)
+        return
+    except ArmlinkError as error:
+        yield SetupFinding("error", str(error), arm, "correct the arm file, or make one of a model with armlink new")
+        return
+    try:
+        yield from model_findings(arm_file)
+        yield from motion_findings(arm_file)
+    except (ArmlinkError, GcompError) as error:  # what later checks rest upon
+        yield _as_finding(error, arm_file)
+    if arm_file.link is None:
+        yield SetupFinding(
+            "error", "key link is missing: no bus and no joint controllers", arm, f"add the section link: {FORMATS}"
+        )
+    elif not offline:
+        yield from bus_findings(arm_file, bus)
+    yield from _assumed(arm, arm_file)
+
+
+def _as_finding(error: Exception, arm_file: ArmFile) -> SetupFinding:
+    what, _, remedy = str(error).removeprefix(f"{arm_file.path}: ").rpartition(": ")
+    if not what:
+        what, remedy = remedy, "correct the arm file or its model"
+    return SetupFinding("error", what, str(arm_file.path), remedy)
+
+
+def _assumed(arm: str, arm_file: ArmFile) -> Iterator[SetupFinding]:
+    """Values that armlink new assumed and nobody has confirmed yet."""
+    if arm in bundled_arms():
+        return
+    lines = Path(arm_file.path).read_text(encoding="utf-8").splitlines()
+    assumed = [number for number, line in enumerate(lines, start=1) if "assumed" in line.partition("#")[2]]
+    if assumed:
+        yield SetupFinding(
+            "hint",
+            f"{len(assumed)} values are marked as assumed, first in line {assumed[0]}",
+            str(arm_file.path),
+            "check each, then remove its comment",
+        )

@@ -1,0 +1,154 @@
+"""Draft of an arm file from a model: every value with where it comes from."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from calib.commissioning.chain import Chain
+from calib.commissioning.clear_range import ClearRange
+from gcomp.arm.load import compile_model
+from gcomp.arrays import Array
+
+ASSUMED_STOP = 2.9
+"""Working range of a joint without stops, to either side [rad]; assumed."""
+TURN = 2 * np.pi
+"""A joint whose limits are further apart has no mechanical stop that it could be pressed on [rad]."""
+SPEED = 1.0
+"""Largest speed, where the model allows more [rad/s]: cautious for the first motion; assumed."""
+RATE_TIME = 0.4
+"""Time in which the commanded torque may go from zero to the largest [s]; assumed."""
+LOAD_FACTOR = 3.0
+"""Rated torque over the largest that the arm's own masses need, where the model states none; assumed."""
+ACCELERATION = 1.0
+"""Acceleration that this need includes, beside gravity [rad/s²]; assumed."""
+LEAST_TORQUE = 2.0
+"""Least such rated torque [N·m]; assumed."""
+FRICTION = 0.02
+"""Coulomb friction of the simulated arm, as a share of rated torque; assumed."""
+POSES = 200
+
+
+@dataclass
+class JointDraft:
+    """One joint of the draft; `notes` are comments for the file, values named first."""
+
+    name: str
+    node: int
+    rated_torque: float
+    max_torque: float
+    max_torque_rate: float
+    max_velocity: float
+    stops: tuple[float, float] | None = None
+    """Only where the model has none, or others were given [rad]."""
+    notes: list[str] = field(default_factory=list)
+    identity: dict[str, int] | None = None
+    """Vendor and product of the drive found at its node."""
+
+
+@dataclass
+class Draft:
+    """What will stand in the arm file."""
+
+    name: str
+    model: Path
+    tip: str | None
+    gravity: tuple[float, float, float]
+    joints: list[JointDraft]
+    aside: tuple[tuple[str, str], ...]
+    notes: list[str]
+    bus: dict[str, str | int] | None = None
+    """None: the simulated arm that this file describes."""
+    serial: str = "unknown"
+    servo: str | None = None
+    """Why resting joints are held by their servos rather than pressed on stops; None: they are pressed."""
+
+    @property
+    def assumed(self) -> list[str]:
+        """Everything that was assumed, as `joint: value`."""
+        return [*self.notes, *(f"{joint.name}: {note}" for joint in self.joints for note in joint.notes)]
+
+
+def draft_of_model(
+    path: Path, chain: Chain, gravity: tuple[float, float, float], stops: Mapping[str, tuple[float, float]]
+) -> Draft:
+    """The draft for one chain of a model; `stops` [rad] by joint name were given by the user. Raises BadModel."""
+    tip = chain.tip if chain.aside else None
+    notes = []
+    if not np.any(gravity):
+        gravity = (0.0, 0.0, -9.80665)
+        notes.append("gravity: the model has none, assumed to point down")
+    need = _load_torque(path, [joint.name for joint in chain.joints], gravity)
+    joints = [
+        _joint(place, chain, stops.get(chain.joints[place].name), float(need[place]))
+        for place in range(len(chain.joints))
+    ]
+    free = [joint.name for joint in joints if joint.stops is not None and joint.name not in stops]
+    servo = f"{', '.join(free)}: no stop to press on" if free else None
+    return Draft(path.stem, path, tip, gravity, joints, chain.aside, notes, servo=servo)
+
+
+def narrow(draft: Draft, found: ClearRange) -> None:
+    """Take a narrower range of every joint into the draft, which is no range between stops any more."""
+    for joint, low, high in zip(draft.joints, found.lower, found.upper, strict=True):
+        joint.stops = (math.ceil(low * 1000) / 1000, math.floor(high * 1000) / 1000)
+        joint.notes = [note for note in joint.notes if not note.startswith("stops")]
+    draft.servo = f"the range under kinematics.stops is narrower than the model's limits: {found.reason}"
+
+
+def _joint(place: int, chain: Chain, given: tuple[float, float] | None, need: float) -> JointDraft:
+    joint, notes = chain.joints[place], []
+    if joint.effort is None:
+        effort = float(f"{max(LOAD_FACTOR * need, LEAST_TORQUE):.2g}")
+        notes.append(f"rated_torque assumed: {LOAD_FACTOR:g} times the load, the model states no effort limit")
+    else:
+        effort = round(joint.effort, 4)
+        notes.append("rated_torque assumed to be the model's effort limit: 6076h of the drive must be the same")
+    stops = given
+    if given is None and joint.limits is None:
+        stops = (-ASSUMED_STOP, ASSUMED_STOP)
+        notes.append(f"stops assumed: ±{ASSUMED_STOP} rad, the model has no limits")
+    elif given is None and joint.limits is not None and joint.limits[1] - joint.limits[0] > TURN:
+        middle = sum(joint.limits) / 2
+        stops = (round(middle - ASSUMED_STOP, 4), round(middle + ASSUMED_STOP, 4))
+        notes.append(f"stops assumed: {ASSUMED_STOP} rad to either side, the model's limits are more than a turn apart")
+    elif given is None:
+        notes.append("stops assumed to be the model's limits")
+    speed = SPEED if joint.speed is None else min(SPEED, joint.speed)
+    if joint.speed is None or joint.speed > SPEED:
+        notes.append(f"max_velocity assumed: {SPEED:g} rad/s")
+    return JointDraft(
+        name=joint.name,
+        node=place + 1,
+        rated_torque=effort,
+        max_torque=effort,
+        max_torque_rate=float(f"{effort / RATE_TIME:.3g}"),
+        max_velocity=round(speed, 4),
+        stops=stops,
+        notes=notes,
+    )
+
+
+def _load_torque(path: Path, names: Sequence[str], gravity: Sequence[float]) -> Array:
+    """Largest torque (n,) [N·m] against gravity and for ACCELERATION of the joint alone, at random poses."""
+    import mujoco
+
+    model = compile_model(path)
+    model.opt.gravity[:] = gravity
+    data = mujoco.MjData(model)
+    joints = [model.joint(name).id for name in names]
+    place, dof = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
+    free = ~model.jnt_limited[joints].astype(bool)
+    low = np.where(free, -np.pi, model.jnt_range[joints, 0])
+    high = np.where(free, np.pi, model.jnt_range[joints, 1])
+    need, column, unit = np.zeros(len(joints)), np.zeros(model.nv), np.eye(model.nv)[dof]
+    for pose in np.random.default_rng(0).uniform(low, high, (POSES, len(joints))):
+        data.qpos[place] = pose
+        mujoco.mj_forward(model, data)
+        for joint, alone in enumerate(unit):
+            mujoco.mj_mulM(model, data, column, alone)
+            least = abs(data.qfrc_bias[dof[joint]]) + ACCELERATION * column[dof[joint]]
+            need[joint] = max(need[joint], least)
+    return need

@@ -1,0 +1,83 @@
+"""Findings about an arm file's model: joints, limits, meshes, gravity."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from armlink.arm_file import ArmFile
+from armlink.model_file import read_model
+from calib.arm.kinematics import gcomp_arm
+from calib.commissioning.finding import SetupFinding
+from calib.plan.sweep_plan import DEAD_LEVER
+from gcomp.gravity.torque import gravity_levers
+
+POSES = 500
+SMALL_LEVER = 0.2
+"""Γ/g below which the torque gain becomes imprecise; a choice."""
+USUAL_GRAVITY = (9.7, 9.9)
+"""On Earth [m/s²]."""
+
+
+def model_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
+    """Findings about kinematics and model; raises BadInput where the model cannot be used at all."""
+    where = str(arm_file.path)
+    if arm_file.model_path is None:
+        yield SetupFinding(
+            "hint",
+            "collisions cannot be checked: the arm file has Denavit-Hartenberg rows and no model",
+            where,
+            "give a URDF or MJCF under kinematics.model, or keep the workspace clear",
+        )
+    else:
+        yield from _file_findings(arm_file)
+    yield from _lever_findings(arm_file)
+
+
+def _file_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
+    assert arm_file.model_path is not None
+    where = str(arm_file.model_path)
+    model = read_model(arm_file.model_path)
+    if model.absent:
+        yield SetupFinding(
+            "warning",
+            f"collision geometry not found: {len(model.absent)} meshes, such as {model.absent[0]}",
+            where,
+            "put the meshes where the model names them (package://NAME/… is looked for in the folders above it)",
+        )
+    elif not model.shapes:
+        yield SetupFinding(
+            "warning",
+            "no collision geometry in the model: collisions are not checked",
+            where,
+            "add collision shapes to the model, or keep the workspace clear",
+        )
+
+
+def _lever_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
+    arm, where = gcomp_arm(arm_file), str(arm_file.path)
+    size = float(np.linalg.norm(arm.gravity))
+    if not USUAL_GRAVITY[0] < size < USUAL_GRAVITY[1]:
+        remedy = "give kinematics.gravity in m/s² in the base frame, such as [0, 0, -9.81]"
+        yield SetupFinding("warning", f"gravity is {size:.3g} m/s², not 9.81", f"{where}: kinematics.gravity", remedy)
+        if size < 1e-6:
+            return
+    low = np.where(np.isfinite(arm.lower), arm.lower, -np.pi)
+    high = np.where(np.isfinite(arm.upper), arm.upper, np.pi)
+    poses = np.random.default_rng(0).uniform(low, high, (POSES, arm.n))
+    lever = gravity_levers(arm, poses).max(axis=0) / size
+    for joint, name in enumerate(arm.names):
+        if lever[joint] < DEAD_LEVER:
+            axis = "its axis is vertical" if joint == 0 else "its axis is vertical in every pose"
+            yield SetupFinding(
+                "warning",
+                f"gravity has no lever on it (Γ/g {lever[joint]:.2f}): {axis}, and its torque gain cannot be found",
+                name,
+                "incline the base for the sweeps, or live with its offset alone",
+            )
+        elif lever[joint] < SMALL_LEVER:
+            yield SetupFinding(
+                "hint",
+                f"gravity has a short lever on it (Γ/g at most {lever[joint]:.2f}): its torque gain will be imprecise",
+                name,
+                "incline the base for the sweeps, or widen the ranges of the joints before it",
+            )

@@ -1,0 +1,86 @@
+"""Findings about what the drives must do: hold the arm, press joints on their stops, sweep without a collision."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from armlink.arm_file import ArmFile
+from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import gcomp_arm, model_arm
+from calib.arm.sweep_section import sweep_section
+from calib.commissioning.finding import SetupFinding
+from calib.plan.bias_torque import pressable
+from calib.plan.collisions import check_plan
+from calib.plan.poses import sweep_range
+from calib.plan.rough_gravity import GravityGuess, guess_of_model
+from calib.plan.stop_selection import stop_combinations
+from calib.plan.sweep_plan import plan_sweep
+from gcomp.gravity.torque import gravity_torque
+
+POSES = 500
+RESERVE = 1.2
+"""Torque that a drive should have over gravity, as a factor; a choice: friction and acceleration need the rest."""
+FASTEST_RATE = 20.0
+"""A torque limit that is reached in less than its inverse [1/s] is a blow; a choice."""
+
+
+def motion_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
+    """Findings about torques, stops and the sweeps; raises BadInput or Refused where no sweep can be planned."""
+    if arm_file.link is None:
+        return
+    for joint in arm_file.link.joints:
+        if joint.max_torque > 3 * joint.rated_torque:
+            what = f"max_torque {joint.max_torque:g} N·m is more than three times rated_torque {joint.rated_torque:g}"
+            yield SetupFinding("warning", what, joint.name, "check both: 6076h and 6072h of the drive")
+        if joint.max_torque_rate > FASTEST_RATE * joint.max_torque:
+            what = f"max_torque_rate {joint.max_torque_rate:g} N·m/s: full torque within {1e3 / FASTEST_RATE:.0f} ms"
+            yield SetupFinding("hint", what, joint.name, f"about {2.5 * joint.max_torque:.3g} N·m/s is usual")
+    guess = None
+    if arm_file.model_path is not None:
+        model = model_arm(arm_file)
+        guess = guess_of_model(model.arm, model.beta)
+        yield from _strength(arm_file, guess)
+        if sweep_section(arm_file).hold == "stops" and np.isfinite([model.arm.lower, model.arm.upper]).all():
+            yield from _stops(arm_file, guess)
+    plan = plan_sweep(arm_file, guess)
+    checked = check_plan(arm_file, plan)
+    for note in plan.notes:
+        what, _, remedy = note.partition(": ")
+        yield SetupFinding("warning", what, str(arm_file.path), remedy or "see docs/sweeps.md")
+    if "not checked" not in checked and "without" in checked:
+        yield SetupFinding("hint", checked, str(arm_file.path), "give the missing meshes")
+
+
+def _strength(arm_file: ArmFile, guess: GravityGuess) -> Iterator[SetupFinding]:
+    """Joints whose drives cannot hold the arm everywhere in its range."""
+    arm, limits = gcomp_arm(arm_file), Limits.of(arm_file)
+    low, high = np.nan_to_num(arm.lower, neginf=-np.pi), np.nan_to_num(arm.upper, posinf=np.pi)
+    poses = np.random.default_rng(0).uniform(low, high, (POSES, arm.n))
+    need = np.abs(gravity_torque(arm, guess.beta, poses)).max(axis=0)
+    for joint, name in enumerate(arm.names):
+        most = limits.max_torque[joint]
+        if need[joint] > most:
+            what = f"gravity needs up to {need[joint]:.3g} N·m by the model, max_torque is {most:g}"
+            remedy = "check the model's masses and max_torque: the arm would fall"
+            yield SetupFinding("error", what, name, remedy)
+        elif RESERVE * need[joint] > most:
+            what = f"gravity needs up to {need[joint]:.3g} N·m by the model, max_torque is {most:g}: little is left"
+            yield SetupFinding("warning", what, name, "narrow the ranges, or allow more torque if the drive has it")
+
+
+def _stops(arm_file: ArmFile, guess: GravityGuess) -> Iterator[SetupFinding]:
+    """Joints that cannot be pressed on any stop within max_torque while another is swept."""
+    arm, section, limits = gcomp_arm(arm_file), sweep_section(arm_file), Limits.of(arm_file)
+    ever = np.zeros(arm.n, dtype=bool)
+    for joint in range(arm.n):
+        candidates = stop_combinations(arm, joint, sweep_range(section, limits, joint))
+        ever |= pressable(guess, section, limits, candidates).any(axis=0) & (np.arange(arm.n) != joint)
+    for name, pressed in zip(arm.names, ever, strict=True):
+        if pressed or arm.n == 1:
+            continue
+        yield SetupFinding(
+            "warning",
+            "it cannot be pressed on a stop within max_torque",
+            name,
+            "hold resting joints by their servos (sweep: {hold: servo}), or allow more torque",
+        )

@@ -1,0 +1,157 @@
+"""Makes an arm file from a model: chain, ranges, drives; asks where somebody can answer, else assumes and says so."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import yaml
+
+from armlink.arm_file import MODEL_SUFFIXES, ArmFile, parse_arm
+from armlink.errors import BadInput
+from armlink.monitor.drives import Drives
+from calib.arm.kinematics import gcomp_arm
+from calib.commissioning.arm_text import arm_text
+from calib.commissioning.chain import Chain, find_chains
+from calib.commissioning.clear_range import narrowed
+from calib.commissioning.draft import Draft, draft_of_model, narrow
+from calib.commissioning.drive_match import Ask, Match, TurnedJoint, match_by_hand, match_in_order
+from calib.commissioning.finding import SetupFinding
+from calib.commissioning.model_joints import model_joints
+
+RATING_FACTOR = 2.5
+"""A drive whose rated torque differs from the model's effort limit by more is doubted; a choice."""
+
+
+class Questions(Protocol):
+    """What a person at a terminal is asked."""
+
+    def which(self, chains: Sequence[Chain]) -> Chain:
+        """Which of several arms in a model is meant."""
+        ...
+
+    def stops(self, joint: str) -> tuple[float, float] | None:
+        """Stops [rad] of a joint for which the model has none; None where they are not known."""
+        ...
+
+
+@dataclass
+class NewArm:
+    """An arm file about to be written, and how it came about."""
+
+    out: Path
+    draft: Draft
+    findings: list[SetupFinding] = field(default_factory=list)
+
+    @property
+    def text(self) -> str:
+        """The file's text."""
+        return arm_text(self.draft, self.out)
+
+    def parsed(self) -> ArmFile:
+        """The arm file, validated as if it lay there already."""
+        return parse_arm(yaml.safe_load(self.text), self.out)
+
+    def write(self) -> None:
+        """Write the file; raises BadInput."""
+        try:
+            self.out.parent.mkdir(parents=True, exist_ok=True)
+            self.out.write_text(self.text, encoding="utf-8")
+        except OSError as error:
+            raise BadInput(f"{self.out}: cannot be written: {error.strerror}") from None
+
+
+def new_arm(
+    model: Path,
+    out: Path,
+    *,
+    tip: str | None = None,
+    stops: Mapping[str, tuple[float, float]] | None = None,
+    name: str | None = None,
+    questions: Questions | None = None,
+) -> NewArm:
+    """The arm file of a model, to stand at `out`; nothing is written. Raises BadInput, BadModel, Refused.
+
+    The longest chain of revolute joints is the arm. A gripper, mimic joints and prismatic joints at its end keep the
+    model's position. Where sweeps within the model's limits would collide, a narrower range is chosen.
+    """
+    if model.suffix.lower() not in MODEL_SUFFIXES:
+        raise BadInput(f"{model}: expected a URDF or MJCF model ({', '.join(MODEL_SUFFIXES)})")
+    if not model.is_file():
+        raise BadInput(f"no model file {model}: give the path of a URDF or MJCF file")
+    joints, gravity = model_joints(model)
+    chains = find_chains(joints, model, tip)
+    chain = chains[0] if questions is None or len(chains) == 1 else questions.which(chains)
+    given = _given_stops(chain, dict(stops or {}), model, questions)
+    draft = draft_of_model(model, chain, gravity, given)
+    if len(chains) > 1 and questions is None:
+        others = ", ".join(each.tip for each in chains if each is not chain)
+        draft.notes.append(f"tip assumed: the model has {len(chains)} arms; the others end in {others} (--tip)")
+    draft.name = name or draft.name
+    made = NewArm(out, draft)
+    clear = narrowed(made.parsed())
+    if clear is not None:
+        narrow(draft, clear)
+    return made
+
+
+def _given_stops(
+    chain: Chain, stops: dict[str, tuple[float, float]], model: Path, questions: Questions | None
+) -> dict[str, tuple[float, float]]:
+    names = [joint.name for joint in chain.joints]
+    for name in stops:
+        if name not in names:
+            raise BadInput(f"--stops {name}: no joint of the arm in {model}; there are {', '.join(names)}")
+    for joint in chain.joints:
+        if joint.limits is None and joint.name not in stops and questions is not None:
+            answer = questions.stops(joint.name)
+            if answer is not None:
+                stops[joint.name] = answer
+    return stops
+
+
+def match_drives(made: NewArm, drives: Drives, bus: str, ask: Ask | None) -> list[Match]:
+    """Find the drive of every joint and take its node, identity and ratings into the draft; raises BusFault, BadInput.
+
+    With `ask` each joint is turned by hand, else the order of node ids counts.
+    """
+    names = [joint.name for joint in made.draft.joints]
+    if ask is None:
+        matches = match_in_order(names, drives, bus)
+    else:
+        arm = gcomp_arm(made.parsed())
+        turned = [TurnedJoint(*each) for each in zip(arm.names, arm.lower, arm.upper, strict=True)]
+        matches, findings = match_by_hand(turned, drives, bus, ask)
+        made.findings += findings
+    for joint, match in zip(made.draft.joints, matches, strict=True):
+        drive = match.drive
+        ratio = drive.rated_torque / joint.rated_torque
+        from_model = not any(note.startswith("rated_torque assumed: ") for note in joint.notes)
+        if from_model and not 1 / RATING_FACTOR < ratio < RATING_FACTOR:
+            made.findings.append(_doubtful_rating(match, joint.rated_torque))
+        joint.node, joint.rated_torque = drive.node, drive.rated_torque
+        joint.max_torque = min(joint.max_torque, drive.max_torque) if from_model else drive.max_torque
+        joint.max_torque_rate = float(f"{2.5 * joint.max_torque:.3g}")
+        joint.identity = {"vendor": drive.identity.vendor, "product": drive.identity.product}
+        joint.notes = [note for note in joint.notes if not note.startswith("rated_torque")]
+        joint.notes.append(
+            "node found by turning the joint by hand" if match.by_hand else "node assumed: in the order of node ids"
+        )
+    return matches
+
+
+def _doubtful_rating(match: Match, effort: float) -> SetupFinding:
+    drive = match.drive
+    remedy = "check that this drive moves this joint" + ("" if match.by_hand else ": --by-hand finds out")
+    what = f"the drive is rated {drive.rated_torque:g} N·m, the model's effort limit is {effort:g} N·m"
+    return SetupFinding("warning", what, f"{match.joint} (node {drive.node})", remedy)
+
+
+def rewired(content: dict[str, Any], matches: Sequence[Match], bus: dict[str, str | int]) -> dict[str, Any]:
+    """An arm file's content with the drives found on a bus: nodes, rated torques and the bus itself."""
+    joints = []
+    for row, match in zip(content["link"]["joints"], matches, strict=True):
+        drive = match.drive
+        most = min(float(row["max_torque"]), drive.max_torque)
+        joints.append({**row, "node": drive.node, "rated_torque": drive.rated_torque, "max_torque": most})
+    return {**content, "link": {**content["link"], "bus": bus, "joints": joints}}

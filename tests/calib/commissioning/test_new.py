@@ -1,0 +1,228 @@
+"""From a model to an arm file: chain, limits, drives found by hand, and what is assumed says so."""
+
+import copy
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from armlink import cli
+from armlink.arm_file import load_arm, parse_arm
+from armlink.errors import BadInput, BusFault
+from armlink.monitor.drives import Drives
+from calib.arm.kinematics import gcomp_arm
+from calib.commissioning.new_arm import NewArm, match_drives, new_arm
+from calib.plan.collisions import Geometry
+from gcomp.errors import BadModel
+from sim_bus.bus.lock_step import LockStepBus
+from sim_bus.simulated_arm import SimulatedArm
+from sim_bus.truth import Truth
+
+MODELS = Path(__file__).parents[2] / "models"
+
+
+@pytest.fixture(scope="module")
+def planned(tmp_path_factory) -> NewArm:
+    return new_arm(MODELS / "arm4.urdf", tmp_path_factory.mktemp("made") / "arm4.yaml")
+
+
+@pytest.fixture
+def made(planned, tmp_path) -> NewArm:
+    """Of its own for each test, beside a copy of the model."""
+    shutil.copy(MODELS / "arm4.urdf", tmp_path)
+    draft = replace(copy.deepcopy(planned.draft), model=tmp_path / "arm4.urdf")
+    return NewArm(tmp_path / "arm4.yaml", draft)
+
+
+def test_gripper_and_mimic_joints_are_set_aside(made):
+    assert [joint.name for joint in made.draft.joints] == ["j1", "j2", "j3", "j4"]
+    assert dict(made.draft.aside).keys() == {"grip_l", "grip_r"}
+    assert made.draft.tip == "l4"
+
+
+def test_limits_torques_and_speeds_are_the_model_s(made):
+    arm = gcomp_arm(made.parsed())
+    np.testing.assert_allclose(arm.lower, [-2.5, -2.0, -2.2, -2.9])
+    np.testing.assert_allclose(arm.upper, [2.5, 1.0, 2.2, 2.9])
+    link = made.parsed().require_link()
+    assert [joint.rated_torque for joint in link.joints] == [40, 40, 20, 8]
+    assert all(joint.max_velocity == 1.0 for joint in link.joints)
+
+
+def test_every_assumed_value_is_a_comment_of_the_file(made):
+    assert made.draft.assumed
+    for each in made.draft.assumed:
+        assert f"# {each.partition(': ')[2]}" in made.text
+
+
+def test_a_joint_without_stops_is_not_pressed_on_any(made, tmp_path):
+    assert made.parsed().sweep.hold == "servo"
+    given = new_arm(MODELS / "arm4.urdf", tmp_path / "arm4.yaml", stops={"j4": (-1.5, 1.0)})
+    assert given.parsed().sweep is None
+    assert gcomp_arm(given.parsed()).upper[3] == 1.0
+
+
+def test_prismatic_fingers_are_set_aside_and_a_range_is_chosen_where_nothing_touches(tmp_path):
+    made = new_arm(MODELS / "own.xml", tmp_path / "own.yaml")
+    assert [joint.name for joint in made.draft.joints] == ["yaw", "pitch", "elbow", "roll"]
+    made.write()
+    arm = load_arm(made.out)
+    geometry, limits = Geometry(arm), gcomp_arm(arm)
+    poses = np.random.default_rng(5).uniform(limits.lower, limits.upper, (300, limits.n))
+    assert geometry.free(poses).mean() > 0.99
+    whole = gcomp_arm(
+        parse_arm({"name": "own", "kinematics": {"model": str(MODELS / "own.xml"), "tip": "wrist"}}, made.out)
+    )
+    poses = np.random.default_rng(5).uniform(whole.lower, whole.upper, (300, limits.n))
+    assert geometry.free(poses).mean() < 0.9  # the floor is there
+
+
+def test_limits_more_than_a_turn_apart_are_no_stops(tmp_path, monkeypatch):
+    monkeypatch.setattr("calib.commissioning.new_arm.narrowed", lambda arm_file: None)
+    made = new_arm(MODELS / "ur10e.urdf", tmp_path / "ur10e.yaml")
+    assert made.parsed().sweep.hold == "servo"
+    limits = gcomp_arm(made.parsed())
+    assert (limits.upper - limits.lower <= 2 * np.pi).all()
+
+
+def test_two_arms_in_a_model(tmp_path, monkeypatch):
+    monkeypatch.setattr("calib.commissioning.new_arm.narrowed", lambda arm_file: None)
+    text = (MODELS / "own.xml").read_text()
+    body = text[text.index('<body name="turret"') : text.index("  </worldbody>")]
+    second = body
+    for word in (
+        "turret",
+        "upper",
+        "fore",
+        "wrist",
+        "palm",
+        "left",
+        "right",
+        "yaw",
+        "pitch",
+        "elbow",
+        "roll",
+        "slide_",
+    ):
+        second = second.replace(f'"{word}', f'"other_{word}')
+    model = tmp_path / "two.xml"
+    model.write_text(
+        text.replace("  </worldbody>", second.replace('pos="0 0 0.3"', 'pos="0 3 0.3"') + "  </worldbody>")
+    )
+    first = new_arm(model, tmp_path / "two.yaml")
+    assert first.draft.joints[0].name == "yaw"
+    assert "other_wrist" in " ".join(first.draft.notes)
+    named = new_arm(model, tmp_path / "two.yaml", tip="other_wrist")
+    assert named.draft.joints[0].name == "other_yaw"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('name="j2" type="revolute"', 'name="j2" type="prismatic"', "j2 is prismatic and lies between the base"),
+        ('<joint name="j1" type="revolute">', '<joint name="" type="revolute">', "joint 1 of the chain"),
+        ('<mass value="2"/>', '<mass value="two"/>', "MuJoCo refuses it"),
+    ],
+)
+def test_a_model_that_cannot_be_used_names_the_joint(old, new, says, tmp_path):
+    text = (MODELS / "arm4.urdf").read_text()
+    assert old in text
+    model = tmp_path / "bad.urdf"
+    model.write_text(text.replace(old, new))
+    with pytest.raises((BadInput, BadModel), match=says):
+        new_arm(model, tmp_path / "bad.yaml")
+
+
+def real_arm(made: NewArm, folder: Path, nodes: list[int], position_gain: list[float]) -> SimulatedArm:
+    """An arm on the bus as somebody wired it: other node ids, other ratings, signs and gears."""
+    content = yaml.safe_load(made.text)
+    for row, node in zip(content["link"]["joints"], nodes, strict=True):
+        row |= {"node": node, "rated_torque": row["rated_torque"] * 1.1, "max_torque": row["max_torque"] * 1.2}
+    content["sim"]["sensors"] = {"position_gain": position_gain}
+    path = folder / "real.yaml"
+    path.write_text(yaml.safe_dump(content))
+    arm = load_arm(path)
+    return SimulatedArm(arm, Truth.of(arm))
+
+
+def hands(arm: SimulatedArm, made: NewArm):
+    """A person who does what is asked."""
+    limits = {each.name: each for each in made.draft.joints}
+    known = gcomp_arm(made.parsed())
+    ends = dict(zip(known.names, zip(known.lower, known.upper, strict=True), strict=True))
+
+    def ask(text: str) -> None:
+        joint = text.partition(":")[0]
+        assert joint in limits
+        arm.turn_by_hand(joint, ends[joint]["upper" in text])
+
+    return ask
+
+
+def test_permuted_ids_a_turned_sign_and_another_gear_are_found_by_hand(made, tmp_path):
+    arm = real_arm(made, tmp_path, nodes=[12, 10, 11, 13], position_gain=[1.0, -1.0, 2.0, 1.01])
+    drives = Drives(LockStepBus(arm=arm))
+    matches = match_drives(made, drives, "the bus", hands(arm, made))
+    assert [match.drive.node for match in matches] == [12, 10, 11, 13]
+    assert [(each.level, each.where) for each in made.findings] == [
+        ("error", "j2 (node 10)"),
+        ("error", "j3 (node 11)"),
+    ]
+    assert "607Eh" in made.findings[0].remedy
+    assert "factor 0.5" in made.findings[1].remedy
+    link = made.parsed().require_link()
+    assert [joint.node for joint in link.joints] == [12, 10, 11, 13]
+    assert [joint.rated_torque for joint in link.joints] == pytest.approx([44, 44, 22, 8.8])
+
+
+def test_in_order_of_ids_a_doubtful_rating_is_named(made, tmp_path):
+    arm = real_arm(made, tmp_path, nodes=[4, 3, 2, 1], position_gain=[1.0] * 4)
+    match_drives(made, Drives(LockStepBus(arm=arm)), "the bus", None)
+    assert [each.where for each in made.findings] == ["j1 (node 1)", "j4 (node 4)"]
+    assert "--by-hand" in made.findings[0].remedy
+
+
+def test_a_joint_that_nobody_turned_and_a_drive_that_is_missing(made, tmp_path):
+    arm = real_arm(made, tmp_path, nodes=[1, 2, 3, 4], position_gain=[1.0] * 4)
+    drives = Drives(LockStepBus(arm=arm))
+    with pytest.raises(BusFault, match="no drive read the motion of j1"):
+        match_drives(made, drives, "the bus", lambda text: None)
+    drives.found.pop()
+    with pytest.raises(BusFault, match=r"3 drives answer \(nodes 1, 2, 3\), the arm has 4 joints"):
+        match_drives(made, drives, "the bus", None)
+
+
+def test_the_command_writes_a_file_that_plan_and_check_take(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(MODELS / "arm4.urdf", tmp_path)
+    assert cli.run(["new", "arm4.urdf", "--stops", "j4:-2.5:2.5", "--json", "-"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["next"] == "armlink demo --arm arm4.yaml"
+    assert cli.run(["sweep", "arm4.yaml", "--plan", "--out", "plan", "--json", "-"]) == 0
+    assert cli.run(["check", "arm4.yaml"]) == 0
+    capsys.readouterr()
+    assert cli.run(["new", "arm4.urdf"]) == 2
+    assert "--force" in capsys.readouterr().err
+
+
+def test_with_a_bus_the_file_passes_the_check_on_that_bus(made, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    real_arm(made, tmp_path, nodes=[7, 8, 9, 10], position_gain=[1.0] * 4)
+    made.write()
+    assert cli.run(["new", "arm4.urdf", "--out", "found.yaml", "--bus", "armlink_sim:real.yaml"]) == 0
+    assert cli.run(["check", "found.yaml"]) == 0
+    assert cli.run(["new", "arm4.yaml", "--out", "rewired.yaml", "--bus", "armlink_sim:real.yaml"]) == 0
+    assert cli.run(["check", "rewired.yaml", "--passive"]) == 0
+    assert [joint.node for joint in load_arm("rewired.yaml").require_link().joints] == [7, 8, 9, 10]
+    assert cli.run(["new", "arm4.urdf", "--out", "x.yaml", "--bus", "armlink_sim:real.yaml", "--by-hand"]) == 2
+    assert "nobody to ask" in capsys.readouterr().err
+
+
+def test_an_arm_file_without_a_bus_has_nothing_to_find(tmp_path):
+    with pytest.raises(BadInput, match="expected a URDF or MJCF model"):
+        new_arm(tmp_path / "arm.yaml", tmp_path / "out.yaml")
+    assert cli.run(["new", "sarcos.yaml"]) == 2
