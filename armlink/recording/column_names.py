@@ -70,7 +70,7 @@ def _plain(column: str) -> str:
 def _parts(column: str) -> tuple[str, int | str]:
     """Stem of a column's name without its number, and the number; without one, the channel word and the whole name."""
     plain = _plain(column)
-    number = re.search(r"(?<!\d)(\d{1,4})(?!.*\d)", plain)
+    number = re.search(r"(?<!\d)(\d{1,9})(?!.*\d)", plain)
     if number:
         return re.sub(r"_+", "_", plain[: number.start()] + plain[number.end() :]).strip("_"), int(number.group(1))
     words = plain.split("_")
