@@ -44,7 +44,7 @@ function drawOne(card, shown, k, name) {
   const drawing = svg("svg", { viewBox: `0 0 ${width} ${TALL}`, height: TALL, role: "img", "aria-label": label });
   for (const value of [middle + half, middle, middle - half]) {
     drawing.append(svg("line", { class: "grid", x1: NEAR, x2: width - FAR, y1: y(value), y2: y(value) }));
-    drawing.append(svg("text", { x: NEAR - 5, y: y(value) + 4, "text-anchor": "end" }, number(value, half < 5 ? 1 : 0)));
+    drawing.append(svg("text", { x: NEAR - 5, y: y(value) + 4, "text-anchor": "end" }, number(value, half < 20 ? 1 : 0).replace(/^−(0\.?0*)$/, "$1")));
   }
   for (const [ago, anchor] of [[SPAN, "start"], [SPAN / 2, "middle"], [0, "end"]]) {
     drawing.append(svg("text", { x: x(to - 1000 * ago), y: FOOT + 12, "text-anchor": anchor }, ago ? `−${ago} s` : "now"));
