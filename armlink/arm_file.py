@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from functools import cached_property
+from functools import cache, cached_property
 from importlib.metadata import entry_points
 from importlib.resources import files
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from armlink.arrays import Array
 from armlink.errors import BadInput
@@ -44,10 +44,14 @@ class BadKeys(BadInput):
         self.keys = keys
 
 
+Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f\x7f/\\]*$")]
+"""A name that goes into file names and reports: one line, no path."""
+
+
 class DhJoint(Section):
     """One revolute joint in standard Denavit-Hartenberg form; `lower` and `upper` are its mechanical stops."""
 
-    name: str
+    name: Name
     a: FiniteFloat = 0.0
     """Link length [m]."""
     alpha: FiniteFloat = 0.0
@@ -109,6 +113,25 @@ class Bus(Section):
     """Further options of python-can's interface, such as data_bitrate or serial."""
 
 
+def _parse_drive(keys: Any) -> Any:
+    """Validate `link.joints[].drive` by its family's own model (entry-point group `armlink.drives`)."""
+    if keys is None or isinstance(keys, Section):
+        return keys
+    if not isinstance(keys, dict) or not isinstance(keys.get("family"), str):
+        raise ValueError("expected a mapping with the key family")
+    return _drive_settings(keys["family"]).model_validate(keys)
+
+
+@cache
+def _drive_settings(family: str) -> type[Section]:
+    points = entry_points(group="armlink.drives", name=family)
+    if not points:
+        known = ", ".join(sorted({point.name for point in entry_points(group="armlink.drives")}))
+        raise ValueError(f"no drive family {family!r}; there are {known}")
+    settings: type[Section] = next(iter(points)).load().settings
+    return settings
+
+
 U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 
 
@@ -122,10 +145,13 @@ class DeviceIdentity(Section):
 
 
 class LinkJoint(Section):
-    """One joint controller: its node and the limits that no frame may exceed."""
+    """One joint controller: its drive and the limits that no frame may exceed."""
 
-    name: str
-    node: Annotated[int, Field(ge=1, le=127)]
+    name: Name
+    node: Annotated[int, Field(ge=1, le=127)] | None = None
+    """Short for `drive: {family: canopen, node: …}`: CiA 402 with our own torque sensor object 2100h."""
+    drive: Annotated[Any, BeforeValidator(_parse_drive)] = None
+    """Family of the drive and the keys of that family (docs/drives.md)."""
     rated_torque: Positive
     """Torque that 1000 ‰ stands for (6076h) [N·m]."""
     max_torque: Positive
@@ -141,13 +167,24 @@ class LinkJoint(Section):
     bus: str = ""
     """Name of its bus in link.buses; empty: link.bus."""
 
+    @model_validator(mode="after")
+    def _one_drive(self) -> "LinkJoint":
+        if (self.node is None) == (self.drive is None):
+            raise ValueError(f"{self.name}: give either drive ({{family: …}}) or node, and not both")
+        return self
+
+    @property
+    def settings(self) -> Any:
+        """Keys of its drive: the settings model of its family."""
+        return self.drive if self.node is None else _parse_drive({"family": "canopen", "node": self.node})
+
 
 class LinkSection(Section):
     """The link: bus, rate and joint controllers in joint order."""
 
     bus: Bus = Bus()
     buses: dict[str, Bus] = {}
-    """Further buses by name, for joints that name one; node ids are unique over all of them."""
+    """Further buses by name, for joints that name one; ids are unique on each bus."""
     rate: Annotated[FiniteFloat, Field(gt=0, le=1000)] = 250.0
     """SYNC rate [Hz]."""
     deadline: Annotated[FiniteFloat, Field(ge=0.01, le=10)] = 0.1
@@ -162,7 +199,7 @@ class LinkSection(Section):
     @model_validator(mode="after")
     def _nodes_are_unique(self) -> "LinkSection":
         _no_twins([joint.name for joint in self.joints])
-        _no_twins([joint.node for joint in self.joints])
+        _no_twins([f"{joint.settings.address}{joint.bus and ' on bus '}{joint.bus}" for joint in self.joints])
         for joint in self.joints:
             if joint.bus and joint.bus not in self.buses:
                 known = ", ".join(self.buses) or "none"
@@ -173,14 +210,21 @@ class LinkSection(Section):
 class ArmFile(Section):
     """A whole arm file. `sweep`, `sim`, `daemon` hold the models that packages registered in `armlink.sections`."""
 
-    name: str
-    serial: str = "unknown"
+    name: Name
+    serial: Name = "unknown"
     kinematics: Kinematics
     link: LinkSection | None = None
     sweep: Any = None
     sim: Any = None
     daemon: Any = None
     path: Path
+
+    @model_validator(mode="after")
+    def _name_is_no_folder(self) -> "ArmFile":
+        for key, value in (("name", self.name), ("serial", self.serial)):
+            if value in (".", ".."):
+                raise ValueError(f"{key} is {value!r}, expected a name that can be part of a file's name")
+        return self
 
     @model_validator(mode="after")
     def _same_joints_everywhere(self) -> "ArmFile":
@@ -245,9 +289,7 @@ def load_arm(arm: str | Path) -> ArmFile:
     if path.suffix.lower() in MODEL_SUFFIXES:
         raise BadInput(f"{path}: is a model, not an arm file: make one of it with armlink new {path}")
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise BadInput(f"{path}: not YAML: {error}") from None
+        content = read_yaml(path)
     except OSError as error:
         raise BadInput(f"{path}: cannot be read: {error.strerror}") from None
     if not isinstance(content, dict):
@@ -264,6 +306,16 @@ def _no_arm_file(path: Path) -> str:
     if path.is_dir():
         return f"{path}: is a folder: give the arm file in it, or a bundled arm ({', '.join(bundled)})"
     return f"no arm file {path}: give a path, or a bundled arm ({', '.join(bundled)}){hint}"
+
+
+def read_yaml(path: Path) -> Any:
+    """Content of a YAML file; raises BadInput, in one line, where it is none, OSError where it cannot be read."""
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except RecursionError:
+        raise BadInput(f"{path}: not YAML that can be used: nested too deeply") from None
+    except (yaml.YAMLError, ValueError, OverflowError) as error:  # a date or number that does not exist, for example
+        raise BadInput(f"{path}: not YAML: {' '.join(str(error).split())}") from None
 
 
 def parse_arm(content: dict[str, Any], path: Path) -> ArmFile:

@@ -54,7 +54,15 @@ def _finding(found: typing.Any, within: str, of: type[BaseModel] | None) -> tupl
     unit = UNIT.fullmatch(value) if isinstance(value, str) else None
     if unit and found["type"].startswith(("float", "int")):
         message += f"; give the number alone, without {unit[1]!r}"
-    return key, f"{message} (value {value!r})"
+    return key, f"{message} (value {_short(value)})"
+
+
+def _short(value: typing.Any) -> str:
+    try:
+        text = repr(value)
+    except ValueError:  # a number of more digits than Python writes
+        return "a number of very many digits"
+    return text if len(text) <= 100 else f"{text[:100]}…"
 
 
 def _keys(model: type[BaseModel] | None, way: list[str]) -> list[str]:

@@ -56,6 +56,12 @@ def read_model(path: Path) -> ModelFile:
             mesh.file = str(file)
             continue
         absent.append(mesh.file)
+        weighed = [geom.parent.name for geom in spec.geoms if geom.meshname == mesh.name and not _has_inertial(geom)]
+        if weighed and kind == "MJCF":
+            raise BadInput(
+                f"{path}: mesh {mesh.file} is not there, and body {weighed[0]!r} has its mass from it alone: put the "
+                "mesh beside the model, or give the body an inertial"
+            )
         _drop(spec, mesh)
     for texture in list(spec.textures):
         if texture.file and _find(texture.file, folder, folder / spec.compiler.texturedir) is None:
@@ -99,6 +105,11 @@ def _find(name: str, *folders: Path) -> Path | None:
     else:
         tries = [folder / name.removeprefix("file://") for folder in folders]
     return next((each for each in tries if each.is_file()), None)
+
+
+def _has_inertial(geom: Any) -> bool:
+    """Whether the body of a shape has its mass stated, or does not move."""
+    return bool(geom.parent.explicitinertial) or geom.parent.name == "world"
 
 
 def _drop(spec: Any, mesh: Any) -> None:

@@ -16,8 +16,8 @@ import canopen
 from echo_nodes import NODES, answer_in_kernel, make_arm, remove_gateway, start_nodes
 
 from armlink.bus.open import open_bus
-from armlink.canopen.eds_file import bundled
 from armlink.clock import MonotonicClock
+from armlink.drives.canopen.eds_file import bundled
 from armlink.link.link import Link
 from armlink.link.types import Command
 

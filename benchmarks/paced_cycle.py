@@ -14,7 +14,7 @@ from echo_nodes import NODES, answer_in_kernel, make_arm, remove_gateway, start_
 
 from armlink.bus.frame_bits import frame_bits, longest_frame_bits
 from armlink.bus.open import open_bus
-from armlink.canopen.pdo import RPDO1
+from armlink.drives.canopen.pdo import RPDO1
 from armlink.link.link import Link
 from armlink.link.types import Command
 

@@ -4,8 +4,9 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
-from armlink.arm_file import ArmFile, Positive, Section, describe
+from armlink.arm_file import ArmFile, Positive, Section
 from armlink.errors import BadInput
+from armlink.key_errors import describe
 from sim_bus.effects.registry import check_entry
 
 Vector3 = Annotated[tuple[FiniteFloat, ...], Field(min_length=3, max_length=3)]

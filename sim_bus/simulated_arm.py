@@ -1,14 +1,19 @@
-"""The simulated arm: plant, sensors, drives and one CANopen node per joint."""
+"""The simulated arm: plant, sensors, and one drive per joint: a CANopen node, or a drive of another family."""
 
 import struct
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+
+import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
-from armlink.canopen.object_dictionary import SYNC_ID
+from armlink.drives.canopen.object_dictionary import SYNC_ID
 from armlink.errors import BadInput
+from sim_bus.drives.fronts import build_fronts
+from sim_bus.drives.motor import Motor, Readings
+from sim_bus.drives.simulated_drive import SimulatedDrive
 from sim_bus.effects.effect import EffectSetting
 from sim_bus.effects.realism import add_realism
 from sim_bus.effects.registry import imperfections
@@ -40,7 +45,7 @@ class SimulatedArm:
         self.arm, self.truth, self.names, self.n = arm, truth, arm.joint_names, len(arm.joint_names)
         self.time = 0.0
         self.outbox: deque[Frame] = deque()
-        self.default_period = 1.0 / link.rate
+        self.default_period = self._period = 1.0 / link.rate
         self._entries: tuple[EffectSetting, ...] = section.effects
         with self._effects_checked():
             state = self._imperfections()
@@ -50,14 +55,20 @@ class SimulatedArm:
         self.drives = Drives(arm, self.plant, self.sensors, self._signals)
         self._sampled = 0.0
         self._synchronous = self._watching = False
-        self.nodes = [Node(j, joint.node, self._signals, self._send) for j, joint in enumerate(link.joints)]
+        self.nodes = [
+            Node(j, joint.settings.node, self._signals, self._send)
+            for j, joint in enumerate(link.joints)
+            if joint.settings.family == "canopen"
+        ]
+        self._node_at = {node.place: node for node in self.nodes}
         self.place_of = {node.node_id: node.place for node in self.nodes}
         self._sdo = {0x600 + node.node_id: node for node in self.nodes}
         self.supervision = Supervision(self.nodes, self.drives, self._send)
         self._nmt = NetworkManagement(self.nodes, self.drives, self.supervision, self._apply)
         self._operational = self._nmt.operational
         self._pdos = PdoTable(self._signals, self._operational, self._send)
-        for node, joint in zip(self.nodes, link.joints, strict=True):
+        for node in self.nodes:
+            joint = link.joints[node.place]
             node.identity = power_on_values(arm, joint, int(self.sensors.increments[node.place]))
             node.reset()
             node.on_write = lambda key, node=node: self._written(node, key)  # type: ignore[misc]
@@ -67,6 +78,14 @@ class SimulatedArm:
         self.drives.on_state, self.drives.on_fault = self._state_changed, self._faulted
         self.drives.take_commands()
         self.drives.sample(0.0, 0.0)
+        readings = Readings(self.plant, self.sensors)
+        motors = [Motor(j, joint, self.drives.loops, self.sensors, readings) for j, joint in enumerate(link.joints)]
+        self.fronts = build_fronts(arm, motors, self._sender)
+        """Bus and drives of every family but CANopen."""
+        self.drive_at = {drive.joint: drive for _, front in self.fronts for drive in front.drives}
+        self._set_torque_constants()
+        for drive in self.drive_at.values():
+            drive.pass_time(0.0)
 
     # ---- bus
 
@@ -88,6 +107,8 @@ class SimulatedArm:
             self._pdos.send_events()
         elif 0x700 < can_id < 0x780 and data:
             self.supervision.heartbeat(can_id - 0x700, self.time)
+        for _, front in self.fronts:
+            front.on_frame(can_id, data)
 
     def waits_for_sync(self, can_id: int) -> bool:
         """Whether a frame takes effect at the next SYNC only: a synchronous RPDO."""
@@ -99,10 +120,14 @@ class SimulatedArm:
         remaining = duration
         while remaining > 1e-9:
             piece = min(remaining, self.period)
+            for drive in self.drive_at.values():
+                drive.control(piece)
             self.drives.loops.advance(piece, self._synchronous)
             self._synchronous = False
             self.time += piece
             remaining -= piece
+            for drive in self.drive_at.values():
+                drive.pass_time(self.time)
             if self.supervision.due <= self.time:
                 self.supervision.check(self.time)
                 self._nmt.update()
@@ -114,7 +139,31 @@ class SimulatedArm:
 
     def reboot(self, joint: int) -> None:
         """Power-cycle one joint's controller: volatile settings are lost."""
-        self._nmt.command(self.nodes[joint], RESET_NODE, self.time)
+        if joint in self._node_at:
+            self._nmt.command(self._node_at[joint], RESET_NODE, self.time)
+        else:
+            self.drive_at[joint].reboot()
+
+    def device(self, joint: int) -> Node | SimulatedDrive:
+        """What stands for a joint on the bus: its CANopen node, or its drive of another family."""
+        return self._node_at.get(joint) or self.drive_at[joint]
+
+    def joint_of(self, can_id: int) -> int | None:
+        """Joint whose device sends frames of this identifier, or None."""
+        if can_id < 0x800 and (place := self.place_of.get(can_id & 0x7F)) is not None and can_id >= 0x80:
+            return place
+        return next((joint for _, front in self.fronts if (joint := front.joint_of(can_id)) is not None), None)
+
+    @property
+    def due(self) -> float:
+        """When a device next acts by itself [s]."""
+        return min([self.supervision.due, *(drive.due for drive in self.drive_at.values())])
+
+    def postpone(self, seconds: float) -> None:
+        """Postpone all deadlines for the host [s], because the simulated arm itself was late."""
+        self.supervision.postpone(seconds)
+        for drive in self.drive_at.values():
+            drive.postpone(seconds)
 
     @property
     def period(self) -> float:
@@ -148,6 +197,7 @@ class SimulatedArm:
     def drift(self, joint: int | str, gain: float, offset: float) -> None:
         """Change a torque sensor from now on: multiply its gain by `gain`, add `offset` [N·m]."""
         self.sensors.drift(self._place(joint), gain, offset)
+        self._set_torque_constants()
 
     def set_effects(self, entries: Iterable[EffectSetting]) -> None:
         """Replace the arm's imperfections while it runs. Raises BadInput."""
@@ -161,6 +211,7 @@ class SimulatedArm:
             raise
         self.sensors.set_imperfections(state)
         self.drives.loops.reconfigure()
+        self._set_torque_constants()
 
     @property
     def effects(self) -> tuple[EffectSetting, ...]:
@@ -180,6 +231,18 @@ class SimulatedArm:
         )
 
     # ---- internals
+
+    def _set_torque_constants(self) -> None:
+        """A drive without a torque sensor makes as much torque too little as its reading is too large."""
+        current = np.zeros(self.n, bool)
+        current[list(self.drive_at)] = True
+        self.plant.torque_constant = np.where(current, self.sensors.gain, 1.0)
+        self.drives.loops.imagined = np.where(current, self.sensors.offset, 0.0)
+        self.drives.loops.reconfigure()
+
+    def _sender(self, bus: str) -> Callable[[int, bytes], None]:
+        """Puts frames of the drives on one bus."""
+        return lambda can_id, data: self.outbox.append((can_id, data))
 
     def _send(self, frame: Frame) -> None:
         self.outbox.append(frame)
@@ -211,7 +274,7 @@ class SimulatedArm:
         if not self._operational[joint]:
             return
         if len(data) < size:
-            self.nodes[joint].emergency(0x8210, 0x10, struct.pack("<BB", len(data), size))
+            self._node_at[joint].emergency(0x8210, 0x10, struct.pack("<BB", len(data), size))
             return
         group.buffer[place * size : (place + 1) * size] = data[:size]
         group.fresh[place] = 1
@@ -241,13 +304,13 @@ class SimulatedArm:
                 self.drives.loops.fresh(index, rows)
 
     def _state_changed(self, joint: int) -> None:
-        node = self.nodes[joint]
+        node = self._node_at[joint]
         if node.errors and self.drives.state[joint] is State.SWITCH_ON_DISABLED:
             node.emergency(0, 0)
         self._watching = self.drives.needs_watch
 
     def _faulted(self, joint: int, code: int) -> None:
-        self.nodes[joint].emergency(code, DRIVE_ERROR)
+        self._node_at[joint].emergency(code, DRIVE_ERROR)
 
     def _sample(self) -> None:
         self.drives.sample(self.time, self.time - self._sampled)

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 
 from armlink.bus.can_bus import MessageBus
 from armlink.bus.port import Frame, Port, Selectable, Stamped, StampedPort
-from armlink.canopen.object_dictionary import SYNC_ID
 from armlink.clock import Clock
 
 if TYPE_CHECKING:
     import can
 
+SYNC_ID = 0x80
+"""CANopen's SYNC goes to every bus and is heard on the first."""
 _SLICE = 0.001
 """Longest wait for one bus at a time if the operating system cannot wait for all of them [s]."""
 

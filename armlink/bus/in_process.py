@@ -28,6 +28,11 @@ class InProcessBus(ABC):
     def take(self, timeout: float = 0.0) -> Frame | None:
         """The next frame, or None after `timeout` seconds of the bus's time."""
 
+    def pass_time(self, seconds: float) -> None:
+        """Let time pass, for a host whose cycle has no SYNC that does."""
+        if self.clock is not None:
+            self.clock.sleep_until(self.clock.now() + seconds)
+
     def open_port(self, as_node: bool = False) -> Port:
         """A port; the same for a node's end."""
         return InProcessPort(self)
@@ -48,6 +53,8 @@ class InProcessPort:
         self._bus = bus
         self.send: Callable[[int, bytes], None] = bus.put
         self.receive: Callable[[float], Frame | None] = bus.take
+        self.pass_time: Callable[[float], None] = bus.pass_time
+        """Advances the bus's time by a period [s], for a host whose cycle has no SYNC that does."""
 
     @property
     def errors(self) -> int:

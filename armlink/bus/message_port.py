@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import can
 
-from armlink.bus.port import ERROR, Frame, InterfaceDown
+from armlink.bus.port import CLASSICAL, ERROR, EXTENDED, REMOTE, Frame, InterfaceDown
 from armlink.errors import BusFault
 
 
@@ -19,16 +19,7 @@ class MessagePort:
 
     def send(self, can_id: int, data: bytes) -> None:
         """Send one frame; raises BusFault if python-can cannot."""
-        is_error = bool(can_id & ERROR)
-        fd = self._fd and not is_error
-        message = can.Message(
-            arbitration_id=can_id & ~ERROR,
-            data=data,
-            is_extended_id=False,
-            is_error_frame=is_error,
-            is_fd=fd,
-            bitrate_switch=fd,
-        )
+        message = as_message(can_id, data, self._fd)
         try:
             self._bus.send(message)
         except (can.CanError, OSError) as error:
@@ -40,17 +31,39 @@ class MessagePort:
             self.send(can_id, data)
 
     def receive(self, timeout: float) -> Frame | None:
-        """The next data frame with an 11-bit identifier, or None after `timeout` seconds."""
+        """The next frame that is no error frame, or None after `timeout` seconds."""
         while True:
             message = receive_message(self._bus, self._name, timeout)
             if message is None:
                 return None
             if message.is_error_frame:
                 self.errors += 1
-            elif is_data(message):
-                if self._as_node:
-                    self._fd = message.is_fd
-                return message.arbitration_id, bytes(message.data)
+                continue
+            if self._as_node and not message.is_remote_frame:
+                self._fd = message.is_fd
+            return as_frame(message)
+
+
+def as_message(can_id: int, data: bytes, fd: bool) -> can.Message:
+    """python-can's message of a frame; `fd`: as CAN FD with bit-rate switch, where its flags allow that."""
+    fd = fd and not can_id & (ERROR | REMOTE | CLASSICAL)
+    remote = bool(can_id & REMOTE)
+    return can.Message(
+        arbitration_id=can_id & 0x1FFFFFFF,
+        data=None if remote else data,
+        dlc=len(data),
+        is_extended_id=bool(can_id & EXTENDED),
+        is_remote_frame=remote,
+        is_error_frame=bool(can_id & ERROR),
+        is_fd=fd,
+        bitrate_switch=fd,
+    )
+
+
+def as_frame(message: can.Message) -> Frame:
+    """Identifier with flags, and data."""
+    flags = EXTENDED * message.is_extended_id | REMOTE * message.is_remote_frame | ERROR * message.is_error_frame
+    return message.arbitration_id | flags, bytes(message.dlc) if message.is_remote_frame else bytes(message.data)
 
 
 def is_data(message: can.Message) -> bool:

@@ -80,4 +80,4 @@ def open_link_bus(spec: str | None, section: LinkSection) -> MessageBus:
         raise
     if len(members) == 1:
         return members[0]
-    return BusGroup(members, {joint.node: names.index(joint.bus) for joint in section.joints})
+    return BusGroup(members, {joint.settings.node: names.index(joint.bus) for joint in section.joints})

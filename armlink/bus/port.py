@@ -6,12 +6,20 @@ from typing import Protocol, runtime_checkable
 from armlink.errors import BusFault
 
 Frame = tuple[int, bytes]
-"""Identifier and data."""
+"""Identifier, with flags as in SocketCAN, and data. A remote frame has as much data (zeros) as it asks for."""
 Stamped = tuple[float, int, bytes]
 """Time of reception by the machine's monotonic clock [s], identifier and data."""
 
+EXTENDED = 0x80000000
+"""Flag in the identifier of a frame with 29 bits of identifier, as in SocketCAN."""
+REMOTE = 0x40000000
+"""Flag in the identifier of a remote frame."""
 ERROR = 0x20000000
 """Flag in the identifier of an error frame, as in SocketCAN."""
+
+
+CLASSICAL = 1 << 33
+"""Flag of a frame that leaves as classical CAN on a port that sends CAN FD; a frame that came never has it."""
 
 
 class InterfaceDown(BusFault):
@@ -19,7 +27,7 @@ class InterfaceDown(BusFault):
 
 
 class Port(Protocol):
-    """Frames with 11-bit identifiers; error frames are counted, extended and remote frames are dropped."""
+    """Frames with their flags; error frames are counted."""
 
     @property
     def errors(self) -> int:

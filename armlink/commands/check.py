@@ -50,25 +50,26 @@ def check(
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
     from armlink.errors import BadInput, BusFault, Refused
+    from armlink.link.controller_setup import protection_of
     from armlink.link.link import Link
-    from armlink.selftest.without_power import SelfTest
+    from armlink.loop.open import open_arm
+    from armlink.selftest.without_power import self_test
 
     console = Console(stderr=True)
     described = load_arm(arm)
     if host:
         return _check_host(console, described, seconds, json)
-    with Link.open(described, bus) as link:
-        simulated = link.bus.clock is not None
+    with open_arm(described, bus) as link:
+        simulated = isinstance(link, Link) and link.bus.clock is not None
         if not (passive or yes or simulated):
-            protection = link.protection
+            protection = protection_of(described.require_link())
             times = {"deadline": protection.deadline_ms, "heartbeat": protection.heartbeat_ms}
             console.print(WARNING.format(arm=described.name, **times), highlight=False)
             if not console.is_terminal:
                 raise BadInput("check: nobody to ask: give --yes, or --passive for what needs no power")
             typer.confirm("Go on?", abort=True, err=True)
         with console.status("check") as status:
-            results = SelfTest(link, status.update).run(power=not passive)
-        channel = str(link.bus.channel_info)
+            results, channel = link.inside(self_test, status.update, not passive)
     console.print(_table(f"{described.name} on {channel}", link.names, results))
     for each in results:
         if each.outcome in ("failed", "absent"):

@@ -23,9 +23,9 @@ def scan(
 
     from armlink.arm_file import Bus, load_arm
     from armlink.bus.open import open_bus, open_link_bus
-    from armlink.canopen.eds_file import expected_identity, of_joints
     from armlink.clock import MonotonicClock
     from armlink.commands.output import write_json
+    from armlink.drives.canopen.eds_file import expected_identity, of_joints
     from armlink.errors import BadInput, BusFault
     from armlink.link.controller_setup import identity_mismatches, refused_identity
     from armlink.monitor.scan import describe_type, scan_bus
@@ -38,8 +38,10 @@ def scan(
     else:
         described = load_arm(arm)
         link, sheets = described.require_link(), of_joints(described)
-        joints = {joint.node: joint.name for joint in link.joints}
-        stated = {each.node: expected_identity(each, sheet) for each, sheet in zip(link.joints, sheets, strict=True)}
+        joints = {joint.settings.node: joint.name for joint in link.joints}
+        stated = {
+            each.settings.node: expected_identity(each, sheet) for each, sheet in zip(link.joints, sheets, strict=True)
+        }
         opened = open_link_bus(bus, link)
     try:
         clock = opened.clock or MonotonicClock()

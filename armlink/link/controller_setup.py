@@ -5,14 +5,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from armlink.arm_file import DeviceIdentity, LinkJoint, LinkSection
-from armlink.canopen import object_dictionary as objects
-from armlink.canopen import pdo
-from armlink.canopen.cia402 import MODE_NAMES, NEEDED_MODES, Mode, state_of, supports
-from armlink.canopen.eds_file import expected_identity
-from armlink.canopen.object_dictionary import Entry
-from armlink.canopen.pdo import Pdo
-from armlink.canopen.sdo import NodeServices
-from armlink.canopen.units import Units, units_from
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen import pdo
+from armlink.drives.canopen.cia402 import MODE_NAMES, NEEDED_MODES, Mode, state_of, supports
+from armlink.drives.canopen.eds_file import expected_identity
+from armlink.drives.canopen.object_dictionary import Entry
+from armlink.drives.canopen.pdo import Pdo
+from armlink.drives.canopen.sdo import NodeServices
+from armlink.drives.canopen.units import Units, units_from
 from armlink.errors import BadInput, BusFault, Refused
 from armlink.link.gate import JointLimits
 from armlink.link.gate_limits import milliseconds
@@ -43,7 +43,7 @@ class Protection:
 
 def protection_of(section: LinkSection) -> Protection:
     """Host node (the highest that no joint has) and times from the arm file's deadline."""
-    nodes = {joint.node for joint in section.joints}
+    nodes = {joint.settings.node for joint in section.joints}
     host = next(node for node in range(127, 0, -1) if node not in nodes)
     return Protection(
         host,
@@ -95,7 +95,7 @@ def check_identity(services: NodeServices, joint: LinkJoint) -> None:
     found = {key: int(services.read(IDENTITY_OBJECTS[key])) for key in stated}
     mismatches = identity_mismatches(expected, found)
     if mismatches:
-        raise refused_identity(joint.name, joint.node, mismatches)
+        raise refused_identity(joint.name, joint.settings.node, mismatches)
 
 
 def refused_identity(name: str, node: int, mismatches: list[str]) -> Refused:
@@ -112,8 +112,8 @@ def read_units(services: NodeServices, joint: LinkJoint) -> Units:
     rated_mnm = int(read(objects.RATED_TORQUE))
     if abs(rated_mnm * 1e-3 - joint.rated_torque) > RATED_TORQUE_TOLERANCE * joint.rated_torque:
         raise BadInput(
-            f"{joint.name} (node {joint.node}): rated torque 6076h is {rated_mnm * 1e-3} N·m, the arm file says "
-            f"{joint.rated_torque}: correct link.joints or connect the right arm"
+            f"{joint.name} ({joint.settings.address}): rated torque 6076h is {rated_mnm * 1e-3} N·m, the arm file "
+            f"says {joint.rated_torque}: correct link.joints or connect the right arm"
         )
     encoder = int(read(objects.ENCODER_INCREMENTS)), int(read(objects.ENCODER_REVOLUTIONS))
     gear = int(read(objects.GEAR_MOTOR)), int(read(objects.GEAR_SHAFT))
@@ -121,7 +121,7 @@ def read_units(services: NodeServices, joint: LinkJoint) -> Units:
     try:
         return units_from(rated_mnm, encoder, gear, feed)
     except ValueError as error:
-        raise BusFault(f"{joint.name} (node {joint.node}): no units: {error}") from None
+        raise BusFault(f"{joint.name} (node {joint.settings.node}): no units: {error}") from None
 
 
 def check_modes(services: NodeServices) -> int:

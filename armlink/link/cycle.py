@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from armlink.canopen.cia402 import Control, Mode, State, next_control, set_point_control, state_of, supports
-from armlink.canopen.pdo import STATUS_DECIMATION
 from armlink.clock import Clock
+from armlink.drives.canopen.cia402 import Control, Mode, State, next_control, set_point_control, state_of, supports
+from armlink.drives.canopen.pdo import STATUS_DECIMATION
 from armlink.errors import BusFault, HostLate, Refused, Silence
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.faults import Known, bus_fault, find_fault, node_fault, refusal, stopped_itself, stuck
@@ -88,11 +88,14 @@ class Commander:
                     self._select(joint, mode, now)
                 if mode == PROFILE_POSITION:
                     control[joint] = set_point_control(loop.statuses[joint])
-        self._commanded = modes
+        self._commanded, synced = modes, loop.synced
         torque_wire, position_wire = [each.torque_wire for each in passed], [each.position_wire for each in passed]
-        expires = math.inf if stopped else now + (self.max_age - age)
-        sample = loop.exchange(control, torque_wire, position_wire, expires)
+        decided = math.inf if stopped else now - age
+        sample = loop.exchange(control, torque_wire, position_wire, decided, self.max_age)
         sample.late = self.late
+        if not self._lock_step:  # this process may have stood still at any line
+            self._note_gap(loop.synced - synced, loop.synced)
+            self._note_gap(self.clock.now() - loop.synced, now)
         why = stopped and refusal(self.names, command, age, passed, seen, self.limits)
         if why:
             raise Refused(f"gate: {why}")
@@ -212,6 +215,12 @@ class Commander:
                 return HostLate(self._gap, self.max_age, stopped)
         return fault
 
+    def _note_gap(self, seconds: float, now: float) -> None:
+        """No SYNC was sent for so long before `now` [s]; the longest of late is kept."""
+        gap = seconds - self.period
+        if gap > self.period and math.isfinite(gap) and (gap >= self._gap or now > self._gap_at + MEMORY):
+            self._gap, self._gap_at = gap, now
+
     def settle(self) -> None:
         """Restart after an interruption: what came meanwhile, and how late the host was, is forgotten."""
         self.loop.settle()
@@ -225,8 +234,6 @@ class Commander:
             self.late = now - self._due
             stats.late += self.late > 0.1 * self.period
             stats.lateness.add(self.late)
-            gap = now - self.loop.synced - self.period
-            if gap > self.period and math.isfinite(gap) and (gap >= self._gap or now > self._gap_at + MEMORY):
-                self._gap, self._gap_at = gap, now
+            self._note_gap(now - self.loop.synced, now)
             self._due = max(self._due, now - self.period) + self.period
         self.loop.drain()

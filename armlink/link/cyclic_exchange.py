@@ -9,15 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armlink.arrays import Array
-from armlink.bus.bus_watchdog import MOST_FRAMES, BusWatch
 from armlink.bus.frame_bits import FIXED_BITS
 from armlink.bus.port import Port
-from armlink.canopen import emcy
-from armlink.canopen import object_dictionary as objects
-from armlink.canopen.pdo import RPDO1, RPDO2, TPDO1, TPDO2, decoding_table
-from armlink.canopen.units import TORQUE_PER_MICRO, Units
 from armlink.clock import Clock
-from armlink.errors import Refused
+from armlink.drives.canopen import emcy
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen.host_frames import HostFrames
+from armlink.drives.canopen.pdo import RPDO1, RPDO2, TPDO1, TPDO2, decoding_table
+from armlink.drives.canopen.units import TORQUE_PER_MICRO, Units
+from armlink.errors import HostLate
+from armlink.link.bus_watchdog import MOST_FRAMES, BusWatch
 from armlink.link.types import Sample, Stats
 
 COLLECT_SHARE = 0.8
@@ -42,13 +43,15 @@ class Loop:
         self, port: Port, clock: Clock, nodes: tuple[int, ...], host: int, period: float, lock_step: bool
     ) -> None:
         self.nodes, self.n = nodes, len(nodes)
-        self.period, self.heartbeat_cycles = period, 1
+        self.period = period
+        self.beat_every = 0.0
+        """Time from one heartbeat of the host to the next [s]; 0 is one in every cycle."""
         self.stats = Stats()
         self.emergencies: deque[tuple[int, int, int]] = deque(maxlen=EMERGENCIES_KEPT)
         """(joint index, code, error register) in the order of arrival, the newest; resets (code 0) are not kept."""
         self.node_states: dict[int, int] = {}
         """Joint index → NMT state of its newest heartbeat; only those received while cycling."""
-        self.watch = BusWatch(nodes, host)
+        self.watch = BusWatch(len(nodes), HostFrames(nodes, host))
         self.withheld: frozenset[int] = frozenset()
         """Joints that get no RPDO1, so that their own deadline is put to the test."""
         self.beating = True
@@ -65,6 +68,7 @@ class Loop:
         self._command = RPDO1.layout.pack
         self._command_ids = tuple(RPDO1.cob_base + node for node in nodes)
         self._heartbeat_id = objects.HEARTBEAT_ID + host
+        self._beat = -math.inf
         self._position: list[float] = [math.nan] * self.n
         self._torque: list[float] = [math.nan] * self.n
         self._motor: list[float] = [math.nan] * self.n
@@ -172,12 +176,22 @@ class Loop:
         self._dropped = self._port.dropped
         self.watch.settle()
 
+    def beat(self) -> None:
+        """The host's heartbeat, at once."""
+        self.send(self._heartbeat_id, _OPERATIONAL)
+        self._beat = self._clock.now()
+
     def exchange(
-        self, control: list[int], torque_wire: list[int], position_wire: list[int], expires: float = math.inf
+        self,
+        control: list[int],
+        torque_wire: list[int],
+        position_wire: list[int],
+        decided: float = math.inf,
+        max_age: float = math.inf,
     ) -> Sample:
         """One cycle: RPDO1 of every joint, heartbeat when due, SYNC, then the TPDOs that it brings.
 
-        Raises Refused, and sends nothing, where the frames would leave after `expires`, by the clock [s].
+        Raises HostLate, and sends nothing, if the frames would leave more than `max_age` [s] after `decided` (clock).
         """
         command = self._command
         frames = [
@@ -185,13 +199,13 @@ class Loop:
             for joint, can_id in enumerate(self._command_ids)
             if joint not in self.withheld
         ]
-        if self.beating and self.stats.cycles % self.heartbeat_cycles == 0:
-            frames.append((self._heartbeat_id, _OPERATIONAL))
-        frames.append(_SYNC)
         now = self._clock.now()
-        if now > expires:
-            late = (now - expires) * 1e3
-            raise Refused(f"gate: the command became too old before its frames left, by {late:.0f} ms: host too slow")
+        if now - decided > max_age:
+            raise HostLate(now - decided, max_age, "the command grew too old before its frames left")
+        if self.beating and now - self._beat > self.beat_every - 0.5 * self.period:
+            frames.append((self._heartbeat_id, _OPERATIONAL))
+            self._beat = now
+        frames.append(_SYNC)
         if self._first is None:
             self._first = now
         self._awaited = self.n

@@ -4,12 +4,12 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
-from armlink.bus.bus_watchdog import BusWatch
-from armlink.canopen import emcy
-from armlink.canopen import object_dictionary as objects
-from armlink.canopen.cia402 import MODE_NAMES, Mode, State, state_of
+from armlink.drives.canopen import emcy
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen.cia402 import MODE_NAMES, Mode, State, state_of
 from armlink.errors import BusFault, Silence, Stall
 from armlink.link import gate
+from armlink.link.bus_watchdog import BusWatch
 from armlink.link.gate import OFF, JointLimits, Passed, Seen
 from armlink.link.types import Command
 

@@ -25,7 +25,7 @@ import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from armlink.canopen.cia402 import Mode
+from armlink.drives.canopen.cia402 import Mode
 
 OFF = int(Mode.OFF)
 POSITION_MODES = (int(Mode.POSITION), int(Mode.PROFILE_POSITION))

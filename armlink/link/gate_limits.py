@@ -3,7 +3,7 @@
 import math
 
 from armlink.arm_file import ArmFile, LinkJoint
-from armlink.canopen.units import Units, assumed_units
+from armlink.drives.canopen.units import Units, assumed_units
 from armlink.errors import BadInput
 from armlink.link.gate import JointLimits
 from armlink.model_file import compile_model

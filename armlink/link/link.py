@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property
 from types import TracebackType
 from typing import TYPE_CHECKING, Concatenate, ParamSpec, Self, TypeVar
 
@@ -11,12 +10,12 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.bus.adapters import as_bus
+from armlink.bus.arm_hold import ArmHold
 from armlink.bus.can_bus import CanBus
-from armlink.canopen import object_dictionary as objects
-from armlink.canopen.cia402 import State
-from armlink.canopen.sdo import NodeServices, PumpedNetwork, joint_services
 from armlink.clock import Clock, MonotonicClock
-from armlink.errors import BusFault
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen.cia402 import State
+from armlink.errors import BusFault, Silence
 from armlink.link import controller_setup as device
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
@@ -25,7 +24,7 @@ from armlink.link.gate import start_from
 from armlink.link.gate_limits import gate_limits, joint_ranges, target_window
 from armlink.link.guard import Crossed
 from armlink.link.torque_sensor_record import TorqueSensorRecords
-from armlink.link.types import Command, Controller, Identity, Sample, Samples, Setpoints, Stats
+from armlink.link.types import Command, Controller, Identity, Sample, Samples, Setpoints, Stats, Tell
 
 if TYPE_CHECKING:
     import can
@@ -37,6 +36,8 @@ LISTEN_PERIODS, LISTEN_SECONDS = 2, 0.1
 since a host on a busy computer may pause for some 0.05 s."""
 
 
+ANSWER_SECONDS = 5.0
+"""After a stall a controller may take so long to answer [s]."""
 R = TypeVar("R")
 P = ParamSpec("P")
 
@@ -52,7 +53,7 @@ class Link(TorqueSensorRecords):
         self.arm, self.bus = arm, as_bus(bus)
         self.section = section = arm.require_link()
         self.names = tuple(joint.name for joint in section.joints)
-        self.nodes = tuple(joint.node for joint in section.joints)
+        self.nodes = tuple(joint.settings.node for joint in section.joints)
         self.n, self.rate, self.period = len(self.names), section.rate, 1.0 / section.rate
         self._lock_step = self.bus.clock is not None
         self.clock: Clock = clock or self.bus.clock or MonotonicClock()
@@ -60,13 +61,14 @@ class Link(TorqueSensorRecords):
         self.protection = device.protection_of(section)
         port, host = self.bus.open_port(), self.protection.host
         self._loop = Loop(port, self.clock, self.nodes, host, self.period, self._lock_step)
-        self._loop.heartbeat_cycles = max(1, int(section.deadline / 2 * self.rate))
+        self._loop.beat_every = section.deadline / 2
         self.commander = Commander(self._loop, self.clock, self.names, self.period, section.deadline, self._lock_step)
         self._cycling = self._enabled = False
         self._since = 0.0
         self.position_step = np.full(self.n, np.inf)
         """Smallest change that each position reading can show (n,) [rad]; inf before start()."""
         self._last: Command | None = None
+        self._hold: ArmHold | None = None
 
     @classmethod
     def open(cls, arm: ArmFile, bus: str | None = None) -> "Link":
@@ -85,6 +87,8 @@ class Link(TorqueSensorRecords):
             self.stop()
         finally:
             self.bus.shutdown()
+            if self._hold is not None:
+                self._hold.release()
 
     @property
     def enabled(self) -> bool:
@@ -132,6 +136,7 @@ class Link(TorqueSensorRecords):
 
         Raises Refused for another controller than the arm file states, BusFault, BadInput.
         """
+        self._hold = self._hold or ArmHold(self.bus, self.nodes)
         missing = [f"{each.joint} (node {each.node})" for each in self.services if not each.present()]
         if missing:
             channel = self.bus.channel_info
@@ -211,9 +216,22 @@ class Link(TorqueSensorRecords):
     def recover(self) -> Sample:
         """After a Stall: start the nodes that left operation, and enable every joint where it stands."""
         self._require_start()
+        self._await_answers()
+        self._loop.beat()  # their watches have run on
         for node in self.nodes:
             self.send_nmt(objects.NMT_START, node)
         return self.enable()
+
+    def _await_answers(self) -> None:
+        """Wait until every controller has answered what it was sent before; raises Silence.
+
+        One that stood still works off what has piled up, and its replies show it as it was before it was stopped.
+        """
+        end = self.clock.now() + ANSWER_SECONDS
+        for services in self.services:
+            while not services.present():
+                if self.clock.now() > end:
+                    raise Silence(f"{services.joint}: no answer for {ANSWER_SECONDS:g} s")
 
     def disable(self) -> None:
         """Take the power from every joint: a joint without a brake falls. Raises BusFault."""
@@ -278,20 +296,15 @@ class Link(TorqueSensorRecords):
         self._enabled = False
         self.commander.quick_stop()
 
-    def inside(self, function: "Callable[Concatenate[Link, P], R]", *args: P.args, **kwargs: P.kwargs) -> R:
-        """Call `function(link, ...)`: in the process that makes the cycles, which is this one."""
-        return function(self, *args, **kwargs)
+    def inside(
+        self, function: "Callable[Concatenate[Link, Tell, P], R]", tell: Tell, *args: P.args, **kw: P.kwargs
+    ) -> R:
+        """Call `function(link, tell, ...)` in the process that makes the cycles, which is this one."""
+        return function(self, tell, *args, **kw)
 
     def read_temperatures(self) -> Array:
         """Temperatures of the drives (n,) [°C]; NaN for a drive that does not report one. Raises BusFault."""
         return np.array([device.read_temperature(services) for services in self.services])
-
-    @cached_property
-    def services(self) -> tuple[NodeServices, ...]:
-        """SDO access to each joint's controller, in joint order."""
-        network = PumpedNetwork(self._loop.send)
-        self._loop.on_other = lambda can_id, data: network.notify(can_id, bytearray(data), 0.0)
-        return joint_services(network, self.arm, self._pump)
 
     def _pump(self, done: Callable[[], bool], timeout: float) -> bool:
         """Run the loop until `done` or the time is over; enabled joints get their last command in every cycle."""

@@ -9,7 +9,6 @@ The one exception is asked for by name: `write_calibration` and `read_calibratio
 import struct
 from collections import deque
 from collections.abc import Callable
-from functools import cached_property
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
@@ -20,11 +19,10 @@ from armlink.arrays import Array
 from armlink.bus.adapters import as_bus
 from armlink.bus.can_bus import CanBus
 from armlink.bus.port import StampedPort
-from armlink.canopen import object_dictionary as objects
-from armlink.canopen.pdo import RPDO1
-from armlink.canopen.sdo import NodeServices, PumpedNetwork, joint_services
-from armlink.canopen.units import assumed_units
 from armlink.clock import Clock, MonotonicClock
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen.pdo import RPDO1
+from armlink.drives.canopen.units import assumed_units
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.torque_sensor_record import TorqueSensorRecords
 from armlink.link.types import Sample, Stats
@@ -49,14 +47,13 @@ class Listener(TorqueSensorRecords):
         self.arm, self.bus = arm, as_bus(bus)
         self.section = section = arm.require_link()
         self.names = tuple(joint.name for joint in section.joints)
-        self.nodes = tuple(joint.node for joint in section.joints)
+        self.nodes = tuple(joint.settings.node for joint in section.joints)
         self.n, self.period = len(self.names), 1.0 / section.rate
         self.clock: Clock = self.bus.clock or MonotonicClock()
         self._port = self.bus.open_listening_port()
         self._loop = Loop(self._port, self.clock, self.nodes, 0, self.period, self.bus.clock is not None)
         units = assumed_units(arm)
         self._loop.set_units(units)
-        self._loop.on_other = self._take_other
         self._torque_unit = np.array([unit.torque for unit in units])
         self._position_unit = np.array([unit.position for unit in units])
         self._commands = {RPDO1.cob_base + node: NO_COMMAND for node in self.nodes}
@@ -66,7 +63,6 @@ class Listener(TorqueSensorRecords):
         """RPDO1 of each joint: for the sample that `next` gave last, and for the one that is coming in."""
         self._sync: float | None = None
         self._since: float | None = None
-        self._notify: Callable[[int, bytearray, float], None] | None = None
 
     def __enter__(self) -> Self:
         """The listener itself."""
@@ -148,10 +144,6 @@ class Listener(TorqueSensorRecords):
             else:
                 take(can_id, data)
 
-    def _take_other(self, can_id: int, data: bytes) -> None:
-        if self._notify is not None:
-            self._notify(can_id, bytearray(data), 0.0)
-
     def _complete(self, now: float) -> None:
         """A SYNC: what came since the one before is its sample."""
         if self._sync is None or self._since is None:
@@ -165,13 +157,6 @@ class Listener(TorqueSensorRecords):
             self._loop.drop_readings()
             self._ready.append((sample, self._given))
         self._sync, self._given = now, tuple(self._commands.values())
-
-    @cached_property
-    def services(self) -> tuple[NodeServices, ...]:
-        """SDO access to each joint's controller, in joint order; using it sends."""
-        network = PumpedNetwork(self._loop.send)
-        self._notify = network.notify
-        return joint_services(network, self.arm, self._pump)
 
     def _pump(self, done: Callable[[], bool], timeout: float) -> bool:
         """Go on listening until `done` or the time is over."""

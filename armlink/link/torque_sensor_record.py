@@ -7,10 +7,14 @@ become the active ones. Nothing is stored to flash unless asked for (1010h:04), 
 
 import struct
 import zlib
+from collections.abc import Callable
+from functools import cached_property
 
-from armlink.canopen import object_dictionary as objects
-from armlink.canopen.sdo import NodeServices
+from armlink.arm_file import ArmFile
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork, joint_services
 from armlink.errors import BadInput
+from armlink.link.cyclic_exchange import Loop
 from armlink.link.types import Calibration
 
 _CONTENT = struct.Struct("<ffII")
@@ -59,11 +63,20 @@ def write_record(services: NodeServices, calibration: Calibration, store: bool =
 
 
 class TorqueSensorRecords:
-    """Calibrations of all joints' controllers, by SDO: a part of whatever has `services` for them."""
+    """Calibrations of all joints' controllers, by SDO: a part of whatever runs a receive loop."""
 
-    @property
+    arm: ArmFile
+    _loop: Loop
+
+    @cached_property
     def services(self) -> tuple[NodeServices, ...]:
-        """SDO access to each joint's controller, in joint order."""
+        """SDO access to each joint's controller, in joint order; using it sends, also where one only listens."""
+        network = PumpedNetwork(self._loop.send)
+        self._loop.on_other = lambda can_id, data: network.notify(can_id, bytearray(data), 0.0)
+        return joint_services(network, self.arm, self._pump)
+
+    def _pump(self, done: Callable[[], bool], timeout: float) -> bool:
+        """Receive until `done` (True) or until `timeout` seconds are over (False)."""
         raise NotImplementedError
 
     def read_calibration(self, joint: int) -> Calibration:

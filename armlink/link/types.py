@@ -1,6 +1,6 @@
 """Input and output of a cycle of the link, in SI units: commands, samples, counters."""
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armlink.arrays import Array
-from armlink.canopen.cia402 import Mode, State
+from armlink.drives.canopen.cia402 import Mode, State
 from armlink.link.guard import Guard
 from armlink.link.lateness import Lateness
 from armlink.torque_calibration import TorqueCalibration
@@ -169,5 +169,7 @@ class Stats:
     """Share of the bus that the frames take at its bit rate, without stuff bits, which are a tenth more."""
 
 
+Tell = Callable[[str], None]
+"""Called with what is being done."""
 Samples = Generator[Sample, None, None]
 """Samples as they come; close it to end what brings them."""

@@ -5,7 +5,7 @@ from typing import Any, Concatenate, ParamSpec, Protocol, Self, TypeVar
 
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
-from armlink.link.types import Calibration, Command, Controller, Identity, Sample, Samples, Setpoints, Stats
+from armlink.link.types import Calibration, Command, Controller, Identity, Sample, Samples, Setpoints, Stats, Tell
 
 R = TypeVar("R")
 P = ParamSpec("P")
@@ -98,8 +98,12 @@ class ArmDriver(Protocol):
         """Forget samples of cycles that were made while the job did something else."""
         ...
 
-    def inside(self, function: "Callable[Concatenate[Any, P], R]", *args: P.args, **kwargs: P.kwargs) -> R:
-        """Call `function(link, ...)` in the process that makes the cycles; picklable both ways."""
+    def inside(self, function: Callable[Concatenate[Any, Tell, P], R], tell: Tell, *args: P.args, **kw: P.kwargs) -> R:
+        """Call `function(link, tell, ...)` in the process that makes the cycles, which it then makes itself.
+
+        Function, arguments and answer must be picklable. `tell` is called in this process; if this process ends, the
+        function's call of it raises.
+        """
         ...
 
     def read_calibration(self, joint: int) -> Calibration:

@@ -26,6 +26,7 @@ class Call:
 
     id: int
     what: str | Callable[..., Any]
+    """A function is called with the link, and with what tells the job what is being done."""
     args: tuple[Any, ...] = ()
     kwargs: tuple[tuple[str, Any], ...] = ()
 
@@ -64,6 +65,14 @@ class Answer:
     id: int
     value: Any = None
     error: ArmlinkError | None = None
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a call that is under way is doing."""
+
+    id: int
+    text: str
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from armlink.link.link import Link
 from armlink.link.types import Command, Controller, Sample, Setpoints
 from armlink.loop.channel import Channel, Closed
 from armlink.loop.ending import Ending
-from armlink.loop.messages import Alive, Answer, Call, Cut, Open, Play, Run, Stopped, pack
+from armlink.loop.messages import Alive, Answer, Call, Cut, Open, Play, Run, Stopped, Told, pack
 from armlink.loop.realtime import prepare
 
 IDLE = 0.05
@@ -92,16 +92,20 @@ class DriveLoop:
         try:
             kwargs = dict(call.kwargs)
             if callable(call.what):
-                answer = Answer(call.id, call.what(link, *call.args, **kwargs))
+                answer = Answer(call.id, call.what(link, lambda text: self._tell(call.id, text), *call.args, **kwargs))
             else:
                 found = getattr(link, call.what)
                 answer = Answer(call.id, found(*call.args, **kwargs) if callable(found) else found)
         except ArmlinkError as error:
             answer = Answer(call.id, error=error)
-        if call.what in ENABLING and answer.error is None:
+        if link.enabled and (callable(call.what) or call.what in ENABLING):
             self._begin(0)
-            self._last = Command.hold(link.position_sent)
+            self._last = link.last
         self._channel.put(answer)
+        self._channel.flush()
+
+    def _tell(self, id: int, text: str) -> None:
+        self._channel.put(Told(id, text))
         self._channel.flush()
 
     def _cycle(self) -> None:

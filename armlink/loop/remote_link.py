@@ -16,9 +16,9 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.errors import BusFault
-from armlink.link.types import Calibration, Command, Controller, Identity, Sample, Samples, Setpoints, Stats
+from armlink.link.types import Calibration, Command, Controller, Identity, Sample, Samples, Setpoints, Stats, Tell
 from armlink.loop.channel import Channel, Closed
-from armlink.loop.messages import Alive, Answer, Call, Cut, Open, Play, Run, Stopped, unpack
+from armlink.loop.messages import Alive, Answer, Call, Cut, Open, Play, Run, Stopped, Told, unpack
 from armlink.loop.realtime import Realtime
 
 CHUNK = 50
@@ -49,7 +49,8 @@ class RemoteLink:
         self._in_force: Command | None = None
         self._torque_sent = self._position_sent = np.full(self.n, np.nan)
         self._step = np.full(self.n, np.inf)
-        self._told = time.monotonic()
+        self._told = self._heard = time.monotonic()
+        self._tell_on: Tell = lambda text: None
         ours, theirs = socket.socketpair()
         command = [sys.executable, "-m", "armlink.loop.process", str(theirs.fileno())]
         self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL)
@@ -77,6 +78,11 @@ class RemoteLink:
     def pid(self) -> int:
         """Process id of the loop."""
         return self._process.pid
+
+    @property
+    def exit_status(self) -> int | None:
+        """How the loop's process ended; None while it runs."""
+        return self._process.poll()
 
     @property
     def position_step(self) -> Array:
@@ -148,9 +154,14 @@ class RemoteLink:
         found: Calibration = self._call("write_calibration", joint, calibration, store)
         return found
 
-    def inside(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        """Call `function(link, ...)` in the process that makes the cycles."""
-        return self._call(function, *args, **kwargs)
+    def inside(self, function: Callable[..., Any], tell: Tell, *args: Any, **kw: Any) -> Any:
+        """Call `function(link, tell, ...)` in the process that makes the cycles."""
+        self._tell_on = tell
+        try:
+            return self._call(function, *args, **kw)
+        except KeyboardInterrupt:
+            self._channel.close()  # the function ends at its next `tell`, and the joints are stopped
+            raise
 
     def cycle(self, command: Command) -> Sample:
         """The next sample with this command in force; a command that is in force already is not sent again."""
@@ -243,6 +254,9 @@ class RemoteLink:
                     self._answers[message.id] = message
                 case Stopped():
                     self._stopped = message
+                case Told():
+                    self._heard = time.monotonic()
+                    self._tell_on(message.text)
                 case _:
                     self._samples.append(message)
 
@@ -252,9 +266,9 @@ class RemoteLink:
         return self._answer(number)
 
     def _answer(self, number: int) -> Any:
-        end = time.monotonic() + ANSWER
+        self._heard = time.monotonic()
         while number not in self._answers:
-            if time.monotonic() > end:
+            if time.monotonic() > self._heard + ANSWER:
                 raise BusFault(f"the process that drives the arm has not answered for {ANSWER:g} s")
             self._channel.wait(TOLD_EVERY)
             self._receive()

@@ -8,8 +8,8 @@ import numpy as np
 
 from armlink.arrays import Array
 from armlink.bus.frame_bits import frame_bits
-from armlink.canopen.object_dictionary import SYNC_ID
-from armlink.canopen.pdo import TPDO1
+from armlink.drives.canopen.object_dictionary import SYNC_ID
+from armlink.drives.canopen.pdo import TPDO1
 
 KEPT = 1_000_000
 """Maximum number of cycles whose times are kept; more than an hour at 250 Hz."""

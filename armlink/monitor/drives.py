@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 
 from armlink.bus.can_bus import CanBus
-from armlink.canopen import object_dictionary as objects
-from armlink.canopen.eds_file import bundled
-from armlink.canopen.sdo import NodeServices
-from armlink.canopen.units import units_from
 from armlink.clock import MonotonicClock
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen.eds_file import bundled
+from armlink.drives.canopen.sdo import NodeServices
+from armlink.drives.canopen.units import units_from
 from armlink.errors import BusFault
 from armlink.link.types import Identity
 from armlink.monitor.scan import reading_network, scan_bus

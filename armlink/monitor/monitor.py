@@ -11,11 +11,11 @@ from armlink.bus.can_bus import MessageBus
 from armlink.bus.message_port import is_data
 from armlink.bus.port import Port
 from armlink.bus.taps import TappedBus, TappedPort
-from armlink.canopen import emcy
-from armlink.canopen.cia402 import state_of
-from armlink.canopen.object_dictionary import NMT_ID, NMT_START, NMT_STATES, OPERATIONAL, SYNC_ID
-from armlink.canopen.units import assumed_units
 from armlink.clock import Clock, MonotonicClock
+from armlink.drives.canopen import emcy
+from armlink.drives.canopen.cia402 import state_of
+from armlink.drives.canopen.object_dictionary import NMT_ID, NMT_START, NMT_STATES, OPERATIONAL, SYNC_ID
+from armlink.drives.canopen.units import assumed_units
 from armlink.link.cyclic_exchange import NO_STATUS, Loop
 from armlink.link.types import Sample
 from armlink.monitor.cycle_stats import CycleStats
@@ -39,7 +39,7 @@ class Monitor:
         """`stats`: also measure the cycle from the timestamp of every frame, which takes more CPU time."""
         self.section = section = arm.require_link()
         self.names = tuple(joint.name for joint in section.joints)
-        self.nodes = tuple(joint.node for joint in section.joints)
+        self.nodes = tuple(joint.settings.node for joint in section.joints)
         self.clock: Clock = bus.clock or MonotonicClock()
         self._sync, self._period = sync, 1.0 / section.rate
         self.cycle_stats: CycleStats | None = None

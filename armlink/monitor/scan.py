@@ -4,10 +4,10 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 
 from armlink.bus.port import Port
-from armlink.canopen.eds_file import bundled
-from armlink.canopen.object_dictionary import SDO_REQUEST_ID
-from armlink.canopen.sdo import NodeServices, Pump, PumpedNetwork
 from armlink.clock import Clock
+from armlink.drives.canopen.eds_file import bundled
+from armlink.drives.canopen.object_dictionary import SDO_REQUEST_ID
+from armlink.drives.canopen.sdo import NodeServices, Pump, PumpedNetwork
 from armlink.link.controller_setup import identify
 from armlink.link.types import Identity
 

@@ -1,26 +1,75 @@
-"""Loads and saves recordings by file suffix."""
+"""Loads and saves recordings by file suffix, and by folder."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from armlink.errors import BadInput
-from armlink.recording.recording import Recording
+from armlink.recording.corrections import AS_IT_IS, Corrections
+from armlink.recording.recording import Recording, take_joints
 
 SUFFIXES = (".csv", ".csv.gz", ".parquet", ".mcap")
 
 
-def load_recording(path: str | Path) -> Recording:
-    """Load `.csv`, `.csv.gz`, `.parquet` or `.mcap`; raises BadInput that names row or column."""
-    path = Path(path)
+def load_recording(path: str | Path, stated: Corrections = AS_IT_IS) -> Recording:
+    """Load one recording (docs/formats.md): a file, or the folder of a ROS 2 bag.
+
+    `stated` are corrections of the file's columns, signs, units and clocks. Raises BadInput that names row or column,
+    also for a data set of several recordings.
+    """
+    found = load_recordings(path, stated)
+    if len(found) != 1:
+        raise BadInput(f"{path}: holds {len(found)} recordings: choose one, such as {next(iter(found))}")
+    return next(iter(found.values()))
+
+
+def load_recordings(path: str | Path, stated: Corrections = AS_IT_IS) -> dict[str, Recording]:
+    """All recordings of a file or folder, by label; `FOLDER#2` is episode 2 of a LeRobot data set."""
+    folder, _, episode = str(path).rpartition("#")
+    found = _loaded(Path(folder) if episode.isdigit() and folder else Path(path), stated)
+    if episode.isdigit() and folder:
+        if str(path) not in found:
+            raise BadInput(f"{path}: no such episode: {folder} has {len(found)}, counted from 0")
+        found = {str(path): found[str(path)]}
+    return {label: _chosen(stated.apply(r, label), stated, label).check(label) for label, r in found.items()}
+
+
+def _loaded(path: Path, stated: Corrections) -> dict[str, Recording]:
+    """The recordings of a path as they stand in it, but for their columns' names."""
+    from armlink.recording.lerobot import is_lerobot, load_lerobot
+    from armlink.recording.ros_bag import is_bag, load_bag
+
+    if is_lerobot(path):
+        return load_lerobot(path)
+    if is_bag(path):
+        return {str(path): load_bag(path, stated.topic)}
+    if path.is_dir():
+        raise BadInput(
+            f"{path}: neither the folder of a ROS 2 bag (metadata.yaml) nor a LeRobot data set (meta/info.json)"
+        )
     suffix = _suffix(path)
     if not path.is_file():
         raise BadInput(f"no recording {path}: give a {', '.join(SUFFIXES)} file")
     if suffix == ".mcap":
-        from armlink.recording.mcap import load_mcap
+        from armlink.recording.mcap import has_our_topics, load_mcap
 
-        return load_mcap(path).check(str(path))
+        ours = not stated.topic and has_our_topics(path)
+        return {str(path): load_mcap(path) if ours else load_bag(path, stated.topic)}
     from armlink.recording.tables import load_csv, load_parquet
 
-    return (load_parquet if suffix == ".parquet" else load_csv)(path).check(str(path))
+    return {str(path): (load_parquet if suffix == ".parquet" else load_csv)(path, stated.columns)}
+
+
+def _chosen(recording: Recording, stated: Corrections, label: str) -> Recording:
+    """The joints that the user stated, in that order."""
+    if not stated.joints:
+        return recording
+    missing = [name for name in stated.joints if name not in recording.names]
+    if missing:
+        raise BadInput(f"--joints {missing[0]}: {label} has no such joint: it has {', '.join(recording.names)}")
+    left = [name for name in recording.names if name not in stated.joints]
+    chosen = take_joints(recording, [recording.names.index(name) for name in stated.joints])
+    note = f"joints left out: {', '.join(left)}" if left else ""
+    return replace(chosen, warning="; ".join(filter(None, (recording.warning, note))))
 
 
 def save_recording(recording: Recording, path: str | Path) -> None:

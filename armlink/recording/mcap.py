@@ -6,23 +6,26 @@ temperatures go as effort on `/joint_temperatures` [°C].
 """
 
 import struct
-from collections import defaultdict
-from collections.abc import Mapping
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import IO, Any, Self
 
 import numpy as np
+from lz4.frame import LZ4FrameDecompressor
 from mcap.exceptions import McapError
-from mcap.records import Channel, Footer, Message, Schema
-from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.reader import make_reader
+from mcap.records import Channel, Chunk, Footer, Message, Schema
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
 from mcap.writer import Writer
-from zstandard import ZstdError
+from zstandard import ZstdDecompressor, ZstdError
 
 from armlink.arrays import Array
 from armlink.errors import BadInput
-from armlink.recording.recording import Recording
+from armlink.recording.recording import MOST_BYTES, MOST_JOINTS, Recording, require_size
 from armlink.recording.ros_joint_state import SCHEMA, SCHEMA_NAME, JointState, JointStateDecoder, joint_state_encoder
 
 TOPICS: dict[str, tuple[str | None, str | None, str | None]] = {
@@ -34,6 +37,8 @@ TOPICS: dict[str, tuple[str | None, str | None, str | None]] = {
 """Topic → channels carried as position, velocity and effort."""
 FLUSH_SECONDS = 0.5
 """Interval of flushes: a killed recorder loses at most this and what the operating system had not written."""
+MOST_CHUNK = 1 << 28
+"""A chunk that unpacks to more bytes is refused; rosbag2 writes less than a thousandth of it."""
 _NANO = 1_000_000_000
 
 
@@ -95,14 +100,23 @@ def load_mcap(path: Path) -> Recording:
     """Load a recording or a ROS 2 bag in MCAP; a truncated file loads as far as it goes, noted in `warning`.
 
     Time is that of `/joint_states` from its first message; other topics' messages go to the row nearest in time, if
-    nearer than half the median period, and are NaN elsewhere. Joints are those of the first `/joint_states` message.
+    nearer than half the median period, and are NaN elsewhere. Joints are those of the most frequent `/joint_states`
+    message.
     """
     messages, cut = _read(path)
     states = messages.pop("/joint_states", [])
     if not states:
         raise BadInput(f"{path}: no {SCHEMA_NAME} on /joint_states{f'; {cut}' if cut else ''}")
     stamps = np.array([state.stamp for state in states], dtype=np.int64)
-    names = states[0].names
+    counts = Counter(state.names for state in states)
+    names = max(counts, key=lambda each: counts[each] * len(each))
+    alone = sorted({name for each in counts if not set(names) <= set(each) for name in each} - set(names))
+    if alone:
+        cut = "; ".join(filter(None, (cut, f"joints in messages of their own, left out: {', '.join(alone)}")))
+        states = [state for state in states if set(names) <= set(state.names)]
+        stamps = np.array([state.stamp for state in states], dtype=np.int64)
+    if len(names) > MOST_JOINTS:
+        raise BadInput(f"{path}: {len(names)} joints in /joint_states, expected at most {MOST_JOINTS}")
     channels = _channels_of("/joint_states", states, names, str(path))
     half = np.median(np.diff(stamps)) / 2 if stamps.size > 1 else 0.0
     for topic, others in messages.items():
@@ -114,17 +128,36 @@ def load_mcap(path: Path) -> Recording:
     return Recording(t=(stamps - stamps[0]) / _NANO, names=names, warning=cut, **channels)
 
 
+def has_our_topics(path: Path) -> bool:
+    """Whether a file's joint states are where this module looks, or cannot be told because it is cut."""
+    try:
+        with path.open("rb") as stream:
+            summary = make_reader(stream).get_summary()
+    except (McapError, ValueError, OSError, struct.error, ZstdError, MemoryError):
+        return True
+    if summary is None or not summary.channels:
+        return True
+    kinds = {
+        channel.topic: summary.schemas[channel.schema_id].name
+        for channel in summary.channels.values()
+        if channel.schema_id in summary.schemas
+    }
+    return "/joint_states" in kinds and all(kinds.get(topic, SCHEMA_NAME) == SCHEMA_NAME for topic in TOPICS)
+
+
 def _read(path: Path) -> tuple[dict[str, list[JointState]], str]:
     """Messages by topic in the order of the file, and a warning if the file is truncated."""
     found: dict[str, list[JointState]] = defaultdict(list)
     topics: dict[int, str] = {}
     schemas: dict[int, Schema] = {}
     decode = JointStateDecoder()
-    complete, why = False, "the file ends early"
+    complete, why, size = False, "the file ends early", 0
     with path.open("rb") as stream:
         try:
-            for record in StreamReader(stream, validate_crcs=True).records:
+            for record in _records(stream, path):
                 if isinstance(record, Message) and record.channel_id in topics:
+                    size += len(record.data)
+                    require_size(size, str(path))
                     found[topics[record.channel_id]].append(decode(record.data))
                 elif isinstance(record, Schema):
                     schemas[record.id] = record
@@ -134,6 +167,8 @@ def _read(path: Path) -> tuple[dict[str, list[JointState]], str]:
                 complete = complete or isinstance(record, Footer)
         except CRCValidationError as error:
             why = str(error)
+        except RuntimeError as error:  # of LZ4
+            why = f"a chunk cannot be unpacked ({error})"
         except (McapError, ValueError, MemoryError, OSError, struct.error, ZstdError):
             pass
         position = stream.tell()
@@ -141,6 +176,33 @@ def _read(path: Path) -> tuple[dict[str, list[JointState]], str]:
         return found, ""
     rows = len(found.get("/joint_states", []))
     return found, f"cut recording, {why}: loaded {rows} rows, up to about byte {position}"
+
+
+def _records(stream: IO[bytes], path: Path) -> Iterator[Any]:
+    """Records of the file; raises BadInput where a chunk unpacks to more than a recording may hold."""
+    for record in StreamReader(stream, validate_crcs=True, emit_chunks=True, record_size_limit=MOST_BYTES).records:
+        if isinstance(record, Chunk):
+            if record.uncompressed_size > MOST_CHUNK:
+                raise BadInput(f"{path}: a chunk of {record.uncompressed_size} bytes, expected at most {MOST_CHUNK}")
+            yield from breakup_chunk(_unpacked(record), validate_crc=True)
+        else:
+            yield record
+
+
+def _unpacked(chunk: Chunk) -> Chunk:
+    """A chunk without its compression; unpacks no more than its header states, and raises ValueError beyond it."""
+    if not chunk.compression:
+        return chunk
+    most = chunk.uncompressed_size + 1
+    if chunk.compression == "zstd":
+        data = ZstdDecompressor().stream_reader(chunk.data).read(most)
+    elif chunk.compression == "lz4":
+        data = LZ4FrameDecompressor().decompress(chunk.data, max_length=most)
+    else:
+        raise ValueError(f"a chunk is packed as {chunk.compression}")
+    if len(data) != chunk.uncompressed_size:
+        raise ValueError(f"a chunk unpacks to other than {chunk.uncompressed_size} bytes")
+    return replace(chunk, compression="", data=data)
 
 
 def _check_schema(channel: Channel, schemas: dict[int, Schema], path: Path) -> None:

@@ -9,10 +9,10 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.bus.can_bus import CanBus, TimedBus
-from armlink.canopen.object_dictionary import SYNC_ID
-from armlink.canopen.pdo import RPDO1
-from armlink.canopen.units import assumed_units
 from armlink.clock import Clock, MonotonicClock
+from armlink.drives.canopen.object_dictionary import SYNC_ID
+from armlink.drives.canopen.pdo import RPDO1
+from armlink.drives.canopen.units import assumed_units
 from armlink.link.cyclic_exchange import Loop
 
 WAIT_SECONDS = 0.1
@@ -26,7 +26,7 @@ class Recorder:
         """Listen to `bus`; times are the frames' own timestamps if the bus has them, else when frames were read."""
         section = arm.require_link()
         self.names = tuple(joint.name for joint in section.joints)
-        nodes = tuple(joint.node for joint in section.joints)
+        nodes = tuple(joint.settings.node for joint in section.joints)
         self.clock: Clock = bus.clock or MonotonicClock()
         self._timed = bus if isinstance(bus, TimedBus) else None
         self._stamp: Callable[[], float] = self._timed.stamp if self._timed else self.clock.now

@@ -1,7 +1,8 @@
 """Recordings: an arm's channels over time, and their columns in tables."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,13 @@ COLUMNS = {
     "temperature": "temp",
 }
 """Channel name -> column prefix; joint i of 1..n has the column `PREFIX_i`."""
+_INDEX = re.compile(r"[1-9][0-9]{0,8}")
+MOST_JOINTS = 64
+"""A recording of more joints is refused."""
+MOST_COLUMNS = 1000
+"""Likewise of more columns, whatever they hold."""
+MOST_BYTES = 2 << 30
+"""Likewise of more content than this once unpacked, as 64-bit numbers: some 9 hours of seven joints at 250 Hz."""
 TORQUE_CHANNELS = ("torque", "motor_torque", "torque_command")
 
 
@@ -71,10 +79,16 @@ class Recording:
                 expected = (self.t.size, len(self.names))
                 raise BadInput(f"{source}: channel {name} has shape {values.shape}, expected {expected}")
             _check_finite_or_nan(values, COLUMNS[name], source)
-        if not any(getattr(self, name) is not None for name in TORQUE_CHANNELS):
+        if not any(getattr(self, name) is not None for name in (*TORQUE_CHANNELS, "position_command")):
             wanted = ", ".join(f"{COLUMNS[name]}_1" for name in TORQUE_CHANNELS)
-            raise BadInput(f"{source}: no torque channel: at least one of {wanted} … is required")
+            raise BadInput(f"{source}: no torque channel: at least one of {wanted} …, or q_cmd_1 …, is required")
         return self
+
+
+def require_size(size: int, source: str) -> None:
+    """Raise BadInput where a recording holds more bytes than it may."""
+    if size > MOST_BYTES:
+        raise BadInput(f"{source}: holds more than {MOST_BYTES / 1e9:.1f} GB: split it into several recordings")
 
 
 def default_names(n: int) -> tuple[str, ...]:
@@ -102,8 +116,12 @@ def channels_of(columns: Mapping[str, Array], source: str) -> dict[str, Array | 
 
 def joint_count(columns: list[str], source: str) -> int:
     """Number of joints that the column names describe; raises BadInput that names a missing column."""
+    if len(columns) > MOST_COLUMNS:
+        raise BadInput(f"{source}: {len(columns)} columns, expected at most {MOST_COLUMNS}")
     indices = [index for column in columns if (index := _joint_index(column)) is not None]
     n = max(indices, default=1)
+    if n > MOST_JOINTS:
+        raise BadInput(f"{source}: a column is of joint {n}, expected at most {MOST_JOINTS} joints")
     present = set(columns)
     for name, prefix in COLUMNS.items():
         wanted = [f"{prefix}_{i}" for i in range(1, n + 1)]
@@ -121,6 +139,12 @@ def is_channel(column: str) -> bool:
     return column == "t" or _joint_index(column) is not None
 
 
+def take_joints(recording: Recording, order: Sequence[int], names: tuple[str, ...] = ()) -> Recording:
+    """Some of a recording's joints, in another order; `names` replaces theirs."""
+    channels = {name: values[:, list(order)] for name, values in recording.channels().items()}
+    return replace(recording, names=names or tuple(recording.names[i] for i in order), **channels)  # type: ignore[arg-type]
+
+
 def slice_rows(recording: Recording, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Recording:
     """Some rows of a recording, with their times unchanged."""
     values = {field.name: getattr(recording, field.name) for field in fields(recording)}
@@ -130,10 +154,16 @@ def slice_rows(recording: Recording, rows: slice | NDArray[np.bool_] | NDArray[n
     return Recording(**values)
 
 
-def _joint_index(column: str) -> int | None:
+def channel_column(column: str) -> tuple[str, int] | None:
+    """Channel prefix and joint number from 1 of a column's name, or None if it is not that of a channel."""
     prefix, _, index = column.rpartition("_")
-    known = prefix in COLUMNS.values() and index.isdigit() and not index.startswith("0")
-    return int(index) if known else None
+    known = prefix in COLUMNS.values() and _INDEX.fullmatch(index) is not None
+    return (prefix, int(index)) if known else None
+
+
+def _joint_index(column: str) -> int | None:
+    place = channel_column(column)
+    return place[1] if place else None
 
 
 def _check_time(t: Array, source: str) -> None:

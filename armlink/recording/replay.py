@@ -12,10 +12,10 @@ from armlink.arrays import Array
 from armlink.bus.frame_log import LogBus, LogReader, is_log
 from armlink.bus.open import open_bus, parse_bus
 from armlink.bus.port import Port, Stamped
-from armlink.canopen.object_dictionary import SYNC_ID
-from armlink.canopen.pdo import TPDO1, TPDO2, TPDO3
-from armlink.canopen.units import TORQUE_PER_MICRO, assumed_units
 from armlink.clock import Clock, MonotonicClock
+from armlink.drives.canopen.object_dictionary import SYNC_ID
+from armlink.drives.canopen.pdo import TPDO1, TPDO2, TPDO3
+from armlink.drives.canopen.units import TORQUE_PER_MICRO, assumed_units
 from armlink.errors import BadInput
 from armlink.recording.recorder import Recorder
 from armlink.recording.recording import Recording
@@ -95,12 +95,12 @@ def frames_of_recording(arm: ArmFile, recording: Recording) -> Iterator[Stamped]
             position, reading = recording.position[row, j], torque[row, j]
             if math.isfinite(position) and math.isfinite(reading):
                 counts = _whole(position / unit.position, _I32), _whole(reading / TORQUE_PER_MICRO, _I32)
-                yield t, TPDO1.cob_base + joint.node, TPDO1.layout.pack(*counts)
+                yield t, TPDO1.cob_base + joint.settings.node, TPDO1.layout.pack(*counts)
             if row == 0:
-                yield t, TPDO3.cob_base + joint.node, TPDO3.layout.pack(_ENABLED, 0)
+                yield t, TPDO3.cob_base + joint.settings.node, TPDO3.layout.pack(_ENABLED, 0)
             if math.isfinite(motor[row, j]) and math.isfinite(velocity[row, j]):
                 values = _whole(motor[row, j] / unit.torque, _I16), _whole(velocity[row, j] / unit.position, _I32)
-                yield t, TPDO2.cob_base + joint.node, TPDO2.layout.pack(_ENABLED, *values)
+                yield t, TPDO2.cob_base + joint.settings.node, TPDO2.layout.pack(_ENABLED, *values)
 
 
 def show(recording: Recording, console: "Console", speed: float, clock: Clock | None = None) -> None:

@@ -16,11 +16,11 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.bus.port import Frame
-from armlink.canopen.cia402 import Mode
-from armlink.canopen.object_dictionary import SYNC_ID
-from armlink.canopen.pdo import STATUS_DECIMATION, TPDO1, TPDO2, TPDO3
-from armlink.canopen.units import Units
-from armlink.clock import MonotonicClock
+from armlink.clock import Clock, MonotonicClock
+from armlink.drives.canopen.cia402 import Mode
+from armlink.drives.canopen.object_dictionary import SYNC_ID
+from armlink.drives.canopen.pdo import STATUS_DECIMATION, TPDO1, TPDO2, TPDO3
+from armlink.drives.canopen.units import Units
 from armlink.errors import BusFault
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
@@ -62,14 +62,20 @@ class HostReport:
 class EchoPort:
     """A port on which every joint answers each SYNC at once, standing still and enabled."""
 
-    def __init__(self, nodes: Sequence[int]) -> None:
-        """For joints at these node ids."""
+    def __init__(self, arm: ArmFile) -> None:
+        """For the joints of this arm, in the middle of their ranges."""
+        self.standing = np.array([(lower + upper) / 2 for lower, upper in joint_ranges(arm)])
+        """(n,) [rad]."""
+        nodes = range(1, len(self.standing) + 1)
         self.errors = self.dropped = 0
-        self._nodes, self._syncs = nodes, 0
+        self.nodes, self._syncs = tuple(nodes), 0
         self._waiting: deque[Frame] = deque()
         status = ENABLED_BITS
         self._shown = [(TPDO3.cob_base + node, TPDO3.layout.pack(status, Mode.POSITION)) for node in nodes]
-        self._read = [(TPDO1.cob_base + node, TPDO1.layout.pack(0, 0)) for node in nodes]
+        wire = np.round(self.standing / USER_UNIT).astype(int).tolist()
+        self._read = [
+            (TPDO1.cob_base + node, TPDO1.layout.pack(place, 0)) for node, place in zip(nodes, wire, strict=True)
+        ]
         self._slow = [(TPDO2.cob_base + node, TPDO2.layout.pack(status, 0, 0)) for node in nodes]
 
     def send(self, can_id: int, data: bytes) -> None:
@@ -126,13 +132,11 @@ def _work(random: np.random.Generator, file: int) -> None:
     time.sleep(0.005)
 
 
-def cycles(arm: ArmFile, seconds: float, channel: Channel) -> HostReport:
-    """The link's cycle on an EchoPort, each sample sent to the job."""
+def echo_commander(arm: ArmFile, port: EchoPort, clock: Clock) -> Commander:
+    """The link's cycle for an arm whose joints are all enabled and answer on an EchoPort; no reading is too old."""
     section = arm.require_link()
     n, period = len(section.joints), 1.0 / section.rate
-    nodes = tuple(range(1, n + 1))
-    clock, realtime = MonotonicClock(), prepare()
-    loop = Loop(EchoPort(nodes), clock, nodes, 127, period, lock_step=False)
+    loop = Loop(port, clock, port.nodes, 127, period, lock_step=False)
     units = [Units(joint.rated_torque * 1e-3, USER_UNIT, USER_UNIT) for joint in section.joints]
     loop.set_units(tuple(units))
     windows = [target_window(*limits) for limits in joint_ranges(arm)]
@@ -142,13 +146,25 @@ def cycles(arm: ArmFile, seconds: float, channel: Channel) -> HostReport:
     ]
     names = tuple(joint.name for joint in section.joints)
     commander = Commander(loop, clock, names, period, np.inf, lock_step=False)
-    commander.begin(limits, [start_from(limit, 0.0, 0.0) for limit in limits], [0] * n)
+    commander.begin(
+        limits, [start_from(limit, 0.0, place) for limit, place in zip(limits, port.standing, strict=True)], [0] * n
+    )
     loop.statuses[:], loop.displays[:] = [ENABLED_BITS] * n, [int(Mode.POSITION)] * n
-    hold, nothing = Command.hold(np.zeros(n)), np.zeros(n)
+    return commander
+
+
+def cycles(arm: ArmFile, seconds: float, channel: Channel) -> HostReport:
+    """The link's cycle on an EchoPort, each sample sent to the job."""
+    rate, n = arm.require_link().rate, len(arm.joint_names)
+    clock, realtime = MonotonicClock(), prepare()
+    port = EchoPort(arm)
+    commander = echo_commander(arm, port, clock)
+    hold, nothing = Command.hold(port.standing), np.zeros(n)
     count, begin, busy = 0, clock.now(), time.process_time()
     for _ in range(3):  # every joint has answered, and memory is warm
         commander.stand([0] * n)
-    loop.stats.lateness = Lateness()
+    stats = commander.loop.stats
+    stats.lateness = Lateness()
     while clock.now() - begin < seconds:
         sample = commander.command(hold)
         channel.put((0, count, pack(sample, nothing, nothing)), True)
@@ -156,7 +172,7 @@ def cycles(arm: ArmFile, seconds: float, channel: Channel) -> HostReport:
         channel.receive()
         count += 1
     busy = (time.process_time() - busy) / max(count, 1)
-    return HostReport(section.rate, seconds, loop.stats.lateness, busy, realtime)
+    return HostReport(rate, seconds, stats.lateness, busy, realtime)
 
 
 def main(number: int) -> None:

@@ -5,9 +5,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from armlink.canopen import emcy
-from armlink.canopen import object_dictionary as objects
-from armlink.canopen.cia402 import Control, Mode, State, state_of
+from armlink.drives.canopen import emcy
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen.cia402 import Control, Mode, State, state_of
 from armlink.errors import ArmlinkError, BusFault
 from armlink.link.faults import bus_fault
 from armlink.link.link import Link
@@ -195,7 +195,7 @@ class PowerTest:
         if self._harmed:
             return
         self._progress(f"all joints: no heartbeat of the host for {limit * 1e3:.0f} ms")
-        self.loop.send(objects.HEARTBEAT_ID + link.protection.host, bytes([objects.OPERATIONAL]))
+        self.loop.beat()
         self.loop.beating = False
         start, seconds = self._last, 0.0
         after: list[tuple[State, float] | None] = [None] * link.n

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 from armlink.arm_file import LinkJoint
-from armlink.canopen import object_dictionary as objects
-from armlink.canopen import pdo
-from armlink.canopen.cia402 import MODE_NAMES, Mode, supports
-from armlink.canopen.eds_file import OPTIONAL, expected_identity, used_objects
-from armlink.canopen.object_dictionary import Entry
-from armlink.canopen.sdo import NodeServices
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen import pdo
+from armlink.drives.canopen.cia402 import MODE_NAMES, Mode, supports
+from armlink.drives.canopen.eds_file import OPTIONAL, expected_identity, used_objects
+from armlink.drives.canopen.object_dictionary import Entry
+from armlink.drives.canopen.sdo import NodeServices
 from armlink.errors import ArmlinkError
 from armlink.link import controller_setup as device
 from armlink.link import torque_sensor_record as calibration
@@ -37,6 +37,11 @@ class Result:
     found: str
     seconds: float | None = None
     """How long the device took, where that was measured [s]."""
+
+
+def self_test(link: Link, tell: Callable[[str], None], power: bool) -> tuple[list[Result], str]:
+    """Run the checks on a link that is open and not started; results, and the bus's name. Raises BusFault."""
+    return SelfTest(link, tell).run(power), str(link.bus.channel_info)
 
 
 class SelfTest:

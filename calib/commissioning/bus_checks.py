@@ -6,8 +6,8 @@ from pathlib import Path
 from armlink.arm_file import SIMULATED, ArmFile, Bus
 from armlink.bus.frame_bits import longest_frame_bits
 from armlink.bus.open import open_link_bus, resolve_bus
-from armlink.canopen import pdo
-from armlink.canopen.eds_file import expected_identity, of_joints
+from armlink.drives.canopen import pdo
+from armlink.drives.canopen.eds_file import expected_identity, of_joints
 from armlink.errors import ArmlinkError
 from armlink.link.controller_setup import RATED_TORQUE_TOLERANCE, identity_mismatches
 from armlink.monitor.drives import Drives, FoundDrive
@@ -84,7 +84,7 @@ def _drives(arm_file: ArmFile, found: list[FoundDrive], bus: str) -> Iterator[Se
     unknown = f"; nodes {', '.join(map(str, spare))} answer and are in no joint" if spare else ""
     for joint, sheet in zip(link.joints, of_joints(arm_file), strict=True):
         where = f"{joint.name} (node {joint.node})"
-        drive = by_node.get(joint.node)
+        drive = by_node.get(joint.node) if joint.node is not None else None
         if drive is None:
             remedy = f"check its power, wiring and node id{unknown}; armlink new with --bus finds the drives"
             yield SetupFinding("error", f"no answer on {bus}", where, remedy)

@@ -55,7 +55,7 @@ class Service:
         self.configuration = Configuration(arm, settings, listen_only)
         self.environment, self.directory, self._store = environment, directory, store
         self.started = monotonic()
-        self.journal = Journal(directory / "journal.db")
+        self.journal = Journal(directory / "journal.db", monotonic)
         self.hub = Hub()
         self.events = EventLog(self.journal, self.hub, monotonic, wall)
         self.jobs = BusJobs(environment.run, self.journal)
@@ -71,6 +71,7 @@ class Service:
         )
         text = f"armlink {version('armlink')} for {arm.name} {arm.serial}"
         self.events.say("started", None, text, {"policy": settings.policy})
+        self._say_set_aside()
         self.records.load()
 
     @property
@@ -85,13 +86,22 @@ class Service:
             return State.FAULT
         return State.OBSERVING if self.tours.progress is None else State.SWEEPING
 
+    @property
+    def trouble(self) -> str:
+        """What the service lacks itself, the arm apart: its journal or its record store; empty if nothing."""
+        return self.journal.trouble or self.records.store_fault
+
     def take(self, message: Message) -> None:
         """Route one message of the bus loop; a disk that fails is shown in the status and stops nothing."""
         self.journal.guard(lambda: self._take(message))
 
     def tick(self) -> None:
-        """Do what is due."""
-        self.journal.guard(self._tick)
+        """Do what is due; what fails on its part does not keep the rest from being done."""
+        self.journal.probe()
+        self._say_set_aside()
+        parts = (self.events, self.arm_state, self.records, self.recalibrations, self.tours)
+        for act in (*(part.tick for part in parts), self._save_due):
+            self.journal.guard(act)
 
     def reload(self, arm: ArmFile, settings: DaemonSection) -> None:
         """Use another configuration of the same arm from now on; the observer's state is kept.
@@ -140,11 +150,13 @@ class Service:
         elif isinstance(message, Answer) and message.error is not None:
             self.tours.refused(str(message.error))
 
-    def _tick(self) -> None:
-        self.events.tick()
-        self.arm_state.tick()
-        self.records.tick()
-        self.tours.tick()
+    def _say_set_aside(self) -> None:
+        aside, self.journal.set_aside = self.journal.set_aside, ""
+        if aside:
+            text = f"the journal was damaged: it is kept as {aside}, and a new one was begun"
+            self.events.say("fault", None, text, {"file": aside})
+
+    def _save_due(self) -> None:
         observation = self.records.observation
         self.storage.tick(None if observation is None else observation.feed)
 
@@ -157,7 +169,7 @@ class Service:
         configuration, before = self.configuration, self.records.observation
         arm = configuration.arm
         feed = ObserverFeed(arm, calibration, gravity, configuration.settings.observer_config())
-        recalibrator = Recalibrator(arm, self.environment.port.controllers, self._store, "propose")
+        recalibrator = Recalibrator(arm, self.environment.port.controllers, self._store, "propose", calibration)
 
         def installed(record: CalibrationRecord, finding: Finding) -> None:
             feed.install(record, finding)

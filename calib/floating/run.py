@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from armlink.canopen.cia402 import Mode
+from armlink.drives.canopen.cia402 import Mode
 from armlink.errors import ArmlinkError, Refused
 from armlink.link.types import Command, Sample
 from armlink.loop.driver import ArmDriver

@@ -69,9 +69,16 @@ def recalibrated(
 class Recalibrator:
     """Turns findings into records under a policy: observe keeps nothing, propose keeps, apply also writes."""
 
-    def __init__(self, arm: ArmFile, controllers: Controllers, store: RecordStore, policy: Policy) -> None:
-        """Start from the arm's current calibration record; raises Refused if there is none."""
-        current = store.current(CalibrationRecord, arm)
+    def __init__(
+        self,
+        arm: ArmFile,
+        controllers: Controllers,
+        store: RecordStore,
+        policy: Policy,
+        current: CalibrationRecord | None = None,
+    ) -> None:
+        """Start from the arm's current calibration record (default: as the store has it); raises Refused if none is."""
+        current = current or store.current(CalibrationRecord, arm)
         if current is None:
             raise Refused(f"{arm.name} {arm.serial} has no calibration record yet: run armlink sweep and calibrate")
         self.record = current

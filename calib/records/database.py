@@ -16,9 +16,24 @@ from calib.records.schema import MIGRATIONS
 HEAD = MIGRATIONS[-1]
 BUSY_SECONDS = 10
 """Wait for another writer of an SQLite store [s]."""
+SILENT_SECONDS = 10
+"""A PostgreSQL server that answers nothing for this time has gone [s]."""
+_POSTGRESQL = {
+    "connect_timeout": 5,
+    "keepalives_idle": 5,
+    "keepalives_interval": 2,
+    "keepalives_count": 3,
+    "tcp_user_timeout": SILENT_SECONDS * 1000,
+    "options": f"-c statement_timeout={SILENT_SECONDS * 1000}",
+}
+"""Of libpq: how long it waits before it takes a connection for lost."""
 _VERSION = "alembic_version"
 _LOCK = 0x61726D6C
 """Advisory lock on PostgreSQL that serialises writers, as SQLite does by itself."""
+
+
+class StoreFault(BadInput):
+    """The record store cannot be reached, read or written now; nothing was changed."""
 
 
 def default_url() -> str:
@@ -34,7 +49,8 @@ def open_database(url: str) -> sa.Engine:
     """
     full = _full_url(url)
     try:
-        engine = sa.create_engine(full)
+        connect = _POSTGRESQL if sa.make_url(full).get_backend_name() == "postgresql" else {}
+        engine = sa.create_engine(full, pool_pre_ping=True, connect_args=connect)
         if engine.dialect.name == "sqlite":
             _prepare_sqlite(engine)
         _migrate(engine)
@@ -45,17 +61,33 @@ def open_database(url: str) -> sa.Engine:
 
 @contextmanager
 def transaction(engine: sa.Engine) -> Iterator[sa.Connection]:
-    """One writing transaction: all of it is on disk when it returns, or nothing is. Raises BadInput if it fails."""
+    """One writing transaction: all of it is on disk when it returns, or nothing is. Raises StoreFault if it fails."""
     try:
         with engine.execution_options(writing=True).begin() as connection:
             _lock(connection)
             yield connection
-    except (sa.exc.OperationalError, sa.exc.InternalError) as error:
-        reason = first_line(error.orig if error.orig is not None else error)
-        shown = engine.url.render_as_string(hide_password=True)
-        raise BadInput(
-            f"record store {shown}: nothing was written: {reason}: fix that and run the command again"
-        ) from None
+    except sa.exc.IntegrityError:
+        raise
+    except sa.exc.SQLAlchemyError as error:
+        raise _fault(engine, "nothing was written", error) from None
+
+
+@contextmanager
+def reading(engine: sa.Engine) -> Iterator[sa.Connection]:
+    """A connection that reads; raises StoreFault where the database fails, and the next one is opened anew."""
+    try:
+        with engine.connect() as connection:
+            yield connection
+    except sa.exc.SQLAlchemyError as error:
+        raise _fault(engine, "cannot be read", error) from None
+
+
+def _fault(engine: sa.Engine, what: str, error: sa.exc.SQLAlchemyError) -> StoreFault:
+    """A failure of the database in one line; its connections are closed, since they may hold a lost server or file."""
+    engine.dispose()
+    reason = first_line(getattr(error, "orig", None) or error)
+    shown = engine.url.render_as_string(hide_password=True)
+    return StoreFault(f"record store {shown}: {what}: {reason}: fix that and run the command again")
 
 
 def _migrate(engine: sa.Engine) -> None:

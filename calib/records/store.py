@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
-import yaml
 
-from armlink.arm_file import ArmFile
+from armlink.arm_file import ArmFile, read_yaml
 from armlink.errors import BadInput, Refused
 from calib.records.atomic_file import write_whole
-from calib.records.database import default_url, first_line, open_database, transaction
+from calib.records.database import StoreFault, default_url, first_line, open_database, reading, transaction
 from calib.records.records import CalibrationRecord, GravityRecord, Record, parse_record
 from calib.records.schema import ACTIVATIONS, RECORDS, WRITES
 
@@ -72,11 +71,11 @@ class RecordStore:
 
     def get(self, record_id: str) -> AnyRecord:
         """The record of that id; raises Refused if there is none."""
-        with self._engine.connect() as connection:
+        with reading(self._engine) as connection:
             body = connection.execute(sa.select(RECORDS.c.body).where(RECORDS.c.id == record_id)).scalar()
         if body is None:
             raise Refused(f"no record {record_id} in {self.url}; armlink history ARM lists the records")
-        return parse_record(json.loads(body), f"record {record_id}")
+        return parse_record(self._parsed(body), f"record {record_id}")
 
     def activate(self, record_id: str, arm: ArmFile, by: str, reason: str) -> Activation:
         """Make a kept record the current one of its kind; raises Refused if it is of another arm."""
@@ -115,6 +114,13 @@ class RecordStore:
         assert isinstance(record, kind)
         return record
 
+    def _parsed(self, body: str) -> Any:
+        """The JSON of a row; raises StoreFault where it is damaged."""
+        try:
+            return json.loads(body)
+        except (ValueError, TypeError):
+            raise StoreFault(f"record store {self.url}: a row is damaged: restore the store from a copy") from None
+
     def _current_id(self, kind: str, arm: ArmFile) -> str | None:
         log = [line.record for line in self.activations(arm) if line.kind == kind]
         return log[-1] if log else None
@@ -124,16 +130,16 @@ class RecordStore:
         log = ACTIVATIONS.c
         wanted = sa.select(log.number, log.record, log.kind, log.at, log.by, log.reason)
         wanted = wanted.where(log.arm == arm.name, log.serial == arm.serial).order_by(log.number)
-        with self._engine.connect() as connection:
+        with reading(self._engine) as connection:
             return [Activation(*row) for row in connection.execute(wanted)]
 
     def history(self, arm: ArmFile) -> list[AnyRecord]:
         """All records of this arm (name and serial), oldest first, of any description."""
         rows = RECORDS.c
         wanted = sa.select(rows.id, rows.body).where(rows.arm == arm.name, rows.serial == arm.serial)
-        with self._engine.connect() as connection:
+        with reading(self._engine) as connection:
             found = connection.execute(wanted.order_by(rows.created, rows.id)).all()
-        return [parse_record(json.loads(body), f"record {record_id}") for record_id, body in found]
+        return [parse_record(self._parsed(body), f"record {record_id}") for record_id, body in found]
 
     def begin_write(
         self, record_id: str, arm: ArmFile, by: str, before: Sequence[dict[str, Any]], *, reason: str, gates: str
@@ -181,8 +187,8 @@ class RecordStore:
         log = WRITES.c
         wanted = sa.select(log.number, log.record, log.at, log.by, log.stage, log.body)
         wanted = wanted.where(log.arm == arm.name, log.serial == arm.serial).order_by(log.number)
-        with self._engine.connect() as connection:
-            return [ControllerWrite(*row[:5], json.loads(row[5])) for row in connection.execute(wanted)]
+        with reading(self._engine) as connection:
+            return [ControllerWrite(*row[:5], self._parsed(row[5])) for row in connection.execute(wanted)]
 
     def import_yaml(self, path: Path, arm: ArmFile) -> str:
         """Append the record of a YAML file (as `Record.to_yaml` wrote it), not making it current; returns its id.
@@ -195,8 +201,8 @@ class RecordStore:
 def load_yaml(path: Path) -> AnyRecord:
     """The record of a YAML file (as `Record.to_yaml` wrote it); raises BadInput if it is none or was changed."""
     try:
-        content: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        content = read_yaml(path)
+    except OSError as error:
         raise BadInput(f"{path}: cannot be read as YAML: {first_line(error)}") from None
     return parse_record(content, str(path))
 

@@ -18,7 +18,7 @@ from calib.plan.sweep_plan import plan_sweep
 from calib.plan.types import Sweep, SweepPlan
 from calib.sweep.dataset import DataWriter, Manifest, PlanLine, SweepData, load_data
 from calib.sweep.scout import SCOUT, SLOWER, rough_model, run_scout
-from calib.sweep.stalls import OnStall, give_up, stall_line
+from calib.sweep.stalls import OnStall, bridged, give_up, restart, stall_line
 from gcomp.arrays import Array
 
 Progress = Callable[[int, int, float, str], None]
@@ -52,11 +52,11 @@ def run_sweep(
     on disk. After a Stall that `on_stall` accepts the joints are enabled again and the interrupted reading is repeated.
     Raises BadInput, Refused if the arm cannot be swept, BusFault; every reading made is on disk.
     """
-    installed = [link.read_calibration(joint) for joint in range(link.n)]
+    installed = bridged(link, on_stall, lambda: [link.read_calibration(joint) for joint in range(link.n)])
     manifest = Manifest.of(arm, reference_mass, installed)
     with DataWriter(out, manifest, resume) as writer:
         data = load_data(out)
-        mover = Mover(link, sweep_section(arm), Limits.of(arm))
+        mover = bridged(link, on_stall, lambda: Mover(link, sweep_section(arm), Limits.of(arm)))
         run = _Pass(mover, writer, list(data.readings), progress or (lambda *_: None), clock, on_stall)
         if data.plan is None:
             first = plan_sweep(arm, seed=seed, reference_mass=reference_mass)
@@ -74,8 +74,7 @@ def run_sweep(
         mover.average_to(plan.standard_error)
         for sweep in plan.sweeps:
             run.sweep(sweep)
-        mover.hold_all()
-        mover.cycle()
+        run.rest()
     return load_data(out)
 
 
@@ -132,11 +131,21 @@ class _Pass:
 
     def bridge(self, stall: Stall, reading: str) -> None:
         """Note a stall, enable the joints again and hold them where they stand; raises it if that is not wanted."""
-        if not self._on_stall(stall):
-            raise stall
-        self.writer.append(stall_line(stall, self.mover.seen_at, reading))
-        self.mover.link.recover()
-        self.mover.resume()
+        link = self.mover.link
+
+        def note(stall: Stall) -> None:
+            self.writer.append(stall_line(stall, self.mover.seen_at, reading))
+
+        restart(link, self._on_stall, stall, note)
+        bridged(link, self._on_stall, self.mover.resume)
+
+    def rest(self) -> None:
+        """Every joint under position control, holding."""
+        try:
+            self.mover.hold_all()
+            self.mover.cycle()
+        except Stall as stall:
+            self.bridge(stall, "end")
 
     def scout(self, plan: SweepPlan) -> None:
         """Take the scout poses that are still to be taken."""

@@ -17,15 +17,29 @@ def give_up(stall: Stall) -> bool:
     return False
 
 
+def restart(
+    link: ArmDriver, on_stall: OnStall, stall: Stall, note: Callable[[Stall], None] = lambda stall: None
+) -> None:
+    """Enable the joints again as often as it takes; raises the Stall that `on_stall` does not accept."""
+    while True:
+        if not on_stall(stall):
+            raise stall
+        note(stall)
+        try:
+            link.recover()
+        except Stall as again:
+            stall = again
+        else:
+            return
+
+
 def bridged(link: ArmDriver, on_stall: OnStall, work: Callable[[], T]) -> T:
     """Return the result of `work`; it is repeated from its beginning after each Stall that `on_stall` accepts."""
     while True:
         try:
             return work()
         except Stall as stall:
-            if not on_stall(stall):
-                raise
-            link.recover()
+            restart(link, on_stall, stall)
 
 
 def stall_line(stall: Stall, t: float, reading: str) -> StallLine:

@@ -7,7 +7,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sim_bus.bus.fault_kinds import Fault
+from armlink.errors import BadInput
+from sim_bus.bus.fault_kinds import CANOPEN_FAULTS, Fault
+from sim_bus.drives.fault_kinds import DRIVE_KINDS
+from sim_bus.drives.simulated_drive import SimulatedDrive
+from sim_bus.node.node import Node
 from sim_bus.node.pdo import Frame
 from sim_bus.simulated_arm import SimulatedArm
 
@@ -16,7 +20,7 @@ ERROR_FLAG = 0x20000000
 PROTOCOL_ERROR, BUS_OFF, RESTARTED = 0x08, 0x40, 0x100
 ABORT_CODE, STORM_CODE = 0x08000022, 0x7305
 BABBLE = (0x001, bytes(8))
-SERVICE, NODE = 0x780, 0x7F
+SERVICE, NODE, LARGEST_STANDARD = 0x780, 0x7F, 0x7FF
 TPDO1, SDO_ANSWER, SDO_REQUEST = 0x180, 0x580, 0x600
 TO_NODES = (0x200, 0x300, 0x400, 0x500, SDO_REQUEST)
 """Function codes of frames to one node: RPDO1 to 4 and SDO."""
@@ -45,7 +49,12 @@ class Injector:
         self._owed: dict[tuple[str, int], float] = {}
 
     def inject(self, fault: Fault) -> None:
-        """Inject a fault now, or at its time."""
+        """Inject a fault now, or at its time. Raises BadInput for a fault that the joint's drive cannot have."""
+        if fault.joint:
+            device = self.arm.device(self.arm.names.index(fault.joint))
+            if fault.id in (CANOPEN_FAULTS if isinstance(device, SimulatedDrive) else DRIVE_KINDS):
+                family = self.arm.arm.require_link().joints[self.arm.names.index(fault.joint)].settings.family
+                raise BadInput(f"fault {fault.id}: {fault.joint} has a {family} drive, which cannot have it")
         self._planned.append(fault)
         self._planned.sort(key=lambda planned: planned.time)
         self._begin()
@@ -53,9 +62,12 @@ class Injector:
     def clear(self) -> None:
         """End all faults."""
         self._planned.clear()
-        for node in self.arm.nodes:
-            node.unplugged = False
-            self.arm.drives.refused_modes[node.place].clear()
+        for joint in range(self.arm.n):
+            device = self.arm.device(joint)
+            device.unplugged = False
+            self.arm.drives.refused_modes[joint].clear()
+            if isinstance(device, SimulatedDrive):
+                device.end_faults()
         if "bus.off" in self._until:
             self._error(RESTARTED)
         self._until.clear()
@@ -73,9 +85,9 @@ class Injector:
         self._begin()
         if self.refusal:
             return
-        place = self._place(can_id)
+        place = self.arm.place_of.get(can_id & NODE) if can_id <= LARGEST_STANDARD else None
         service = can_id & SERVICE
-        if place is not None and service in TO_NODES and self.arm.nodes[place].unplugged:
+        if place is not None and service in TO_NODES and self.arm.device(place).unplugged:
             return
         if place is not None and service == SDO_REQUEST and self._answered(place, data):
             return
@@ -91,13 +103,16 @@ class Injector:
                 self._owed[fault, place] = self._owed.get((fault, place), 0.0) + rate * duration
                 whole = int(self._owed[fault, place])
                 self._owed[fault, place] -= whole
-                node = self.arm.nodes[place].node_id
-                storm = (0x80 + node, struct.pack("<HB5x", STORM_CODE, 0x21))
-                self._sent.extend([BABBLE if fault == "node.babbling" else storm] * whole)
+                self._sent.extend([BABBLE if fault == "node.babbling" else self._storm(place)] * whole)
         self._carry()
         self._end()
 
     # ---- internals
+
+    def _storm(self, place: int) -> Frame:
+        device = self.arm.device(place)
+        assert isinstance(device, Node)
+        return 0x80 + device.node_id, struct.pack("<HB5x", STORM_CODE, 0x21)
 
     def _begin(self) -> None:
         while self._planned and self._planned[0].time <= self.arm.time:
@@ -108,6 +123,10 @@ class Injector:
 
     def _start(self, fault: Fault, place: int) -> None:
         arm = self.arm
+        device = arm.device(place) if place >= 0 else None
+        if isinstance(device, SimulatedDrive) and (fault.id in DRIVE_KINDS or fault.id == "mode.refused"):
+            device.inject(fault.id, fault.amount)
+            return
         once: dict[str, Callable[[], None]] = {
             "node.reboot": lambda: arm.reboot(place),
             "mode.refused": lambda: arm.drives.refused_modes[place].add(int(fault.amount)),
@@ -120,7 +139,8 @@ class Injector:
             if fault.id == "bus.off":
                 self._error(BUS_OFF)
         elif fault.id == "node.silent":
-            arm.nodes[place].unplugged = True
+            assert device is not None
+            device.unplugged = True
             self._until[fault.joint] = arm.time + fault.amount
         else:
             self._on[fault.id, place] = fault.amount
@@ -131,13 +151,15 @@ class Injector:
             if what == "bus.off":
                 self._error(RESTARTED)
             elif what in self.arm.names:
-                self.arm.nodes[self.arm.names.index(what)].unplugged = False
+                self.arm.device(self.arm.names.index(what)).unplugged = False
 
     def _answered(self, place: int, request: bytes) -> bool:
         """Whether a fault handles an SDO request, by an abort or by silence."""
         if ("sdo.abort", place) in self._on:
             answer = struct.pack("<B3sI", 0x80, request[1:4].ljust(3, b"\0"), ABORT_CODE)
-            self._sent.append((SDO_ANSWER + self.arm.nodes[place].node_id, answer))
+            device = self.arm.device(place)
+            assert isinstance(device, Node)
+            self._sent.append((SDO_ANSWER + device.node_id, answer))
             self._carry()
             return True
         return ("sdo.timeout", place) in self._on
@@ -155,12 +177,12 @@ class Injector:
                     self.dropped += 1
 
     def _arriving(self, can_id: int, data: bytes) -> tuple[Frame, ...]:
-        place = self._place(can_id)
-        if place is None or can_id < 0x80:
+        place = self.arm.joint_of(can_id)
+        if place is None:
             return ((can_id, data),)
-        if self.arm.nodes[place].unplugged:
+        if self.arm.device(place).unplugged:
             return ()
-        is_reading = can_id & SERVICE == TPDO1
+        is_reading = place in self.arm.drive_at or can_id & SERVICE == TPDO1
         if self._strikes("frame.corrupt", place):
             return ((ERROR_FLAG | PROTOCOL_ERROR, bytes(8)),)
         if is_reading and self._strikes("frame.short", place):
@@ -175,6 +197,3 @@ class Injector:
 
     def _error(self, kind: int) -> None:
         self.outbox.append((ERROR_FLAG | kind, bytes(8)))
-
-    def _place(self, can_id: int) -> int | None:
-        return self.arm.place_of.get(can_id & NODE)

@@ -5,20 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from armlink.errors import BadInput
+from sim_bus.drives.fault_kinds import DRIVE_KINDS, FaultKind
 
 FORM = "ID:JOINT[:VALUE][@T] or ID::VALUE[@T], for example node.silent:joint_2 or bus.off::0.5@3"
-
-
-@dataclass(frozen=True)
-class FaultKind:
-    """One kind of fault: whether it belongs to a joint, meaning of its value, and its effect."""
-
-    id: str
-    per_joint: bool
-    value: str
-    """Meaning and unit of the value; empty if there is none."""
-    default: float
-    does: str
 
 
 KINDS = {
@@ -41,6 +30,9 @@ KINDS = {
         FaultKind("clock.jump", False, "jump [s]", 1.0, "time jumps: as if the host had slept"),
     )
 }
+ALL_KINDS = KINDS | DRIVE_KINDS
+CANOPEN_FAULTS = frozenset(("emcy.storm", "sdo.abort", "sdo.timeout"))
+"""Faults that only a CANopen node can have."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +49,7 @@ class Fault:
     @property
     def kind(self) -> FaultKind:
         """Its kind."""
-        return KINDS[self.id]
+        return ALL_KINDS[self.id]
 
     @property
     def amount(self) -> float:
@@ -69,9 +61,9 @@ def parse_fault(text: str, joints: Sequence[str]) -> Fault:
     """Parse one `--fault`. Raises BadInput."""
     what, at, time = text.partition("@")
     parts = what.split(":")
-    kind = KINDS.get(parts[0])
+    kind = ALL_KINDS.get(parts[0])
     if kind is None:
-        raise BadInput(f"fault {text!r}: no fault {parts[0]!r}; there are {', '.join(KINDS)}")
+        raise BadInput(f"fault {text!r}: no fault {parts[0]!r}; there are {', '.join(ALL_KINDS)}")
     joint, value = [*parts[1:], "", ""][:2]
     if len(parts) > 3 or bool(joint) != kind.per_joint:
         raise BadInput(

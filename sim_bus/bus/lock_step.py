@@ -1,4 +1,7 @@
-"""In-process CAN bus with the simulated arm: SYNC advances the physics by one period; nothing sleeps."""
+"""In-process CAN bus with the simulated arm: a cycle advances the physics by one period; nothing sleeps.
+
+A cycle is a SYNC, or for an arm without CANopen drives what its host says it is (`pass_time`).
+"""
 
 from threading import RLock
 from typing import Any
@@ -7,14 +10,18 @@ import can
 
 from armlink.arm_file import load_arm
 from armlink.bus.in_process import InProcessBus
-from armlink.bus.port import Frame
-from armlink.canopen.object_dictionary import SYNC_ID
+from armlink.bus.message_port import as_frame, as_message
+from armlink.bus.port import CLASSICAL, Frame
+from armlink.drives.canopen.object_dictionary import SYNC_ID
 from armlink.errors import BusFault
 from sim_bus.bus.fault_injector import BUS_OFF, ERROR_FLAG, HOST_REFUSES, Injector
 from sim_bus.bus.fault_kinds import Fault, parse_fault
 from sim_bus.bus.wire_timing import Line, Wire
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
+
+CLASSICAL_BYTES = 8
+"""A longer frame can only be CAN FD."""
 
 
 class SimulatedClock:
@@ -99,7 +106,7 @@ class LockStepBus(can.BusABC, InProcessBus):  # type: ignore[misc]
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Deliver a frame to all nodes; a SYNC also advances the arm by one period."""
         try:
-            self.put(msg.arbitration_id, bytes(msg.data))
+            self.put(*as_frame(msg))
         except BusFault as error:
             raise can.CanOperationError(str(error)) from None
 
@@ -126,7 +133,10 @@ class LockStepBus(can.BusABC, InProcessBus):  # type: ignore[misc]
     def _next(self, timeout: float) -> tuple[int, bytes] | None:
         if not self._outbox and timeout > 0:
             self._wait(timeout)
-        return self._outbox.popleft() if self._outbox else None
+        if not self._outbox:
+            return None
+        can_id, data = self._outbox.popleft()
+        return can_id & ~CLASSICAL, data
 
     def _wait(self, timeout: float) -> None:
         """Advance time until a frame arrives; another thread may send meanwhile (python-can's Notifier)."""
@@ -140,15 +150,9 @@ class LockStepBus(can.BusABC, InProcessBus):  # type: ignore[misc]
         frame = self._next(1.0 if timeout is None else timeout)
         if frame is None:
             return None
-        return can.Message(
-            arbitration_id=frame[0] & ~ERROR_FLAG,
-            data=frame[1],
-            is_extended_id=False,
-            is_error_frame=bool(frame[0] & ERROR_FLAG),
-            timestamp=self.arm.time,
-            is_rx=True,
-            check=False,
-        )
+        message = as_message(*frame, fd=len(frame[1]) > CLASSICAL_BYTES)
+        message.timestamp = self.arm.time
+        return message
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         return self.recv(timeout), True

@@ -8,7 +8,7 @@ from types import FrameType
 from armlink.bus.bus_group import BusGroup, GroupPort
 from armlink.bus.can_bus import CanBus
 from armlink.bus.port import Frame, InterfaceDown, Port
-from armlink.canopen.object_dictionary import NMT_ID, SYNC_ID
+from armlink.drives.canopen.object_dictionary import NMT_ID, SYNC_ID
 from armlink.errors import BusFault
 from sim_bus.bus.control_pipe import ControlPipe
 from sim_bus.bus.effect_options import Drift
@@ -103,7 +103,7 @@ class Server:
 
     def _until_tick(self) -> float:
         """Time until physics and timers must advance without a frame [s]."""
-        due = min(self._arm.supervision.due, self._arm.time + TICK)
+        due = min(self._arm.due, self._arm.time + TICK)
         return due + self._offset - self._now()
 
     def _take_from_others(self) -> None:
@@ -139,7 +139,7 @@ class Server:
             self._offset += lag - LARGEST_LAG
             lag = LARGEST_LAG
         if lag > LATE:
-            self._arm.supervision.postpone(lag - LATE)
+            self._arm.postpone(lag - LATE)
         if lag > 0:
             self._line.advance(lag)
         while self._drifts and self._drifts[0].time <= self._arm.time:

@@ -12,7 +12,7 @@ from itertools import count
 from typing import Protocol
 
 from armlink.bus.frame_bits import frame_bits
-from armlink.canopen.object_dictionary import SYNC_ID
+from armlink.drives.canopen.object_dictionary import SYNC_ID
 from armlink.errors import BusFault
 from sim_bus.node.pdo import Frame
 

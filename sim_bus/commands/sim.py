@@ -1,9 +1,12 @@
 """Runs a simulated arm on a CAN bus, in real time, until stopped."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from armlink.arm_file import ArmFile
 
 
 def sim(
@@ -82,8 +85,8 @@ def sim(
         pipe = None if control is None else ControlPipe(control)
         console = Console(stderr=True)
         console.print(
-            f"{described.name}: {simulated.n} joints, nodes {', '.join(str(node.node_id) for node in simulated.nodes)} "
-            f"on {endpoint.channel_info}; stop with Ctrl-C"
+            f"{described.name}: {simulated.n} joints, {_addresses(described)} on {endpoint.channel_info}; "
+            f"stop with Ctrl-C"
         )
         server = Server(simulated, endpoint, drifts, lockstep, faults=faults, control=pipe)
         server.on_wrong = lambda wrong: console.print(f"sim: {wrong}", markup=False)
@@ -92,3 +95,12 @@ def sim(
         if pipe is not None:
             pipe.close()
         endpoint.shutdown()
+
+
+def _addresses(arm: "ArmFile") -> str:
+    """Ids of the drives: `nodes 1, 2`, or each with its word where they differ."""
+    parts = [joint.settings.address.rpartition(" ") for joint in arm.require_link().joints]
+    words = {word for word, _, _ in parts}
+    if len(words) == 1:
+        return f"{words.pop()}s {', '.join(number for _, _, number in parts)}"
+    return ", ".join("".join(part) for part in parts)

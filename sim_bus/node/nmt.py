@@ -19,7 +19,7 @@ class NetworkManagement:
     ) -> None:
         """`apply` applies a node's objects after a reset."""
         self._nodes, self._drives, self._supervision, self._apply = nodes, drives, supervision, apply
-        self.operational = bytearray(len(nodes))
+        self.operational = bytearray(drives.n)
 
     def frame(self, data: bytes, time: float) -> None:
         """Process an NMT command."""
@@ -45,4 +45,5 @@ class NetworkManagement:
 
     def update(self) -> None:
         """Update after nodes changed their own state (1029h)."""
-        self.operational[:] = bytes(node.nmt == OPERATIONAL for node in self._nodes)
+        for node in self._nodes:
+            self.operational[node.place] = node.nmt == OPERATIONAL

@@ -8,7 +8,7 @@ import numpy as np
 from canopen.objectdictionary import ODVariable
 from numpy.typing import NDArray
 
-from armlink.canopen.eds_file import bundled_path
+from armlink.drives.canopen.eds_file import bundled_path
 
 DTYPES = {0x02: "<i1", 0x03: "<i2", 0x04: "<i4", 0x05: "<u1", 0x06: "<u2", 0x07: "<u4", 0x08: "<f4"}
 """numpy types of CiA 301 data types."""

@@ -3,7 +3,8 @@
 The motor torque is `drive − stiffness·q − damping·q̇`, clamped to the max torque (6072h); the plant evaluates it at
 every step of the physics. `drive` is the target torque in torque modes and
 `stiffness·target + damping·target rate + integral + feed-forward` in position modes. The integrator is stopped within a
-dead band and at the clamp, to avoid hunting under stiction and wind-up on a stop.
+dead band and at the clamp, to avoid hunting under stiction and wind-up on a stop. Drives that are no CiA 402 drives
+(`sim_bus.drives`) give stiffness, damping and drive torque of their joint themselves.
 """
 
 import numpy as np
@@ -19,7 +20,7 @@ from sim_bus.sim_section import sim_section
 FEED = 1 << 20
 """User units per joint revolution (6092h)."""
 UNIT = 2 * np.pi / FEED
-OFF, TORQUE, POSITION = 0, 1, 2
+OFF, TORQUE, POSITION, IMPEDANCE = 0, 1, 2, 3
 PROFILE_POSITION, PROFILE_TORQUE, CSP, CSV, CST = 1, 4, 8, 9, 10
 KINDS = {PROFILE_POSITION: POSITION, PROFILE_TORQUE: TORQUE, CSP: POSITION, CSV: POSITION, CST: TORQUE}
 LATE_SHARE = 0.5
@@ -47,13 +48,20 @@ class Loops:
         inertia = np.max([np.diag(plant.inertia(pose)) for pose in poses], axis=0) + self.rated / SPARE_ACCELERATION
         self._inertia, self._damping_ratio = inertia, section.damping
         self._deadband, self.deceleration = section.deadband, np.full(self.n, section.quick_stop_deceleration)
-        self._with_brake, self._bandwidth = section.brake, section.bandwidth
+        self._bandwidth = section.bandwidth
+        families = [joint.settings.family for joint in arm.require_link().joints]
+        self._with_brake = np.array([section.brake and family == "canopen" for family in families])
         self.kind, self.mode = np.zeros(self.n, int), np.zeros(self.n, int)
         self.stopping = np.zeros(self.n, bool)
         self.limit = np.zeros(self.n)
         """Active torque limit [N·m]."""
         self._torque, self._target, self._rate = np.zeros(self.n), plant.motor_position, np.zeros(self.n)
         self._integral = np.zeros(self.n)
+        self._given = np.zeros((3, self.n))
+        """Stiffness, damping and limit of joints whose drive gives them; 0 for the others."""
+        self._given_anew = False
+        self.imagined = np.zeros(self.n)
+        """Offset of a drive's current sensor, as torque [N·m]: so much less is made than the drive asks for."""
         self._fresh: dict[int, NDArray[np.bool_]] = {
             index: np.zeros(self.n, bool) for index in (0x6071, 0x607A, 0x60FF)
         }
@@ -80,7 +88,7 @@ class Loops:
     def start(self, joint: int, kind: int, mode: int) -> None:
         """Switch a joint's loop without a bump, from its present torque and position."""
         plant = self._plant
-        powered = self.kind[joint] != OFF or not self._with_brake
+        powered = self.kind[joint] != OFF or not self._with_brake[joint]
         torque = float((plant.drive_torque if powered else plant.link_torque)[joint])
         velocity = float(plant.motor_velocity[joint])
         self._torque[joint] = torque if kind == TORQUE else 0.0
@@ -90,6 +98,25 @@ class Loops:
             waiting[joint] = False
         self.reconfigure()
         self._integral[joint] = torque + self._d[joint] * velocity if kind == POSITION else 0.0
+
+    def impede(self, joint: int, stiffness: float, damping: float, drive: float, limit: float) -> None:
+        """Motor torque `drive − stiffness·q − damping·q̇` within ±limit, from the next step on (true motor angle)."""
+        if self.kind[joint] != IMPEDANCE:
+            self.start(joint, IMPEDANCE, 0)
+        self._torque[joint] = drive - self.imagined[joint]
+        self._given[:, joint] = stiffness, damping, limit
+        self._given_anew = True
+
+    def tuned(self, joint: int) -> tuple[float, float, float]:
+        """Stiffness, damping and integral gain of the position loop that suits a joint, in SI units."""
+        bandwidth, inertia = float(self._stable_bandwidth()[joint]), float(self._inertia[joint])
+        stiffness = inertia * bandwidth**2
+        return stiffness, 2 * self._damping_ratio * inertia * bandwidth, INTEGRAL_SHARE * bandwidth * stiffness
+
+    def release(self, joint: int) -> None:
+        """Take the power from a joint under impede()."""
+        self._given[:, joint] = 0.0
+        self.start(joint, OFF, 0)
 
     def stop(self, joint: int) -> None:
         """Decelerate a joint to rest (quick stop deceleration) and hold it there."""
@@ -111,7 +138,7 @@ class Loops:
 
     def reconfigure(self) -> None:
         """Apply modes and limits to the plant."""
-        self.limit = self._max_torque_in * self._per_mille
+        self.limit = np.where(self.kind == IMPEDANCE, self._given[2], self._max_torque_in * self._per_mille)
         closed, bandwidth = self.kind == POSITION, self._stable_bandwidth()
         self._closed = closed.astype(float)
         self._k = self._inertia * bandwidth**2 * self._closed
@@ -119,10 +146,18 @@ class Loops:
         self._ki = INTEGRAL_SHARE * bandwidth * self._k
         self._powered = self.kind != OFF
         self._fed_forward = self._per_mille * self._powered
-        self._plant.set_servo(self._k, self._d, np.where(self._powered, self.limit, 0.0))
-        if self._with_brake:
-            self._plant.set_brakes(~self._powered)
+        self._serve()
+        if self._with_brake.any():
+            self._plant.set_brakes(self._with_brake & ~self._powered)
         self._select()
+
+    def _serve(self) -> None:
+        """Hand stiffness, damping and limits to the plant."""
+        stiffness, damping, limit = self._given
+        np.copyto(self.limit, limit, where=self.kind == IMPEDANCE)
+        limits = np.where(self._powered, self.limit, 0.0)
+        self._plant.set_servo(self._k + stiffness, self._d + damping, limits)
+        self._given_anew = False
 
     def _stable_bandwidth(self) -> Array:
         """The configured bandwidth, reduced as far as a motor's delay requires."""
@@ -147,6 +182,8 @@ class Loops:
 
     def advance(self, duration: float, synchronous: bool) -> None:
         """Run loops and plant for `duration` [s]; `synchronous`: directly after a SYNC with its new targets."""
+        if self._given_anew:
+            self._serve()
         np.copyto(self._torque, self._torque_in * self._per_mille, where=self._cyclic_torque)
         if self._any_slow:
             self._follow_profiles(duration)

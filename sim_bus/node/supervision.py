@@ -23,7 +23,7 @@ class Supervision:
     def __init__(self, nodes: list[Node], drives: Drives, outbox: Callable[[Frame], None]) -> None:
         """Nothing is monitored before configure()."""
         self._nodes, self._drives, self._outbox = nodes, drives, outbox
-        n = len(nodes)
+        n = drives.n
         self.due = math.inf
         self.watches_rpdos = False
         self._produce = [(0.0, math.inf)] * n
@@ -56,9 +56,10 @@ class Supervision:
 
     def heartbeat(self, master: int, time: float) -> None:
         """A heartbeat of node id `master` arrived: start or restart its consumers' timers."""
-        for node, consumed, due in zip(self._nodes, self._consume, self._consume_due, strict=True):
+        for node in self._nodes:
+            consumed = self._consume[node.place]
             if master in consumed and not node.unplugged:
-                due[master] = time + consumed[master]
+                self._consume_due[node.place][master] = time + consumed[master]
         self._schedule()
 
     def rpdo(self, joint: int, number: int, time: float) -> None:
@@ -70,7 +71,8 @@ class Supervision:
     def sync(self, time: float) -> None:
         """A SYNC arrived."""
         if any(self._sync):
-            for node, period in zip(self._nodes, self._sync, strict=True):
+            for node in self._nodes:
+                period = self._sync[node.place]
                 if not node.unplugged:
                     self._sync_due[node.place] = time + period if period else math.inf
             self.due = min(self.due, *self._sync_due)

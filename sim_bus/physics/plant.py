@@ -41,6 +41,8 @@ class Plant:
         self._brake_torque = BRAKE_SHARE * np.array([joint.max_torque for joint in link.joints])
         self._braked = np.zeros(n, bool)
         self._servo = (np.zeros(n), np.zeros(n), np.zeros(n))
+        self.torque_constant = np.ones(n)
+        """Torque that each drive believes to make for one that it makes: its nominal by its true torque constant."""
         self._lost, self._sag = np.zeros(n), np.zeros(n)
         self._cables: Cables | None = None
         self._build(Imperfections(arm.joint_names))
@@ -193,7 +195,7 @@ class Plant:
 
     @property
     def drive_torque(self) -> Array:
-        """Motor torque estimated by the drive: current times nominal torque constant."""
+        """Motor torque estimated by the drive: current times nominal torque constant, but for `torque_constant`."""
         return self.motor_torque / self._imperfections.actuator_gain
 
     @property
@@ -216,7 +218,7 @@ class Plant:
     def set_servo(self, stiffness: Array, damping: Array, limit: Array) -> None:
         """Motor torque = clamp(drive − stiffness·q − damping·q̇, ±limit), at every step of the physics."""
         self._servo, state = (stiffness, damping, limit), self._imperfections
-        gain, model = state.actuator_gain, self.model
+        gain, model = state.actuator_gain / self.torque_constant, self.model
         limit = gain * np.minimum(limit, state.actuator_saturation)
         fed_back = gain if self._motors is None else np.zeros(self.n)
         model.actuator_gainprm[:, 0] = gain

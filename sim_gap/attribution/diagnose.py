@@ -1,27 +1,36 @@
 """Entry point of the diagnosis in Python: a nominal model and recordings in, a `Diagnosis` out.
 
-In order: the model (`sim_gap.model`), prepared recordings and residuals (`sim_gap.residuals`), selection and fit of
-effects (`sim_gap.search`), causes, and the answer with the verdict (this package). `armlink gap diagnose`
-(`sim_gap.commands.gap_diagnose`) reads the files, calls `diagnose` and shows its result.
+In order: the model (`sim_gap.model`), the check of joints, units and clocks (`sim_gap.checks`), prepared recordings and
+residuals (`sim_gap.residuals`), selection and fit of effects (`sim_gap.search`), causes, and the answer with verdict
+(this package). `armlink gap diagnose` (`sim_gap.commands.gap_diagnose`) reads the files, calls `diagnose` and shows its
+result.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from armlink.errors import BadInput
+from armlink.recording.corrections import AS_IT_IS, Corrections
 from armlink.recording.recording import Recording, default_names, slice_rows
 from sim_gap.attribution.answer import Internals, answer
+from sim_gap.attribution.bodies import groups_of, placed
 from sim_gap.attribution.causes import causes
 from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.attribution.rivals import Rivals
 from sim_gap.attribution.verdict import is_quiet
+from sim_gap.checks.check import check_recordings
+from sim_gap.checks.finding import Finding
+from sim_gap.checks.joints import match_joints
 from sim_gap.effects.registry import library_without
-from sim_gap.model.load import load_model
+from sim_gap.model.arm_joints import hinges_of
+from sim_gap.model.load import SimModel, load_compiled, load_model
 from sim_gap.residuals.preprocess import prepare, require_length
 from sim_gap.residuals.residual_set import ResidualSet, residual_sets
+from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import Estimate
 from sim_gap.search.model_selection import select_model
-from sim_gap.search.normal_equations import ColumnStore
 
 OWN_HELDOUT = 0.3
 """Share at the end of each training recording that is held out if no held-out recording is given."""
@@ -36,6 +45,8 @@ def diagnose(
     *,
     labels: Sequence[str] = (),
     withhold: Sequence[str] = (),
+    stated: Corrections = AS_IT_IS,
+    groups: Sequence[str] = (),
 ) -> Diagnosis:
     """Explain the gap between a simulation model and recordings of the real arm.
 
@@ -44,39 +55,57 @@ def diagnose(
         train: recordings to fit.
         heldout: recordings to judge on, not used in the fit; without any, the end of each training recording is.
         labels: names of the recordings for messages, train first.
+        groups: `NAME=REC[,REC…]`: recordings (by label) that share a body; without any, it is found which do.
         withhold: ids of effects to leave out of the library (blind check).
+        stated: corrections that the user stated when the recordings were loaded; the check leaves those as they are.
 
     Raises BadInput if the recordings cannot be used with the model.
     """
     if not train:
         raise BadInput("no training recording: give at least one (--train FILE)")
-    sim = load_model(model, _names(train[0]), train[0].n)
     labels = list(labels) or [f"recording {i + 1}" for i in range(len(train) + len(heldout))]
-    for recording, label in zip([*train, *heldout], labels, strict=False):
-        require_length(recording, label)
+    sim, recordings, findings = _checked(model, [*train, *heldout], labels, stated)
+    train, heldout = recordings[: len(train)], recordings[len(train) :]
     heldout_is = "the recordings given" if heldout else f"the last {OWN_HELDOUT:.0%} of each training recording"
-    numbers = [*range(1, len(train) + 1), *([0] * len(heldout))]
+    numbers = list(range(1, len(train) + len(heldout) + 1))
+    named = groups_of(groups, labels)
     if not heldout:
-        train, heldout, labels, numbers = *_split(train), labels * 2, numbers * 2
+        train, heldout, labels, numbers, named = *_split(train), labels * 2, numbers * 2, named * 2
     ready = [
-        prepare(recording, sim.arm, label, number)
-        for recording, label, number in zip([*train, *heldout], labels, numbers, strict=False)
+        prepare(recording, sim.arm, label, number, names)
+        for recording, label, number, names in zip([*train, *heldout], labels, numbers, named, strict=False)
     ]
     fit, judge = residual_sets(ready[: len(train)], ready[len(train) :])
     _require_motion(fit)
     store = ColumnStore(fit)
     search = select_model(store, library_without(withhold))
-    estimate = Estimate(store, search.active)
+    estimate = Estimate(search.normal.store, search.active)
+    judge = placed(estimate, judge)
     quiet = not fit.impacts and is_quiet(judge) and is_quiet(fit)
     found, minor = causes(estimate, judge, Rivals(search), sim.arm.names, quiet=quiet)
     if quiet and not found:
-        return answer(Internals(sim, fit, judge, None), [], [], heldout_is)
-    return answer(Internals(sim, fit, judge, estimate), found, minor, heldout_is)
+        made = answer(Internals(sim, fit, judge, None, tuple(heldout), estimate), [], [], heldout_is)
+    else:
+        made = answer(Internals(sim, fit, judge, estimate, tuple(heldout), estimate), found, minor, heldout_is)
+    return replace(made, checks=findings)
 
 
-def _names(recording: Recording) -> tuple[str, ...]:
-    """Joint names given in the recording itself, if any."""
-    return () if recording.names == default_names(recording.n) else tuple(recording.names)
+def _checked(
+    source: Any, recordings: Sequence[Recording], labels: Sequence[str], stated: Corrections
+) -> tuple[SimModel, list[Recording], tuple[Finding, ...]]:
+    """The model, the recordings with joints, units and clocks as they should be, and what was found in them."""
+    compiled_model = load_compiled(source)
+    hinges = list(hinges_of(compiled_model))
+    matched, findings = [], []
+    for recording, label in zip(recordings, labels, strict=False):
+        require_length(recording, label)
+        taken, found = match_joints(recording, hinges, stated, label)
+        matched.append(taken)
+        findings += [finding for finding in found if finding not in findings]
+    names = () if matched[0].names == default_names(matched[0].n) else matched[0].names
+    sim = load_model(source if isinstance(source, str | Path) else compiled_model, names, matched[0].n)
+    checked, found = check_recordings(sim.arm, matched, labels[: len(matched)], stated)
+    return sim, checked, (*findings, *found)
 
 
 def _split(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Recording]]:

@@ -18,6 +18,28 @@ def diagnose(
         list[Path] | None,
         typer.Option(help="Held-out recording to judge on; may be repeated. Default: the end of each --train."),
     ] = None,
+    columns: Annotated[
+        list[str] | None,
+        typer.Option("--map", help="Column of the file for one of ours: t=time,q_1=pos_a or q_1=q_2,q_2=q_1."),
+    ] = None,
+    joints: Annotated[str, typer.Option(help="Joints of the recordings to take, base to tip: a,b,c.")] = "",
+    units: Annotated[
+        list[str] | None,
+        typer.Option(help="Unit of a channel: q=deg, q=counts:4096, tau_motor=A:12.5 (N·m/A), t=ms."),
+    ] = None,
+    sign: Annotated[list[str] | None, typer.Option(help="Sign of a channel or column: tau_3=-1.")] = None,
+    zero: Annotated[list[str] | None, typer.Option(help="Angle to add to a position: q_2=1.5708 [rad].")] = None,
+    clock: Annotated[list[str] | None, typer.Option(help="Time to add to a channel: tau=-0.02 [s].")] = None,
+    effort_is: Annotated[str, typer.Option(help="Source of the efforts: motor or link (sensor).")] = "",
+    topic: Annotated[str, typer.Option(help="Topic of a bag that holds the joint states.")] = "",
+    group: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=REC[,REC…]",
+            help="Recordings (held-out ones too) with a common body such as a payload; may be repeated. "
+            "Default: found by itself.",
+        ),
+    ] = None,
     json: Annotated[Path | None, typer.Option(help="Write the result here; - is standard output.")] = None,
     report: Annotated[Path | None, typer.Option(help="Write a self-contained HTML report here.")] = None,
     out_model: Annotated[
@@ -35,7 +57,8 @@ def diagnose(
 
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
-    from armlink.recording.files import load_recording
+    from armlink.recording.corrections import parse_corrections
+    from armlink.recording.files import load_recordings
     from sim_gap.attribution import diagnose as diagnosis
 
     console = Console(stderr=True)
@@ -43,14 +66,33 @@ def diagnose(
     for target in (None if str(json) == "-" else json, report, out_model):
         if target is not None and not target.resolve().parent.is_dir():
             raise BadInput(f"{target}: its folder does not exist: create it first")
+    stated = parse_corrections(
+        columns=columns or (),
+        sign=sign or (),
+        units=units or (),
+        zero=zero or (),
+        clock=clock or (),
+        effort=effort_is,
+        joints=joints,
+        topic=topic,
+    )
     with console.status(f"reading {len(paths)} recordings"):
-        recordings = [load_recording(path) for path in paths]
-    count = len(train)
-    with console.status("fitting effects to the gap"):
-        answer = diagnosis.diagnose(sim, recordings[:count], recordings[count:], labels=[str(path) for path in paths])
-    for path, recording in zip(paths, recordings, strict=True):
+        fitted = {name: each for path in train for name, each in load_recordings(path, stated).items()}
+        judged = {name: each for path in heldout or () for name, each in load_recordings(path, stated).items()}
+    with console.status("checking the data, and fitting effects to the gap"):
+        answer = diagnosis.diagnose(
+            sim,
+            list(fitted.values()),
+            list(judged.values()),
+            labels=[*fitted, *judged],
+            stated=stated,
+            groups=group or (),
+        )
+    for name, recording in {**fitted, **judged}.items():
         if recording.warning:
-            console.print(f"{path}: {recording.warning}", style="yellow")
+            console.print(f"{name}: {recording.warning}", style="yellow", markup=False)
+    for finding in answer.checks:
+        console.print(finding.sentence(), style="yellow", markup=False)
     _show(answer, console)
     if report is not None:
         from sim_gap.report.page import write_report

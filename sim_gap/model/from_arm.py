@@ -10,9 +10,12 @@ from armlink.errors import BadInput
 def nominal_model(path: Path) -> Any:
     """Path of the model of an arm file (by path or bundled name), or the `mujoco.MjSpec` of its `sim` section.
 
-    The section's effects are left out. Raises BadInput if the file has no masses.
+    The model counts if the section gives no masses of its own, so that both give the same answer. The section's effects
+    are left out. Raises BadInput if the file has no masses.
     """
     arm = load_arm(str(path))
+    if arm.model_path is not None and not (isinstance(arm.sim, dict) and arm.sim.get("links")):
+        return arm.model_path
     if arm.sim is not None:
         from sim_bus.effects.state import Imperfections
         from sim_bus.physics.mjcf import build_model
@@ -21,6 +24,4 @@ def nominal_model(path: Path) -> Any:
         for joint in spec.joints:
             joint.frictionloss = 0.0  # the simulated arm sets its friction at run time
         return spec
-    if arm.model_path is None:
-        raise BadInput(f"{path}: has no masses: give kinematics.model (URDF or MJCF), a sim section, or --sim MJCF")
-    return arm.model_path
+    raise BadInput(f"{path}: has no masses: give kinematics.model (URDF or MJCF), a sim section, or --sim MJCF")

@@ -9,6 +9,7 @@ import numpy as np
 
 from armlink.errors import BadInput
 from armlink.model_file import one_line, read_model
+from sim_gap.model.arm_joints import arm_hinges, hinges_of
 from sim_gap.model.rigid_body import RigidArm, Tendons, inertial_of
 
 
@@ -32,18 +33,19 @@ def load_model(source: Any, names: tuple[str, ...] = (), count: int | None = Non
     """Compile a model from a path (.xml, .urdf, .yaml arm file), or take a compiled `mujoco.MjModel`.
 
     `names` are the recording's joint names if it has any; `count` is its number of joints. Joints are matched by name
-    if the model has all of them, else in order. Raises BadInput if the model cannot be read or does not fit.
+    if the model has all of them, else in order; if there are too many, those of a hand and coupled ones are locked.
+    Raises BadInput if the model cannot be read or does not fit.
     """
-    import mujoco
-
     path = Path(source) if isinstance(source, str | Path) else None
-    model = source if path is None else compiled(path)
-    hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
-    known = {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, j): j for j in hinges}
+    model = load_compiled(source)
+    known = hinges_of(model)
+    hinges = list(known.values())
     label = str(path or "the model")
     if names and all(name in known for name in names):
         joints = [known[name] for name in names]
     else:
+        if count is not None and count != len(hinges):
+            hinges = list(arm_hinges(model, known).values())
         if count is not None and count != len(hinges):
             raise BadInput(
                 f"{label}: has {len(hinges)} hinge joints ({', '.join(map(str, known))}), the recording {count}: "
@@ -57,6 +59,11 @@ def load_model(source: Any, names: tuple[str, ...] = (), count: int | None = Non
         raise BadInput(f"{label}: joints {', '.join(arm.names)} do not run from base to tip: reorder them")
     _check(model, joints, arm, label)
     return SimModel(model, tuple(joints), arm, path)
+
+
+def load_compiled(source: Any) -> Any:
+    """The `mujoco.MjModel` of a path, or the one given. Raises BadInput."""
+    return compiled(Path(source)) if isinstance(source, str | Path) else source
 
 
 def compiled(path: Path) -> Any:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from armlink.arm_file import parse_arm
 from armlink.bus.in_process import InProcessBus
-from armlink.canopen import object_dictionary as objects
+from armlink.drives.canopen import object_dictionary as objects
 
 SWITCH_ON_DISABLED, READY, SWITCHED_ON, ENABLED, QUICK_STOP, FAULT = 0x40, 0x21, 0x23, 0x27, 0x07, 0x08
 

@@ -41,13 +41,14 @@ class FastDaemon:
         arm: str = "sarcos",
         listen_only: bool = False,
         records: bool = True,
+        store: str | None = None,
     ) -> None:
         self.arm = slow(load_arm(arm))
         self.fast = FastArm(self.arm, seed)
         self.directory, self.listen_only = directory, listen_only
         self.settings = settings or DaemonSection(policy="apply", recording=QUIET)
         self.wall_shift, self.clock_shift = timedelta(), 0.0
-        self.store = RecordStore(str(directory / "records.db"))
+        self.store = RecordStore(store or str(directory / "records.db"))
         self.controllers, self.port = self, self
         self.ids, self.dates = [0] * self.fast.n, [0] * self.fast.n
         self.sdo: list[str] = []

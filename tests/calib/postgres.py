@@ -5,9 +5,10 @@ import shutil
 import socket
 import subprocess
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 DEBIAN = sorted(Path("/usr/lib/postgresql").glob("*/bin"), key=lambda path: int(path.parent.name))
 
@@ -39,6 +40,21 @@ def as_ordinary_user() -> list[str]:
 @contextmanager
 def server() -> Iterator[str]:
     """URL of a fresh server while in the context; raises NoServer."""
+    with stoppable_server() as running:
+        yield running.url
+
+
+class Running(NamedTuple):
+    """A server that can be stopped and started under way."""
+
+    url: str
+    start: Callable[[], None]
+    stop: Callable[[], None]
+
+
+@contextmanager
+def stoppable_server() -> Iterator[Running]:
+    """A fresh server while in the context; raises NoServer."""
     bin_folder, become = programs(), as_ordinary_user()
     with tempfile.TemporaryDirectory(prefix="armlink-pg-") as folder:
         data = Path(folder) / "data"
@@ -47,12 +63,20 @@ def server() -> Iterator[str]:
         port = _free_port()
         _run([*become, bin_folder / "initdb", "-D", data, "-A", "trust", "-U", "armlink", "--no-sync"], folder)
         options = f"-c listen_addresses=127.0.0.1 -c port={port} -c unix_socket_directories={folder} -c fsync=off"
-        start = ["-D", data, "-l", Path(folder) / "log", "-w", "-t", "60"]
-        _run([*become, bin_folder / "pg_ctl", *start, "-o", options, "start"], folder)
+        control = [*become, bin_folder / "pg_ctl", "-D", data, "-w"]
+
+        def start() -> None:
+            _run([*control, "-l", Path(folder) / "log", "-t", "60", "-o", options, "start"], folder)
+
+        def stop() -> None:
+            _run([*control, "-m", "immediate", "stop"], folder)
+
+        start()
         try:
-            yield f"postgresql://armlink@127.0.0.1:{port}"
+            yield Running(f"postgresql://armlink@127.0.0.1:{port}", start, stop)
         finally:
-            _run([*become, bin_folder / "pg_ctl", "-D", data, "-m", "immediate", "-w", "stop"], folder)
+            if (data / "postmaster.pid").exists():
+                stop()
 
 
 def _free_port() -> int:

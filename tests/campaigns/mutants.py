@@ -33,7 +33,7 @@ ROOT = Path(__file__).parent.parent.parent
 TARGETS = {
     "armlink/link/gate.py": ["tests/armlink/link/test_gate.py"],
     "armlink/link/gate_limits.py": ["tests/armlink/link/test_gate_limits.py"],
-    "armlink/canopen/cia402.py": ["tests/armlink/canopen/test_cia402.py"],
+    "armlink/drives/canopen/cia402.py": ["tests/armlink/drives/canopen/test_cia402.py"],
 }
 EXPLAINED = {
     "int becomes round": "a mode is a whole number, and round() of one is that number",

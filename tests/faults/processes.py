@@ -14,7 +14,7 @@ import can
 from rows import ARM
 
 from armlink.arm_file import parse_arm
-from armlink.canopen.cia402 import State, state_of
+from armlink.drives.canopen.cia402 import State, state_of
 
 ROOT = Path(__file__).parent.parent.parent
 ARMLINK = [sys.executable, "-c", "from armlink.cli import main; main()"]

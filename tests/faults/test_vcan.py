@@ -16,7 +16,7 @@ from rows import QUICK_STOP, ROWS, Row
 from test_lock_step import pattern
 
 from armlink.arm_file import load_arm
-from armlink.canopen.cia402 import State
+from armlink.drives.canopen.cia402 import State
 from armlink.errors import ArmlinkError, BusFault
 from armlink.link.link import Link
 from armlink.link.types import Command

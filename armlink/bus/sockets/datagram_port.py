@@ -30,8 +30,8 @@ BUS_OFF = 0x40
 """Error class bit in the identifier of an error frame."""
 NOT_OURS = 1 << 32
 """Marks a datagram that is no frame for the reader: its own echo, or malformed."""
-FLAGS = 0xE0000000 | NOT_OURS
-"""Flags of everything but data frames with an 11-bit identifier, as in SocketCAN."""
+NO_FRAME = ERROR | NOT_OURS
+"""Flags of everything but data and remote frames."""
 _RETRY = 0.002  # [s] between tries while the transmit queue is full
 _TRIES = 25
 _FULL = (errno.ENOBUFS, errno.EAGAIN)
@@ -131,7 +131,7 @@ class DatagramPort(ABC):
 
     @abstractmethod
     def _decode(self, count: int) -> list[Frame]:
-        """Decode the first `count` datagrams, one frame each, with FLAGS in identifiers."""
+        """Decode the first `count` datagrams, one frame each, with flags in identifiers."""
 
     def fileno(self) -> int:
         """File descriptor of the receiving socket."""
@@ -164,7 +164,7 @@ class DatagramPort(ABC):
             select.select([], [], [], _RETRY)
 
     def receive(self, timeout: float) -> Frame | None:
-        """The next data frame with an 11-bit identifier, or None after `timeout` seconds."""
+        """The next frame that is no error frame, or None after `timeout` seconds."""
         waiting = self._waiting
         if waiting:
             return waiting.pop()
@@ -202,9 +202,9 @@ class DatagramPort(ABC):
         self._dry = count < BATCH
         frames = self._decode(count)
         for can_id, _ in frames:
-            if can_id & FLAGS:
-                self._take_others([each for each, _ in frames if each & FLAGS])
-                frames = [frame for frame in frames if not frame[0] & FLAGS]
+            if can_id & NO_FRAME:
+                self._take_others([each for each, _ in frames if each & NO_FRAME])
+                frames = [frame for frame in frames if not frame[0] & NO_FRAME]
                 break
         frames.reverse()
         self._waiting[:] = frames

@@ -10,9 +10,8 @@ from typing import Any
 
 import msgpack
 
-from armlink.bus.port import ERROR
+from armlink.bus.port import ERROR, EXTENDED, REMOTE
 
-EXTENDED, REMOTE = 0x80000000, 0x40000000
 LONGEST = 1024
 """Limit of datagrams [bytes]; python-can's have at most 240 without the name of a channel."""
 HEADS_KEPT = 4096
@@ -50,14 +49,14 @@ _WIDTHS = {0xCC: 2, 0xCD: 3, 0xCE: 5}
 
 
 def _head(can_id: int, length: int) -> bytes:
-    """Datagram from identifier to length of the data, for any frame but a remote frame."""
-    extended, error = bool(can_id & EXTENDED), bool(can_id & ERROR)
+    """Datagram from identifier to length of the data, which a remote frame only asks for."""
+    extended, error, remote = bool(can_id & EXTENDED), bool(can_id & ERROR), bool(can_id & REMOTE)
     return b"".join(
         (
             _key("arbitration_id") + msgpack.packb(can_id & 0x1FFFFFFF),
-            _key("is_extended_id") + _BOOL[extended] + _key("is_remote_frame") + _BOOL[False],
+            _key("is_extended_id") + _BOOL[extended] + _key("is_remote_frame") + _BOOL[remote],
             _key("is_error_frame") + _BOOL[error] + _key("channel") + b"\xc0",
-            _key("dlc") + bytes([length]) + _key("data") + bytes([0xC4, length]),
+            _key("dlc") + bytes([length]) + _key("data") + bytes([0xC4, 0 if remote else length]),
         )
     )
 
@@ -85,8 +84,8 @@ def _start(can_id: int, length: int) -> bytes:
 
 
 def encode(can_id: int, data: bytes, fd: bool) -> bytes:
-    """Datagram of a data or error frame, with bit-rate switch if it is CAN FD."""
-    return _start(can_id, len(data)) + data + _SENT_TAILS[fd]
+    """Datagram of a frame, with bit-rate switch if it is CAN FD."""
+    return _start(can_id, len(data)) + (b"" if can_id & REMOTE else data) + _SENT_TAILS[fd]
 
 
 class Decoder:
@@ -107,7 +106,7 @@ class Decoder:
                 if fd is not None and (length <= 8 or fd):
                     return can_id, datagram[end : end + length], fd
             found = _unpack(datagram)
-            if found is not None and head == _head(found[0], len(found[1])):
+            if found is not None and not found[0] & REMOTE and head == _head(found[0], len(found[1])):
                 if len(self._heads) >= HEADS_KEPT:
                     self._heads.clear()
                 self._heads[head] = found[0], len(found[1])
@@ -127,7 +126,7 @@ def _unpack(datagram: bytes) -> tuple[int, bytes, bool] | None:
     can_id, data, dlc = fields["arbitration_id"], fields["data"], fields["dlc"]
     remote, fd = fields["is_remote_frame"], fields["is_fd"]
     if data is None or remote:
-        data = b""
+        data = bytes(dlc) if remote and type(dlc) is int and 0 <= dlc <= 8 else b""
     if not (type(can_id) is int and isinstance(data, bytes) and type(dlc) in (int, type(None))):
         return None
     if any(type(fields[name]) is not bool for name in _FLAGS):

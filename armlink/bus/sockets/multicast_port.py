@@ -10,7 +10,7 @@ import socket
 import struct
 from collections.abc import Sequence
 
-from armlink.bus.port import ERROR, Frame
+from armlink.bus.port import CLASSICAL, ERROR, REMOTE, Frame
 from armlink.bus.sockets.datagram_port import NAME, NOT_OURS, Batch, DatagramPort
 from armlink.bus.sockets.multicast_frames import LONGEST, Decoder, encode
 from armlink.errors import BusFault
@@ -51,7 +51,7 @@ class MulticastPort(DatagramPort):
     def _encode(self, frames: Sequence[Frame]) -> None:
         put, fd = self._out.put, self._fd
         for i, (can_id, data) in enumerate(frames):
-            put(i, encode(can_id, data, fd and not can_id & ERROR))
+            put(i, encode(can_id & 0xFFFFFFFF, data, fd and not can_id & (ERROR | REMOTE | CLASSICAL)))
 
     def _decode(self, count: int) -> list[Frame]:
         batch, own, decode = self._in, self._own, self._decoder.decode
@@ -68,7 +68,7 @@ class MulticastPort(DatagramPort):
             elif found[2] and not self._takes_fd:
                 frames.append(_IGNORED)
             else:
-                if self._as_node and not found[0] & ERROR:
+                if self._as_node and not found[0] & (ERROR | REMOTE):
                     self._fd = found[2]
                 frames.append(found[:2])
         return frames

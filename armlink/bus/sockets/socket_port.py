@@ -4,10 +4,11 @@ import socket
 import struct
 from collections.abc import Sequence
 
-from armlink.bus.port import Frame
-from armlink.bus.sockets.datagram_port import FLAGS, Batch, DatagramPort
+from armlink.bus.port import CLASSICAL, ERROR, REMOTE, Frame
+from armlink.bus.sockets.datagram_port import Batch, DatagramPort
 
 _CLASSIC, _FD = struct.Struct("=IBB2x8s"), struct.Struct("=IBB2x64s")
+_NEVER_FD, _ON_WIRE = ERROR | REMOTE | CLASSICAL, 0xFFFFFFFF
 _FD_FLAGS = 0x05  # CANFD_BRS | CANFD_FDF: a CAN FD frame with bit-rate switch
 
 
@@ -26,15 +27,14 @@ class SocketPort(DatagramPort):
         self._fd = fd
 
     def _encode(self, frames: Sequence[Frame]) -> None:
-        if self._as_node and self._layout is _FD:
+        if self._layout is _FD:
             for i, (can_id, data) in enumerate(frames):
-                layout, flags = (_CLASSIC, 0) if can_id & FLAGS or not self._fd else (_FD, _FD_FLAGS)
-                self._out.put(i, layout.pack(can_id, len(data), flags, data))
+                layout, flags = (_CLASSIC, 0) if can_id & _NEVER_FD or not self._fd else (_FD, _FD_FLAGS)
+                self._out.put(i, layout.pack(can_id & _ON_WIRE, len(data), flags, data))
             return
         content, pack, size = self._out.content, self._layout.pack_into, self._layout.size
-        flags = _FD_FLAGS if self._fd else 0
         for i, (can_id, data) in enumerate(frames):
-            pack(content, i * size, can_id, len(data), flags, data)
+            pack(content, i * size, can_id & _ON_WIRE, len(data), 0, data)
 
     def _decode(self, count: int) -> list[Frame]:
         layout = self._layout

@@ -7,7 +7,7 @@ import struct
 import time
 
 from armlink.bus.port import Stamped
-from armlink.bus.sockets.datagram_port import BATCH, CONTROL, FLAGS, DatagramPort
+from armlink.bus.sockets.datagram_port import BATCH, CONTROL, NO_FRAME, DatagramPort
 from armlink.bus.sockets.multicast_port import MulticastPort
 from armlink.bus.sockets.socket_port import SocketPort
 
@@ -52,7 +52,7 @@ class Stamping(DatagramPort):
             count = self._take_batch()
             stamps = _STAMP.iter_unpack(self._stamps[: count * CONTROL])
             for (can_id, data), (seconds, nano) in zip(self._decode(count), stamps, strict=True):
-                if can_id & FLAGS:
+                if can_id & NO_FRAME:
                     others.append(can_id)
                 else:
                     frames.append((seconds - ahead + 1e-9 * nano, can_id, data))

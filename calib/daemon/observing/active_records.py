@@ -12,13 +12,18 @@ from calib.daemon.state.bus_jobs import BusJobs
 from calib.daemon.state.event_log import EventLog
 from calib.install.journaled_write import recover
 from calib.install.plausibility import GateRefused
+from calib.records.database import StoreFault, first_line
 from calib.records.records import CalibrationRecord, GravityRecord
-from calib.records.store import RecordStore
+from calib.records.store import ControllerWrite, RecordStore
 
 _LOG = logging.getLogger("armlink.daemon")
 RECORDS_SECONDS = 5.0
 """Time between two looks at the record store, where other commands may have made another record current [s]."""
 
+STORE_SECONDS = 1.0
+"""Likewise while it fails [s]."""
+
+Found = tuple[CalibrationRecord | None, GravityRecord | None]
 Held = tuple[tuple[float, float, int], ...] | None
 """Gain, offset [N·m] and record id of every controller; None if the daemon only listens."""
 
@@ -45,7 +50,9 @@ class ActiveRecords:
         """Why there is no observation, or none against the newest records; empty otherwise."""
         self._held: Held = None
         self._unchecked = False
-        self._looked = -float("inf")
+        self._looked, self._looking = -float("inf"), False
+        self.store_fault = ""
+        """Why the record store cannot be read; empty while it can."""
 
     def tick(self) -> None:
         """Look at the record store when it is time."""
@@ -62,28 +69,63 @@ class ActiveRecords:
         """Take over the records in force; other ones than before begin a new observation."""
         if self._jobs.busy:
             return  # an approval may be about to change them
-        self._looked = self._environment.monotonic()
-        arm = self._configuration.arm
+        if self._looking:
+            return  # the store is slow
+        arm, store = self._configuration.arm, self._store
+        self._looking, self._looked = True, self._environment.monotonic()
+
+        def look() -> Found:
+            try:
+                return store.current(CalibrationRecord, arm), store.current(GravityRecord, arm)
+            except ArmlinkError:
+                raise
+            except Exception as error:  # whatever the database's driver raises
+                raise StoreFault(f"record store {store.url}: {type(error).__name__}: {first_line(error)}") from None
+
+        self._jobs.aside(look, self._found)
+
+    def _found(self, found: Found | ArmlinkError) -> None:
+        """What the store has now; while it fails, the records in force stay in force."""
+        self._looking = False
+        if isinstance(found, StoreFault):
+            self._store_failed(found)
+            return
+        if self.store_fault:
+            self.store_fault = ""
+            self._events.say("recovered", None, "the record store answers again", {})
+        if self._jobs.busy:
+            return
         try:
-            calibration = self._store.current(CalibrationRecord, arm)
-            gravity = self._store.current(GravityRecord, arm)
-            if calibration is None or gravity is None:
-                found = {"calibration": calibration, "gravity": gravity}
-                missing = " and ".join(name for name, record in found.items() if record is None)
-                of_arm = f"of {arm.name} {arm.serial}"
-                waits = f"waits for a {missing} record {of_arm}: armlink sweep, calibrate, identify"
-                if waits != self.detail:
-                    _LOG.warning(waits)
-                self.detail = waits
-                return
-            before = self.observation
-            if before is not None and before.feed.measures_against(calibration, gravity):
-                self.detail = ""
-                return
-            self.observation = self._observe(calibration, gravity)
+            if isinstance(found, ArmlinkError):
+                raise found
+            self._take_over(*found)
         except ArmlinkError as error:
             self.detail = str(error)
+
+    def _store_failed(self, fault: StoreFault) -> None:
+        self._looked = self._environment.monotonic() - RECORDS_SECONDS + STORE_SECONDS
+        if not self.store_fault:
+            kept = "" if self.observation is None else "; the records in force stay in force"
+            self._events.say("fault", None, f"{fault}{kept}", {})
+        self.store_fault = str(fault)
+
+    def _take_over(self, calibration: CalibrationRecord | None, gravity: GravityRecord | None) -> None:
+        """Observe against these records, if they are other ones; raises Refused if they are of another arm."""
+        arm = self._configuration.arm
+        if calibration is None or gravity is None:
+            found = {"calibration": calibration, "gravity": gravity}
+            missing = " and ".join(name for name, record in found.items() if record is None)
+            of_arm = f"of {arm.name} {arm.serial}"
+            waits = f"waits for a {missing} record {of_arm}: armlink sweep, calibrate, identify"
+            if waits != self.detail:
+                _LOG.warning(waits)
+            self.detail = waits
             return
+        before = self.observation
+        if before is not None and before.feed.measures_against(calibration, gravity):
+            self.detail = ""
+            return
+        self.observation = self._observe(calibration, gravity)
         self.detail = ""
         if before is not None:
             evidence = {"calibration": calibration.id, "gravity": gravity.id}
@@ -107,7 +149,15 @@ class ActiveRecords:
         self._unchecked = self._jobs.busy
         if self._unchecked:
             return
-        if self.observation is not None and self._store.unfinished_write(self._configuration.arm) is not None:
+        if self.observation is None:
+            return
+        arm, store = self._configuration.arm, self._store
+        self._jobs.aside(lambda: store.unfinished_write(arm), self._compare_or_ask)
+
+    def _compare_or_ask(self, unfinished: ControllerWrite | ArmlinkError | None) -> None:
+        if self._jobs.busy or isinstance(unfinished, ArmlinkError):
+            self._unchecked = True  # later: the job, or the store's failure, comes first
+        elif unfinished is not None:
             self._ask()
         else:
             self._compare()

@@ -52,13 +52,14 @@ class Observation:
 
     def _report(self, events: list[Event]) -> None:
         """Keep events and estimates together, then act on the findings."""
-        with self._events.together():
-            for event in one_alarm_a_joint(events):
-                kind, text, evidence = describe(event)
-                self._events.say(kind, event.joint, text, evidence)
-                if event.kind == "verdict":
-                    self.recalibrations.explained(kind, event.joint)
-            self._storage.save(self.feed, history=True)
+        told = one_alarm_a_joint(events)
+        described = [describe(event) for event in told]
+        rows = zip(told, described, strict=True)
+        said = [(kind, event.joint, text, evidence) for event, (kind, text, evidence) in rows]
+        self._events.say_all(said, lambda: self._storage.save(self.feed, history=True))
+        for event, (kind, _, _) in zip(told, described, strict=True):
+            if event.kind == "verdict":
+                self.recalibrations.explained(kind, event.joint)
         for event in events:
             if event.finding is not None:
                 self.recalibrations.found(event.finding)

@@ -1,5 +1,6 @@
 """From findings to calibrations in the controllers: policy, rate limit, approval, write, check, roll-back."""
 
+import sqlite3
 from collections import deque
 from collections.abc import Callable
 from datetime import datetime
@@ -17,6 +18,7 @@ from calib.daemon.view.view import NoSuch, NotPossible
 from calib.observer.check_at_rests import Checked
 from calib.observer.decision import Finding
 from calib.observer.recalibrator import APPLIED_BY, Recalibration, Recalibrator
+from calib.records.database import StoreFault
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
 
@@ -77,17 +79,25 @@ class RecalibrationWorkflow:
         policy = self._configuration.settings.policy
         if policy == "observe":
             return
-        if self._jobs.busy:
+        if self._jobs.busy or self._journal.trouble:
             self._waiting.append(finding)
             return
         recalibrator, automatic = self._active(), policy == "apply"
         by, ask = (APPLIED_BY if automatic else None), not self._configuration.listen_only or automatic
 
         def done(outcome: Recalibration | ArmlinkError) -> None:
-            if isinstance(outcome, ArmlinkError):
-                self._refused(finding, outcome)
-            else:
-                self._proposed(finding, outcome, automatic)
+            if isinstance(outcome, StoreFault):
+                self._waiting.append(finding)
+                return
+            try:
+                if isinstance(outcome, ArmlinkError):
+                    self._refused(finding, outcome)
+                else:
+                    self._proposed(finding, outcome, automatic)
+            except sqlite3.Error as error:
+                self._journal.failed(error)
+                self._waiting.append(finding)
+                return
             self._next()
 
         self._jobs.start(lambda: recalibrator.propose(finding, by, ask), done)
@@ -158,6 +168,9 @@ class RecalibrationWorkflow:
                 with self._journal.transaction():
                     self._journal.decide(number, self._events.now(), "failed", "daemon", str(outcome))
                     self._refused(row.finding, outcome, number)
+                if isinstance(outcome, StoreFault) and by == APPLIED_BY:
+                    self._waiting.append(row.finding)  # to be proposed again once the store answers
+                    return
             else:
                 with self._journal.transaction():
                     self._applied(row, by, outcome)
@@ -247,8 +260,12 @@ class RecalibrationWorkflow:
 
     # ---- inside
 
+    def tick(self) -> None:
+        """Go on with findings that waited for the journal or the record store."""
+        self._next()
+
     def _next(self) -> None:
-        if self._waiting and not self._jobs.busy:
+        if self._waiting and not self._jobs.busy and not self._journal.trouble:
             self.found(self._waiting.pop(0))
 
     def _refused(self, finding: Finding, error: ArmlinkError, number: int | None = None) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 from armlink.arm_file import ArmFile
-from armlink.canopen import emcy
+from armlink.drives.canopen import emcy
 from calib.daemon.loop.loop_messages import Batch
 from calib.daemon.state.event_log import EventLog
 

@@ -23,16 +23,24 @@ class BusJobs:
 
         def back(outcome: T | Exception) -> None:
             self.busy = False
-            self._journal.guard(lambda: finish(outcome))
-
-        def finish(outcome: T | Exception) -> None:
-            if isinstance(outcome, Exception) and not isinstance(outcome, ArmlinkError):
-                raise outcome
-            done(outcome)
+            self._finish(outcome, done)
 
         assert not self.busy
         self.busy = True
         self._run(work, back)
+
+    def aside(self, work: Callable[[], T], done: Callable[[T | ArmlinkError], None]) -> None:
+        """As `start`, for work that leaves the controllers alone: `busy` stays what it is."""
+
+        self._run(work, lambda outcome: self._finish(outcome, done))
+
+    def _finish(self, outcome: T | Exception, done: Callable[[T | ArmlinkError], None]) -> None:
+        def finish() -> None:
+            if isinstance(outcome, Exception) and not isinstance(outcome, ArmlinkError):
+                raise outcome
+            done(outcome)
+
+        self._journal.guard(finish)
 
 
 class InThread:

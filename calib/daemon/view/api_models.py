@@ -78,6 +78,10 @@ class Status(Answer):
     pending_proposals: int = 0
     last_event: int = 0
     """Id of the newest event; 0 if there is none."""
+    store_fault: str | None = None
+    """Why the record store cannot be read, in one line; the records in force stay in force."""
+    journal_fault: str | None = None
+    """Why the journal cannot be written, in one line; events wait until it can."""
     report: Path | None = None
     """The newest report (HTML) of a sweep, if there is one."""
 
@@ -115,6 +119,12 @@ class JointEstimate(Answer):
     installed_gain: float | None
     """Gain and offset [N·m] of the record in force."""
     installed_offset: float | None
+    gain_limit: float | None = None
+    """Smallest change of gain that would be noticed now, relative; None if gravity does not load the joint."""
+    offset_limit: float | None = None
+    """Smallest change of offset that would be noticed now [N·m]."""
+    limit_rests: int | None = None
+    """Rests at other poses after which changes of this size are noticed; larger ones are sooner."""
 
 
 class EventRecord(Answer):

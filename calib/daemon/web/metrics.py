@@ -79,6 +79,8 @@ def _of_status(status: Status) -> Iterable[Metric]:
     yield GaugeMetricFamily(PREFIX + "estimates_held", "1 while the cause of an alarm is not known.", status.held)
     yield GaugeMetricFamily(PREFIX + "observed_rests", "Rests of the arm that the observer has used.", status.rows)
     yield GaugeMetricFamily(PREFIX + "proposals_pending", "Pending proposals.", status.pending_proposals)
+    yield GaugeMetricFamily(PREFIX + "record_store_up", "1 while the record store answers.", not status.store_fault)
+    yield GaugeMetricFamily(PREFIX + "journal_up", "1 while the journal can be written.", not status.journal_fault)
     yield CounterMetricFamily(PREFIX + "events", "Number of events: the id of the newest one.", status.last_event)
 
 

@@ -68,11 +68,11 @@ def test_a_frame_that_came_after_the_queue_was_empty_is_seen_at_the_next_look(pa
     assert port.receive(1.0) == (3, b"")
 
 
-def test_what_is_no_standard_data_frame_is_dropped_and_error_frames_are_counted(pair):
+def test_extended_and_remote_frames_come_with_their_flags_and_error_frames_are_counted(pair):
     port = SocketPort(pair.socket, "pair")
     for can_id in (0x80000001, 0x40000001, 0x20000004, 5):
         pair.other.send(raw(can_id))
-    assert port.receive(0.0) == (5, b"")
+    assert [port.receive(0.0) for _ in range(3)] == [(0x80000001, b""), (0x40000001, b""), (5, b"")]
     assert port.errors == 1
     assert port.receive(0.0) is None
     pair.other.send(raw(0x20000040))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from armlink.arm_file import LinkJoint, load_arm, parse_arm
-from armlink.canopen.units import Units
+from armlink.drives.canopen.units import Units
 from armlink.errors import BadInput
 from armlink.link.gate_limits import gate_limits, joint_ranges, milliseconds, target_window
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import can
 import pytest
 
-from armlink.canopen.cia402 import State, state_of
+from armlink.drives.canopen.cia402 import State, state_of
 
 pytestmark = pytest.mark.vcan
 

@@ -5,8 +5,9 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,12 @@ import pytest
 import yaml
 
 from armlink.arm_file import ArmFile, load_arm
-from armlink.canopen.cia402 import State, state_of
-from armlink.canopen.object_dictionary import STATUS_WORD as STATUS
-from armlink.errors import BusFault, HostLate, Silence, Stall
+from armlink.bus.open import open_link_bus
+from armlink.drives.canopen.cia402 import State, state_of
+from armlink.drives.canopen.object_dictionary import STATUS_WORD as STATUS
+from armlink.errors import BusFault, HostLate, Silence
 from armlink.link.guard import Crossed, Guard
+from armlink.link.link import Link
 from armlink.link.listener import Listener
 from armlink.link.types import Command, Sample, Setpoints
 from armlink.loop.remote_link import RemoteLink
@@ -192,15 +195,11 @@ def test_an_arm_that_stands_still_is_not_called_broken(
     arm.send_signal(signal.SIGSTOP)
     with pytest.raises(Silence, match="no joint has sent a reading for"):
         cycles(link, hold)
-    arm.send_signal(signal.SIGCONT)
-    time.sleep(0.3)
-    for _ in range(5):
-        try:
-            link.recover()
-            break
-        except Stall:
-            time.sleep(0.2)
-    assert np.isfinite(link.cycle(Command.hold(link.position_sent)).position).all()
+    threading.Timer(1.0, arm.send_signal, (signal.SIGCONT,)).start()
+    link.recover()  # waits for it, and takes no reply of before it was stopped for an enabled joint
+    for _ in range(50):
+        sample = link.cycle(Command.hold(link.position_sent))
+    assert all(state_of(int(status)) is State.ENABLED for status in sample.status)
 
 
 @pytest.mark.parametrize("who", ["job", "loop"])
@@ -222,12 +221,46 @@ def test_the_joints_stop_when_job_or_loop_is_killed(tmp_path: Path, who: str) ->
         while Path(f"/proc/{loop}").exists():
             assert time.monotonic() < end, "the loop goes on without its job"
             time.sleep(0.05)
-        from armlink.bus.open import open_link_bus
-
-        link = arm.require_link()
-        with Listener(arm, open_link_bus(bus, link)) as listener:
+        with Listener(arm, open_link_bus(bus, arm.require_link())) as listener:
             states = [state_of(int(services.read(STATUS))) for services in listener.services]
     assert all(state is not State.ENABLED for state in states), states
+
+
+def dawdle(link: Link, tell: Callable[[str], None], seconds: float) -> int:
+    """Enable the arm and hold it for so long, and say so."""
+    link.start()
+    link.enable()
+    hold = Command.hold(link.position_sent)
+    for _ in range(round(seconds * link.rate)):
+        link.cycle(hold)
+        tell("holding")
+    return os.getpid()
+
+
+def test_a_function_runs_in_the_loop_until_it_ends_or_ctrl_c(tmp_path: Path) -> None:
+    def interrupt(text: str) -> None:
+        raise KeyboardInterrupt
+
+    told: list[str] = []
+    with simulated(tmp_path, os.getpid() % 200 + 1) as (arm, bus, _):
+        with RemoteLink(arm, bus) as link:
+            assert link.inside(dawdle, told.append, 0.2) == link.pid
+            assert told == ["holding"] * 20
+            link.stop()
+            with pytest.raises(KeyboardInterrupt):
+                link.inside(dawdle, interrupt, 60.0)
+        assert link.exit_status == 0, "it was killed"
+        with Listener(arm, open_link_bus(bus, arm.require_link())) as listener:
+            states = [state_of(int(services.read(STATUS))) for services in listener.services]
+    assert all(state is State.QUICK_STOP for state in states), states
+
+
+def test_sigterm_to_the_loop_is_left_to_the_job(started: tuple[RemoteLink, subprocess.Popen[bytes]]) -> None:
+    link, _ = started
+    os.kill(link.pid, signal.SIGTERM)
+    hold = Command.hold(link.position_sent)
+    for _ in range(20):
+        link.cycle(hold)
 
 
 JOB = """

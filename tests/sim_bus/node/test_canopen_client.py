@@ -7,7 +7,7 @@ import canopen
 import numpy as np
 import pytest
 
-from armlink.canopen.eds_file import bundled_path
+from armlink.drives.canopen.eds_file import bundled_path
 from sim_bus.bus.lock_step import LockStepBus
 
 

@@ -19,7 +19,7 @@ from canopen.profiles.p402 import BaseNode402
 pytestmark = pytest.mark.vcan
 
 ROOT = Path(__file__).parents[3]
-EDS = str(ROOT / "armlink" / "canopen" / "eds" / "joint.eds")
+EDS = str(ROOT / "armlink" / "drives" / "canopen" / "eds" / "joint.eds")
 BUS = "socketcan:vcan0"
 NODE = 5
 ARM = """

@@ -81,7 +81,8 @@ messages = st.builds(
 
 def expected(sent):
     flags = EXTENDED * sent.is_extended_id | REMOTE * sent.is_remote_frame | ERROR * sent.is_error_frame
-    return sent.arbitration_id | flags, bytes(sent.data), sent.is_fd
+    data = bytes(sent.dlc) if sent.is_remote_frame else bytes(sent.data)
+    return sent.arbitration_id | flags, data, sent.is_fd
 
 
 @given(messages, st.randoms())
@@ -220,7 +221,14 @@ def test_a_port_hears_what_python_can_sends(port, stock):
     ]
     for each in sent:
         stock.send(each)
-    assert drain(port) == [(0x181, b"12345678"), (0x05, b""), (0x181, bytes(64)), (0x7FF, b"end")]
+    assert drain(port) == [
+        (0x181, b"12345678"),
+        (0x05, b""),
+        (0x181, bytes(64)),
+        (0x80012345, b"extended"),
+        (0x40000183, bytes(4)),
+        (0x7FF, b"end"),
+    ]
     assert port.errors == 1
     assert (port.ignored, port.dropped) == (0, 0)
 

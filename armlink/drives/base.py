@@ -1,0 +1,112 @@
+"""What all drive families have in common: names, power states, faults told by readings. Families derive from it."""
+
+import math
+from collections.abc import Sequence
+
+from armlink.arm_file import LinkJoint
+from armlink.drives.family import Ask
+from armlink.drives.orders import Order, Power, Reading
+from armlink.drives.traits import Traits
+from armlink.errors import BusFault, Stall
+
+
+class BasicDrives:
+    """Keeps the newest power state, fault and temperature of m drives; `note` takes every reading.
+
+    A family implements routes, commands, identify, set_up, frames, sent, take and command_of, and calls `note(reading)`
+    in take before it returns the reading.
+    """
+
+    def __init__(self, joints: Sequence[LinkJoint], traits: Traits) -> None:
+        """The drives of these joints; `traits` of all of them, but for who calibrates."""
+        self.rows = tuple(joints)
+        self.names = tuple(joint.name for joint in joints)
+        self.m = len(self.rows)
+        self.powers = [Power.UNKNOWN] * self.m
+        """Newest power states."""
+        self.faults = [""] * self.m
+        """Newest faults, in words; empty: none."""
+        self.temperatures = [math.nan] * self.m
+        """[°C]."""
+        self._traits = [
+            traits
+            if joint.settings.calibration is None
+            else Traits(**{**vars(traits), "calibration": joint.settings.calibration})
+            for joint in joints
+        ]
+
+    def where(self, joint: int) -> str:
+        """Joint's name and its id on the bus, to begin a message with."""
+        return f"{self.names[joint]} ({self.rows[joint].settings.address})"
+
+    def note(self, reading: Reading) -> Reading:
+        """Keep what a reading tells of power, fault and temperature; returns it."""
+        joint = reading.joint
+        if reading.power is not None:
+            self.powers[joint] = reading.power
+        if reading.fault is not None:
+            self.faults[joint] = reading.fault
+        if reading.temperature == reading.temperature:  # not NaN
+            self.temperatures[joint] = reading.temperature
+        return reading
+
+    def traits(self, joint: int) -> Traits:
+        """See Drives."""
+        return self._traits[joint]
+
+    def power(self, joint: int) -> Power:
+        """See Drives."""
+        return self.powers[joint]
+
+    def ready(self, joint: int) -> bool:
+        """See Drives."""
+        return self.powers[joint] is Power.ON
+
+    def alarm(self) -> BusFault | None:
+        """See Drives; faults are states here, which `fault` tells."""
+        return None
+
+    def fault(self, modes: Sequence[int], now: float) -> BusFault | None:
+        """See Drives."""
+        for joint, mode in enumerate(modes):
+            power = self.powers[joint]
+            if self.faults[joint]:
+                return BusFault(f"{self.where(joint)}: {self.faults[joint]}")
+            if power is Power.FAULT:
+                return BusFault(f"{self.where(joint)}: the drive has a fault")
+            if mode and power is Power.STOPPED:
+                return Stall(f"{self.where(joint)}: stopped by itself: it did not hear its host")
+            if mode and power not in (Power.ON, Power.UNKNOWN):
+                return BusFault(f"{self.where(joint)}: power is {power.value}, expected on")
+        return None
+
+    def own_stop(self) -> str:
+        """See Drives."""
+        for joint, power in enumerate(self.powers):
+            if power is Power.STOPPED:
+                return f"{self.names[joint]} stopped itself"
+        return ""
+
+    def stuck(self, joint: int, target: Power, seconds: float) -> str:
+        """See Drives."""
+        if self.faults[joint]:
+            return f"{self.where(joint)}: {self.faults[joint]}"
+        found = self.powers[joint].value
+        return f"{self.where(joint)}: power stays {found}, expected {target.value} within {seconds:g} s"
+
+    def forget(self, restarts: bool = False) -> None:
+        """See Drives."""
+        self.faults = [""] * self.m
+
+    def recover(self, ask: Ask) -> None:
+        """See Drives: nothing to do."""
+
+    def temperature(self, joint: int, ask: Ask) -> float:
+        """See Drives: the newest that a reading told."""
+        return self.temperatures[joint]
+
+
+def no_order() -> Order:
+    """An order whose every target is NaN, to be filled by `_replace`: for decoding another host's frames."""
+    nan = math.nan
+    return Order(Power.ON, False, 0, nan, nan, nan, nan, nan)

@@ -1,0 +1,88 @@
+"""Electronic data sheets (EDS, CiA 306) of joint controllers: named in the arm file, by default the bundled one."""
+
+from collections.abc import Iterable
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import canopen
+
+from armlink.arm_file import ArmFile, DeviceIdentity, LinkJoint
+from armlink.drives.canopen import object_dictionary
+from armlink.drives.canopen.object_dictionary import Entry
+from armlink.drives.canopen.pdo import LINK_PDOS
+from armlink.errors import BadInput
+
+SUFFIXES = (".eds", ".dcf")
+OPTIONAL = {
+    object_dictionary.TORQUE_OFFSET: "torque offset: nothing latched to clear",
+    object_dictionary.PROFILE_VELOCITY: "profile velocity: no profile position mode",
+    object_dictionary.TORQUE_SLOPE: "torque slope: no profile torque mode",
+    object_dictionary.STORE_MANUFACTURER: "store: a calibration is lost at power-off",
+    object_dictionary.HEARTBEAT_PRODUCER: "",
+}
+"""Objects that a controller may lack → the function that is then missing."""
+
+
+def used_objects() -> Iterable[Entry]:
+    """The objects of a controller that the link uses."""
+    return [value for value in vars(object_dictionary).values() if isinstance(value, Entry)]
+
+
+def bundled_path() -> str:
+    """Path of the bundled data sheet."""
+    return str(files("armlink.drives.canopen").joinpath("eds/joint.eds"))
+
+
+def bundled() -> Any:
+    """Object dictionary of a joint controller from the bundled data sheet, for node 1."""
+    return canopen.import_od(bundled_path(), 1)
+
+
+def of_joints(arm: ArmFile) -> tuple[Any, ...]:
+    """Object dictionary of each joint's controller, in joint order; raises BadInput as read_sheet."""
+    joints, read = arm.require_link().joints, dict[str | None, Any]()
+    for joint in joints:
+        if joint.eds not in read:
+            read[joint.eds] = bundled() if joint.eds is None else read_sheet(arm.path.parent / joint.eds, joint)
+    return tuple(read[joint.eds] for joint in joints)
+
+
+def read_sheet(path: Path, joint: LinkJoint) -> Any:
+    """Object dictionary that a joint's own data sheet describes.
+
+    Raises BadInput if the file cannot be read, or if an object that the link uses is missing, has another length, or
+    cannot be mapped into the PDO in which the link needs it.
+    """
+    where = f"{joint.name}: data sheet {path}"
+    if path.suffix.lower() not in SUFFIXES:
+        raise BadInput(f"{where}: expected a file that ends in {' or '.join(SUFFIXES)}")
+    try:
+        sheet = canopen.import_od(str(path), joint.settings.node)
+    except OSError as error:
+        raise BadInput(f"{where}: {error.strerror or error}: correct eds of this joint under link.joints") from None
+    except Exception as error:  # configparser and canopen raise many kinds
+        raise BadInput(f"{where}: not a valid EDS (CiA 306): {' '.join(str(error).split())}") from None
+    for entry in used_objects():
+        found = sheet.get_variable(entry.index, entry.sub)
+        if found is None and entry not in OPTIONAL:
+            raise BadInput(f"{where}: lacks {entry}, which the link needs (see docs/adding-a-drive.md)")
+        if found is not None and len(found) != entry.bits:
+            raise BadInput(f"{where}: {entry} has {len(found)} bits, expected {entry.bits}")
+    for pdo in LINK_PDOS:
+        for entry in pdo.entries:
+            if not sheet.get_variable(entry.index, entry.sub).pdo_mappable:
+                raise BadInput(f"{where}: {entry} cannot be mapped into a PDO, but the link needs it in {pdo.name}")
+    return sheet
+
+
+def expected_identity(joint: LinkJoint, sheet: Any) -> DeviceIdentity:
+    """Identity that a joint's controller must have: from the arm file, else vendor and product of its data sheet.
+
+    The revision of the data sheet is not required: a data sheet often serves later revisions too.
+    """
+    if joint.eds is None:
+        return joint.identity
+    device = sheet.device_information
+    stated = DeviceIdentity(vendor=device.vendor_number or None, product=device.product_number or None)
+    return stated.model_copy(update=joint.identity.model_dump(exclude_none=True))

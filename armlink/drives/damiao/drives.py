@@ -1,0 +1,257 @@
+"""Damiao DM-J drives on one bus, in MIT mode: set-up by registers, one command and one reply a cycle."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from armlink.arm_file import ArmFile, LinkJoint
+from armlink.bus.port import Frame
+from armlink.drives.base import BasicDrives, no_order
+from armlink.drives.damiao import frames
+from armlink.drives.damiao.frames import Register, Special, State
+from armlink.drives.damiao.set_up import prepare, read_registers
+from armlink.drives.family import BROADCAST, Ask
+from armlink.drives.mit_packing import MitCommand, Ranges, damping, pack_command, round_within, unpack_command, unwrap
+from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
+from armlink.drives.traits import Traits
+from armlink.errors import BusFault, Stall
+
+TRAITS = Traits(torque="current", calibration="host", silence="falls", bounds=(), cadence="reply", frame="11")
+OTHER_MODES = {0x100: "position", 0x200: "velocity", 0x300: "force"}
+"""Offsets of the command ids of the modes that armlink does not use."""
+IDENTITY = (Register.HARDWARE_VERSION, Register.SOFTWARE_VERSION, Register.SERIAL_NUMBER, Register.REPLY_ID)
+FAULTS = {
+    State.OVERVOLTAGE: "overvoltage",
+    State.UNDERVOLTAGE: "undervoltage",
+    State.OVERCURRENT: "overcurrent",
+    State.MOSFET_HOT: "power stage too hot",
+    State.ROTOR_HOT: "motor too hot",
+    State.OVERLOAD: "overload",
+}
+
+
+@dataclass
+class _Known:
+    """What is known of one drive."""
+
+    ranges: Ranges | None = None
+    """By its registers; None before set_up()."""
+    limits: Limits | None = None
+    state: int | None = None
+    position: float = math.nan
+    """Unwrapped [rad]."""
+    velocity: float = math.nan
+    damping: bool = False
+    """The newest frame damps, whatever was ordered."""
+    sent: Order | None = None
+
+
+class DamiaoDrives(BasicDrives):
+    """The drives of one bus; see `Drives`."""
+
+    def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
+        """Nothing is sent."""
+        super().__init__(joints, TRAITS)
+        self._settings = [joint.settings for joint in joints]
+        self._known = [_Known() for _ in joints]
+        self._joint_of = {settings.id: joint for joint, settings in enumerate(self._settings)}
+
+    def routes(self) -> Mapping[int, int]:
+        """Reply ids; drives that share one are told apart by the id in their replies."""
+        replies = [settings.reply for settings in self._settings]
+        return {reply: joint if replies.count(reply) == 1 else BROADCAST for joint, reply in enumerate(replies)}
+
+    def commands(self) -> Mapping[int, str]:
+        """See Drives."""
+        found = {frames.REGISTERS_ID: "register request"}
+        for drive, joint in self._joint_of.items():
+            name = self.names[joint]
+            found[drive] = f"MIT command to {name}"
+            found |= {drive + offset: f"{mode} command to {name}" for offset, mode in OTHER_MODES.items()}
+        return found
+
+    def poll(self, first: bool) -> list[Frame]:
+        """Requests for the state alone."""
+        return [(frames.REGISTERS_ID, frames.refresh_request(settings.id)) for settings in self._settings]
+
+    # ---- set-up
+
+    def identify(self, ask: Ask) -> list[DriveIdentity]:
+        """See Drives."""
+        found = []
+        for joint, settings in enumerate(self._settings):
+            values = read_registers(ask, settings.id, IDENTITY)
+            if None in values.values():
+                found.append(DriveIdentity(joint, settings.address, present=False))
+                continue
+            hardware, software, serial, reply = (int(value or 0) for value in values.values())
+            wrong = (
+                "" if reply == settings.reply else f"replies on {reply:02X}h, the arm file says {settings.reply:02X}h"
+            )
+            found.append(
+                DriveIdentity(
+                    joint,
+                    settings.address,
+                    True,
+                    "Damiao DM-J",
+                    f"{serial:08X}",
+                    f"{software} (hardware {hardware})",
+                    self.power(joint),
+                    wrong,
+                )
+            )
+        return found
+
+    def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
+        """See Drives."""
+        found = []
+        for joint, (known, settings, limit) in enumerate(zip(self._known, self._settings, limits, strict=True)):
+            known.ranges, result = prepare(ask, self.names[joint], settings, limit)
+            known.limits, known.state = limit, None
+            found.append(result)
+            known.position = result.position
+        return found
+
+    # ---- cycle
+
+    def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
+        """See Drives."""
+        return [self._frame(joint, order) for joint, order in enumerate(orders) if order is not None]
+
+    def _frame(self, joint: int, order: Order) -> Frame:
+        known, drive = self._known[joint], self._settings[joint].id
+        known.damping = False
+        on = known.state == State.ENABLED
+        if order.power is Power.ON and on:
+            return self._command(joint, order)
+        if order.power is Power.STOPPED and on:
+            return self._damp(joint)
+        known.sent = None
+        if order.power is Power.OFF and on:
+            return drive, frames.special(Special.DISABLE)
+        if order.power is Power.ON and order.walk:
+            if known.state == State.DISABLED:
+                return drive, frames.special(Special.ENABLE)
+            if known.state is not None:
+                return drive, frames.special(Special.CLEAR_ERROR)
+        return frames.REGISTERS_ID, frames.refresh_request(drive)
+
+    def _command(self, joint: int, order: Order) -> Frame:
+        known = self._known[joint]
+        ranges, limits = known.ranges, known.limits
+        if ranges is None or limits is None:
+            raise BusFault(f"{self.names[joint]}: a command before the set-up")
+        stiff = order.mode == Mode.POSITION
+        asked = MitCommand(
+            order.position, order.velocity, order.kp if stiff else 0.0, order.kd if stiff else 0.0, order.torque
+        )
+        rounded = round_within(
+            asked,
+            lambda command: unpack_command(pack_command(command, ranges), ranges),
+            ranges,
+            ranges.torque_quantum,
+            limits,
+            known.position,
+            known.velocity,
+        )
+        data = pack_command(rounded, ranges)
+        known.sent = _order_of(unpack_command(data, ranges))
+        return self._settings[joint].id, data
+
+    def _damp(self, joint: int) -> Frame:
+        """No stiffness, no torque: the joint sinks slowly, and no torque leaves the limit on the way."""
+        known = self._known[joint]
+        assert known.ranges is not None
+        assert known.limits is not None
+        known.damping = True
+        command = damping(self._settings[joint].kd, known.position, known.velocity, known.limits.max_torque)
+        data = pack_command(command, known.ranges)
+        known.sent = _order_of(unpack_command(data, known.ranges))._replace(power=Power.STOPPED)
+        return self._settings[joint].id, data
+
+    def sent(self, joint: int) -> Order | None:
+        """See Drives."""
+        return self._known[joint].sent
+
+    def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
+        """See Drives."""
+        joint = self._joint_of_reply(can_id, data)
+        if joint is None:
+            return None
+        known, drive = self._known[joint], self._settings[joint].id
+        if frames.register_answer(data, drive) is not None or known.ranges is None:
+            return None
+        reply = frames.unpack_reply(data, known.ranges)
+        if reply is None or reply.drive != drive & 0xF:
+            return None
+        known.state = reply.state
+        position = reply.feedback.position
+        if math.isfinite(known.position):
+            position = unwrap(position, known.position, 2 * known.ranges.position)
+        known.position, known.velocity = position, reply.feedback.velocity
+        return self.note(
+            Reading(
+                joint,
+                position,
+                reply.feedback.velocity,
+                reply.feedback.torque,
+                temperature=float(max(reply.stage_temperature, reply.rotor_temperature)),
+                power=self._power(known),
+                fault=_fault_text(reply.state),
+            )
+        )
+
+    def _joint_of_reply(self, can_id: int, data: bytes) -> int | None:
+        if len(data) != 8:
+            return None
+        places = [
+            joint
+            for joint, settings in enumerate(self._settings)
+            if settings.reply == can_id and (data[0] & 0xF == settings.id & 0xF)
+        ]
+        return places[0] if places else None
+
+    @staticmethod
+    def _power(known: _Known) -> Power:
+        if known.state == State.ENABLED:
+            return Power.STOPPED if known.damping else Power.ON
+        powers: dict[int | None, Power] = {State.DISABLED: Power.OFF, State.LOST_COMMUNICATION: Power.STOPPED}
+        return powers.get(known.state, Power.FAULT)
+
+    def fault(self, modes: Sequence[int], now: float) -> BusFault | None:
+        """See Drives."""
+        lost = self.own_stop()
+        return Stall(lost) if lost else super().fault(modes, now)
+
+    def own_stop(self) -> str:
+        """See Drives."""
+        for joint, known in enumerate(self._known):
+            if known.state == State.LOST_COMMUNICATION:
+                return f"{self.where(joint)}: lost communication (state Dh): its TIMEOUT ran out, the torque is off"
+        return ""
+
+    # ---- listening
+
+    def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
+        """See Drives."""
+        joint = self._joint_of.get(can_id)
+        if joint is None or len(data) != 8:
+            return None
+        special = frames.special_of(data)
+        if special is not None:
+            power = {Special.ENABLE: Power.ON, Special.DISABLE: Power.OFF}.get(special)
+            return None if power is None else (joint, no_order()._replace(power=power))
+        ranges = self._known[joint].ranges
+        return None if ranges is None else (joint, _order_of(unpack_command(data, ranges)))
+
+
+def _fault_text(state: int) -> str:
+    if state in (State.DISABLED, State.ENABLED, State.LOST_COMMUNICATION):
+        return ""
+    words = FAULTS[State(state)] if state in FAULTS else "unknown state"
+    return f"{words} (state {state:X}h)"
+
+
+def _order_of(command: MitCommand) -> Order:
+    mode = Mode.POSITION if command.kp > 0 else Mode.TORQUE
+    return Order(Power.ON, False, mode, command.position, command.velocity, command.torque, command.kp, command.kd)

@@ -1,0 +1,143 @@
+"""Frames of Damiao DM-J drives: bytes to SI values and back, without a bus.
+
+Sources: enactic/openarm_can (`dm_motor_control.cpp`), the maker's register table as in python-damiao-driver.
+"""
+
+import struct
+from enum import IntEnum
+from typing import NamedTuple
+
+from armlink.drives.mit_packing import MitFeedback, Ranges, pack_feedback, unpack_feedback
+
+REGISTERS_ID = 0x7FF
+"""Identifier of register requests to any drive."""
+READ, WRITE, REFRESH = 0x33, 0x55, 0xCC
+
+
+class Special(IntEnum):
+    """Last byte of a special command: seven bytes FFh, then this."""
+
+    CLEAR_ERROR = 0xFB
+    ENABLE = 0xFC
+    DISABLE = 0xFD
+    SET_ZERO = 0xFE
+
+
+class Register(IntEnum):
+    """Registers that armlink uses; all can be read."""
+
+    UNDER_VOLTAGE = 0
+    TORQUE_CONSTANT = 1
+    OVER_TEMPERATURE = 2
+    OVER_CURRENT = 3
+    REPLY_ID = 7
+    COMMAND_ID = 8
+    TIMEOUT = 9
+    CONTROL_MODE = 10
+    HARDWARE_VERSION = 13
+    SOFTWARE_VERSION = 14
+    SERIAL_NUMBER = 15
+    GEAR_RATIO = 20
+    POSITION_RANGE = 21
+    VELOCITY_RANGE = 22
+    TORQUE_RANGE = 23
+    BIT_RATE = 35
+    LARGEST_CURRENT = 59
+
+
+SPECIALS = frozenset(int(command) for command in Special)
+INTEGER_REGISTERS = frozenset((7, 8, 9, 10, 13, 14, 15, 16, 35, 36))
+"""Registers with a 32-bit unsigned value; all others are floats."""
+TIMEOUT_UNIT = 50e-6
+"""Unit of register 9 [s]; 0 switches the deadman off."""
+MIT_MODE = 1
+"""Value of register 10 in which MIT frames are understood."""
+VALUES = struct.Struct("<I"), struct.Struct("<f")
+
+
+class State(IntEnum):
+    """State nibble of a reply."""
+
+    DISABLED = 0x0
+    ENABLED = 0x1
+    OVERVOLTAGE = 0x8
+    UNDERVOLTAGE = 0x9
+    OVERCURRENT = 0xA
+    MOSFET_HOT = 0xB
+    ROTOR_HOT = 0xC
+    LOST_COMMUNICATION = 0xD
+    OVERLOAD = 0xE
+
+
+class Reply(NamedTuple):
+    """Reply to a command: state nibble, feedback, temperatures of power stage and rotor [°C]."""
+
+    drive: int
+    """Low nibble of the drive's command id."""
+    state: int
+    feedback: MitFeedback
+    stage_temperature: int
+    rotor_temperature: int
+
+
+def special(command: Special) -> bytes:
+    """A special command, sent to the drive's command id."""
+    return bytes([0xFF] * 7 + [command])
+
+
+def special_of(data: bytes) -> Special | None:
+    """The special command in `data`, or None."""
+    if len(data) == 8 and data[:7] == b"\xff" * 7 and data[7] in SPECIALS:
+        return Special(data[7])
+    return None
+
+
+def read_request(drive: int, register: int) -> bytes:
+    """Read a register of the drive with command id `drive`."""
+    return struct.pack("<HBB4x", drive, READ, register)
+
+
+def write_request(drive: int, register: int, value: float) -> bytes:
+    """Write a register in RAM; flash is never written."""
+    return struct.pack("<HBB4s", drive, WRITE, register, pack_value(register, value))
+
+
+def refresh_request(drive: int) -> bytes:
+    """Ask for a reply without a command."""
+    return struct.pack("<HB5x", drive, REFRESH)
+
+
+def pack_value(register: int, value: float) -> bytes:
+    """Four bytes of a register's value."""
+    return VALUES[0].pack(int(value)) if register in INTEGER_REGISTERS else VALUES[1].pack(value)
+
+
+def unpack_value(register: int, data: bytes) -> float:
+    """Value of a register from its four bytes."""
+    value: float = VALUES[register not in INTEGER_REGISTERS].unpack(data)[0]
+    return value
+
+
+def register_answer(data: bytes, drive: int) -> tuple[int, int, float] | None:
+    """(READ or WRITE, register, value) of an answer from `drive`, or None.
+
+    A reply about the motion can have the same bytes, of a drive near the lower end of its range; hence only a reader
+    that waits for an answer calls this.
+    """
+    if len(data) != 8 or data[0] | data[1] << 8 != drive or data[2] not in (READ, WRITE):
+        return None
+    return data[2], data[3], unpack_value(data[3], data[4:8])
+
+
+def pack_reply(reply: Reply, ranges: Ranges) -> bytes:
+    """The eight bytes of a reply."""
+    head = reply.state << 4 | reply.drive & 0xF
+    tail = (max(0, min(255, reply.stage_temperature)), max(0, min(255, reply.rotor_temperature)))
+    return bytes([head]) + pack_feedback(reply.feedback, ranges) + bytes(tail)
+
+
+def unpack_reply(data: bytes, ranges: Ranges) -> Reply | None:
+    """The reply in `data`, or None for another length."""
+    if len(data) != 8:
+        return None
+    return Reply(data[0] & 0xF, data[0] >> 4, unpack_feedback(data[1:6], ranges), data[6], data[7])

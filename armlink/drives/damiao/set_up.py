@@ -1,0 +1,119 @@
+"""Registers of a Damiao drive: reading the scales, setting mode and deadman in RAM, reading back."""
+
+import math
+from collections.abc import Callable, Iterable
+
+from armlink.drives.damiao import frames
+from armlink.drives.damiao.frames import READ, TIMEOUT_UNIT, WRITE, Register, Special, State
+from armlink.drives.damiao.settings import DamiaoSettings
+from armlink.drives.family import Ask
+from armlink.drives.mit_packing import Ranges
+from armlink.drives.orders import Gains, Limits, Mode, Setup
+from armlink.errors import BadInput, BusFault
+
+SCALES = (Register.POSITION_RANGE, Register.VELOCITY_RANGE, Register.TORQUE_RANGE)
+LARGEST_RANGE = 1e4
+"""No range of a real drive is larger [rad, rad/s, N·m]."""
+NOTED = (Register.TORQUE_CONSTANT, Register.OVER_CURRENT, Register.LARGEST_CURRENT, Register.GEAR_RATIO)
+
+
+def read_registers(ask: Ask, drive: int, registers: Iterable[int]) -> dict[int, float | None]:
+    """Values of registers of the drive with command id `drive`, None where it does not answer."""
+    found: dict[int, float | None] = {}
+    for register in registers:
+        request = (frames.REGISTERS_ID, frames.read_request(drive, register))
+        found[register] = ask(request, _answer(drive, READ, register))
+        if found[register] is None:
+            return found | dict.fromkeys(set(registers) - set(found))
+    return found
+
+
+def prepare(ask: Ask, name: str, settings: DamiaoSettings, limits: Limits) -> tuple[Ranges, Setup]:
+    """Ranges of one drive by its registers, and its set-up: off, MIT mode, deadman, both read back.
+
+    Raises BusFault, BadInput.
+    """
+    drive = settings.id
+    ask.send(drive, frames.special(Special.DISABLE))
+    values = read_registers(ask, drive, (*SCALES, Register.REPLY_ID, *NOTED))
+    if None in values.values():
+        raise BusFault(f"{name}: no answer from {settings.address}: is it powered, and its id right?")
+    known = {register: float(value or 0.0) for register, value in values.items()}
+    if known[Register.REPLY_ID] != settings.reply:
+        raise BadInput(
+            f"{name}: its drive replies on id {int(known[Register.REPLY_ID]):02X}h (register 7), "
+            f"the arm file says reply: {settings.reply:#04x}"
+        )
+    ranges = _ranges(name, known)
+    if not (-ranges.position <= limits.lower and limits.upper <= ranges.position):
+        raise BadInput(
+            f"{name}: its position window {limits.lower:.2f} to {limits.upper:.2f} rad at the drive exceeds the range "
+            f"±{ranges.position:.2f} rad of its frames (register 21): correct zero and direction, or limit the joint"
+        )
+    _set(ask, name, drive, Register.CONTROL_MODE, frames.MIT_MODE, "the drive is not in MIT mode")
+    deadman = round(limits.deadline / TIMEOUT_UNIT)
+    _set(ask, name, drive, Register.TIMEOUT, deadman, "it would keep on after its host died")
+    return ranges, _result(ask, name, settings, ranges, known)
+
+
+def _ranges(name: str, values: dict[int, float]) -> Ranges:
+    for register in SCALES:
+        if not 0.0 < values[register] < LARGEST_RANGE:
+            raise BusFault(f"{name}: register {int(register)} ({register.name}) is {values[register]}: no usable scale")
+    return Ranges(*(values[register] for register in SCALES))
+
+
+def _set(ask: Ask, name: str, drive: int, register: Register, value: int, otherwise: str) -> None:
+    """Write a register in RAM and read it back. Raises BusFault."""
+    request = (frames.REGISTERS_ID, frames.write_request(drive, register, value))
+    ask(request, _answer(drive, WRITE, register))
+    found = read_registers(ask, drive, (register,))[register]
+    if found != value:
+        raise BusFault(
+            f"{name}: register {int(register)} ({register.name}) was set to {value} and reads back {found}: {otherwise}"
+        )
+
+
+def _result(ask: Ask, name: str, settings: DamiaoSettings, ranges: Ranges, known: dict[int, float]) -> Setup:
+    def state_of(can_id: int, data: bytes) -> frames.Reply | None:
+        if can_id != settings.reply or frames.register_answer(data, settings.id) is not None:
+            return None
+        reply = frames.unpack_reply(data, ranges)
+        return reply if reply is not None and reply.drive == settings.id & 0xF else None
+
+    reply = ask((frames.REGISTERS_ID, frames.refresh_request(settings.id)), state_of)
+    if reply is None:
+        raise BusFault(f"{name}: {settings.address} answers registers, but sends no feedback")
+    if reply.state == State.ENABLED:
+        raise BusFault(f"{name}: {settings.address} stays enabled although it was told to disable")
+    constant = known[Register.TORQUE_CONSTANT]
+    notes = [
+        f"torque constant {constant:g} N·m/A"
+        if constant
+        else "torque constant register reads 0: its meaning is unknown",
+        f"gear {known[Register.GEAR_RATIO]:g}",
+        f"current limit {known[Register.OVER_CURRENT] * known[Register.LARGEST_CURRENT]:g} A",
+    ]
+    return Setup(
+        position=reply.feedback.position,
+        torque=0.0,
+        position_step=ranges.position_quantum,
+        modes=frozenset((int(Mode.POSITION), int(Mode.TORQUE))),
+        gains=Gains(settings.kp, settings.kd, ranges.kp, ranges.kd),
+        notes=tuple(notes),
+        scales={
+            "position range, rad": ranges.position,
+            "velocity range, rad/s": ranges.velocity,
+            "torque range, N·m": ranges.torque,
+        },
+    )
+
+
+def _answer(drive: int, kind: int, register: int) -> Callable[[int, bytes], float | None]:
+    def answer(can_id: int, data: bytes) -> float | None:
+        found = frames.register_answer(data, drive)
+        if found is None or found[:2] != (kind, register) or not math.isfinite(found[2]):
+            return None
+        return found[2]
+
+    return answer

@@ -1,0 +1,324 @@
+"""moteus controllers on one CAN FD bus: one frame with command and query, one reply a cycle."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from armlink.arm_file import ArmFile, LinkJoint
+from armlink.bus.port import EXTENDED, Frame
+from armlink.drives.base import BasicDrives, no_order
+from armlink.drives.family import Ask
+from armlink.drives.moteus import frames
+from armlink.drives.moteus.frames import READ, READ_ERROR, REPLY, WRITE, Register
+from armlink.drives.moteus.settings import MoteusSettings
+from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
+from armlink.drives.traits import Traits
+from armlink.errors import BadInput, BusFault, Stall
+
+TURN = 2 * math.pi
+TRAITS = Traits(torque="current", calibration="host", silence="damps", bounds=("torque",), cadence="reply", frame="fd")
+QUERY = (
+    Register.MODE, Register.POSITION, Register.VELOCITY, Register.TORQUE, Register.TEMPERATURE, Register.FAULT,
+)  # fmt: skip
+COMMAND = (
+    Register.MODE, Register.COMMAND_POSITION, Register.COMMAND_VELOCITY, Register.COMMAND_TORQUE,
+    Register.COMMAND_KP_SCALE, Register.COMMAND_KD_SCALE, Register.COMMAND_MAX_TORQUE,
+    Register.COMMAND_STOP_POSITION, Register.COMMAND_WATCHDOG, Register.COMMAND_ILIMIT_SCALE,
+)  # fmt: skip
+CYCLE_COMMAND = frames.FixedPayload([(WRITE, COMMAND), (READ, QUERY)])
+CYCLE_REPLY = frames.FixedPayload([(REPLY, QUERY)])
+HOMED_AT_OUTPUT = 2
+LARGEST_POSITION = 1e4
+"""No joint's position is larger [rev]; a larger one is no reading."""
+FAULTS = {
+    32: "calibration fault",
+    33: "motor driver",
+    34: "overvoltage",
+    35: "encoder",
+    36: "motor not configured",
+    37: "control loop overrun",
+    38: "too hot",
+    39: "start outside of servopos.position_min and position_max",
+    40: "undervoltage",
+    41: "configuration changed",
+    42: "no valid commutation encoder",
+    43: "no valid output encoder",
+    44: "gate driver could not be enabled",
+    45: "stop position with limits",
+    46: "timing violation",
+    47: "back-EMF feed-forward without an acceleration limit",
+    48: "invalid position limits",
+    49: "position error too large",
+    50: "velocity error too large",
+}
+"""Fault codes of mode 1; in other modes 96 to 105 tell what limits the torque at present."""
+STOPS = {frames.Mode.STOPPED: Power.OFF, frames.Mode.FAULT: Power.FAULT, frames.Mode.POSITION: Power.ON}
+STOPPED_MODES = (frames.Mode.TIMEOUT, frames.Mode.ZERO_VELOCITY, frames.Mode.BRAKE)
+
+
+@dataclass
+class _Known:
+    """What is known of one controller."""
+
+    limits: Limits | None = None
+    mode: int | None = None
+    fault: int = 0
+    position: float = math.nan
+    sent: Order | None = None
+
+
+class MoteusDrives(BasicDrives):
+    """The controllers of one bus; see `Drives`."""
+
+    def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
+        """Nothing is sent. Raises BadInput for a bus without CAN FD."""
+        super().__init__(joints, TRAITS)
+        self._settings = [joint.settings for joint in joints]
+        self._known = [_Known() for _ in joints]
+        self._joint_of = {_reply_id(settings): joint for joint, settings in enumerate(self._settings)}
+        section = arm.require_link()
+        bus = section.buses[joints[0].bus] if joints[0].bus else section.bus
+        if not bus.fd:
+            raise BadInput(f"{arm.path}: {joints[0].name}: moteus controllers need CAN FD: set fd: true at their bus")
+
+    def routes(self) -> Mapping[int, int]:
+        """See Drives."""
+        return self._joint_of
+
+    def commands(self) -> Mapping[int, str]:
+        """Frames to our controllers, from any source, with or without a wish for a reply."""
+        return {
+            _flagged(head << 8 | settings.id): f"command to {name}"
+            for settings, name in zip(self._settings, self.names, strict=True)
+            for head in range(0x100)
+        }
+
+    def poll(self, first: bool) -> list[Frame]:
+        """Queries alone."""
+        return [
+            (_flagged(frames.identifier(settings.source, settings.id, True)), frames.pack({}, QUERY))
+            for settings in self._settings
+        ]
+
+    # ---- set-up
+
+    def identify(self, ask: Ask) -> list[DriveIdentity]:
+        """See Drives."""
+        asked = (Register.MODEL, Register.FIRMWARE, Register.SERIAL1, Register.SERIAL2, Register.SERIAL3)
+        found = []
+        for joint, settings in enumerate(self._settings):
+            values = self._ask(ask, joint, {}, asked)
+            if values is None:
+                found.append(DriveIdentity(joint, settings.address, present=False))
+                continue
+            model, firmware, *serial = (int(values.get(register, 0)) for register in asked)
+            text = "".join(f"{part & 0xFFFFFFFF:08X}" for part in reversed(serial))
+            version = f"{firmware >> 8 & 0xFF}.{firmware & 0xFF}"
+            found.append(
+                DriveIdentity(joint, settings.address, True, f"moteus model {model}", text, version, self.power(joint))
+            )
+        return found
+
+    def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
+        """See Drives: stopped, and referenced to its output; torque and watchdog go with every command."""
+        found = []
+        for joint, (known, limit) in enumerate(zip(self._known, limits, strict=True)):
+            name, asked = self.names[joint], (*QUERY, Register.HOME_STATE)
+            values = self._ask(ask, joint, {Register.MODE: frames.Mode.STOPPED}, asked)
+            if values is None:
+                address = self._settings[joint].address
+                raise BusFault(f"{name}: no answer from {address}: is it powered, its id right, the bus CAN FD?")
+            if values.get(Register.HOME_STATE) != HOMED_AT_OUTPUT:
+                raise BusFault(
+                    f"{name}: its position is not that of the output (home state "
+                    f"{values.get(Register.HOME_STATE, math.nan):.0f}, expected 2): set it (register 130h) or use an "
+                    f"encoder at the output"
+                )
+            position = values.get(Register.POSITION, math.nan) * TURN
+            if not math.isfinite(position):
+                raise BusFault(f"{name}: reports no position")
+            known.limits, known.position, known.mode = limit, position, None
+            found.append(
+                Setup(
+                    position=position,
+                    torque=0.0,
+                    position_step=TURN * 2.0**-23 * max(1.0, abs(position) / TURN),
+                    modes=frozenset((int(Mode.POSITION), int(Mode.TORQUE))),
+                    notes=("largest torque and watchdog are part of every command",),
+                )
+            )
+        return found
+
+    def _ask(self, ask: Ask, joint: int, writes: Mapping[int, float], asked: Sequence[int]) -> dict[int, float] | None:
+        """Values of the registers that came, or None without an answer."""
+        settings = self._settings[joint]
+        reply_id = _reply_id(settings)
+
+        def answer(can_id: int, data: bytes) -> dict[int, float] | None:
+            if can_id != reply_id:
+                return None
+            subframes = [each for each in frames.unpack(data) if each.kind in (REPLY, READ_ERROR)]
+            if {each.register for each in subframes} != set(asked):
+                return None
+            return {each.register: each.value for each in subframes if each.kind == REPLY}
+
+        return ask(
+            (_flagged(frames.identifier(settings.source, settings.id, True)), frames.pack(writes, asked)), answer
+        )
+
+    # ---- cycle
+
+    def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
+        """See Drives."""
+        found = []
+        for joint, order in enumerate(orders):
+            if order is None:
+                continue
+            settings = self._settings[joint]
+            writes = self._writes(joint, order)
+            data = CYCLE_COMMAND.pack(writes) if len(writes) == len(COMMAND) else frames.pack(writes, QUERY)
+            told = _order_of(data)
+            self._known[joint].sent = told if told is not None and told.power is Power.ON else None
+            found.append((_flagged(frames.identifier(settings.source, settings.id, True)), data))
+        return found
+
+    def _writes(self, joint: int, order: Order) -> dict[int, float]:
+        known = self._known[joint]
+        on = known.mode == frames.Mode.POSITION
+        if order.power is Power.STOPPED and known.mode in (frames.Mode.POSITION, *STOPPED_MODES):
+            damps = known.mode == frames.Mode.TIMEOUT
+            return {} if damps else {Register.MODE: frames.Mode.ZERO_VELOCITY}
+        if order.power is Power.ON and on:
+            return self._command(joint, order)
+        if order.power is Power.ON and order.walk and known.mode is not None:
+            if known.mode == frames.Mode.STOPPED:
+                return self._command(joint, order)
+            return {Register.MODE: frames.Mode.STOPPED}
+        return {Register.MODE: frames.Mode.STOPPED} if order.power is Power.OFF else {}
+
+    def _command(self, joint: int, order: Order) -> dict[int, float]:
+        limits = self._known[joint].limits
+        if limits is None:
+            raise BusFault(f"{self.names[joint]}: a command before the set-up")
+        if not all(math.isfinite(value) for value in (order.position, order.velocity, order.torque)):
+            raise ValueError(f"{self.names[joint]}: an order that is not finite: {order}")
+        stiff = float(order.mode == Mode.POSITION)
+        most = limits.max_torque
+        return {
+            Register.MODE: frames.Mode.POSITION,
+            Register.COMMAND_POSITION: order.position / TURN if stiff else math.nan,
+            Register.COMMAND_VELOCITY: order.velocity / TURN if stiff else 0.0,
+            Register.COMMAND_TORQUE: _float_within(order.torque, most),
+            Register.COMMAND_KP_SCALE: stiff,
+            Register.COMMAND_KD_SCALE: stiff,
+            Register.COMMAND_MAX_TORQUE: _float_within(most, most),
+            Register.COMMAND_STOP_POSITION: math.nan,
+            Register.COMMAND_WATCHDOG: limits.deadline,
+            Register.COMMAND_ILIMIT_SCALE: stiff,
+        }
+
+    def sent(self, joint: int) -> Order | None:
+        """See Drives."""
+        return self._known[joint].sent
+
+    def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
+        """See Drives."""
+        joint = self._joint_of.get(can_id)
+        if joint is None:
+            return None
+        values = CYCLE_REPLY.unpack(data) or {
+            each.register: each.value for each in frames.unpack(data) if each.kind == REPLY
+        }
+        mode, fault = values.get(Register.MODE, math.nan), values.get(Register.FAULT, math.nan)
+        if not math.isfinite(mode):
+            return None
+        known = self._known[joint]
+        known.mode = int(mode)
+        if math.isfinite(fault):
+            known.fault = int(fault)
+        position = values.get(Register.POSITION, math.nan)
+        if not abs(position) < LARGEST_POSITION:
+            position = math.nan
+        known.position = position * TURN
+        return self.note(
+            Reading(
+                joint,
+                position * TURN,
+                _finite(values.get(Register.VELOCITY, math.nan)) * TURN,
+                _finite(values.get(Register.TORQUE, math.nan)),
+                temperature=_finite(values.get(Register.TEMPERATURE, math.nan)),
+                power=_power(known),
+                fault=_fault_text(known),
+            )
+        )
+
+    def fault(self, modes: Sequence[int], now: float) -> BusFault | None:
+        """See Drives."""
+        lost = self.own_stop()
+        return Stall(lost) if lost else super().fault(modes, now)
+
+    def own_stop(self) -> str:
+        """See Drives."""
+        for joint, known in enumerate(self._known):
+            if known.mode == frames.Mode.TIMEOUT:
+                return f"{self.where(joint)}: its watchdog ran out: it damps until it is stopped (mode 11)"
+        return ""
+
+    # ---- listening
+
+    def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
+        """See Drives."""
+        for joint, settings in enumerate(self._settings):
+            if can_id & 0xFF == settings.id and can_id & 0x1FFFFFFF < 0x10000 and _flagged(can_id & 0xFFFF) == can_id:
+                order = _order_of(data)
+                return None if order is None else (joint, order)
+        return None
+
+
+def _power(known: _Known) -> Power:
+    if known.mode in STOPPED_MODES:
+        return Power.STOPPED
+    return STOPS[frames.Mode(known.mode)] if known.mode in STOPS else Power.READY
+
+
+def _fault_text(known: _Known) -> str:
+    if known.mode == frames.Mode.FAULT:
+        return f"{FAULTS.get(known.fault, 'unknown fault')} (fault {known.fault})"
+    return ""
+
+
+def _reply_id(settings: MoteusSettings) -> int:
+    return _flagged(settings.id << 8 | settings.source)
+
+
+def _flagged(number: int) -> int:
+    """Identifier with its flag: 29 bits where it does not fit 11."""
+    return number | EXTENDED * (number > 0x7FF)
+
+
+def _order_of(data: bytes) -> Order | None:
+    """The order that the bytes of a frame give; None if they command no mode."""
+    values = CYCLE_COMMAND.unpack(data) or {
+        each.register: each.value for each in frames.unpack(data) if each.kind == WRITE
+    }
+    mode = values.get(Register.MODE)
+    if mode is None:
+        return None
+    if mode != frames.Mode.POSITION:
+        power = {0: Power.OFF, 12: Power.STOPPED, 15: Power.STOPPED}.get(int(mode) if math.isfinite(mode) else 0)
+        return no_order()._replace(power=power or Power.UNKNOWN)
+    stiff = values.get(Register.COMMAND_KP_SCALE, 1.0) > 0
+    position = values.get(Register.COMMAND_POSITION, math.nan) * TURN
+    velocity = values.get(Register.COMMAND_VELOCITY, 0.0) * TURN
+    torque = values.get(Register.COMMAND_TORQUE, 0.0)
+    return Order(Power.ON, False, Mode.POSITION if stiff else Mode.TORQUE, position, velocity, torque, 0.0, 0.0)
+
+
+def _float_within(value: float, most: float) -> float:
+    """A value within ±most that stays within after rounding to a 32-bit float."""
+    shrunk = most * (1 - 2.0**-23)
+    return max(-shrunk, min(shrunk, value))
+
+
+def _finite(value: float) -> float:
+    return value if math.isfinite(value) else math.nan

@@ -1,0 +1,343 @@
+"""ODrive axes on one bus (CANSimple): inputs go out each cycle, estimates and torques come by the drive's own clock.
+
+The drive's cyclic messages, its watchdog and its limits are set over USB: CANSimple cannot read them.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from armlink.arm_file import ArmFile, LinkJoint
+from armlink.bus.port import REMOTE, Frame
+from armlink.drives.base import BasicDrives, no_order
+from armlink.drives.family import Ask
+from armlink.drives.odrive import frames
+from armlink.drives.odrive.frames import (
+    INPUT_FEED_FORWARD,
+    PASSTHROUGH,
+    POSITION_CONTROL,
+    TORQUE_CONTROL,
+    AxisError,
+    AxisState,
+    Message,
+    error_names,
+    identifier,
+    pack,
+    unpack,
+)
+from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
+from armlink.drives.traits import Traits
+from armlink.errors import BusFault, Stall
+
+TURN = 2 * math.pi
+TRAITS = Traits(torque="current", calibration="host", silence="falls", bounds=(), cadence="cyclic", frame="11")
+FROM_DRIVE = (
+    Message.VERSION, Message.HEARTBEAT, Message.ERROR, Message.ESTIMATES, Message.CURRENT, Message.TEMPERATURE,
+    Message.BUS, Message.TORQUES,
+)  # fmt: skip
+FROM_HOST = (
+    Message.ESTOP, Message.AXIS_STATE, Message.CONTROLLER_MODE, Message.INPUT_POSITION, Message.INPUT_VELOCITY,
+    Message.INPUT_TORQUE, Message.LIMITS, Message.CLEAR_ERRORS, Message.POSITION_GAIN, Message.VELOCITY_GAINS,
+)  # fmt: skip
+ASK_AGAIN = 0.25
+"""A request that shows in no heartbeat is sent again after this time [s]."""
+PATIENCE = 0.5
+"""Longest wait for heartbeat, estimates and torques at the start [s]."""
+LARGEST_POSITION = 1e5
+"""No motor's position is larger [rev]; a larger one is no reading."""
+
+
+@dataclass
+class _Known:
+    """What is known of one axis."""
+
+    limits: Limits | None = None
+    heartbeat: frames.Heartbeat | None = None
+    position: float = math.nan
+    """[rad]."""
+    velocity: float = math.nan
+    torque: float = math.nan
+    """That came since the newest estimates [N·m]; it goes with the next ones."""
+    came: set[int] = field(default_factory=set)
+    """Messages that have come."""
+    mode: int = 0
+    """Control mode that it was last told; 0: none."""
+    asked: tuple[int, float] = (0, -math.inf)
+    """Message or state that was last asked for, and when [s]."""
+    sent: Order | None = None
+    stopping: bool = False
+    """The newest input holds it where it stood, whatever was ordered."""
+
+
+class ODriveDrives(BasicDrives):
+    """The axes of one bus; see `Drives`."""
+
+    def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
+        """Nothing is sent."""
+        super().__init__(joints, TRAITS)
+        self._settings = [joint.settings for joint in joints]
+        self._known = [_Known() for _ in joints]
+        self._joint_of = {settings.node: joint for joint, settings in enumerate(self._settings)}
+
+    def routes(self) -> Mapping[int, int]:
+        """See Drives."""
+        return {identifier(node, message): joint for node, joint in self._joint_of.items() for message in FROM_DRIVE}
+
+    def commands(self) -> Mapping[int, str]:
+        """See Drives."""
+        return {
+            identifier(node, message): f"{message.name.lower().replace('_', ' ')} to {self.names[joint]}"
+            for node, joint in self._joint_of.items()
+            for message in FROM_HOST
+        }
+
+    def reading_ids(self) -> Mapping[int, int]:
+        """See Drives."""
+        return {identifier(node, Message.ESTIMATES): joint for node, joint in self._joint_of.items()}
+
+    # ---- set-up
+
+    def identify(self, ask: Ask) -> list[DriveIdentity]:
+        """See Drives: by a remote frame for the version, else by the cyclic heartbeat."""
+        found = []
+        for joint, settings in enumerate(self._settings):
+            version = self._request(ask, joint, Message.VERSION)
+            if version is None:
+                known = self._known[joint]
+                known.came.discard(Message.HEARTBEAT)
+                there = ask.wait(lambda known=known: Message.HEARTBEAT in known.came, PATIENCE)  # type: ignore[misc]
+                found.append(DriveIdentity(joint, settings.address, there, "ODrive" if there else ""))
+                continue
+            _, product, major, minor, *firmware, _ = (int(value) for value in version)
+            name = f"ODrive {product}.{major}.{minor}"
+            text = ".".join(str(part) for part in firmware)
+            wrong = "" if firmware[:2] >= [0, 6] else f"firmware {text}, expected 0.6 or newer"
+            found.append(DriveIdentity(joint, settings.address, True, name, "", text, self.power(joint), wrong))
+        return found
+
+    def _request(self, ask: Ask, joint: int, message: Message) -> tuple[float, ...] | None:
+        """Values of a message that is asked for by a remote frame; None where nothing answers."""
+        can_id = identifier(self._settings[joint].node, message)
+
+        def answer(came: int, data: bytes) -> tuple[float, ...] | None:
+            return unpack(message, data) if came == can_id else None
+
+        return ask((can_id | REMOTE, bytes(8)), answer)
+
+    def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
+        """See Drives: idle, and its cyclic messages come."""
+        for settings in self._settings:
+            ask.send(identifier(settings.node, Message.AXIS_STATE), pack(Message.AXIS_STATE, AxisState.IDLE))
+        wanted = {Message.HEARTBEAT, Message.ESTIMATES, Message.TORQUES}
+        for known in self._known:
+            known.came.clear()
+        ask.wait(lambda: all(wanted <= known.came for known in self._known), PATIENCE)
+        return [self._result(joint, limit) for joint, limit in enumerate(limits)]
+
+    def _result(self, joint: int, limit: Limits) -> Setup:
+        known, name, address = self._known[joint], self.names[joint], self._settings[joint].address
+        if Message.HEARTBEAT not in known.came:
+            raise BusFault(f"{name}: no heartbeat from {address}: is it powered, its node id and bit rate right?")
+        if Message.ESTIMATES not in known.came or not math.isfinite(known.position):
+            raise BusFault(
+                f"{name}: {address} sends no encoder estimates: set axis0.config.can.encoder_msg_rate_ms to the cycle"
+            )
+        lost: tuple[str, ...] = ()
+        modes = {int(Mode.POSITION), int(Mode.TORQUE)}
+        if Message.TORQUES not in known.came:
+            lost = ("torques (1Ch) do not come: no torque reading; set axis0.config.can.torques_msg_rate_ms",)
+            modes.discard(int(Mode.TORQUE))
+        known.limits, known.mode = limit, 0
+        return Setup(
+            position=known.position,
+            torque=0.0,
+            position_step=TURN * 2.0**-23 * max(1.0, abs(known.position) / TURN),
+            modes=frozenset(modes),
+            lost=lost,
+            notes=("watchdog, current limit and torque constant are set over USB and cannot be read over CAN",),
+        )
+
+    # ---- cycle
+
+    def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
+        """See Drives."""
+        return [
+            frame
+            for joint, order in enumerate(orders)
+            if order is not None
+            for frame in self._frames(joint, order, now)
+        ]
+
+    def _frames(self, joint: int, order: Order, now: float) -> list[Frame]:
+        known = self._known[joint]
+        state = known.heartbeat.state if known.heartbeat else AxisState.UNDEFINED
+        on = state == AxisState.CLOSED_LOOP
+        held, known.sent, known.stopping = known.sent, None, False
+        if order.power is Power.ON and on:
+            return self._input(joint, order)
+        if order.power is Power.ON and order.walk and known.heartbeat is not None:
+            return self._towards_on(joint, order, now)
+        if order.power is Power.STOPPED and on:
+            # no state in which it holds without its host: hold by input, where it stands now
+            known.stopping = True
+            at = held.position if held is not None and held.power is Power.STOPPED else known.position
+            return self._input(joint, Order(Power.STOPPED, False, Mode.POSITION, at, 0.0, 0.0, 0.0, 0.0))
+        if (
+            order.power is not Power.ON
+            and (on or state == AxisState.UNDEFINED)
+            and _may_ask(known, AxisState.IDLE, now)
+        ):
+            return [self._message(joint, Message.AXIS_STATE, AxisState.IDLE)]
+        return []
+
+    def _towards_on(self, joint: int, order: Order, now: float) -> list[Frame]:
+        known = self._known[joint]
+        found: list[Frame] = []
+        if known.heartbeat is not None and known.heartbeat.error:
+            if _may_ask(known, -Message.CLEAR_ERRORS, now):
+                found = [self._message(joint, Message.CLEAR_ERRORS, 0)]
+            return found
+        known.mode = 0
+        fed = self._input(joint, order)
+        known.sent = None
+        if _may_ask(known, AxisState.CLOSED_LOOP, now):
+            return [*fed, self._message(joint, Message.AXIS_STATE, AxisState.CLOSED_LOOP)]
+        return fed
+
+    def _input(self, joint: int, order: Order) -> list[Frame]:
+        """Control mode where it changes, and the input."""
+        known = self._known[joint]
+        if known.limits is None:
+            raise BusFault(f"{self.names[joint]}: a command before the set-up")
+        control = TORQUE_CONTROL if order.mode == Mode.TORQUE else POSITION_CONTROL
+        if control == TORQUE_CONTROL:
+            most = known.limits.max_torque * (1 - 2.0**-23)
+            data = pack(Message.INPUT_TORQUE, max(-most, min(most, _checked(order.torque))))
+            frame = identifier(self._settings[joint].node, Message.INPUT_TORQUE), data
+        else:
+            data = frames.input_position(_checked(order.position) / TURN, _checked(order.velocity) / TURN, 0.0)
+            frame = identifier(self._settings[joint].node, Message.INPUT_POSITION), data
+        told = _order_of(*frame)
+        assert told is not None
+        known.sent = told._replace(power=order.power)
+        if known.mode == control:
+            return [frame]
+        known.mode = control
+        return [self._message(joint, Message.CONTROLLER_MODE, control, PASSTHROUGH), frame]
+
+    def _message(self, joint: int, message: Message, *values: int) -> Frame:
+        return identifier(self._settings[joint].node, message), pack(message, *values)
+
+    def sent(self, joint: int) -> Order | None:
+        """See Drives."""
+        return self._known[joint].sent
+
+    def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
+        """See Drives."""
+        joint = self._joint_of.get(can_id >> 5)
+        message = can_id & 0x1F
+        values = unpack(message, data)
+        if joint is None or values is None or message not in FROM_DRIVE:
+            return None
+        known = self._known[joint]
+        known.came.add(message)
+        if message == Message.HEARTBEAT:
+            known.heartbeat = frames.heartbeat(data)
+            return self.note(Reading(joint, power=_power(known), fault=_fault_text(known)))
+        if message == Message.ESTIMATES:
+            position, velocity = values
+            if not abs(position) < LARGEST_POSITION or not math.isfinite(velocity):
+                return None
+            known.position, known.velocity = position * TURN, velocity * TURN
+            torque, known.torque = known.torque, math.nan
+            return Reading(joint, known.position, known.velocity, torque)
+        if message == Message.TORQUES and math.isfinite(values[1]):
+            known.torque = values[1]
+            return None
+        if message == Message.TEMPERATURE and all(math.isfinite(value) for value in values):
+            return self.note(Reading(joint, temperature=max(values)))
+        return None
+
+    def fault(self, modes: Sequence[int], now: float) -> BusFault | None:
+        """See Drives."""
+        lost = self.own_stop()
+        return Stall(lost) if lost else super().fault(modes, now)
+
+    def own_stop(self) -> str:
+        """See Drives."""
+        for joint, known in enumerate(self._known):
+            beat = known.heartbeat
+            if beat is not None and beat.state != AxisState.CLOSED_LOOP and beat.error & AxisError.WATCHDOG:
+                return f"{self.where(joint)}: its watchdog ran out: idle, the torque is off"
+        return ""
+
+    def forget(self, restarts: bool = False) -> None:
+        """See Drives; the next request goes out at once."""
+        super().forget(restarts)
+        for known in self._known:
+            known.asked = (0, -math.inf)
+
+    # ---- listening
+
+    def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
+        """See Drives."""
+        joint = self._joint_of.get(can_id >> 5)
+        if joint is None:
+            return None
+        order = _order_of(can_id, data)
+        return None if order is None else (joint, order)
+
+
+def _may_ask(known: _Known, what: int, now: float) -> bool:
+    """Whether something may be asked for: not again before the last request for it has had time to show."""
+    if known.asked[0] == what and now - known.asked[1] < ASK_AGAIN:
+        return False
+    known.asked = (what, now)
+    return True
+
+
+def _power(known: _Known) -> Power:
+    """The state counts, not the error: that can be 0 after a disarm."""
+    beat = known.heartbeat
+    if beat is None:
+        return Power.UNKNOWN
+    if beat.state == AxisState.CLOSED_LOOP:
+        return Power.STOPPED if known.stopping else Power.ON
+    if beat.error & AxisError.WATCHDOG:
+        return Power.STOPPED
+    if beat.error:
+        return Power.FAULT
+    return Power.OFF if beat.state == AxisState.IDLE else Power.READY
+
+
+def _fault_text(known: _Known) -> str:
+    error = known.heartbeat.error & ~AxisError.WATCHDOG if known.heartbeat else 0
+    return f"{error_names(error)} (axis error {error:#x})" if error else ""
+
+
+def _order_of(can_id: int, data: bytes) -> Order | None:
+    """The order that a host's message gives, or None."""
+    message = can_id & 0x1F
+    values = unpack(message, data)
+    if message == Message.ESTOP:
+        return no_order()._replace(power=Power.OFF)
+    if values is None:
+        return None
+    if message == Message.AXIS_STATE:
+        power: dict[float, Power] = {AxisState.IDLE: Power.OFF, AxisState.CLOSED_LOOP: Power.ON}
+        return no_order()._replace(power=power[values[0]]) if values[0] in power else None
+    if message == Message.INPUT_TORQUE:
+        return Order(Power.ON, False, Mode.TORQUE, math.nan, math.nan, values[0], 0.0, 0.0)
+    if message == Message.INPUT_POSITION:
+        position, velocity, torque = values
+        return Order(
+            Power.ON, False, Mode.POSITION, position * TURN, velocity * INPUT_FEED_FORWARD * TURN,
+            torque * INPUT_FEED_FORWARD, 0.0, 0.0,
+        )  # fmt: skip
+    return None
+
+
+def _checked(value: float) -> float:
+    if not math.isfinite(value):
+        raise ValueError(f"an order of {value}: expected a finite number")
+    return value

@@ -1,0 +1,13 @@
+"""The ODrive family, as the registry finds it."""
+
+from armlink.drives.family import Family
+from armlink.drives.odrive.drives import TRAITS, ODriveDrives
+from armlink.drives.odrive.settings import ODriveSettings
+
+FAMILY = Family(
+    name="odrive",
+    traits=TRAITS,
+    settings=ODriveSettings,
+    build=ODriveDrives,
+    summary="ODrive Pro, S1, Micro with firmware 0.6, CANSimple",
+)

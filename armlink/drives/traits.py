@@ -1,0 +1,33 @@
+"""Traits: what the drives of a family are like, so that the link knows what it may rely on."""
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+TorqueSource = Literal["link", "current"]
+CalibrationPlace = Literal["controller", "host"]
+Silence = Literal["holds", "damps", "falls", "keeps on"]
+Bound = Literal["torque", "window", "speed"]
+Cadence = Literal["sync", "reply", "cyclic"]
+FrameKind = Literal["11", "29", "fd"]
+
+
+@dataclass(frozen=True)
+class Traits:
+    """What a drive is like."""
+
+    torque: TorqueSource
+    """Whether its torque reading is of a sensor at the joint (link side), or current times torque constant."""
+    calibration: CalibrationPlace
+    """Who applies gain and offset of the torque reading: the controller itself, or the host (calibration record)."""
+    silence: Silence
+    """What it does by itself when its host falls silent, once `set_up` has set its watchdog."""
+    bounds: tuple[Bound, ...]
+    """What the drive itself bounds, whatever the host commands."""
+    cadence: Cadence
+    """When a reading comes: after SYNC, as the reply to a command, or by the drive's own clock."""
+    frame: FrameKind
+    """Identifiers of 11 or 29 bits on classical CAN, or CAN FD."""
+
+    def as_json(self) -> dict[str, Any]:
+        """By name, as `armlink drives --json` has them."""
+        return {**asdict(self), "bounds": list(self.bounds)}

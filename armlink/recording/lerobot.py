@@ -1,0 +1,81 @@
+"""LeRobot data sets (format 2 and 3): one recording an episode, positions and position commands.
+
+A data set is a folder with `meta/info.json` and Parquet files under `data/`; `observation.state` holds the positions
+and `action` the commands, in degrees, radians, or a normalised range of the recorder's own calibration.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pa_parquet
+
+from armlink.arrays import Array
+from armlink.errors import BadInput
+from armlink.recording.recording import Recording
+
+STATE, ACTION = "observation.state", "action"
+_COLUMNS = ("episode_index", "timestamp", STATE, ACTION)
+
+
+def is_lerobot(path: Path) -> bool:
+    """Whether a folder is a LeRobot data set."""
+    return (path / "meta" / "info.json").is_file()
+
+
+def load_lerobot(path: Path) -> dict[str, Recording]:
+    """Recordings of all episodes by label (`FOLDER#EPISODE`). Raises BadInput that names what is missing."""
+    names = _names(path)
+    tables = []
+    for file in sorted((path / "data").rglob("*.parquet")):
+        try:
+            table = pa_parquet.read_table(file, columns=list(_COLUMNS))
+        except (pa.ArrowInvalid, pa.ArrowNotImplementedError, KeyError, OSError) as error:
+            raise BadInput(f"{file}: not the data of a LeRobot data set: {str(error).partition(chr(10))[0]}") from None
+        missing = [column for column in _COLUMNS if column not in table.column_names]
+        if missing:
+            raise BadInput(f"{file}: column {missing[0]} is missing: expected {', '.join(_COLUMNS)}")
+        tables.append(table)
+    if not tables:
+        raise BadInput(f"{path}: no Parquet file under data/: download the data set with its data")
+    whole = pa.concat_tables(tables)
+    episodes = np.asarray(whole["episode_index"].to_numpy(), dtype=int)
+    times = np.asarray(whole["timestamp"].to_numpy(), dtype=float)
+    state, action = (_matrix(whole[column], path, column) for column in (STATE, ACTION))
+    if state.shape != action.shape or state.shape[1] != len(names):
+        raise BadInput(
+            f"{path}: {STATE} has {state.shape[1]} values, {ACTION} {action.shape[1]}, for {len(names)} names: "
+            "expected one a joint in each"
+        )
+    found = {}
+    for episode in np.unique(episodes):
+        rows = np.flatnonzero(episodes == episode)
+        rows = rows[np.argsort(times[rows], kind="stable")]
+        found[f"{path}#{episode}"] = Recording(
+            t=times[rows], position=state[rows], position_command=action[rows], names=names
+        )
+    return found
+
+
+def _names(path: Path) -> tuple[str, ...]:
+    """Joint names of the state, without the suffix `.pos`."""
+    try:
+        info = json.loads((path / "meta" / "info.json").read_text())
+        names: Any = info["features"][STATE]["names"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise BadInput(f"{path}/meta/info.json: no names of {STATE} ({type(error).__name__} {error})") from None
+    while isinstance(names, dict):
+        names = next(iter(names.values()), [])
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise BadInput(f"{path}/meta/info.json: names of {STATE} are {names!r}: expected a list of joint names")
+    return tuple(name.removesuffix(".pos") for name in names)
+
+
+def _matrix(column: Any, path: Path, name: str) -> Array:
+    rows = column.to_pylist()
+    widths = {len(row) if row is not None else 0 for row in rows}
+    if len(widths) != 1:
+        raise BadInput(f"{path}: {name} has rows of {min(widths)} to {max(widths)} values: expected one a joint")
+    return np.asarray(rows, dtype=float)

@@ -1,0 +1,207 @@
+"""Simulated Damiao drives: registers, MIT mode, state nibble, TIMEOUT register."""
+
+import struct
+from collections.abc import Callable
+
+from armlink.bus.port import EXTENDED, REMOTE
+from armlink.drives.damiao.frames import (
+    INTEGER_REGISTERS,
+    MIT_MODE,
+    READ,
+    REFRESH,
+    REGISTERS_ID,
+    TIMEOUT_UNIT,
+    WRITE,
+    Register,
+    Reply,
+    Special,
+    State,
+    pack_reply,
+    pack_value,
+    special_of,
+    unpack_value,
+)
+from armlink.drives.mit_packing import MitCommand, MitFeedback, Ranges, unpack_command
+from sim_bus.drives.motor import Motor
+from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
+
+MODELS = {
+    "DM3507": (12.566, 50.0, 5.0),
+    "DM4310": (12.5, 30.0, 10.0),
+    "DM4310P": (12.5, 50.0, 10.0),
+    "DM4340": (12.5, 10.0, 28.0),
+    "DM4340P": (12.5, 10.0, 28.0),
+    "DM6006": (12.5, 45.0, 20.0),
+    "DM8006": (12.5, 45.0, 40.0),
+    "DM8009": (12.5, 45.0, 54.0),
+    "DM10010": (12.5, 20.0, 200.0),
+    "DM6248P": (12.566, 20.0, 120.0),
+}
+"""Registers PMAX, VMAX, TMAX as the maker delivers each model."""
+LEAST_RANGE = 1e-3
+"""A range register of 0 counts as this."""
+STORE = 0xAA
+OTHER_MODES = 0x100, 0x200, 0x300
+"""Offsets of the command ids of the position, velocity and force modes."""
+NO_COMMAND = MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
+WRITABLE = frozenset((0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31, 32, 33, 34, 35))
+
+
+class DamiaoDrive(SimulatedDrive):
+    """One DM-J drive with command id `drive` and reply id `reply`."""
+
+    def __init__(
+        self, motor: Motor, send: Callable[[int, bytes], None], drive: int, reply: int, model: str, serial: int
+    ) -> None:
+        """As the maker delivers it, but for the ids: the deadman is off, the mode is MIT."""
+        super().__init__(motor, send)
+        position, velocity, torque = MODELS[model]
+        self._stored: dict[int, float] = {
+            0: 15.0, 1: 1.2, 2: 100.0, 3: 0.95, 4: 50.0, 5: -50.0, 6: 200.0, 7: reply, 8: drive, 9: 0, 10: MIT_MODE,
+            11: 1e-4, 12: 1e-4, 13: 3, 14: 5016, 15: serial, 16: 14, 17: 0.6, 18: 4e-4, 19: 0.005, 20: 10.0,
+            21: position, 22: velocity, 23: torque, 24: 1000.0, 25: 0.004, 26: 0.002, 27: 50.0, 28: 1.0, 29: 60.0,
+            30: 1.0, 31: 4.0, 32: 100.0, 33: 1000.0, 34: 1000.0, 35: 4, 36: 1, 50: 0.0, 51: 0.0, 52: 0.0, 53: 0.0,
+            54: 0.0, 55: 1.0, 56: 0.0, 59: 40.0, 60: 48.0, 61: STAGE_TEMPERATURE, 62: MOTOR_TEMPERATURE, 63: 0.0,
+            64: 0.0, 65: 0.0, 80: 0.0, 81: 0.0,
+        }  # fmt: skip
+        self.registers = dict(self._stored)
+        self.state = State.DISABLED
+        self.command = NO_COMMAND
+
+    @property
+    def coding(self) -> Ranges:
+        """Ranges by which it really codes and decodes."""
+        position, velocity, torque = (max(self.registers[number], LEAST_RANGE) for number in (21, 22, 23))
+        return Ranges(
+            position * self.scale("position"), velocity * self.scale("velocity"), torque * self.scale("torque")
+        )
+
+    @property
+    def patience(self) -> float:
+        """See SimulatedDrive."""
+        return self.registers[Register.TIMEOUT] * TIMEOUT_UNIT
+
+    def receive(self, can_id: int, data: bytes) -> None:
+        """A command, or a register request that names this drive."""
+        if len(data) != 8:
+            return
+        if can_id == REGISTERS_ID:
+            self._register(data)
+            return
+        special = special_of(data)
+        if special is not None:
+            self._obey(special)
+        elif can_id == self.registers[Register.COMMAND_ID] and self.registers[10] == MIT_MODE:
+            self.command = unpack_command(data, self.coding)
+        self.heard = self.now
+        if self.state is State.ENABLED:
+            self._follow()
+        self._reply()
+
+    def _obey(self, special: Special) -> None:
+        if special is Special.ENABLE and self.state is State.DISABLED:
+            self.state, self.command = State.ENABLED, NO_COMMAND
+        elif (special is Special.DISABLE and self.state is State.ENABLED) or (
+            special is Special.CLEAR_ERROR and self.state is not State.ENABLED and not self.latched
+        ):
+            self._stop(State.DISABLED)
+
+    def _follow(self) -> None:
+        command, coding = self.command, self.coding
+        position = self.motor.position
+        target = command.position + position - _wrapped(position, coding.position)
+        self.motor.impede(command.kp, command.kd, target, command.velocity, command.torque, coding.torque)
+
+    def _stop(self, state: State) -> None:
+        self.state, self.command = state, NO_COMMAND
+        self.motor.free()
+
+    def _reply(self) -> None:
+        if "feedback.lost" in self.faults:
+            return
+        motor, coding = self.motor, self.coding
+        feedback = MitFeedback(_wrapped(motor.position, coding.position), motor.velocity, motor.torque)
+        drive = int(self.registers[Register.COMMAND_ID])
+        reply = Reply(drive, self.state, feedback, int(STAGE_TEMPERATURE), int(MOTOR_TEMPERATURE))
+        self.answer(int(self.registers[Register.REPLY_ID]), pack_reply(reply, coding))
+
+    def _register(self, data: bytes) -> None:
+        drive, request, register = struct.unpack_from("<HBB", data)
+        if drive != self.registers[Register.COMMAND_ID]:
+            return
+        reply_id = int(self.registers[Register.REPLY_ID])
+        if request == REFRESH:
+            self._reply()
+        elif request == STORE:
+            self.flash_writes += 1
+            self._stored = dict(self.registers)
+        elif register in self.registers and request in (READ, WRITE):
+            if request == WRITE and register in WRITABLE:
+                self._write(register, unpack_value(register, data[4:]))
+            value = pack_value(register, self.registers[register])
+            self.answer(reply_id, struct.pack("<HBB4s", drive, request, register, value))
+
+    def _write(self, register: int, value: float) -> None:
+        if register in INTEGER_REGISTERS:
+            value = int(value)
+        if register == Register.CONTROL_MODE:
+            if "mode.refused" in self.faults or value not in (1, 2, 3, 4):
+                return
+            self.command = NO_COMMAND
+            if self.state is State.ENABLED:
+                self._follow()
+        if register in (21, 22, 23) and not 0.0 < value < 1e6:
+            return
+        self.registers[register] = value
+
+    def trip(self) -> None:
+        """Torque off, state D, until the error is cleared."""
+        self._stop(State.LOST_COMMUNICATION)
+
+    def reboot(self) -> None:
+        """See SimulatedDrive."""
+        self.registers = dict(self._stored)
+        self._stop(State.DISABLED)
+
+    def inject(self, fault: str, value: float) -> None:
+        """See SimulatedDrive."""
+        super().inject(fault, value)
+        if fault == "drive.mode":
+            self.registers[Register.CONTROL_MODE] = int(value)
+
+    def lose_feedback(self) -> None:
+        """Replies stop; the drive itself goes on."""
+
+
+class DamiaoFront:
+    """All Damiao drives on one bus: which of them a frame is for."""
+
+    def __init__(self, drives: list[DamiaoDrive]) -> None:
+        """`drives` have different command ids."""
+        self.drives = drives
+        ids = [int(drive.registers[Register.COMMAND_ID]) for drive in drives]
+        self._commanded = {
+            drive_id + offset: drive
+            for drive_id, drive in zip(ids, drives, strict=True)
+            for offset in (0, *OTHER_MODES)
+        }
+
+    def on_frame(self, can_id: int, data: bytes) -> None:
+        """A frame from the bus."""
+        if can_id & (EXTENDED | REMOTE):
+            return
+        if can_id == REGISTERS_ID:
+            for drive in self.drives:
+                drive.on_frame(can_id, data)
+        elif (addressed := self._commanded.get(can_id)) is not None:
+            addressed.on_frame(can_id, data)
+
+    def joint_of(self, can_id: int) -> int | None:
+        """See Front; None where several drives share a reply id."""
+        found = [drive.joint for drive in self.drives if drive.registers[Register.REPLY_ID] == can_id]
+        return found[0] if len(found) == 1 else None
+
+
+def _wrapped(position: float, largest: float) -> float:
+    """Position as the drive shows it, within ±largest."""
+    return (position + largest) % (2 * largest) - largest

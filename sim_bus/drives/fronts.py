@@ -1,0 +1,102 @@
+"""The simulated drives of an arm that are no CANopen nodes, by family and bus."""
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+from zlib import crc32
+
+from armlink.arm_file import ArmFile, LinkJoint
+from armlink.errors import BadInput
+from sim_bus.drives.damiao import MODELS, DamiaoDrive, DamiaoFront
+from sim_bus.drives.moteus import MoteusDrive, MoteusFront
+from sim_bus.drives.motor import Motor
+from sim_bus.drives.odrive import ODriveAxis, ODriveFront, cyclic_periods
+from sim_bus.drives.robstride import RobStrideDrive, RobStrideFront
+from sim_bus.drives.simulated_drive import SimulatedDrive
+
+Send = Callable[[int, bytes], None]
+Joint = tuple[LinkJoint, Motor]
+
+
+class Front(Protocol):
+    """The drives of one family on one bus."""
+
+    @property
+    def drives(self) -> Sequence[SimulatedDrive]:
+        """In arm order."""
+        ...
+
+    def on_frame(self, can_id: int, data: bytes) -> None:
+        """A frame from the bus."""
+        ...
+
+    def joint_of(self, can_id: int) -> int | None:
+        """Joint whose drive sends frames of this identifier, or None."""
+        ...
+
+
+def _damiao(arm: ArmFile, joints: Sequence[Joint], send: Send) -> Front:
+    drives = []
+    for joint, motor in joints:
+        settings = joint.settings
+        if settings.model not in MODELS:
+            raise BadInput(
+                f"{arm.path}: {joint.name}: drive.model is {settings.model!r}; simulated are {', '.join(MODELS)}"
+            )
+        drives.append(DamiaoDrive(motor, send, settings.id, settings.reply, settings.model, _serial(arm, joint)))
+    return DamiaoFront(drives)
+
+
+def _robstride(arm: ArmFile, joints: Sequence[Joint], send: Send) -> Front:
+    return RobStrideFront(
+        [
+            RobStrideDrive(motor, send, each.settings.id, each.settings.model, _serial(arm, each))
+            for each, motor in joints
+        ]
+    )
+
+
+def _moteus(arm: ArmFile, joints: Sequence[Joint], send: Send) -> Front:
+    return MoteusFront([MoteusDrive(motor, send, each.settings.id, _serial(arm, each)) for each, motor in joints])
+
+
+def _odrive(arm: ArmFile, joints: Sequence[Joint], send: Send) -> Front:
+    link = arm.require_link()
+    periods = cyclic_periods(1.0 / link.rate)
+    return ODriveFront(
+        [
+            ODriveAxis(motor, send, each.settings.node, _serial(arm, each), link.deadline, periods)
+            for each, motor in joints
+        ]
+    )
+
+
+FAMILIES: dict[str, Callable[[ArmFile, Sequence[Joint], Send], Front]] = {
+    "damiao": _damiao,
+    "robstride": _robstride,
+    "moteus": _moteus,
+    "odrive": _odrive,
+}
+"""Families that are simulated, besides canopen."""
+
+
+def build_fronts(arm: ArmFile, motors: Sequence[Motor], send: Callable[[str], Send]) -> list[tuple[str, Front]]:
+    """Bus name and front of every family on every bus; `motors` of all joints in arm order, `send(bus)` puts frames.
+
+    Raises BadInput for a family that is not simulated.
+    """
+    groups: dict[tuple[str, str], list[Joint]] = {}
+    for joint, motor in zip(arm.require_link().joints, motors, strict=True):
+        family = joint.settings.family
+        if family == "canopen":
+            continue
+        if family not in FAMILIES:
+            raise BadInput(
+                f"{arm.path}: {joint.name}: drives of family {family!r} are not simulated; there are canopen, "
+                f"{', '.join(FAMILIES)}"
+            )
+        groups.setdefault((joint.bus, family), []).append((joint, motor))
+    return [(bus, FAMILIES[family](arm, joints, send(bus))) for (bus, family), joints in groups.items()]
+
+
+def _serial(arm: ArmFile, joint: LinkJoint) -> int:
+    return crc32(f"{arm.name} {arm.serial} {joint.name}".encode())

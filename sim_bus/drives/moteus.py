@@ -1,0 +1,242 @@
+"""Simulated moteus controllers: registers, position mode with PID, watchdog to zero velocity."""
+
+import math
+from collections.abc import Callable
+
+from armlink.bus.port import EXTENDED, REMOTE
+from armlink.drives.moteus.frames import (
+    FLOAT,
+    INT32,
+    READ,
+    READ_ERROR,
+    REPLY,
+    REPLY_WANTED,
+    WRITE,
+    WRITE_ERROR,
+    Mode,
+    Register,
+    Subframe,
+    identifier,
+    pack_reply,
+    unpack,
+)
+from sim_bus.drives.motor import Motor
+from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
+
+TURN = 2 * math.pi
+DEFAULT_TIMEOUT = 0.1
+"""servo.default_timeout_s [s]."""
+TIMEOUT_TORQUE = 5.0
+"""servo.timeout_max_torque_Nm: largest torque of the zero-velocity mode [N·m]."""
+ENCODER_FAULT = 35
+NO_REGISTER = 1
+HOME_OUTPUT = 2
+"""Home state: positions are those of the output."""
+COMMANDS = {
+    Register.COMMAND_POSITION: math.nan,
+    Register.COMMAND_VELOCITY: 0.0,
+    Register.COMMAND_TORQUE: 0.0,
+    Register.COMMAND_KP_SCALE: 1.0,
+    Register.COMMAND_KD_SCALE: 1.0,
+    Register.COMMAND_MAX_TORQUE: math.nan,
+    Register.COMMAND_STOP_POSITION: math.nan,
+    Register.COMMAND_WATCHDOG: math.nan,
+    0x028: math.nan,
+    0x029: math.nan,
+    0x02A: math.nan,
+    Register.COMMAND_ILIMIT_SCALE: 1.0,
+    0x02C: math.nan,
+    0x02D: 0.0,
+}
+"""Registers of a position command with the values that a command without them has."""
+
+
+class MoteusDrive(SimulatedDrive):
+    """One controller with id `drive`."""
+
+    LATCHES = True
+
+    def __init__(self, motor: Motor, send: Callable[[int, bytes], None], drive: int, serial: int) -> None:
+        """As configured for its joint: gains tuned, encoder at the output."""
+        super().__init__(motor, send)
+        self.drive, self.serial = drive, serial
+        self.mode, self.fault_code = Mode.STOPPED, 0
+        self.command: dict[int, float] = dict(COMMANDS)
+        self._gains = motor.tuned
+        self._target = self._integral = 0.0
+        self._largest = 3 * motor.rated_torque
+
+    @property
+    def patience(self) -> float:
+        """See SimulatedDrive; a command's watchdog of 0 or NaN stands for the default."""
+        asked = self.command[Register.COMMAND_WATCHDOG]
+        return asked if asked > 0 else DEFAULT_TIMEOUT
+
+    @property
+    def watches(self) -> bool:
+        """See SimulatedDrive."""
+        return super().watches and self.mode is Mode.POSITION
+
+    def receive(self, can_id: int, data: bytes) -> None:
+        """A frame whose destination is this controller."""
+        source, replies = can_id >> 8 & 0x7F, can_id >> 8 & REPLY_WANTED
+        frames = list(unpack(data))
+        errors = self._write({each.register: each.value for each in frames if each.kind == WRITE})
+        asked = [each for each in frames if each.kind == READ]
+        if not replies or ("feedback.lost" in self.faults and not self.fault_code):
+            return
+        try:
+            shown = self._shown_registers() if asked else {}
+            content = pack_reply([*errors, *(_reply(each, shown) for each in asked)])
+        except ValueError:  # more than a frame holds: the controller sends none
+            return
+        answer = identifier(self.drive, source)
+        self.answer(answer | EXTENDED * (answer > 0x7FF), content)
+
+    # ---- registers
+
+    def _write(self, values: dict[int, float]) -> list[Subframe]:
+        """Take the registers of a frame; errors for those that cannot be written."""
+        unknown = [number for number in values if number not in COMMANDS and number != Register.MODE]
+        if Register.MODE in values:
+            self.command = COMMANDS | {number: value for number, value in values.items() if number in COMMANDS}
+            self._enter(int(values[Register.MODE]) if math.isfinite(values[Register.MODE]) else 0)
+        else:
+            known = {number: value for number, value in values.items() if number in COMMANDS}
+            self.command |= known
+        return [Subframe(WRITE_ERROR, number, NO_REGISTER) for number in unknown]
+
+    def _shown_registers(self) -> dict[int, float]:
+        motor = self.motor
+        return self.command | {
+            Register.MODE: self.mode,
+            Register.POSITION: motor.position / TURN * self._shown("position"),
+            Register.VELOCITY: motor.velocity / TURN * self._shown("velocity"),
+            Register.TORQUE: motor.torque * self._shown("torque"),
+            Register.Q_CURRENT: motor.torque,
+            0x005: 0.0,
+            0x006: motor.position / TURN,
+            0x007: 0.0,
+            Register.MOTOR_TEMPERATURE: MOTOR_TEMPERATURE,
+            0x00B: 1,
+            Register.HOME_STATE: HOME_OUTPUT,
+            Register.VOLTAGE: BUS_VOLTAGE,
+            Register.TEMPERATURE: STAGE_TEMPERATURE,
+            Register.FAULT: self.fault_code,
+            Register.MODEL: 1,
+            Register.FIRMWARE: 0x0104,
+            Register.SERIAL1: self.serial & 0x7FFFFFFF,
+            Register.SERIAL2: 0,
+            Register.SERIAL3: 0,
+        }
+
+    def _shown(self, quantity: str) -> float:
+        return 1.0 / self.scale(quantity)
+
+    # ---- modes
+
+    def _enter(self, mode: int) -> None:
+        if mode == Mode.STOPPED:
+            if "feedback.lost" not in self.faults and not self.latched:
+                self.mode, self.fault_code = Mode.STOPPED, 0
+            self.motor.free()
+        elif self.mode in (Mode.FAULT, Mode.TIMEOUT) or "mode.refused" in self.faults:
+            return
+        elif mode == Mode.POSITION:
+            self.heard = self.now
+            if self.mode is not Mode.POSITION:
+                self._target, self._integral = self.motor.position, 0.0
+            position = self.command[Register.COMMAND_POSITION] * TURN / self._shown("position")
+            if math.isfinite(position):
+                self._target = position
+            self.mode = Mode.POSITION
+            self._follow()
+        elif mode in (Mode.ZERO_VELOCITY, Mode.BRAKE):
+            self.mode = Mode(mode)
+            self._damp()
+
+    def control(self, duration: float) -> None:
+        """PID with a target that moves at the commanded velocity."""
+        if self.mode is not Mode.POSITION:
+            return
+        command, (_, _, integral) = self.command, self._gains
+        velocity = command[Register.COMMAND_VELOCITY] * TURN
+        if math.isfinite(velocity):
+            self._target += velocity * duration
+        error, most = self._target - self.motor.position, self._torque_limit
+        share = command[Register.COMMAND_ILIMIT_SCALE] * command[Register.COMMAND_KP_SCALE]
+        self._integral = max(-most, min(most, self._integral + integral * error * duration)) if share > 0 else 0.0
+        self._follow()
+
+    @property
+    def _torque_limit(self) -> float:
+        asked = self.command[Register.COMMAND_MAX_TORQUE]
+        return min(abs(asked), self._largest) if math.isfinite(asked) else self._largest
+
+    def _follow(self) -> None:
+        command, (stiffness, damping, _) = self.command, self._gains
+        kp = max(0.0, min(1.0, command[Register.COMMAND_KP_SCALE]))
+        kd = max(0.0, min(kp, command[Register.COMMAND_KD_SCALE]))
+        velocity, torque = command[Register.COMMAND_VELOCITY] * TURN, command[Register.COMMAND_TORQUE]
+        ahead = (torque if math.isfinite(torque) else 0.0) * self.scale("torque") + self._integral
+        velocity = velocity if math.isfinite(velocity) else 0.0
+        self.motor.impede(stiffness * kp, damping * kd, self._target, velocity, ahead, self._torque_limit)
+
+    def _damp(self) -> None:
+        self.motor.impede(0.0, self._gains[1], 0.0, 0.0, 0.0, TIMEOUT_TORQUE)
+
+    def trip(self) -> None:
+        """Position timeout: zero velocity, until a stop."""
+        if self.mode is Mode.POSITION:
+            self.mode = Mode.TIMEOUT
+            self._damp()
+
+    def reboot(self) -> None:
+        """See SimulatedDrive."""
+        self.mode, self.fault_code, self.command = Mode.STOPPED, 0, dict(COMMANDS)
+        self.motor.free()
+
+    def inject(self, fault: str, value: float) -> None:
+        """See SimulatedDrive."""
+        super().inject(fault, value)
+        if fault == "drive.mode":
+            self.mode = Mode.BRAKE
+            self._damp()
+
+    def lose_feedback(self) -> None:
+        """Encoder fault: free."""
+        self.mode, self.fault_code = Mode.FAULT, ENCODER_FAULT
+        self.motor.free()
+
+
+def _reply(asked: Subframe, shown: dict[int, float]) -> Subframe:
+    value = shown.get(asked.register)
+    if value is None:
+        return Subframe(READ_ERROR, asked.register, NO_REGISTER)
+    whole = asked.register in (Register.MODEL, Register.FIRMWARE, Register.SERIAL1)
+    return Subframe(REPLY, asked.register, value, INT32 if whole and asked.resolution == FLOAT else asked.resolution)
+
+
+class MoteusFront:
+    """All moteus controllers on one bus: which of them a frame is for."""
+
+    def __init__(self, drives: list[MoteusDrive]) -> None:
+        """`drives` have different ids."""
+        self.drives = drives
+        self._addressed = {drive.drive: drive for drive in drives}
+
+    def on_frame(self, can_id: int, data: bytes) -> None:
+        """A frame from the bus."""
+        if can_id & REMOTE:
+            return
+        number = can_id & 0x1FFFFFFF
+        if number & 0x7F == 0x7F:
+            for drive in self.drives:
+                drive.on_frame(number, data)
+        elif number >> 16 == 0 and (drive_at := self._addressed.get(number & 0x7F)) is not None:
+            drive_at.on_frame(number, data)
+
+    def joint_of(self, can_id: int) -> int | None:
+        """See Front."""
+        drive = self._addressed.get(can_id >> 8 & 0x7F) if can_id & 0x1FFFFFFF < 0x10000 else None
+        return None if drive is None else drive.joint

@@ -1,0 +1,231 @@
+"""Simulated ODrive axes (CANSimple, firmware 0.6): cyclic messages, cascade of position and velocity, watchdog."""
+
+import math
+from collections.abc import Callable
+
+from armlink.bus.port import EXTENDED, REMOTE
+from armlink.drives.odrive.frames import (
+    INPUT_FEED_FORWARD,
+    PASSTHROUGH,
+    POSITION_CONTROL,
+    TORQUE_CONTROL,
+    AxisError,
+    AxisState,
+    Message,
+    identifier,
+    pack,
+    unpack,
+)
+from sim_bus.drives.motor import Motor
+from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
+
+TURN = 2 * math.pi
+HEARTBEAT_PERIOD = 0.1
+"""axis0.config.can.heartbeat_msg_rate_ms, by default 100 [s]."""
+TORQUE_CONSTANT = 0.083
+"""8.27/KV as its user typed it in [N·m/A]."""
+RATES = {Message.HEARTBEAT: HEARTBEAT_PERIOD, Message.TEMPERATURE: 0.5}
+
+
+def cyclic_periods(cycle: float) -> dict[Message, float]:
+    """Periods [s] as they are to be set for a host with this cycle: estimates and torques once a cycle, in whole ms."""
+    period = max(int(cycle * 1000 + 1e-9), 1) / 1000
+    return {Message.ESTIMATES: period, Message.TORQUES: period}
+
+
+class ODriveAxis(SimulatedDrive):
+    """One axis with node id `node`."""
+
+    LATCHES = True
+
+    def __init__(
+        self,
+        motor: Motor,
+        send: Callable[[int, bytes], None],
+        node: int,
+        serial: int,
+        watchdog: float,
+        rates: dict[Message, float],
+    ) -> None:
+        """Configured over USB: gains tuned, watchdog time [s] (0: off), period of each cyclic message [s]."""
+        super().__init__(motor, send)
+        self.node, self.serial = node, serial
+        self.state, self.errors, self.reason = AxisState.IDLE, 0, 0
+        self.control_mode, self.input_mode = POSITION_CONTROL, PASSTHROUGH
+        stiffness, damping, integral = motor.tuned
+        self._position_gain, self._velocity_gain = stiffness / damping, damping
+        """[1/s], [N·m·s/rad]."""
+        self._integral_gain = integral / self._position_gain
+        self._integral = 0.0
+        self._velocity_limit, self._current_limit = 1e3, 3 * motor.rated_torque / abs(motor.ratio) / TORQUE_CONSTANT
+        self._input = (0.0, 0.0, 0.0)
+        """Position [rad], velocity [rad/s], torque [N·m]."""
+        self._watchdog = watchdog
+        self._periods = RATES | rates
+        self._next = dict.fromkeys(self._periods, 0.0)
+
+    @property
+    def patience(self) -> float:
+        """See SimulatedDrive."""
+        return self._watchdog
+
+    @property
+    def due(self) -> float:
+        """See SimulatedDrive."""
+        return min(super().due, *self._next.values())
+
+    def receive(self, can_id: int, data: bytes) -> None:
+        """A message to this axis."""
+        command = can_id & 0x1F
+        if can_id & REMOTE:
+            self._send_message(command)
+            return
+        if command == Message.ESTOP:
+            self._disarm(AxisError.ESTOP)
+            return
+        values = unpack(command, data)
+        if values is None:
+            return
+        if command == Message.AXIS_STATE:
+            self._request(int(values[0]))
+        elif command == Message.CONTROLLER_MODE:
+            if "mode.refused" not in self.faults:
+                self.control_mode, self.input_mode = int(values[0]), int(values[1])
+        elif command == Message.INPUT_POSITION:
+            ahead = self.scale("torque")
+            position, velocity, torque = values
+            velocity, torque = velocity * INPUT_FEED_FORWARD, torque * INPUT_FEED_FORWARD
+            self._take_input(position * TURN * self.scale("position"), velocity * TURN, torque * ahead)
+        elif command == Message.INPUT_TORQUE:
+            self._take_input(self._input[0], 0.0, values[0] * self.scale("torque"))
+        elif command == Message.LIMITS and all(math.isfinite(value) and value >= 0 for value in values):
+            self._velocity_limit, self._current_limit = values[0] * TURN, values[1]
+        elif command == Message.POSITION_GAIN and math.isfinite(values[0]):
+            self._position_gain = values[0]
+        elif command == Message.VELOCITY_GAINS and all(math.isfinite(value) for value in values):
+            self._velocity_gain, self._integral_gain = values[0] / TURN, values[1] / TURN
+        elif command == Message.CLEAR_ERRORS and not self.latched:
+            self.errors = AxisError.MISSING_ESTIMATE if "feedback.lost" in self.faults else 0
+
+    def _take_input(self, position: float, velocity: float, torque: float) -> None:
+        if not all(math.isfinite(value) for value in (position, velocity, torque)):
+            return
+        self._input, self.heard = (position, velocity, torque), self.now
+        if self.state is AxisState.CLOSED_LOOP:
+            self.control(0.0)
+
+    def _request(self, state: int) -> None:
+        if state == AxisState.IDLE:
+            self.state = AxisState.IDLE
+            self.motor.free()
+        elif state == AxisState.CLOSED_LOOP and not self.errors:
+            if self.state is not AxisState.CLOSED_LOOP:
+                self._input, self._integral = (self.motor.position, 0.0, 0.0), 0.0
+                self.heard, self.reason = self.now, 0
+            self.state = AxisState.CLOSED_LOOP
+            self.control(0.0)
+        self._send_message(Message.HEARTBEAT)
+
+    def _disarm(self, error: int) -> None:
+        self.errors |= error
+        self.reason = error
+        self.state = AxisState.IDLE
+        self.motor.free()
+
+    def control(self, duration: float) -> None:
+        """Cascade: velocity = feed-forward + gain · position error; torque by its error, with an integral term."""
+        if self.state is not AxisState.CLOSED_LOOP:
+            return
+        position, velocity, torque = self._input
+        limit = self._current_limit * TORQUE_CONSTANT
+        if self.control_mode == TORQUE_CONTROL:
+            self._integral = 0.0
+            self.motor.impede(0.0, 0.0, 0.0, 0.0, torque, limit)
+        elif self.control_mode == POSITION_CONTROL:
+            error = position - self.motor.position
+            most, wanted = self._velocity_limit, velocity + self._position_gain * error
+            short = max(-most, min(most, wanted)) - self.motor.velocity
+            moved = self._integral + self._integral_gain * short * duration
+            self._integral = max(-limit, min(limit, moved))
+            gain = self._velocity_gain
+            if abs(wanted) < most:
+                kp = gain * self._position_gain
+                self.motor.impede(kp, gain, position, velocity, torque + self._integral, limit)
+            else:
+                pace = math.copysign(most, wanted)
+                self.motor.impede(0.0, gain, 0.0, pace, torque + self._integral, limit)
+        else:
+            self.motor.impede(0.0, self._velocity_gain, 0.0, velocity, torque, limit)
+
+    # ---- messages
+
+    def pass_time(self, now: float) -> None:
+        """See SimulatedDrive; cyclic messages."""
+        super().pass_time(now)
+        for message, instant in self._next.items():
+            if instant <= now + 1e-9:
+                self._next[message] = max(instant + self._periods[message], now)
+                self._send_message(message)
+
+    def _send_message(self, command: int) -> None:
+        motor, estimated = self.motor, "feedback.lost" not in self.faults
+        content: dict[int, tuple[float, ...]] = {
+            Message.VERSION: (2, 4, 4, 58, 0, 6, 10, 0),
+            Message.HEARTBEAT: (self.errors, self.state, 0, 1),
+            Message.ERROR: (self.errors, self.reason),
+            Message.CURRENT: (motor.torque / TORQUE_CONSTANT,) * 2,
+            Message.TEMPERATURE: (STAGE_TEMPERATURE, MOTOR_TEMPERATURE),
+            Message.BUS: (BUS_VOLTAGE, 0.5),
+        }
+        if estimated:
+            position, velocity = motor.position / TURN, motor.velocity / TURN
+            content[Message.ESTIMATES] = (position / self.scale("position"), velocity / self.scale("velocity"))
+            torque = motor.torque / self.scale("torque")
+            content[Message.TORQUES] = (self._input[2], torque)
+        values = content.get(command)
+        if values is not None:
+            self.answer(identifier(self.node, command), pack(Message(command), *values))
+
+    # ---- faults
+
+    def trip(self) -> None:
+        """Watchdog: idle, free."""
+        self._disarm(AxisError.WATCHDOG)
+
+    def reboot(self) -> None:
+        """See SimulatedDrive."""
+        self.state, self.errors, self.reason = AxisState.IDLE, 0, 0
+        self.control_mode, self.input_mode = POSITION_CONTROL, PASSTHROUGH
+        self.motor.free()
+
+    def inject(self, fault: str, value: float) -> None:
+        """See SimulatedDrive."""
+        super().inject(fault, value)
+        if fault == "drive.mode":
+            self.control_mode = int(value)
+
+    def lose_feedback(self) -> None:
+        """Missing estimate: idle, free."""
+        self._disarm(AxisError.MISSING_ESTIMATE)
+
+
+class ODriveFront:
+    """All ODrive axes on one bus: which of them a frame is for."""
+
+    def __init__(self, drives: list[ODriveAxis]) -> None:
+        """`drives` have different node ids."""
+        self.drives = drives
+        self._addressed = {drive.node: drive for drive in drives}
+
+    def on_frame(self, can_id: int, data: bytes) -> None:
+        """A frame from the bus."""
+        if can_id & EXTENDED:
+            return
+        drive = self._addressed.get((can_id & 0x7FF) >> 5)
+        if drive is not None:
+            drive.on_frame(can_id & (0x7FF | REMOTE), data)
+
+    def joint_of(self, can_id: int) -> int | None:
+        """See Front."""
+        drive = self._addressed.get(can_id >> 5) if can_id < 0x800 else None
+        return None if drive is None else drive.joint

@@ -1,0 +1,215 @@
+"""Simulated RobStride drives in the private protocol."""
+
+import math
+from collections.abc import Callable
+
+from armlink.bus.port import EXTENDED, REMOTE
+from armlink.drives.mit_packing import MitCommand, MitFeedback, Ranges
+from armlink.drives.robstride.frames import (
+    MOTION_MODE,
+    NEVER_READ,
+    RANGES,
+    TIMEOUT_UNIT,
+    Feedback,
+    Mode,
+    Parameter,
+    Type,
+    data_of,
+    identifier,
+    kind_of,
+    pack_feedback,
+    pack_value,
+    unpack_motion,
+    unpack_value,
+)
+from sim_bus.drives.motor import Motor
+from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, SimulatedDrive
+
+NO_COMMAND = MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
+HOST = 0xFD
+"""Host id to which feedback goes before a host has shown its own."""
+ENCODER_FAULT = 1 << 3
+REPORT_PERIOD = 0.01
+"""Period of active reports (type 24) [s]."""
+IDENTITY_TARGET = 0xFE
+READ_ONLY = frozenset((Parameter.POSITION, Parameter.CURRENT, Parameter.VELOCITY, Parameter.BUS_VOLTAGE))
+
+
+class RobStrideDrive(SimulatedDrive):
+    """One drive with id `drive`."""
+
+    def __init__(self, motor: Motor, send: Callable[[int, bytes], None], drive: int, model: str, serial: int) -> None:
+        """As the maker delivers it: deadman off, motion mode."""
+        super().__init__(motor, send)
+        self.drive, self.serial = drive, serial
+        self._ranges = RANGES[model]
+        self._stored: dict[int, float] = {
+            Parameter.RUN_MODE: MOTION_MODE,
+            0x7006: 0.0,
+            0x700A: 0.0,
+            Parameter.LIMIT_TORQUE: self._ranges.torque,
+            0x7010: 0.17,
+            0x7011: 0.012,
+            0x7014: 0.1,
+            0x7016: 0.0,
+            0x7017: 2.0,
+            Parameter.LIMIT_CURRENT: 16.0,
+            0x701E: 40.0,
+            0x701F: 6.0,
+            0x7020: 0.02,
+            0x7021: 0.1,
+            Parameter.TIMEOUT: 0,
+            Parameter.ZERO_STATE: 1,
+        }
+        self.parameters = dict(self._stored)
+        self.mode, self.fault_bits = Mode.RESET, 0
+        self.command = NO_COMMAND
+        self._host, self._reports_at = HOST, math.inf
+
+    @property
+    def coding(self) -> Ranges:
+        """Ranges by which it really codes and decodes."""
+        position, velocity, torque, kp, kd = self._ranges
+        return Ranges(
+            position * self.scale("position"), velocity * self.scale("velocity"), torque * self.scale("torque"), kp, kd
+        )
+
+    @property
+    def patience(self) -> float:
+        """See SimulatedDrive."""
+        return self.parameters[Parameter.TIMEOUT] * TIMEOUT_UNIT
+
+    @property
+    def due(self) -> float:
+        """See SimulatedDrive."""
+        return min(super().due, self._reports_at)
+
+    def receive(self, can_id: int, data: bytes) -> None:
+        """A frame whose target is this drive."""
+        kind = kind_of(can_id)
+        if len(data) != 8:
+            return
+        if kind != Type.MOTION:
+            self._host = data_of(can_id) & 0xFF
+        if kind == Type.IDENTITY:
+            self.answer(
+                identifier(Type.IDENTITY, self.drive, IDENTITY_TARGET) | EXTENDED, self.serial.to_bytes(8, "little")
+            )
+        elif kind == Type.READ:
+            self._read(int.from_bytes(data[:2], "little"))
+        elif kind == Type.SAVE:
+            self.flash_writes += 1
+            self._stored = dict(self.parameters)
+        elif kind == Type.REPORT:
+            self._reports_at = self.now + REPORT_PERIOD if data[6] == 1 else math.inf
+        elif kind in (Type.MOTION, Type.ENABLE, Type.STOP, Type.WRITE):
+            self._obey(kind, can_id, data)
+            self._feed_back(Type.FEEDBACK)
+
+    def _obey(self, kind: int, can_id: int, data: bytes) -> None:
+        if kind == Type.WRITE:
+            self._write(int.from_bytes(data[:2], "little"), data[4:8])
+            return
+        self.heard = self.now
+        if kind == Type.ENABLE:
+            if not self.fault_bits and not self.latched and self.mode is not Mode.RUN:
+                self.mode, self.command = Mode.RUN, NO_COMMAND
+                self._follow()
+        elif kind == Type.STOP:
+            self._stop()
+            if data[0] == 1 and "feedback.lost" not in self.faults:
+                self.fault_bits = 0
+        elif self.parameters[Parameter.RUN_MODE] == MOTION_MODE:
+            self.command = unpack_motion(can_id, data, self.coding)
+            if self.mode is Mode.RUN:
+                self._follow()
+
+    def _follow(self) -> None:
+        command = self.command
+        limit = min(self.coding.torque, max(self.parameters[Parameter.LIMIT_TORQUE], 0.0))
+        self.motor.impede(command.kp, command.kd, command.position, command.velocity, command.torque, limit)
+
+    def _stop(self) -> None:
+        self.mode, self.command = Mode.RESET, NO_COMMAND
+        self.motor.free()
+
+    def _feed_back(self, kind: int) -> None:
+        if "feedback.lost" in self.faults and not self.fault_bits:
+            return
+        motor = self.motor
+        motion = MitFeedback(motor.position, motor.velocity, motor.torque)
+        feedback = Feedback(self.drive, self.fault_bits, self.mode, motion, MOTOR_TEMPERATURE)
+        can_id, data = pack_feedback(feedback, self._host, self.coding, kind)
+        self.answer(can_id | EXTENDED, data)
+
+    def _read(self, parameter: int) -> None:
+        live = {
+            Parameter.POSITION: self.motor.position,
+            Parameter.VELOCITY: self.motor.velocity,
+            Parameter.CURRENT: self.motor.torque,
+            Parameter.BUS_VOLTAGE: BUS_VOLTAGE,
+        }
+        value = (live | self.parameters).get(parameter)
+        unknown = NEVER_READ << 8 if value is None else 0
+        head = identifier(Type.READ, unknown | self.drive, self._host)
+        content = bytes(4) if value is None else pack_value(parameter, value)
+        self.answer(head | EXTENDED, parameter.to_bytes(2, "little") + bytes(2) + content)
+
+    def _write(self, parameter: int, content: bytes) -> None:
+        if parameter not in self.parameters or parameter in READ_ONLY:
+            return
+        if parameter == Parameter.RUN_MODE and (self.mode is Mode.RUN or "mode.refused" in self.faults):
+            return
+        value = unpack_value(parameter, content)
+        if math.isfinite(value):
+            self.parameters[parameter] = value
+
+    def pass_time(self, now: float) -> None:
+        """See SimulatedDrive; active reports."""
+        super().pass_time(now)
+        if self._reports_at <= now:
+            self._reports_at = max(self._reports_at + REPORT_PERIOD, now)
+            self._feed_back(Type.REPORT)
+
+    def trip(self) -> None:
+        """Mode reset, free; no fault is reported."""
+        self._stop()
+
+    def reboot(self) -> None:
+        """See SimulatedDrive."""
+        self.parameters = dict(self._stored)
+        self.fault_bits, self._reports_at, self._host = 0, math.inf, HOST
+        self._stop()
+
+    def inject(self, fault: str, value: float) -> None:
+        """See SimulatedDrive."""
+        super().inject(fault, value)
+        if fault == "drive.mode":
+            self.parameters[Parameter.RUN_MODE] = int(value)
+
+    def lose_feedback(self) -> None:
+        """Encoder fault: free, with the bit set."""
+        self.fault_bits |= ENCODER_FAULT
+        self._stop()
+
+
+class RobStrideFront:
+    """All RobStride drives on one bus: which of them a frame is for."""
+
+    def __init__(self, drives: list[RobStrideDrive]) -> None:
+        """`drives` have different ids."""
+        self.drives = drives
+        self._addressed = {drive.drive: drive for drive in drives}
+
+    def on_frame(self, can_id: int, data: bytes) -> None:
+        """A frame from the bus."""
+        if not can_id & EXTENDED or can_id & REMOTE:
+            return
+        drive = self._addressed.get(can_id & 0xFF)
+        if drive is not None:
+            drive.on_frame(can_id & 0x1FFFFFFF, data)
+
+    def joint_of(self, can_id: int) -> int | None:
+        """See Front."""
+        drive = self._addressed.get(can_id >> 8 & 0xFF) if can_id & EXTENDED else None
+        return None if drive is None else drive.joint

@@ -1,0 +1,115 @@
+"""Common part of simulated drives that are no CANopen nodes: motor, frames out, injected firmware faults."""
+
+import math
+from collections.abc import Callable
+
+from armlink.bus.port import CLASSICAL
+from sim_bus.drives.motor import Motor
+
+STAGE_TEMPERATURE, MOTOR_TEMPERATURE = 31.0, 33.0
+"""Temperatures that every drive reports [°C]."""
+BUS_VOLTAGE = 48.0
+
+
+class SimulatedDrive:
+    """One drive on one joint. A family's drive overrides receive(), control(), and what a fault does."""
+
+    LATCHES = False
+    """Whether a trip of the watchdog ends only by a command of its own."""
+
+    def __init__(self, motor: Motor, send: Callable[[int, bytes], None]) -> None:
+        """`send(can_id, data)` puts a frame on the drive's bus."""
+        self.motor, self.joint = motor, motor.joint
+        self.now = 0.0
+        self.heard = 0.0
+        """When its host last fed the watchdog [s]."""
+        self.unplugged = False
+        """Disconnected from the bus."""
+        self.flash_writes = 0
+        """Commands to write flash that it got."""
+        self.faults: dict[str, float] = {}
+        """Firmware faults in force, by id, with their values."""
+        self._send = send
+
+    # ---- bus
+
+    def on_frame(self, can_id: int, data: bytes) -> None:
+        """A frame that its family takes as addressed to it; lost where it is unplugged."""
+        if not self.unplugged:
+            self.receive(can_id, data)
+
+    def receive(self, can_id: int, data: bytes) -> None:
+        """Process a frame."""
+        raise NotImplementedError
+
+    def answer(self, can_id: int, data: bytes) -> None:
+        """Send a frame, but from an unplugged drive."""
+        if not self.unplugged:
+            self._send(can_id | CLASSICAL * ("drive.classic" in self.faults), data)
+
+    # ---- time
+
+    @property
+    def patience(self) -> float:
+        """Set time of the watchdog [s]; 0 or infinite where it is off."""
+        return 0.0
+
+    @property
+    def due(self) -> float:
+        """When the drive next acts by itself [s]."""
+        patience = self.patience
+        return self.heard + patience if patience and self.watches else math.inf
+
+    @property
+    def watches(self) -> bool:
+        """Whether the watchdog runs."""
+        return self.motor.powered and "watchdog.off" not in self.faults
+
+    def pass_time(self, now: float) -> None:
+        """It is `now` [s]: watchdog and cyclic frames."""
+        self.now = now
+        self.motor.pass_time(now)
+        if self.watches and self.patience and now - self.heard > self.patience:
+            self.trip()
+
+    def postpone(self, seconds: float) -> None:
+        """Postpone the watchdog [s], because the simulated arm itself was late."""
+        self.heard += seconds
+
+    def control(self, duration: float) -> None:
+        """Set the motor's law for the next `duration` [s], for drives with an integral term or a moving target."""
+
+    # ---- faults
+
+    def trip(self) -> None:
+        """The watchdog acts."""
+        raise NotImplementedError
+
+    def reboot(self) -> None:
+        """Power cycle: what is not in flash is lost; a latched fault ends."""
+        raise NotImplementedError
+
+    def inject(self, fault: str, value: float) -> None:
+        """A firmware fault begins."""
+        self.faults[fault] = value
+        if fault in ("drive.trip", "drive.latched"):
+            self.trip()
+        elif fault == "feedback.lost":
+            self.lose_feedback()
+
+    def lose_feedback(self) -> None:
+        """The encoder no longer answers the drive."""
+        self.motor.free()
+
+    def end_faults(self) -> None:
+        """All injected faults end; what they did stays until it is cleared by the host."""
+        self.faults.clear()
+
+    @property
+    def latched(self) -> bool:
+        """Whether nothing but a power cycle clears a trip."""
+        return "drive.latched" in self.faults
+
+    def scale(self, quantity: str) -> float:
+        """Factor by which the drive's coding of `position`, `velocity` or `torque` differs from its registers."""
+        return self.faults.get(f"scale.{quantity}", 1.0)

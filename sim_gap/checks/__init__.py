@@ -1,0 +1,1 @@
+"""Checks of mapping, units and clocks, before any effect is fitted."""

@@ -1,0 +1,98 @@
+"""The rows' times: jitter of receipt, and rows that repeat the one before."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from armlink.recording.corrections import Corrections
+from armlink.recording.recording import Recording, slice_rows
+from gcomp.arrays import Array
+from sim_gap.checks.finding import Finding
+
+JITTER = 0.2
+"""Standard deviation of the steps over their median from which the times may be those of receipt."""
+SMOOTHER = 0.7
+"""Roughness of the positions on even times over that on the recorded ones, below which the recorded are of receipt."""
+REPEATED = 0.03
+"""Share of repeated rows in motion from which a recording is said to repeat."""
+
+
+def even_times(recording: Recording, stated: Corrections) -> tuple[Recording, list[Finding]]:
+    """The recording on the sample times that its times of receipt scatter about, if they do."""
+    if "t" in stated.clock or recording.t.size < 50:
+        return recording, []
+    steps = np.diff(recording.t)
+    period = float(np.median(steps))
+    if float(np.std(np.clip(steps, 0.0, 5.0 * period))) < JITTER * period:
+        return recording, []
+    sampled = _sample_times(recording.t)
+    if sampled is None:
+        return recording, []
+    before, after = (_roughness(t, recording.position) for t in (recording.t, sampled))
+    if after > SMOOTHER * before:
+        return recording, []
+    scatter = float(np.std(recording.t - sampled))
+    evidence = (
+        f"steps scatter by {scatter * 1e3:.1f} ms about even samples of {1e3 * float(np.median(np.diff(sampled))):.2f} "
+        f"ms, on which the positions are {before / max(after, 1e-12):.1f} times as smooth: times of receipt"
+    )
+    values = {**vars(recording), "t": sampled}
+    return Recording(**values), [Finding("jitter", "t", "all", evidence, "--clock t=0 (keep the times)", True)]
+
+
+def _sample_times(t: Array) -> Array | None:
+    """Even times that the stamps scatter about, gaps kept; None where they do not scatter about even times."""
+    number = np.arange(t.size, dtype=float)
+    for _ in range(5):
+        period, start = np.polyfit(number, t, 1)
+        late = (t - start - period * np.arange(t.size)) / period
+        missed = np.round(median_filter(late, size=min(51, t.size | 1), mode="nearest"))
+        following = np.arange(t.size) + np.maximum.accumulate(missed - missed[0])
+        if np.array_equal(following, number):
+            break
+        number = following
+    period, start = np.polyfit(number, t, 1)
+    even = start + period * number
+    scatter = t - even
+    wander = np.corrcoef(scatter[1:], scatter[:-1])[0, 1]
+    if np.std(scatter) > 2.0 * period or wander > 0.9 or np.any(np.diff(even) <= 0.0):
+        return None
+    return np.asarray(even)
+
+
+def _roughness(t: Array, position: Array) -> float:
+    """Sum over the joints of the median departure of each position from the line through its neighbours."""
+    filled = position[np.isfinite(position).all(axis=1)]
+    own = t[np.isfinite(position).all(axis=1)]
+    share = ((own[1:-1] - own[:-2]) / (own[2:] - own[:-2]))[:, None]
+    line = filled[:-2] + share * (filled[2:] - filled[:-2])
+    moving = np.abs(filled[2:] - filled[:-2]) > 1e-9
+    off = np.where(moving, np.abs(filled[1:-1] - line), 0.0)
+    spread = filled.std(0) + 1e-12
+    return float((np.sqrt(np.mean(off**2, axis=0)) / spread).sum())
+
+
+def without_repeats(recording: Recording) -> tuple[Recording, list[Finding]]:
+    """The recording without rows that repeat the one before while the arm moves."""
+    columns = np.column_stack(list(recording.channels().values()))
+    same = np.concatenate([[False], np.all((columns[1:] == columns[:-1]) | ~np.isfinite(columns[1:]), axis=1)])
+    moving = _fast(recording.position)
+    share = float(same[moving].mean()) if moving.any() else 0.0
+    if share < REPEATED:
+        return recording, []
+    evidence = f"{share:.0%} of the rows in motion repeat the row before in every channel: old messages read again"
+    kept = slice_rows(recording, ~(same & moving))
+    return kept, [Finding("duplicate", "t", "all", evidence, "record each message once", True)]
+
+
+def _fast(position: Array) -> NDArray[np.bool_]:
+    """Rows at which some joint travels at least three of its smallest steps a row, over ten rows, (K,)."""
+    span = 5
+    fast = np.zeros(len(position), bool)
+    for q in position.T:
+        steps = np.abs(np.diff(q))
+        steps = steps[np.isfinite(steps) & (steps > 1e-9)]
+        if steps.size:
+            quantum = max(float(np.quantile(steps, 0.02)), 1e-6)
+            fast[span:-span] |= np.abs(q[2 * span :] - q[: -2 * span]) > 2 * span * 3.0 * quantum
+    return fast

@@ -1,0 +1,34 @@
+"""A finding of the check of mapping, units and clocks."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+Kind = Literal["order", "sign", "scale", "zero", "unsigned", "effort_source", "clock", "jitter", "filter", "duplicate"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong with the data as they stand, and the option that corrects it."""
+
+    finding: Kind
+    channel: str
+    """Column prefix of docs/formats.md, such as `tau_motor`; `t` for the time."""
+    joint: str
+    """Name of the joint, or `all`."""
+    evidence: str
+    option: str
+    """Option of `armlink gap diagnose` that makes, or prevents, the correction."""
+    corrected: bool
+    """Whether it was corrected; where it was not, there is no diagnosis."""
+    fall: float = 0.0
+    """Fall of the logarithm of what the model leaves unexplained, summed over the joints."""
+
+    def sentence(self) -> str:
+        """One line for people."""
+        where = f"{self.channel} of {'all joints' if self.joint == 'all' else self.joint}"
+        done = "corrected" if self.corrected else "not corrected"
+        return f"{where}: {self.evidence} ({self.finding}, {done}: {self.option})"
+
+    def to_json(self) -> dict[str, Any]:
+        """Entry of `checks` in the answer."""
+        return {name: value for name, value in vars(self).items() if name != "fall"}

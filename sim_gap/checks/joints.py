@@ -1,0 +1,75 @@
+"""Joints of a recording and joints of the model, matched by name where the recording has names."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+
+from armlink.errors import BadInput
+from armlink.recording.corrections import Corrections
+from armlink.recording.recording import Recording, default_names, take_joints
+from sim_gap.checks.finding import Finding
+
+FILLERS = {"joint", "joints", "jnt", "motor", "link", "arm", "robot", "actuator", "axis", "j", "pos"}
+"""Words of joint names that say nothing about which joint it is."""
+
+
+def match_joints(
+    recording: Recording, model: Sequence[str], stated: Corrections, label: str
+) -> tuple[Recording, list[Finding]]:
+    """The recording's joints in the order of the model's, named as there.
+
+    Args:
+        recording: with names, or with the default names of a file that has none: then the order of the columns counts.
+        model: names of the model's hinges, base to tip.
+        stated: with `joints`, those are the model's, base to tip, whatever they are called.
+        label: the recording's name for messages.
+
+    Returns the recording and a finding where names were matched that differ. Raises BadInput where it is not certain
+    which joint is which.
+    """
+    own = recording.names
+    if stated.joints:
+        return (replace(recording, names=tuple(model)) if len(own) == len(model) else recording), []
+    known = [name for name in model if name in own]
+    if known and (len(known) == len(model) or len(known) == len(own)):
+        return _taken(recording, known, known), []
+    if own == default_names(recording.n):
+        return recording, []
+    matched = _by_words(own, model)
+    if matched is None:
+        raise BadInput(
+            f"{label}: its joints {', '.join(own)} are not those of the model, {', '.join(model)}: give them in the "
+            f"model's order, --joints {','.join(own[: len(model)])}"
+        )
+    pairs = ", ".join(f"{name} as {to}" for to, name in matched.items())
+    finding = Finding("order", "q", "all", f"taken by name: {pairs}", "--joints " + ",".join(matched.values()), True)
+    return _taken(recording, list(matched.values()), list(matched)), [finding]
+
+
+def _taken(recording: Recording, names: Sequence[str], called: Sequence[str]) -> Recording:
+    left = [name for name in recording.names if name not in names]
+    taken = take_joints(recording, [recording.names.index(name) for name in names], tuple(called))
+    note = f"joints that the model has not, left out: {', '.join(left)}" if left else ""
+    return replace(taken, warning="; ".join(filter(None, (recording.warning, note))))
+
+
+def _by_words(own: Sequence[str], model: Sequence[str]) -> dict[str, str] | None:
+    """Model joint → recorded joint, where each model joint has exactly one recorded one with its words."""
+    words = {name: _words(name) for name in own}
+    matched = {}
+    for name in model:
+        wanted = _words(name)
+        if not wanted:
+            return None
+        equal = [other for other in own if words[other] == wanted]
+        near = equal or [other for other in own if words[other] and (words[other] > wanted or words[other] < wanted)]
+        if len(near) != 1:
+            return None
+        matched[name] = near[0]
+    return matched if len(set(matched.values())) == len(model) else None
+
+
+def _words(name: str) -> frozenset[str]:
+    """Words and numbers of a joint's name that tell it from others."""
+    parts = re.findall(r"[a-z]+|\d+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower())
+    return frozenset(part.lstrip("0") or "0" if part.isdigit() else part for part in parts) - FILLERS

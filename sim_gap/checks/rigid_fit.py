@@ -1,0 +1,113 @@
+"""How well the nominal model explains a torque channel, joint by joint, under physical signs.
+
+A reading is fitted by the model's torque and the joint's own friction and rotor, each with a coefficient that cannot be
+negative. A wrong sign, order or unit leaves most of the reading unexplained; wrong masses, friction or gains do not.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from gcomp.arrays import Array
+from sim_gap.model.rigid_body import RigidArm
+from sim_gap.residuals.preprocess import Signals
+
+ROWS = 1500
+"""Rows that the fit looks at."""
+TURNING = 0.02
+"""Speed from which friction has its full sign [rad/s]."""
+MOVING_SHARE = 0.3
+"""Share of rows in motion from which the sign of friction counts."""
+FLOOR = 0.02
+"""Share of a reading's variance below which what is left does not count: noise, and effects of every arm."""
+STRONG_SHARE, STRONG_CORRELATION = 0.2, 0.8
+"""A joint is strong if the model's own part is this share of the reading, and correlates with it so."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Positions, velocities, accelerations and one torque channel on common rows, (K, n) each."""
+
+    q: Array
+    v: Array
+    a: Array
+    reading: Array
+    channel: str
+
+
+@dataclass(frozen=True, eq=False)
+class RigidFit:
+    """Fit of every joint, (n,) each."""
+
+    explained: Array
+    """Share of the reading's variance that the fit explains."""
+    scale: Array
+    """Coefficient of the model's torque; 1 for a perfect model in the same unit."""
+    correlation: Array
+    """Partial correlation of reading and model, given the other columns: negative for a wrong sign."""
+    own_share: Array
+    """Standard deviation of the model's own part, over that of the reading, at scale 1."""
+    friction: Array
+    """Direction-dependent torque [N·m], of either sign."""
+    spread: Array
+    """Standard deviation of the reading [N·m]."""
+
+    @property
+    def cost(self) -> Array:
+        """Logarithm of what is left, (n,)."""
+        return np.asarray(np.log(1.0 - np.clip(self.explained, 0.0, 1.0) + FLOOR))
+
+    @property
+    def strong(self) -> NDArray[np.bool_]:
+        """Whether the model says much of a joint's reading, (n,)."""
+        share = self.own_share * np.maximum(self.scale, 1.0)
+        return np.asarray((share > STRONG_SHARE) & (np.abs(self.correlation) > STRONG_CORRELATION))
+
+
+def motion_of(s: Signals, channel: str) -> Motion:
+    """The compared rows of a recording, thinned to about `ROWS`."""
+    thin = slice(None, None, max(1, len(s.filtered(s.t)) // ROWS))
+    q, v, a, reading = (s.filtered(x)[thin] for x in (s.q, s.v, s.a, s.reading[channel]))
+    return Motion(q, v, a, reading, channel)
+
+
+def fit_rigid(arm: RigidArm, motion: Motion) -> RigidFit:
+    """Fit the reading of every joint by the model's torque at the motion."""
+    model = arm.torque(motion.q, motion.v, motion.a)
+    return fit_model(model, motion)
+
+
+def fit_model(model: Array, motion: Motion) -> RigidFit:
+    """Fit the reading of every joint by a model torque (K, n)."""
+    fits = [_joint(model[:, j], motion, j) for j in range(model.shape[1])]
+    return RigidFit(*(np.array(values) for values in zip(*fits, strict=True)))
+
+
+def _joint(model: Array, motion: Motion, j: int) -> tuple[float, ...]:
+    y = motion.reading[:, j] - motion.reading[:, j].mean()
+    spread = float(y.std())
+    columns = np.column_stack([model, np.clip(motion.v[:, j] / TURNING, -1.0, 1.0), motion.v[:, j], motion.a[:, j]])
+    columns -= columns.mean(0)
+    size = columns.std(0)
+    if spread < 1e-9 or size[1] < 1e-6:  # nothing read, or a joint that rests
+        return 1.0, 1.0, 0.0, 0.0, 0.0, spread
+    units = np.where(size > 1e-9, size, 1.0)
+    scaled = columns / units
+    others = scaled[:, 1:] @ np.linalg.lstsq(scaled[:, 1:], np.column_stack([y, scaled[:, 0]]), rcond=None)[0]
+    left, own = y - others[:, 0], scaled[:, 0] - others[:, 1]
+    correlation = float(left @ own / (np.linalg.norm(left) * np.linalg.norm(own) + 1e-12))
+    free = np.linalg.lstsq(scaled, y, rcond=None)[0] / units
+    unsigned = motion.channel == "tau" or np.mean(np.abs(motion.v[:, j]) > TURNING) < MOVING_SHARE
+    if unsigned:  # a link sensor feels no gear, and a joint at rest no friction: their sign says nothing
+        scaled = np.column_stack([scaled, -scaled[:, 1:]])
+    coefficients, rest = nnls(scaled, y)
+    explained = 1.0 - rest**2 / float(y @ y)
+    own_share = float(own.std() * units[0]) / spread
+    return explained, float(coefficients[0] / units[0]), correlation, own_share, float(free[1]), spread
+
+
+def changed(motion: Motion, **values: Array) -> Motion:
+    """The motion with some of its channels replaced."""
+    return replace(motion, **values)  # type: ignore[arg-type]

@@ -1,0 +1,112 @@
+"""Scale, sign of rectified readings and source of a torque channel, and its time against the positions'."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from armlink.recording.corrections import Corrections
+from gcomp.arrays import Array
+from sim_gap.checks.finding import Finding
+from sim_gap.checks.rigid_fit import Motion, RigidFit, fit_model
+from sim_gap.model.rigid_body import RigidArm
+from sim_gap.residuals.preprocess import Signals
+
+SCALE = 0.42, 2.4
+"""Median coefficient of the model's torque, weighted by that torque, outside which a channel is in another unit; with
+loads and wrong torque constants it stays between 0.65 and 1.9 on real arms."""
+GEAR_FRICTION = 0.13
+"""Friction over torque (root sum of squares over the joints) from which a channel is a motor's: link sensors of two
+real arms show 0.04 to 0.07, motors of four others 0.26 to 0.6."""
+LAG, LAG_STEP = 1.5, 0.02
+"""Longest delay that is looked for, and its step [s]."""
+OWN_LAG = 0.12
+"""Delay up to which it is an effect of drive or sensor, which the diagnosis finds by itself [s]."""
+SURE = 0.7
+
+
+def find_scale(arm: RigidArm, fit: RigidFit, motion: Motion, stated: Corrections) -> list[Finding]:
+    """A channel in another unit: the model's torque comes back with a coefficient that no arm has."""
+    strong = fit.strong & (fit.correlation > 0.0)
+    if stated.states("units", f"{motion.channel}_1") or not strong.any():
+        return []
+    scale = _weighted_median(fit.scale[strong], (fit.own_share * fit.spread)[strong])
+    if SCALE[0] < scale < SCALE[1]:
+        return []
+    joints = ", ".join(f"{arm.names[j]} {fit.scale[j]:.3g}" for j in np.flatnonzero(strong))
+    evidence = f"reads the model's torque times {joints}: amperes, or another unit?"
+    option = f"--units {motion.channel}=A:K (N·m/A at the joint, or one each: K1;K2;…), or {motion.channel}=N·m"
+    return [Finding("scale", motion.channel, "all", evidence, option, False)]
+
+
+def _weighted_median(values: Array, weights: Array) -> float:
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
+
+
+def find_unsigned(arm: RigidArm, motion: Motion, stated: Corrections) -> list[Finding]:
+    """Readings that are never negative although the model's torque changes its sign."""
+    model = arm.torque(motion.q, motion.v, motion.a)
+    found = []
+    for j in range(arm.n):
+        y, m = motion.reading[:, j], model[:, j]
+        if stated.states("sign", f"{motion.channel}_{j + 1}") or y.std() < 1e-9:
+            continue
+        both_ways = min(np.mean(motion.v[:, j] > 0.05), np.mean(motion.v[:, j] < -0.05)) > 0.1
+        never = min(np.mean(y > 0.02 * y.std()), np.mean(y < -0.02 * y.std())) < 0.005
+        crosses = min(np.mean(m > 0.0), np.mean(m < 0.0)) > 0.1
+        folded, plain = (abs(np.corrcoef(np.abs(y), x)[0, 1]) for x in (np.abs(m), m))
+        if never and crosses and both_ways and folded > max(plain + 0.2, 0.6):
+            evidence = f"never changes its sign, though the model's torque does; it follows its amount ({folded:.2f})"
+            option = f"record signed torque, or --sign {motion.channel}_{j + 1}=1 if it is right"
+            found.append(Finding("unsigned", motion.channel, arm.names[j], evidence, option, False))
+    return found
+
+
+def find_source(fit: RigidFit, s: Signals, motion: Motion, stated: Corrections) -> list[Finding]:
+    """A channel taken for a link sensor's that holds the friction of gears: a motor's."""
+    if motion.channel != "tau" or stated.effort:
+        return []
+    share = float(np.linalg.norm(np.maximum(fit.friction, 0.0)) / (np.linalg.norm(fit.spread) + 1e-12))
+    if share < GEAR_FRICTION:
+        return []
+    evidence = (
+        f"holds friction of {share:.0%} of its torque, which a link-side sensor does not feel: it is a motor's effort"
+    )
+    return [Finding("effort_source", "tau", "all", evidence, "--effort-is motor", "tau_motor" not in s.reading)]
+
+
+def find_delay(arm: RigidArm, motion: Motion, rate: float, stated: Corrections) -> tuple[list[Finding], float]:
+    """A torque channel whose clock is far off that of the positions, and by how much the cost falls with it.
+
+    `rate` is that of the motion's rows [Hz].
+    """
+    if motion.channel in stated.clock:
+        return [], 0.0
+    model = arm.torque(motion.q, motion.v, motion.a)
+    start = float(fit_model(model, motion).cost.sum())
+    costs = {}
+    for rows in np.unique(np.round(np.arange(-LAG, LAG + LAG_STEP, LAG_STEP) * rate).astype(int)):
+        if abs(rows) < len(model) // 4:
+            costs[rows / rate] = _delayed_cost(model, motion, int(rows))
+    lag = min(costs, key=costs.__getitem__, default=0.0)
+    fall = start - costs.get(lag, start)
+    if not OWN_LAG < abs(lag) < LAG - 2.0 * LAG_STEP or fall < SURE:
+        return [], 0.0
+    evidence = f"is {abs(lag):.2f} s {'late' if lag > 0 else 'early'} against the positions"
+    option = f"--clock {motion.channel}={-lag:.3f}"
+    return [Finding("clock", motion.channel, "all", evidence, option, True)], fall
+
+
+def _delayed_cost(model: Array, motion: Motion, rows: int) -> float:
+    """Cost with the reading taken `rows` later than the motion."""
+    ahead, behind = max(0, -rows), max(0, rows)
+    n = len(model) - abs(rows)
+    moved = replace(
+        motion,
+        q=motion.q[ahead : ahead + n],
+        v=motion.v[ahead : ahead + n],
+        a=motion.a[ahead : ahead + n],
+        reading=motion.reading[behind : behind + n],
+    )
+    return float(fit_model(model[ahead : ahead + n], moved).cost.sum())

@@ -1,0 +1,213 @@
+"""Bags as drivers record them: folders, several publishers, other message types, LeRobot data sets, foreign tables."""
+
+import json
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pa_parquet
+import pytest
+from mcap_ros2.writer import Writer as RosWriter
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from armlink.errors import BadInput
+from armlink.recording.corrections import parse_corrections
+from armlink.recording.files import load_recording, load_recordings
+
+CONTROLLER_STATE = """std_msgs/Header header
+string[] joint_names
+trajectory_msgs/JointTrajectoryPoint reference
+trajectory_msgs/JointTrajectoryPoint feedback
+"""
+DYNAMIC_STATE = "std_msgs/Header header\nstring[] joint_names\ncontrol_msgs/InterfaceValue[] interface_values\n"
+INTERFACE_VALUE = "string[] interface_names\nfloat64[] values\n"
+
+
+def store():
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    for text, name in (
+        (INTERFACE_VALUE, "control_msgs/msg/InterfaceValue"),
+        (DYNAMIC_STATE, "control_msgs/msg/DynamicJointState"),
+        (CONTROLLER_STATE, "control_msgs/msg/JointTrajectoryControllerState"),
+    ):
+        types.register(get_types_from_msg(text, name))
+    return types
+
+
+def header(types, nanoseconds: int):
+    time = types.types["builtin_interfaces/msg/Time"](sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
+    return types.types["std_msgs/msg/Header"](stamp=time, frame_id="")
+
+
+def write(path, topics, storage=StoragePlugin.MCAP):
+    """A bag folder of (topic, type, [(stamp in ns, fields)])."""
+    types = store()
+    with Writer(path, version=9, storage_plugin=storage) as bag:
+        for topic, kind, messages in topics:
+            connection = bag.add_connection(topic, kind, typestore=types)
+            for stamp, fields in messages:
+                message = types.types[kind](header=header(types, stamp), **fields(types))
+                bag.write(connection, stamp, types.serialize_cdr(message, kind))
+
+
+def states(names, positions, efforts=()):
+    return lambda _: {
+        "name": list(names),
+        "position": np.array(positions, float),
+        "velocity": np.zeros(0),
+        "effort": np.array(efforts, float),
+    }
+
+
+@pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_a_folder_with_arm_and_gripper_on_one_topic(tmp_path, storage):
+    arm = [(k * 10**7, states("ba", [0.1 * k, 1.0], [5.0, -k])) for k in range(20)]
+    hand = [(k * 10**7 + 3, states(["finger"], [0.04])) for k in range(0, 20, 5)]
+    kind = "sensor_msgs/msg/JointState"
+    write(tmp_path / "bag", [("/joint_states", kind, sorted(arm + hand, key=lambda message: message[0]))], storage)
+    loaded = load_recording(tmp_path / "bag")
+    assert loaded.names == ("b", "a")
+    np.testing.assert_allclose(loaded.position[:, 0], 0.1 * np.arange(20))
+    np.testing.assert_allclose(loaded.torque[:, 1], -np.arange(20.0))
+    assert "finger" in loaded.warning
+
+
+def test_a_controllers_state_holds_the_command(tmp_path):
+    def fields(types):
+        point = types.types["trajectory_msgs/msg/JointTrajectoryPoint"]
+        still = types.types["builtin_interfaces/msg/Duration"](sec=0, nanosec=0)
+        made = [
+            point(np.array(q), np.zeros(2), np.zeros(0), np.array(tau), still)
+            for q, tau in (([1.0, 2.0], []), ([0.9, 1.9], [3.0, 4.0]))
+        ]
+        return {"joint_names": ["x", "y"], "reference": made[0], "feedback": made[1]}
+
+    topic = "/arm_controller/controller_state"
+    kind = "control_msgs/msg/JointTrajectoryControllerState"
+    write(tmp_path / "bag", [(topic, kind, [(k * 10**7, fields) for k in range(5)])])
+    loaded = load_recording(tmp_path / "bag")
+    np.testing.assert_array_equal(loaded.position_command[0], [1.0, 2.0])
+    np.testing.assert_array_equal(loaded.position[0], [0.9, 1.9])
+    np.testing.assert_array_equal(loaded.torque[0], [3.0, 4.0])
+
+
+def test_dynamic_joint_states_by_interface(tmp_path):
+    def fields(types):
+        value = types.types["control_msgs/msg/InterfaceValue"]
+        rows = [
+            value(interface_names=["effort", "position"], values=np.array([7.0, 0.5])),
+            value(interface_names=["position"], values=np.array([0.6])),
+        ]
+        return {"joint_names": ["x", "y"], "interface_values": rows}
+
+    kind = "control_msgs/msg/DynamicJointState"
+    write(tmp_path / "bag", [("/dynamic_joint_states", kind, [(k * 10**7, fields) for k in range(5)])])
+    loaded = load_recording(next((tmp_path / "bag").glob("*.mcap")))
+    np.testing.assert_array_equal(loaded.position[0], [0.5, 0.6])
+    assert loaded.torque[0, 0] == 7.0
+    assert np.isnan(loaded.torque[0, 1])
+
+
+def test_several_topics_must_be_named(tmp_path):
+    messages = [(k * 10**7, states("ab", [k, 0], [1, 2])) for k in range(5)]
+    kind = "sensor_msgs/msg/JointState"
+    write(tmp_path / "bag", [("/left/joint_states", kind, messages), ("/right/joint_states", kind, messages)])
+    with pytest.raises(BadInput, match="/left/joint_states, /right/joint_states: name one with --topic"):
+        load_recording(tmp_path / "bag")
+    loaded = load_recording(tmp_path / "bag", parse_corrections(topic="/left/joint_states"))
+    assert loaded.t.size == 5
+    with pytest.raises(BadInput, match=r"no joint states on --topic /nope: the bag has /left"):
+        load_recording(tmp_path / "bag", parse_corrections(topic="/nope"))
+
+
+def test_a_file_of_the_stock_writer_on_another_topic(tmp_path):
+    from armlink.recording.ros_joint_state import SCHEMA, SCHEMA_NAME
+
+    with (tmp_path / "ur.mcap").open("wb") as stream:
+        writer = RosWriter(stream)
+        schema = writer.register_msgdef(SCHEMA_NAME, SCHEMA)
+        for k in range(6):
+            stamp = {"sec": 3, "nanosec": k * 10**7}
+            message = {
+                "header": {"stamp": stamp, "frame_id": ""},
+                "name": ["q"],
+                "position": [k],
+                "velocity": [],
+                "effort": [2.0],
+            }
+            writer.write_message("/ur/joint_states", schema, message, k * 10**7, k * 10**7)
+        writer.finish()
+    loaded = load_recording(tmp_path / "ur.mcap")
+    np.testing.assert_allclose(loaded.t, 0.01 * np.arange(6))
+
+
+def test_a_broken_bag_is_one_line(tmp_path):
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "metadata.yaml").write_text("rosbag2_bagfile_information: 3\n")
+    with pytest.raises(BadInput, match="bag: cannot read the bag"):
+        load_recording(tmp_path / "bag")
+    with pytest.raises(BadInput, match="neither the folder of a ROS 2 bag"):
+        load_recording(tmp_path)
+
+
+def lerobot(folder):
+    names = {"motors": ["shoulder.pos", "elbow.pos"]}
+    (folder / "meta").mkdir(parents=True)
+    (folder / "data" / "chunk-000").mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text(
+        json.dumps({"fps": 30, "features": {"observation.state": {"names": names}}})
+    )
+    table = pa.table(
+        {
+            "episode_index": [0, 0, 0, 1, 1],
+            "timestamp": [0.0, 0.033, 0.067, 0.0, 0.033],
+            "observation.state": [[1.0, 2.0]] * 5,
+            "action": [[1.1, 2.1]] * 5,
+        }
+    )
+    pa_parquet.write_table(table, folder / "data" / "chunk-000" / "file-000.parquet")
+
+
+def test_a_lerobot_data_set_is_a_recording_an_episode(tmp_path):
+    lerobot(tmp_path / "set")
+    found = load_recordings(tmp_path / "set", parse_corrections(units=["q=deg", "q_cmd=deg"]))
+    assert [r.t.size for r in found.values()] == [3, 2]
+    second = load_recording(f"{tmp_path / 'set'}#1", parse_corrections(units=["q=deg"]))
+    assert second.names == ("shoulder", "elbow")
+    np.testing.assert_allclose(second.position[0], np.radians([1.0, 2.0]))
+    np.testing.assert_allclose(second.position_command[0], [1.1, 2.1])
+    with pytest.raises(BadInput, match=r"holds 2 recordings: choose one, such as .*#0"):
+        load_recording(tmp_path / "set")
+
+
+def test_a_foreign_table_gets_a_map_to_paste(tmp_path):
+    path = tmp_path / "ur.csv"
+    path.write_text("timestamp,actual_q_0,actual_q_1,actual_current_0,actual_current_1\n" + "0,1,2,3,4\n0.1,1,2,3,4\n")
+    with pytest.raises(BadInput, match="missing column") as error:
+        load_recording(path)
+    option = str(error.value).partition("--map ")[2]
+    loaded = load_recording(path, parse_corrections(columns=[option], units=["tau_motor=A:10;20", "t=ms"]))
+    np.testing.assert_array_equal(loaded.position[0], [1.0, 2.0])
+    np.testing.assert_array_equal(loaded.motor_torque[0], [30.0, 80.0])
+    assert loaded.t[1] == pytest.approx(1e-4)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"sign": ["tau_9=-1"]}, "--sign tau_9: .* has no such column"),
+        ({"sign": ["tau=2"]}, "expected 1 or -1"),
+        ({"units": ["q=inch"]}, "--units q=inch: expected rad"),
+        ({"units": ["tau=A:1;2;3"]}, "3 values for 2 joints"),
+        ({"zero": ["q_1=a"]}, "--zero q_1=a: expected a number"),
+        ({"columns": ["q_1"]}, "--map q_1: expected COLUMN=VALUE"),
+        ({"columns": ["q_1=nope"]}, "--map q_1=nope: no such column"),
+        ({"joints": "x,y"}, "--joints x: .* has no such joint"),
+        ({"effort": "gear"}, "--effort-is gear: expected motor or link"),
+    ],
+)
+def test_options_that_do_not_fit_are_one_line(tmp_path, options, message):
+    path = tmp_path / "r.csv"
+    path.write_text("t,q_1,q_2,tau_1,tau_2\n0,1,2,3,4\n0.1,1,2,3,4\n")
+    with pytest.raises(BadInput, match=message):
+        load_recording(path, parse_corrections(**options))

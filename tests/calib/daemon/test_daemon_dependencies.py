@@ -1,0 +1,211 @@
+"""A dependency of the daemon fails: it goes on, says so, loses no event, and is right again when that has passed."""
+
+import shutil
+import sqlite3
+from pathlib import Path
+
+import pytest
+from failing_calls import DEPENDENCIES, events, watched_drift
+from fast_daemon import QUIET, FastDaemon
+from postgres import NoServer, stoppable_server
+
+from calib.daemon.settings import DaemonSection
+from calib.daemon.state.journal import Journal
+from calib.daemon.view.api_models import State
+from calib.daemon.web.metrics import metrics_text
+from calib.daemon.web.stream import Streams
+
+
+def settings(policy: str = "propose") -> DaemonSection:
+    return DaemonSection.model_validate({"policy": policy, "recording": QUIET})
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[str, str | None]]:
+    with pytest.MonkeyPatch.context() as patch:
+        daemon, _ = watched_drift(tmp_path_factory.mktemp("undisturbed"), lambda dependency, count: False, patch)
+        found = events(daemon)
+    assert {kind for kind, _ in found} >= {"alarm", "drift", "proposal", "approved", "recalibration"}
+    return found
+
+
+@pytest.mark.parametrize("failing", DEPENDENCIES)
+def test_no_failing_call_ends_it_or_loses_an_event(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: list[tuple[str, str | None]], failing: str
+) -> None:
+    """The calls of one dependency fail, ten and more in a row, with as many between that succeed."""
+    burst = {"store": 14, "journal": 11, "disk": 10}[failing]
+    daemon, counted = watched_drift(
+        tmp_path, lambda name, count: name == failing and count // burst % 2 == 1, monkeypatch
+    )
+    assert counted.failed >= (2 if failing == "disk" else 10)  # recordings pause for a minute after each
+    found = events(daemon)
+    assert [event for event in undisturbed if event not in found] == []
+    status = daemon.view.status()
+    assert (status.detail, status.state) == ("", State.OBSERVING)
+    assert daemon.store.unfinished_write(daemon.arm) is None
+
+
+def metric(daemon: FastDaemon, name: str) -> str:
+    text = metrics_text(daemon.view, Streams(daemon.view))().decode()
+    return next(line.split()[1] for line in text.splitlines() if line.startswith(f"armlink_{name} "))
+
+
+def test_a_truncated_store_is_said_and_the_records_stay_in_force(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon.run(10)
+    records, database = daemon.view.status().records, tmp_path / "records.db"
+    daemon.store.close()
+    shutil.copy(database, tmp_path / "copy.db")
+    database.write_bytes(database.read_bytes()[:5000])
+    for name in ("records.db-wal", "records.db-shm"):
+        (tmp_path / name).unlink(missing_ok=True)
+    daemon.run(10)
+    status = daemon.view.status()
+    assert "cannot be read" in (status.store_fault or "")
+    assert status.detail == status.store_fault
+    assert (status.records, status.state) == (records, State.OBSERVING)
+    assert metric(daemon, "record_store_up") == "0.0"
+    daemon.store.close()
+    shutil.copy(tmp_path / "copy.db", database)
+    daemon.run(5)
+    status = daemon.view.status()
+    assert (status.store_fault, status.detail, status.records) == (None, "", records)
+    assert metric(daemon, "record_store_up") == "1.0"
+    assert [event.kind for event in daemon.of_kind("fault", "recovered")] == ["fault", "recovered"]
+
+
+def test_a_postgresql_that_restarts_is_found_again(tmp_path: Path) -> None:
+    try:
+        with stoppable_server() as server:
+            daemon = FastDaemon(tmp_path, 1, settings(), store=f"{server.url}/postgres")
+            daemon.run(10)
+            records = daemon.view.status().records
+            assert records.calibration is not None
+            server.stop()
+            daemon.run(10)
+            assert daemon.view.status().store_fault
+            assert daemon.view.status().records == records
+            server.start()
+            daemon.run(5)
+            assert daemon.view.status().store_fault is None
+            better = daemon.good_records()[0]
+            daemon.store.put(better, daemon.arm, by="ann", reason="sweep")
+            daemon.run(6)
+            assert daemon.view.status().records.calibration == better.id
+            daemon.store.close()
+    except NoServer as reason:
+        pytest.skip(str(reason))
+
+
+def test_a_store_that_does_not_answer_holds_nobody_up(tmp_path: Path) -> None:
+    """As a hung PostgreSQL: the look for records, which runs aside, does not come back."""
+    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon.run(10)
+    later = []
+    daemon.run_aside = lambda work, done: later.append((work, done))
+    daemon.run(30)
+    assert len(later) == 1
+    assert daemon.view.status().state is State.OBSERVING
+    daemon.run_aside = lambda work, done: done(work())
+    work, done = later.pop()
+    done(work())
+    daemon.run(6)
+    assert daemon.view.status().detail == ""
+
+
+# ---- the journal
+
+
+def test_a_lock_of_another_program_holds_the_daemon_for_a_moment_only(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon.run(5)
+    other = sqlite3.connect(tmp_path / "state" / "journal.db", isolation_level=None)
+    other.execute("BEGIN EXCLUSIVE")
+    assert daemon.service.journal._db.execute("PRAGMA busy_timeout").fetchone() == (50,)  # [ms], on the event loop
+    tried = []
+    daemon.service.journal._db.set_trace_callback(tried.append)
+    for number in range(100):
+        daemon.service.events.say("clock", None, f"number {number}", {})
+    daemon.service.journal._db.set_trace_callback(None)
+    assert len(tried) == 1
+    assert daemon.view.status().journal_fault
+    other.execute("ROLLBACK")
+    daemon.run(3)
+    assert [event.text for event in daemon.of_kind("clock")] == [f"number {number}" for number in range(100)]
+    assert daemon.view.status().journal_fault is None
+
+
+def test_what_cannot_be_committed_is_not_half_kept(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "journal.db", lambda: 0.0)
+    real = journal._db
+
+    class NoCommit:
+        def execute(self, statement: str, *values: object) -> object:
+            if statement == "COMMIT":
+                raise sqlite3.OperationalError("database or disk is full")
+            return real.execute(statement, *values)
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(real, name)
+
+    journal._db = NoCommit()  # type: ignore[assignment]
+    with pytest.raises(sqlite3.OperationalError), journal.transaction():
+        real.execute("INSERT INTO history(time, t, record, estimate) VALUES ('a', 0, 'b', '{}')")
+    assert not real.in_transaction
+    assert real.execute("SELECT COUNT(*) FROM history").fetchone() == (0,)
+    assert "disk is full" in journal.trouble
+
+
+def test_a_disk_that_is_full_at_the_start_is_said_and_the_start_is_kept_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add = Journal.add_event
+    monkeypatch.setattr(
+        Journal, "add_event", lambda *_: (_ for _ in ()).throw(sqlite3.OperationalError("disk is full"))
+    )
+    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon.run(3)
+    assert "disk is full" in daemon.view.status().detail
+    monkeypatch.setattr(Journal, "add_event", add)
+    daemon.run(3)
+    assert daemon.view.status().detail == ""
+    assert daemon.view.events()[0].kind == "started"
+
+
+def damage(path: Path) -> None:
+    """As a disk does that returns other pages than were written."""
+    with path.open("r+b") as file:
+        file.seek(4096)
+        file.write(b"\xa5" * 4096 * 6)
+
+
+def test_a_damaged_journal_is_set_aside_and_that_is_said(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon.run(30)
+    daemon.service.close("end")
+    journal = tmp_path / "state" / "journal.db"
+    damage(journal)
+    daemon.start()
+    daemon.run(10)
+    (event,) = daemon.of_kind("fault")
+    (aside,) = journal.parent.glob("journal.db.damaged-*")
+    assert event.text == f"the journal was damaged: it is kept as {aside.name}, and a new one was begun"
+    assert daemon.view.status().detail == ""
+    assert daemon.view.status().state is State.OBSERVING
+
+
+def test_a_journal_that_is_damaged_under_way_is_set_aside_too(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon.run(10)
+    daemon.service.journal.failed(sqlite3.DatabaseError("database disk image is malformed"))
+    daemon.run(5)
+    assert [event.text.partition(":")[0] for event in daemon.of_kind("fault")] == ["the journal was damaged"]
+    assert daemon.view.status().detail == ""
+
+
+def test_a_journal_that_is_no_database_is_set_aside(tmp_path: Path) -> None:
+    (tmp_path / "journal.db").write_bytes(b"no database at all" * 1000)
+    journal = Journal(tmp_path / "journal.db", lambda: 0.0)
+    assert journal.set_aside.startswith("journal.db.damaged-")
+    assert journal.events() == []

@@ -1,0 +1,179 @@
+"""Draws faults of mapping, units and clocks into recordings of real arms: named, corrected or refused, never silent.
+
+    python tests/campaigns/corrupted_recordings.py --draws 200 [--realdata DIR]
+
+One line a draw, then what was noticed by kind; the recordings as they are must be no finding. Exit status 1 below 98 %.
+"""
+
+import argparse
+import sys
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from armlink.errors import BadInput
+from armlink.recording.corrections import AS_IT_IS
+from armlink.recording.files import load_recording
+from armlink.recording.recording import Recording, take_joints
+from sim_gap.checks.check import check_recording
+from sim_gap.model.load import load_model
+
+ARMS = (("ur10e", "train_a"), ("tx40", "recording"), ("ur10", "recording"), ("panda", "recording"), ("lwr4", "train"))
+GOAL = 0.98
+Corruption = Callable[[Recording, np.random.Generator], Recording | None]
+
+
+def torque_channel(recording: Recording) -> str:
+    return "torque" if recording.torque is not None else "motor_torque"
+
+
+def with_torque(recording: Recording, change: Callable[[np.ndarray], np.ndarray]) -> Recording:
+    name = torque_channel(recording)
+    return replace(recording, **{name: change(getattr(recording, name).copy())})
+
+
+def one_sign(recording: Recording, random: np.random.Generator) -> Recording:
+    sign = np.ones(recording.n)
+    sign[random.integers(recording.n)] = -1.0
+    return with_torque(recording, lambda y: y * sign)
+
+
+def position_sign(recording: Recording, random: np.random.Generator) -> Recording:
+    sign = np.ones(recording.n)
+    sign[random.integers(recording.n)] = -1.0
+    velocity = None if recording.velocity is None else recording.velocity * sign
+    return replace(recording, position=recording.position * sign, velocity=velocity)
+
+
+def degrees(recording: Recording, _: np.random.Generator) -> Recording:
+    velocity = None if recording.velocity is None else np.degrees(recording.velocity)
+    return replace(recording, position=np.degrees(recording.position), velocity=velocity)
+
+
+def amperes(recording: Recording, random: np.random.Generator) -> Recording:
+    constants = (
+        random.uniform(8.0, 20.0, recording.n) if random.random() < 0.5 else random.uniform(0.02, 0.3, recording.n)
+    )
+    return with_torque(recording, lambda y: y / constants)
+
+
+def exchanged(recording: Recording, random: np.random.Generator) -> Recording:
+    i, k = random.choice(recording.n, 2, replace=False)
+    order = np.arange(recording.n)
+    order[[i, k]] = order[[k, i]]
+    return take_joints(recording, order.tolist(), recording.names)
+
+
+def exchanged_torque(recording: Recording, random: np.random.Generator) -> Recording:
+    i, k = random.choice(recording.n, 2, replace=False)
+    order = np.arange(recording.n)
+    order[[i, k]] = order[[k, i]]
+    return with_torque(recording, lambda y: y[:, order])
+
+
+def reversed_order(recording: Recording, _: np.random.Generator) -> Recording:
+    return take_joints(recording, list(reversed(range(recording.n))), recording.names)
+
+
+def zero(recording: Recording, random: np.random.Generator) -> Recording:
+    position = recording.position.copy()
+    position[:, random.integers(1, recording.n)] += random.choice([0.5 * np.pi, -0.5 * np.pi, np.pi])
+    return replace(recording, position=position)
+
+
+def effort(recording: Recording, _: np.random.Generator) -> Recording | None:
+    return (
+        None if recording.motor_torque is None else replace(recording, torque=recording.motor_torque, motor_torque=None)
+    )
+
+
+def skew(recording: Recording, random: np.random.Generator) -> Recording:
+    late = random.choice([-1.0, 1.0]) * random.uniform(0.2, 1.0)
+    return with_torque(
+        recording, lambda y: np.column_stack([np.interp(recording.t - late, recording.t, x) for x in y.T])
+    )
+
+
+def jitter(recording: Recording, random: np.random.Generator) -> Recording:
+    period = float(np.median(np.diff(recording.t)))
+    received = np.maximum.accumulate(recording.t + np.abs(random.normal(0.0, 0.6 * period, recording.t.size)))
+    return replace(recording, t=received + 1e-9 * np.arange(recording.t.size))
+
+
+def repeats(recording: Recording, random: np.random.Generator) -> Recording:
+    rows = np.arange(recording.t.size)
+    rows[1:] -= random.random(rows.size - 1) < 0.15
+    return replace(recording, **{name: values[rows] for name, values in recording.channels().items()})
+
+
+def velocity_degrees(recording: Recording, _: np.random.Generator) -> Recording | None:
+    return None if recording.velocity is None else replace(recording, velocity=np.degrees(recording.velocity))
+
+
+def velocity_order(recording: Recording, _: np.random.Generator) -> Recording | None:
+    return None if recording.velocity is None else replace(recording, velocity=recording.velocity[:, ::-1])
+
+
+CORRUPTIONS: dict[str, Corruption] = {
+    "sign of one torque": one_sign,
+    "sign of all torques": lambda recording, _: with_torque(recording, lambda y: -y),
+    "sign of a position": position_sign,
+    "degrees": degrees,
+    "amperes": amperes,
+    "unsigned": lambda recording, _: with_torque(recording, np.abs),
+    "joints exchanged": exchanged,
+    "torques exchanged": exchanged_torque,
+    "reverse order": reversed_order,
+    "zero": zero,
+    "effort": effort,
+    "skew": skew,
+    "jitter": jitter,
+    "repeats": repeats,
+    "velocity in degrees": velocity_degrees,
+    "velocity order": velocity_order,
+}
+
+
+def said(arm, recording: Recording) -> str:
+    try:
+        return "; ".join(f"{each.finding} {each.option}" for each in check_recording(arm, recording, "r", AS_IT_IS)[1])
+    except BadInput as error:
+        return f"refused: {error}"
+
+
+def main() -> int:
+    options = argparse.ArgumentParser(description=__doc__)
+    options.add_argument("--draws", type=int, default=200)
+    options.add_argument("--realdata", type=Path, default=Path(__file__).parents[3] / "shared" / "realdata")
+    options.add_argument("--seed", type=int, default=1)
+    asked = options.parse_args()
+    arms = {}
+    for folder, file in ARMS:
+        recording = load_recording(asked.realdata / folder / f"{file}.csv.gz")
+        arms[folder] = load_model(asked.realdata / folder / "sim.xml", (), recording.n).arm, recording
+    alarms = {folder: text for folder, (arm, recording) in arms.items() if (text := said(arm, recording))}
+    print("as recorded:", alarms or "no finding", flush=True)
+    random, seen, noticed = np.random.default_rng(asked.seed), Counter(), Counter()
+    while seen.total() < asked.draws:
+        kind = list(CORRUPTIONS)[random.integers(len(CORRUPTIONS))]
+        folder = list(arms)[random.integers(len(arms))]
+        arm, recording = arms[folder]
+        spoiled = CORRUPTIONS[kind](recording, random)
+        if spoiled is None:
+            continue
+        text = said(arm, spoiled)
+        seen[kind] += 1
+        noticed[kind] += bool(text)
+        print(f"{kind:20s} {folder:6s} {text or 'NOTHING'}"[:200], flush=True)
+    for kind in seen:
+        print(f"{kind:20s} {noticed[kind]} of {seen[kind]}")
+    share = noticed.total() / seen.total()
+    print(f"noticed: {noticed.total()} of {seen.total()}, {share:.1%}")
+    return 0 if share >= GOAL and not alarms else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

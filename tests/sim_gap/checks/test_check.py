@@ -1,0 +1,147 @@
+"""Recordings whose columns, units or clocks are wrong are corrected or refused; sound ones pass untouched."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from wrong_arms import Wrong, model, record
+
+from armlink.errors import BadInput
+from armlink.recording.corrections import AS_IT_IS, parse_corrections
+from armlink.recording.files import load_recording
+from armlink.recording.recording import Recording, take_joints
+from sim_gap.attribution.diagnose import diagnose
+from sim_gap.checks.check import check_recording
+from sim_gap.model.load import load_model
+
+REAL = Wrong(
+    coulomb=np.array([4.0, 2.0, 0.8]),
+    viscous=np.array([1.5, 0.8, 0.3]),
+    rotor=0.3,
+    offset=0.2,
+    gain=np.array([1.1, 0.9, 1.05]),
+    payload=0.8,
+)
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return load_model(model()).arm
+
+
+@pytest.fixture(scope="module")
+def motor() -> Recording:
+    made = record(model(), REAL, seconds=30.0, rate=100.0)
+    return replace(made, torque=None)
+
+
+def check(arm, recording, stated=AS_IT_IS):
+    return check_recording(arm, recording, "r.csv", stated)
+
+
+def turned(recording: Recording, channel: str, joints) -> Recording:
+    values = getattr(recording, channel).copy()
+    values[:, joints] *= -1.0
+    return replace(recording, **{channel: values})
+
+
+def test_a_wrong_arm_is_no_finding(arm, motor):
+    assert check(arm, motor) == (motor, [])
+
+
+@pytest.mark.parametrize("tilt", [0.1, 0.5])
+def test_a_tilted_base_is_an_effect_and_no_finding(arm, tilt):
+    made = record(model(), Wrong(coulomb=0.5, tilt=(tilt, -tilt)), seconds=30.0, rate=100.0)
+    assert check(arm, replace(made, torque=None))[1] == []
+
+
+@pytest.mark.parametrize(
+    ("spoil", "kind", "option"),
+    [
+        (lambda r: turned(r, "motor_torque", [1]), "sign", "--sign tau_motor_2=-1"),
+        (lambda r: turned(r, "motor_torque", [0, 1, 2]), "sign", "--sign tau_motor=-1"),
+        (lambda r: turned(r, "position", [2]), "sign", "--sign q_3=-1"),
+        (lambda r: replace(r, position=np.degrees(r.position)), "scale", "--units q=deg"),
+        (lambda r: take_joints(r, [0, 2, 1], r.names), "order", None),
+        (lambda r: replace(r, position=r.position + np.array([0.0, np.pi / 2, 0.0])), "zero", "--zero q_2=-1.57080"),
+        (lambda r: replace(r, torque=r.motor_torque, motor_torque=None), "effort_source", "--effort-is motor"),
+    ],
+)
+def test_certain_faults_are_corrected(arm, motor, spoil, kind, option):
+    spoiled = replace(spoil(motor), velocity=None)
+    corrected, (finding,) = check(arm, spoiled)
+    assert (finding.finding, finding.corrected) == (kind, True)
+    assert option is None or finding.option == option
+    np.testing.assert_allclose(corrected.position, motor.position, atol=1e-4)
+    np.testing.assert_allclose(corrected.motor_torque, motor.motor_torque, atol=1e-9)
+
+
+def test_torque_far_from_its_time_is_moved_back(arm, motor):
+    late = replace(motor, motor_torque=np.roll(motor.motor_torque, 40, axis=0), velocity=None)
+    corrected, (finding,) = check(arm, late)
+    assert finding.finding == "clock"
+    assert float(finding.option.rpartition("=")[2]) == pytest.approx(-0.4, abs=0.03)
+    assert np.isnan(corrected.motor_torque[-1]).all()
+
+
+def test_times_of_receipt_become_sample_times(arm, motor):
+    scatter = np.random.default_rng(1).normal(0.0, 0.005, motor.t.size)
+    received = np.maximum.accumulate(motor.t + np.clip(scatter, -0.02, 0.02)) + 1e-9 * np.arange(motor.t.size)
+    corrected, (finding,) = check(arm, replace(motor, t=received, velocity=None))
+    assert finding.finding == "jitter"
+    even = corrected.t - corrected.t[0]
+    assert np.std(even - (motor.t - motor.t[0])) < 2e-4
+
+
+def test_rows_read_twice_are_left_out(arm, motor):
+    twice = np.arange(motor.t.size)
+    drawn = np.random.default_rng(2).random(twice.size) < 0.2
+    twice[1:] -= drawn[1:]
+    stale = replace(motor, **{name: values[twice] for name, values in motor.channels().items()})
+    corrected, (finding,) = check(arm, replace(stale, velocity=None))
+    assert finding.finding == "duplicate"
+    assert 0.75 * motor.t.size < corrected.t.size < 0.9 * motor.t.size
+
+
+@pytest.mark.parametrize(("factor", "kind"), [(np.degrees(1.0), "scale"), (-1.0, "sign")])
+def test_a_velocity_that_is_not_the_derivative_is_left_out(arm, motor, factor, kind):
+    rate = np.gradient(motor.position, motor.t, axis=0)
+    corrected, (finding,) = check(arm, replace(motor, velocity=rate * factor))
+    assert (finding.finding, finding.channel) == (kind, "dq")
+    assert corrected.velocity is None
+
+
+@pytest.mark.parametrize("constant", [0.08, 12.0])
+def test_amperes_are_refused_with_the_option(arm, motor, constant):
+    amperes = replace(motor, motor_torque=motor.motor_torque / constant)
+    with pytest.raises(BadInput, match=r"r.csv: tau_motor of all joints: .*amperes.*--units tau_motor=A:K"):
+        check(arm, amperes)
+    check(arm, amperes, parse_corrections(units=["tau_motor=N·m"]))
+
+
+def test_unsigned_torque_is_refused(arm, motor):
+    with pytest.raises(BadInput, match="never changes its sign"):
+        check(arm, replace(motor, motor_torque=np.abs(motor.motor_torque)))
+
+
+def test_a_sign_that_the_user_states_is_left(arm, motor):
+    spoiled = turned(motor, "motor_torque", [1])
+    stated = parse_corrections(sign=["tau_motor_2=1", "q_2=1"])
+    assert check(arm, spoiled, stated)[1] == []
+
+
+def test_the_answer_lists_the_findings(motor):
+    answer = diagnose(model(), [turned(motor, "motor_torque", [1])])
+    (finding,) = answer.to_json()["checks"]
+    assert finding["option"] == "--sign tau_motor_2=-1"
+    assert {cause.effect for cause in answer.causes} >= {"friction.coulomb"}
+
+
+@pytest.mark.parametrize(
+    ("folder", "file"),
+    [("ur10e", "train_a"), ("tx40", "recording"), ("ur10", "recording"), ("panda", "recording"), ("lwr4", "other")],
+)
+def test_real_arms_as_recorded_are_no_finding(realdata, folder, file):
+    recording = load_recording(realdata / folder / f"{file}.csv.gz")
+    real = load_model(realdata / folder / "sim.xml", (), recording.n).arm
+    assert check(real, recording)[1] == []
