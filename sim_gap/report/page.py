@@ -11,7 +11,6 @@ from sim_gap.report.cause_figures import cause_figure
 from sim_gap.report.effect_text import advice, sentence
 from sim_gap.report.figures import gap_bars, residual_panels, rollout_bars
 
-
 WORDS = {
     "explained": "explained",
     "ambiguous": "ambiguous",
