@@ -73,6 +73,8 @@ class CauseTest:
         residual = window.torque - belief.torque(window.position) - expected.mean
         covariance = expected.covariance.copy()
         covariance[np.diag_indices_from(covariance)] += window.sigma.ravel() ** 2
+        noise = (window.sigma**2).mean(axis=0)
+        self._of_model: list[float] = (1 - noise / (noise + expected.variance.mean(axis=0))).tolist()
         self.entries = list(dictionary(belief.arm, belief.beta, window))
         stacked = np.column_stack([residual.ravel(), *(entry.columns for entry in self.entries)])
         white: Array = np.linalg.solve(np.linalg.cholesky(covariance), stacked)  # scipy takes longer to load
@@ -189,6 +191,10 @@ class CauseTest:
         values[at] = fit.values[: len(at)]
         covariance[np.ix_(at, at)] = fit.covariance[: len(at), : len(at)]
         return values, covariance
+
+    def of_model(self, joint: int) -> float:
+        """Share of the model's own error in the variance of a joint's residuals."""
+        return self._of_model[joint]
 
     def loss(self, joint: int, simple: str, full: str, beside: int | None = None) -> float:
         """BIC of a joint's drift `simple` above that of `full` (each gain, offset or drift)."""

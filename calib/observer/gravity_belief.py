@@ -19,6 +19,9 @@ from gcomp.gravity.torque import gravity_regressor, gravity_stiffness
 
 LEVEL_ROWS = 120
 """Most rows that the level is fitted to, evenly chosen: known to 7 % then, in 50 ms."""
+WANDER = 0.5
+"""How far a zero may have moved with temperature since the reference, as a share of the discrepancy's level: a sensor
+of class 0.05 moves by 0.1 % of rated torque in 20 K, and an arm of such sensors has a discrepancy of 0.2 to 0.4 %."""
 LEVEL_ARRAYS = ("smooth", "rough", "before", "spread")
 FIRST_ROWS = 120
 """Rows of the first epoch unless told otherwise."""
@@ -121,6 +124,7 @@ class GravityBelief:
         if self._posterior is None:
             self._posterior = self._learn(self._reference.rows)
         mean, blocks, columns = self._posterior.predict(self.kernel.points(q, side), self._columns(q))
+        blocks += (WANDER * self.level.total[:, None, None]) ** 2
         flat = columns.swapaxes(0, 1).reshape(q.size, -1)
         tool = (gravity_regressor(self.arm, q) @ self._tool).reshape(q.size, -1)
         return Expected(mean, blocks, np.hstack([flat, tool]))

@@ -192,7 +192,7 @@ class Observer:
             return []  # more rows may decide
         if state.silent and not self._confirmed(test, verdict):
             return []
-        state.silent = False
+        found, state.silent = state.silent and verdict.is_drift, False
         window, state.window = state.window, []
         state.doubtful = state.doubtful + 1 if verdict.cause == "unknown" else 0
         if state.doubtful == 1:
@@ -208,7 +208,8 @@ class Observer:
             state.first = None
             return self._carried(t, verdict) or self._report(t, verdict)
         state.carrying = 0
-        return self._report(t, verdict) + self._confirm(t, window, test, verdict)
+        alarms = [self._event(t, "alarm", joint, channel=verdict.cause) for joint in verdict.joints if found]
+        return alarms + self._report(t, verdict) + self._confirm(t, window, test, verdict)
 
     def _may_adapt(self, window: list[StaticReading]) -> bool:
         """Whether rows that nothing explains show the discrepancy rather than a contact, for which an alarm is open."""

@@ -44,7 +44,7 @@ CONTENT: dict[str, Any] = {
 }
 
 
-def describe(folder: Path, **link: float) -> Path:
+def describe(folder: Path, **link: Any) -> Path:
     """An arm file of it, with these keys in its link section."""
     path = folder / "pair.yaml"
     path.write_text(yaml.safe_dump({**CONTENT, "link": {**CONTENT["link"], **link}}))
@@ -61,10 +61,10 @@ def armlink(folder: Path, *words: str, ok: tuple[int, ...] = (0,)) -> dict[str, 
 
 
 @contextlib.contextmanager
-def simulated(folder: Path, bus: str) -> Iterator[tuple[Path, "subprocess.Popen[bytes]"]]:
+def simulated(folder: Path, bus: str, seed: int = SEED) -> Iterator[tuple[Path, "subprocess.Popen[bytes]"]]:
     """The arm of `folder` in real time on this bus; its control pipe and its process."""
     pipe = folder / "arm.pipe"
-    words = ["sim", "pair.yaml", "--bus", bus, "--seed", str(SEED), "--control", str(pipe)]
+    words = ["sim", "pair.yaml", "--bus", bus, "--seed", str(seed), "--control", str(pipe)]
     with subprocess.Popen([ARMLINK, *words], cwd=folder, stderr=subprocess.DEVNULL) as process:
         while not pipe.exists():
             assert process.poll() is None, "the simulated arm has ended"

@@ -45,10 +45,10 @@ def push(name: str, group: str) -> None:
     host = Host(bus.open_port(), drives)
     drives.set_up(host, [Limits(5.0, 200.0, 10.0, -6.0, 6.0, DEADLINE, 0.02)])
 
-    def order(mode: int = Mode.TORQUE) -> Order:
-        return Order(Power.ON, True, mode, host.latest.get(0, 0.0), 0.0, 0.3, 0.0, 0.0)
+    def order(walk: bool = False) -> Order:
+        return Order(Power.ON, walk, Mode.TORQUE, host.latest.get(0, 0.0), 0.0, 0.3, 0.0, 0.0)
 
-    assert host.until(lambda: drives.power(0) is Power.ON, order)
+    assert host.until(lambda: drives.power(0) is Power.ON, lambda: order(walk=True))
     host.until(lambda: False, order, 0.2)
     print("pushing", flush=True)
     host.until(lambda: False, order, 3600.0)

@@ -320,3 +320,36 @@ def test_hints_in_messages_name_commands_that_exist():
                             f"{file}: {name} {option}"
                         )
     assert found > 40
+
+
+@pytest.mark.parametrize(
+    ("module", "extra"),
+    [
+        ("fastapi", "daemon"),
+        ("uvicorn", "daemon"),
+        ("prometheus_client", "daemon"),
+        ("distributed", "gap"),
+        ("msgpack", "simulator"),
+        ("psycopg", "postgresql"),
+    ],
+)
+def test_a_missing_extra_is_named(command, capsys, module, extra):
+    command(raising(ModuleNotFoundError(f"No module named {module!r}", name=module)))
+    assert cli.run(["work"]) == 2
+    assert capsys.readouterr().err == f"armlink: work: {module} is not installed: pip install 'armlink[{extra}]'\n"
+
+
+def test_another_missing_module_is_a_bug(command):
+    command(raising(ModuleNotFoundError("No module named 'numpy'", name="numpy")))
+    with pytest.raises(ModuleNotFoundError):
+        cli.run(["work"])
+
+
+def test_the_package_states_its_pythons():
+    from importlib.metadata import metadata
+
+    stated = metadata("armlink")
+    assert stated["Requires-Python"] == ">=3.11"
+    pythons = [each for each in stated.get_all("Classifier") if each.startswith("Programming Language")]
+    assert [each[-4:] for each in pythons] == ["3.11", "3.12", "3.13"]
+    assert {"all", "daemon", "gap", "simulator"} <= set(stated.get_all("Provides-Extra"))

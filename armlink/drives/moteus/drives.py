@@ -93,6 +93,13 @@ class MoteusDrives(BasicDrives):
             for head in range(0x100)
         }
 
+    def poll(self, first: bool) -> list[Frame]:
+        """Queries alone."""
+        return [
+            (_flagged(frames.identifier(settings.source, settings.id, True)), frames.pack({}, QUERY))
+            for settings in self._settings
+        ]
+
     # ---- set-up
 
     def identify(self, ask: Ask) -> list[DriveIdentity]:

@@ -39,6 +39,8 @@ class Tracking:
         self.filter = SensorFilter(n, config)
         self._cusum = Cusum(n, config)
         self._poses = PoseMemory(n, config)
+        self._suspected = 0
+        """Rows for which there has been a suspicion: it may yet become an alarm."""
         self._since: deque[tuple[StaticReading, bool]] = deque(maxlen=config.window)
 
     def count(self, row: StaticReading) -> None:
@@ -59,18 +61,27 @@ class Tracking:
         if not self.belief.level.is_known:
             return []
         alarms = self._cusum.handle(residual - here, torque, noise + left)
-        found = [(self._seen_as(*alarm), *alarm) for alarm in alarms]
-        for kind, joint, channel in found:
-            if not kind:
-                self._cusum.drop(joint, channel)
-        if any(kind for kind, *_ in found):
-            return [(kind, joint, {"channel": channel}) for kind, joint, channel in found if kind]
+        if alarms and (told := self._judged(alarms)) is not None:
+            return told
         if self._poses.seen(q) < self._config.place_rows:
             self.filter.handle(row.torque - expected.mean[0], torque, noise + of_model)
         self._poses.add(q, residual)
         most = self._config.outliers_in_a_row
         wild = [j for j in np.flatnonzero(self.filter.rejected >= most).tolist() if self._are_outliers(j)]
         return [("outliers", joint, {"rows": most}) for joint in wild]
+
+    def _judged(self, alarms: list[tuple[int, str]]) -> list[Alarm] | None:
+        """Alarms of the CUSUM to tell now, none while they are open; None if all were the model's error."""
+        found = [(self._seen_as(*alarm), *alarm) for alarm in alarms]
+        for kind, joint, channel in found:
+            if not kind:
+                self._cusum.drop(joint, channel)
+        seen = [(kind, joint, {"channel": channel}) for kind, joint, channel in found if kind]
+        self._suspected = self._suspected + 1 if seen else 0
+        certain = [alarm for alarm in seen if alarm[0] == "alarm"]
+        if certain or self._suspected >= self._config.audit_rows:
+            return certain or seen
+        return [] if seen else None
 
     def _recent(self, joint: int, count: int) -> tuple[Array, Array, Array]:
         """Of the last rows (K,): one joint's residual, its model torque, and the covariance (K, K) of the residual."""
@@ -138,6 +149,7 @@ class Tracking:
         """The alarm is closed: change detection starts from zero."""
         self._cusum.reset()
         self._since.clear()
+        self._suspected = 0
 
     def limits(self, rows: list[StaticReading]) -> Limits:
         """Limits in work like these rows; over the whole range while they are few."""
@@ -153,6 +165,7 @@ class Tracking:
         """All parts as JSON values."""
         since = [[*save_rows([row])[0], known] for row, known in self._since]
         own: dict[str, Any] = {"sigma": self.sigma.tolist(), "rows": self.rows, "since": since}
+        own["suspected_rows"] = self._suspected
         return own | self.belief.save() | self.filter.save() | self._cusum.save() | self._poses.save()
 
     def restore(self, values: dict[str, Any]) -> bool:
@@ -163,13 +176,13 @@ class Tracking:
             sigma, rows = as_array("sigma", values["sigma"], self.sigma.shape), int(values["rows"])
             saved = values.get("since", [])
             since = read_rows([row[:4] for row in saved], len(sigma))
-            known = [bool(row[4]) for row in saved]
+            known, suspected = [bool(row[4]) for row in saved], int(values.get("suspected_rows", 0))
         except UNREADABLE:
             return False
         fits = belief.restore(values) and sensors.restore(values) and cusum.restore(values) and poses.restore(values)
         if not fits:
             return False
-        self.sigma, self.rows = sigma, rows
+        self.sigma, self.rows, self._suspected = sigma, rows, suspected
         self._since = deque(zip(since, known, strict=True), maxlen=self._since.maxlen)
         self.belief, self.filter, self._cusum, self._poses = belief, sensors, cusum, poses
         return True
