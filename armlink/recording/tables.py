@@ -109,7 +109,7 @@ def _renamed(header: list[str], columns: Mapping[str, str], path: Path) -> list[
     try:
         joint_count(header, str(path))
     except BadInput as error:
-        suggestion = suggested_map(header) if not foreign else ""
+        suggestion = suggested_map([name for name in header if len(name) <= 100]) if not foreign else ""
         if not suggestion:
             raise
         raise BadInput(f"{error}; if its columns have other names, try {suggestion}") from None
