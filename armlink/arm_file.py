@@ -44,10 +44,14 @@ class BadKeys(BadInput):
         self.keys = keys
 
 
+Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f\x7f/\\]*$")]
+"""A name that goes into file names and reports: one line, no path."""
+
+
 class DhJoint(Section):
     """One revolute joint in standard Denavit-Hartenberg form; `lower` and `upper` are its mechanical stops."""
 
-    name: str
+    name: Name
     a: FiniteFloat = 0.0
     """Link length [m]."""
     alpha: FiniteFloat = 0.0
@@ -143,7 +147,7 @@ class DeviceIdentity(Section):
 class LinkJoint(Section):
     """One joint controller: its drive and the limits that no frame may exceed."""
 
-    name: str
+    name: Name
     node: Annotated[int, Field(ge=1, le=127)] | None = None
     """Short for `drive: {family: canopen, node: …}`: CiA 402 with our own torque sensor object 2100h."""
     drive: Annotated[Any, BeforeValidator(_parse_drive)] = None
@@ -206,14 +210,21 @@ class LinkSection(Section):
 class ArmFile(Section):
     """A whole arm file. `sweep`, `sim`, `daemon` hold the models that packages registered in `armlink.sections`."""
 
-    name: str
-    serial: str = "unknown"
+    name: Name
+    serial: Name = "unknown"
     kinematics: Kinematics
     link: LinkSection | None = None
     sweep: Any = None
     sim: Any = None
     daemon: Any = None
     path: Path
+
+    @model_validator(mode="after")
+    def _name_is_no_folder(self) -> "ArmFile":
+        for key, value in (("name", self.name), ("serial", self.serial)):
+            if value in (".", ".."):
+                raise ValueError(f"{key} is {value!r}, expected a name that can be part of a file's name")
+        return self
 
     @model_validator(mode="after")
     def _same_joints_everywhere(self) -> "ArmFile":
@@ -278,9 +289,7 @@ def load_arm(arm: str | Path) -> ArmFile:
     if path.suffix.lower() in MODEL_SUFFIXES:
         raise BadInput(f"{path}: is a model, not an arm file: make one of it with armlink new {path}")
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise BadInput(f"{path}: not YAML: {error}") from None
+        content = read_yaml(path)
     except OSError as error:
         raise BadInput(f"{path}: cannot be read: {error.strerror}") from None
     if not isinstance(content, dict):
@@ -297,6 +306,16 @@ def _no_arm_file(path: Path) -> str:
     if path.is_dir():
         return f"{path}: is a folder: give the arm file in it, or a bundled arm ({', '.join(bundled)})"
     return f"no arm file {path}: give a path, or a bundled arm ({', '.join(bundled)}){hint}"
+
+
+def read_yaml(path: Path) -> Any:
+    """Content of a YAML file; raises BadInput, in one line, where it is none, OSError where it cannot be read."""
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except RecursionError:
+        raise BadInput(f"{path}: not YAML that can be used: nested too deeply") from None
+    except (yaml.YAMLError, ValueError, OverflowError) as error:  # a date or number that does not exist, for example
+        raise BadInput(f"{path}: not YAML: {' '.join(str(error).split())}") from None
 
 
 def parse_arm(content: dict[str, Any], path: Path) -> ArmFile:

@@ -1,4 +1,4 @@
-"""Nodes on the bus with their identity and state; writes nothing to them."""
+"""Lists the nodes on the bus with their identity and state; writes nothing to them."""
 
 from pathlib import Path
 from typing import Annotated

@@ -94,7 +94,7 @@ class BasicDrives:
         found = self.powers[joint].value
         return f"{self.where(joint)}: power stays {found}, expected {target.value} within {seconds:g} s"
 
-    def forget(self) -> None:
+    def forget(self, restarts: bool = False) -> None:
         """See Drives."""
         self.faults = [""] * self.m
 

@@ -140,7 +140,7 @@ class Drives(Protocol):
         """Why a drive is not in `target` after `seconds`, in words that name the joint."""
         ...
 
-    def forget(self) -> None:
+    def forget(self, restarts: bool = False) -> None:
         """Forget alarms of the past: a walk to ON begins, or has succeeded."""
         ...
 

@@ -10,6 +10,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.bus.adapters import as_bus
+from armlink.bus.arm_hold import ArmHold
 from armlink.bus.can_bus import CanBus
 from armlink.clock import Clock, MonotonicClock
 from armlink.drives.canopen import object_dictionary as objects
@@ -67,6 +68,7 @@ class Link(TorqueSensorRecords):
         self.position_step = np.full(self.n, np.inf)
         """Smallest change that each position reading can show (n,) [rad]; inf before start()."""
         self._last: Command | None = None
+        self._hold: ArmHold | None = None
 
     @classmethod
     def open(cls, arm: ArmFile, bus: str | None = None) -> "Link":
@@ -85,6 +87,8 @@ class Link(TorqueSensorRecords):
             self.stop()
         finally:
             self.bus.shutdown()
+            if self._hold is not None:
+                self._hold.release()
 
     @property
     def enabled(self) -> bool:
@@ -132,6 +136,7 @@ class Link(TorqueSensorRecords):
 
         Raises Refused for another controller than the arm file states, BusFault, BadInput.
         """
+        self._hold = self._hold or ArmHold(self.bus, self.nodes)
         silent = [each for each in self.services if not each.present()]
         missing = [f"{each.joint} (node {each.node})" for each in silent if not each.present()]  # a busy one gets two
         if missing:

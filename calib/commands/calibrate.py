@@ -1,4 +1,4 @@
-"""Gains and offsets of torque and position sensors from sweeps; keeps a calibration record."""
+"""Fits gains and offsets of torque and position sensors to sweeps; keeps a calibration record."""
 
 import getpass
 from pathlib import Path

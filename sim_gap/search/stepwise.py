@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sim_gap.effects.effect import Key
-from sim_gap.search.normal_equations import NormalEquations, Term, Weighted
+from sim_gap.search.normal_equations import NormalEquations, Weighted
+from sim_gap.search.term import Term
 
 Scored = tuple[float, list[Term]]
 """Score of a set of terms, lower is better, and the terms."""
@@ -63,11 +64,12 @@ class Search:
     def _implausible(self, terms: Sequence[Term]) -> Term | None:
         """The first of the terms with implausible coefficients."""
         ends = np.cumsum([len(self.normal.at[term]) for term in terms])
-        pieces = np.split(self.weighted.fit(terms)[1], ends[:-1]) if terms else []
+        pieces = np.split(self.weighted.fit(terms)[1], ends)[:-1] if terms else []
         values = {term.key: piece for term, piece in zip(terms, pieces, strict=True)}
         for term in terms:
             beneath = {name: values[name, place] for name, place in term.beneath}
             beneath["nominal"] = self.normal.known_friction[term.place, None]
+            beneath["tip"] = self.normal.tip_mass
             if not term.form.plausibility.allows(values[term.key], term.shape, beneath):
                 return term
         return None

@@ -79,7 +79,7 @@ def test_the_command_gathers_a_table_by_arm_and_effect_and_goes_on_where_it_stop
     }
     assert [row["verdict"] for row in rows if row["arm"] == "arm_b"] == ["failed"]
     kept = json.loads(Path(answers).read_text(encoding="utf-8"))["answers"]
-    assert kept["arm_a/run_1"]["schema"] == "armlink.gap/1"
+    assert kept["arm_a/run_1"]["schema"] == "armlink.gap/2"
     whole = Path(out).read_bytes()
     Path(out).write_bytes(whole[:-40])  # as a kill leaves it
     again = CliRunner().invoke(app, arguments, standalone_mode=False)
