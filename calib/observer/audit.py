@@ -19,7 +19,7 @@ def audit(tracking: Tracking, state: Investigation, config: ObserverConfig) -> N
     if not tracking.belief.learnt:
         if len(window) < config.window:
             return
-        tracking.adapt(window)
+        tracking.adapt(window[: -len(window) // 4])  # a change in the newest rows is not discrepancy
     verdict = tracking.cause_test(window).verdict()
     if verdict.cause == "unknown":
         state.doubtful += 1
