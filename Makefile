@@ -2,10 +2,10 @@
 PYTHON ?= python3
 BIN := .venv/bin
 export PYTHON
-CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host daemon_days daemon_kills fuzz_frames web
+CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host daemon_days daemon_kills fuzz_frames fuzz_drives kill_drives web
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint format bench soak realtime blind corruptions mutants docs constraints clean
+.PHONY: help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour
 
 help: ## Say what can be done
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
@@ -46,6 +46,18 @@ soak: .venv/.dev ## Long campaigns outside make test: kills, faults, simulated d
 realtime: .venv/.dev ## Long campaign outside make test: the whole job between processes, in real time (ARGS="--seeds 1 --busy")
 	$(BIN)/python tests/campaigns/real_time.py $(ARGS)
 
+observer: .venv/.dev ## Long campaign outside make test: the observer on arms that are not perfect (ARGS="--draws 20 --only drifts")
+	$(BIN)/python tests/campaigns/observer_arms.py $(ARGS)
+
+stalls: .venv/.dev ## Long campaign outside make test: sweeps while job, loop and arm are stopped, and on a busy machine
+	$(BIN)/python tests/campaigns/stalls.py $(ARGS)
+
+realism: .venv/.dev ## Long campaign outside make test: sensor fits of realistic arms, good and bad (ARGS="--seeds 1 5 --full")
+	$(BIN)/python tests/campaigns/realism.py $(ARGS)
+
+walk: .venv/.dev ## Long campaign outside make test: every command of first-run, sweeps, … in order, in real time, on a short arm
+	$(BIN)/python tests/campaigns/docs_walk.py $(ARGS)
+
 blind: .venv/.dev ## Long campaign outside make test: the diagnosis against sealed cases (ARGS="--cases 20")
 	$(BIN)/armlink gap bench $(ARGS)
 
@@ -54,6 +66,12 @@ corruptions: .venv/.dev ## Long campaign outside make test: wrong columns, units
 
 mutants: .venv/.dev ## Long campaign outside make test: each change of the gate's source must make a test fail
 	$(BIN)/python tests/campaigns/mutants.py $(ARGS)
+
+wheel: .venv/.dev ## Build the wheel into dist/ and run the demo from it in an empty environment (ARGS="python3.12 python3.13")
+	scripts/test-wheel $(ARGS)
+
+firsthour: .venv/.dev ## Long campaign outside make test: docs/first-hour.md typed for five models, each to a finished demo report
+	$(BIN)/python tests/campaigns/first_hour.py $(ARGS)
 
 docs: .venv/.dev ## Build the documentation site into site/ and check it: warnings are errors, links hold, commands run
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict

@@ -35,6 +35,10 @@ class Section(BaseModel):
 S = TypeVar("S", bound=Section)
 
 
+Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f\x7f/\\]*$")]
+"""A name that goes into file names and reports: one line, no path."""
+
+
 class BadKeys(BadInput):
     """Keys of an arm file that cannot be used; the message names the first."""
 
@@ -47,7 +51,7 @@ class BadKeys(BadInput):
 class DhJoint(Section):
     """One revolute joint in standard Denavit-Hartenberg form; `lower` and `upper` are its mechanical stops."""
 
-    name: str
+    name: Name
     a: FiniteFloat = 0.0
     """Link length [m]."""
     alpha: FiniteFloat = 0.0
@@ -143,7 +147,7 @@ class DeviceIdentity(Section):
 class LinkJoint(Section):
     """One joint controller: its drive and the limits that no frame may exceed."""
 
-    name: str
+    name: Name
     node: Annotated[int, Field(ge=1, le=127)] | None = None
     """Short for `drive: {family: canopen, node: …}`: CiA 402 with our own torque sensor object 2100h."""
     drive: Annotated[Any, BeforeValidator(_parse_drive)] = None
@@ -206,14 +210,21 @@ class LinkSection(Section):
 class ArmFile(Section):
     """A whole arm file. `sweep`, `sim`, `daemon` hold the models that packages registered in `armlink.sections`."""
 
-    name: str
-    serial: str = "unknown"
+    name: Name
+    serial: Name = "unknown"
     kinematics: Kinematics
     link: LinkSection | None = None
     sweep: Any = None
     sim: Any = None
     daemon: Any = None
     path: Path
+
+    @model_validator(mode="after")
+    def _name_is_no_folder(self) -> "ArmFile":
+        for key, value in (("name", self.name), ("serial", self.serial)):
+            if value in (".", ".."):
+                raise ValueError(f"{key} is {value!r}, expected a name that can be part of a file's name")
+        return self
 
     @model_validator(mode="after")
     def _same_joints_everywhere(self) -> "ArmFile":
@@ -278,15 +289,23 @@ def load_arm(arm: str | Path) -> ArmFile:
     if path.suffix.lower() in MODEL_SUFFIXES:
         raise BadInput(f"{path}: is a model, not an arm file: make one of it with armlink new {path}")
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise BadInput(f"{path}: not YAML: {error}") from None
+        content = read_yaml(path)
     except OSError as error:
         raise BadInput(f"{path}: cannot be read: {error.strerror}") from None
     if not isinstance(content, dict):
         kind = "nothing" if content is None else type(content).__name__
         raise BadInput(f"{path}: expected a mapping with keys name, kinematics, link, not {kind}")
     return parse_arm(content, path)
+
+
+def read_yaml(path: Path) -> Any:
+    """Content of a YAML file; raises BadInput, in one line, where it is none, OSError where it cannot be read."""
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except RecursionError:
+        raise BadInput(f"{path}: not YAML that can be used: nested too deeply") from None
+    except (yaml.YAMLError, ValueError, OverflowError) as error:  # a date or number that does not exist, for example
+        raise BadInput(f"{path}: not YAML: {' '.join(str(error).split())}") from None
 
 
 def _no_arm_file(path: Path) -> str:

@@ -3,10 +3,13 @@
 import ast
 import importlib.util
 import os
+import re
 import sys
-from importlib.metadata import EntryPoint, entry_points, version
+from importlib.metadata import EntryPoint, entry_points, requires, version
 from pathlib import Path
+from typing import Any
 
+from armlink import completion
 from armlink.termination import terminate_as_interrupt
 
 PURPOSE = (
@@ -14,6 +17,8 @@ PURPOSE = (
 )
 USAGE_STATUS = 2
 INTERRUPTED_STATUS = 130
+COLLECTIONS = ("all", "dev")
+"""Extras that only collect others."""
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment of the linear algebra, set before numpy is imported: our matrices are small, and threads that wait for
 one another on a busy machine cost up to a hundred times the arithmetic."""
@@ -37,9 +42,40 @@ def run(arguments: list[str]) -> int:
     if name == "--version":
         sys.stdout.write(f"armlink {version('armlink')}\n")
         return 0
+    if name in (completion.WORD, "completion"):
+        return _complete(points, name, rest)
     if name not in points:
-        return _fail(f"no command {name!r}; there are {', '.join(sorted(points))}", USAGE_STATUS)
+        return _fail(_no_command(name, points), USAGE_STATUS)
     return _call(points[name], rest)
+
+
+def _complete(points: dict[str, EntryPoint], name: str, words: list[str]) -> int:
+    """Candidates for the shell, or the script that asks for them."""
+    if name == completion.WORD:
+        sys.stdout.writelines(f"{word}\n" for word in completion.candidates(points, words))
+        return 0
+    if words[:1] in (["--help"], ["-h"]):
+        uses = "\n".join(f"  {use}" for use in completion.USE.values())
+        shells = "|".join(completion.SCRIPTS)
+        sys.stdout.write(
+            f"Usage: armlink completion {shells}\n\n  Prints the script that completes commands and options.\n\n"
+            f"{uses}\n\n  Example: armlink completion bash\n"
+        )
+        return 0
+    if len(words) != 1 or words[0] not in completion.SCRIPTS:
+        return _fail(f"completion: give a shell: {', '.join(completion.SCRIPTS)}", USAGE_STATUS)
+    sys.stdout.write(completion.SCRIPTS[words[0]])
+    return 0
+
+
+def _no_command(name: str, points: dict[str, EntryPoint]) -> str:
+    import difflib
+
+    if name.lower().endswith((".urdf", ".xml", ".mjcf")):
+        return f"no command {name!r}; an arm file of a model is made by armlink new {name}"
+    close = difflib.get_close_matches(name, [*points, "--help", "--version", "completion"], n=1)
+    hint = f"did you mean {close[0]}? " if close else ""
+    return f"no command {name!r}; {hint}there are {', '.join(sorted(points))}"
 
 
 def _call(point: EntryPoint, arguments: list[str]) -> int:
@@ -50,15 +86,39 @@ def _call(point: EntryPoint, arguments: list[str]) -> int:
     except BrokenPipeError:  # whoever read our output has gone; Python's own flush at exit must not complain
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except ModuleNotFoundError as error:
+        extra = _extra_with(error.name or "")
+        if extra is None:
+            raise
+        return _fail(f"{point.name}: {error.name} is not installed: pip install 'armlink[{extra}]'", USAGE_STATUS)
     except Exception as error:
         if hasattr(error, "format_message"):  # a usage error: unknown option, missing argument, bad value
-            return _fail(f"{point.name}: {error.format_message()} (see armlink {point.name} --help)", USAGE_STATUS)
+            return _fail(f"{point.name}: {_usage(error)} (see armlink {point.name} --help)", USAGE_STATUS)
         if isinstance(error, OSError) and error.strerror is not None:  # a write to a full disk names no file
             return _fail(f"{error.filename or point.name}: {error.strerror}", USAGE_STATUS)
         status = getattr(error, "exit_status", None)  # every package's own error tree carries one
         if status is None:
             raise
         return _fail(str(error), int(status))
+
+
+def _extra_with(module: str) -> str | None:
+    """The extra of this package that brings a module; None where it is none of ours."""
+    wanted = module.partition(".")[0].replace("_", "-").lower()
+    for requirement in requires("armlink") or []:
+        name, _, extra = requirement.replace("'", "").replace('"', "").partition("extra == ")
+        known = re.split(r"[^A-Za-z0-9-]", name, maxsplit=1)[0].lower()
+        if extra not in ("", *COLLECTIONS) and known.removesuffix("-sdk") == wanted:
+            return extra.strip()
+    return None
+
+
+def _usage(error: Any) -> str:
+    """Click's message, with what was probably meant."""
+    message = str(error.format_message())
+    begin, *suggested = re.split(r" ?\(?(?:Possible options:|Did you mean)", message)
+    meant = re.findall(r"[\w-]+", " ".join(suggested))
+    return f"{begin.rstrip('. ')}; did you mean {' or '.join(meant)}?" if meant else message
 
 
 def _invoke(point: EntryPoint, arguments: list[str]) -> int:
@@ -90,7 +150,10 @@ def _help(points: dict[str, EntryPoint]) -> str:
     rows = "\n".join(f"  {name:<{width}}  {_summary(points[name])}" for name in sorted(points))
     return (
         f"Usage: armlink COMMAND [OPTIONS]\n\n{PURPOSE}\n\nCommands:\n{rows}\n\n"
-        "armlink COMMAND --help says more. Example: armlink demo --seed 1\n"
+        "Options:\n  --help     Shows this, and armlink COMMAND --help says more.\n"
+        f"  --version  Shows the version, {version('armlink')}.\n\n"
+        "armlink completion bash|zsh|fish prints the script for completion in the shell.\n\n"
+        "Example: armlink demo --seed 1\n"
     )
 
 

@@ -20,8 +20,12 @@ def describe(error: ValidationError, within: str = "", of: type[BaseModel] | Non
 
 
 def describe_all(error: ValidationError, within: str = "", of: type[BaseModel] | None = None) -> list[tuple[str, str]]:
-    """(Key, what is wrong with it) of all findings; `of` is the model that was validated, for likely keys."""
-    return [_finding(found, within, of) for found in error.errors(include_url=False)]
+    """(Key, what is wrong with it) of all findings; `of` is the model that was validated, for likely keys.
+
+    Unknown keys come first: a misspelt key is missing under its own name too.
+    """
+    order = sorted(error.errors(include_url=False), key=lambda found: found["type"] != "extra_forbidden")
+    return [_finding(found, within, of) for found in order]
 
 
 def meant(word: str, known: Iterable[str]) -> str:
@@ -50,7 +54,15 @@ def _finding(found: typing.Any, within: str, of: type[BaseModel] | None) -> tupl
     unit = UNIT.fullmatch(value) if isinstance(value, str) else None
     if unit and found["type"].startswith(("float", "int")):
         message += f"; give the number alone, without {unit[1]!r}"
-    return key, f"{message} (value {value!r})"
+    return key, f"{message} (value {_short(value)})"
+
+
+def _short(value: typing.Any) -> str:
+    try:
+        text = repr(value)
+    except ValueError:  # a number of more digits than Python writes
+        return "a number of very many digits"
+    return text if len(text) <= 100 else f"{text[:100]}…"
 
 
 def _keys(model: type[BaseModel] | None, way: list[str]) -> list[str]:

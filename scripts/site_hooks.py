@@ -28,6 +28,7 @@ OUTSIDE = (
     "CITATION.cff",
     "examples/*.*",
     "notebooks/*.ipynb",
+    "tests/models/*.*",
     "packaging/*.service",
 )
 """Files of the site that lie outside docs/."""

@@ -30,6 +30,10 @@ class BusGroup:
         """Name of a bus → what its identifiers have in addition."""
         self.channel_info = " and ".join(member.channel_info for member in self.members)
 
+    def member(self, name: str) -> MessageBus:
+        """The bus of this name in the arm file."""
+        return self.members[self.tags[name] >> BUS_SHIFT]
+
     def open_port(self, as_node: bool = False) -> "GroupPort":
         """See CanBus."""
         return GroupPort([member.open_port(as_node) for member in self.members])

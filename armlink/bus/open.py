@@ -49,6 +49,8 @@ def open_bus(spec: str | None, section: Bus) -> MessageBus:
     try:
         return adapt(can.Bus(interface=bus.interface, channel=bus.channel, **options, **bus.options), name)
     except CanInterfaceNotImplementedError as error:
+        if "msgpack" in str(error):  # python-can finds the interface, which lacks what it is made of
+            raise BadInput(f"bus {name}: msgpack is not installed: pip install 'armlink[simulator]'") from None
         raise BadInput(f"bus {name}: {error}: unknown interface of python-can") from None
     except TypeError as error:
         raise BadInput(

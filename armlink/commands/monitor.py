@@ -1,4 +1,4 @@
-"""Live table of an arm's joints: position, torque, state, age, bus load; commands nothing."""
+"""Shows an arm's joints live: position, torque, state, age, bus load; commands nothing."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any

@@ -1,4 +1,4 @@
-"""Drives on the bus with their identity and state; writes nothing to them."""
+"""Lists the drives on the bus with their identity and state; writes nothing to them."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated

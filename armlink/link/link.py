@@ -10,6 +10,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.bus.adapters import as_bus
+from armlink.bus.arm_hold import ArmHold
 from armlink.bus.can_bus import CanBus
 from armlink.clock import Clock, MonotonicClock
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Setup
@@ -73,6 +74,7 @@ class Link(Calibrations):
         """Smallest change that each position reading can show (n,) [rad]; inf before start()."""
         self._last: Command | None = None
         self._limits: list[Limits] = []
+        self._hold: ArmHold | None = None
 
     @classmethod
     def open(cls, arm: ArmFile, bus: str | None = None) -> "Link":
@@ -91,11 +93,18 @@ class Link(Calibrations):
             self.stop()
         finally:
             self.bus.shutdown()
+            if self._hold is not None:
+                self._hold.release()
 
     @property
     def enabled(self) -> bool:
         """Whether the joints are enabled and cycles must go on."""
         return self._enabled
+
+    @property
+    def addresses(self) -> list[tuple[str, str]]:
+        """Bus, by its name in the arm file, and id of each joint's drive."""
+        return [(joint.bus, joint.settings.address) for joint in self.section.joints]
 
     @property
     def last(self) -> Command | None:
@@ -149,10 +158,12 @@ class Link(Calibrations):
 
         Raises Refused for another controller than the arm file states, BusFault, BadInput.
         """
+        self._hold = self._hold or ArmHold(self.bus, self.addresses)
         missing = [
             f"{self.names[group.places[joint]]} ({self.section.joints[group.places[joint]].settings.address})"
             for group in self.groups
-            for joint in group.drives.missing(self._ask(group))
+            if group.drives.missing(self._ask(group))
+            for joint in group.drives.missing(self._ask(group))  # a busy one is asked twice
         ]
         if missing:
             channel = self.bus.channel_info

@@ -7,23 +7,25 @@ temperatures go as effort on `/joint_temperatures` [°C].
 
 import struct
 from collections import Counter, defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import IO, Any, Self
 
 import numpy as np
+from lz4.frame import LZ4FrameDecompressor
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
-from mcap.records import Channel, Footer, Message, Schema
-from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.records import Channel, Chunk, Footer, Message, Schema
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
 from mcap.writer import Writer
-from zstandard import ZstdError
+from zstandard import ZstdDecompressor, ZstdError
 
 from armlink.arrays import Array
 from armlink.errors import BadInput
-from armlink.recording.recording import Recording
+from armlink.recording.recording import MOST_BYTES, MOST_JOINTS, Recording, require_size
 from armlink.recording.ros_joint_state import SCHEMA, SCHEMA_NAME, JointState, JointStateDecoder, joint_state_encoder
 
 TOPICS: dict[str, tuple[str | None, str | None, str | None]] = {
@@ -35,6 +37,8 @@ TOPICS: dict[str, tuple[str | None, str | None, str | None]] = {
 """Topic → channels carried as position, velocity and effort."""
 FLUSH_SECONDS = 0.5
 """Interval of flushes: a killed recorder loses at most this and what the operating system had not written."""
+MOST_CHUNK = 1 << 28
+"""A chunk that unpacks to more bytes is refused; rosbag2 writes less than a thousandth of it."""
 _NANO = 1_000_000_000
 
 
@@ -43,7 +47,8 @@ class RecordingWriter:
 
     def __init__(self, path: str | Path, names: tuple[str, ...]) -> None:
         """Create the file for joints with these names."""
-        self._stream = Path(path).open("wb")  # noqa: SIM115 - closed by __exit__
+        path = Path(path)
+        self._stream = path.open("wb")
         self._names, self._n = names, len(names)
         self._writer = Writer(self._stream)
         self._writer.start(profile=Profile.ROS2, library="armlink")
@@ -110,6 +115,8 @@ def load_mcap(path: Path) -> Recording:
         cut = "; ".join(filter(None, (cut, f"joints in messages of their own, left out: {', '.join(alone)}")))
         states = [state for state in states if set(names) <= set(state.names)]
         stamps = np.array([state.stamp for state in states], dtype=np.int64)
+    if len(names) > MOST_JOINTS:
+        raise BadInput(f"{path}: {len(names)} joints in /joint_states, expected at most {MOST_JOINTS}")
     channels = _channels_of("/joint_states", states, names, str(path))
     half = np.median(np.diff(stamps)) / 2 if stamps.size > 1 else 0.0
     for topic, others in messages.items():
@@ -144,11 +151,13 @@ def _read(path: Path) -> tuple[dict[str, list[JointState]], str]:
     topics: dict[int, str] = {}
     schemas: dict[int, Schema] = {}
     decode = JointStateDecoder()
-    complete, why = False, "the file ends early"
+    complete, why, size = False, "the file ends early", 0
     with path.open("rb") as stream:
         try:
-            for record in StreamReader(stream, validate_crcs=True).records:
+            for record in _records(stream, path):
                 if isinstance(record, Message) and record.channel_id in topics:
+                    size += len(record.data)
+                    require_size(size, str(path))
                     found[topics[record.channel_id]].append(decode(record.data))
                 elif isinstance(record, Schema):
                     schemas[record.id] = record
@@ -158,6 +167,8 @@ def _read(path: Path) -> tuple[dict[str, list[JointState]], str]:
                 complete = complete or isinstance(record, Footer)
         except CRCValidationError as error:
             why = str(error)
+        except RuntimeError as error:  # of LZ4
+            why = f"a chunk cannot be unpacked ({error})"
         except (McapError, ValueError, MemoryError, OSError, struct.error, ZstdError):
             pass
         position = stream.tell()
@@ -165,6 +176,33 @@ def _read(path: Path) -> tuple[dict[str, list[JointState]], str]:
         return found, ""
     rows = len(found.get("/joint_states", []))
     return found, f"cut recording, {why}: loaded {rows} rows, up to about byte {position}"
+
+
+def _records(stream: IO[bytes], path: Path) -> Iterator[Any]:
+    """Records of the file; raises BadInput where a chunk unpacks to more than a recording may hold."""
+    for record in StreamReader(stream, validate_crcs=True, emit_chunks=True, record_size_limit=MOST_BYTES).records:
+        if isinstance(record, Chunk):
+            if record.uncompressed_size > MOST_CHUNK:
+                raise BadInput(f"{path}: a chunk of {record.uncompressed_size} bytes, expected at most {MOST_CHUNK}")
+            yield from breakup_chunk(_unpacked(record), validate_crc=True)
+        else:
+            yield record
+
+
+def _unpacked(chunk: Chunk) -> Chunk:
+    """A chunk without its compression; unpacks no more than its header states, and raises ValueError beyond it."""
+    if not chunk.compression:
+        return chunk
+    most = chunk.uncompressed_size + 1
+    if chunk.compression == "zstd":
+        data = ZstdDecompressor().stream_reader(chunk.data).read(most)
+    elif chunk.compression == "lz4":
+        data = LZ4FrameDecompressor().decompress(chunk.data, max_length=most)
+    else:
+        raise ValueError(f"a chunk is packed as {chunk.compression}")
+    if len(data) != chunk.uncompressed_size:
+        raise ValueError(f"a chunk unpacks to other than {chunk.uncompressed_size} bytes")
+    return replace(chunk, compression="", data=data)
 
 
 def _check_schema(channel: Channel, schemas: dict[int, Schema], path: Path) -> None:

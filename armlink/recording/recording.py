@@ -1,5 +1,6 @@
 """Recordings: an arm's channels over time, and their columns in tables."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -19,6 +20,13 @@ COLUMNS = {
     "temperature": "temp",
 }
 """Channel name -> column prefix; joint i of 1..n has the column `PREFIX_i`."""
+_INDEX = re.compile(r"[1-9][0-9]{0,8}")
+MOST_JOINTS = 64
+"""A recording of more joints is refused."""
+MOST_COLUMNS = 1000
+"""Likewise of more columns, whatever they hold."""
+MOST_BYTES = 2 << 30
+"""Likewise of more content than this once unpacked, as 64-bit numbers: some 9 hours of seven joints at 250 Hz."""
 TORQUE_CHANNELS = ("torque", "motor_torque", "torque_command")
 
 
@@ -77,6 +85,22 @@ class Recording:
         return self
 
 
+def require_width(columns: Sequence[str], source: str) -> int:
+    """The highest joint number of the columns, at least 1; raises BadInput where no recording has so many."""
+    if len(columns) > MOST_COLUMNS:
+        raise BadInput(f"{source}: {len(columns)} columns, expected at most {MOST_COLUMNS}")
+    n = max((index for column in columns if (index := _joint_index(column)) is not None), default=1)
+    if n > MOST_JOINTS:
+        raise BadInput(f"{source}: a column is of joint {n}, expected at most {MOST_JOINTS} joints")
+    return n
+
+
+def require_size(size: int, source: str) -> None:
+    """Raise BadInput where a recording holds more bytes than it may."""
+    if size > MOST_BYTES:
+        raise BadInput(f"{source}: holds more than {MOST_BYTES / 1e9:.1f} GB: split it into several recordings")
+
+
 def default_names(n: int) -> tuple[str, ...]:
     """`joint_1` … `joint_n`, for files without joint names."""
     return tuple(f"joint_{i}" for i in range(1, n + 1))
@@ -102,8 +126,7 @@ def channels_of(columns: Mapping[str, Array], source: str) -> dict[str, Array | 
 
 def joint_count(columns: list[str], source: str) -> int:
     """Number of joints that the column names describe; raises BadInput that names a missing column."""
-    indices = [index for column in columns if (index := _joint_index(column)) is not None]
-    n = max(indices, default=1)
+    n = require_width(columns, source)
     present = set(columns)
     for name, prefix in COLUMNS.items():
         wanted = [f"{prefix}_{i}" for i in range(1, n + 1)]
@@ -139,7 +162,7 @@ def slice_rows(recording: Recording, rows: slice | NDArray[np.bool_] | NDArray[n
 def channel_column(column: str) -> tuple[str, int] | None:
     """Channel prefix and joint number from 1 of a column's name, or None if it is not that of a channel."""
     prefix, _, index = column.rpartition("_")
-    known = prefix in COLUMNS.values() and index.isascii() and index.isdigit() and not index.startswith("0")
+    known = prefix in COLUMNS.values() and _INDEX.fullmatch(index) is not None
     return (prefix, int(index)) if known else None
 
 

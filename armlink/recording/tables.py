@@ -4,6 +4,7 @@ import csv
 import gzip
 import json
 import zlib
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -26,9 +27,15 @@ from armlink.recording.recording import (
     default_names,
     is_channel,
     joint_count,
+    require_size,
+    require_width,
 )
 
 _LOOK_BACK = 20_000  # bytes at the end of a CSV file that show how long its numbers are
+_PIECE = 1 << 24  # bytes that are unpacked at a time
+_MOST_HEADER = 1 << 18
+_MOST_RATIO, _SURELY_MUCH = 200, 1 << 28
+"""A file that unpacks to more than _SURELY_MUCH bytes must not be smaller than this share of them."""
 NAMES_KEY = b"armlink.names"
 """Parquet schema metadata: joint names as JSON."""
 
@@ -38,8 +45,11 @@ def load_csv(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> R
 
     `columns`: column of docs/formats.md → the file's name for it.
     """
+    _require_header(path)
     content, cut = _content(path)
-    header = _renamed(_header(path, content), columns, path)
+    header = _header(path, content)
+    require_width(header, str(path))
+    header = _renamed(header, columns, path)
     wanted = [column for column in header if is_channel(column)]
     try:
         table = pa_csv.read_csv(
@@ -61,16 +71,29 @@ def load_csv(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> R
 def load_parquet(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> Recording:
     """Load Parquet with the columns of docs/formats.md, joint names from the schema's metadata; raises BadInput."""
     try:
-        table = pa_parquet.read_table(path)
-        header = _renamed(list(table.column_names), columns, path)
-        table = table.rename_columns(header).replace_schema_metadata(table.schema.metadata)
-        wanted = [column for column in header if is_channel(column)]
-        metadata = table.schema.metadata or {}
-        table = table.select(wanted).cast(pa.schema([(column, pa.float64()) for column in wanted]))
-    except (pa.ArrowInvalid, pa.ArrowNotImplementedError, OSError) as error:
+        schema = pa_parquet.read_schema(path)
+        require_width(schema.names, str(path))
+        header = _renamed(list(schema.names), columns, path)
+        wanted = {column: name for column, name in zip(header, schema.names, strict=True) if is_channel(column)}
+        require_size(8 * len(wanted) * pa_parquet.read_metadata(path).num_rows, str(path))
+        table = pa_parquet.read_table(path, columns=list(wanted.values())).select(list(wanted.values()))
+        table = table.rename_columns(list(wanted)).cast(pa.schema([(column, pa.float64()) for column in wanted]))
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise BadInput(f"{path}: {_first_line(error)}") from None
-    names = tuple(json.loads(metadata[NAMES_KEY])) if NAMES_KEY in metadata else ()
-    return _recording(table, header, str(path), names)
+    return _recording(table, header, str(path), _names((schema.metadata or {}).get(NAMES_KEY), str(path)))
+
+
+def _names(content: bytes | None, source: str) -> tuple[str, ...]:
+    """Joint names from the schema's metadata; empty where there are none, raises BadInput where they are none."""
+    if content is None:
+        return ()
+    try:
+        names = json.loads(content)
+    except (ValueError, RecursionError):
+        names = None
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise BadInput(f"{source}: the schema's metadata {NAMES_KEY.decode()} is no JSON list of joint names")
+    return tuple(names)
 
 
 def _renamed(header: list[str], columns: Mapping[str, str], path: Path) -> list[str]:
@@ -86,7 +109,7 @@ def _renamed(header: list[str], columns: Mapping[str, str], path: Path) -> list[
     try:
         joint_count(header, str(path))
     except BadInput as error:
-        suggestion = suggested_map(header) if not foreign else ""
+        suggestion = suggested_map([name for name in header if len(name) <= 100]) if not foreign else ""
         if not suggestion:
             raise
         raise BadInput(f"{error}; if its columns have other names, try {suggestion}") from None
@@ -132,10 +155,11 @@ def _table(recording: Recording) -> Any:
 def _content(path: Path) -> tuple[bytes, str]:
     """Complete lines of the file, uncompressed, and why it is truncated (empty if it is not)."""
     try:
+        require_size(path.stat().st_size, str(path))
         content = path.read_bytes()
         cut = ""
         if path.name.lower().endswith(".gz"):
-            content, ended = _unpacked(content)
+            content, ended = _unpacked(content, str(path))
             cut = "" if ended else "the file ends early"
     except (OSError, zlib.error) as error:
         raise BadInput(f"{path}: not a readable CSV file: {_first_line(error)}") from None
@@ -147,12 +171,18 @@ def _content(path: Path) -> tuple[bytes, str]:
     return content[:whole], cut or "its last line is not complete"
 
 
-def _unpacked(packed: bytes) -> tuple[bytes, bool]:
-    """Content of the gzip members as far as it goes, and whether the last member is complete."""
-    parts, ended = [], False
+def _unpacked(packed: bytes, source: str) -> tuple[bytes, bool]:
+    """Content of the gzip members as far as it goes, and whether the last member is complete; raises BadInput."""
+    parts, ended, size, whole = [], False, 0, len(packed)
     while packed:
         member = zlib.decompressobj(wbits=31)
-        parts.append(member.decompress(packed))
+        while packed and not member.eof:
+            parts.append(member.decompress(packed, _PIECE))
+            packed = member.unconsumed_tail
+            size += len(parts[-1])
+            require_size(size, source)
+            if size > _SURELY_MUCH and size > _MOST_RATIO * whole:
+                raise BadInput(f"{source}: unpacks to more than {_MOST_RATIO} times its size: not a recording")
         ended, packed = member.eof, member.unused_data.lstrip(b"\0")
         if not ended:
             break
@@ -186,13 +216,25 @@ def _is_number(cell: str) -> bool:
     return True
 
 
+def _require_header(path: Path) -> None:
+    """Raise BadInput where the header row is longer than any of a recording; reads no more than that."""
+    packed = path.name.lower().endswith(".gz")
+    try:
+        with gzip.open(path, "rb") if packed else open(path, "rb") as stream:
+            begin = stream.read(_MOST_HEADER)
+    except (OSError, EOFError, zlib.error):
+        return  # said by who reads it whole, as far as it goes
+    if len(begin) == _MOST_HEADER and b"\n" not in begin:
+        raise BadInput(f"{path}: its header row has more than {_MOST_HEADER // 1024} kB, expected names of columns")
+
+
 def _header(path: Path, content: bytes) -> list[str]:
     try:
         line = content.partition(b"\n")[0].decode("utf-8-sig")
         header = [column.strip() for column in next(csv.reader([line]), [])]
     except (UnicodeDecodeError, csv.Error) as error:
         raise BadInput(f"{path}: not a readable CSV file: {_first_line(error)}") from None
-    twins = sorted({column for column in header if header.count(column) > 1})
+    twins = sorted(column for column, count in Counter(header).items() if count > 1)
     if twins:
         raise BadInput(f"{path}: column {twins[0]!r} occurs twice in the header row")
     return header

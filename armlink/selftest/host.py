@@ -107,8 +107,10 @@ class EchoDrives(BasicDrives):
 class EchoPort:
     """A port on which every joint answers each command at once."""
 
-    def __init__(self) -> None:
-        """Nothing waits."""
+    def __init__(self, arm: ArmFile) -> None:
+        """For the joints of this arm, in the middle of their ranges."""
+        self.standing = np.array([(lower + upper) / 2 for lower, upper in joint_ranges(arm)])
+        """(n,) [rad]."""
         self.errors = self.dropped = 0
         self._waiting: deque[Frame] = deque()
 
@@ -175,7 +177,8 @@ def echo_commander(arm: ArmFile, port: EchoPort, clock: Clock) -> Commander:
     commander = Commander(loop, clock, arm.joint_names, period, np.inf, lock_step=False)
     setups = drives.set_up(LinkAsk(loop, clock, lambda done, timeout: False), limits)
     gates = [gate_limits(limit) for limit in limits]
-    commander.begin(gates, [start_from(gate, 0.0, 0.0) for gate in gates], [each.modes for each in setups])
+    passed = [start_from(gate, 0.0, place) for gate, place in zip(gates, port.standing, strict=True)]
+    commander.begin(gates, passed, [each.modes for each in setups])
     return commander
 
 
@@ -183,8 +186,9 @@ def cycles(arm: ArmFile, seconds: float, channel: Channel) -> HostReport:
     """The link's cycle on an EchoPort, each sample sent to the job."""
     rate, n = arm.require_link().rate, len(arm.joint_names)
     clock, realtime = MonotonicClock(), prepare()
-    commander = echo_commander(arm, EchoPort(), clock)
-    hold, nothing = Command.hold(np.zeros(n)), np.zeros(n)
+    port = EchoPort(arm)
+    commander = echo_commander(arm, port, clock)
+    hold, nothing = Command.hold(port.standing), np.zeros(n)
     count, begin, busy = 0, clock.now(), time.process_time()
     for _ in range(3):  # every joint has answered, and memory is warm
         commander.stand([Power.OFF] * n)

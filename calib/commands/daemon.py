@@ -1,4 +1,4 @@
-"""The long-running service: watches the arm, keeps its torque sensors true, serves a page and an API."""
+"""Runs the service that watches the arm, keeps its torque sensors true, and serves a page and an API."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -13,6 +13,10 @@ class Policies(StrEnum):
     observe = "observe"
     propose = "propose"
     apply = "apply"
+
+
+TAKE_OVER_SECONDS = 3.0
+"""Time that the bus process of a daemon that was killed may take to leave the joints safe and end [s]."""
 
 
 def daemon(
@@ -50,6 +54,7 @@ def daemon(
     from calib.daemon.logs import log_as_json
     from calib.daemon.loop.loop_process import LoopProcess
     from calib.daemon.options import Options, state_directory
+    from calib.records.file_lock import locked_directory
 
     described = load_arm(arm)
     resolve_bus(bus, described.require_link().bus)
@@ -72,10 +77,11 @@ def daemon(
         work=work,
     )
     log_as_json()
-    host = LoopProcess(options.loop(described), fork=True)
-    from calib.daemon.main_loop import run_daemon  # which takes long to load: the bus process opens the bus meanwhile
+    with locked_directory(directory, f"--state {directory}", patience=TAKE_OVER_SECONDS):
+        host = LoopProcess(options.loop(described), fork=True)
+        from calib.daemon.main_loop import run_daemon  # takes long to load: the bus process opens the bus meanwhile
 
-    run_daemon(options, described, directory, host)
+        run_daemon(options, described, directory, host)
     return 0
 
 

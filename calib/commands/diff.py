@@ -1,4 +1,4 @@
-"""Differences between two records: per joint, in units and in standard deviations."""
+"""Compares two records: per joint, in units and in standard deviations."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated

@@ -1,4 +1,4 @@
-"""Gravity-compensated float: the arm stays where a hand leaves it."""
+"""Floats the arm: gravity is compensated, and it stays where a hand leaves it."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated

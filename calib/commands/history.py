@@ -1,4 +1,4 @@
-"""Records kept for an arm, and which were current when, by whom and why."""
+"""Lists the records kept for an arm, and which were current when, by whom and why."""
 
 import getpass
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Gravity parameters from sweeps, recursive from tip to base, then global; keeps a gravity record."""
+"""Identifies gravity parameters from sweeps, recursively from tip to base, then globally; keeps a gravity record."""
 
 from typing import TYPE_CHECKING, Annotated, Any
 

@@ -1,4 +1,4 @@
-"""Torque sensor gains and offsets in the field, without a mass: from slow motion and the gravity record."""
+"""Finds torque sensor gains and offsets in the field, without a mass, from slow motion and the gravity record."""
 
 import getpass
 from pathlib import Path

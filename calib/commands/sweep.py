@@ -1,5 +1,6 @@
-"""Single-joint sweeps of an arm, planned, checked and run; continues after an interruption."""
+"""Plans, checks and runs the single-joint sweeps of an arm; continues after an interruption."""
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,11 +23,9 @@ def sweep(
     ] = 0.0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the data set in --out.")] = False,
     plan: Annotated[
-        bool, typer.Option("--plan", help="Print and draw the plan from the arm file alone; nothing moves.")
+        bool, typer.Option("--plan", help="Print the plan from the arm file alone; nothing moves.")
     ] = False,
-    picture: Annotated[
-        Path | None, typer.Option(help="Where --plan draws the poses; default NAME-plan.html in this directory.")
-    ] = None,
+    picture: Annotated[Path | None, typer.Option(help="With --plan: draw the poses into this HTML file.")] = None,
     hold: Annotated[str | None, typer.Option(help="stops or servo: how resting joints are held.")] = None,
     check_stops: Annotated[
         bool, typer.Option(help="Before the pass without load, push every joint slowly onto both its stops.")
@@ -59,7 +58,7 @@ def sweep(
 
     arm_file = with_hold(load_arm(arm), hold)
     if plan:
-        write_json(json_file, _plan(arm_file, seed, picture or (out or Path()) / f"{arm_file.name}-plan.html"))
+        write_json(json_file, _plan(arm_file, seed, picture))
         return
     if out is None:
         raise BadInput("sweep: give --out DIR for the data set, or --plan to print the plan alone")
@@ -82,13 +81,13 @@ def sweep(
                 check_stops and not resume and not reference_mass,
             )
         lateness = link.stats.lateness
-    _show(arm_file, found, data, screen)
+    _show(arm, arm_file, found, data, screen)
     warn_late(arm_file, lateness)
     write_json(json_file, {**_answer(arm_file, data), "late_ms": lateness.in_ms()})
 
 
-def _plan(arm_file: "ArmFile", seed: int, picture: Path) -> dict[str, Any]:
-    """Print, check and draw the plan; the answer for machines."""
+def _plan(arm_file: "ArmFile", seed: int, picture: Path | None) -> dict[str, Any]:
+    """Print and check the plan, and draw it if asked to; the answer for machines."""
     from calib.arm.kinematics import model_arm
     from calib.commands.screen import print_lines, print_plan
     from calib.plan.collisions import check_plan
@@ -99,10 +98,14 @@ def _plan(arm_file: "ArmFile", seed: int, picture: Path) -> dict[str, Any]:
     model = None if arm_file.model_path is None else model_arm(arm_file)
     planned = plan_sweep(arm_file, None if model is None else guess_of_model(model.arm, model.beta), seed=seed)
     print_plan(arm_file, planned)
-    draw_plan(arm_file, planned, picture)
+    drawn = ""
+    if picture is not None:
+        draw_plan(arm_file, planned, picture)
+        drawn = f"; drawn in {picture}"
     took, checked = pass_seconds(arm_file, planned), check_plan(arm_file, planned)
-    print_lines([f"about {took / 60:.0f} min a pass; {checked}; drawn in {picture}"])
-    return {**planned.model_dump(mode="json"), "seconds": took, "collisions": checked, "picture": str(picture)}
+    print_lines([f"about {took / 60:.0f} min a pass; {checked}{drawn}"])
+    answer = {"seconds": took, "collisions": checked, "picture": None if picture is None else str(picture)}
+    return {**planned.model_dump(mode="json"), **answer}
 
 
 def _run(
@@ -140,7 +143,7 @@ def _run(
     return found, data
 
 
-def _show(arm_file: "ArmFile", found: "Preflight", data: "SweepData", screen: "SweepScreen") -> None:
+def _show(arm: str, arm_file: "ArmFile", found: "Preflight", data: "SweepData", screen: "SweepScreen") -> None:
     from calib.commands.screen import print_lines, print_plan, print_preflight, stalls_said, unsettled_said
 
     assert data.plan is not None
@@ -149,10 +152,9 @@ def _show(arm_file: "ArmFile", found: "Preflight", data: "SweepData", screen: "S
     print_lines([*unsettled_said(data), *stalls_said(data)], "yellow")
     if not data.manifest.reference_mass:
         mass = data.plan.reference_mass
-        screen.say(
-            f"{data.path} is complete. Now attach {mass:g} kg and sweep again with --reference-mass {mass:g} into"
-            " another directory."
-        )
+        loaded = data.path.with_name(f"{data.path.name}-loaded")
+        screen.say(f"{data.path} is complete. Now attach {mass:g} kg and sweep again:")
+        screen.say(shlex.join(["armlink", "sweep", arm, "--reference-mass", f"{mass:g}", "--out", str(loaded)]))
 
 
 def _answer(arm_file: "ArmFile", data: "SweepData") -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Gravity torque at poses, from a model's own inertials or an identified gravity record."""
+"""Computes gravity torque at poses, from a model's own inertials or an identified gravity record."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated

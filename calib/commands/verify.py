@@ -1,4 +1,4 @@
-"""Model torque against sensor torque at poses that were not used for the fit (the paper's Figure 6)."""
+"""Compares model torque with sensor torque at poses that were not used for the fit (the paper's Figure 6)."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any

@@ -25,10 +25,32 @@ class JsonFormatter(logging.Formatter):
         return json.dumps(line, default=str, ensure_ascii=False)
 
 
+class LineLimit(logging.Filter):
+    """Lets a logger have so many lines at once and so many a second; the next line says how many were left out."""
+
+    def __init__(self, burst: float = 200.0, per_second: float = 20.0) -> None:
+        super().__init__()
+        self._burst, self._per_second = burst, per_second
+        self._buckets: dict[str, tuple[float, float, int]] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether a line is written."""
+        left, since, missing = self._buckets.get(record.name, (self._burst, record.created, 0))
+        left = min(self._burst, left + max(record.created - since, 0.0) * self._per_second)
+        if left < 1.0:
+            self._buckets[record.name] = left, record.created, missing + 1
+            return False
+        self._buckets[record.name] = left - 1.0, record.created, 0
+        if missing:
+            record.left_out = missing
+        return True
+
+
 def log_as_json(level: int = logging.INFO) -> None:
     """Send everything that is logged to stderr as JSON."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonFormatter())
+    handler.addFilter(LineLimit())
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(level)

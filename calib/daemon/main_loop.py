@@ -25,6 +25,10 @@ from calib.records.store import RecordStore
 SNAPSHOT_SECONDS = 0.1
 SILENT_SECONDS = 15.0
 """A bus process that sends nothing for this time hangs: it is killed and started again [s]."""
+PAUSE_SECONDS = 2.0
+"""A timer of this process that is later than this says nothing of the bus process [s]."""
+AGAIN_SECONDS = 5.0
+"""Time to the next attempt where the system gives no process [s]."""
 BEGIN_SECONDS = 30.0
 """Time for a new bus process to send its first message [s]."""
 log = logging.getLogger("armlink.daemon")
@@ -99,13 +103,21 @@ class Daemon:
             if now - ticked >= 1.0:
                 ticked = now
                 self.service.tick()
-                if now - self._heard > SILENT_SECONDS:
-                    self._restart("the bus loop's process hangs")
+                self._judge(now, stood_still=now - due)
             if self._watchdog is not None and now - kept_alive >= self._watchdog / 3:
                 kept_alive = now
                 self._notify("WATCHDOG=1")
             due = max(due + SNAPSHOT_SECONDS, now)
             await asyncio.sleep(due - now)
+
+    def _judge(self, now: float, stood_still: float) -> None:
+        """Replace a bus process that hangs; not because this process itself stood still (stopped, say) [s]."""
+        if stood_still > PAUSE_SECONDS:
+            self._heard = max(self._heard, now)
+        if now - self._heard > SILENT_SECONDS:
+            self._messages()  # what waits here is a sign of life too
+        if now - self._heard > SILENT_SECONDS:
+            self._restart("the bus loop's process hangs")
 
     def _messages(self) -> None:
         try:
@@ -113,7 +125,8 @@ class Daemon:
         except EOFError as error:
             self._restart(str(error))
             return
-        self._heard = time.monotonic()
+        if messages:
+            self._heard = max(self._heard, time.monotonic())
         for message in messages:
             if isinstance(message, Started):
                 log.info(f"bus process: {message.realtime}")
@@ -122,10 +135,16 @@ class Daemon:
     def _restart(self, why: str) -> None:
         """Replace the bus process; meanwhile the joints' own deadlines hold them."""
         log.error(why)
-        self._loop.remove_reader(self.process.fileno())
+        if self.process.fileno() >= 0:
+            self._loop.remove_reader(self.process.fileno())
         self.process.close()
         self.service.take(Down(why))
-        self.process = LoopProcess(self.options.loop(self.arm))
+        try:
+            self.process = LoopProcess(self.options.loop(self.arm))
+        except OSError as error:
+            log.error(f"no bus process: {error}")
+            self._heard = time.monotonic() - SILENT_SECONDS + AGAIN_SECONDS
+            return
         self._heard = time.monotonic() + BEGIN_SECONDS
         self._loop.add_reader(self.process.fileno(), self._messages)
 

@@ -71,6 +71,7 @@ class Service:
         )
         text = f"armlink {version('armlink')} for {arm.name} {arm.serial}"
         self.events.say("started", None, text, {"policy": settings.policy})
+        self._say_set_aside()
         self.records.load()
 
     @property
@@ -97,6 +98,7 @@ class Service:
     def tick(self) -> None:
         """Do what is due; what fails on its part does not keep the rest from being done."""
         self.journal.probe()
+        self._say_set_aside()
         parts = (self.events, self.arm_state, self.records, self.recalibrations, self.tours)
         for act in (*(part.tick for part in parts), self._save_due):
             self.journal.guard(act)
@@ -147,6 +149,12 @@ class Service:
             self.tours.advanced(message)
         elif isinstance(message, Answer) and message.error is not None:
             self.tours.refused(str(message.error))
+
+    def _say_set_aside(self) -> None:
+        aside, self.journal.set_aside = self.journal.set_aside, ""
+        if aside:
+            text = f"the journal was damaged: it is kept as {aside}, and a new one was begun"
+            self.events.say("fault", None, text, {"file": aside})
 
     def _save_due(self) -> None:
         observation = self.records.observation

@@ -1,6 +1,7 @@
 """The service as the web layer sees it: implements `calib.daemon.view.view.DaemonView`."""
 
 import math
+from collections.abc import Iterator
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 from armlink.link.joints.groups import state_name
 from calib.daemon.observing.observation import Observation
 from calib.daemon.service import Service
+from calib.daemon.state.history_reader import HistoryReader
 from calib.daemon.view.api_models import (
     BusHealth,
     EventRecord,
@@ -31,6 +33,7 @@ class ServiceView:
 
     def __init__(self, service: Service) -> None:
         self._service, self._version = service, version("armlink")
+        self._history = HistoryReader(service.journal.path)
         self.decisions: Decisions = service.recalibrations
 
     @property
@@ -88,7 +91,7 @@ class ServiceView:
         if self._observation is None:
             return ()
         feed, last_accepted = self._observation.feed, self._observation.last_accepted
-        estimate = feed.observer.estimate()
+        estimate, limits = feed.observer.estimate(), feed.observer.limits()
         gain, offset = (feed.calibration.values(name) for name in ("gain", "offset"))
         return tuple(
             JointEstimate(
@@ -101,6 +104,9 @@ class ServiceView:
                 last_accepted=last_accepted.get(name),
                 installed_gain=_number(gain[j]),
                 installed_offset=_number(offset[j]),
+                gain_limit=_number(limits.gain[j]),
+                offset_limit=_number(limits.offset[j]),
+                limit_rests=limits.rests,
             )
             for j, name in enumerate(feed.names)
         )
@@ -113,12 +119,19 @@ class ServiceView:
         self, joint: str | None, since: datetime | None = None, until: datetime | None = None, most: int = 2000
     ) -> tuple[HistoryPoint, ...]:
         """Estimates over time, oldest first; raises NoSuch."""
-        names = self._service.configuration.names
+        return tuple(point for page in self.history_pages(joint, since, until, most) for point in page)
+
+    def history_pages(
+        self, joint: str | None, since: datetime | None = None, until: datetime | None = None, most: int = 2000
+    ) -> Iterator[tuple[HistoryPoint, ...]]:
+        """Likewise in pieces; raises NoSuch at the first."""
+        names, reader = self._service.configuration.names, self._history
         if joint is not None and joint not in names:
             raise NoSuch(f"no joint {joint!r}; there are {', '.join(names)}")
-        points = self._service.journal.history(since, until, most)
-        wanted = range(len(names)) if joint is None else (names.index(joint),)
-        return tuple(_point(names[j], j, *point) for j in wanted for point in points if len(point[3]["gain"]) > j)
+        chosen = reader.chosen(since, until, most)
+        for j in range(len(names)) if joint is None else (names.index(joint),):
+            for page in reader.pages(chosen):
+                yield tuple(_point(names[j], j, *point) for point in page if len(point[3]["gain"]) > j)
 
     def proposals(self, limit: int = 200) -> tuple[Proposal, ...]:
         """Newest first."""

@@ -76,6 +76,7 @@ def fit_field(
     n, q = belief.arm.n, rows.position * belief.position_gain + belief.position_offset
     if not np.isfinite(rows.torque).any():
         raise BadInput("no torque reading counts")
+    belief = belief.over(rows, q)
     gain, sigma = belief.installed.gain, rows.sigma
     noise, prior = sigma, belief.prior(np.ones(n))
     for _ in range(ROUNDS):

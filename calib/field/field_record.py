@@ -50,7 +50,14 @@ def _joint(name: str, j: int, fit: FieldFit, before: CalibrationRecord | None) -
         reasons |= {key: why for key, why in old.not_identifiable.items() if values[key] is None}
     residual = fit.residual[:, j][np.isfinite(fit.residual[:, j])]
     return JointCalibration(
-        name=name, **values, not_identifiable=reasons, residual_std=_rms(residual) if len(residual) else None
+        name=name,
+        gain=values["gain"],
+        offset=values["offset"],
+        position_gain=values["position_gain"],
+        position_offset=values["position_offset"],
+        not_identifiable=reasons,
+        residual_std=_rms(residual) if len(residual) else None,
+        discrepancy=None if old is None else old.discrepancy,
     )
 
 

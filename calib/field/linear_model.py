@@ -1,6 +1,6 @@
 """Linear problem of the field calibration: prior, columns, and least squares with that prior."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -8,7 +8,8 @@ from armlink.arm_file import ArmFile
 from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, per_joint
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
-from calib.records.records import CalibrationRecord, GravityRecord
+from calib.fit.position_field import PositionField
+from calib.records.records import CalibrationRecord, Discrepancy, GravityRecord
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_regressor, gravity_stiffness
@@ -36,6 +37,22 @@ class Belief:
     """The current record's (n,)."""
     spread: tuple[Array, Array] | None
     """Its standard deviations of gain and offset (n,), NaN if unknown; None without a record."""
+    discrepancy: tuple[Discrepancy | None, ...]
+    """What that record's calibrated torque and the gravity model disagree by, joint by joint."""
+    local: Array
+    """Columns of the discrepancy, each of unit standard deviation, at the rows (K, n, F) [N·m]; see `over`."""
+
+    def over(self, rows: StaticReadings, q: Array) -> "Belief":
+        """The same with the discrepancy expanded over rows at true angles q (K, n) [rad]."""
+        parts = []
+        for joint, each in enumerate(self.discrepancy):
+            counted = np.isfinite(rows.torque[:, joint])
+            if each is None or each.level == 0 or not counted.any():
+                continue
+            columns = each.level * PositionField.over(q[counted], each.length).columns(q)
+            parts.append(columns[:, None, :] * (np.arange(len(self.rated)) == joint)[:, None])
+        empty = np.zeros((len(q), len(self.rated), 0))
+        return replace(self, local=np.concatenate([empty, *parts], axis=2))
 
     def prior(self, gain_share: Array) -> tuple[Array, Array]:
         """(mean, std) of all parameters: gains around the installed ones within a share of them, offsets unknown."""
@@ -48,7 +65,7 @@ class Belief:
         return self._prior(*tight)
 
     def _prior(self, gain_std: Array, offset_std: Array) -> tuple[Array, Array]:
-        others = self.root.shape[1] + len(self.rated)
+        others = self.root.shape[1] + len(self.rated) + self.local.shape[2]
         zeros = np.zeros(len(self.rated) + others)
         return (
             np.concatenate([self.installed.gain, self.installed.offset, zeros]),
@@ -105,15 +122,20 @@ def belief_of(arm: ArmFile, gravity: GravityRecord, calibration: CalibrationReco
         position_std=np.maximum(zero_std, 1e-6),
         installed=blank if calibration is None else calibration.torque_calibration(blank),
         spread=spread,
+        discrepancy=(None,) * n if calibration is None else tuple(each.discrepancy for each in calibration.joints),
+        local=np.zeros((0, n, 0)),
     )
 
 
 def field_columns(belief: Belief, rows: StaticReadings, q: Array, gain: Array) -> Array:
-    """Columns (K, n, p): gains, offsets, hysteresis, β in units of its root, position offsets in units of their std."""
+    """Columns (K, n, p): gains, offsets, hysteresis, β in units of its root, position offsets in units of their std,
+    and the discrepancy in units of its level.
+    """
     n, each = belief.arm.n, np.eye(belief.arm.n)
     regressor = gravity_regressor(belief.arm, q)
     torque = regressor @ belief.beta
     stiffness = gravity_stiffness(belief.arm, belief.beta, q) * belief.position_std
     by_joint = [each * torque[:, :, None], np.broadcast_to(each, (len(q), n, n)), each * rows.direction[:, :, None]]
     scaled = gain[:, None]
-    return np.concatenate([*by_joint, scaled * (regressor @ belief.root), scaled * stiffness], axis=2)
+    beyond = [scaled * (regressor @ belief.root), scaled * stiffness, scaled * belief.local]
+    return np.concatenate([*by_joint, *beyond], axis=2)

@@ -7,9 +7,13 @@ import numpy as np
 import numpy.typing as npt
 
 from calib.fit.findings import Finding, effect_finding, encoder_findings, outlier_findings, scatter_findings
+from calib.fit.position_field import PositionField
 from calib.fit.refinement import Extra, Refined, refine
+from calib.fit.remaining_doubt import remaining_doubt
+from calib.fit.small_troubles import Setting
 from calib.fit.sweep_readings import SweepReadings
 from calib.fit.unmodelled_effects import Effect, size_of, strongest_effect
+from calib.records.records import Discrepancy
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
 from gcomp.identify.global_fit import GlobalFit
@@ -55,6 +59,8 @@ class Goodness:
     outliers: Mask
     """Readings left out as outliers (K, n)."""
     left_out: tuple[LeftOut, ...]
+    discrepancy: tuple[Discrepancy, ...]
+    """What the fit still doubts at a new pose, joint by joint."""
 
 
 def examine(
@@ -66,13 +72,14 @@ def examine(
     """
     rows, findings = _without_plateaus(kinematics.names, rows)
     encoders = encoder_findings(kinematics.names, rows)
+    setting = _setting(kinematics, rows, rated)
     effects, sound = list[Effect](), rows.readings.sigma
     outliers = np.zeros(sound.shape, dtype=bool)
 
     def fitted() -> Refined:
         extras = tuple(extra for effect in effects for extra in effect.extras)
         kept = replace(rows.readings, torque=np.where(outliers, np.nan, rows.readings.torque))
-        return refine(kinematics, kept, fit, priors, rows.resolution, extras)
+        return refine(replace(rows, readings=kept), setting, fit, priors, extras)
 
     refined = fitted()
     for _ in range(MOST_EFFECTS):
@@ -93,7 +100,14 @@ def examine(
     findings += outlier_findings(kinematics.names, rows, outliers)
     findings += scatter_findings(kinematics.names, refined, rated, {finding.joint for finding in findings})
     final = encoders or findings  # a wrong position causes the others
-    return Goodness(refined, tuple(final), outliers, leave_out(refined, rows))
+    doubt = remaining_doubt(setting, rows, refined)
+    return Goodness(refined, tuple(final), outliers, leave_out(refined, rows), doubt)
+
+
+def _setting(kinematics: Arm, rows: SweepReadings, rated: Array) -> Setting:
+    counted, poses = rows.readings.counted, rows.readings.position
+    fields = tuple(PositionField.over(poses[counted[:, joint]], 1.0) for joint in range(kinematics.n))
+    return Setting(kinematics, rated, fields, (float(rows.time.min()), float(rows.time.max())))
 
 
 def _sized(effects: list[Effect], refined: Refined) -> Iterator[tuple[Effect, Array]]:
@@ -144,15 +158,13 @@ def _sharp(rows: SweepReadings, joint: int) -> npt.NDArray[np.intp]:
 def leave_out(refined: Refined, rows: SweepReadings) -> tuple[LeftOut, ...]:
     """Cross-validation of each sweep, by the block form of the leave-one-out residual (docs/theory.md, section 5.4)."""
     linear, found = refined.linear, []
-    count = len(linear.row)
     series = rows.readings.series[linear.row]
     own = rows.swept[linear.row] == linear.joint
     for sweep, name in enumerate(rows.sweeps):
         here = np.flatnonzero((series == sweep) & own)
         if not len(here):
             continue
-        part = linear.basis[:count][here]
-        rest = np.eye(len(here)) - part @ part.T
+        rest = linear.annihilator[np.ix_(here, here)]
         size, turn = np.linalg.eigh(rest)
         kept = size > 1e-8
         residual = linear.residual[here]
@@ -174,8 +186,7 @@ def _outliers(kinematics: Arm, refined: Refined, rows: SweepReadings, extras: li
     deleted = error / (rows.readings.sigma * refined.factor)
     inside = np.zeros(counted.shape, dtype=bool)
     inside[linear.row, linear.joint] = True
-    count = len(linear.row)
-    deleted[linear.row, linear.joint] = linear.residual[:count] / np.sqrt(np.maximum(1 - linear.leverage, 1e-3))
+    deleted[linear.row, linear.joint] = linear.residual / np.sqrt(np.maximum(1 - linear.leverage, 1e-3))
     flags = np.zeros(counted.shape, dtype=bool)
     for joint in range(kinematics.n):
         used = np.abs(deleted[inside[:, joint], joint])

@@ -113,8 +113,7 @@ def outlier_findings(names: tuple[str, ...], rows: SweepReadings, outliers: Mask
 def scatter_findings(names: tuple[str, ...], refined: Refined, rated: Array, named: set[str]) -> list[Finding]:
     """Findings of joints whose readings scatter far more than their samples' noise, without a known cause."""
     linear, found = refined.linear, []
-    count = len(linear.row)
-    rest = linear.residual[:count] * linear.sigma
+    rest = linear.residual * linear.sigma
     for joint, name in enumerate(names):
         here = linear.joint == joint
         if name in named or not here.any():

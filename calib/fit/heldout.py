@@ -1,5 +1,7 @@
 """Held-out data: how well a calibration predicts the steps of sweeps that were left out of its fit."""
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
@@ -51,6 +53,8 @@ def heldout_scores(
     the remaining steps, else they are the record's; likewise mass moments unless `beta` (2n,) [kg·m] is given.
     """
     kinematics, score = gcomp_arm(arm_file), np.full(rows.readings.torque.shape, np.nan)
+    doubt = record.discrepancy("level") * np.abs(record.values("gain", 1.0))
+    rows = replace(rows, readings=replace(rows.readings, sigma=np.hypot(rows.readings.sigma, doubt)))
     start = sensor_parameters(record, **({} if beta is None else {"beta": beta}))
     priors = {"gain": Prior(start.gain, LOOSE)} if refit else {}
     fold = _folds(rows)

@@ -1,7 +1,8 @@
 """Refinement of the sensor fit: effects beyond the sensor model, as extra linear columns (docs/theory.md, section 5.4).
 
 A rounded position has the same error in every reading taken there, so the rounding of each distinct position is an
-unknown of its own, with a prior. Other effects (hysteresis, a spring) enter in the same way, without a prior.
+unknown of its own, with a prior. So are the small troubles of a real arm, whose levels are learned from the readings
+(section 4.6). Effects that stand out against these (hysteresis, a spring) enter in the same way, without a prior.
 Gauss-Newton from the global fit; each joint's noise is scaled to the scatter found.
 """
 
@@ -10,8 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy import linalg
 
-from gcomp.arm.arm import Arm
+from calib.fit.levels import Effects, Levels, learn
+from calib.fit.small_troubles import FAMILIES, HELD, UNITS, Setting, Troubles, troubles
+from calib.fit.sweep_readings import SweepReadings
 from gcomp.arrays import Array
 from gcomp.identify.global_fit import GlobalFit
 from gcomp.identify.identifiability import analyse, describe_null_space
@@ -49,22 +53,24 @@ class Linear:
     """Its joint (P,)."""
     sigma: Array
     """Its standard deviation, position rounding not counted (P,) [N·m]."""
-    basis: Array
-    """Orthonormal basis (P + priors, r) of the parameters' columns, in standard deviations."""
+    annihilator: Array
+    """M (P, P) with residual = M · (what the readings say beyond the start): takes out what parameters, rounding and
+    small troubles can do, each as far as its prior lets it."""
     residual: Array
-    """Residuals of readings, then of priors, in standard deviations (P + priors,)."""
+    """Residuals of the readings in standard deviations (P,)."""
+
+    precision: Array
+    """Inverse covariance (P, P) of the readings in standard deviations, rounding and small troubles included."""
+    design: Array
+    """Columns of the fit's parameters, in standard deviations (P, p)."""
+    effects: Array
+    """Columns of the small troubles, each at its level, in standard deviations (P, m)."""
 
     @property
     def leverage(self) -> Array:
         """Leverage of each reading on its own prediction (P,), 0 to 1."""
-        part: Array = np.einsum("pr,pr->p", self.basis, self.basis)[: len(self.row)]
+        part: Array = 1 - np.diag(self.annihilator)
         return part
-
-    def left_over(self, columns: Array) -> Array:
-        """Columns (P, m), in standard deviations, with the parameters projected out (P + priors, m)."""
-        padded = np.vstack([columns, np.zeros((len(self.residual) - len(columns), columns.shape[1]))])
-        rest: Array = padded - self.basis @ (self.basis.T @ padded)
-        return rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,32 +88,38 @@ class Refined:
     coefficient_std: Array
     freedom: Array
     """Free readings of each joint (n,)."""
+    levels: Levels
+    """Of the small troubles."""
+    troubles: Troubles
 
 
 def refine(
-    kinematics: Arm,
-    readings: StaticReadings,
+    rows: SweepReadings,
+    setting: Setting,
     fit: GlobalFit,
     priors: Mapping[str, Prior],
-    resolution: Array,
     extras: tuple[Extra, ...] = (),
 ) -> Refined:
-    """Refine a global fit; `resolution` (n,) [rad] is the smallest step of the position readings, 0 if unknown."""
-    problem = _Problem(kinematics, readings, fit, priors, resolution, extras)
+    """Refine a global fit with the small troubles of `setting` as random effects."""
+    kinematics, readings = setting.arm, rows.readings
+    problem = _Problem(rows, setting, fit, priors, extras)
     vector, factor = fit.complete.vector.copy(), np.ones(kinematics.n)
+    level = np.ones(len(FAMILIES))
     for _ in range(ROUNDS):
-        step = problem.step(vector, factor)
+        step = problem.step(vector, factor, level)
+        level = step.levels.level
         vector[problem.free] += step.solution[: step.parameters]
         raw, freedom = _scatter(step.linear, kinematics.n)
         used, factor = factor, np.maximum(factor * np.where(np.isnan(raw), 1.0, raw), 1.0)
     found = analyse(step.triangle, step.scale)
     inner, behind = slice(0, step.parameters), slice(step.parameters, None)
     residual = np.full(readings.torque.shape, np.nan)
-    residual[readings.counted] = step.linear.residual[: len(step.linear.row)] * step.linear.sigma
+    troubled = step.linear.effects @ (step.linear.effects.T @ step.linear.residual)
+    residual[readings.counted] = (step.linear.residual + troubled) * step.linear.sigma
     determined, covariance = found.determined[inner], found.covariance[inner, inner]
     deviation = np.zeros(len(vector))
     deviation[problem.free] = np.where(determined, np.sqrt(np.abs(np.diag(covariance))), np.inf)
-    scaled = step.linear.residual[: len(step.linear.row)]
+    scaled = step.linear.residual
     refined = replace(
         fit,
         values=Parameters.from_vector(np.where(np.isinf(deviation), np.nan, vector), kinematics.n),
@@ -121,7 +133,9 @@ def refine(
         dof=round(float(freedom.sum())),
     )
     spread = np.sqrt(np.abs(np.diag(found.covariance)[behind]))
-    return Refined(refined, factor, raw * used, step.linear, step.solution[behind], spread, freedom)
+    return Refined(
+        refined, factor, raw * used, step.linear, step.solution[behind], spread, freedom, step.levels, step.troubles
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +148,8 @@ class _Step:
     triangle: Array
     scale: Array
     linear: Linear
+    levels: Levels
+    troubles: Troubles
 
 
 class _Problem:
@@ -141,13 +157,14 @@ class _Problem:
 
     def __init__(
         self,
-        kinematics: Arm,
-        readings: StaticReadings,
+        rows: SweepReadings,
+        setting: Setting,
         fit: GlobalFit,
         priors: Mapping[str, Prior],
-        resolution: Array,
         extras: tuple[Extra, ...],
     ) -> None:
+        self.rows, self.setting = rows, setting
+        kinematics, readings = setting.arm, rows.readings
         self.arm, self.readings = kinematics, readings
         self.free = np.array([name in fit.names for name in parameter_names(kinematics)])
         self.mean, self.std = (values[self.free] for values in prior_vectors(kinematics.n, priors))
@@ -157,41 +174,60 @@ class _Problem:
         torque = float(np.abs(readings.torque[readings.counted]).max())
         sizes = torque / np.maximum(np.abs(self.columns).max(axis=0, initial=0.0), 1e-9)
         self.scale = np.concatenate([natural_units(kinematics, readings, fit.complete)[self.free], sizes])
-        self.resolution = resolution
+        self.resolution = rows.resolution
 
-    def step(self, vector: Array, factor: Array) -> _Step:
+    def step(self, vector: Array, factor: Array, level: Array) -> _Step:
         """Solve the problem linearised at a parameter vector (6n + 3,), noise times factor (n,)."""
         readings, free = self.readings, int(self.free.sum())
         modelled, jacobian, slope = predict_and_jacobian(self.arm, Parameters.from_vector(vector, self.arm.n), readings)
-        sigma = readings.sigma[readings.counted] * factor[self.joint]
+        lag = HELD * level[FAMILIES.index("direction")] * UNITS["direction"][0] * self.setting.rated[self.joint]
+        own = self.rows.swept[self.row] == self.joint
+        sigma = np.hypot(readings.sigma[readings.counted], np.where(own, 0.0, lag)) * factor[self.joint]
         rounding = _rounding_columns(readings, self.resolution, slope / sigma[:, None])
+        found = troubles(self.setting, self.rows, Parameters.from_vector(vector, self.arm.n))
         informed = np.flatnonzero(np.isfinite(self.std))
         count, known = len(sigma), len(informed)
-        rows = count + known + rounding.shape[1]
+        rows = count + known
         design, target = np.zeros((rows, free + self.columns.shape[1])), np.zeros(rows)
         design[:count] = np.hstack([jacobian[:, self.free], self.columns]) / sigma[:, None]
         target[:count] = (readings.torque[readings.counted] - modelled) / sigma
         design[np.arange(count, count + known), informed] = 1 / self.std[informed]
         target[count : count + known] = ((self.mean - vector[self.free]) / self.std)[informed]
-        nuisance = np.zeros((rows, rounding.shape[1]))
-        nuisance[:count] = rounding
-        nuisance[count + known :] = np.eye(rounding.shape[1])
-        taken = np.linalg.qr(nuisance)[0]
-        rest = design - taken @ (taken.T @ design)
+        weighted = found.columns / sigma[:, None]
+        nuisance = np.vstack([rounding, np.zeros((known, rounding.shape[1]))])
+        fixed = np.hstack([design * self.scale, nuisance])
+        effects = Effects.of(fixed, weighted, target, found.family, len(FAMILIES))
+        levels = learn(effects, level)
+        random = np.hstack([rounding, weighted * levels.level[found.family]])
+        root = np.linalg.cholesky(np.eye(count) + random @ random.T)
+        whitened = linalg.solve_triangular(root, np.column_stack([design[:count], target[:count]]), lower=True)
+        rest = np.vstack([whitened[:, :-1], design[count:]])
+        aim = np.concatenate([whitened[:, -1], target[count:]])
         left, values, right = np.linalg.svd(rest * self.scale, full_matrices=False)
         keep = values > max(1.0, 1e-7 * values[0])
-        basis = np.hstack([taken, left[:, keep]])
-        solution = self.scale * (right[keep].T @ ((left[:, keep].T @ target) / values[keep]))
-        linear = Linear(self.row, self.joint, sigma, basis, target - basis @ (basis.T @ target))
+        solution = self.scale * (right[keep].T @ ((left[:, keep].T @ aim) / values[keep]))
+        inverse = linalg.solve_triangular(root, np.eye(count), lower=True)
+        part = inverse.T @ left[:count, keep]
+        residual = inverse.T @ (whitened[:, -1] - whitened[:, :-1] @ solution)
+        precision = inverse.T @ inverse
+        linear = Linear(
+            self.row,
+            self.joint,
+            sigma,
+            precision - part @ part.T,
+            residual,
+            precision,
+            design[:count, :free],
+            random[:, rounding.shape[1] :],
+        )
         triangle: Array = np.asarray(np.linalg.qr(rest, mode="r"), dtype=np.float64)
-        return _Step(solution, free, triangle, self.scale, linear)
+        return _Step(solution, free, triangle, self.scale, linear, levels, found)
 
 
 def _scatter(linear: Linear, n: int) -> tuple[Array, Array]:
     """(Scatter over its expected value, NaN with too few free readings; free readings) of each joint (n,)."""
-    count = len(linear.row)
     free: Array = np.bincount(linear.joint, 1 - linear.leverage, minlength=n).astype(np.float64)
-    total = np.bincount(linear.joint, linear.residual[:count] ** 2, minlength=n)
+    total = np.bincount(linear.joint, linear.residual**2, minlength=n)
     ratio: Array = np.where(free >= FEWEST, np.sqrt(total / np.maximum(free, 1e-9)), np.nan)
     return ratio, free
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
+from threadpoolctl import threadpool_limits
 
 from armlink.arm_file import ArmFile
 from armlink.torque_calibration import TorqueCalibration
@@ -133,9 +134,13 @@ class SensorFit:
         joints = tuple(
             JointCalibration(
                 name=name,
-                **{parameter: _number(self.value(parameter)[joint]) for parameter in PARAMETERS},
+                gain=_number(self.value("gain")[joint]),
+                offset=_number(self.value("offset")[joint]),
+                position_gain=_number(self.value("position_gain")[joint]),
+                position_offset=_number(self.value("position_offset")[joint]),
                 not_identifiable={p: self.reasons[name, p] for p in PARAMETERS if (name, p) in self.reasons},
                 residual_std=_number(residual[joint]),
+                discrepancy=self.goodness.discrepancy[joint],
             )
             for joint, name in enumerate(self.names)
         )
@@ -162,9 +167,11 @@ def fit_sensors(arm_file: ArmFile, data: Sequence[SweepData]) -> SensorFit:
     data that cannot be fitted, Refused on data of another arm.
     """
     rows = sweep_readings([each.require(arm_file) for each in data])
-    good = _fit(arm_file, rows)
-    fit = good.refined.fit
     loaded = any(rows.masses)
+    with threadpool_limits(1, "blas"):  # matrices of a few hundred rows: on a busy machine threads are ten times slower
+        good = _fit(arm_file, rows)
+        gain_ratio = None if loaded else _gain_ratio(arm_file, rows)
+    fit = good.refined.fit
     return SensorFit(
         names=arm_file.joint_names,
         fit=fit,
@@ -175,7 +182,7 @@ def fit_sensors(arm_file: ArmFile, data: Sequence[SweepData]) -> SensorFit:
         goodness=good,
         quantile=float(stats.t.ppf(0.975, max(fit.dof, 1))),
         reasons=missing_values(fit, rows),
-        gain_ratio=None if loaded else _gain_ratio(arm_file, rows),
+        gain_ratio=gain_ratio,
         sources={each.path.name: each.digest for each in data},
     )
 

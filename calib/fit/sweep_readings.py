@@ -32,6 +32,9 @@ class SweepReadings:
     """Index of the swept joint (K,); -1 if all were held."""
     time: Array
     """When each was taken, passes one after the other (K,) [s]."""
+    felt: Array
+    """Torque readings of all sensors (K, n) [N·m], those of joints pressed on stops included; like `readings.torque`,
+    as the sensors gave them."""
     motor_torque: Array
     """The drives' own estimates (K, n) [N·m]; NaN if missing."""
     target: Array
@@ -78,6 +81,7 @@ def sweep_readings(data: Sequence[SweepData]) -> SweepReadings:
         sweeps=sweeps,
         swept=np.array([-1 if reading.joint is None else reading.joint for reading in taken]),
         time=_time(data),
+        felt=TorqueCalibration(gain, offset).apply(stack(taken, "torque")),
         motor_torque=stack(taken, "motor_torque"),
         target=np.concatenate([_targets(each) for each in data if each.readings]),
         noise=noise,

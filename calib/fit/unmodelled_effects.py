@@ -60,19 +60,17 @@ def strongest_effect(kinematics: Arm, rows: SweepReadings, kept: Mask, refined: 
     """
     counted = rows.readings.counted & kept
     linear, best, most = refined.linear, None, 0.0
-    count = len(linear.row)
-    squares = np.bincount(linear.joint, linear.residual[:count] ** 2, minlength=kinematics.n)
+    squares = np.bincount(linear.joint, linear.residual**2, minlength=kinematics.n)
     for effect in _candidates(kinematics, rows, refined):
         columns = np.column_stack([extra.column[counted] for extra in effect.extras]) / linear.sigma[:, None]
         if not np.abs(columns).max(initial=0.0) > 0:
             continue
-        rest = linear.left_over(columns)
-        norm = np.linalg.norm(rest, axis=0)
-        if np.any(norm < 1e-3 * np.linalg.norm(columns, axis=0)):
+        told = columns.T @ linear.annihilator @ columns
+        if np.any(np.diag(told) < 1e-6 * (columns**2).sum(axis=0)):
             continue  # the parameters can do nearly the same
-        basis, triangle = np.linalg.qr(rest / norm)
-        along = basis.T @ linear.residual
-        gain, m = float(along @ along), len(effect.extras)
+        along = columns.T @ linear.residual
+        coefficient = np.linalg.lstsq(told, along, rcond=1e-10)[0]
+        gain, m = float(along @ coefficient), len(effect.extras)
         touched = np.unique(linear.joint[np.abs(columns).max(axis=1) > 1e-3 * np.abs(columns).max()])
         free = float(refined.freedom[touched].sum()) - m
         if free < 4:
@@ -80,7 +78,6 @@ def strongest_effect(kinematics: Arm, rows: SweepReadings, kept: Mask, refined: 
         left = max(float(squares[touched].sum()) - gain, 1e-6 * float(squares[touched].sum()) + 1e-9)
         ratio = (gain / m) / (left / free)
         p_value = float(stats.f.sf(ratio, m, free))
-        coefficient = np.linalg.lstsq(triangle, along, rcond=None)[0] / norm
         own = linear.joint == effect.joint
         shape = (columns * linear.sigma[:, None] @ coefficient)[own]
         size = float(np.std(shape)) if len(shape) else 0.0

@@ -33,6 +33,8 @@ POSES = 4
 FLOOR = 0.004
 """Difference of readings or of RMS that does not count, as a share of rated torque: twice the torque noise of the
 simulated arm (0.2 %), as the servo's friction holds a joint a little off the first position the second time."""
+DOUBT = 2.0
+"""The same as a multiple of the record's discrepancy: a better calibration may fit these few poses worse by it."""
 WORSE = 1.1
 """Ratio of RMS against the model, after over before, above which the fit is worse if the FLOOR is exceeded too."""
 
@@ -44,6 +46,7 @@ class CheckMotion:
         """The motion is around the arm's present pose; `beta` (2n,) [kg·m] is None if no gravity model is known."""
         self._link, self._arm, self._record, self._beta = link, arm, record, beta
         self._limits, self._names = Limits.of(arm), arm.joint_names
+        self._floor = np.maximum(FLOOR * self._limits.rated, DOUBT * record.discrepancy("level"))
         self._installed: list[Calibration] = []
         self._before: list[StaticReading] = []
         self._poses: Array = np.empty((0, link.n))
@@ -88,7 +91,7 @@ class CheckMotion:
         for j, name in enumerate(self._names):
             expected = new[j].invert(old[j].apply(before[:, j]))
             away = float(np.mean(after[:, j] - expected))
-            if abs(away) > FLOOR * self._limits.rated[j]:
+            if abs(away) > self._floor[j]:
                 return (
                     f"{name}: its readings differ by {away:+.3f} N·m from the old ones converted by its new calibration"
                 )
@@ -98,7 +101,7 @@ class CheckMotion:
         if self._beta is None:
             return None
         before, after = self._rms(self._before, self._beta), self._rms(readings, self._beta)
-        worse = (after > WORSE * before) & (after - before > FLOOR * self._limits.rated)
+        worse = (after > WORSE * before) & (after - before > self._floor)
         if not worse.any():
             return None
         j = int(np.argmax(np.where(worse, after - before, -np.inf)))

@@ -12,6 +12,13 @@ from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_levers
 from gcomp.identify.readings import StaticReadings
 
+OF_AN_ARM = ("friction", "spring", "slip", "tilt", "scale")
+"""Causes that a discrepancy consists of: as small as its level they are not told."""
+INEXACT = 0.02
+"""Most that an effect's own shape may be off, as a share: it is as inexact as the gravity model's torque."""
+LEVEL_ROWS = 10
+"""Rows that what was expected of the discrepancy's level counts for beside those it was fitted to."""
+
 
 @dataclass(frozen=True)
 class Verdict:
@@ -57,14 +64,17 @@ class _Fit:
 
 
 class CauseTest:
-    """The dictionary fitted to one window, with model error marginalised: covariance σ²I + Y Cov(β) Yᵀ + H Σ_q Hᵀ."""
+    """The dictionary fitted to one window, with model error marginalised: the belief's covariance and σ²I."""
 
     def __init__(self, belief: GravityBelief, window: StaticReadings, config: ObserverConfig) -> None:
         """Of K rows with true angles, torques as installed and their standard deviations."""
         self.belief, self.window, self._config = belief, window, config
-        residual, nuisance = belief.residual(window.position, window.torque, config.position_std)
-        covariance = nuisance @ nuisance.T
+        expected = belief.expected(window.position, window.direction)
+        residual = window.torque - belief.torque(window.position) - expected.mean
+        covariance = expected.covariance.copy()
         covariance[np.diag_indices_from(covariance)] += window.sigma.ravel() ** 2
+        noise = (window.sigma**2).mean(axis=0)
+        self._of_model: list[float] = (1 - noise / (noise + expected.variance.mean(axis=0))).tolist()
         self.entries = list(dictionary(belief.arm, belief.beta, window))
         stacked = np.column_stack([residual.ravel(), *(entry.columns for entry in self.entries)])
         white: Array = np.linalg.solve(np.linalg.cholesky(covariance), stacked)  # scipy takes longer to load
@@ -72,6 +82,8 @@ class CauseTest:
         ends = np.cumsum([1, *(entry.columns.shape[1] for entry in self.entries)])
         self._columns: list[Array] = [white[:, start:end] for start, end in pairwise(ends)]
         self.chi2_none = float(self._white @ self._white)
+        discrepancy = float(np.median(belief.level.total / belief.kernel.typical)) if belief.level.total.any() else 0.0
+        self._inexact = min(discrepancy, INEXACT)
 
     def verdict(self) -> Verdict:
         """The winning class, or why none wins."""
@@ -97,14 +109,23 @@ class CauseTest:
             evidence["misfit"] = misfit
             return answer("unknown" if misfit > config.misfit else "none", None, "none")
         winner, name = best.entry, class_of(best.entry)
-        evidence["misfit"] = self._misfit(best.chi2, winner.columns.shape[1])
+        inexact = self._inexact**2 * (self.chi2_none - best.chi2)
+        evidence["misfit"] = self._misfit(best.chi2 - inexact, winner.columns.shape[1])
         if evidence["misfit"] > config.misfit or (winner.cause == "payload" and not self._weighs(best)):
             return self._two_drifts() or self._all_zeros() or answer("unknown", None, name)
         near = [fit.entry for fit in fits[1:] if fit.bic - best.bic < config.evidence]
         rivals = tuple(dict.fromkeys(class_of(entry) for entry in near if not kin(entry, winner)))
+        sensor_or_load = any(entry.cause in (*DRIFT, "payload") for entry in near)
+        if winner.cause in OF_AN_ARM and not sensor_or_load and self._is_small(best):
+            return answer("none", None, "none")
         if rivals:
             return answer("ambiguous", best, name, rivals)
         return answer(winner.cause, best, name)
+
+    def _is_small(self, fit: _Fit) -> bool:
+        """Whether an effect is no larger than the arm's discrepancy anyway: twice its level at each joint."""
+        size = (fit.entry.columns @ fit.values).reshape(-1, self.belief.arm.n)
+        return bool((np.sqrt((size**2).mean(axis=0)) <= 2 * self.belief.level.total).all())
 
     def _fit(self, *indices: int) -> _Fit:
         """Generalised least squares of entries together; columns that are collinear at these poses never win."""
@@ -172,6 +193,10 @@ class CauseTest:
         covariance[np.ix_(at, at)] = fit.covariance[: len(at), : len(at)]
         return values, covariance
 
+    def of_model(self, joint: int) -> float:
+        """Share of the model's own error in the variance of a joint's residuals."""
+        return self._of_model[joint]
+
     def loss(self, joint: int, simple: str, full: str, beside: int | None = None) -> float:
         """BIC of a joint's drift `simple` above that of `full` (each gain, offset or drift)."""
         also = [] if beside is None else [self._index("drift", beside)]
@@ -186,5 +211,7 @@ class CauseTest:
         return [(entry.cause, entry.joint) for entry in self.entries].index((cause, joint))
 
     def _misfit(self, chi2: float, parameters: int) -> float:
-        dof = len(self._white) - parameters
-        return round(float((chi2 - dof) / np.sqrt(2 * dof)), 2)
+        """χ² above its degrees of freedom in standard deviations, those of the level's own uncertainty included."""
+        dof, level = len(self._white) - parameters, self.belief.level
+        known = np.inf if not level.total.any() else level.rows + LEVEL_ROWS
+        return round(float((chi2 - dof) / np.sqrt(2 * dof * (1 + len(self.window.position) / known))), 2)

@@ -89,8 +89,16 @@ class ObserverConfig:
     """Standard deviation of a position sensor's zero [rad]; marginalised like the model's error."""
     patience: int = 120
     """Repeated poses after an alarm, six windows' worth, after which the test is given up as undecided."""
-    baseline_rows: int = 40
-    """Drift-free rows from which the gravity model is adapted to the sensors as installed: two windows."""
+    baseline_rows: int = 120
+    """Drift-free rows that drift is measured against: gravity model and discrepancy are adapted to them. Three minutes,
+    in which a drift of 0.5 % an hour is 0.03 %."""
+    discrepancy_share: float = 5e-4
+    """Discrepancy of the gravity model expected before the first row, as a share of rated torque; if the calibration
+    says how large it is, that counts."""
+
+    zero_wander: float = 3e-3
+    """Most that a zero moves with temperature (standard deviation), as a share of rated torque: a sensor of class 0.15,
+    three times worse than good ones, by 20 K. Where the arm's discrepancy is small, less is assumed."""
 
     tool_windows: int = 60
     """Consecutive windows that find the same payload until it counts as a tool: half an hour of stops."""

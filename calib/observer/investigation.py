@@ -9,8 +9,7 @@ from calib.motion.static_reading import StaticReading
 from calib.observer.cause_test import CauseTest
 from calib.observer.config import ObserverConfig
 from calib.observer.decision import Agreeing
-from calib.observer.saved_values import UNREADABLE
-from gcomp.arrays import as_array
+from calib.observer.saved_values import UNREADABLE, read_rows, save_rows
 
 
 class Investigation:
@@ -21,6 +20,8 @@ class Investigation:
         self._n, self._config = n, config
         self.held = False
         """Whether an alarm is open: estimates are held until a verdict."""
+        self.silent = False
+        """Whether it was opened by an audit, and fresh rows have not confirmed what that found."""
         self.clear()
 
     def clear(self) -> None:
@@ -28,24 +29,28 @@ class Investigation:
         self.window: list[StaticReading] = []
         self.fresh = self.repeated = self.carrying = 0
         """New rows since the last test; repeated poses; consecutive windows that found the same payload."""
-        self.doubtful = False
-        """Whether the last window had no single cause."""
+        self.learned = 0
+        """Rows at the front of the window that are reference already; only without an alarm."""
+        self.doubtful = 0
+        """Windows in a row that had no single cause."""
         self.first: Agreeing | None = None
         """Rows that found a drift, to be confirmed by the next window."""
+        self.suspected: tuple[str, tuple[int, ...]] | None = None
+        """Cause and joints that fresh rows have found once; only while it is silent."""
         self.reported: tuple[str, tuple[int, ...]] | None = None
         """The last verdict reported: cause and joints."""
         self.reasons: tuple[str, ...] = ()
         """The last reasons reported for not deciding."""
 
-    def start(self) -> None:
-        """Begin with fresh rows: an alarm, or an audit that found something."""
+    def start(self, silent: bool = False) -> None:
+        """Begin with fresh rows: an alarm, or (silent) an audit that found something."""
         self.clear()
-        self.held = True
+        self.held, self.silent = True, silent
 
     def resume(self) -> None:
         """End: the cause is known and dealt with."""
         self.clear()
-        self.held = False
+        self.held = self.silent = False
 
     def add(self, row: StaticReading) -> bool:
         """Take a row; False if the window has enough rows of this pose already."""
@@ -63,17 +68,33 @@ class Investigation:
             self.fresh = 0
         return due
 
+    def settled(self, first: bool) -> list[StaticReading]:
+        """Rows of the window, found free of drift, that become reference now; cuts the window to its length.
+
+        While the reference's first epoch is open (`first`) all but the newest; afterwards those that leave the window,
+        so that a window is tested against rows of another time.
+        """
+        leaving = max(0, len(self.window) - self._config.longest_window)
+        upto = max(leaving, len(self.window) - self._config.audit_rows) if first else leaving
+        rows = self.window[self.learned : upto]
+        del self.window[:leaving]
+        self.learned = max(self.learned, upto) - leaving
+        return rows
+
     def save(self) -> dict[str, Any]:
         """Rows and results as JSON values."""
         first, said = self.first, self.reported
         return {
             "held": self.held,
+            "silent": self.silent,
             "carrying": self.carrying,
             "doubtful": self.doubtful,
-            "window": _save_rows(self.window),
+            "learned": self.learned,
+            "window": save_rows(self.window),
             "fresh": self.fresh,
             "repeated": self.repeated,
-            "first": None if first is None else {"rows": _save_rows(first.rows), "joints": sorted(first.joints)},
+            "first": None if first is None else {"rows": save_rows(first.rows), "joints": sorted(first.joints)},
+            "suspected": None if self.suspected is None else [self.suspected[0], list(self.suspected[1])],
             "said": None if said is None else [said[0], list(said[1])],
             "reasons": list(self.reasons),
         }
@@ -84,28 +105,22 @@ class Investigation:
         `cause_test` makes the test of the rows to be confirmed, by the restored belief.
         """
         try:
-            window, first, said = _read_rows(values["window"], self._n), values["first"], values["said"]
+            window, first, said = read_rows(values["window"], self._n), values["first"], values["said"]
             if first is not None:
-                rows = _read_rows(first["rows"], self._n)
+                rows = read_rows(first["rows"], self._n)
                 first = Agreeing(rows, cause_test(rows), frozenset(map(int, first["joints"])))
             if said is not None:
                 said = (str(said[0]), tuple(said[1]))
+            suspected = values.get("suspected")
+            if suspected is not None:
+                suspected = (str(suspected[0]), tuple(suspected[1]))
             fresh, repeated, carrying = (int(values[name]) for name in ("fresh", "repeated", "carrying"))
-            held, doubtful, reasons = bool(values["held"]), bool(values["doubtful"]), tuple(values["reasons"])
+            held, doubtful, reasons = bool(values["held"]), int(values["doubtful"]), tuple(values["reasons"])
+            learned, silent = int(values.get("learned", 0)), bool(values.get("silent", False))
         except UNREADABLE:
             return False
         self.window, self.first, self.reported, self.reasons = window, first, said, reasons
         self.fresh, self.repeated, self.carrying = fresh, repeated, carrying
-        self.held, self.doubtful = held, doubtful
+        self.suspected = suspected
+        self.held, self.silent, self.doubtful, self.learned = held, silent, doubtful, learned
         return True
-
-
-def _save_rows(rows: list[StaticReading]) -> list[list[Any]]:
-    return [[row.t, row.position.tolist(), row.torque.tolist(), row.direction.tolist()] for row in rows]
-
-
-def _read_rows(values: Any, n: int) -> list[StaticReading]:
-    return [
-        StaticReading.of(float(t), *(as_array("row", column, (n,)) for column in (position, torque, direction)))
-        for t, position, torque, direction in values
-    ]

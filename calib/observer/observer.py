@@ -11,13 +11,16 @@ from typing import Any
 import numpy as np
 
 from calib.motion.static_reading import StaticReading
+from calib.observer.audit import DOUBTED, audit, confirmed, may_adapt
 from calib.observer.cause_test import CauseTest, Verdict
 from calib.observer.config import ObserverConfig
 from calib.observer.decision import Agreeing, Finding, agreed, decide
+from calib.observer.discrepancy.level import Level
 from calib.observer.events import Event, verdict_evidence
 from calib.observer.gravity_belief import GravityBelief
 from calib.observer.investigation import Investigation
 from calib.observer.rest_detector import RestDetector
+from calib.observer.tracking.limits import Limits
 from calib.observer.tracking.sensor_filter import Estimate
 from calib.observer.tracking.tracking import Tracking
 from calib.records.records import CalibrationRecord, GravityRecord
@@ -40,20 +43,28 @@ class Observer:
         config: ObserverConfig | None = None,
         position_gain: Array | None = None,
         position_offset: Array | None = None,
+        level: Level | None = None,
     ) -> None:
         """Watch an arm.
 
         beta (2n,) [kg·m] and its covariance (2n, 2n) as the gravity record has them; sigma (n,) [N·m], standard
         deviation of one averaged torque reading to begin with, replaced by the measured one; position gains and offsets
-        (n,) of the calibration record.
+        (n,) of the calibration record; level of the discrepancy that the calibration left, if it said.
         """
         self.arm, self.config = arm, config or ObserverConfig()
         self._position_gain = np.ones(arm.n) if position_gain is None else position_gain
         self._position_offset = np.zeros(arm.n) if position_offset is None else position_offset
         self._rest = RestDetector(arm.n, self.config)
-        self._tracking = Tracking(GravityBelief(arm, beta, beta_covariance), sigma, self.config)
+        rated, settings = np.asarray(sigma, dtype=float) / self.config.noise_share, self.config
+        expected = level or Level.expected(settings.discrepancy_share * rated)
+        wander = settings.zero_wander * rated
+        belief = GravityBelief(
+            arm, beta, beta_covariance, settings.position_std, expected, settings.baseline_rows, wander
+        )
+        self._tracking = Tracking(belief, sigma, self.config)
         self._investigation = Investigation(arm.n, self.config)
         self._proposed = np.full(arm.n, -np.inf)
+        self._limits: tuple[tuple[int, ...], Limits] | None = None
 
     @property
     def rows(self) -> int:
@@ -63,7 +74,7 @@ class Observer:
     @property
     def held(self) -> bool:
         """Whether an alarm is open: estimates are held until a verdict."""
-        return self._investigation.held
+        return self._investigation.held and not self._investigation.silent
 
     @classmethod
     def of_records(
@@ -78,7 +89,8 @@ class Observer:
         config = config or ObserverConfig()
         sigma = config.noise_share * np.asarray(rated_torque, dtype=float)
         position = (calibration.values("position_gain", 1.0), calibration.values("position_offset", 0.0))
-        return cls(arm, np.array(gravity.beta), np.array(gravity.covariance), sigma, config, *position)
+        level = Level.of_record(calibration, config.discrepancy_share * np.asarray(rated_torque, dtype=float))
+        return cls(arm, np.array(gravity.beta), np.array(gravity.covariance), sigma, config, *position, level)
 
     def handle(self, t: float, position: Array, torque: Array) -> list[Event]:
         """Take one sample: readings (n,) in SI units, NaN if missing; returns events, usually none."""
@@ -89,19 +101,34 @@ class Observer:
         """Take one row: the average over one stop, as the rest detector makes it."""
         row = replace(row, position=self._angle(row.position))
         self._tracking.count(row)
-        alarms = [] if self.held else self._tracking.watch(row)
+        alarms = [] if self._investigation.held else self._tracking.watch(row)
         if alarms:
-            self._investigation.start()
-            return [self._event(row.t, kind, joint, **evidence) for kind, joint, evidence in alarms]
+            told = [alarm for alarm in alarms if alarm[0] != "suspicion"]
+            self._investigation.start(silent=not told)
+            return [self._event(row.t, kind, joint, **evidence) for kind, joint, evidence in told]
         if not self._investigation.add(row):
             return self._repeat(row.t)
         if not self._investigation.is_due():
             return []
-        return self._test(row.t) if self.held else self._audit(row.t)
+        if self._investigation.held:
+            return self._test(row.t)
+        audit(self._tracking, self._investigation, self.config)
+        return []
 
     def estimate(self) -> Estimate:
         """Current gain and offset of every joint against the installed calibration."""
         return self._tracking.filter.estimate()
+
+    def limits(self) -> Limits:
+        """The changes of each joint that would be noticed now, at poses like the latest ones."""
+        key = (
+            self._tracking.rows // self.config.audit_rows,
+            self._tracking.belief.learnt,
+            self._tracking.belief.level.rows,
+        )
+        if self._limits is None or self._limits[0] != key:
+            self._limits = (key, self._tracking.limits(self._investigation.window[-self.config.longest_window :]))
+        return self._limits[1]
 
     def model_torque(self, position: Array) -> Array:
         """Gravity torque (n,) [N·m] that the observer believes at position readings (n,) [rad]."""
@@ -131,31 +158,27 @@ class Observer:
         """True angles of position readings."""
         return np.asarray(self._position_gain * position + self._position_offset)
 
-    def _audit(self, t: float) -> list[Event]:
-        """No alarm is open: test the last rows for effects that are too small or too slow for an alarm."""
-        window = self._investigation.window
-        del window[: -self.config.longest_window]
-        verdict = self._tracking.cause_test(window).verdict()
-        if verdict.cause == "none":
-            if self._tracking.belief.learnt < self.config.baseline_rows:
-                self._tracking.learn(window[-self.config.audit_rows :])
-            return []
-        if verdict.cause in ("unknown", "ambiguous"):
-            return []  # an alarm follows if it lasts
-        self._investigation.start()
-        return [self._verdict(t, verdict)]
-
     def _test(self, t: float) -> list[Event]:
         """An alarm is open and its window is full: report the cause; propose once two windows agree on a drift."""
         state = self._investigation
         test = self._tracking.cause_test(state.window)
+        if state.silent and test.verdict().cause == "unknown" and may_adapt(self._tracking, state.window, self.config):
+            self._tracking.adapt(state.window)
+            test = self._tracking.cause_test(state.window)
         verdict = test.verdict()
         if verdict.cause == "ambiguous" and len(state.window) < self.config.longest_window:
             return []  # more rows may decide
+        if state.silent and not confirmed(self._tracking, state, test, verdict, self.config):
+            return []
+        found, state.silent = state.silent and verdict.is_drift, False
         window, state.window = state.window, []
-        doubted, state.doubtful = state.doubtful, verdict.cause == "unknown"
-        if state.doubtful and not doubted:
+        state.doubtful = state.doubtful + 1 if verdict.cause == "unknown" else 0
+        if state.doubtful == 1:
             return []  # the cause may have changed within this window: wait for another one
+        if state.doubtful > DOUBTED:  # it stays: another discrepancy than the one known
+            self._tracking.adapt(window)
+            test = self._tracking.cause_test(window)
+            verdict = test.verdict()
         if verdict.cause == "none":
             self._resume()
             return [self._verdict(t, verdict)]
@@ -163,7 +186,8 @@ class Observer:
             state.first = None
             return self._carried(t, verdict) or self._report(t, verdict)
         state.carrying = 0
-        return self._report(t, verdict) + self._confirm(t, window, test, verdict)
+        alarms = [self._event(t, "alarm", joint, channel=verdict.cause) for joint in verdict.joints if found]
+        return alarms + self._report(t, verdict) + self._confirm(t, window, test, verdict)
 
     def _carried(self, t: float, verdict: Verdict) -> list[Event]:
         """A payload that stays is a tool: the model takes it over and watching resumes; likewise when it is removed."""

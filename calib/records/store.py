@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
-import yaml
 
-from armlink.arm_file import ArmFile
+from armlink.arm_file import ArmFile, read_yaml
 from armlink.errors import BadInput, Refused
 from calib.records.atomic_file import write_whole
 from calib.records.database import StoreFault, default_url, first_line, open_database, reading, transaction
@@ -202,8 +201,8 @@ class RecordStore:
 def load_yaml(path: Path) -> AnyRecord:
     """The record of a YAML file (as `Record.to_yaml` wrote it); raises BadInput if it is none or was changed."""
     try:
-        content: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        content = read_yaml(path)
+    except OSError as error:
         raise BadInput(f"{path}: cannot be read as YAML: {first_line(error)}") from None
     return parse_record(content, str(path))
 

@@ -21,6 +21,7 @@ from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration
 from calib.motion.static_reading import StaticReading, stack
 from calib.plan.types import SweepPlan
 from calib.records.atomic_file import part_of, write_whole
+from calib.records.file_lock import lock_file
 from gcomp.arrays import Array
 
 MANIFEST, LINES = "manifest.json", "readings.jsonl"
@@ -201,6 +202,11 @@ class DataWriter:
             path.mkdir(parents=True, exist_ok=True)
             write_whole(path / MANIFEST, manifest.model_dump_json(by_alias=True, indent=1))
         self._file = (path / LINES).open("ab+", buffering=0)
+        try:
+            lock_file(self._file.fileno(), str(path))
+        except BadInput:
+            self._file.close()
+            raise
         self._drop_torn_line()
         _keep_names(path)
 

@@ -86,7 +86,8 @@ class MoteusDrive(SimulatedDrive):
         if not replies or ("feedback.lost" in self.faults and not self.fault_code):
             return
         try:
-            content = pack_reply([*errors, *map(self._read, asked)])
+            shown = self._shown_registers() if asked else {}
+            content = pack_reply([*errors, *(_reply(each, shown) for each in asked)])
         except ValueError:  # more than a frame holds: the controller sends none
             return
         answer = identifier(self.drive, source)
@@ -105,9 +106,9 @@ class MoteusDrive(SimulatedDrive):
             self.command |= known
         return [Subframe(WRITE_ERROR, number, NO_REGISTER) for number in unknown]
 
-    def _read(self, asked: Subframe) -> Subframe:
+    def _shown_registers(self) -> dict[int, float]:
         motor = self.motor
-        values: dict[int, float] = {
+        return self.command | {
             Register.MODE: self.mode,
             Register.POSITION: motor.position / TURN * self._shown("position"),
             Register.VELOCITY: motor.velocity / TURN * self._shown("velocity"),
@@ -128,13 +129,6 @@ class MoteusDrive(SimulatedDrive):
             Register.SERIAL2: 0,
             Register.SERIAL3: 0,
         }
-        value = (values | self.command).get(asked.register)
-        if value is None:
-            return Subframe(READ_ERROR, asked.register, NO_REGISTER)
-        whole = asked.register in (Register.MODEL, Register.FIRMWARE, Register.SERIAL1)
-        return Subframe(
-            REPLY, asked.register, value, INT32 if whole and asked.resolution == FLOAT else asked.resolution
-        )
 
     def _shown(self, quantity: str) -> float:
         return 1.0 / self.scale(quantity)
@@ -213,6 +207,14 @@ class MoteusDrive(SimulatedDrive):
         """Encoder fault: free."""
         self.mode, self.fault_code = Mode.FAULT, ENCODER_FAULT
         self.motor.free()
+
+
+def _reply(asked: Subframe, shown: dict[int, float]) -> Subframe:
+    value = shown.get(asked.register)
+    if value is None:
+        return Subframe(READ_ERROR, asked.register, NO_REGISTER)
+    whole = asked.register in (Register.MODEL, Register.FIRMWARE, Register.SERIAL1)
+    return Subframe(REPLY, asked.register, value, INT32 if whole and asked.resolution == FLOAT else asked.resolution)
 
 
 class MoteusFront:

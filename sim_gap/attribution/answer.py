@@ -2,15 +2,19 @@
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
+from armlink.recording.recording import Recording
 from sim_gap.attribution.causes import left_over
 from sim_gap.attribution.confidence import HINT
-from sim_gap.attribution.diagnosis import Cause, Diagnosis, Verdict
-from sim_gap.attribution.notes import notes
+from sim_gap.attribution.diagnosis import Cause, Diagnosis, Rollout
+from sim_gap.attribution.notes import besides_notes, notes
 from sim_gap.attribution.rollout import roll_out
 from sim_gap.attribution.verdict import share_left, verdict
 from sim_gap.model.load import SimModel
+from sim_gap.residuals.besides import fast, left_out, slow
 from sim_gap.residuals.residual_set import ResidualSet
-from sim_gap.residuals.where import by_joint, combined, locate
+from sim_gap.residuals.where import Location, by_joint, combined, locate
 from sim_gap.search.estimate import Estimate
 
 
@@ -23,6 +27,10 @@ class Internals:
     heldout: ResidualSet
     estimate: Estimate | None
     """None if there is no gap."""
+    recordings: tuple[Recording, ...] = ()
+    """Held-out recordings."""
+    nominal: Estimate | None = None
+    """The fit even if there is no gap."""
 
 
 def answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: str) -> Diagnosis:
@@ -32,13 +40,16 @@ def answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: 
         left_over(data, estimate.predict(data)) if estimate is not None else data.values for data in (judge, fit)
     )
     stuck = [each for s in (*fit.signals, *judge.signals) for each in s.stuck]
-    result: Verdict = "no_gap" if estimate is None else verdict(found, judge, left)
+    sets = [(judge, left), *([(fit, left_fit)] if found else [])]
+    aside = _aside(made, estimate)
+    result = verdict(found, sets, unsettled=any(place.clear for place in aside))
     if stuck or (fit.impacts and not any(cause.effect == "transmission.backlash" for cause in found)):
         result = "unexplained"
     return Diagnosis(
         verdict=result,
         names=made.model.arm.names,
-        where=tuple(locate(judge)),
+        where=(*locate(judge), *aside),
+        left_out=left_out(judge),
         causes=tuple(_hints(found) if result == "unexplained" else found),
         minor=tuple(minor),
         noise_floor=combined(judge, judge.floor),
@@ -49,10 +60,29 @@ def answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: 
         unexplained=share_left(judge, left),
         margin=combined(judge, judge.margin),
         heldout_is=heldout_is,
-        rollout=roll_out(made.model, judge, estimate),
-        notes=notes(found, stuck, estimate, fit, judge, left),
+        rollout=_rolled(made, found),
+        notes=(*notes(found, stuck, estimate, fit, judge, left), *besides_notes(aside)),
         internals=made,
     )
+
+
+def _aside(made: Internals, estimate: Estimate | None) -> list[Location]:
+    """Gaps at rest, in creep and above the band on held-out data."""
+    judge, arm = made.heldout, made.model.arm
+    zero = {row: np.zeros(len(values)) for row, values in judge.values.items()}
+    friction = arm.frictionloss.copy()
+    for term in estimate.terms if estimate is not None else ():
+        if term.effect == "friction.coulomb":
+            friction[term.place] += abs(estimate.of(term)[0]) if estimate is not None else 0.0
+    explained = zero if estimate is None else estimate.predict(judge)
+    return [*slow(judge, explained, friction), *fast(judge, made.recordings)]
+
+
+def _rolled(made: Internals, found: list[Cause]) -> Rollout | None:
+    """Roll-outs of the exported files along the held-out recordings."""
+    if made.nominal is None or not made.recordings:
+        return None
+    return roll_out(made.model, made.heldout, made.recordings, made.estimate, found, made.nominal)
 
 
 def _hints(found: list[Cause]) -> list[Cause]:

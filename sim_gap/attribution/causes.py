@@ -17,7 +17,8 @@ from sim_gap.effects.registry import effects
 from sim_gap.residuals.layout import Layout, Row
 from sim_gap.residuals.residual_set import RELEVANT_NM, ResidualSet
 from sim_gap.search.estimate import Estimate, Value
-from sim_gap.search.normal_equations import ColumnStore, NormalEquations, Term
+from sim_gap.search.normal_equations import NormalEquations
+from sim_gap.search.term import Term
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ FLOOR_KNOWN = 1.05
 class _Scorer:
     def __init__(self, estimate: Estimate, heldout: ResidualSet) -> None:
         self.estimate, self.heldout = estimate, heldout
-        self.normal = NormalEquations(ColumnStore(heldout), estimate.terms)
+        self.normal = NormalEquations(estimate.on(heldout), estimate.terms, estimate.normal)
         self.joint = np.array([row[1] for row in self.normal.rows])
         self.counts = self.normal.count.sum(0) > 0
 
@@ -133,7 +134,10 @@ def relevant_terms(
 ) -> tuple[Term, ...]:
     """Those of a step's terms that matter: without the others together, no joint's RMS rises by a relevant amount."""
     hit = heldout.impacts | estimate.store.data.impacts
-    if any(term.bound or (term.effect == "transmission.backlash" and term.place in hit) for term in step.terms):
+    if any(
+        not _is_held_out(term, heldout) or (term.effect == "transmission.backlash" and term.place in hit)
+        for term in step.terms
+    ):
         return step.terms
     shows = {row for term in step.terms for row in estimate.store.columns(term)}
     least = np.maximum(_minor(shows, heldout.layout) * heldout.usual_torque, QUIET_NM if quiet else RELEVANT_NM)
@@ -183,9 +187,14 @@ def causes(
         rest = tuple(term for term in step.terms if term not in main)
         for terms, out in ((main, found), (rest, minor)):
             if terms:
-                bound = any(term.bound for term in terms)
+                bound = not any(_is_held_out(term, heldout) for term in terms)
                 out.append(_cause(step, terms, fitted if bound else scorer, (rivals, law_test), names))
     return found, minor
+
+
+def _is_held_out(term: Term, heldout: ResidualSet) -> bool:
+    """Whether some held-out recording has a term."""
+    return any(term.form.signature.present(term.shape, s.number) for s in heldout.signals)
 
 
 def _cause(

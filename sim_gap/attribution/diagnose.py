@@ -15,6 +15,7 @@ from armlink.errors import BadInput
 from armlink.recording.corrections import AS_IT_IS, Corrections
 from armlink.recording.recording import Recording, default_names, slice_rows
 from sim_gap.attribution.answer import Internals, answer
+from sim_gap.attribution.bodies import groups_of, placed
 from sim_gap.attribution.causes import causes
 from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.attribution.rivals import Rivals
@@ -27,9 +28,9 @@ from sim_gap.model.arm_joints import hinges_of
 from sim_gap.model.load import SimModel, load_compiled, load_model
 from sim_gap.residuals.preprocess import prepare, require_length
 from sim_gap.residuals.residual_set import ResidualSet, residual_sets
+from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import Estimate
 from sim_gap.search.model_selection import select_model
-from sim_gap.search.normal_equations import ColumnStore
 
 OWN_HELDOUT = 0.3
 """Share at the end of each training recording that is held out if no held-out recording is given."""
@@ -45,6 +46,7 @@ def diagnose(
     labels: Sequence[str] = (),
     withhold: Sequence[str] = (),
     stated: Corrections = AS_IT_IS,
+    groups: Sequence[str] = (),
 ) -> Diagnosis:
     """Explain the gap between a simulation model and recordings of the real arm.
 
@@ -53,6 +55,7 @@ def diagnose(
         train: recordings to fit.
         heldout: recordings to judge on, not used in the fit; without any, the end of each training recording is.
         labels: names of the recordings for messages, train first.
+        groups: `NAME=REC[,REC…]`: recordings (by label) that share a body; without any, it is found which do.
         withhold: ids of effects to leave out of the library (blind check).
         stated: corrections that the user stated when the recordings were loaded; the check leaves those as they are.
 
@@ -64,23 +67,27 @@ def diagnose(
     sim, recordings, findings = _checked(model, [*train, *heldout], labels, stated)
     train, heldout = recordings[: len(train)], recordings[len(train) :]
     heldout_is = "the recordings given" if heldout else f"the last {OWN_HELDOUT:.0%} of each training recording"
-    numbers = [*range(1, len(train) + 1), *([0] * len(heldout))]
+    numbers = list(range(1, len(train) + len(heldout) + 1))
+    named = groups_of(groups, labels)
     if not heldout:
-        train, heldout, labels, numbers = *_split(train), labels * 2, numbers * 2
+        train, heldout, labels, numbers, named = *_split(train), labels * 2, numbers * 2, named * 2
     ready = [
-        prepare(recording, sim.arm, label, number)
-        for recording, label, number in zip([*train, *heldout], labels, numbers, strict=False)
+        prepare(recording, sim.arm, label, number, names)
+        for recording, label, number, names in zip([*train, *heldout], labels, numbers, named, strict=False)
     ]
     fit, judge = residual_sets(ready[: len(train)], ready[len(train) :])
     _require_motion(fit)
     store = ColumnStore(fit)
     search = select_model(store, library_without(withhold))
-    estimate = Estimate(store, search.active)
+    estimate = Estimate(search.normal.store, search.active)
+    judge = placed(estimate, judge)
     quiet = not fit.impacts and is_quiet(judge) and is_quiet(fit)
     found, minor = causes(estimate, judge, Rivals(search), sim.arm.names, quiet=quiet)
     if quiet and not found:
-        return replace(answer(Internals(sim, fit, judge, None), [], [], heldout_is), checks=findings)
-    return replace(answer(Internals(sim, fit, judge, estimate), found, minor, heldout_is), checks=findings)
+        made = answer(Internals(sim, fit, judge, None, tuple(heldout), estimate), [], [], heldout_is)
+    else:
+        made = answer(Internals(sim, fit, judge, estimate, tuple(heldout), estimate), found, minor, heldout_is)
+    return replace(made, checks=findings)
 
 
 def _checked(

@@ -10,7 +10,7 @@ from sim_gap.checks.finding import Finding
 from sim_gap.residuals.where import Location
 from sim_gap.search.estimate import Value
 
-SCHEMA = "armlink.gap/1"
+SCHEMA = "armlink.gap/2"
 Verdict = Literal["no_gap", "explained", "ambiguous", "unexplained"]
 
 
@@ -63,6 +63,19 @@ class Rollout:
     horizon_s: float
     before: Array
     after: Array
+    effects: "tuple[EffectRollout, ...]" = ()
+    """Those whose absence costs most first."""
+    closed_loop: bool = False
+
+
+@dataclass(frozen=True)
+class EffectRollout:
+    """Position gap with one effect added to the nominal model alone, and with all effects but this one [rad], (n,)."""
+
+    effect: str
+    joints: tuple[str, ...]
+    alone: Array
+    without: Array
 
 
 @dataclass(frozen=True)
@@ -85,6 +98,8 @@ class Diagnosis:
     """RMS per joint from which it is a gap [N·m], (n,)."""
     heldout_is: str
     """Description of the held-out data."""
+    left_out: float = 0.0
+    """Share of the held-out samples that no row judges."""
     rollout: Rollout | None = None
     notes: tuple[str, ...] = ()
     checks: tuple[Finding, ...] = ()
@@ -93,7 +108,7 @@ class Diagnosis:
     """Fit and data behind the result (`answer.Internals`), for report and export."""
 
     def to_json(self) -> dict[str, Any]:
-        """The dictionary of schema armlink.gap/1."""
+        """The dictionary of schema armlink.gap/2."""
         roll = self.rollout
         return {
             "schema": SCHEMA,
@@ -106,6 +121,7 @@ class Diagnosis:
                     "rms": _round(place.rms),
                     "noise": _round(place.noise),
                     "share": _round(place.share),
+                    **({} if place.hz is None else {"hz": _round(place.hz)}),
                 }
                 for place in self.where
             ],
@@ -124,10 +140,21 @@ class Diagnosis:
             "rollout": {
                 "unit": "rad",
                 "horizon_s": roll.horizon_s if roll else None,
+                "closed_loop": roll.closed_loop if roll else False,
                 "before": _list(roll.before) if roll else [],
                 "after": _list(roll.after) if roll else [],
+                "effects": [
+                    {
+                        "effect": each.effect,
+                        "joints": list(each.joints),
+                        "alone": _list(each.alone),
+                        "without": _list(each.without),
+                    }
+                    for each in (roll.effects if roll else ())
+                ],
             },
             "unexplained": _round(self.unexplained),
+            "left_out": _round(self.left_out),
             "notes": list(self.notes),
             "checks": [finding.to_json() for finding in self.checks],
         }

@@ -7,8 +7,10 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.effects.laws import LAWS
-from sim_gap.search.normal_equations import ColumnStore, NormalEquations, Term
+from sim_gap.search.column_store import ColumnStore
+from sim_gap.search.normal_equations import NormalEquations
 from sim_gap.search.stepwise import Search
+from sim_gap.search.term import Term
 
 TRIED = 3
 """Number of laws tried in place of a term: the best of a first screening."""
@@ -64,7 +66,7 @@ class LawTest:
         normal, family = self.search.normal, LAWS[law.effect].family
         if any(term.effect.split(".")[0] != family for term in own):
             return False
-        at, of = normal.at[law], normal.index(own)
+        at, of = normal.at[law], np.concatenate([normal.at[term] for term in own])
         law_gram, across, power = np.zeros((len(at), len(at))), np.zeros((len(at), len(of))), np.zeros(len(of))
         for weight, block in zip(self.search.weighted.weights, normal.blocks, strict=True):
             ours, theirs = block.position[at], block.position[of]

@@ -3,13 +3,14 @@
 from collections.abc import Sequence
 
 from gcomp.arrays import Array
+from sim_gap.attribution.bodies import recordings_with
 from sim_gap.attribution.diagnosis import Cause
 from sim_gap.attribution.verdict import row_rms
 from sim_gap.effects.laws import LAWS
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.residuals.stuck_channels import Stuck
-from sim_gap.residuals.where import locate
+from sim_gap.residuals.where import Location, locate
 from sim_gap.search.estimate import Estimate
 
 ALIKE = 0.05
@@ -27,7 +28,7 @@ def notes(
     left: dict[Row, Array],
 ) -> tuple[str, ...]:
     """All notes; `fit` is the training set, `judge` the held-out set with the remaining residual `left`."""
-    known = (*_noisy(fit), *_stuck(stuck, fit), *_impacts(fit), *_bound(estimate, fit), *_alike(found))
+    known = (*_noisy(fit), *_stuck(stuck, fit), *_impacts(fit), *_bound(estimate, fit, judge), *_alike(found))
     return (*known, *_remaining(judge, left), *_at_rest(fit))
 
 
@@ -60,16 +61,19 @@ def _impacts(data: ResidualSet) -> tuple[str, ...]:
     )
 
 
-def _bound(estimate: Estimate | None, data: ResidualSet) -> tuple[str, ...]:
-    """A note for effects in one recording alone, and for a payload that includes model errors of the links."""
-    terms = () if estimate is None else estimate.terms
-    labels = {s.number: s.label for s in data.signals}
-    lines = [f"{term.effect} is present in {labels[term.bound]} alone" for term in terms if term.bound]
-    if any(term.effect == "link.payload" and not term.bound for term in terms):
-        lines.append(
-            "link.payload: includes mass errors of the links themselves; to separate them, add recordings of the arm "
-            "without the payload (--train)"
-        )
+def _bound(estimate: Estimate | None, fit: ResidualSet, judge: ResidualSet) -> tuple[str, ...]:
+    """A note for effects in some recordings alone, and for a payload that includes model errors of the links."""
+    lines = []
+    for term in () if estimate is None else estimate.terms:
+        if alone := recordings_with(term, (fit, judge)):
+            lines.append(f"{term.effect} is present in {' and '.join(alone)} alone")
+        elif term.effect == "link.payload":
+            lines.append(
+                "link.payload: includes mass errors of the links themselves; to separate them, add recordings of the "
+                "arm without the payload (--train)"
+            )
+        if term.effect == "link.payload" and estimate is not None and estimate.of(term)[0] < 0.0:
+            lines.append("link.payload: its mass is negative: the model has a body at its tip that the arm lacks")
     return tuple(lines)
 
 
@@ -98,4 +102,16 @@ def _at_rest(data: ResidualSet) -> tuple[str, ...]:
         f"{data.signals[0].arm.names[joint]} hardly moves: its {channel} contains no information on friction"
         for channel, joint in data.rows
         if channel == data.layout.motor and not any(s.moving[:, joint].mean() > 0.02 for s in data.signals)
+    )
+
+
+def besides_notes(aside: Sequence[Location]) -> tuple[str, ...]:
+    """A note for each gap at rest, in creep or above the band that nothing known accounts for."""
+    where = {"rest": "at rest", "creep": "in creep and around reversals"}
+    return tuple(
+        f"{at.joint}: {at.rms:.2g} N·m of {at.channel} "
+        + (f"at {at.hz:.3g} Hz: a hum or a resonance above the comparison's band" if at.hz else where[at.regime])
+        + ("" if at.hz else ", more than known friction: breakaway, hysteresis or backlash")
+        for at in aside
+        if at.clear
     )

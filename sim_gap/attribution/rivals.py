@@ -3,14 +3,18 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sim_gap.search.normal_equations import Term
+from sim_gap.search.gauss_newton import converged
+from sim_gap.search.normal_equations import NormalEquations
 from sim_gap.search.stepwise import Search, shortlist
+from sim_gap.search.term import Term
 
 AS_GOOD = 0.036
 """A rival is as good if its score (½ log of the mean square) is worse by no more than this: the price of three
 coefficients, for the background of every arm can favour either by that much."""
 BARE = 0.012
 """A cause that brings no more than the price of a coefficient has as a rival any effect that brings some of it."""
+NEAR = 0.3
+"""A rival within this is fitted about itself, if the columns of either depend on the other."""
 TRIED = 4
 """Number of rivals tried in place of a term: the best of a first screening."""
 SEPARATING_MOTION = {
@@ -80,6 +84,8 @@ class Rivals:
             known = [other for other in here if frozenset({term.effect, other.effect}) in SEPARATING_MOTION]
             for other in dict.fromkeys([*likely, *known]):
                 worse = search.judge(search.with_beneath(other, rest)) - search.score
+                if AS_GOOD <= worse < NEAR and _bends(term) and _bends(other):
+                    worse = min(worse, self._refitted(other, rest))
                 weakest = min(weakest, worse)
                 enough = max(0.5 * lost, min(lost, BARE))
                 if worse < AS_GOOD and worse < enough and other.effect != effect:
@@ -91,3 +97,19 @@ class Rivals:
             return Weighed(evidence, (), None)
         motion = SEPARATING_MOTION.get(frozenset({effect, confounded[0]}), GENERAL_MOTION)
         return Weighed(evidence, confounded, f"record {motion}")
+
+    def _refitted(self, other: Term, rest: list[Term]) -> float:
+        """How much worse another term scores in place of one, with all columns about that fit."""
+        terms = self.search.with_beneath(other, rest)
+        store = self.search.normal.store
+        nominal, start = store.nominal or store, store.values
+        about, kept = converged(nominal, terms, {term: c for term, c in start.items() if term in rest})
+        if other.key not in {term.key for term in kept}:
+            return float("inf")
+        again = Search(NormalEquations(about, kept), kept)
+        return again.score - self.search.score
+
+
+def _bends(term: Term) -> bool:
+    """Whether the columns of other terms depend on this one's size."""
+    return term.form.signature.side == "link" and term.effect != "transmission.spring"

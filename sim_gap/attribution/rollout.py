@@ -1,91 +1,115 @@
-"""Forward simulation from recorded states with recorded torque: deviation of the simulated from the real joints.
+"""Roll-outs of what is written: simulations with the exported model and module from recorded states.
 
-Effects that a MuJoCo model can hold are put into it; the torque of the others along the recorded motion is subtracted
-from the driving torque. The windows are short, for an arm with open-loop torque drifts away in any case.
+The whole, each effect added alone, and each left out alone. The windows are short, for an arm with open-loop torque
+drifts away in any case. Each model comes from the text that `--out-model` writes.
 """
 
+from collections.abc import Sequence
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 
+from armlink.recording.recording import Recording
 from gcomp.arrays import Array
-from sim_gap.attribution.diagnosis import Rollout
-from sim_gap.better_model.with_effects import CorrectedModel, with_effects
+from sim_gap.attribution.diagnosis import Cause, EffectRollout, Rollout
+from sim_gap.better_model import forward_effects
+from sim_gap.better_model.effects_module import joint_effects
+from sim_gap.better_model.export import Written, written
+from sim_gap.better_model.with_effects import with_effects
 from sim_gap.model.load import SimModel
-from sim_gap.residuals.layout import Layout
-from sim_gap.residuals.preprocess import Signals
+from sim_gap.residuals.preprocess import CHANNELS
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.estimate import Estimate
+from sim_gap.search.term import Term
 
-HORIZON_S = 0.5
-WINDOWS = 40
-STEP_S = 0.002
-LOST, WILD = np.pi, 50.0
-"""Limits of a joint's deviation [rad] and speed [rad/s]: without friction and rotor inertia a light joint would diverge
-and the simulation with it."""
-LOCKED = 1e9
-"""Armature of joints of the model that the recording does not have [kg·m²]: they stay at rest."""
+MOST_EFFECTS = 12
+"""Number of effects, the most important first, that are also added and left out alone."""
+FEW_WINDOWS = 6
+"""Number of windows of each of these."""
+NAME = "model.xml"
 
 
-def roll_out(sim: SimModel, heldout: ResidualSet, estimate: Estimate | None) -> Rollout:
-    """Position gap per joint, RMS over the windows [rad], of the nominal model and of the model with the effects."""
-    before = _gap(sim, with_effects(sim, None), heldout, None)
-    after = before if estimate is None else _gap(sim, with_effects(sim, estimate), heldout, estimate)
-    return Rollout(HORIZON_S, before, after)
+class RollOuts:
+    """Simulations of the exported files along held-out recordings."""
+
+    def __init__(
+        self, sim: SimModel, heldout: ResidualSet, recordings: Sequence[Recording], estimate: Estimate
+    ) -> None:
+        self.sim, self.recordings, self.estimate = sim, recordings, estimate
+        self.numbers = [s.number for s in heldout.signals]
+        self.channel = CHANNELS[heldout.layout.motor_side]
+        self.source = {"tau_motor": "motor", "tau_cmd": "command", "tau": "sensor"}[heldout.layout.motor_side]
+
+    def of(self, terms: Sequence[Term], windows: int) -> Array:
+        """Deviation per joint with these terms [rad], RMS over the windows of all recordings, (n,)."""
+        share, squares = max(1, windows // len(self.recordings)), []
+        bodies = any(term.effect == "link.payload" for term in terms)
+        made: dict[int, tuple[Any, ModuleType, Any]] = {}
+        for r, number in zip(self.recordings, self.numbers, strict=True):
+            number = number if bodies else 0
+            if number not in made:
+                made[number] = self._files(terms, number)
+            model, module, effects = made[number]
+            torque = getattr(r, self.channel)
+            squares.append(module.roll_out(model, effects, r.t, r.position, torque, self.source, windows=share) ** 2)
+        return np.asarray(np.sqrt(np.nanmean(squares, axis=0)))
+
+    def _files(self, terms: Sequence[Term], number: int) -> tuple[Any, ModuleType, Any]:
+        """Model, module and effects with these terms as they are written for one recording."""
+        if self.sim.path is None:  # a compiled model has no file to write
+            corrected = with_effects(self.sim, self.estimate, terms, number)
+            entries = joint_effects(self.sim, self.estimate, corrected.not_held)
+            own = forward_effects.Effects(corrected.model, entries, self.sim.arm.names)
+            return corrected.model, forward_effects, own
+        files = written(self.sim, self.estimate, NAME, terms, number)
+        model, module = _compiled(files), _loaded(files)
+        return model, module, module.Effects(model, module.EFFECTS, module.JOINTS or self.sim.arm.names)
 
 
-def _gap(sim: SimModel, corrected: CorrectedModel, heldout: ResidualSet, estimate: Estimate | None) -> Array:
-    model = corrected.model
-    _prepare(model, sim)
-    squares, count = np.zeros(sim.n), 0
-    for signals in heldout.signals:
-        drive = signals.reading[heldout.layout.motor_side] - _not_held(signals, heldout.layout, corrected, estimate)
-        steps = round(HORIZON_S * signals.rate)
-        last = len(signals.t) - steps - 1
-        share = max(1, WINDOWS // len(heldout.signals))
-        for start in np.unique(np.linspace(0.0, last, share).astype(int)) if last > 0 else []:
-            stray = _window(model, sim, signals, drive, int(start), steps)
-            squares += np.mean(stray**2, axis=0)
-            count += 1
-    return np.asarray(np.sqrt(squares / max(count, 1)))
+def roll_out(
+    sim: SimModel,
+    heldout: ResidualSet,
+    recordings: Sequence[Recording],
+    estimate: Estimate | None,
+    causes: Sequence[Cause],
+    nominal: Estimate,
+) -> Rollout:
+    """Position gap per joint of the nominal model, of the whole correction, and with each cause added or left out.
+
+    `estimate` is None if there is no gap; `nominal` stands for it then. Effects whose absence costs most come first.
+    """
+    runs = RollOuts(sim, heldout, recordings, estimate or nominal)
+    horizon, windows = forward_effects.HORIZON_S, forward_effects.WINDOWS
+    before = runs.of((), windows)
+    if estimate is None:
+        return Rollout(horizon, before, before)
+    after = runs.of(estimate.terms, windows)
+    out = []
+    for cause in causes[:MOST_EFFECTS]:
+        own = [term for term in estimate.terms if term.effect == cause.effect]
+        rest = [term for term in estimate.terms if term not in own and not {t.key for t in own} & {*term.beneath}]
+        needed = [term for term in estimate.terms if any(term.key in t.beneath for t in own)]
+        alone, without = (runs.of(terms, FEW_WINDOWS) for terms in ([*needed, *own], rest))
+        out.append(EffectRollout(cause.effect, cause.joints, alone, without))
+    cost = lambda each: -float(np.nanmax(each.without))  # noqa: E731
+    return Rollout(horizon, before, after, tuple(sorted(out, key=cost)))
 
 
-def _prepare(model: Any, sim: SimModel) -> None:
+def _compiled(files: Written) -> Any:
+    """The model from its text; from the same specification if it refers to files beside it."""
     import mujoco
 
-    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
-    own = model.jnt_dofadr[list(sim.joints)]
-    others = np.setdiff1d(np.arange(model.nv), own)
-    model.dof_armature[others] = LOCKED
+    try:
+        return mujoco.MjModel.from_xml_string(files.xml)
+    except ValueError:
+        return files.spec.compile()
 
 
-def _not_held(signals: Signals, layout: Layout, corrected: CorrectedModel, estimate: Estimate | None) -> Array:
-    """Torque at the motor (without one, at the sensor) of the effects that the model cannot hold, (K, n)."""
-    out = np.zeros_like(signals.q)
-    for term in corrected.not_held:
-        assert estimate is not None
-        columns = term.form.signature.columns(signals, layout, term.place, term.shape)
-        for (channel, joint), x in columns.items():
-            if channel != layout.command:
-                out[:, joint] += x @ estimate.of(term)
-    return out
-
-
-def _window(model: Any, sim: SimModel, signals: Signals, drive: Array, start: int, steps: int) -> Array:
-    """Simulated minus recorded position over one window, (steps, n)."""
-    import mujoco
-
-    each = max(1, int(np.ceil(1.0 / signals.rate / STEP_S)))
-    model.opt.timestep = 1.0 / signals.rate / each
-    data = mujoco.MjData(model)
-    adr, dof = model.jnt_qposadr[list(sim.joints)], model.jnt_dofadr[list(sim.joints)]
-    data.qpos[adr], data.qvel[dof] = signals.q[start], signals.v[start]
-    out = np.empty((steps, sim.n))
-    for k in range(steps):
-        data.qfrc_applied[dof] = 0.5 * (drive[start + k] + drive[start + k + 1])
-        for _ in range(each):
-            mujoco.mj_step(model, data)
-            np.clip(data.qvel, -WILD, WILD, out=data.qvel)
-        out[k] = data.qpos[adr] - signals.q[start + k + 1]
-    return np.clip(out, -LOST, LOST)
+def _loaded(files: Written) -> ModuleType:
+    """The module from its text; the one that it is made from if there is none."""
+    if not files.module:
+        return forward_effects
+    module = ModuleType("model_effects")
+    exec(compile(files.module, "model_effects.py", "exec"), module.__dict__)
+    return module

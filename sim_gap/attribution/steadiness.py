@@ -6,7 +6,7 @@ import numpy as np
 
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.estimate import Estimate
-from sim_gap.search.normal_equations import ColumnStore, Term
+from sim_gap.search.term import Term
 
 STEADY = 2.0
 """Least mean decrease of a row's sum of squares over the blocks, in standard errors."""
@@ -18,7 +18,7 @@ def steadiness(estimate: Estimate, heldout: ResidualSet, terms: Sequence[Term]) 
     The mean over blocks of time of the decrease per block, divided by the standard error of that mean; the largest of
     the rows.
     """
-    store = ColumnStore(heldout)
+    store = estimate.on(heldout)
     with_them = estimate.subset(list(estimate.terms))
     without = estimate.subset([term for term in estimate.terms if term not in terms])
     best = 0.0
@@ -27,7 +27,7 @@ def steadiness(estimate: Estimate, heldout: ResidualSet, terms: Sequence[Term]) 
         touching = [term for term in estimate.terms if row in store.columns(term)]
         if not valid.any() or not any(row in store.columns(term) for term in terms):
             continue
-        columns = np.hstack([store.columns(term)[row][valid] for term in touching])
+        columns = store.wide(touching, row, estimate.normal.fixed)[valid]
         index = estimate.normal.index(touching)
         left, more = (heldout.values[row][valid] - columns @ c[index] for c in (with_them, without))
         falls = np.bincount(heldout.blocks[valid], more**2 - left**2)

@@ -5,13 +5,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.attribution.confidence import founded
+from sim_gap.attribution.confidence import HINT, founded
 from sim_gap.attribution.diagnosis import Cause, Verdict
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
 
-EXPLAINED = 0.15
-"""Largest remaining share of the squared gap above the noise in an explained diagnosis."""
+EXPLAINED = 0.3
+"""Largest share of the RMS of the gap, above the noise, that remains in an explained diagnosis."""
+NEAR, ROW_LEFT = 2.0, 0.15
+"""What may remain of a row: this many times its margin, or this share of its RMS."""
+CARRIES = 0.3
+"""Fall of the gap by a cause that carries the explanation, as a share of that of the most important one."""
 
 
 def row_rms(data: ResidualSet, left: dict[Row, Array] | None = None) -> dict[Row, float]:
@@ -38,14 +42,36 @@ def share_left(data: ResidualSet, left: dict[Row, Array]) -> float:
     return float(min(np.sum(shares) / max(np.sum(weights), 1e-9), 1.0)) if shares else 0.0
 
 
-def verdict(found: Sequence[Cause], data: ResidualSet, left: dict[Row, Array]) -> Verdict:
-    """`unexplained` if a gap remains or no cause is well founded, `ambiguous` if the first cause has a rival."""
-    after = row_rms(data, left)
-    quiet = all(rms <= data.margin[row] for row, rms in after.items())
+def closed(data: ResidualSet, left: dict[Row, Array]) -> bool:
+    """Whether the gap is closed: what remains is a small share of its RMS, and near the noise in every row.
+
+    A row is near the noise within NEAR times its margin, or with no more than ROW_LEFT of its own RMS left.
+    """
+    before, after = row_rms(data), row_rms(data, left)
+    near = all(rms <= max(NEAR * data.margin[row], ROW_LEFT * before[row]) for row, rms in after.items())
+    return near and float(np.sqrt(share_left(data, left))) <= EXPLAINED
+
+
+def carries(cause: Cause, found: Sequence[Cause]) -> bool:
+    """Whether a cause carries the explanation: it takes off a good part of what the most important one does."""
+    return cause.fall >= CARRIES * max(each.fall for each in found)
+
+
+def verdict(
+    found: Sequence[Cause], sets: Sequence[tuple[ResidualSet, dict[Row, Array]]], *, unsettled: bool = False
+) -> Verdict:
+    """The verdict from the causes and the held-out and training sets with what remains of them, held-out first.
+
+    `unexplained` if a gap remains in either, no cause is well founded, or there is none while something beside the
+    comparison is `unsettled`; `ambiguous` if the first cause has a rival, or one that carries the rest is a hint only.
+    """
+    data, left = sets[0]
+    quiet = all(rms <= data.margin[row] for row, rms in row_rms(data, left).items())
     if not found:
-        return "no_gap" if quiet else "unexplained"
-    if not quiet and share_left(data, left) > EXPLAINED:
+        return "no_gap" if quiet and not unsettled else "unexplained"
+    if not (quiet or closed(data, left)) or not all(closed(*each) for each in sets[1:]):
         return "unexplained"
-    if found[0].confounded_with:
-        return "ambiguous"
-    return "explained" if any(founded(cause.signs) for cause in found) else "unexplained"
+    if not any(founded(cause.signs) for cause in found):
+        return "unexplained"
+    weak = any(cause.confidence < HINT and carries(cause, found) for cause in found)
+    return "ambiguous" if weak or found[0].confounded_with else "explained"

@@ -6,6 +6,7 @@ from typing import Any
 
 from sim_gap.model.load import SimModel
 from sim_gap.search.estimate import Estimate
+from sim_gap.search.term import Term
 
 
 @dataclass(frozen=True)
@@ -23,9 +24,12 @@ class CoupledMotor:
     """[N·m·s/rad]."""
 
 
-def coupled_motors(sim: SimModel, estimate: Estimate | None) -> list[CoupledMotor]:
-    """Motors coupled to two joints."""
-    terms = [] if estimate is None else [t for t in estimate.terms if t.effect == "transmission.coupling"]
+def coupled_motors(
+    sim: SimModel, estimate: Estimate | None, chosen: Sequence[Term] | None = None
+) -> list[CoupledMotor]:
+    """Motors coupled to two joints, of an estimate or of some of its terms."""
+    every = () if estimate is None else estimate.terms if chosen is None else chosen
+    terms = [term for term in every if term.effect == "transmission.coupling"]
     names = sim.arm.names
     return [
         CoupledMotor(names[t.place], names[int(t.shape[0]) - 1], t.shape[1], *estimate.of(t).tolist())

@@ -6,7 +6,7 @@ from pathlib import Path
 from sim_gap.better_model import forward_effects as forward
 from sim_gap.model.load import SimModel
 from sim_gap.search.estimate import Estimate
-from sim_gap.search.normal_equations import Term
+from sim_gap.search.term import Term
 
 
 def module_path(model: Path) -> Path:
@@ -30,9 +30,9 @@ def joint_effects(sim: SimModel, estimate: Estimate, terms: Sequence[Term]) -> l
     return out
 
 
-def module_text(sim: SimModel, estimate: Estimate, terms: Sequence[Term], model: str) -> str:
+def module_text(sim: SimModel, effects: Sequence[forward.JointEffect], model: str) -> str:
     """Source of the module with the effects that the MJCF file `model` cannot hold."""
-    rows = "".join(f"    {each!r},\n" for each in joint_effects(sim, estimate, terms))
+    rows = "".join(f"    {each!r},\n" for each in effects)
     text = Path(forward.__file__).read_text(encoding="utf-8")
     for name, declared, value in (
         ("MODEL", 'MODEL = ""', f"{model!r}"),

@@ -1,5 +1,7 @@
 """Export of the corrected model (`--out-model`): MJCF, and a module for the effects that MJCF cannot hold."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -7,11 +9,58 @@ import numpy as np
 
 from armlink.errors import BadInput
 from sim_gap.better_model.coupled_motors import add_to, coupled_motors
-from sim_gap.better_model.effects_module import module_path, module_text
+from sim_gap.better_model.effects_module import joint_effects, module_path, module_text
+from sim_gap.better_model.forward_effects import GEARED, JointEffect
 from sim_gap.better_model.with_effects import spec_of, with_effects
 from sim_gap.model.load import SimModel
 from sim_gap.search.estimate import Estimate
-from sim_gap.search.normal_equations import Term
+from sim_gap.search.term import Term
+
+
+@dataclass(frozen=True)
+class Written:
+    """The text of a corrected model and of the module beside it."""
+
+    xml: str
+    module: str
+    """Empty if MJCF holds every effect."""
+    spec: Any
+    """`mujoco.MjSpec` of the model."""
+    lines: list[str]
+    """A line per effect that MJCF cannot hold, and per link that is not as fitted."""
+    effects: list[JointEffect]
+    """What the module holds."""
+
+
+def written(
+    sim: SimModel, estimate: Estimate | None, name: str, terms: Sequence[Term] | None = None, number: int = 0
+) -> Written:
+    """The files of the model with the effects of an estimate, or with some of its terms; `name` is the MJCF's.
+
+    A body that only some recordings have is left out, except for the one with this `number`.
+    """
+    chosen = () if estimate is None else estimate.terms if terms is None else tuple(terms)
+    spec, corrected = spec_of(sim), with_effects(sim, estimate, chosen, number)
+    for body in list(spec.bodies)[1:]:
+        _set_inertial(body, corrected.model)
+    for joint in spec.joints:
+        _set_joint(joint, corrected.model)
+    add_to(spec, coupled_motors(sim, estimate, chosen))
+    gains = _gains(sim, estimate, chosen)
+    driven = {actuator.target for actuator in spec.actuators}
+    for actuator in spec.actuators:
+        actuator.gear = [gains.get(actuator.target, 1.0) * actuator.gear[0], *actuator.gear[1:]]
+    spec.option.gravity = corrected.model.opt.gravity
+    spec.compile()
+    left = [t for t in corrected.not_held if t.effect != "actuator.gain" or sim.arm.names[t.place] not in driven]
+    lines = [] if estimate is None else [_line(sim, estimate, term) for term in left]
+    lines += [f"{name}: its link as fitted cannot exist; the file has one that can" for name in corrected.changed]
+    module = module_path(Path(name)).name
+    comment = xml_comment([f"Effects that MJCF cannot hold ({module} applies them):", *lines]) if lines else ""
+    effects = [] if estimate is None else joint_effects(sim, estimate, left)
+    effects += [(GEARED, joint, {"gain": gain}) for joint, gain in gains.items() if joint in driven]
+    source = module_text(sim, effects, name) if effects else ""
+    return Written(comment + spec.to_xml(), source, spec, lines, effects)
 
 
 def write_model(sim: SimModel, estimate: Estimate | None, path: Path) -> list[str]:
@@ -20,43 +69,33 @@ def write_model(sim: SimModel, estimate: Estimate | None, path: Path) -> list[st
     Returns a line per effect that MJCF cannot hold; the file lists them in a comment. Raises BadInput if the nominal
     model did not come from a file or a file cannot be written.
     """
-    spec, corrected = spec_of(sim), with_effects(sim, estimate)
-    for body in list(spec.bodies)[1:]:
-        _set_inertial(body, corrected.model)
-    for joint in spec.joints:
-        _set_joint(joint, corrected.model)
-    add_to(spec, coupled_motors(sim, estimate))
-    gains = _gains(sim, estimate)
-    driven = {actuator.target for actuator in spec.actuators}
-    for actuator in spec.actuators:
-        actuator.gear = [gains.get(actuator.target, 1.0) * actuator.gear[0], *actuator.gear[1:]]
-    spec.option.gravity = corrected.model.opt.gravity
-    spec.compile()
-    left = [
-        term for term in corrected.not_held if term.effect != "actuator.gain" or sim.arm.names[term.place] not in driven
-    ]
-    lines = [] if estimate is None else [_line(sim, estimate, term) for term in left]
-    module = module_path(path)
-    text = "".join(f"  {line}\n" for line in lines)
-    comment = f"<!-- Effects that MJCF cannot hold ({module.name} applies them):\n{text}-->\n" if lines else ""
+    files = written(sim, estimate, path.name)
     try:
-        path.write_text(comment + spec.to_xml(), encoding="utf-8")
-        if lines and estimate is not None:
-            module.write_text(module_text(sim, estimate, left, path.name), encoding="utf-8")
+        path.write_text(files.xml, encoding="utf-8")
+        if files.module:
+            module_path(path).write_text(files.module, encoding="utf-8")
     except OSError as error:
         raise BadInput(f"{error.filename}: cannot be written: {error.strerror}") from None
-    return lines
+    return files.lines
 
 
-def _gains(sim: SimModel, estimate: Estimate | None) -> dict[str, float]:
+def xml_comment(lines: list[str]) -> str:
+    """Lines as an XML comment; two hyphens, which would end it, are parted."""
+    text = "\n  ".join(lines)
+    while "--" in text:
+        text = text.replace("--", "- -")
+    return f"<!-- {text}\n-->\n"
+
+
+def _gains(sim: SimModel, estimate: Estimate | None, terms: Sequence[Term]) -> dict[str, float]:
     """Motor torque per torque command, by joint name."""
-    terms = [] if estimate is None else [term for term in estimate.terms if term.effect == "actuator.gain"]
-    return {sim.arm.names[t.place]: estimate.parameters(t)["gain"].value for t in terms if estimate is not None}
+    gains = [term for term in terms if term.effect == "actuator.gain"]
+    return {sim.arm.names[t.place]: estimate.parameters(t)["gain"].value for t in gains if estimate is not None}
 
 
 def _line(sim: SimModel, estimate: Estimate, term: Term) -> str:
     values = estimate.parameters(term)
-    where = f"in recording {term.bound}" if term.bound else sim.arm.names[term.place]
+    where = f"in recording {', '.join(map(str, term.bound))}" if term.bound else sim.arm.names[term.place]
     listed = (f"{name} {v.value:.6g}" + (f" {v.unit}" if v.unit != "1" else "") for name, v in values.items())
     return f"{term.effect} {where} " + ", ".join(listed)
 

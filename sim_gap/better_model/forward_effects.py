@@ -9,7 +9,11 @@
         mujoco.mj_step(model, data)
         q, tau = effects.read(model, data)       # readings of position and torque sensors
 
-Torques in N·m, angles in rad, times in s; arrays (n,) in the order of JOINTS.
+How far a simulation with these effects strays from a recording (rad, RMS per joint):
+
+    stray = roll_out(model, effects, t, position, motor_torque)
+
+Torques in N·m, angles in rad, times in s; arrays (n,) in the order of JOINTS, recordings (K,) and (K, n).
 """
 
 from collections.abc import Sequence
@@ -27,6 +31,19 @@ MODEL = ""
 JOINTS: tuple[str, ...] = ()
 """Base to tip."""
 EFFECTS: tuple[JointEffect, ...] = ()
+PASSIVE = ("friction.stribeck", "friction.load", "friction.asymmetric", "transmission.ripple")
+"""Effects that act on the joints themselves."""
+GEARED = "actuator.gain in the model's gear"
+"""A drive's gain that the model's actuators have; a torque that is applied past them needs it too."""
+HORIZON_S, WINDOWS, STEP_S = 0.5, 40, 0.002
+"""Length of a forward simulation from a recorded state, number of them over a recording, largest time step."""
+AROUND_S = 0.06
+"""The state at the start of a simulation is that of a parabola through the readings this close to it [s]."""
+LOST, WILD = np.pi, 50.0
+"""Limits of a joint's deviation [rad] and speed [rad/s]: without friction and rotor inertia a light joint would diverge
+and the simulation with it."""
+LOCKED = 1e9
+"""Armature of joints of the model that the recording does not have [kg·m²]: they stay at rest."""
 RESTING = 1e-4
 """Speed below which a joint is at rest [rad/s], and its motor torque sets the direction of friction."""
 
@@ -57,6 +74,11 @@ class Effects:
         return self._known[effect, parameter]
 
     # ---- the transmission
+
+    @property
+    def resist(self) -> bool:
+        """Whether any effect acts on the joints beside what the model holds."""
+        return any(name in PASSIVE or "lost" in parameters for name, _, parameters in self._effects)
 
     def passive(self, model: Any, data: Any) -> None:
         """MuJoCo's passive-force callback: the ripple torque now, and the level of dry friction for the next step."""
@@ -92,7 +114,30 @@ class Effects:
         limit = self.values("actuator.saturation", "limit", np.inf)
         return np.asarray(np.clip(self._followed, -limit, limit) * self.values("actuator.gain", "gain", 1.0))
 
+    def drive(self, t: Array, torque: Array, source: str = "motor") -> Array:
+        """Torque of the motors from a recorded channel (K, n): the drives' own estimate (`motor`), a command that they
+        follow (`command`), or a torque sensor where no other channel is (`sensor`)."""
+        if source == "command":
+            self._commands, self._followed = [], None
+            return np.array([self.made(now, time) for time, now in zip(t.tolist(), torque, strict=True)])
+        if source == "sensor":
+            drift = self.values("torque.drift", "rate") * t[:, None] + self.values("torque.offset", "offset")
+            return np.asarray((torque - drift) / self.values("torque.gain", "gain", 1.0))
+        return np.asarray(torque * self.values("actuator.gain", "gain", 1.0) * self.values(GEARED, "gain", 1.0))
+
     # ---- the sensors
+
+    def state(self, reading: Array, speed: Array, torque: Array) -> tuple[Array, Array]:
+        """Angle and speed of the links from those of the position sensors and the torque through the joints."""
+        phase = reading + self.values("position.eccentricity", "phase")
+        amplitude, gain = self.values("position.eccentricity", "amplitude"), self.values("position.gain", "gain", 1.0)
+        angle = gain * reading + self.values("position.offset", "offset") + amplitude * np.sin(phase)
+        return angle - self._give(torque), (gain + amplitude * np.cos(phase)) * speed
+
+    def _give(self, torque: Array) -> Array:
+        """Angle by which the transmissions give [rad]."""
+        give = torque / self.values("transmission.elasticity", "stiffness", np.inf)
+        return np.asarray(give + 0.5 * self.values("transmission.backlash", "width") * np.sign(torque))
 
     def read(self, model: Any, data: Any) -> tuple[Array, Array]:
         """Readings of position [rad] and torque [N·m] sensors after a step, (n,) each.
@@ -101,9 +146,13 @@ class Effects:
         oscillation is neglected.
         """
         torque = self.carried(model, data) - self._pushed(model, data)
-        give = torque / self.values("transmission.elasticity", "stiffness", np.inf)
-        give = give + 0.5 * self.values("transmission.backlash", "width") * np.sign(torque)
+        give = self._give(torque)
         return self._angle(data.qpos[self.places] + give), self._torque(torque, float(data.time))
+
+    def position(self, model: Any, data: Any) -> Array:
+        """Readings of the position sensors after a step [rad], (n,)."""
+        rigid = not any(name in ("transmission.elasticity", "transmission.backlash") for name, _, _ in self._effects)
+        return self._angle(data.qpos[self.places]) if rigid else self.read(model, data)[0]
 
     def _pushed(self, model: Any, data: Any) -> Array:
         """Torque of stops and contacts on the links, (n,)."""
@@ -138,6 +187,77 @@ class Effects:
         bent = np.clip(np.sign(self._play) * dead, -limit, limit)
         drift = self.values("torque.drift", "rate") * time + self.values("torque.offset", "offset")
         return np.asarray(self.values("torque.gain", "gain", 1.0) * bent + drift)
+
+
+def roll_out(
+    model: Any,
+    effects: Effects,
+    t: Array,
+    position: Array,
+    torque: Array,
+    source: str = "motor",
+    horizon: float = HORIZON_S,
+    windows: int = WINDOWS,
+) -> Array:
+    """How far simulations from recorded states under the recorded torque stray from the recording [rad], RMS, (n,).
+
+    `t` (K,) and readings (K, n) as recorded; `source` as in `Effects.drive`. NaN if the recording is shorter than a
+    window. The model's contacts and limits are switched off; joints that the recording does not have are locked.
+    """
+    _prepare(model, effects)
+    step = float(np.median(np.diff(t)))
+    even = np.arange(t[0], t[-1], step)
+    q, tau = (_even(even, t, values) for values in (position, torque))
+    drive = effects.drive(even - even[0], tau, source)
+    steps, beside = round(horizon / step), max(2, round(AROUND_S / step))
+    last = len(even) - steps - beside - 1
+    if last <= beside:
+        return np.full(len(effects.joints), np.nan)
+    starts = np.unique(np.linspace(beside, last, windows).astype(int))
+    near = step * np.arange(-beside, beside + 1)
+    fit = np.linalg.pinv(np.vander(near, 3, increasing=True))
+    squares = np.zeros(len(effects.joints))
+    mujoco.set_mjcb_passive(effects.passive if effects.resist else None)
+    try:
+        for start in starts.tolist():
+            at = fit @ q[start - beside : start + beside + 1]
+            state = effects.state(at[0], at[1], drive[start])
+            stray = _window(
+                model, effects, state, drive[start : start + steps + 1], q[start + 1 : start + steps + 1], step
+            )
+            squares += np.mean(stray**2, axis=0)
+    finally:
+        mujoco.set_mjcb_passive(None)
+    return np.asarray(np.sqrt(squares / len(starts)))
+
+
+def _even(even: Array, t: Array, values: Array) -> Array:
+    columns = [np.interp(even, t[there := np.isfinite(x)], x[there]) for x in values.T]
+    return np.column_stack(columns)
+
+
+def _prepare(model: Any, effects: Effects) -> None:
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
+    model.dof_armature[np.setdiff1d(np.arange(model.nv), effects.dofs)] = LOCKED
+
+
+def _window(
+    model: Any, effects: Effects, state: tuple[Array, Array], drive: Array, reading: Array, step: float
+) -> Array:
+    """Simulated minus recorded reading over one window, (steps, n)."""
+    each = max(1, int(np.ceil(step / STEP_S)))
+    model.opt.timestep = step / each
+    data = mujoco.MjData(model)
+    data.qpos[effects.places], data.qvel[effects.dofs] = state
+    out = np.empty_like(reading)
+    for k in range(len(reading)):
+        data.qfrc_applied[effects.dofs] = 0.5 * (drive[k] + drive[k + 1])
+        for _ in range(each):
+            mujoco.mj_step(model, data)
+            np.clip(data.qvel, -WILD, WILD, out=data.qvel)
+        out[k] = effects.position(model, data) - reading[k]
+    return np.clip(out, -LOST, LOST)
 
 
 def _past(history: list[tuple[float, Array]], now: float, delay: Array, *, held: bool) -> Array:

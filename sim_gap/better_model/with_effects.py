@@ -1,6 +1,7 @@
 """The simulation model corrected by the fitted effects, as far as a MuJoCo model can hold them."""
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,11 +10,14 @@ import numpy as np
 from armlink.errors import BadInput
 from gcomp.arrays import Array
 from sim_gap.better_model.coupled_motors import CoupledMotor, add_to, coupled_motors
-from sim_gap.effects.base import across
+from sim_gap.effects.base import tilted
+from sim_gap.effects.inertials import pseudo_inertia
 from sim_gap.model.load import SimModel, read_spec
 from sim_gap.model.rigid_body import inertial_of
+from sim_gap.residuals.preprocess import ABSENT
+from sim_gap.search.about import inertial_change
 from sim_gap.search.estimate import Estimate
-from sim_gap.search.normal_equations import Term
+from sim_gap.search.term import Term
 
 HELD = {
     "friction.coulomb": "joint frictionloss",
@@ -28,6 +32,8 @@ HELD = {
 }
 """Effects that a MuJoCo model can hold, and the element that holds them."""
 SMALLEST_INERTIA = 1e-6
+LEFT_KG = 1e-9
+"""Mass and inertia left in a body whose inertials are counted to the body that it is fixed to."""
 
 
 @dataclass(frozen=True)
@@ -39,34 +45,119 @@ class CorrectedModel:
     held: tuple[Term, ...]
     not_held: tuple[Term, ...]
     """Terms that MJCF cannot express."""
+    changed: tuple[str, ...] = ()
+    """Joints whose link is not the one that was fitted, which cannot exist, but one close to it."""
 
 
-def with_effects(sim: SimModel, estimate: Estimate | None) -> CorrectedModel:
-    """A copy of the compiled model with the estimate's effects in it."""
+def with_effects(
+    sim: SimModel, estimate: Estimate | None, terms: Sequence[Term] | None = None, number: int = 0
+) -> CorrectedModel:
+    """A copy of the compiled model with the estimate's effects in it, or with some of its terms.
+
+    A body that only some recordings have is left out, except for the one with this `number`.
+    """
     if estimate is None:
         return CorrectedModel(copy.copy(sim.mujoco_model), (), ())
-    model, coupled = _base(sim, coupled_motors(sim, estimate))
+    chosen = estimate.terms if terms is None else tuple(terms)
+    model, coupled = _base(sim, coupled_motors(sim, estimate, chosen))
     held = tuple(
         term
-        for term in estimate.terms
-        if term.effect in HELD and not term.bound and (coupled or term.effect != "transmission.coupling")
+        for term in chosen
+        if term.effect in HELD and in_model(term, number) and (coupled or term.effect != "transmission.coupling")
     )
+    changed = _set_links(model, sim, [(term, estimate.of(term)) for term in held], number)
     for term in held:
-        c, joint = estimate.of(term), sim.joints[-1 if term.effect == "link.payload" else term.place]
-        if term.effect == "link.mass_moment":
-            body = model.jnt_bodyid[joint]
-            model.body_ipos[body] += c / model.body_mass[body]
-        elif term.effect == "link.inertia":
-            _body(model, joint, np.concatenate([np.zeros(4), c]))
-        elif term.effect == "link.payload":
-            weighed = any(t.effect == "link.inertia" and t.place == sim.n - 1 for t in held)
-            _body(model, joint, np.concatenate([c, np.zeros(6)]) if weighed else _point(c))
-        elif term.effect == "base.tilt":
-            turns = [-np.cross(axis, sim.arm.gravity) for axis in across(sim.arm.gravity)]
-            model.opt.gravity[:] += np.stack(turns, axis=-1) @ c
-        elif term.effect != "transmission.coupling":
+        c, joint = estimate.of(term), sim.joints[term.place]
+        if term.effect == "base.tilt":
+            model.opt.gravity[:] = tilted(sim.arm.gravity, c)
+        elif not term.effect.startswith("link.") and term.effect != "transmission.coupling":
             _joint(model, joint, term.effect, c)
-    return CorrectedModel(model, held, tuple(term for term in estimate.terms if term not in held))
+    return CorrectedModel(model, held, tuple(term for term in chosen if term not in held), changed)
+
+
+def _set_links(model: Any, sim: SimModel, terms: Sequence[tuple[Term, Array]], number: int) -> tuple[str, ...]:
+    """Put the terms that change links into the model; the joints whose link could not be made as fitted."""
+    inertial = sim.arm.inertial.copy()
+    for term, c in terms:
+        change = inertial_change(term, c, inertial, number)
+        if change is not None:
+            inertial[sim.n - 1 if term.effect == "link.payload" else term.place] += change
+    moved = np.flatnonzero(np.any(inertial != sim.arm.inertial, axis=1)).tolist()
+    exact = [_set_link(model, sim.joints, link, inertial[link] - sim.arm.inertial[link]) for link in moved]
+    return tuple(sim.arm.names[link] for link, fine in zip(moved, exact, strict=True) if not fine)
+
+
+def _set_link(model: Any, joints: Sequence[int], link: int, added: Array) -> bool:
+    """Add ten parameters to the body that a joint moves, or to it with all that is fixed to it if it alone could not
+    exist (a gripper taken away); whether the result is what was wanted."""
+    joint = joints[link]
+    body, anchor = int(model.jnt_bodyid[joint]), model.jnt_pos[joint]
+    total = _parameters(model, body, anchor, np.eye(3)) + added
+    if not exists(total):
+        fixed = _fixed_to(model, body, joints)
+        whole = total + sum((_seen_from(model, other, body, anchor) for other in fixed), np.zeros(10))
+        if fixed and exists(whole):
+            total = whole
+            for other in fixed:
+                model.body_mass[other], model.body_inertia[other] = LEFT_KG, LEFT_KG
+    mass, centre, about = split(total)
+    values, axes = np.linalg.eigh(about)
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    model.body_mass[body], model.body_ipos[body] = mass, anchor + centre
+    model.body_inertia[body] = possible(values)
+    mujoco_quaternion(model.body_iquat[body], axes)
+    return bool(np.allclose(possible(values), values, rtol=1e-3, atol=1e-9) and mass == total[0])
+
+
+def _fixed_to(model: Any, body: int, joints: Sequence[int]) -> list[int]:
+    """Bodies without a joint of their own among `joints` that are carried by this one without one in between."""
+    moving = {int(model.jnt_bodyid[joint]) for joint in joints}
+    out: list[int] = []
+    for other in range(body + 1, model.nbody):
+        up = int(model.body_parentid[other])
+        if other not in moving and (up == body or up in out):
+            out.append(other)
+    return out
+
+
+def _parameters(model: Any, body: int, origin: Array, turn: Array) -> Array:
+    """Ten parameters of a body about a point of its frame, in a frame turned by `turn`."""
+    import mujoco
+
+    spin = np.zeros(9)
+    mujoco.mju_quat2Mat(spin, model.body_iquat[body])
+    axes = turn @ spin.reshape(3, 3)
+    inertia = axes @ np.diag(model.body_inertia[body]) @ axes.T
+    return inertial_of(float(model.body_mass[body]), turn @ (model.body_ipos[body] - origin), inertia)
+
+
+def _seen_from(model: Any, other: int, body: int, anchor: Array) -> Array:
+    """Ten parameters of a body that is fixed to another, about that one's anchor and in its frame."""
+    import mujoco
+
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    up, own = data.xmat[body].reshape(3, 3), data.xmat[other].reshape(3, 3)
+    turn = up.T @ own
+    place = up.T @ (data.xpos[other] - data.xpos[body]) - anchor
+    return _parameters(model, other, -turn.T @ place, turn)
+
+
+def mujoco_quaternion(out: Array, axes: Array) -> None:
+    """Write the quaternion of a rotation matrix (3, 3)."""
+    import mujoco
+
+    mujoco.mju_mat2Quat(out, axes.ravel())
+
+
+def exists(inertial: Array) -> bool:
+    """Whether a body with these ten parameters can exist."""
+    return bool(inertial[0] > 0.0 and np.linalg.eigvalsh(pseudo_inertia(inertial)).min() > 0.0)
+
+
+def in_model(term: Term, number: int) -> bool:
+    """Whether a term belongs to the arm, or to the recording with this number."""
+    return (not term.bound and number != ABSENT) or term.form.signature.present(term.shape, number)
 
 
 def _base(sim: SimModel, motors: list[CoupledMotor]) -> tuple[Any, bool]:
@@ -92,11 +183,6 @@ def spec_of(sim: SimModel) -> Any:
     return spec
 
 
-def _point(c: Array) -> Array:
-    """Ten inertial parameters of a point mass from its mass and first moment."""
-    return inertial_of(float(c[0]), c[1:] / float(c[0]), np.zeros((3, 3)))
-
-
 def _joint(model: Any, joint: int, effect: str, c: Array) -> None:
     dof, adr = model.jnt_dofadr[joint], model.jnt_qposadr[joint]
     if effect == "friction.coulomb":
@@ -110,24 +196,6 @@ def _joint(model: Any, joint: int, effect: str, c: Array) -> None:
         total = stiffness[joint, 0] + c[0]
         model.qpos_spring[adr] = (stiffness[joint, 0] * model.qpos_spring[adr] - c[1]) / total
         stiffness[joint, 0] = total
-
-
-def _body(model: Any, joint: int, added: Array) -> None:
-    """Add inertial parameters, about the joint's anchor and in the body's frame, to the body that the joint moves."""
-    import mujoco
-
-    body, anchor = model.jnt_bodyid[joint], model.jnt_pos[joint]
-    spin = np.zeros(9)
-    mujoco.mju_quat2Mat(spin, model.body_iquat[body])
-    turn = spin.reshape(3, 3)
-    inertia = turn @ np.diag(model.body_inertia[body]) @ turn.T
-    total = inertial_of(float(model.body_mass[body]), model.body_ipos[body] - anchor, inertia) + added
-    mass, centre, about = split(total)
-    values, axes = np.linalg.eigh(about)
-    axes[:, 2] *= np.sign(np.linalg.det(axes))
-    model.body_mass[body], model.body_ipos[body] = mass, anchor + centre
-    model.body_inertia[body] = possible(values)
-    mujoco.mju_mat2Quat(model.body_iquat[body], axes.ravel())
 
 
 def possible(principal: Array) -> Array:

@@ -14,6 +14,8 @@ from sim_gap.blind.cases.make import HELDOUT_S, TRAIN_S
 from sim_gap.blind.cases.seal import open_labels, seal, write_answer
 from sim_gap.blind.judging.score import answer_name, score
 
+MOST_EFFECTS = 10
+"""Largest number of effects in one case."""
 Diagnose = Callable[[Path, Sequence[Path], Sequence[Path], Sequence[str]], dict[str, Any]]
 """Model, training and held-out recordings, effects withheld → the answer as in docs/formats.md."""
 
@@ -26,19 +28,22 @@ def run_bench(
     workers: int = 2,
     lengths: tuple[float, float] = (TRAIN_S, HELDOUT_S),
     progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+    effects: str = "",
 ) -> dict[str, Any]:
     """Make `cases` sealed cases under `out`, have them diagnosed, seal the answers, open the labels and score.
 
-    `lengths` are the seconds of training and held-out recordings. `progress` gets stage, done, total. `diagnose` must
+    `lengths` are the seconds of training and held-out recordings; `effects` is the number of effects in every case such
+    as `5-8`, empty for none, one or two. `progress` gets stage, done, total. `diagnose` must
     be a module-level function if `workers` exceeds 1. Raises BadInput if `out` holds an earlier check.
     """
+    _require_range(effects)
     if cases < 1:
         raise BadInput(f"--cases {cases}: expected at least 1")
     if any((out / name).exists() for name in ("answers", "cases", "labels")):
         raise BadInput(f"{out}: holds an earlier check: give another --out, or remove it")
     started = time.monotonic()
     progress("making cases", 0, cases)
-    for done in make_apart(out, seed, cases, workers, lengths):
+    for done in make_apart(out, seed, cases, workers, lengths, effects):
         progress("making cases", done, cases)
     made = time.monotonic()
     todo = tasks(out)
@@ -53,11 +58,22 @@ def run_bench(
     return {**result, "seed": seed, "sealed": digest, "seconds": seconds}
 
 
-def make_apart(out: Path, seed: int, cases: int, workers: int, lengths: tuple[float, float]) -> Iterator[int]:
+def _require_range(effects: str) -> None:
+    """Raise BadInput unless `effects` is empty or LOW-HIGH within what an arm can show."""
+    if not effects:
+        return
+    low, _, high = effects.partition("-")
+    if not (low.isdecimal() and high.isdecimal() and 1 <= int(low) <= int(high) <= MOST_EFFECTS):
+        raise BadInput(f"--effects {effects}: expected LOW-HIGH from 1 to {MOST_EFFECTS}, such as 5-8")
+
+
+def make_apart(
+    out: Path, seed: int, cases: int, workers: int, lengths: tuple[float, float], effects: str = ""
+) -> Iterator[int]:
     """Make the cases in a separate process and yield their number from time to time. Raises Refused if it fails."""
     command = [sys.executable, "-m", "sim_gap.blind.cases.make", "--seed", str(seed), "--cases", str(cases)]
     command += ["--out", str(out / "cases"), "--labels", str(out / "labels"), "--workers", str(workers)]
-    command += ["--train-s", str(lengths[0]), "--heldout-s", str(lengths[1])]
+    command += ["--train-s", str(lengths[0]), "--heldout-s", str(lengths[1]), "--effects", effects]
     (out / "cases").mkdir(parents=True)
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as maker:
         while True:

@@ -1,4 +1,4 @@
-"""The whole job on a simulated arm: sweep, calibrate, identify, verify, drift and recalibration, gap diagnosis."""
+"""Runs the whole job on a simulated arm: sweep, calibrate, identify, verify, drift and recalibration, gap diagnosis."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,9 +7,13 @@ import typer
 
 
 def demo(
+    target: Annotated[
+        str | None, typer.Argument(metavar="[ARM]", help="The same as --arm.", show_default=False)
+    ] = None,
     arm: Annotated[
-        str, typer.Option(help="Bundled arm's name, path of an arm file with a sim section, or a URDF or MJCF model.")
-    ] = "sarcos",
+        str | None,
+        typer.Option(help="Bundled arm, arm file with a sim section, or URDF or MJCF model; default: sarcos."),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Draws another hidden truth.")] = 0,
     realism: Annotated[
         float | None,
@@ -30,6 +34,11 @@ def demo(
     """
     from rich.console import Console
 
+    from armlink.errors import BadInput
     from sim_gap.demo.run import run_demo
 
-    run_demo(arm, seed=seed, realism=realism, out=out, json_path=json, console=Console(stderr=True))
+    if target is not None and arm is not None and target != arm:
+        raise BadInput(f"demo: two arms, {target} and --arm {arm}: give one")
+    run_demo(
+        target or arm or "sarcos", seed=seed, realism=realism, out=out, json_path=json, console=Console(stderr=True)
+    )

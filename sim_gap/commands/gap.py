@@ -1,4 +1,4 @@
-"""Why the simulation disagrees with the real arm: location and causes of the gap, and how far they close it."""
+"""Explains why simulation and real arm disagree: where the gap is, its causes, and how far they close it."""
 
 import typer
 
@@ -8,7 +8,7 @@ from sim_gap.commands.gap_diagnose import diagnose
 from sim_gap.commands.gap_fleet import diagnose_fleet
 from sim_gap.commands.gap_plan import plan
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True, help=__doc__)
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True)
 
 
 @app.callback()

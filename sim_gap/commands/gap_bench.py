@@ -9,6 +9,9 @@ import typer
 def bench(
     seed: Annotated[int, typer.Option(help="Seed of arms, effects and motions.")] = 1,
     cases: Annotated[int, typer.Option(help="Number of cases.")] = 150,
+    effects: Annotated[
+        str, typer.Option(metavar="LOW-HIGH", help="Number of effects in every case; default: none, one or two.")
+    ] = "",
     json: Annotated[Path | None, typer.Option(help="Write the score here; - is standard output.")] = None,
     out: Annotated[Path | None, typer.Option(help="Keep cases, answers and labels in this new folder.")] = None,
     workers: Annotated[int, typer.Option(help="Number of processes.")] = 2,
@@ -16,6 +19,8 @@ def bench(
     """Make sealed cases, diagnose them, then open the labels and score (label withheld and effect withheld).
 
     Example: armlink gap bench --seed 3 --cases 60 --out bench-3 --json bench-3.json
+
+    Many effects at once: armlink gap bench --effects 5-8 --cases 30 --seed 3
     """
     from tempfile import TemporaryDirectory
 
@@ -38,6 +43,8 @@ def bench(
                 known[stage] = bars.add_task(stage, total=total)
             bars.update(known[stage], completed=done)
 
-        result = run_bench(diagnose_files, out or Path(scratch), seed, cases, workers, progress=progress)
+        result = run_bench(
+            diagnose_files, out or Path(scratch), seed, cases, workers, progress=progress, effects=effects
+        )
     show(result, console)
     write_json(json, result)

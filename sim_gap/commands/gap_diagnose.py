@@ -32,6 +32,14 @@ def diagnose(
     clock: Annotated[list[str] | None, typer.Option(help="Time to add to a channel: tau=-0.02 [s].")] = None,
     effort_is: Annotated[str, typer.Option(help="Source of the efforts: motor or link (sensor).")] = "",
     topic: Annotated[str, typer.Option(help="Topic of a bag that holds the joint states.")] = "",
+    group: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=REC[,REC…]",
+            help="Recordings (held-out ones too) with a common body such as a payload; may be repeated. "
+            "Default: found by itself.",
+        ),
+    ] = None,
     json: Annotated[Path | None, typer.Option(help="Write the result here; - is standard output.")] = None,
     report: Annotated[Path | None, typer.Option(help="Write a self-contained HTML report here.")] = None,
     out_model: Annotated[
@@ -73,7 +81,12 @@ def diagnose(
         judged = {name: each for path in heldout or () for name, each in load_recordings(path, stated).items()}
     with console.status("checking the data, and fitting effects to the gap"):
         answer = diagnosis.diagnose(
-            sim, list(fitted.values()), list(judged.values()), labels=[*fitted, *judged], stated=stated
+            sim,
+            list(fitted.values()),
+            list(judged.values()),
+            labels=[*fitted, *judged],
+            stated=stated,
+            groups=group or (),
         )
     for name, recording in {**fitted, **judged}.items():
         if recording.warning:

@@ -14,7 +14,7 @@ def _gain(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:
 EFFECTS = (
     Effect(  # the whole nominal motor torque: known rotor inertia and friction are scaled too
         "actuator.gain",
-        Signature.at_motor(lambda s, j, _: s.motor_model[:, j], "motor"),
+        Signature.at_motor(lambda s, j, _: s.motor_model[:, j], "motor", "drive"),
         Plausibility(
             background_std=0.002, prior_std=lambda _signals, _place: np.full(1, 0.5), allows=between(-0.5, 1.0)
         ),

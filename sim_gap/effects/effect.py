@@ -14,7 +14,7 @@ import numpy as np
 from armlink.effect_catalogue import CATALOGUE
 from gcomp.arrays import Array
 from sim_gap.residuals.layout import Columns, Layout
-from sim_gap.residuals.preprocess import Signals
+from sim_gap.residuals.preprocess import ABSENT, Signals
 
 Shape = tuple[float, ...]
 """Nonlinear parameters of an effect, such as its Stribeck velocity."""
@@ -28,6 +28,11 @@ Beneath = Mapping[str, Array]
 
 Channel = Literal["any", "sensor", "motor", "command"]
 """The channel without which an effect cannot show."""
+Side = Literal["link", "motor", "drive", "distortion", "reading", "command"]
+"""Where in the chain from link to command an effect acts: on the torque of the links, between link and motor, on the
+motor's report of all that, in the sensor before its gain, on the sensor's reading, between command and motor."""
+Moves = Callable[[Signals, Layout, int], Array]
+"""Change of a joint's position, velocity and acceleration per unit of each coefficient, (K, p, 3)."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +44,21 @@ class Signature:
     channel: Channel = "any"
     whole_arm: bool = False
     """Whether it belongs to the arm as a whole instead of to one joint or link."""
-    recording: Callable[[Shape], int] = lambda _shape: 0
-    """The one training recording (from 1) that it is present in; 0 if it belongs to the arm for good."""
+    recordings: Callable[[Shape], tuple[int, ...]] = lambda _shape: ()
+    """Numbers (from 1) of the recordings that it is present in; empty if it belongs to the arm for good."""
+    side: Side = "link"
+    moves: Moves | None = None
+    """Of an effect that moves the true joint against its reading."""
+    offset: Callable[[Signals, Layout, Shape], Columns] | None = None
+    """Of a nonlinear effect linearised at its shape: what it is beside its columns, (K,) by row."""
+
+    slopes: Callable[[Signals, Layout, Shape, Array], Columns] | None = None
+    """Of a nonlinear effect: its columns about fitted coefficients."""
+
+    def present(self, shape: Shape, number: int) -> bool:
+        """Whether recording `number` has it."""
+        numbers = self.recordings(shape)
+        return number != ABSENT and (not numbers or number in numbers)
 
     def places(self, layout: Layout) -> range:
         """Joints or links at which it may be; empty if these channels cannot show it."""
@@ -50,14 +68,14 @@ class Signature:
         return range(1 if self.whole_arm else layout.n)
 
     @classmethod
-    def at_motor(cls, column: Column, channel: Channel = "any") -> "Signature":
+    def at_motor(cls, column: Column, channel: Channel = "any", side: Side = "motor") -> "Signature":
         """An effect between motor and torque sensor, of one joint."""
-        return cls(lambda s, layout, j, shape: {(layout.motor_side, j): _2d(column(s, j, shape))}, channel)
+        return cls(lambda s, layout, j, shape: {(layout.motor_side, j): _2d(column(s, j, shape))}, channel, side=side)
 
     @classmethod
-    def at_sensor(cls, column: Column, channel: Channel = "sensor") -> "Signature":
+    def at_sensor(cls, column: Column, channel: Channel = "sensor", side: Side = "reading") -> "Signature":
         """An effect on the torque sensor's reading, of one joint."""
-        return cls(lambda s, layout, j, shape: layout.sensor_columns(j, _2d(column(s, j, shape))), channel)
+        return cls(lambda s, layout, j, shape: layout.sensor_columns(j, _2d(column(s, j, shape))), channel, side=side)
 
     @classmethod
     def at_link(cls, column: Column) -> "Signature":
@@ -67,7 +85,11 @@ class Signature:
     @classmethod
     def at_command(cls, column: Column) -> "Signature":
         """An effect between command and motor torque, of one joint."""
-        return cls(lambda s, layout, j, shape: {(str(layout.commanded), j): _2d(column(s, j, shape))}, "command")
+        return cls(
+            lambda s, layout, j, shape: {(str(layout.commanded), j): _2d(column(s, j, shape))},
+            "command",
+            side="command",
+        )
 
 
 def _2d(columns: Array) -> Array:

@@ -7,8 +7,9 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from gcomp.arrays import Array
-from sim_gap.effects.effect import Beneath, Effect, Plausibility, Shape, Signature, between, positive
-from sim_gap.residuals.layout import Columns, Layout
+from sim_gap.effects.effect import Beneath, Effect, Plausibility, Shape, between, positive
+from sim_gap.effects.position import moving
+from sim_gap.residuals.layout import Layout
 from sim_gap.residuals.preprocess import Signals
 
 SMOOTH_HZ = 10.0
@@ -31,22 +32,18 @@ def transmitted(signals: Signals, layout: Layout, joint: int) -> Array:
     return np.asarray(sosfiltfilt(butter(4, cut, fs=signals.rate, output="sos"), torque))
 
 
-def _elasticity(signals: Signals, layout: Layout, place: int, _shape: Shape) -> Columns:
+def _bend(signals: Signals, layout: Layout, place: int) -> Array:
     """A spring between motor and link; the coefficient is its compliance."""
     bend = transmitted(signals, layout, place)
     speed = np.gradient(bend, 1.0 / signals.rate)
-    moves = bend, speed, np.gradient(speed, 1.0 / signals.rate)
-    pairs = zip(signals.sensitivity(place), moves, strict=True)
-    change = sum((-slope * move[:, None] for slope, move in pairs), np.zeros_like(signals.q))
-    return {(layout.against_model, i): change[:, i, None] for i in range(signals.n)}
+    return -np.stack([bend, speed, np.gradient(speed, 1.0 / signals.rate)], axis=-1)[:, None]
 
 
-def _backlash(signals: Signals, layout: Layout, place: int, _shape: Shape) -> Columns:
+def _play(signals: Signals, layout: Layout, place: int) -> Array:
     """Play between motor and link; the coefficient is its full width."""
     torque = transmitted(signals, layout, place)
     side = np.clip(torque / (SETTLED * np.abs(torque).max() + 1e-9), -1.0, 1.0)
-    change = -0.5 * signals.sensitivity(place)[0] * side[:, None]
-    return {(layout.against_model, i): change[:, i, None] for i in range(signals.n)}
+    return -0.5 * np.stack([side, 0.0 * side, 0.0 * side], axis=-1)[:, None]
 
 
 def _stiffness(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:
@@ -54,6 +51,6 @@ def _stiffness(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:
 
 
 EFFECTS = (
-    Effect("transmission.elasticity", Signature(_elasticity), Plausibility(allows=positive), parameters_of=_stiffness),
-    Effect("transmission.backlash", Signature(_backlash), Plausibility(allows=between(0.0, 0.3))),
+    Effect("transmission.elasticity", moving(_bend), Plausibility(allows=positive), parameters_of=_stiffness),
+    Effect("transmission.backlash", moving(_play), Plausibility(allows=between(0.0, 0.3))),
 )

@@ -1,13 +1,15 @@
 """Links whose masses differ from the model: they show at every joint from the base to that link."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import combinations
 
 import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.effects.effect import Beneath, Effect, Key, Plausibility, SearchHints, Shape, Signature
+from sim_gap.effects.inertials import moment_to_inertia, point_slopes
 from sim_gap.residuals.layout import Columns, Layout
-from sim_gap.residuals.preprocess import Signals
+from sim_gap.residuals.preprocess import ABSENT, Signals
 
 LEVER = 0.15
 """Plausible shift of a link's centre of mass [m], and radius of gyration of added mass [m]."""
@@ -15,8 +17,12 @@ LIGHTEST = 0.2
 """Least mass of a link [kg] for judging the plausible error of its inertials."""
 SEVERAL = 6
 """With up to this number of training recordings, a payload may be in one of them alone."""
+FEW = 4
+"""With up to this number, in any of them."""
 SHOWS = 0.3
 """A mass moment's own torque must be at least this share of the torque of the inertia that comes with it."""
+TAKEN = 0.98
+"""Largest share of the last link's mass that a missing body may have."""
 FARTHEST = 0.6
 """Largest distance of a payload's centre of mass from the last joint [m]."""
 
@@ -32,8 +38,9 @@ def _mass_moment(signals: Signals, layout: Layout, place: int, _shape: Shape) ->
 
     If only the inertia that comes with it would show, it is an error of the inertia and not of the moment.
     """
-    own = signals.regressor[:, :, place]
-    moved, along = own[..., 1:4], own[..., 4:] @ moment_to_inertia(signals.arm.inertial[place])
+    own, inertial = signals.regressor[:, :, place], signals.arm.inertial[place]
+    centre = inertial[1:4] / max(float(inertial[0]), 1e-9)
+    moved, along = own[..., 1:4], own[..., 4:] @ moment_to_inertia(centre)
     shows = np.mean(moved**2, axis=(0, 1)) > SHOWS**2 * np.mean(along**2, axis=(0, 1))
     return _rows(signals, layout, place, (moved + along) * shows)
 
@@ -46,16 +53,44 @@ def _inertia(signals: Signals, layout: Layout, place: int, _shape: Shape) -> Col
 def _payload(signals: Signals, layout: Layout, _place: int, shape: Shape) -> Columns:
     """A mass fixed to the tip; its centre of mass is in the last link's frame, whose origin is on that joint's axis.
 
-    If only one of several training recordings was made with it, the shape holds that recording's number.
+    If only some of the recordings were made with it, the shape holds their numbers as bits, the first as 1.
     """
     tip = signals.n - 1
-    present = not shape or signals.number == int(shape[0])
-    return _rows(signals, layout, tip, signals.regressor[:, :, tip, :4] * present)
+    return _rows(signals, layout, tip, signals.regressor[:, :, tip, :4] * _has(signals, shape))
+
+
+def _payload_slopes(signals: Signals, layout: Layout, shape: Shape, c: Array) -> Columns:
+    """The same about a fitted payload: a point mass, whose inertia changes with it."""
+    tip = signals.n - 1
+    slopes = signals.regressor[:, :, tip] @ point_slopes(float(c[0]), c[1:])
+    return _rows(signals, layout, tip, slopes * _has(signals, shape))
+
+
+def _has(signals: Signals, shape: Shape) -> bool:
+    """Whether a recording was made with the body of this shape."""
+    return signals.number != ABSENT and (not shape or signals.number in numbers(shape))
+
+
+def numbers(shape: Shape) -> tuple[int, ...]:
+    """Numbers of the recordings, from 1, in a shape that holds them as bits."""
+    bits = int(shape[0]) if shape else 0
+    return tuple(k + 1 for k in range(bits.bit_length()) if bits >> k & 1)
+
+
+def shape_of(chosen: Iterable[int]) -> Shape:
+    """The shape that holds these numbers."""
+    return (float(sum(1 << (number - 1) for number in set(chosen))),)
 
 
 def _recordings(signals: Sequence[Signals], _place: int) -> tuple[Shape, ...]:
-    several = len(signals) if 1 < len(signals) <= SEVERAL else 0
-    return ((), *((float(number),) for number in range(1, several + 1)))
+    """In all recordings, in those of a group, or without groups in one of several or (of a few) in any but not all."""
+    groups = {name: {s.number for s in signals if name in s.groups} for s in signals for name in s.groups}
+    if groups:
+        return ((), *dict.fromkeys(shape_of(each) for each in groups.values()))
+    known = sorted({s.number for s in signals} - {0})
+    most = len(known) - 1 if len(known) <= FEW else 1
+    some = most if 1 < len(known) <= SEVERAL else 0
+    return ((), *(shape_of(each) for size in range(1, some + 1) for each in combinations(known, size)))
 
 
 def _tip_mass_moment(layout: Layout, _place: int) -> tuple[Key, ...]:
@@ -66,9 +101,11 @@ def _all_mass_moments(layout: Layout, _place: int, _shape: Shape) -> tuple[Key, 
     return tuple(("link.mass_moment", link) for link in range(layout.n))
 
 
-def _near_the_tip(coefficients: Array, _shape: Shape, _beneath: Beneath) -> bool:
+def _near_the_tip(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
+    """A body at the last link; if the arm lacks it, it is no heavier than what the model has there."""
     mass = float(coefficients[0])
-    return mass > 0.0 and float(np.linalg.norm(coefficients[1:])) < FARTHEST * mass
+    most = TAKEN * float(beneath["tip"][0])
+    return mass > -most and mass != 0.0 and float(np.linalg.norm(coefficients[1:])) < FARTHEST * abs(mass)
 
 
 def _mass_and_centre(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:
@@ -79,19 +116,6 @@ def _mass_and_centre(coefficients: Array, _shape: Shape, _beneath: Beneath) -> A
 def _mass(signals: Signals, link: int) -> float:
     """Mass of a link [kg], as a scale of the plausible error of its inertials."""
     return max(float(signals.arm.inertial[link, 0]), LIGHTEST)
-
-
-def moment_to_inertia(inertial: Array) -> Array:
-    """Change of the inertia about the joint with the first moment, to first order at the nominal centre c, (6, 3).
-
-    I = Σ m (|r|² 1 − r rᵀ), so moving mass at c by δ adds 2 (c·mδ) 1 − (c mδᵀ + mδ cᵀ).
-    """
-    centre = inertial[1:4] / max(float(inertial[0]), 1e-9)
-    out = np.empty((6, 3))
-    for k, unit in enumerate(np.eye(3)):
-        change = 2.0 * centre @ unit * np.eye(3) - np.outer(centre, unit) - np.outer(unit, centre)
-        out[:, k] = change[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
-    return out
 
 
 EFFECTS = (
@@ -107,7 +131,7 @@ EFFECTS = (
     ),
     Effect(
         "link.payload",
-        Signature(_payload, whole_arm=True, recording=lambda shape: int(shape[0]) if shape else 0),
+        Signature(_payload, whole_arm=True, recordings=numbers, slopes=_payload_slopes),
         Plausibility(
             prior_penalty=0, prior_std=lambda _signals, _place: np.array([20.0, 4.0, 4.0, 4.0]), allows=_near_the_tip
         ),

@@ -9,7 +9,17 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.effects.effect import Beneath, Effect, Plausibility, SearchHints, Shape, Signature, as_gain, between
+from sim_gap.effects.effect import (
+    Beneath,
+    Effect,
+    Moves,
+    Plausibility,
+    SearchHints,
+    Shape,
+    Signature,
+    as_gain,
+    between,
+)
 from sim_gap.residuals.layout import Columns, Layout
 from sim_gap.residuals.preprocess import Signals
 
@@ -19,31 +29,48 @@ PART_OF_TURN = 2.0
 WORST_GAIN = 0.15
 """Largest scale error of a position sensor."""
 
-Error = Callable[[Array], tuple[Array, Array, Array]]
-"""Error δ(φ) of the reading per unit, δ'(φ) and δ''(φ), (K,) each."""
+Error = Callable[[Array], tuple[Array, ...]]
+"""Errors δ(φ) of the reading φ per unit of each coefficient, then δ'(φ) of each, then δ''(φ), (K,) each."""
 
 
-def _response(signals: Signals, layout: Layout, joint: int, error: Error, size: float = 0.0) -> Columns:
-    """Change of the model torque per unit of the error: the secant over `size`, or the derivative if that is zero."""
-    q, v, a = signals.q[:, joint], signals.v[:, joint], signals.a[:, joint]
-    shift, slope, curve = error(q)
-    moves = shift, slope * v, slope * a + curve * v**2
+def responses(signals: Signals, layout: Layout, joint: int, moves: Array, size: float = 0.0) -> Columns:
+    """Change of the model torque per unit of each coefficient that moves a joint: (K, p, 3) → (K, p) by row.
+
+    The secant over `size` of the first coefficient, or the derivative if that is zero.
+    """
     if abs(size) > EPSILON:
         moved = [x.copy() for x in (signals.q, signals.v, signals.a)]
-        for x, move in zip(moved, moves, strict=True):
+        for x, move in zip(moved, moves[:, 0].T, strict=True):
             x[:, joint] += size * move
-        change = (signals.arm.torque(*moved) - signals.model) / size
+        change = ((signals.arm.torque(*moved) - signals.model) / size)[..., None]
     else:
-        slopes = signals.sensitivity(joint)
-        change = slopes[0] * moves[0][:, None] + slopes[1] * moves[1][:, None] + slopes[2] * moves[2][:, None]
-    return {(layout.against_model, i): change[:, i, None] for i in range(signals.n)}
+        slopes = np.stack(signals.sensitivity(joint), axis=-1)
+        change = np.einsum("kid,kpd->kip", slopes, moves)
+    return {(layout.against_model, i): change[:, i] for i in range(signals.n)}
 
 
-def _eccentricity(signals: Signals, layout: Layout, place: int, _shape: Shape) -> Columns:
-    """An eccentric encoder disc: an error with a period of one turn."""
-    sine = _response(signals, layout, place, lambda q: (np.sin(q), np.cos(q), -np.sin(q)))
-    cosine = _response(signals, layout, place, lambda q: (np.cos(q), -np.sin(q), -np.cos(q)))
-    return {row: np.hstack([sine[row], cosine[row]]) for row in sine}
+def moving(moves: Moves, shaped: bool = False) -> Signature:
+    """An effect that moves the true joint against its reading; the shape, if any, is the size of its secant."""
+    return Signature(
+        lambda s, layout, place, shape: responses(
+            s, layout, place, moves(s, layout, place), shape[0] if shaped else 0.0
+        ),
+        moves=moves,
+    )
+
+
+def _reads(error: Error) -> Moves:
+    """Moves for an error of the reading, a function of the reading."""
+
+    def moves(signals: Signals, _layout: Layout, joint: int) -> Array:
+        q, v, a = (x[:, joint] for x in (signals.read.q, signals.read.v, signals.read.a))
+        parts = error(q)
+        count = len(parts) // 3
+        shift, slope, curve = (np.column_stack(parts[k * count : (k + 1) * count]) for k in range(3))
+        speed = slope * v[:, None]
+        return np.stack([shift, speed, slope * a[:, None] + curve * v[:, None] ** 2], axis=-1)
+
+    return moves
 
 
 def _far_enough(signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
@@ -56,11 +83,6 @@ def _amplitude_and_phase(coefficients: Array, _shape: Shape, _beneath: Beneath) 
     return np.array([np.hypot(*coefficients), np.arctan2(coefficients[1], coefficients[0])])
 
 
-def _secant(error: Error) -> Signature:
-    """An error of one parameter; the shape is the size over which its secant is taken."""
-    return Signature(lambda s, layout, place, shape: _response(s, layout, place, error, shape[0]))
-
-
 def _small(_signals: Signals, _place: int) -> Array:
     return np.full(1, 0.2)
 
@@ -69,20 +91,20 @@ FROM_ZERO = SearchHints(shapes=((0.0,),), linearised_at=0)
 EFFECTS = (
     Effect(
         "position.offset",
-        _secant(lambda q: (np.ones_like(q), 0 * q, 0 * q)),
+        moving(_reads(lambda q: (np.ones_like(q), 0 * q, 0 * q)), shaped=True),
         Plausibility(prior_std=_small),
         FROM_ZERO,
     ),
     Effect(
         "position.gain",
-        _secant(lambda q: (q, np.ones_like(q), 0 * q)),
+        moving(_reads(lambda q: (q, np.ones_like(q), 0 * q)), shaped=True),
         Plausibility(prior_std=_small, allows=between(-WORST_GAIN, WORST_GAIN)),
         FROM_ZERO,
         parameters_of=as_gain,
     ),
     Effect(
         "position.eccentricity",
-        Signature(_eccentricity),
+        moving(_reads(lambda q: (np.sin(q), np.cos(q), np.cos(q), -np.sin(q), -np.sin(q), -np.cos(q)))),
         Plausibility(prior_std=lambda _signals, _place: np.full(2, 0.1)),
         SearchHints(shapes_for=_far_enough),
         parameters_of=_amplitude_and_phase,

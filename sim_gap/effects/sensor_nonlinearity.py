@@ -34,7 +34,9 @@ def _other_joints(signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
 
 def _distorted(distort: Callable[[Array, float, float], Array]) -> Signature:
     """Reading less true torque, `distort(torque (K,), level, rate)`."""
-    return Signature.at_sensor(lambda s, joint, shape: distort(s.smooth_model[:, joint], shape[0], s.rate))
+    return Signature.at_sensor(
+        lambda s, joint, shape: distort(s.smooth_model[:, joint], shape[0], s.rate), side="distortion"
+    )
 
 
 def _shares(*shares: float) -> Callable[[Sequence[Signals], int], tuple[Shape, ...]]:
@@ -62,7 +64,7 @@ def play(x: Array, half: float, rate: float) -> Array:
 EFFECTS = (
     Effect(
         "torque.crosstalk",
-        Signature.at_sensor(lambda s, _joint, shape: s.model[:, int(shape[0]) - 1]),
+        Signature.at_sensor(lambda s, _joint, shape: s.model[:, int(shape[0]) - 1], side="distortion"),
         Plausibility(allows=between(-0.5, 0.5)),
         SearchHints(shapes_for=_other_joints, discrete=frozenset({0})),
         parameters_of=as_fitted_and_shape,

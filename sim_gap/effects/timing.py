@@ -33,4 +33,4 @@ def _delayed(signals: Signals, joint: int, shape: Shape) -> Array:
     return np.asarray(np.interp(signals.t - shape[0], signals.t, torque) - torque)
 
 
-EFFECTS = (late("timing.delay", Signature.at_sensor(_delayed, "any"), 0.005, LONGEST),)
+EFFECTS = (late("timing.delay", Signature.at_sensor(_delayed, "any", "distortion"), 0.005, LONGEST),)

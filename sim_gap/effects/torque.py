@@ -12,7 +12,7 @@ EFFECTS = (
     ),
     Effect(
         "torque.gain",
-        Signature.at_sensor(lambda s, joint, _shape: s.model[:, joint]),
+        Signature.at_sensor(lambda s, joint, _shape: s.sensed[:, joint]),
         Plausibility(prior_penalty=0, background_std=0.002, allows=between(-0.5, 1.0)),
         parameters_of=as_gain,
     ),

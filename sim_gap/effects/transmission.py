@@ -95,7 +95,7 @@ EFFECTS = (
     ),
     Effect(
         "transmission.coupling",
-        Signature(_coupling),
+        Signature(_coupling, side="motor"),
         Plausibility(allows=_all_positive),
         SearchHints(shapes_for=_neighbours, discrete=frozenset({0}), alternatives=_own_rotors, canonical=_outer_joint),
         parameters_of=_coupled,

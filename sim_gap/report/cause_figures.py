@@ -10,8 +10,9 @@ from sim_gap.attribution.diagnosis import Cause, Diagnosis
 from sim_gap.report.figures import BELOW_TITLE, GREY, ORANGE, stacked, thinned
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
+from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import Estimate
-from sim_gap.search.normal_equations import ColumnStore, Term
+from sim_gap.search.term import Term
 
 AGAINST = {
     "friction": "velocity",
@@ -42,7 +43,7 @@ def cause_figure(answer: Diagnosis, cause: Cause) -> Any:
     """Residual less all other causes, and this cause's share, on the row where it is largest; None without one."""
     data, estimate = answer.internals.heldout, answer.internals.estimate
     terms = tuple(term for term in estimate.terms if _is_of(term, cause, answer.names))
-    store = ColumnStore(data)
+    store = estimate.on(data)
     own, all_of_them = (_sums(data, estimate, store, some) for some in (terms, estimate.terms))
     sizes = {row: root_mean_square(own[row][data.valid[row]]) for row in data.rows if data.valid[row].sum() > 10}
     if not sizes or max(sizes.values()) == 0.0:

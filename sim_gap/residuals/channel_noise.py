@@ -15,14 +15,14 @@ def band_noise(t: Array, values: Array, band: float) -> float:
     if len(x) < 64:
         return 0.0
     rate = 1.0 / float(np.median(np.diff(own)))
-    frequency, density = _spectrum(x - x.mean(), rate)
+    frequency, density = spectrum(x - x.mean(), rate)
     high = frequency > min(2.0 * band, 0.3 * rate)
     near = (frequency > 1.5 * band) & (frequency < 3.0 * band)
     levels = [float(np.median(density[part])) for part in (high, near) if part.any()]
     return float(np.sqrt(min(levels) / 0.69 * band)) if levels else 0.0
 
 
-def _spectrum(x: Array, rate: float) -> tuple[Array, Array]:
+def spectrum(x: Array, rate: float) -> tuple[Array, Array]:
     """Power spectral density (Welch: Hann windows of 512 samples, overlapping by half, each detrended)."""
     size = min(len(x), 512)
     pieces = np.lib.stride_tricks.sliding_window_view(x, size)[:: size // 2]

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 from scipy.interpolate import make_interp_spline
 from scipy.signal import butter, sosfiltfilt, sosfreqz
 
@@ -28,9 +29,13 @@ CALM_HZ = 8.0
 """Pass band of the model torque before a play or a clip is evaluated [Hz]."""
 WORK_HZ = 125.0
 """Highest rate at which columns are computed [Hz]; faster recordings are low-passed and decimated to it."""
+PAD_S = 1.0
+"""Length of the reflection at either end of a signal that is filtered [s]."""
 TRIM_S = 0.3
 """Length cut off at both ends after filtering [s]."""
 SHORTEST_S = 3.0
+ABSENT = -1
+"""Number of a recording without the body that training recordings have."""
 CHANNELS = {"tau": "torque", "tau_motor": "motor_torque", "tau_cmd": "torque_command"}
 
 
@@ -57,9 +62,14 @@ class Signals:
     arm: RigidArm
     temperature: Array | None = None
     number: int = 0
-    """Number from 1 of the training recording that this is (a part of); 0 for others."""
+    """Number from 1 of the recording that this is (a part of), training recordings first; 0 if it has none, ABSENT if
+    it is known to lack the body that others have."""
+    groups: tuple[str, ...] = ()
+    """Names of the groups of recordings with a common body that it belongs to."""
     stuck: tuple[Stuck, ...] = ()
     """Channels that are stuck for some time, in which they are not `known`."""
+    found: "Found | None" = None
+    """What an estimate has found, if q, v, a and arm are those of the estimate."""
 
     @property
     def n(self) -> int:
@@ -73,8 +83,8 @@ class Signals:
 
     @cached_property
     def model(self) -> Array:
-        """Nominal rigid-body torque [N·m], (K, n)."""
-        return self.arm.torque(self.q, self.v, self.a)
+        """Torque of the links [N·m], (K, n): the nominal model's, or that of the estimate."""
+        return self.arm.torque(self.q, self.v, self.a) if self.found is None else self.found.link
 
     @cached_property
     def smooth_model(self) -> Array:
@@ -83,8 +93,19 @@ class Signals:
 
     @cached_property
     def motor_model(self) -> Array:
-        """Nominal torque at the motor, with the model's own rotors, friction and springs [N·m], (K, n)."""
-        return self.model + self.arm.nominal_joint_torque(self.q, self.v, self.a, self.direction)
+        """Torque at the motor, with the model's own rotors, friction and springs [N·m], (K, n)."""
+        own = self.model + self.arm.nominal_joint_torque(self.q, self.v, self.a, self.direction)
+        return own if self.found is None else own + self.found.lost
+
+    @property
+    def sensed(self) -> Array:
+        """Torque that a sensor passes on, before its gain and offset [N·m], (K, n)."""
+        return self.model if self.found is None else self.model + self.found.bent
+
+    @property
+    def read(self) -> "Signals":
+        """The signals as they were read: positions without the corrections of an estimate."""
+        return self if self.found is None else self.found.read
 
     @cached_property
     def gravity_columns(self) -> Array:
@@ -95,6 +116,9 @@ class Signals:
     @cached_property
     def regressor(self) -> Array:
         """Columns of the model torque in the links' inertial parameters, (K, n, n, 10)."""
+        read = self.read
+        if read is not self and read.q is self.q and np.array_equal(read.arm.gravity, self.arm.gravity):
+            return read.regressor
         return self.arm.regressor(self.q, self.v, self.a)
 
     def sensitivity(self, joint: int) -> tuple[Array, Array, Array]:
@@ -134,9 +158,30 @@ class Signals:
         return max(1, round(self.rate / (4.0 * self.band)))
 
     def filtered(self, x: Array) -> Array:
-        """Low-pass (4th-order Butterworth, forward and backward), trimmed and decimated; (K, …) → (k, …)."""
-        trim = max(1, round(TRIM_S * self.rate))
-        return np.asarray(sosfiltfilt(self._sections, x, axis=0)[trim : len(x) - trim : self.step])
+        """Low-pass (4th-order Butterworth, forward and backward), trimmed and decimated; (K, …) → (k, …).
+
+        As a product of spectra, of the signal extended by its reflection in its ends.
+        """
+        trim, pad = max(1, round(TRIM_S * self.rate)), min(round(PAD_S * self.rate), len(x) - 1)
+        columns = np.ascontiguousarray(np.reshape(x, (len(x), -1)).T)
+        first, last = columns[:, :1], columns[:, -1:]
+        before, after = 2.0 * first - columns[:, pad:0:-1], 2.0 * last - columns[:, -2 : -2 - pad : -1]
+        size = next_fast_len(len(x) + 2 * pad, real=True)
+        spectrum = rfft(np.hstack([before, columns, after]), size, axis=1)
+        spectrum *= self._passed(size)
+        out = irfft(spectrum, size, axis=1)[:, pad + trim : pad + len(x) - trim : self.step]
+        return np.ascontiguousarray(out.T).reshape(-1, *np.shape(x)[1:])
+
+    def _passed(self, size: int) -> Array:
+        """Share of each frequency that the filter passes, forward and backward, for a spectrum of `size` samples."""
+        if size not in self._responses:
+            frequency = rfftfreq(size, 1.0 / self.rate)
+            self._responses[size] = np.abs(sosfreqz(self._sections, frequency, fs=self.rate)[1]) ** 2
+        return self._responses[size]
+
+    @cached_property
+    def _responses(self) -> dict[int, Array]:
+        return {}
 
     @cached_property
     def _sections(self) -> Array:
@@ -159,6 +204,20 @@ class Signals:
         return x[trim : len(x) - trim : self.step]
 
 
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What an estimate adds to the torques along a recording."""
+
+    read: Signals
+    """The signals before the estimate."""
+    link: Array
+    """Torque of the links [N·m], (K, n)."""
+    lost: Array
+    """Torque between link and motor beside the nominal model's: friction, rotors, ripple [N·m], (K, n)."""
+    bent: Array
+    """What the sensor adds by hysteresis, crosstalk and the like, before gain and offset [N·m], (K, n)."""
+
+
 def require_length(recording: Recording, label: str) -> None:
     """Raise BadInput if a recording is too short for a diagnosis."""
     span = float(recording.t[-1] - recording.t[0]) if len(recording.t) else 0.0
@@ -169,7 +228,9 @@ def require_length(recording: Recording, label: str) -> None:
         )
 
 
-def prepare(recording: Recording, arm: RigidArm, label: str = "recording", number: int = 0) -> Signals:
+def prepare(
+    recording: Recording, arm: RigidArm, label: str = "recording", number: int = 0, groups: tuple[str, ...] = ()
+) -> Signals:
     """Prepare a recording for the comparison with `arm`. Raises BadInput if it cannot be used, with the reason."""
     if recording.n != arm.n:
         raise BadInput(f"{label}: has {recording.n} joints, the model {arm.n}: give the model of the recorded arm")
@@ -201,6 +262,7 @@ def prepare(recording: Recording, arm: RigidArm, label: str = "recording", numbe
         raise BadInput(f"{label}: no torque channel holds a number: at least one of tau, tau_motor, tau_cmd is needed")
     clock = times - times[0]
     signals = Signals(label, rate, band, clock, q, v, a, reading, known, noise, arm, recording.temperature, number)
+    signals = replace(signals, groups=groups)
     return _without_stuck(signals, recording)
 
 

@@ -24,6 +24,10 @@ class Location:
     rms: float
     noise: float
     share: float
+    hz: float | None = None
+    """Frequency of a line above the pass band."""
+    clear: bool = False
+    """Beside the comparison: whether it exceeds what is known to be there."""
 
 
 def locate(

@@ -10,8 +10,10 @@ from scipy.stats import t as student
 from gcomp.arrays import Array
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet
-from sim_gap.search.normal_equations import CORRELATED, ColumnStore, NormalEquations, Term
+from sim_gap.search.column_store import ColumnStore
+from sim_gap.search.normal_equations import CORRELATED, NormalEquations
 from sim_gap.search.stepwise import Search
+from sim_gap.search.term import Term
 
 NOMINAL, WORSE, WORST = 0.01, 0.5, 0.2
 """Undetected error of the nominal mass moments of all links, relative: NOMINAL, or WORSE times the largest error found
@@ -38,6 +40,7 @@ class Estimate:
     """Terms fitted to a training set."""
 
     def __init__(self, store: ColumnStore, terms: list[Term]) -> None:
+        """Terms of a search on this store, which holds the columns about what they are fitted to be."""
         self.store = store
         self.normal = NormalEquations(store, terms)
         self.terms = tuple(self.normal.terms)
@@ -64,9 +67,8 @@ class Estimate:
         for weight, row in zip(weights, self.normal.rows, strict=True):
             valid = data.valid[row]
             x = np.zeros((len(valid), self.normal.size + len(shaped)))
-            for term in self.terms:
-                if row in (columns := self.store.columns(term)):
-                    x[:, self.normal.at[term]] = columns[row]
+            touching = [term for term in self.terms if row in self.store.columns(term)]
+            x[:, self.normal.index(touching)] = self.store.wide(touching, row, self.normal.fixed)
             for k, (term, i) in enumerate(shaped):
                 if row in self.store.columns(term):
                     assert i is not None
@@ -98,7 +100,7 @@ class Estimate:
         for weight, x, residual, block in self._jacobian:
             bread += weight * x.T @ x
             np.add.at(scores, block, weight * x * residual[:, None])
-        bread[np.arange(self.normal.size), np.arange(self.normal.size)] += self.normal.prior
+        bread[np.arange(self.normal.size), np.arange(self.normal.size)] += self.normal.free
         scale = 1.0 / np.sqrt(np.maximum(np.diag(bread), 1e-300))
         inverse = np.linalg.pinv(bread * scale * scale[:, None], hermitian=True, rcond=1e-10) * scale * scale[:, None]
         blocks = max(len(scores), 2)
@@ -182,9 +184,15 @@ class Estimate:
         self, data: ResidualSet, store: ColumnStore | None = None, terms: tuple[Term, ...] | None = None
     ) -> dict[Row, Array]:
         """Sum of the terms on another set, (K,) per row."""
-        store = store or ColumnStore(data)
+        store = store or self.on(data)
         out = {row: np.zeros(sum(data.lengths)) for row in data.rows}
         for term in self.terms if terms is None else terms:
             for row, columns in store.columns(term).items():
                 out[row] += columns @ self.of(term)
+            for row, beside in store.offset(term).items():
+                out[row] += beside[:, 0]
         return out
+
+    def on(self, data: ResidualSet) -> ColumnStore:
+        """The columns of another set about this estimate."""
+        return self.store if data is self.store.data else ColumnStore(data, self.store.values)

@@ -6,8 +6,11 @@ import numpy as np
 
 from sim_gap.effects.registry import effects
 from sim_gap.residuals.residual_set import ResidualSet
-from sim_gap.search.normal_equations import ColumnStore, NormalEquations, Term, Weighted
+from sim_gap.search.column_store import ColumnStore
+from sim_gap.search.gauss_newton import Values, converged
+from sim_gap.search.normal_equations import NormalEquations, Weighted
 from sim_gap.search.stepwise import TRIES, Search, shortlist
+from sim_gap.search.term import Term
 
 
 def select_model(store: ColumnStore, library: Sequence[str]) -> Search:
@@ -16,12 +19,36 @@ def select_model(store: ColumnStore, library: Sequence[str]) -> Search:
     first = Search(NormalEquations(store, offered))
     first.run()
     chosen = refine(store, one_each([canonical(term) for term in without_doubtful(first).active]))
+    values: Values = {}
+    for _ in range(ROUNDS):
+        search = about_itself(store, chosen, offered, values)
+        keys = {term.key for term in search.active}
+        search.least = AGAIN
+        search.run()
+        if {term.key for term in search.active} == keys:
+            return search
+        values = search.normal.store.values
+        chosen = one_each([canonical(term) for term in search.active])
+    return about_itself(store, chosen, offered, values)
+
+
+def about_itself(nominal: ColumnStore, chosen: list[Term], offered: Sequence[Term], start: Values) -> Search:
+    """The chosen terms and their rivals with columns evaluated about the fit of the chosen ones, from coefficients
+    `start` on."""
+    store, chosen = converged(nominal, chosen, start)
+    refined = refine(store, chosen)
+    if refined != chosen:
+        store, chosen = converged(nominal, refined, store.values)
     keys = {term.key for term in chosen}
     rivals = relinearised_in_place(store, chosen, [term for term in offered if term.key not in keys])
-    search = Search(NormalEquations(store, [*chosen, *rivals]), chosen)
-    while search.backward():
-        pass
-    return search
+    return Search(NormalEquations(store, [*chosen, *rivals]), chosen)
+
+
+AGAIN = 0.06
+"""Least improvement of the score by a term that only a search about the estimate adds: five coefficients' price, for on
+real arms a little of many effects looks like what is left."""
+ROUNDS = 2
+"""How often the library is searched again about the estimate."""
 
 
 def candidates(data: ResidualSet, library: Sequence[str]) -> list[Term]:

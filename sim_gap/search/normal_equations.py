@@ -1,6 +1,6 @@
 """Normal equations of all candidate terms, by row and fold: any subset of terms is fitted in microseconds."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -8,100 +8,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcomp.arrays import Array
-from sim_gap.effects.effect import Effect, Key, Shape
-from sim_gap.effects.registry import effects
-from sim_gap.residuals.layout import Columns, Layout, Row
-from sim_gap.residuals.residual_set import ResidualSet
+from sim_gap.residuals.layout import Row
+from sim_gap.search.column_store import ColumnStore
+from sim_gap.search.term import Term
 
 PRICE = 0.012
 """Least decrease of Σ ½ log(R² + floor²) over all rows per coefficient: about 1 % of one row's RMS."""
+PINNED = 1e9
+"""Weight of the coefficients that are one, in units of the data's."""
 CORRELATED = 8.0
 """Samples per effective observation: residuals of real arms are correlated over a third of a second or more."""
-
-
-@dataclass(frozen=True)
-class Term:
-    """One effect at one place with one shape."""
-
-    effect: str
-    place: int
-    shape: Shape = ()
-
-    @property
-    def form(self) -> Effect:
-        """The inverse form of its effect."""
-        return effects()[self.effect]
-
-    @property
-    def key(self) -> Key:
-        """Effect and place, for every shape."""
-        return self.effect, self.place
-
-    def reshaped(self, entry: int, value: float) -> "Term":
-        """The same term with one entry of its shape replaced."""
-        return Term(self.effect, self.place, (*self.shape[:entry], value, *self.shape[entry + 1 :]))
-
-    @property
-    def free(self) -> int | None:
-        """The one entry of its shape that is fitted in addition to its coefficients; None if there is none."""
-        hints = self.form.hints
-        entries = [i for i in range(len(self.shape)) if i not in hints.discrete]
-        return entries[0] if len(entries) == 1 and hints.linearised_at is None else None
-
-    def covers(self, layout: Layout) -> tuple[Key, ...]:
-        """Keys of the terms that it contains."""
-        return self.form.hints.covers(layout, self.place)
-
-    def alternatives(self, layout: Layout) -> tuple[Key, ...]:
-        """Keys of the simpler terms that together could replace it."""
-        return self.form.hints.alternatives(layout, self.place, self.shape)
-
-    def relinearised(self, coefficients: Array) -> "Term":
-        """The same term, linearised at its fitted size; unchanged if it is linear."""
-        if self.form.hints.linearised_at is None:
-            return self
-        return Term(self.effect, self.place, self.form.hints.relinearise(coefficients, self.shape))
-
-    @property
-    def bound(self) -> int:
-        """The one training recording that it is present in, from 1; 0 if it belongs to the arm."""
-        return self.form.signature.recording(self.shape)
-
-    @property
-    def beneath(self) -> tuple[Key, ...]:
-        """Keys of the terms that it needs."""
-        return tuple((name, self.place) for name in self.form.needs)
-
-
-class ColumnStore:
-    """Filtered columns of terms on one residual set, each computed once."""
-
-    def __init__(self, data: ResidualSet) -> None:
-        self.data = data
-        self._columns: dict[Term, Columns] = {}
-
-    def columns(self, term: Term) -> Columns:
-        """Columns per row, (K, p) each; rows that the term does not touch are absent."""
-        if term not in self._columns:
-            signature = term.form.signature
-            self._columns[term] = self.data.columns(
-                lambda signals, layout: signature.columns(signals, layout, term.place, term.shape)
-            )
-        return self._columns[term]
 
 
 class NormalEquations:
     """Gram matrices of the terms' columns with each other and with the residuals, per fold and row."""
 
-    def __init__(self, store: ColumnStore, terms: Sequence[Term]) -> None:
+    def __init__(self, store: ColumnStore, terms: Sequence[Term], like: "NormalEquations | None" = None) -> None:
+        """`like` has the same coefficients, on other data."""
         data = store.data
+        self.store = store
         self.terms = [term for term in terms if store.columns(term)]
         self.rows, self.layout = data.rows, data.layout
         self.known_friction = data.signals[0].arm.frictionloss
+        self.tip_mass = data.signals[0].arm.inertial[-1, :1]
         widths = [next(iter(store.columns(term).values())).shape[1] for term in self.terms]
         ends = np.cumsum([0, *widths])
         self.at = {term: np.arange(ends[i], ends[i + 1]) for i, term in enumerate(self.terms)}
-        self.size = int(ends[-1])
+        held = [term for term in self.terms if (term in like.fixed if like else store.offset(term))]
+        self.fixed: dict[Term, int] = {term: int(ends[-1]) + k for k, term in enumerate(held)}
+        """Index of the column that a nonlinear term has beside its own; its coefficient is one."""
+        self.size = int(ends[-1]) + len(held)
         self.folds = int(data.folds.max()) + 1
         shape = (self.folds, len(self.rows))
         self.square, self.count = np.zeros(shape), np.zeros(shape)
@@ -112,14 +48,31 @@ class NormalEquations:
             self._accumulate(store, r, row)
         self.seen = self.count.sum(0) > 25
         spreads = [term.form.plausibility.prior_std(data.signals[0], term.place) for term in self.terms]
-        spread = np.concatenate([np.broadcast_to(s, w) for s, w in zip(spreads, widths, strict=True)] or [np.zeros(0)])
+        own = [np.broadcast_to(s, w) for s, w in zip(spreads, widths, strict=True)]
+        spread = np.concatenate([*own, np.full(len(held), np.inf)])
         mean_square = np.zeros(self.size)
         for block in self.blocks:
             mean_square[block.index] += np.diagonal(block.whole) / max(self.count.sum(), 1.0)
         self.prior = 1.0 / spread**2 + 1e-9 * mean_square
         self.prior[mean_square == 0.0] += 1.0
+        last = list(self.fixed.values())
+        self.prior[last] = PINNED * (
+            1.0 + mean_square[last] * self.count.sum() / float(self.floor.min(initial=1.0)) ** 2
+        )
         means = [np.full(w, term.form.plausibility.prior_mean) for term, w in zip(self.terms, widths, strict=True)]
-        self.pull = self.prior * np.concatenate([*means, np.zeros(0)])
+        self.pull = self.prior * np.concatenate([*means, np.ones(len(held))])
+
+        self.free = self.prior.copy()
+        """The prior without the coefficients that are kept."""
+        self.pin({term: c for term, c in store.pins.items() if term in self.at})
+
+    def pin(self, kept: Mapping[Term, Array]) -> None:
+        """Keep coefficients in every fit."""
+        power = sum((b.diagonal(self.size) for b in self.blocks), np.zeros(self.size))
+        for term, c in kept.items():
+            at = self.at[term]
+            self.prior[at] = PINNED * (1.0 + power[at] / float(self.floor.min(initial=1.0)) ** 2)
+            self.pull[at] = self.prior[at] * c
 
     @property
     def price(self) -> float:
@@ -134,8 +87,8 @@ class NormalEquations:
         data = store.data
         touching = [term for term in self.terms if row in store.columns(term)]
         valid, y = data.valid[row], data.values[row]
-        index = np.concatenate([self.at[term] for term in touching] or [np.zeros(0, int)]).astype(int)
-        x = np.hstack([store.columns(term)[row] for term in touching]) if touching else np.zeros((len(y), 0))
+        index = self.index(touching)
+        x = store.wide(touching, row, self.fixed)
         gram, side = np.zeros((self.folds, len(index), len(index))), np.zeros((self.folds, len(index)))
         for fold in range(self.folds):
             pick = valid & (data.folds == fold)
@@ -151,8 +104,9 @@ class NormalEquations:
         return np.asarray(np.where(self.seen, 1.0 / (self.floor**2 + mean_square) / CORRELATED, 0.0))
 
     def index(self, terms: Sequence[Term]) -> NDArray[np.intp]:
-        """Indices of the terms' coefficients."""
-        return np.concatenate([self.at[term] for term in terms] or [np.zeros(0, np.intp)]).astype(np.intp)
+        """Indices of the terms' coefficients, then of the columns beside them (`fixed`)."""
+        beside = [np.array([self.fixed[term]]) for term in terms if term in self.fixed]
+        return np.concatenate([*(self.at[term] for term in terms), *beside, np.zeros(0, np.intp)]).astype(np.intp)
 
     def solve(self, index: NDArray[np.intp], gram: Array, side: Array) -> Array:
         """Coefficients at `index` from their weighted sums (p, p) and (p,), with the prior."""
@@ -191,6 +145,11 @@ class NormalEquations:
                 out[r] = np.sqrt(max(float(c @ block.whole[np.ix_(at, at)] @ c), 0.0) / max(self.count[:, r].sum(), 1))
         return out
 
+    def power(self, change: Array) -> Array:
+        """Mean square per row of the columns times a change of all coefficients (P,), (R,)."""
+        sums = [change[b.index] @ b.whole @ change[b.index] for b in self.blocks]
+        return np.asarray(np.array(sums) / np.maximum(self.count.sum(0), 1.0))
+
     def errors(self, index: NDArray[np.intp], coefficients: Array, fold: int) -> Array:
         """Sum of squares per row over one fold after subtracting the terms, (R,)."""
         out = self.square[fold].copy()
@@ -214,6 +173,12 @@ class _Block:
     gram: Array
     side: Array
     """(F, p, p) and (F, p)."""
+
+    def diagonal(self, size: int) -> Array:
+        """Sums of squares of all columns, (P,)."""
+        out = np.zeros(size)
+        out[self.index] = np.diagonal(self.whole)
+        return out
 
     @cached_property
     def whole(self) -> Array:
@@ -263,7 +228,9 @@ class Weighted:
     def screen(self, terms: Sequence[Term], candidates: Sequence[Term]) -> list[tuple[float, Term]]:
         """Candidates by the decrease of the weighted squares that each brings in addition to `terms`, best first."""
         normal, index = self.normal, self.normal.index(terms)
-        matrix, left = self.gram + np.diag(normal.prior), self.side
+        matrix, left = self.gram + np.diag(normal.prior), self.side.copy()
+        beside = np.array(list(normal.fixed.values()), np.intp)
+        left[beside] += normal.pull[beside]
         if len(index):
             onto = self.gram[:, index]
             through = np.linalg.solve(matrix[np.ix_(index, index)], np.column_stack([onto.T, left[index]]))
@@ -278,6 +245,14 @@ class Weighted:
             same = [candidates[i] for i in np.flatnonzero(widths == width).tolist()]
             own = np.array([normal.at[candidate] for candidate in same])
             blocks = matrix[own[:, :, None], own[:, None, :]] + (floor[own] + 1e-300)[:, :, None] * np.eye(width)
-            gains = np.einsum("ki,ki->k", left[own], np.linalg.solve(blocks, left[own][..., None])[..., 0])
+            at = np.array([normal.fixed.get(candidate, -1) for candidate in same])
+            aim, there = left[own], np.flatnonzero(at >= 0)
+            first = np.zeros(len(same))
+            if len(there):  # what a nonlinear candidate is beside its columns comes first
+                f = at[there]
+                aim[there] -= np.take_along_axis(matrix[f], own[there], axis=1)
+                power = matrix[f, f] - normal.prior[f]
+                first[there] = 2.0 * (left[f] - normal.pull[f]) - power
+            gains = first + np.einsum("ki,ki->k", aim, np.linalg.solve(blocks, aim[..., None])[..., 0])
             falls += zip(gains.tolist(), same, strict=True)
         return sorted(falls, key=lambda pair: -pair[0])

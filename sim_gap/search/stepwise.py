@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sim_gap.effects.effect import Key
-from sim_gap.search.normal_equations import NormalEquations, Term, Weighted
+from sim_gap.search.normal_equations import NormalEquations, Weighted
+from sim_gap.search.term import Term
 
 Scored = tuple[float, list[Term]]
 """Score of a set of terms, lower is better, and the terms."""
@@ -32,6 +33,8 @@ class Search:
     active: list[Term] = field(default_factory=list)
     added: Counter[Key] = field(default_factory=Counter)
     """How often each effect and place was added, which bounds the search."""
+    least: float = 1e-4
+    """Least improvement of the score by a term that is added."""
 
     def __post_init__(self) -> None:
         self.reweigh()
@@ -63,11 +66,12 @@ class Search:
     def _implausible(self, terms: Sequence[Term]) -> Term | None:
         """The first of the terms with implausible coefficients."""
         ends = np.cumsum([len(self.normal.at[term]) for term in terms])
-        pieces = np.split(self.weighted.fit(terms)[1], ends[:-1]) if terms else []
+        pieces = np.split(self.weighted.fit(terms)[1], ends)[:-1] if terms else []
         values = {term.key: piece for term, piece in zip(terms, pieces, strict=True)}
         for term in terms:
             beneath = {name: values[name, place] for name, place in term.beneath}
             beneath["nominal"] = self.normal.known_friction[term.place, None]
+            beneath["tip"] = self.normal.tip_mass
             if not term.form.plausibility.allows(values[term.key], term.shape, beneath):
                 return term
         return None
@@ -103,7 +107,7 @@ class Search:
         trials = (
             self.with_beneath(term, self.active) for _, term in shortlist(self.weighted.screen(self.active, inactive))
         )
-        chosen = self._best(self._judged(trials), self.score - 1e-4)
+        chosen = self._best(self._judged(trials), self.score - self.least)
         return chosen is not None and len(chosen) <= MOST_TERMS and self.accept(chosen)
 
     def backward(self) -> bool:
@@ -114,7 +118,7 @@ class Search:
 
     def swap(self) -> bool:
         """Exchange one term for another that scores better in its place."""
-        chosen = self._best(self._judged(self._exchanges()), self.score - 1e-3)
+        chosen = self._best(self._judged(self._exchanges()), self.score - max(1e-3, self.least))
         return chosen is not None and self.accept(chosen)
 
     def dissolve(self) -> bool:

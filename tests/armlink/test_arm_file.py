@@ -128,3 +128,40 @@ def test_another_description_has_another_hash(tmp_path):
     third = load_arm(written(tmp_path, changed(("link", "rate"), 100))).description_hash
     assert first != second
     assert first == third
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("name: 2026-13-45\n", "not YAML: month must be in 1..12"),
+        ("name: " + "9" * 6000 + "\n", "not YAML: Exceeds the limit"),
+        ("name: " + "[" * 3000 + "\n", "nested too deeply"),
+        ("name: " + "{a: " * 3000 + "\n", "nested too deeply"),
+        ("name: 2026-11-22\n", "key name: "),
+    ],
+)
+def test_a_file_that_yaml_chokes_on_is_one_line(tmp_path, text, says):
+    with pytest.raises(BadInput) as caught:
+        load_arm(written(tmp_path, text))
+    message = str(caught.value)
+    assert says in message
+    assert "\n" not in message
+    assert len(message) < 600
+
+
+@pytest.mark.parametrize(
+    ("keys", "value"),
+    [
+        (("name",), "../.."),
+        (("name",), ".."),
+        (("serial",), "a/b"),
+        (("serial",), "c\\d"),
+        (("name",), ""),
+        (("name",), "two\nlines"),
+        (("kinematics", "joints", 0, "name"), "../joint"),
+        (("link", "joints", 0, "name"), "a\x1b[2J"),
+    ],
+)
+def test_a_name_is_one_line_and_no_path(tmp_path, keys, value):
+    with pytest.raises(BadInput, match=rf"(key {'.'.join(map(str, keys))}|name is '\.\.')"):
+        load_arm(written(tmp_path, changed(keys, value)))

@@ -1,6 +1,7 @@
 """The console command: usage, errors as one line, exit statuses. The commands here are made up."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -206,3 +207,149 @@ def test_help_takes_less_than_0_3_s_of_cpu_and_loads_no_heavy_package():
     assert "armlink" in loaded
     assert not loaded & {"numpy", "scipy", "pydantic", "typer", "rich", "can", "canopen", "mujoco", "pyarrow", "plotly"}
     assert usage.ru_utime + usage.ru_stime < 0.3
+
+
+def commands() -> dict[str, EntryPoint]:
+    return {point.name: point for point in cli.entry_points(group="armlink.commands")}
+
+
+SUB_COMMANDS = [(name,) for name in sorted(commands())] + [
+    ("gap", name) for name in ("diagnose", "plan", "collect", "diagnose-fleet", "bench")
+]
+
+
+@pytest.mark.parametrize("words", SUB_COMMANDS, ids=" ".join)
+def test_every_help_has_an_example_that_begins_with_the_command(words, capsys):
+    assert cli.run([*words, "--help"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "Usage: armlink " + words[0] in text
+    assert f"Example: armlink {words[0]}" in text
+
+
+def test_the_list_is_sorted_one_line_each_in_one_style(capsys):
+    cli.run(["--help"])
+    listed = capsys.readouterr().out.partition("Commands:\n")[2].partition("\n\n")[0].splitlines()
+    names = [line.split()[0] for line in listed]
+    assert names == sorted(commands())
+    for line in listed:
+        summary = line.split(None, 1)[1]
+        assert re.match(r"[A-Z][a-z]+s\b", summary), line
+        assert summary.endswith("."), line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        (["swep"], "did you mean sweep?"),
+        (["calibrat", "x"], "did you mean calibrate?"),
+        (["--verson"], "did you mean --version?"),
+        (["my-arm.urdf"], "armlink new my-arm.urdf"),
+        (["sweep", "sarcos", "--outt", "x"], "did you mean --out?"),
+        (["monitor", "sarcos", "--stat"], "did you mean --stats?"),
+        (["gap", "diagnos"], "did you mean diagnose"),
+        (["demo", "sarcos", "--arm", "parallel6"], "two arms"),
+        (["demo", "--arm", "sarocs"], "did you mean sarcos?"),
+        (["completion", "tcsh"], "bash, zsh, fish"),
+    ],
+)
+def test_a_typo_names_what_was_meant(arguments, meant, capsys):
+    assert cli.run(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    assert meant in err
+
+
+@pytest.mark.parametrize(
+    ("words", "some", "none"),
+    [
+        ([""], ["sweep", "new", "completion", "--version"], ["sarcos"]),
+        (["swe"], ["sweep"], ["new"]),
+        (["sweep", ""], ["sarcos", "parallel6"], []),
+        (["sweep", "sarcos", "--re"], ["--reference-mass", "--resume"], ["--out"]),
+        (["gap", "di"], ["diagnose", "diagnose-fleet"], ["plan"]),
+        (["gap", "diagnose", "--he"], ["--heldout", "--help"], []),
+        (["completion", ""], ["bash", "fish", "zsh"], []),
+        (["nosuch", ""], [], []),
+    ],
+)
+def test_completion_offers_what_can_follow(words, some, none, capsys):
+    assert cli.run(["--complete", *words]) == 0
+    offered = capsys.readouterr().out.split()
+    assert set(some) <= set(offered)
+    assert not set(none) & set(offered)
+
+
+def test_completion_works_in_bash(capsys):
+    assert cli.run(["completion", "bash"]) == 0
+    script = capsys.readouterr().out
+    asked = f'{script}\nCOMP_WORDS=(armlink calib); COMP_CWORD=1; _armlink; echo "${{COMPREPLY[*]}}"'
+    path = f"{os.path.dirname(sys.executable)}{os.pathsep}{os.environ['PATH']}"
+    done = subprocess.run(
+        ["bash", "-c", asked], env={**os.environ, "PATH": path}, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["calibrate"]
+
+
+VERBS = {"completion", "knows", "does", "needs"}
+"""Words after `armlink` in sentences of messages, and the command that is none of a package."""
+HINT = re.compile(r"armlink ([a-z][a-z-]*)((?: (?:plan|collect|diagnose-fleet|diagnose|bench))?)((?: --[a-z-]+)*)")
+
+
+def test_hints_in_messages_name_commands_that_exist():
+    """Each `armlink …` in a string of ours is a command, with options that it has."""
+    import ast
+    from pathlib import Path
+
+    root, known = Path(cli.__file__).parents[1], commands()
+    found = 0
+    for package in ("armlink", "calib", "gcomp", "sim_bus", "sim_gap"):
+        for file in (root / package).rglob("*.py"):
+            tree = ast.parse(file.read_text())
+            prose = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}  # docstrings
+            for node in ast.walk(tree):
+                if not (isinstance(node, ast.Constant) and isinstance(node.value, str)) or id(node) in prose:
+                    continue
+                for name, sub, options in HINT.findall(node.value):
+                    if name in VERBS or file.name == "completion.py":
+                        continue
+                    found += 1
+                    assert name in known, f"{file}: armlink {name}"
+                    for option in options.split():
+                        assert option in cli.completion.candidates(known, [name, *sub.split(), option]), (
+                            f"{file}: {name} {option}"
+                        )
+    assert found > 40
+
+
+@pytest.mark.parametrize(
+    ("module", "extra"),
+    [
+        ("fastapi", "daemon"),
+        ("uvicorn", "daemon"),
+        ("prometheus_client", "daemon"),
+        ("distributed", "gap"),
+        ("msgpack", "simulator"),
+        ("psycopg", "postgresql"),
+    ],
+)
+def test_a_missing_extra_is_named(command, capsys, module, extra):
+    command(raising(ModuleNotFoundError(f"No module named {module!r}", name=module)))
+    assert cli.run(["work"]) == 2
+    assert capsys.readouterr().err == f"armlink: work: {module} is not installed: pip install 'armlink[{extra}]'\n"
+
+
+def test_another_missing_module_is_a_bug(command):
+    command(raising(ModuleNotFoundError("No module named 'numpy'", name="numpy")))
+    with pytest.raises(ModuleNotFoundError):
+        cli.run(["work"])
+
+
+def test_the_package_states_its_pythons():
+    from importlib.metadata import metadata
+
+    stated = metadata("armlink")
+    assert stated["Requires-Python"] == ">=3.11"
+    pythons = [each for each in stated.get_all("Classifier") if each.startswith("Programming Language")]
+    assert [each[-4:] for each in pythons] == ["3.11", "3.12", "3.13"]
+    assert {"all", "daemon", "gap", "simulator"} <= set(stated.get_all("Provides-Extra"))

@@ -61,7 +61,7 @@ def test_the_drift_is_seen_and_put_right(summary):
 
 def test_the_gap_is_friction_and_closes(summary):
     gap = summary["gap"]
-    assert gap["schema"] == "armlink.gap/1"
+    assert gap["schema"] == "armlink.gap/2"
     assert gap["causes"][0]["effect"].startswith("friction.")
     heldout = gap["gap"]["heldout"]
     assert all(after < before for before, after in zip(heldout["before"], heldout["after"], strict=True))

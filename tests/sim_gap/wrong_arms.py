@@ -110,7 +110,7 @@ def _truth(nominal: mujoco.MjModel, wrong: Wrong) -> mujoco.MjModel:
         mujoco.mju_mat2Quat(real.body_iquat[tip], axes.ravel())
     x, y = wrong.tilt
     turn = np.array([[1, 0, -y], [0, 1, x], [y, -x, 1.0]])
-    real.opt.gravity[:] = turn @ real.opt.gravity
+    real.opt.gravity[:] = turn @ nominal.opt.gravity
     return real
 
 

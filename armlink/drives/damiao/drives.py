@@ -70,6 +70,10 @@ class DamiaoDrives(BasicDrives):
             found |= {drive + offset: f"{mode} command to {name}" for offset, mode in OTHER_MODES.items()}
         return found
 
+    def poll(self, first: bool) -> list[Frame]:
+        """Requests for the state alone."""
+        return [(frames.REGISTERS_ID, frames.refresh_request(settings.id)) for settings in self._settings]
+
     # ---- set-up
 
     def identify(self, ask: Ask) -> list[DriveIdentity]:

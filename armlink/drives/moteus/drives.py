@@ -9,7 +9,7 @@ from armlink.bus.port import EXTENDED, Frame
 from armlink.drives.base import BasicDrives, no_order
 from armlink.drives.family import Ask
 from armlink.drives.moteus import frames
-from armlink.drives.moteus.frames import READ_ERROR, REPLY, WRITE, Register
+from armlink.drives.moteus.frames import READ, READ_ERROR, REPLY, WRITE, Register
 from armlink.drives.moteus.settings import MoteusSettings
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
 from armlink.drives.traits import Traits
@@ -20,6 +20,13 @@ TRAITS = Traits(torque="current", calibration="host", silence="damps", bounds=("
 QUERY = (
     Register.MODE, Register.POSITION, Register.VELOCITY, Register.TORQUE, Register.TEMPERATURE, Register.FAULT,
 )  # fmt: skip
+COMMAND = (
+    Register.MODE, Register.COMMAND_POSITION, Register.COMMAND_VELOCITY, Register.COMMAND_TORQUE,
+    Register.COMMAND_KP_SCALE, Register.COMMAND_KD_SCALE, Register.COMMAND_MAX_TORQUE,
+    Register.COMMAND_STOP_POSITION, Register.COMMAND_WATCHDOG, Register.COMMAND_ILIMIT_SCALE,
+)  # fmt: skip
+CYCLE_COMMAND = frames.FixedPayload([(WRITE, COMMAND), (READ, QUERY)])
+CYCLE_REPLY = frames.FixedPayload([(REPLY, QUERY)])
 HOMED_AT_OUTPUT = 2
 LARGEST_POSITION = 1e4
 """No joint's position is larger [rev]; a larger one is no reading."""
@@ -85,6 +92,13 @@ class MoteusDrives(BasicDrives):
             for settings, name in zip(self._settings, self.names, strict=True)
             for head in range(0x100)
         }
+
+    def poll(self, first: bool) -> list[Frame]:
+        """Queries alone."""
+        return [
+            (_flagged(frames.identifier(settings.source, settings.id, True)), frames.pack({}, QUERY))
+            for settings in self._settings
+        ]
 
     # ---- set-up
 
@@ -162,7 +176,7 @@ class MoteusDrives(BasicDrives):
                 continue
             settings = self._settings[joint]
             writes = self._writes(joint, order)
-            data = frames.pack(writes, QUERY)
+            data = CYCLE_COMMAND.pack(writes) if len(writes) == len(COMMAND) else frames.pack(writes, QUERY)
             told = _order_of(data)
             self._known[joint].sent = told if told is not None and told.power is Power.ON else None
             found.append((_flagged(frames.identifier(settings.source, settings.id, True)), data))
@@ -212,7 +226,9 @@ class MoteusDrives(BasicDrives):
         joint = self._joint_of.get(can_id)
         if joint is None:
             return None
-        values = {each.register: each.value for each in frames.unpack(data) if each.kind == REPLY}
+        values = CYCLE_REPLY.unpack(data) or {
+            each.register: each.value for each in frames.unpack(data) if each.kind == REPLY
+        }
         mode, fault = values.get(Register.MODE, math.nan), values.get(Register.FAULT, math.nan)
         if not math.isfinite(mode):
             return None
@@ -282,7 +298,9 @@ def _flagged(number: int) -> int:
 
 def _order_of(data: bytes) -> Order | None:
     """The order that the bytes of a frame give; None if they command no mode."""
-    values = {each.register: each.value for each in frames.unpack(data) if each.kind == WRITE}
+    values = CYCLE_COMMAND.unpack(data) or {
+        each.register: each.value for each in frames.unpack(data) if each.kind == WRITE
+    }
     mode = values.get(Register.MODE)
     if mode is None:
         return None

@@ -18,6 +18,7 @@ INT8, INT16, INT32, FLOAT = 0, 1, 2, 3
 LAYOUTS = (struct.Struct("<b"), struct.Struct("<h"), struct.Struct("<i"), struct.Struct("<f"))
 SIZES = (1, 2, 4, 4)
 REPLY_WANTED = 0x80
+_NOPS = bytes([NOP])
 LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 """Lengths of a CAN FD frame."""
 
@@ -89,6 +90,48 @@ class Subframe(NamedTuple):
     register: int
     value: float
     resolution: int = FLOAT
+
+
+class FixedPayload:
+    """A payload whose registers never change, packed and unpacked in one step: the way of the cycle."""
+
+    def __init__(self, kinds: Sequence[tuple[int, Sequence[int]]]) -> None:
+        """(WRITE or REPLY, registers with values) or (READ, registers); values travel as pack() has them."""
+        layout, self.heads = "<", []
+        self.registers: tuple[int, ...] = ()
+        for kind, registers in kinds:
+            for run in _runs(sorted(registers), FLOAT):
+                form = _form(run[0], FLOAT)
+                head = _head(kind, form, run)
+                self.heads.append(head)
+                layout += f"{len(head)}s"
+                if kind != READ:
+                    layout += LAYOUTS[form].format[1:] * len(run)
+                    self.registers += tuple(run)
+        self._struct = struct.Struct(layout)
+        self.size = next(length for length in LENGTHS if length >= self._struct.size)
+        self._fill = bytes([NOP]) * (self.size - self._struct.size)
+        shape = self._struct.unpack(bytes(self._struct.size))
+        self._values = [place for place, value in enumerate(shape) if not isinstance(value, bytes)]
+        self._places = [place for place, value in enumerate(shape) if isinstance(value, bytes)]
+
+    def pack(self, values: Mapping[int, float]) -> bytes:
+        """The payload with these values of `registers`."""
+        fields: list[float | bytes] = [0.0] * (len(self._values) + len(self._places))
+        for place, head in zip(self._places, self.heads, strict=True):
+            fields[place] = head
+        for place, register in zip(self._values, self.registers, strict=True):
+            fields[place] = values[register]
+        return self._struct.pack(*fields) + self._fill
+
+    def unpack(self, data: bytes) -> dict[int, float] | None:
+        """Values by register, or None for a payload that is laid out otherwise."""
+        if len(data) < self._struct.size:
+            return None
+        fields = self._struct.unpack_from(data)
+        if [fields[place] for place in self._places] != self.heads or data[self._struct.size :].strip(_NOPS):
+            return None
+        return dict(zip(self.registers, (fields[place] for place in self._values), strict=True))
 
 
 def identifier(source: int, destination: int, reply_wanted: bool = False) -> int:

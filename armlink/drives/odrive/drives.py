@@ -57,6 +57,7 @@ class _Known:
     """[rad]."""
     velocity: float = math.nan
     torque: float = math.nan
+    """That came since the newest estimates [N·m]; it goes with the next ones."""
     came: set[int] = field(default_factory=set)
     """Messages that have come."""
     mode: int = 0
@@ -89,6 +90,10 @@ class ODriveDrives(BasicDrives):
             for node, joint in self._joint_of.items()
             for message in FROM_HOST
         }
+
+    def reading_ids(self) -> Mapping[int, int]:
+        """See Drives."""
+        return {identifier(node, Message.ESTIMATES): joint for node, joint in self._joint_of.items()}
 
     # ---- set-up
 
@@ -244,10 +249,11 @@ class ODriveDrives(BasicDrives):
             if not abs(position) < LARGEST_POSITION or not math.isfinite(velocity):
                 return None
             known.position, known.velocity = position * TURN, velocity * TURN
-            return Reading(joint, known.position, known.velocity)
+            torque, known.torque = known.torque, math.nan
+            return Reading(joint, known.position, known.velocity, torque)
         if message == Message.TORQUES and math.isfinite(values[1]):
             known.torque = values[1]
-            return Reading(joint, motor_torque=values[1])
+            return None
         if message == Message.TEMPERATURE and all(math.isfinite(value) for value in values):
             return self.note(Reading(joint, temperature=max(values)))
         return None

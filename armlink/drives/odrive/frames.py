@@ -118,6 +118,8 @@ LAYOUTS = {
     Message.VELOCITY_GAINS: "<ff",
     Message.TORQUES: "<ff",
 }
+LENGTHS = dict.fromkeys((Message.AXIS_STATE, Message.INPUT_TORQUE, Message.POSITION_GAIN), 8)
+"""Lengths of messages that the published file pads; the drive, as ODrive's own examples, takes them shorter too."""
 STRUCTS = {message: struct.Struct(layout) for message, layout in LAYOUTS.items()}
 
 
@@ -128,7 +130,7 @@ def identifier(node: int, message: int) -> int:
 
 def pack(message: Message, *values: float) -> bytes:
     """Bytes of a message; raises struct.error for values that do not fit."""
-    return STRUCTS[message].pack(*values)
+    return STRUCTS[message].pack(*values).ljust(LENGTHS.get(message, 0), b"\0")
 
 
 def unpack(message: int, data: bytes) -> tuple[float, ...] | None:

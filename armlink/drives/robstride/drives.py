@@ -56,6 +56,22 @@ class RobStrideDrives(BasicDrives):
         """None by identifier, for a motion command's tells its torque: alarm() names another host."""
         return {}
 
+    def intrusion(self, can_id: int, data: bytes) -> str:
+        """Another host's command, by the type in its identifier."""
+        joint = self._joint_of.get(can_id & 0xFF)
+        if joint is None or not can_id & EXTENDED or frames.kind_of(can_id) not in HOST_TYPES:
+            return ""
+        return f"{Type(frames.kind_of(can_id)).name.lower().replace('_', ' ')} to {self.names[joint]}"
+
+    def reading_ids(self) -> Mapping[int, int]:
+        """Feedback and reports, with all modes and faults that their identifiers may tell."""
+        return {
+            frames.identifier(kind, head << 8 | settings.id, settings.host) | EXTENDED: joint
+            for joint, settings in enumerate(self._settings)
+            for kind in (Type.FEEDBACK, Type.REPORT)
+            for head in range(0x100)
+        }
+
     # ---- set-up
 
     def identify(self, ask: Ask) -> list[DriveIdentity]:
@@ -146,9 +162,8 @@ class RobStrideDrives(BasicDrives):
         """See Drives."""
         if not can_id & EXTENDED:
             return None
-        if frames.kind_of(can_id) in HOST_TYPES and (addressed := self._joint_of.get(can_id & 0xFF)) is not None:
-            kind = Type(frames.kind_of(can_id)).name.lower().replace("_", " ")
-            self._intruder = f"{self.where(addressed)}: another host sends {kind} ({can_id & 0x1FFFFFFF:08X}h)"
+        if intruder := self.intrusion(can_id, data):
+            self._intruder = f"another host sends {intruder} ({can_id & 0x1FFFFFFF:08X}h)"
         joint = self._joint_of.get(frames.data_of(can_id) & 0xFF)
         if joint is None or can_id & 0xFF != self._settings[joint].host:
             return None

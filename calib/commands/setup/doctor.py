@@ -1,5 +1,7 @@
 """Says what is missing or doubtful between an arm file, this machine and its bus, first things first."""
 
+import shlex
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -31,11 +33,11 @@ def doctor(
         findings = examine(arm, bus, offline)
     for found in findings:
         console.print(found.level, style=COLOURS[found.level], end=": ")
-        console.print(str(found))
+        console.print(str(found).replace(f"{Path.cwd()}/", ""))
     errors = sum(found.level == "error" for found in findings)
     if errors:
         console.print(f"{errors} {'error' if errors == 1 else 'errors'} to deal with first")
     else:
-        console.print(f"no errors; next: armlink check {arm}")
+        console.print(f"no errors; next: {shlex.join(['armlink', 'check', arm])}")
     write_json(json_file, {"schema": "armlink.doctor/1", "arm": arm, "findings": [each.to_json() for each in findings]})
     return 1 if errors else 0

@@ -1,5 +1,6 @@
 """Makes an arm file from a URDF or MJCF model, and finds its drives on a bus."""
 
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -91,7 +92,7 @@ def new(
     made.parsed()
     made.write()
     _show(console, made)
-    step = f"armlink {'demo --arm' if bus is None else 'check'} {out}"
+    step = shlex.join(["armlink", *(["demo", "--arm"] if bus is None else ["check"]), str(out)])
     console.print(f"next: {step}", style="bold")
     write_json(json_file, _answer(made, step))
     return 1 if any(found.level == "error" for found in made.findings) else 0
@@ -132,12 +133,12 @@ def _rewire(console: Any, model: Path, out: Path, bus: str, ask: "Ask | None", j
     out.write_text(text + yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
     for found in findings:
         console.print(str(found), style="red")
-    step = f"armlink check {out}"
+    step = shlex.join(["armlink", "check", str(out)])
     console.print(f"{out}: nodes {', '.join(str(match.drive.node) for match in matches)}")
     console.print(f"next: {step}", style="bold")
     joints = [{"name": match.joint, "node": match.drive.node, "by_hand": match.by_hand} for match in matches]
-    answer = {"schema": SCHEMA, "out": str(out), "name": arm.name, "joints": joints, "next": step}
-    write_json(json_file, {**answer, "findings": [found.to_json() for found in findings]})
+    answer = {"out": str(out), "name": arm.name, "joints": joints, "next": step}
+    write_json(json_file, {"schema": SCHEMA, **answer, "findings": [found.to_json() for found in findings]})
     return 1 if findings else 0
 
 

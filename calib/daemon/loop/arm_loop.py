@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from armlink.bus.arm_hold import ArmHold
 from armlink.errors import ArmlinkError, BusFault, Refused
 from armlink.link.link import Link
 from armlink.link.listener import Listener
@@ -38,6 +39,7 @@ class ArmLoop:
         self._tour: list[int] | None = None
         self._reported = -1
         self._source: Link | Listener | None = None
+        self._hold: ArmHold | None = None
         self._targets: Iterator[Array] | None = None
         self._shift = 0.0
         self._reason: str | None = None
@@ -115,6 +117,7 @@ class ArmLoop:
             return self._up(None)
         link = Link(options.arm, bus)
         self._source = link
+        self._hold = self._hold or ArmHold(bus, link.addresses)  # for good: through a passing fault too
         link.start()
         held = [link.read_calibration(joint) for joint in range(link.n)]  # before SDO has to wait for cycles
         sample = link.enable()

@@ -63,33 +63,70 @@ class Journal:
     """One process writes it; any other may read it. Raises sqlite3.Error if the disk fails."""
 
     def __init__(self, path: Path, monotonic: Callable[[], float] = time.monotonic) -> None:
-        """Open or create it; raises BadInput if that is not possible. `monotonic` is the clock of retries [s]."""
+        """Open or create it; raises BadInput if that is not possible. `monotonic` is the clock of retries [s].
+
+        One that is damaged is set aside, under another name, and a new one is begun.
+        """
         self.path, self._monotonic = path, monotonic
         self._failed_at = -float("inf")
         self._last_event = self._pending = 0
         self.trouble = ""
         """Why nothing can be written, in one line; empty while it can."""
+        self.set_aside = ""
+        """Name of a damaged journal that was set aside; empty if none was."""
+        self._damaged = False
+        self._db: sqlite3.Connection = None  # type: ignore[assignment]
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._db = sqlite3.connect(path, isolation_level=None, timeout=OPEN_SECONDS)
-            for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", f"cache_size=-{CACHE_KB}"):
-                self._db.execute(f"PRAGMA {pragma}")
-            version = self._db.execute("PRAGMA user_version").fetchone()[0]
-            if version not in (0, SCHEMA):
-                raise BadInput(f"{path}: journal of schema {version}, this program has {SCHEMA}: use its own version")
-            with self.transaction():
-                for statement in filter(str.strip, _TABLES.split(";")):
-                    self._db.execute(statement)
-                for table in _APPEND_ONLY:
-                    for change in ("UPDATE", "DELETE"):
-                        self._db.execute(
-                            f"CREATE TRIGGER IF NOT EXISTS {table}_no_{change.lower()} BEFORE {change} ON {table} "
-                            f"BEGIN SELECT RAISE(ABORT, '{table} is append-only'); END"
-                        )
-                self._db.execute(f"PRAGMA user_version={SCHEMA}")
-            self._db.execute(f"PRAGMA busy_timeout={int(LOCK_SECONDS * 1000)}")
+            self._open()
+        except sqlite3.DatabaseError as error:
+            if not _is_damage(error):
+                raise self._not_opened(error) from None
+            self._begin_anew()
+        except OSError as error:
+            raise self._not_opened(error) from None
+
+    def _not_opened(self, error: Exception) -> BadInput:
+        return BadInput(f"{self.path}: the journal cannot be opened: {error}")
+
+    def _begin_anew(self) -> None:
+        """Set the damaged file aside and begin another; raises BadInput if that is not possible."""
+        stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+        aside = self.path.with_name(f"{self.path.name}.damaged-{stamp}")
+        self._damaged, self.trouble = False, ""
+        try:
+            if self._db is not None:
+                self._db.close()
+            for suffix in ("", "-wal", "-shm"):
+                with suppress(FileNotFoundError):
+                    self.path.with_name(self.path.name + suffix).rename(aside.with_name(aside.name + suffix))
+            self._open()
         except (sqlite3.Error, OSError) as error:
-            raise BadInput(f"{path}: the journal cannot be opened: {error}") from None
+            raise self._not_opened(error) from None
+        self.set_aside = aside.name
+
+    def _open(self) -> None:
+        path = self.path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._db = sqlite3.connect(path, isolation_level=None, timeout=OPEN_SECONDS)
+        for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", f"cache_size=-{CACHE_KB}"):
+            self._db.execute(f"PRAGMA {pragma}")
+        found = self._db.execute("PRAGMA quick_check(1)").fetchone()[0]
+        if found != "ok":
+            raise sqlite3.DatabaseError(f"malformed: {found}")
+        version = self._db.execute("PRAGMA user_version").fetchone()[0]
+        if version not in (0, SCHEMA):
+            raise BadInput(f"{path}: journal of schema {version}, this program has {SCHEMA}: use its own version")
+        with self.transaction():
+            for statement in filter(str.strip, _TABLES.split(";")):
+                self._db.execute(statement)
+            for table in _APPEND_ONLY:
+                for change in ("UPDATE", "DELETE"):
+                    self._db.execute(
+                        f"CREATE TRIGGER IF NOT EXISTS {table}_no_{change.lower()} BEFORE {change} ON {table} "
+                        f"BEGIN SELECT RAISE(ABORT, '{table} is append-only'); END"
+                    )
+            self._db.execute(f"PRAGMA user_version={SCHEMA}")
+        self._db.execute(f"PRAGMA busy_timeout={int(LOCK_SECONDS * 1000)}")
 
     def close(self) -> None:
         """Close the file."""
@@ -125,6 +162,7 @@ class Journal:
 
     def failed(self, error: sqlite3.Error) -> None:
         """Note a failure, for the status."""
+        self._damaged = self._damaged or _is_damage(error)
         if not self.trouble:
             log.error("journal: %s", error)
             self.trouble = f"the journal cannot be written: {error}"
@@ -133,7 +171,10 @@ class Journal:
             self._failed_at = self._monotonic()
 
     def probe(self) -> None:
-        """After a failure: find out whether it can be written again."""
+        """After a failure: find out whether it can be written again, or begin another where it is damaged."""
+        if self._damaged:
+            with suppress(BadInput):
+                self._begin_anew()
         if self.trouble:
             with suppress(sqlite3.Error), self.transaction():
                 self._db.execute(f"PRAGMA user_version={SCHEMA}")
@@ -241,24 +282,14 @@ class Journal:
                 (_iso(time), t, record, json.dumps(estimate)),
             )
 
-    def history(
-        self, since: datetime | None, until: datetime | None, most: int
-    ) -> list[tuple[datetime, float, str | None, dict[str, Any]]]:
-        """Estimates of a time span, oldest first, thinned evenly to at most `most`; always includes the newest."""
-        span = (_iso(since) if since else "", _iso(until) if until else "9999")
-        count = int(self._db.execute("SELECT COUNT(*) FROM history WHERE time >= ? AND time <= ?", span).fetchone()[0])
-        step = max(1, -(-count // max(most, 1)))
-        rows = self._db.execute(
-            "SELECT time, t, record, estimate FROM (SELECT *, ROW_NUMBER() OVER (ORDER BY id DESC) AS place "
-            "FROM history WHERE time >= ? AND time <= ?) WHERE (place - 1) % ? = 0 ORDER BY id",
-            (*span, step),
-        )
-        return [(datetime.fromisoformat(time), t, record, json.loads(found)) for time, t, record, found in rows]
-
     def thin_history(self, before: datetime, keep_every: int) -> None:
         """Keep one in `keep_every` of the estimates before a time."""
         with self.transaction():
             self._db.execute("DELETE FROM history WHERE time < ? AND id % ? != 0", (_iso(before), keep_every))
+
+
+def _is_damage(error: sqlite3.Error) -> bool:
+    return "malformed" in str(error) or "not a database" in str(error)
 
 
 _PROPOSALS = (

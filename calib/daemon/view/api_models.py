@@ -119,6 +119,12 @@ class JointEstimate(Answer):
     installed_gain: float | None
     """Gain and offset [N·m] of the record in force."""
     installed_offset: float | None
+    gain_limit: float | None = None
+    """Smallest change of gain that would be noticed now, relative; None if gravity does not load the joint."""
+    offset_limit: float | None = None
+    """Smallest change of offset that would be noticed now [N·m]."""
+    limit_rests: int | None = None
+    """Rests at other poses after which changes of this size are noticed; larger ones are sooner."""
 
 
 class EventRecord(Answer):

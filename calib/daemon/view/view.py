@@ -1,8 +1,10 @@
 """The interface of the service to the web layer, and its refusals.
 
-All calls are made on the service's event loop (asyncio, the same thread); no answer waits for the bus.
+All calls but those for the history are made on the service's event loop (asyncio, the same thread); no answer waits for
+the bus.
 """
 
+from collections.abc import Iterator
 from datetime import datetime
 from typing import Protocol
 
@@ -82,8 +84,14 @@ class DaemonView(Protocol):
     ) -> tuple[HistoryPoint, ...]:
         """Estimates over time, oldest first, thinned evenly to at most `most` per joint; raises NoSuch.
 
-        Without a joint: those of every joint, one joint after the other.
+        Without a joint: those of every joint, one joint after the other. May be called in any thread.
         """
+        ...
+
+    def history_pages(
+        self, joint: str | None, since: datetime | None = None, until: datetime | None = None, most: int = 2000
+    ) -> Iterator[tuple[HistoryPoint, ...]]:
+        """Likewise in pieces that fit in memory; what it raises it raises at the first."""
         ...
 
     def proposals(self, limit: int = 200) -> tuple[Proposal, ...]:

@@ -102,6 +102,8 @@ class Guard:
                 raise Denied(403, f"a page of {origin[:100]!r} may not decide anything here")
         if peer.tcp and scope["path"] not in self.access.open_paths:
             self._check_token(headers.get("authorization", ""), peer)
+            if not peer.trust():
+                raise Denied(503, "too many clients over TCP: try again later", {"connection": "close"})
 
     def _is_ours(self, host: str, peer: Peer) -> bool:
         if _is_loopback(host):

@@ -7,12 +7,13 @@ import pwd
 import socket
 import struct
 from collections.abc import Awaitable, Callable, MutableMapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from calib.daemon.web.admission import Admission
 from calib.daemon.web.linger import LingeringTransport
 
 Scope = MutableMapping[str, Any]
@@ -23,6 +24,8 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 PEER = "armlink.peer"
 """Key of the ASGI scope that holds the Peer."""
+TAKE_SECONDS = 10.0
+"""A client that has not taken what was sent to it, down to a rest, within this time is cut [s]."""
 HEAD_SECONDS = 10.0
 """A connection that has not sent a complete request head within this time is cut [s]."""
 WRITE_BUFFER = 32 * 1024
@@ -45,6 +48,8 @@ class Peer:
     """Local address of this connection (TCP), a valid Host for it."""
     abort: Callable[[], None] = lambda: None
     """Cuts the connection at once, unsent bytes included."""
+    trust: Callable[[], bool] = lambda: True
+    """It has shown the token; False where there is no room for one more such connection."""
 
 
 UNKNOWN = Peer("unknown", "unknown", tcp=True)
@@ -71,13 +76,21 @@ def describe_peer(transport: asyncio.Transport) -> Peer:
 class BoundedProtocol(H11Protocol):
     """uvicorn's protocol, which passes the peer to the application, buffers little, and ends in time and in stages."""
 
+    admission = Admission()
+    """Of all connections of a server, which has a class of its own (`protocol_of`)."""
+    address = ""
     _deadline: asyncio.TimerHandle | None = None
+    _taking: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Identify the peer and start the deadline of the first request."""
         super().connection_made(cast(asyncio.Transport, LingeringTransport(transport)))
         transport.set_write_buffer_limits(high=WRITE_BUFFER)
-        peer, app = describe_peer(transport), self.app
+        peer, app = replace(describe_peer(transport), trust=lambda: self.admission.trust(self)), self.app
+        self.address = peer.address
+        if not self.admission.enter(self):
+            transport.abort()
+            return
 
         async def with_peer(scope: Any, receive: Any, send: Any) -> None:
             scope[PEER] = peer
@@ -92,9 +105,37 @@ class BoundedProtocol(H11Protocol):
         self._mind_the_clock()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Stop the deadline."""
+        """Stop the deadlines."""
         self._stop_the_clock()
+        self._stop_waiting()
+        self.admission.leave(self)
         super().connection_lost(exc)
+
+    def pause_writing(self) -> None:
+        """As uvicorn's, with a deadline for the client to take what was sent."""
+        super().pause_writing()
+        if self._taking is None:
+            self._taking = self.loop.call_later(TAKE_SECONDS, self.cut)
+        self.admission.stuck(self)
+
+    def resume_writing(self) -> None:
+        """As uvicorn's."""
+        self._stop_waiting()
+        self.admission.moves(self)
+        super().resume_writing()
+
+    def cut(self) -> None:
+        """End the connection at once, unsent bytes included."""
+        self.transport.abort()
+
+    def unsent(self) -> int:
+        """Bytes that the client has not taken."""
+        return int(self.transport.get_write_buffer_size())
+
+    def _stop_waiting(self) -> None:
+        if self._taking is not None:
+            self._taking.cancel()
+            self._taking = None
 
     def shutdown(self) -> None:
         """The server ends: close an idle connection at once; one that lingers ends within the server's own time."""
@@ -138,6 +179,11 @@ class BoundedProtocol(H11Protocol):
         self._deadline = None
         if self._awaits_head() and not self.transport.is_closing():
             self.transport.abort()
+
+
+def protocol_of(admission: Admission) -> type[BoundedProtocol]:
+    """The protocol of one server's connections."""
+    return type("BoundedProtocol", (BoundedProtocol,), {"admission": admission})
 
 
 def _user(uid: int) -> str:

@@ -1,15 +1,16 @@
 """The API's routes (docs/daemon-api.md). All read, except the two that decide on a proposal; none commands motion."""
 
+import sqlite3
 from collections.abc import Callable
 from datetime import timedelta
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Header, Path, Query, Request
 from fastapi.responses import FileResponse, Response
-from pydantic import TypeAdapter
 
 from calib.daemon.view.api_models import EventRecord, HistoryPoint, JointEstimate, JointNow, Overview, Proposal, Status
 from calib.daemon.view.view import DaemonView, NoSuch, NotPossible
+from calib.daemon.web.history import Histories, TooMany
 from calib.daemon.web.parameters import (
     LARGEST_ID,
     ApiError,
@@ -29,7 +30,8 @@ REFUSALS: dict[int | str, dict[str, Any]] = {
     408: {"model": ApiError, "description": "The body did not arrive in time"},
     413: {"model": ApiError, "description": "The body is too large"},
     422: {"model": ApiError, "description": "A parameter is not valid"},
-    429: {"model": ApiError, "description": "Too many requests, or too many clients on the stream"},
+    429: {"model": ApiError, "description": "Too many requests, long answers, or clients on the stream"},
+    503: {"model": ApiError, "description": "The journal cannot be read or written now, or too many clients"},
 }
 NO_SUCH: dict[int | str, dict[str, Any]] = {404: {"model": ApiError, "description": "Not found"}}
 NOT_NOW: dict[int | str, dict[str, Any]] = {
@@ -55,8 +57,9 @@ OptionalDecision = Annotated[Decision | None, Body()]
 def api_router(view: DaemonView, streams: Streams, metrics: Callable[[], bytes]) -> APIRouter:
     """Every route of the API on this view."""
     router = APIRouter(responses=REFUSALS)
-    _add_now(router, view)
-    _add_past(router, view)
+    histories = Histories(view)
+    _add_now(router, view, histories)
+    _add_past(router, view, histories)
     _add_proposals(router, view)
 
     @router.get("/api/stream", response_class=Response, responses=STREAM, tags=["now"])
@@ -76,11 +79,7 @@ def api_router(view: DaemonView, streams: Streams, metrics: Callable[[], bytes])
     return router
 
 
-class TooMany(Exception):
-    """No room for another client (HTTP 429)."""
-
-
-def _add_now(router: APIRouter, view: DaemonView) -> None:
+def _add_now(router: APIRouter, view: DaemonView, histories: Histories) -> None:
     @router.get("/api/status", tags=["now"])
     async def status() -> Status:
         """State of daemon and bus, records in force."""
@@ -107,12 +106,16 @@ def _add_now(router: APIRouter, view: DaemonView) -> None:
             estimates=view.estimates(),
             proposals=view.proposals(),
             events=view.events(after=max(0, status.last_event - query.events)),
-            history=view.history(None, since, None, query.limit),
+            history=(),
         )
-        return Response(answer.model_dump_json(), media_type="application/json")
+
+        def encoded() -> str:
+            return answer.model_copy(update={"history": view.history(None, since, None, query.limit)}).model_dump_json()
+
+        return Response(await histories.aside(encoded), media_type="application/json")
 
 
-def _add_past(router: APIRouter, view: DaemonView) -> None:
+def _add_past(router: APIRouter, view: DaemonView, histories: Histories) -> None:
     @router.get("/api/events", tags=["past"])
     async def events(query: Annotated[EventsQuery, Query()]) -> tuple[EventRecord, ...]:
         """Events after an id, oldest first."""
@@ -121,8 +124,7 @@ def _add_past(router: APIRouter, view: DaemonView) -> None:
     @router.get("/api/history", response_model=tuple[HistoryPoint, ...], responses=NO_SUCH, tags=["past"])
     async def history(query: Annotated[HistoryQuery, Query()]) -> Response:
         """Gain and offset over time, oldest first; without a joint, one joint after the other."""
-        points = view.history(query.joint or None, query.since, query.until, query.limit)
-        return Response(_HISTORY.dump_json(points), media_type="application/json")
+        return await histories.answer(query)
 
     @router.get("/api/report", response_class=FileResponse, responses=NO_SUCH | _HTML, tags=["past"])
     async def report() -> FileResponse:
@@ -133,7 +135,6 @@ def _add_past(router: APIRouter, view: DaemonView) -> None:
         return FileResponse(path, media_type="text/html", headers={"content-security-policy": REPORT_CSP})
 
 
-_HISTORY = TypeAdapter(tuple[HistoryPoint, ...])
 _HTML: dict[int | str, dict[str, Any]] = {200: {"content": {"text/html": {}}, "description": "HTML"}}
 
 
@@ -159,5 +160,5 @@ def _who(decision: Decision | None, peer: Peer) -> str:
     return peer.name if decision is None or decision.by is None else f"{decision.by} ({peer.name})"
 
 
-ERRORS: dict[type[Exception], int] = {NoSuch: 404, NotPossible: 409, TooMany: 429}
+ERRORS: dict[type[Exception], int] = {NoSuch: 404, NotPossible: 409, TooMany: 429, sqlite3.Error: 503}
 """HTTP status of what a route may raise."""

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import errno
 import os
+import resource
 import socket as sockets
 import stat
 from collections.abc import Iterator
@@ -13,14 +14,20 @@ import uvicorn
 
 from armlink.errors import BadInput
 from calib.daemon.view.view import DaemonView
+from calib.daemon.web.admission import Admission
 from calib.daemon.web.app import make_app
 from calib.daemon.web.guard import Access, names_of_host
-from calib.daemon.web.peer import BoundedProtocol
+from calib.daemon.web.peer import protocol_of
 
 SOCKET_MODE = 0o660
 """Access for owner and group only."""
 SHORTEST_TOKEN = 16
-MOST_CONNECTIONS = 512
+MOST_CONNECTIONS = 640
+"""More than all that `admission` lets in together."""
+ACCEPTED_AT_ONCE = 32
+"""Connections accepted in one go: those that find no room are closed before the next go."""
+FILES = 4096
+"""Open files that the daemon asks the system for, as far as its hard limit allows."""
 CLOSING_SECONDS = 2
 
 
@@ -96,6 +103,13 @@ def _make_room(path: Path) -> None:
     raise BadInput(f"--socket {path}: another daemon listens there; stop it, or give another path")
 
 
+def _allow_files() -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = FILES if hard == resource.RLIM_INFINITY else min(FILES, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+
+
 def _identity(path: Path) -> tuple[int, int] | None:
     try:
         found = path.lstat()
@@ -114,9 +128,11 @@ class _Server(uvicorn.Server):
 
 async def _run(view: DaemonView, listening: list[sockets.socket], access: Access) -> None:
     app, streams = make_app(view, access)
+    _allow_files()
     config = uvicorn.Config(
         app,
-        http=BoundedProtocol,
+        http=protocol_of(Admission()),
+        backlog=ACCEPTED_AT_ONCE,
         ws="none",
         lifespan="off",
         log_config=None,

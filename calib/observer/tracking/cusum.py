@@ -22,6 +22,7 @@ class Cusum:
         """n joints."""
         self._config = config
         self._sums: Array = np.zeros((n, len(CHANNELS)))
+        self._rising = np.zeros((n, len(CHANNELS)), dtype=int)
 
     def handle(self, residual: Array, torque: Array, variance: Array) -> list[tuple[int, str]]:
         """Update with one row; returns joints and channels in alarm.
@@ -33,20 +34,32 @@ class Cusum:
         change = np.stack([gain, -gain, offset, -offset], axis=1)
         ratio = (change * residual[:, None] - change**2 / 2) / variance[:, None]
         self._sums = np.maximum(0.0, self._sums + ratio)
+        self._rising = np.where(self._sums > 0.0, self._rising + 1, 0)
         return [(int(j), CHANNELS[c]) for j, c in np.argwhere(self._sums > self._config.alarm_threshold)]
 
     def reset(self) -> None:
         """Set every sum to zero."""
-        self._sums = np.zeros_like(self._sums)
+        self._sums, self._rising = np.zeros_like(self._sums), np.zeros_like(self._rising)
+
+    def rising(self, joint: int, channel: str) -> int:
+        """Rows since a channel's sum was last 0, at least 1."""
+        return max(1, int(self._rising[joint, CHANNELS.index(channel)]))
+
+    def drop(self, joint: int, channel: str) -> None:
+        """Set one channel's sum to zero: the model's own error has raised it."""
+        at = joint, CHANNELS.index(channel)
+        self._sums[at], self._rising[at] = 0.0, 0
 
     def save(self) -> dict[str, Any]:
-        """The sums as JSON values."""
-        return {"sums": self._sums.tolist()}
+        """The sums and how long they have been rising, as JSON values."""
+        return {"sums": self._sums.tolist(), "rising": self._rising.tolist()}
 
     def restore(self, values: dict[str, Any]) -> bool:
         """Continue from saved values; False, and nothing changed, if they do not fit."""
         try:
-            self._sums = as_array("sums", values["sums"], self._sums.shape)
+            sums = as_array("sums", values["sums"], self._sums.shape)
+            rising = as_array("rising", values.get("rising", np.zeros_like(sums)), self._sums.shape).astype(int)
         except UNREADABLE:
             return False
+        self._sums, self._rising = sums, rising
         return True

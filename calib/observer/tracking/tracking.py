@@ -1,5 +1,6 @@
 """Tracking of every joint's sensor row by row: noise, filtered gain and offset, change detection."""
 
+from collections import deque
 from copy import copy
 from typing import Any
 
@@ -10,14 +11,20 @@ from calib.observer.cause_test import CauseTest
 from calib.observer.config import ObserverConfig
 from calib.observer.decision import Finding
 from calib.observer.gravity_belief import GravityBelief
-from calib.observer.saved_values import UNREADABLE
+from calib.observer.saved_values import UNREADABLE, read_rows, save_rows
 from calib.observer.tracking.cusum import Cusum
+from calib.observer.tracking.limits import Limits, limits
 from calib.observer.tracking.pose_memory import PoseMemory
 from calib.observer.tracking.sensor_filter import SensorFilter
 from gcomp.arrays import Array, as_array
 
 Alarm = tuple[str, int, dict[str, Any]]
-"""Kind (alarm or outliers), joint, evidence."""
+"""Kind (alarm, suspicion or outliers), joint, evidence."""
+
+
+DOUBT = 4.0
+"""An alarm is one at once if its log-likelihood ratio is this many times larger than needed, where the model's error is
+all there is beside it; else it is first confirmed."""
 
 
 class Tracking:
@@ -32,6 +39,9 @@ class Tracking:
         self.filter = SensorFilter(n, config)
         self._cusum = Cusum(n, config)
         self._poses = PoseMemory(n, config)
+        self._suspected = 0
+        """Rows for which there has been a suspicion: it may yet become an alarm."""
+        self._since: deque[tuple[StaticReading, bool]] = deque(maxlen=config.window)
 
     def count(self, row: StaticReading) -> None:
         """Count a row, and average its measured noise into sigma."""
@@ -44,24 +54,83 @@ class Tracking:
         """Take a row while no alarm is open: update the filter unless the row raises an alarm."""
         q, noise = row.position, self.sigma**2
         torque = self.belief.torque(q[None])[0]
-        of_model = self.belief.torque_variance(q, self._config.position_std)
-        expected, left = self._poses.expected(q, of_model, noise)
-        alarms = self._cusum.handle(row.torque - torque - expected, torque, noise + left)
-        if alarms:
-            return [("alarm", joint, {"channel": channel}) for joint, channel in alarms]
+        expected = self.belief.expected(q[None], row.direction[None])
+        residual, of_model = row.torque - torque - expected.mean[0], expected.variance[0]
+        here, left = self._poses.expected(q, of_model, noise)
+        self._since.append((row, self._poses.seen(q) >= self._config.place_rows))
+        if not self.belief.level.is_known:
+            return []
+        alarms = self._cusum.handle(residual - here, torque, noise + left)
+        if alarms and (told := self._judged(alarms)) is not None:
+            return told
         if self._poses.seen(q) < self._config.place_rows:
-            self.filter.handle(row.torque, torque, noise + of_model)
-        self._poses.add(q, row.torque - torque)
+            self.filter.handle(row.torque - expected.mean[0], torque, noise + of_model)
+        self._poses.add(q, residual)
         most = self._config.outliers_in_a_row
-        return [("outliers", int(joint), {"rows": most}) for joint in np.flatnonzero(self.filter.rejected >= most)]
+        wild = [j for j in np.flatnonzero(self.filter.rejected >= most).tolist() if self._are_outliers(j)]
+        return [("outliers", joint, {"rows": most}) for joint in wild]
+
+    def _judged(self, alarms: list[tuple[int, str]]) -> list[Alarm] | None:
+        """Alarms of the CUSUM to tell now, none while they are open; None if all were the model's error."""
+        found = [(self._seen_as(*alarm), *alarm) for alarm in alarms]
+        for kind, joint, channel in found:
+            if not kind:
+                self._cusum.drop(joint, channel)
+        seen = [(kind, joint, {"channel": channel}) for kind, joint, channel in found if kind]
+        self._suspected = self._suspected + 1 if seen else 0
+        certain = [alarm for alarm in seen if alarm[0] == "alarm"]
+        if certain or self._suspected >= self._config.audit_rows:
+            return certain or seen
+        return [] if seen else None
+
+    def _recent(self, joint: int, count: int) -> tuple[Array, Array, Array]:
+        """Of the last rows (K,): one joint's residual, its model torque, and the covariance (K, K) of the residual."""
+        rows = [row for row, _ in self._since][-count:]
+        position, side = stack(rows, "position"), stack(rows, "direction")
+        torque, expected = self.belief.torque(position), self.belief.expected(position, side)
+        residual = (stack(rows, "torque") - torque - expected.mean)[:, joint]
+        return residual, torque[:, joint], expected.of_joint(joint) + self.sigma[joint] ** 2 * np.eye(len(rows))
+
+    def _are_outliers(self, joint: int) -> bool:
+        """Whether the rejected rows stand out together; the model's own error is alike at poses close to each other."""
+        count = self._config.outliers_in_a_row
+        residual, _, covariance = self._recent(joint, count)
+        outliers = bool(residual @ np.linalg.solve(covariance, residual) > count * self._config.outlier)
+        if not outliers:
+            self.filter.rejected[joint] = 0
+        return outliers
+
+    def _seen_as(self, joint: int, channel: str) -> str:
+        """Whether the rows since a channel began to rise show its change beyond the model's own, correlated error.
+
+        "alarm" if they do without doubt, "suspicion" if other rows must confirm it, "" if they do not.
+        """
+        count = self._cusum.rising(joint, channel)
+        known = [known for _, known in self._since][-count:]
+        if 2 * sum(known) > len(known):
+            return "alarm"  # at places whose error is known
+        residual, torque, covariance = self._recent(joint, count)
+        change = torque if channel.startswith("gain") else np.ones_like(torque)
+        weight = np.linalg.solve(covariance, change)
+        of_model = 1 - self.sigma[joint] ** 2 * len(residual) / float(np.trace(covariance))
+        shown = float((weight @ residual) ** 2 / (weight @ change)) / (2 * self._config.alarm_threshold)
+        if shown <= 1:
+            return ""
+        return "alarm" if shown > 1 + DOUBT * of_model else "suspicion"
 
     def cause_test(self, rows: list[StaticReading]) -> CauseTest:
-        """The cause test of these rows, by the present belief."""
-        return CauseTest(self.belief, batch(rows, self.sigma), self._config)
+        """The cause test of these rows, by the belief from rows before them."""
+        return CauseTest(self.belief.before(rows[0].position), batch(rows, self.sigma), self._config)
 
     def learn(self, rows: list[StaticReading]) -> None:
-        """Adapt the model to rows that are free of drift."""
-        self.belief.learn(stack(rows, "position"), stack(rows, "torque"), self.sigma)
+        """Take rows that are free of drift as reference."""
+        if rows:
+            self.belief.learn(*_arrays(rows), self.sigma)
+            self._poses.forget()
+
+    def adapt(self, rows: list[StaticReading]) -> None:
+        """Adapt the discrepancy's level to rows whose cause nothing explains."""
+        self.belief.adapt(*_arrays(rows), self.sigma)
         self._poses.forget()
 
     def carry(self, values: Array, covariance: Array) -> None:
@@ -73,15 +142,30 @@ class Tracking:
         """The finding was written: its joint is as installed, within the finding's uncertainty."""
         floor = np.diag([self._config.drift_gain**2, self._config.drift_offset**2])
         self.filter.restart(finding.joint, covariance=finding.covariance + floor)
+        self.belief.close()
         self._poses.forget()
 
     def resume(self) -> None:
         """The alarm is closed: change detection starts from zero."""
         self._cusum.reset()
+        self._since.clear()
+        self._suspected = 0
+
+    def limits(self, rows: list[StaticReading]) -> Limits:
+        """Limits in work like these rows; over the whole range while they are few."""
+        config, arm = self._config, self.belief.arm
+        wait = 0 if self.belief.level.is_known else max(0, config.window - self.rows)
+        if len(rows) >= config.window:
+            position, side = stack(rows, "position"), stack(rows, "direction")
+        else:
+            position, side = self.belief.kernel.poses[: config.longest_window], np.zeros((config.longest_window, arm.n))
+        return limits(self.belief, self.sigma, position, side, config, wait)
 
     def save(self) -> dict[str, Any]:
         """All parts as JSON values."""
-        own: dict[str, Any] = {"sigma": self.sigma.tolist(), "rows": self.rows}
+        since = [[*save_rows([row])[0], known] for row, known in self._since]
+        own: dict[str, Any] = {"sigma": self.sigma.tolist(), "rows": self.rows, "since": since}
+        own["suspected_rows"] = self._suspected
         return own | self.belief.save() | self.filter.save() | self._cusum.save() | self._poses.save()
 
     def restore(self, values: dict[str, Any]) -> bool:
@@ -90,11 +174,20 @@ class Tracking:
         cusum, poses = copy(self._cusum), copy(self._poses)
         try:
             sigma, rows = as_array("sigma", values["sigma"], self.sigma.shape), int(values["rows"])
+            saved = values.get("since", [])
+            since = read_rows([row[:4] for row in saved], len(sigma))
+            known, suspected = [bool(row[4]) for row in saved], int(values.get("suspected_rows", 0))
         except UNREADABLE:
             return False
         fits = belief.restore(values) and sensors.restore(values) and cusum.restore(values) and poses.restore(values)
         if not fits:
             return False
-        self.sigma, self.rows = sigma, rows
+        self.sigma, self.rows, self._suspected = sigma, rows, suspected
+        self._since = deque(zip(since, known, strict=True), maxlen=self._since.maxlen)
         self.belief, self.filter, self._cusum, self._poses = belief, sensors, cusum, poses
         return True
+
+
+def _arrays(rows: list[StaticReading]) -> tuple[Array, Array, Array]:
+    """Positions, torques and sides of approach (K, n) of rows."""
+    return stack(rows, "position"), stack(rows, "torque"), stack(rows, "direction")

@@ -85,10 +85,14 @@ def _judged(drawing: Drawing, logs: list[Log], rate: float) -> Judged:
     recorded = [
         _chosen(each, drawing.columns) for each in gaps
     ]  # channels that are not recorded do not make a case clear
-    falls = [largest_fall(recorded[0], less) for less in recorded[1 : 1 + len(drawing.drawn)]]
+    others = recorded[1 : 1 + len(drawing.drawn)]
+    if drawing.recipe.several:  # the others hold one effect each
+        falls = [largest_fall(alone, recorded[-1]) for alone in others]
+    else:
+        falls = [largest_fall(recorded[0], less) for less in others]
     steady = all(_steady(run.command, log) for run, log in zip(runs, logs, strict=True))
     found = {"with": gaps[0], "without": gaps[-1], "falls": falls}
-    return Judged(recordings[0], found, steady and all(visible(fall) for fall in falls))
+    return Judged(recordings[0], found, steady and (bool(drawing.recipe.several) or all(visible(f) for f in falls)))
 
 
 def _steady(command: Array, log: Log) -> bool:
@@ -146,11 +150,13 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--labels", type=Path, required=True)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--effects", default="")
     parser.add_argument("--train-s", type=float, default=TRAIN_S)
     parser.add_argument("--heldout-s", type=float, default=HELDOUT_S)
     given = parser.parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    wanted = recipes(given.seed, given.cases)
+    low, _, high = given.effects.partition("-")
+    wanted = recipes(given.seed, given.cases, (int(low), int(high)) if high else None)
     size = max(1, min(BATCH, -(-len(wanted) // given.workers)))
     with ProcessPoolExecutor(given.workers, mp_context=get_context("spawn")) as pool:
         jobs = [

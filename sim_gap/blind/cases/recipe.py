@@ -19,20 +19,33 @@ ATTEMPTS = 600
 OTHER_PAIR = 20
 """Number of arms drawn for two effects before two others are drawn."""
 NONE_SHARE, TWO_SHARE = 0.12, 0.18
+INDISTINCT = (
+    {"actuator.lag", "actuator.delay"},
+    {"link.payload", "link.mass_moment"},
+    {"link.payload", "link.inertia"},
+    {"link.mass_moment", "link.inertia"},
+    {"transmission.elasticity", "transmission.backlash"},
+    {"position.offset", "base.tilt"},
+    {"position.offset", "position.eccentricity"},
+    {"position.gain", "position.eccentricity"},
+)
+"""Effects not drawn together at one joint (or at the last one and the tip): slow motion cannot separate them."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """One case before it is drawn: its effects by id, none, one or two."""
+    """One case before it is drawn: its effects by id; or the number of effects of a `several` case."""
 
     name: str
     effects: tuple[str, ...]
     seed: tuple[int, int]
+    several: int = 0
+    """Number of effects that are drawn for the arm, whichever it can show; 0 if `effects` names them."""
 
     @property
     def kind(self) -> str:
-        """`none`, `single` or `two`."""
-        return ("none", "single", "two")[len(self.effects)]
+        """`none`, `single`, `two` or `several`."""
+        return "several" if self.several else ("none", "single", "two")[len(self.effects)]
 
 
 @dataclass(frozen=True)
@@ -46,16 +59,23 @@ class Drawing:
     train: Run
     heldout: Run
     without: tuple[Run, ...]
-    """The held-out motion of the same arm without each effect in turn, then without any; one run for one effect."""
+    """The held-out motion of the same arm without each effect in turn (of several: with each alone), then without any;
+    one run for one effect."""
     attempt: int
     """Number of this drawing of the recipe."""
     columns: dict[str, bool]
     """Optional columns: `velocity`, `position_command`, `torque_command`."""
 
 
-def recipes(seed: int, count: int) -> list[Recipe]:
-    """`count` cases: every effect in turn, and among them arms without an effect and with two effects."""
+def recipes(seed: int, count: int, several: tuple[int, int] | None = None) -> list[Recipe]:
+    """`count` cases: every effect in turn, and among them arms without an effect and with two effects.
+
+    With `several`, every case has a number of effects between these two, both included.
+    """
     random = np.random.default_rng([seed, 0])
+    if several:
+        numbers = random.integers(several[0], several[1] + 1, count).tolist()
+        return [Recipe(f"case_{k:04d}", (), (seed, k + 1), number) for k, number in enumerate(numbers)]
     none, two = round(NONE_SHARE * count), round(TWO_SHARE * count)
     order = [*random.permutation(EFFECTS).tolist()]
     singles = [(order[k % len(order)],) for k in range(count - none - two)]
@@ -85,12 +105,43 @@ def draw(recipe: Recipe, train_s: float, heldout_s: float, first: int = 0) -> Dr
         training = tuple(others if random.random() < 0.6 else [str(random.choice(others))])
         training += ("chirp",) * bool(random.random() < 0.5)
         scene = Scene(arm, trajectory(training, train_s, limits, random))
-        drawn = [DRAWS[effect](scene, random) for effect in recipe.effects]
-        if all(drawn) and _compatible([d for d in drawn if d]):
+        drawn = _several(recipe.several, scene, random) if recipe.several else _named(recipe.effects, scene, random)
+        if drawn is not None:
             command = trajectory((held,), heldout_s, limits, random)
             motions = {"train": training, "heldout": (held,)}
-            return _assemble(recipe, scene, tuple(d for d in drawn if d), motions, command, random, attempt)
+            return _assemble(recipe, scene, drawn, motions, command, random, attempt)
     return None
+
+
+def _named(effects: tuple[str, ...], scene: Scene, random: np.random.Generator) -> tuple[Drawn, ...] | None:
+    """These effects on one arm; None if it cannot show one of them or they exclude each other."""
+    drawn = [DRAWS[effect](scene, random) for effect in effects]
+    found = tuple(d for d in drawn if d)
+    return found if len(found) == len(drawn) and (len(found) < 2 or _compatible(*found)) else None
+
+
+def _several(count: int, scene: Scene, random: np.random.Generator) -> tuple[Drawn, ...] | None:
+    """`count` different effects that the arm can show together; None if it cannot show as many."""
+    found: list[Drawn] = []
+    tip = scene.arm.names[-1]
+    for effect in random.permutation(EFFECTS).tolist():
+        drawn = DRAWS[effect](scene, random)
+        if drawn and all(_compatible(drawn, other) and _distinct(drawn, other, tip) for other in found):
+            found.append(drawn)
+        if len(found) == count:
+            return tuple(found)
+    return None
+
+
+def _distinct(first: Drawn, second: Drawn, tip: str) -> bool:
+    """Whether slow motion can separate two effects of one arm: a payload counts as one of the last joint, a tilt as one
+    of any."""
+    if {first.effect, second.effect} not in INDISTINCT:
+        return True
+    if "base.tilt" in (first.effect, second.effect):
+        return False
+    places = [{tip} if each.effect == "link.payload" else set(each.joints) for each in (first, second)]
+    return not places[0] & places[1]
 
 
 def _assemble(
@@ -124,7 +175,8 @@ def _assemble(
     columns = {name: bool(random.random() < share) for name, share in (("velocity", 0.5), ("position_command", 0.8))}
     late = any(effect.startswith("actuator") for effect in recipe.effects)
     columns["torque_command"] = late or bool(random.random() < 0.8)
-    less = [tuple(d for d in drawn if d is not left) for left in drawn] if len(drawn) > 1 else []
+    less = [tuple(d for d in drawn if d is not left) for left in drawn] if len(drawn) == 2 else []
+    less = [(each,) for each in drawn] if recipe.several else less
     without = tuple(run(effects, 1) for effects in (*less, ()))
     return Drawing(recipe, nominal, drawn, motions, run(drawn, 0), run(drawn, 1), without, attempt, columns)
 
@@ -135,11 +187,8 @@ def _limits(arm: Arm, random: np.random.Generator) -> Limits:
     return Limits(arm.lower, arm.upper, velocity, acceleration)
 
 
-def _compatible(drawn: list[Drawn]) -> bool:
+def _compatible(first: Drawn, second: Drawn) -> bool:
     """Whether two effects can be combined: on a common joint, neither may overwrite the other."""
-    if len(drawn) < 2:
-        return True
-    first, second = drawn
     same = set(first.joints) & set(second.joints)
     rewriting = {"transmission.coupling", "friction.stribeck", "friction.asymmetric", "transmission.elasticity"}
     rewriting |= {"transmission.backlash"}

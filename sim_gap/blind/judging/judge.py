@@ -8,6 +8,8 @@ import numpy as np
 
 CONFIDENT = 0.8
 """Confidence above which a cause counts as blamed."""
+DOUBLED = 2.0
+"""Least factor on the sound arm's gap by an effect that has to be named among several."""
 MAIN_SHARE = 0.15
 """Least parameter of a joint that counts to a cause, as a share of the cause's largest."""
 BESIDE_POINT = ("phase", "rest", "source", "other_joint")
@@ -55,6 +57,12 @@ class Judgement:
     """Claimed relative decrease of the held-out gap at the joint concerned."""
     shrink_true: float = float("nan")
     """Relative decrease of the held-out gap by the true effects."""
+    shown: tuple[str, ...] = ()
+    """Of several effects, those that alone at least double the gap of the sound arm somewhere."""
+    placed: tuple[str, ...] = ()
+    """Of these, the ones among the causes, at one of their true joints."""
+    confident: int = 0
+    """Number of causes with a confidence above CONFIDENT."""
 
 
 def judge(answer: Json, label: Json, withheld: str = "") -> Judgement:
@@ -68,6 +76,7 @@ def judge(answer: Json, label: Json, withheld: str = "") -> Judgement:
     offered = {first["effect"], *(first["confounded_with"] or ())} if first else set()
     right, wrong, missed = _joints(causes, truths)
     shrink, shrink_true = _shrinks(answer, label)
+    shown = _shown(label, truths)
     return Judgement(
         case=label["case"],
         kind=label["kind"],
@@ -87,7 +96,25 @@ def judge(answer: Json, label: Json, withheld: str = "") -> Judgement:
         errors=tuple(error for t in truths for error in _parameter_errors(causes, t)),
         shrink=shrink,
         shrink_true=shrink_true,
+        shown=tuple(t["effect"] for t in shown),
+        placed=tuple(t["effect"] for t in shown if _placed(causes, t)),
+        confident=sum(c["confidence"] > CONFIDENT for c in causes),
     )
+
+
+def _shown(label: Json, truths: Sequence[Json]) -> list[Json]:
+    """Of several effects, those that alone at least double the gap of the sound arm somewhere."""
+    if label["kind"] != "several":
+        return []
+    falls = zip(label["effects"], label["gap"]["falls"], strict=True)
+    clear = [t["effect"] for t, fall in falls if fall["before"] > DOUBLED * fall["after"]]
+    return [t for t in truths if t["effect"] in clear]
+
+
+def _placed(causes: Sequence[Json], truth: Json) -> bool:
+    """Whether the causes name a true effect at one of its joints."""
+    named = [c for c in causes if c["effect"] == truth["effect"]]
+    return any(not truth["joints"] or set(truth["joints"]) & set(c["joints"]) for c in named)
 
 
 def _blamed(causes: Sequence[Json], label: Json, withheld: str) -> tuple[str, ...]:

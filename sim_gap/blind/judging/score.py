@@ -60,6 +60,7 @@ def label_withheld(judged: Sequence[Judgement]) -> dict[str, Any]:
         "extra_confident": _share([bool(j.blamed) for j in some]),
         "joints": {"precision": precision, "recall": recall, "f1": _f1(precision, recall)},
         "no_effect": {"cases": len(none), "false_alarms": _share([j.verdict != "no_gap" for j in none])},
+        "several": several([j for j in judged if j.kind == "several"]),
         "two": {"cases": len(two), "both_found": _share([set(j.found) == set(j.truth) for j in two])},
         "parameters": {
             "count": len(errors),
@@ -72,6 +73,18 @@ def label_withheld(judged: Sequence[Judgement]) -> dict[str, Any]:
             "at_least_0.95": _share((ratios >= 0.95).tolist()),
         },
         "verdicts": dict(Counter(j.verdict for j in judged)),
+    }
+
+
+def several(judged: Sequence[Judgement]) -> dict[str, Any]:
+    """Shares over the cases with many effects: true effects named, confident causes that are false."""
+    shown, placed = (sum(len(getattr(j, name)) for j in judged) for name in ("shown", "placed"))
+    return {
+        "cases": len(judged),
+        "effects": shown,
+        "named": _ratio(placed, shown),
+        "false_confident": _ratio(sum(len(j.blamed) for j in judged), sum(j.confident for j in judged)),
+        "explained": _share([j.verdict == "explained" for j in judged]),
     }
 
 
@@ -90,7 +103,7 @@ def confusion(judged: Sequence[Judgement]) -> dict[str, dict[str, int]]:
     """Counts of single-effect and no-effect cases: true effect (or `none`) by effect named first (or verdict)."""
     table: dict[str, Counter[str]] = defaultdict(Counter)
     for j in judged:
-        if j.kind != "two":
+        if j.kind in ("none", "single"):
             table[j.truth[0] if j.truth else "none"][j.first or j.verdict] += 1
     return {true: dict(table[true].most_common()) for true in sorted(table)}
 

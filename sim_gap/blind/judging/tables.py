@@ -14,8 +14,11 @@ ROWS = (
     ("joints: F1", "label_withheld", "joints", "f1"),
     ("no effect: false alarms", "label_withheld", "no_effect", "false_alarms"),
     ("two effects: both found", "label_withheld", "two", "both_found"),
+    ("many effects: true ones named", "label_withheld", "several", "named"),
+    ("many effects: false among the causes claimed with confidence", "label_withheld", "several", "false_confident"),
     ("parameters: median error", "label_withheld", "parameters", "median_error"),
     ("parameters: within 10 %", "label_withheld", "parameters", "within_10_percent"),
+    ("parameters: 95 % intervals that hold", "label_withheld", "parameters", "inside_ci95"),
     ("decrease of the gap relative to the true effect's: median", "label_withheld", "shrink", "median_ratio"),
     ("effect withheld: a wrong one blamed", "effect_withheld", "false_blame"),
 )

@@ -22,7 +22,7 @@ class StandingStill(EchoPort):
     """Between two lines the process stands still, once, and the joints stop by themselves meanwhile."""
 
     def __init__(self, clock: FakeClock) -> None:
-        super().__init__()
+        super().__init__(load_arm("sarcos"))
         self.clock, self.still, self.place = clock, 0.0, ""
 
     def stand_still(self, place: str) -> None:
@@ -50,7 +50,7 @@ def test_it_is_the_host_wherever_it_stands_still(place: str, still: float) -> No
     port = StandingStill(clock)
     commander = echo_commander(load_arm("sarcos"), port, clock)
     commander.max_age = DEADLINE
-    hold = Command.hold(np.zeros(N))
+    hold = Command.hold(port.standing)
     for _ in range(3):
         commander.stand([Power.OFF] * N)
     for _ in range(50):
@@ -73,7 +73,7 @@ def test_a_short_stop_is_bridged(place: str) -> None:
     port = StandingStill(clock)
     commander = echo_commander(load_arm("sarcos"), port, clock)
     commander.max_age = DEADLINE
-    hold = Command.hold(np.zeros(N))
+    hold = Command.hold(port.standing)
     for _ in range(3):
         commander.stand([Power.OFF] * N)
     for k in range(50):

@@ -171,3 +171,41 @@ def test_a_disk_that_is_full_at_the_start_is_said_and_the_start_is_kept_later(
     daemon.run(3)
     assert daemon.view.status().detail == ""
     assert daemon.view.events()[0].kind == "started"
+
+
+def damage(path: Path) -> None:
+    """As a disk does that returns other pages than were written."""
+    with path.open("r+b") as file:
+        file.seek(4096)
+        file.write(b"\xa5" * 4096 * 6)
+
+
+def test_a_damaged_journal_is_set_aside_and_that_is_said(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon.run(30)
+    daemon.service.close("end")
+    journal = tmp_path / "state" / "journal.db"
+    damage(journal)
+    daemon.start()
+    daemon.run(10)
+    (event,) = daemon.of_kind("fault")
+    (aside,) = journal.parent.glob("journal.db.damaged-*")
+    assert event.text == f"the journal was damaged: it is kept as {aside.name}, and a new one was begun"
+    assert daemon.view.status().detail == ""
+    assert daemon.view.status().state is State.OBSERVING
+
+
+def test_a_journal_that_is_damaged_under_way_is_set_aside_too(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon.run(10)
+    daemon.service.journal.failed(sqlite3.DatabaseError("database disk image is malformed"))
+    daemon.run(5)
+    assert [event.text.partition(":")[0] for event in daemon.of_kind("fault")] == ["the journal was damaged"]
+    assert daemon.view.status().detail == ""
+
+
+def test_a_journal_that_is_no_database_is_set_aside(tmp_path: Path) -> None:
+    (tmp_path / "journal.db").write_bytes(b"no database at all" * 1000)
+    journal = Journal(tmp_path / "journal.db", lambda: 0.0)
+    assert journal.set_aside.startswith("journal.db.damaged-")
+    assert journal.events() == []

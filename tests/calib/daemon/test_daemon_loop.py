@@ -65,6 +65,29 @@ def test_a_fault_of_a_joint_is_a_message_and_the_bus_is_opened_again(tmp_path: P
     assert bench.view.status().state is State.OBSERVING
 
 
+def test_through_a_fault_no_other_program_may_take_the_arm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from calib.daemon.loop import arm_loop
+
+    holds = []
+
+    class Hold:
+        def __init__(self, bus: object, nodes: object) -> None:
+            holds.append(self)
+
+        def release(self) -> None:
+            holds.remove(self)
+
+    monkeypatch.setattr(arm_loop, "ArmHold", Hold)
+    bench = DaemonBench(tmp_path, settings=settings("observe"), work=False)
+    bench.run(0.5)
+    bench.host.loop.source.stop()
+    bench.host.loop.run()
+    assert bench.host.loop.source is None
+    assert len(holds) == 1
+    bench.run(0.5)
+    assert len(holds) == 1
+
+
 def test_errors_of_the_bus_loop_come_back_as_what_they_are(tmp_path: Path) -> None:
     bench = DaemonBench(tmp_path, settings=settings("observe"), work=False)
     with pytest.raises(BadInput, match="gain 9"):

@@ -17,10 +17,11 @@ from fast_daemon import QUIET, FastDaemon
 from armlink.arm_file import load_arm
 from armlink.errors import BadInput
 from armlink.recording.files import load_recording
-from calib.daemon.logs import JsonFormatter
+from calib.daemon.logs import JsonFormatter, LineLimit
 from calib.daemon.loop.loop_messages import Down, Up
 from calib.daemon.notify import Notifier, watchdog_seconds
 from calib.daemon.settings import DaemonSection
+from calib.daemon.state.history_reader import HistoryReader
 from calib.daemon.state.journal import Journal
 from calib.daemon.view.api_models import State
 from calib.daemon.view.view import NoSuch, NotPossible
@@ -418,7 +419,8 @@ def test_history_older_than_a_month_is_thinned_the_rest_stays_whole(tmp_path: Pa
     for minute in range(100):
         journal.add_history(old + timedelta(minutes=minute), 60.0 * minute, None, {"gain": []})
     daemon.run(400)
-    times = [point[0] for point in journal.history(None, None, 1000)]
+    reader = HistoryReader(journal.path)
+    times = [point[0] for page in reader.pages(reader.chosen(None, None, 1000)) for point in page]
     assert sum(time < daemon.wall() - timedelta(days=30) for time in times) == 10
     assert len(daemon.view.history("joint_3")) >= 6
 
@@ -468,6 +470,17 @@ def test_a_log_line_is_one_json_object() -> None:
     assert "\n" not in line
     assert json.loads(line)["joint"] == "joint_1"
     assert json.loads(line)["message"] == "a\nb"
+
+
+def test_a_flood_of_log_lines_is_cut_and_counted() -> None:
+    limit, lines = LineLimit(burst=3, per_second=1), []
+    for second in (0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0):
+        record = logging.makeLogRecord({"name": "uvicorn", "levelname": "WARNING", "msg": "again", "created": second})
+        if limit.filter(record):
+            lines.append(getattr(record, "left_out", 0))
+    assert lines == [0, 0, 0, 2]
+    other = logging.makeLogRecord({"name": "armlink.daemon", "msg": "important", "created": 1.0})
+    assert limit.filter(other)
 
 
 async def _first(client: object) -> object:

@@ -3,6 +3,7 @@
 import asyncio
 import os
 import socket
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,10 @@ import pytest
 import yaml
 
 from armlink.arm_file import bundled_arms, load_arm
+from armlink.loop.messages import Alive
 from calib.daemon import main_loop
-from calib.daemon.main_loop import Daemon
+from calib.daemon.loop.loop_messages import Message
+from calib.daemon.main_loop import BEGIN_SECONDS, SILENT_SECONDS, Daemon
 from calib.daemon.options import Options
 
 
@@ -21,10 +24,16 @@ class NoProcess:
 
     def __init__(self, options: Any = None) -> None:
         self.options, self.closed = options, False
+        self.waiting: list[Message] = []
+        self.pumped = 0
         self._ends = os.pipe()
 
     def fileno(self) -> int:
         return self._ends[0]
+
+    def pump(self) -> list[Message]:
+        self.pumped += 1
+        return self.waiting
 
     def close(self) -> None:
         self.closed = True
@@ -165,3 +174,39 @@ def test_systemd_is_told_of_the_end_of_a_reload_whatever_happens(
         with_daemon(tmp_path, monkeypatch, act)
         assert receiver.recv(200).startswith(b"RELOADING=1\n")
         assert receiver.recv(200) == b"READY=1"
+
+
+@pytest.mark.parametrize(("waiting", "stood_still"), [([Alive()], 0.0), ([], 20.0)])
+def test_a_service_that_stood_still_does_not_judge_its_bus_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, waiting: list[Message], stood_still: float
+) -> None:
+    def act(running: Running) -> None:
+        daemon, now = running.daemon, time.monotonic()
+        running.process.waiting, daemon._heard = waiting, now - SILENT_SECONDS - 5.0
+        daemon._judge(now, stood_still)
+        assert not running.process.closed
+
+    with_daemon(tmp_path, monkeypatch, act)
+
+
+def test_a_bus_process_that_hangs_is_replaced_and_again_where_there_is_no_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def act(running: Running) -> None:
+        daemon = running.daemon
+
+        def none_left(options: object) -> None:
+            raise BlockingIOError("Resource temporarily unavailable")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(main_loop, "LoopProcess", none_left)
+            daemon._heard = time.monotonic() - SILENT_SECONDS - 5.0
+            daemon._judge(time.monotonic(), 0.0)
+            assert running.process.closed
+            assert not running.started
+        daemon._judge(time.monotonic() + SILENT_SECONDS, 0.0)
+        assert len(running.started) == 1
+        daemon._judge(time.monotonic() + BEGIN_SECONDS, 0.0)
+        assert len(running.started) == 1
+
+    with_daemon(tmp_path, monkeypatch, act)

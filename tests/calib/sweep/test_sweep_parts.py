@@ -141,6 +141,14 @@ def test_a_data_set_whose_beginning_was_cut_off_can_be_begun_again(tmp_path: Pat
     assert load_data(tmp_path).readings == ()
 
 
+def test_a_data_set_that_another_process_writes_is_not_resumed(tmp_path: Path) -> None:
+    arm = random_arm(1, 3)
+    says = r"set: in use by .*\(process \d+\): stop that, or choose another"
+    with DataWriter(tmp_path / "set", Manifest.of(arm, 0.0)), pytest.raises(BadInput, match=says):
+        DataWriter(tmp_path / "set", Manifest.of(arm, 0.0), resume=True)
+    DataWriter(tmp_path / "set", Manifest.of(arm, 0.0), resume=True).__exit__()
+
+
 def test_unsettled_readings_are_told_with_their_sweeps() -> None:
     arm = random_arm(1, 3)
     data = synthetic_pass(arm, Truth.of(arm), plan_sweep(arm), 0.0, np.random.default_rng(0))

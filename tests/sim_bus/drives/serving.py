@@ -43,11 +43,11 @@ def pendulum(drive: dict[str, Any], **link: Any) -> ArmFile:
 class Served:
     """The arm in its thread; `drive` is the simulated drive."""
 
-    def __init__(self, arm: ArmFile, fd: bool) -> None:
+    def __init__(self, arm: ArmFile, fd: bool, bus: Bus | None = None) -> None:
         self.channel, self.fd = f"drives-{next(CHANNELS)}", fd
         self.arm = SimulatedArm(arm, Truth.of(arm))
         self.drive = self.arm.device(0)
-        self._bus = open_bus(None, Bus(interface="virtual", channel=self.channel, fd=fd))
+        self._bus = open_bus(None, bus or Bus(interface="virtual", channel=self.channel, fd=fd))
         self._server = Server(self.arm, self._bus)
         self._jobs: queue.Queue[Callable[[], None]] = queue.Queue()
         self._ends = threading.Event()
@@ -83,9 +83,9 @@ class Served:
 
 
 @contextmanager
-def served(drive: dict[str, Any], fd: bool = False) -> Iterator[Served]:
-    bus = {"bus": {"interface": "virtual", "fd": fd}}
-    served = Served(pendulum(drive, **bus), fd)
+def served(drive: dict[str, Any], fd: bool = False, bus: Bus | None = None, **link: Any) -> Iterator[Served]:
+    """By default on a virtual bus of its own; `link` are further keys of the arm file."""
+    served = Served(pendulum(drive, bus={"interface": "virtual", "fd": fd}, **link), fd, bus)
     try:
         yield served
     finally:

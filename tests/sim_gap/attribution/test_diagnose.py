@@ -10,7 +10,7 @@ from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.search.model_selection import one_each
-from sim_gap.search.normal_equations import Term
+from sim_gap.search.term import Term
 
 BOTH, MOTOR = ("tau", "tau_motor"), ("tau_motor",)
 
@@ -117,7 +117,7 @@ def test_without_other_motion_the_end_of_the_recording_is_kept_for_judging():
 
 def test_the_json_has_the_documented_keys():
     answer = diagnosed(Wrong(coulomb=at(1, 0.8))).to_json()
-    assert answer["schema"] == "armlink.gap/1"
+    assert answer["schema"] == "armlink.gap/2"
     assert set(answer) >= {"verdict", "where", "causes", "gap", "rollout", "unexplained"}
     assert set(answer["where"][0]) == {"joint", "channel", "regime", "rms", "noise", "share"}
     cause = answer["causes"][0]
@@ -127,6 +127,10 @@ def test_the_json_has_the_documented_keys():
     assert torque["ci95"][0] < torque["value"] < torque["ci95"][1]
     assert torque["unit"] == "N·m"
     assert len(answer["gap"]["heldout"]["after"]) == 3
+    assert set(answer["rollout"]) == {"unit", "horizon_s", "closed_loop", "before", "after", "effects"}
+    (alone,) = answer["rollout"]["effects"]
+    assert (alone["effect"], alone["joints"]) == ("friction.coulomb", ["joint_2"])
+    assert alone["alone"][1] < 0.3 * alone["without"][1]
     assert answer["rollout"]["after"][1] < 0.3 * answer["rollout"]["before"][1]
     assert answer["where"][0]["joint"] == "joint_2"
     assert answer["where"][0]["regime"] == "velocity"

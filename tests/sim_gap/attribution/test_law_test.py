@@ -12,7 +12,8 @@ from sim_gap.model.load import load_model
 from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import prepare
 from sim_gap.residuals.residual_set import ResidualSet
-from sim_gap.search.normal_equations import ColumnStore, Term
+from sim_gap.search.column_store import ColumnStore
+from sim_gap.search.term import Term
 
 
 def law_test(wrong: Wrong, *active: Term) -> LawTest:

@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 from sim_gap.attribution.rivals import Rivals
-from sim_gap.search.normal_equations import Term
+from sim_gap.search.term import Term
 
 LAG, DELAY = Term("actuator.lag", 0, (0.01,)), Term("actuator.delay", 0, (0.01,))
 CLIPS = [Term("actuator.saturation", joint, (5.0,)) for joint in range(6)]

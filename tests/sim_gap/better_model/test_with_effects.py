@@ -77,3 +77,13 @@ def test_an_arm_files_model_can_be_written_too(tmp_path):
     assert same.arm.torque(q, v, a) == pytest.approx(
         nominal.arm.torque(q, v, a), rel=1e-4, abs=1e-4
     )  # six digits are written
+
+
+def test_a_joint_s_name_does_not_end_a_comment():
+    from xml.etree import ElementTree
+
+    from sim_gap.better_model.export import xml_comment
+
+    comment = xml_comment(["first", "friction of a--->--><body/>: 3", "--"])
+    assert [child.tag for child in ElementTree.fromstring(f"<mujoco>{comment}</mujoco>")] == []
+    assert comment.startswith("<!-- first\n  friction of a- - ->")

@@ -8,6 +8,7 @@ import pytest
 
 from armlink.errors import BadInput, Refused
 from sim_gap.blind.bench import _answers, run_bench
+from sim_gap.blind.cases.recipe import draw, recipes
 from sim_gap.blind.cases.seal import MANIFEST, open_labels, seal, verify, write_answer
 from sim_gap.blind.judging.judge import judge
 from sim_gap.blind.judging.score import answer_name, score
@@ -234,3 +235,18 @@ def test_bench_runs_from_cases_to_score(tmp_path: Path) -> None:
     assert len(result["sealed"]) == 64
     with pytest.raises(BadInput, match="earlier check"):
         run_bench(diagnose, tmp_path / "bench", cases=1)
+
+
+def test_many_effects_at_once_are_different_and_can_be_told_apart():
+    wanted = recipes(5, 3, (5, 8))
+    assert all(recipe.kind == "several" and 5 <= recipe.several <= 8 for recipe in wanted)
+    drawing = draw(wanted[0], 60.0, 20.0)
+    assert drawing is not None
+    effects = [each.effect for each in drawing.drawn]
+    assert len(effects) == len(set(effects)) == wanted[0].several
+    assert len(drawing.without) == len(effects) + 1
+
+
+def test_a_number_of_effects_that_no_arm_has_is_refused(tmp_path):
+    with pytest.raises(BadInput, match="5-8"):
+        run_bench(lambda *_: {}, tmp_path, effects="8-5")

@@ -103,7 +103,7 @@ def test_json_on_standard_output_is_nothing_but_json(tmp_path, capsys):
     paths = {name: str(tmp_path / name) for name in ("arm.xml", "a.csv", "report.html", "out.xml")}
     options = ["--json", "-", "--report", paths["report.html"], "--out-model", paths["out.xml"]]
     assert run(["gap", "diagnose", "--sim", paths["arm.xml"], "--train", paths["a.csv"], *options]) == 0
-    assert json.loads(capsys.readouterr().out)["schema"] == "armlink.gap/1"
+    assert json.loads(capsys.readouterr().out)["schema"] == "armlink.gap/2"
     page = (tmp_path / "report.html").read_text()
     assert "friction.coulomb" in page
     assert 'src="http' not in page

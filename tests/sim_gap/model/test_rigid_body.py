@@ -6,7 +6,7 @@ import pytest
 from wrong_arms import THREE
 
 from armlink.errors import BadInput
-from sim_gap.effects.link import moment_to_inertia
+from sim_gap.effects.inertials import moment_to_inertia
 from sim_gap.model.load import load_model, rigid_arm
 from sim_gap.model.rigid_body import RigidArm
 
@@ -68,7 +68,7 @@ def test_regressor_columns_are_finite_differences_of_mujocos_torque():
         slope = (inverse(model, q, v, a) - before) / (mass * shift)
         model.body_ipos[link + 1] = centre
         own = columns[:, :, link]
-        moved = own[..., 1:4] + own[..., 4:] @ moment_to_inertia(arm.inertial[link])
+        moved = own[..., 1:4] + own[..., 4:] @ moment_to_inertia(arm.inertial[link, 1:4] / arm.inertial[link, 0])
         np.testing.assert_allclose(slope, moved[..., 1], atol=1e-4)
 
 

@@ -20,7 +20,7 @@ function row(name) {
   }
   cells.fill = make("i");
   line.append(make("td", { className: "bar-cell" }, make("span", { className: "bar" }, cells.fill)));
-  for (const [kind, label] of [["gain", "Gain change [%, 95 %]"], ["offset", "Offset [N·m, 95 %]"]]) {
+  for (const [kind, label] of [["gain", "Gain change [%, 95 %]"], ["offset", "Offset [N·m, 95 %]"], ["limit", "Noticed from [%, N·m]"]]) {
     cells[kind] = cell(kind);
     cells[kind].dataset.label = label;
     line.append(cells[kind]);
@@ -37,7 +37,9 @@ function nice(largest) {
   return [1, 2, 5, 10].map((step) => step * ten).find((value) => value >= largest);
 }
 
-export function showJoints(joints) {
+export function showJoints(joints, moving = false) {
+  by("joints").classList.toggle("moving", moving);
+  put(by("moving"), moving ? "The arm moves: residuals count again at rest." : "");
   const largest = Math.max(...joints.map((joint) => Math.abs(joint.residual ?? 0)), 0.1);
   scale = largest > scale || largest < scale / 4 ? nice(largest) : scale;
   put(by("bar-scale"), `±${scale} N·m`);
@@ -75,7 +77,11 @@ export function showEstimates(estimates) {
     const { line, cells } = row(one.joint);
     interval(cells.gain, 100 * (one.gain - 1), 100 * one.gain_std, 2, gainIsOff(one));
     interval(cells.offset, one.offset, one.offset_std, 3, offsetIsOff(one));
+    const gain = one.gain_limit === null ? MISSING : number(100 * one.gain_limit, 2);
+    put(cells.limit, `${gain}, ${number(one.offset_limit, 3)}`);
     line.classList.toggle("drifting", gainIsOff(one) || offsetIsOff(one));
     line.title = `${one.samples} rests used`;
   }
+  const rests = estimates[0]?.limit_rests ?? null;
+  put(by("limit-rests"), rests === null ? "" : ` Changes from the size in “noticed from” are found within ${rests} rests, larger ones sooner.`);
 }

@@ -170,6 +170,9 @@ class MadeUpView:
         points = [p for p in points if (since is None or p.time >= since) and (until is None or p.time <= until)]
         return tuple(points[:: max(1, math.ceil(len(points) / most))])
 
+    def history_pages(self, *query):
+        yield self.history(*query)
+
     def proposals(self, limit: int = 200) -> tuple[Proposal, ...]:
         return tuple(self.offered[:limit])
 

@@ -1,0 +1,68 @@
+"""Answers that are long: read in a thread of their own, sent page by page as the client takes them."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+from fastapi.responses import StreamingResponse
+from pydantic import TypeAdapter
+
+from calib.daemon.view.api_models import HistoryPoint
+from calib.daemon.view.view import DaemonView
+from calib.daemon.web.parameters import HistoryQuery
+
+MOST_ANSWERS = 16
+"""Long answers under way; each has one page in memory."""
+_POINTS = TypeAdapter(tuple[HistoryPoint, ...])
+T = TypeVar("T")
+
+
+class TooMany(Exception):
+    """No room for another client (HTTP 429)."""
+
+
+class Histories:
+    """GET /api/history, and whatever else reads the history."""
+
+    def __init__(self, view: DaemonView) -> None:
+        self._view, self._under_way = view, 0
+        self._thread = ThreadPoolExecutor(1, "history")
+
+    async def aside(self, work: Callable[[], T]) -> T:
+        """The value of `work`, which reads history, from the thread; raises TooMany and what `work` raises."""
+        self._enter()
+        try:
+            return await asyncio.get_running_loop().run_in_executor(self._thread, work)
+        finally:
+            self._under_way -= 1
+
+    async def answer(self, query: HistoryQuery) -> StreamingResponse:
+        """The points that a query asks for; raises NoSuch, TooMany."""
+        pages = self._view.history_pages(query.joint or None, query.since, query.until, query.limit)
+        first = await self.aside(lambda: _encoded(pages))
+        return StreamingResponse(self._body(first, pages), media_type="application/json")
+
+    async def _body(self, page: bytes | None, pages: Iterator[tuple[HistoryPoint, ...]]) -> AsyncIterator[bytes]:
+        self._under_way += 1
+        try:
+            separator = b"["
+            while page is not None:
+                if page:
+                    yield separator + page
+                    separator = b","
+                page = await asyncio.get_running_loop().run_in_executor(self._thread, _encoded, pages)
+            yield b"[]" if separator == b"[" else b"]"
+        finally:
+            self._under_way -= 1
+
+    def _enter(self) -> None:
+        if self._under_way >= MOST_ANSWERS:
+            raise TooMany(f"{self._under_way} long answers are under way already: ask again in a moment")
+        self._under_way += 1
+
+
+def _encoded(pages: Iterator[tuple[HistoryPoint, ...]]) -> bytes | None:
+    """The next page as JSON without its brackets; None at the end."""
+    page = next(pages, None)
+    return None if page is None else _POINTS.dump_json(page)[1:-1]

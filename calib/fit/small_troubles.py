@@ -1,0 +1,169 @@
+"""Small troubles of a real arm as columns: what each would change in the torque readings (docs/theory.md, 4.6).
+
+A family is one kind of trouble; its coefficients on all joints are drawn from one normal distribution of unknown
+level. Units are chosen so that a level of 1 is what good arms have.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from calib.fit.position_field import PositionField
+from calib.fit.sweep_readings import SweepReadings
+from gcomp.arm.arm import Arm, bar_frames
+from gcomp.arrays import Array, Mask
+from gcomp.gravity.torque import composite_moments
+from gcomp.identify.parameters import Parameters
+from gcomp.identify.sensor_model import joint_positions, row_moments
+
+UNITS = {
+    "axes": (1e-3, "rad"),
+    "eccentricity": (3e-4, "rad"),
+    "sag": (3e-4, "rad at rated torque"),
+    "crosstalk": (2.5e-3, "1"),
+    "nonlinear": (2.5e-4, "at rated torque"),
+    "spring": (1.5e-3, "of rated torque per rad"),
+    "direction": (5e-4, "of rated torque"),
+    "drift": (1e-3, "of rated torque"),
+    "field": (1e-3, "of rated torque"),
+}
+"""Families with the size of a coefficient of 1; what good arms have (sim_bus.effects.realism has the sources)."""
+FAMILIES = tuple(UNITS)
+BASE = 2.0
+"""Tilt of the base over the tilt of one axis against the next."""
+REST = 0.2
+"""Where a cable is at rest: standard deviation from the middle of the range [rad]."""
+HELD = 0.8
+"""Standard deviation, in levels of `direction`, of what a sensor and a cable lag while their joint is held: anywhere
+between both sides, each of them (twice 0.58²)."""
+WAVES = 5
+"""Terms of the drift in time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Troubles:
+    """Columns of P readings for m coefficients."""
+
+    columns: Array
+    """Change of each reading per coefficient, in units of the family (P, m) [N·m]."""
+    family: npt.NDArray[np.int64]
+    """Index in FAMILIES of each coefficient (m,)."""
+    joint: npt.NDArray[np.int64]
+    """Joint that each coefficient belongs to (m,)."""
+    label: tuple[str, ...]
+    """Neighbouring joint, axis or term of each coefficient (m,); for people."""
+    kept: Mask
+    """Which of all columns these are: those that change some reading."""
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """What the columns need beside the readings."""
+
+    arm: Arm
+    rated: Array
+    """Rated torques (n,) [N·m]."""
+    fields: tuple[PositionField, ...]
+    """One a joint."""
+    span: tuple[float, float]
+    """First and last time of the readings [s]."""
+
+
+def troubles(setting: Setting, rows: SweepReadings, parameters: Parameters, keep: Mask | None = None) -> Troubles:
+    """All small troubles at the counted readings of `rows`, linearised at parameters.
+
+    `keep` chooses columns; default: those that change some reading.
+    """
+    counted = rows.readings.counted
+    found = [_one_column(counted, *each) for each in _dense(setting, rows, parameters)]
+    for joint, field in enumerate(setting.fields):
+        here = counted[:, joint]
+        values = np.zeros((*counted.shape, field.root.shape[0]))
+        values[here, joint] = setting.rated[joint] * field.columns(rows.readings.position[here])
+        found += [("field", joint, f"{k}", column) for k, column in enumerate(values[counted].T * UNITS["field"][0])]
+    if keep is None:
+        keep = np.array([np.abs(each[3]).max(initial=0.0) > 0 for each in found])
+    kept = [each for each, wanted in zip(found, keep, strict=True) if wanted]
+    return Troubles(
+        np.column_stack([np.zeros((int(counted.sum()), 0)), *(each[3] for each in kept)]),
+        np.array([FAMILIES.index(each[0]) for each in kept], dtype=np.int64),
+        np.array([each[1] for each in kept], dtype=np.int64),
+        tuple(each[2] for each in kept),
+        keep,
+    )
+
+
+def _one_column(counted: Mask, family: str, joint: int, label: str, values: Array) -> tuple[str, int, str, Array]:
+    return family, joint, label, values[counted] * UNITS[family][0]
+
+
+def _dense(setting: Setting, rows: SweepReadings, parameters: Parameters) -> Iterator[tuple[str, int, str, Array]]:
+    """(Family, joint, label, change of all readings (K, n) per unit) of every named trouble."""
+    arm, readings, rated = setting.arm, rows.readings, setting.rated
+    n, gain = arm.n, parameters.gain
+    frames = bar_frames(arm, joint_positions(parameters, readings))
+    composite = composite_moments(frames.rotation, row_moments(arm, parameters, readings.load))
+    torque = np.einsum("kid,kid->ki", frames.lever, composite)
+    felt = np.where(np.isnan(rows.felt), torque, (rows.felt - parameters.offset) / gain)
+    turned = np.cross(frames.rotation[..., 2], composite)
+
+    def turn(joint: int, axis: Array) -> Array:
+        """Change of true torque as all from a joint on turns about an axis (K, 3) [N·m/rad]."""
+        beyond = np.einsum("kd,kid->ki", np.cross(axis, arm.gravity), turned)
+        before = np.einsum("kid,kd->ki", frames.lever, np.cross(axis, composite[:, joint]))
+        change: Array = np.where(np.arange(n) >= joint, beyond, before)
+        return change
+
+    for joint in range(n):
+        for label, axis in zip("xy", _crossing(arm, frames.rotation, joint), strict=True):
+            yield "axes", joint, label, gain * turn(joint, axis) * (BASE if joint == 0 else 1.0)
+        stiffness = gain * turn(joint, frames.rotation[:, joint, :, 2])
+        angle = readings.position[:, joint]
+        yield "eccentricity", joint, "sin", stiffness * np.sin(angle)[:, None]
+        yield "eccentricity", joint, "cos", stiffness * np.cos(angle)[:, None]
+        yield "sag", joint, "", stiffness * felt[:, joint, None] / rated[joint]
+        if joint < n - 1:
+            for across in range(3):  # a length: where the load hangs beyond this link
+                shift = np.einsum("kid,kd->ki", frames.lever, frames.rotation[:, joint, :, across])
+                reach = np.where(np.arange(n) <= joint, shift, 0.0) * readings.load[:, None]
+                yield "axes", joint, f"length {'xyz'[across]}", gain * reach
+    own, bare = np.eye(n), np.ones((len(torque), 1))
+    middle = (arm.lower + arm.upper) / 2
+    since = _waves(rows.time, setting.span)
+    for joint, here in enumerate(own):
+        for other in {joint - 1, joint + 1} & set(range(n)):
+            yield "crosstalk", joint, arm.names[other], here * gain[joint] * felt[:, other, None]
+        share = torque[:, joint, None] / rated[joint]
+        yield "nonlinear", joint, "", here * gain[joint] * rated[joint] * share**3
+        for other in {joint - 1, joint, joint + 1} & set(range(n)):
+            bent = readings.position[:, other, None] - middle[other]
+            yield "spring", joint, arm.names[other], here * gain[joint] * rated[joint] * bent
+        yield "spring", joint, "rest", here * gain[joint] * rated[joint] * REST * bare
+        side = np.where(rows.swept == joint, readings.direction[:, joint], 0.0)[:, None]
+        rising = np.sign(np.einsum("kd,kd->k", turned[:, joint], frames.lever[:, joint]))[:, None]
+        yield "direction", joint, "position", here * rated[joint] * side
+        yield "direction", joint, "torque", here * rated[joint] * side * rising
+        share = (readings.position[:, joint] - middle[joint])[:, None] / ((arm.upper - arm.lower)[joint] / 2)
+        for bend in (share, 1.5 * share**2 - 0.5, 2.5 * share**3 - 1.5 * share):
+            yield "direction", joint, "bend", here * rated[joint] * side * bend
+        for number, wave in enumerate(since):
+            yield "drift", joint, f"{number}", here * gain[joint] * rated[joint] * wave[:, None]
+
+
+def _crossing(arm: Arm, rotation: Array, joint: int) -> tuple[Array, Array]:
+    """Two axes (K, 3) across a joint's, fixed to the link before it."""
+    if joint == 0:
+        fixed = np.broadcast_to(np.eye(3), (len(rotation), 3, 3))
+        return fixed[..., 0], fixed[..., 1]
+    before, twist = rotation[:, joint - 1], arm.alpha[joint - 1]
+    return before[..., 0], np.cos(twist) * before[..., 1] + np.sin(twist) * before[..., 2]
+
+
+def _waves(time: Array, span: tuple[float, float]) -> Array:
+    """Terms (WAVES, K) of a random walk of unit variance over the span that ends at zero at its end."""
+    back = (span[1] - time) / max(span[1] - span[0], 1e-9)
+    rate = (np.arange(1, WAVES + 1) - 0.5)[:, None] * np.pi
+    waves: Array = np.sqrt(2) * np.sin(rate * back) / rate
+    return waves

@@ -1,0 +1,80 @@
+"""Covariance of an arm's discrepancy, the torque that its gravity model lacks, between two poses (docs/theory.md)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gcomp.arm.arm import Arm
+from gcomp.arrays import Array
+from gcomp.gravity.torque import gravity_torque
+
+LOCAL_ANGLE = 0.5
+"""Correlation length in a joint's own angle and in its neighbours' [rad]: cables, encoder eccentricity and gear errors
+have one to four periods a turn."""
+WIDE_ANGLE = 1.4
+"""Correlation length in all angles at once [rad]: wrong kinematics and sag are products of first harmonics."""
+PARTS = ("local", "wide", "torque")
+"""Parts whose sizes are learned: by a joint's own and its neighbours' angles, by all angles, and by torque, of the
+joint itself (a sensor that is not linear) and of the others (crosstalk)."""
+CONSTANT, SLOPE, SIDE = 0.1, 0.1, 0.05
+"""Shares in the variance of each part: of an offset and a gain, which a calibration gets wrong by this much where there
+is discrepancy, and of the side of approach (hysteresis)."""
+POSES = 256
+"""Random poses over the joint ranges from which the typical gravity torque is taken."""
+
+
+@dataclass(frozen=True)
+class Points:
+    """K poses as the kernel sees them."""
+
+    position: Array
+    """True angles (K, n) [rad]."""
+    torque: Array
+    """Gravity torque over its typical size (K, n)."""
+    side: Array
+    """Sign of each joint's last motion (K, n); 0 if unknown."""
+
+
+class Kernel:
+    """Unit covariance of each joint's discrepancy; its variance is about 1 at a typical pose."""
+
+    def __init__(self, arm: Arm, beta: Array) -> None:
+        """beta (2n,) [kg·m] is the gravity model."""
+        self._arm, self._beta = arm, beta
+        lower, upper = np.maximum(arm.lower, -np.pi), np.minimum(arm.upper, np.pi)
+        self.poses: Array = np.random.default_rng(0).uniform(lower, upper, (POSES, arm.n))
+        """Random poses over the joint ranges [rad]."""
+        typical = gravity_torque(arm, beta, self.poses).std(axis=0)
+        self.typical: Array = np.maximum(typical, 1e-3 * max(float(typical.max()), 1e-9))
+        """Standard deviation of each joint's gravity torque over the joint ranges (n,) [N·m]; never 0."""
+
+    def points(self, position: Array, side: Array) -> Points:
+        """Poses (K, n) [rad] and sides of approach (K, n)."""
+        return Points(position, gravity_torque(self._arm, self._beta, position) / self.typical, side)
+
+    def between(self, a: Points, b: Points) -> Array:
+        """Covariance (parts, n, A, B) between two sets of poses, joint by joint."""
+        n = a.position.shape[1]
+        turned = [np.stack([np.cos(points.position.T), np.sin(points.position.T)], axis=2) for points in (a, b)]
+        away = 1.0 - turned[0] @ turned[1].swapaxes(1, 2)
+        near = np.exp(away * (-1 / LOCAL_ANGLE**2))
+        beside = np.zeros_like(near)
+        beside[:-1] += near[1:]
+        beside[1:] += near[:-1]
+        neighbours = np.array([(j > 0) + (j < n - 1) for j in range(n)])
+        local = near * (1.0 + beside) / (1.0 + neighbours)[:, None, None]
+        wide = np.exp(-away.sum(axis=0) / WIDE_ANGLE**2)
+        slope = a.torque.T[:, :, None] * b.torque.T[:, None, :]
+        crosstalk = (slope.sum(axis=0) - slope) / max(n - 1, 1)
+        curve = slope * slope * (1 / 6.0 + slope / 30.0)  # E t⁴ = 3, E t⁶ = 15 of a normal t: each half of the part
+        side = a.side.T[:, :, None] * b.side.T[:, None, :]
+        parts = np.stack([local, np.broadcast_to(wide, local.shape), (crosstalk + curve) / 2])
+        common = CONSTANT + SLOPE * slope + SIDE * side
+        covariance: Array = (1.0 - CONSTANT - SLOPE - SIDE) * parts + common
+        return covariance
+
+
+def weighted(smooth: Array, unit: Array) -> Array:
+    """Covariance (n, A, B) from the sizes of the parts (parts, n) [N·m] and `Kernel.between` (parts, n, A, B)."""
+    covariance: Array = np.einsum("mj,mjab->jab", smooth**2, unit)
+    return covariance

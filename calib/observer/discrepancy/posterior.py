@@ -1,0 +1,72 @@
+"""The discrepancy and the gravity model as reference rows have shown them (docs/theory.md)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.observer.discrepancy.kernel import Kernel, Points, weighted
+from calib.observer.discrepancy.level import Level
+from gcomp.arrays import Array
+
+
+@dataclass(frozen=True)
+class Data:
+    """N reference rows."""
+
+    points: Points
+    residual: Array
+    """Readings less gravity model as installed (N, n) [N·m]."""
+    columns: Array
+    """Columns (N, n, P) of the model's stated uncertainty, with unit prior, shared by all joints."""
+    epoch: Array
+    """Number of the stretch of time that each row is of (N,); 0 is the one right after the installation."""
+
+
+class Posterior:
+    """Residuals at other poses as reference rows predict them: mean and covariance, jointly over joints and poses."""
+
+    def __init__(self, kernel: Kernel, level: Level, noise: Array, free: Array, data: Data, shared: int) -> None:
+        """noise (n,) [N·m]: of one row. free (n,) [N·m]: size of an offset or gain's change between two epochs.
+
+        In later epochs than the first the sensors may have drifted: those rows tell the discrepancy but for an offset
+        and a gain of their own. `shared` is P.
+        """
+        self._kernel, self._level, self._data = kernel, level, data
+        self._whitener: Array | None = None
+        self._mean: Array = np.zeros(shared)
+        self._factor: Array = np.eye(shared)
+        if not len(data.epoch):
+            return
+        covariance = weighted(level.smooth, kernel.between(data.points, data.points))
+        t = data.points.torque.T
+        later = (data.epoch[:, None] == data.epoch[None]) & (data.epoch[:, None] > 0)
+        covariance += later * free[:, None, None] ** 2 * (1.0 + t[:, :, None] * t[:, None, :])
+        index = np.arange(len(data.epoch))
+        covariance[:, index, index] += (noise**2 + level.rough**2)[:, None]
+        self._whitener = np.linalg.inv(np.linalg.cholesky(covariance))
+        columns = self._whitener @ data.columns.swapaxes(0, 1)
+        residual = self._whitener @ data.residual.T[:, :, None]
+        flat = columns.reshape(-1, shared)
+        information = np.eye(shared) + flat.T @ flat
+        self._mean = np.asarray(np.linalg.solve(information, flat.T @ residual.ravel()))
+        self._factor = np.linalg.cholesky(np.linalg.inv(information))
+        self._columns = columns
+        self._left = residual - columns @ self._mean[:, None]
+
+    def predict(self, points: Points, columns: Array) -> tuple[Array, Array, Array]:
+        """At K poses with columns (K, n, P): mean (K, n), covariance of each joint (n, K, K), columns (n, K, P).
+
+        The last have unit prior and are shared by the joints.
+        """
+        at = columns.swapaxes(0, 1)
+        covariance = weighted(self._level.smooth, self._kernel.between(points, points))
+        mean = at @ self._mean
+        if self._whitener is not None:
+            across = weighted(self._level.smooth, self._kernel.between(self._data.points, points))
+            known = self._whitener @ across
+            covariance -= known.swapaxes(1, 2) @ known
+            mean = mean + (known.swapaxes(1, 2) @ self._left)[:, :, 0]
+            at = at - known.swapaxes(1, 2) @ self._columns
+        index = np.arange(points.position.shape[0])
+        covariance[:, index, index] += (self._level.rough**2)[:, None]
+        return mean.T, covariance, at @ self._factor

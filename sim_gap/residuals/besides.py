@@ -1,0 +1,114 @@
+"""What the comparison leaves aside: motor rows at rest and in creep, and lines of the spectrum above the pass band."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armlink.recording.recording import Recording
+from gcomp.arrays import Array
+from sim_gap.residuals.channel_noise import spectrum
+from sim_gap.residuals.layout import Row
+from sim_gap.residuals.preprocess import BAND_HZ, CHANNELS, Signals
+from sim_gap.residuals.residual_set import RELEVANT_NM, ResidualSet, root_mean_square
+from sim_gap.residuals.where import Location
+
+AT_REST = 0.05
+"""Share of motion in the filter's window below which a joint is at rest; above, and without sliding, it creeps."""
+FEWEST = 25
+"""Number of samples from which a regime is judged."""
+ABOVE = 1.5
+"""Multiple of the pass band's end from which lines are looked for."""
+SHARP, ASIDE, BESIDE = 30.0, 3, 20
+"""A line exceeds the median of the bins from ASIDE to BESIDE bins away by this factor."""
+
+Mask = NDArray[np.bool_]
+
+
+def regimes(data: ResidualSet) -> dict[tuple[Row, str], Mask]:
+    """Samples at rest and in creep of each motor row that the comparison leaves out, (K,)."""
+    share = np.concatenate([s.filtered(s.moving) for s in data.signals])
+    out = {}
+    for channel, joint in data.rows:
+        row = (channel, joint)
+        if channel != data.layout.motor:
+            continue
+        known = np.concatenate([_known(data, s, row) for s in data.signals])
+        aside = known & ~data.valid[row] & ~_hit(data)
+        still = share[:, joint] < AT_REST
+        out[row, "rest"], out[row, "creep"] = aside & still, aside & ~still
+    return out
+
+
+def left_out(data: ResidualSet) -> float:
+    """Share of all samples that no row judges: not read, stuck, or near impacts of a gear."""
+    judged = {row: data.valid[row].copy() for row in data.rows}
+    for (row, _), mask in regimes(data).items():
+        judged[row] |= mask
+    return 1.0 - float(np.mean([mask.mean() for mask in judged.values()]))
+
+
+def slow(data: ResidualSet, explained: Mapping[Row, Array], friction: Array) -> list[Location]:
+    """Rows at rest and in creep; `friction` (n,) is the known dry friction [N·m], which may take any value there.
+
+    A location is `clear` if more remains there than that friction and the row's margin.
+    """
+    names, out = data.signals[0].arm.names, []
+    for (row, regime), mask in regimes(data).items():
+        if mask.sum() < FEWEST:
+            continue
+        raw, left = data.values[row][mask], (data.values[row] - explained[row])[mask]
+        clear = root_mean_square(left) > data.margin[row] + friction[row[1]]
+        share = float(np.sum(raw**2) / max(np.sum(raw**2) + np.sum(data.values[row][data.valid[row]] ** 2), 1e-12))
+        out.append(Location(names[row[1]], row[0], regime, root_mean_square(raw), data.floor[row], share, clear=clear))
+    return out
+
+
+def fast(data: ResidualSet, recordings: Sequence[Recording]) -> list[Location]:
+    """Lines above the pass band: the largest of each channel and joint, with its frequency and RMS [N·m]."""
+    names, best = data.signals[0].arm.names, dict[Row, Location]()
+    for recording in recordings:
+        for channel, name in CHANNELS.items():
+            values = getattr(recording, name)
+            for joint in range(len(names)) if values is not None else ():
+                found = _line(recording.t, values[:, joint])
+                row = (channel, joint)
+                if found and (row not in best or found[1] > best[row].rms):
+                    hz, rms, share = found
+                    noise = data.floor.get(row, 0.0)
+                    clear = rms > max(RELEVANT_NM, 2.0 * noise)
+                    best[row] = Location(names[joint], channel, "band", rms, noise, share, hz, clear)
+    return [each for each in best.values() if each.clear]
+
+
+def _line(t: Array, values: Array) -> tuple[float, float, float] | None:
+    """Frequency [Hz], RMS and share of the power above the band of the sharpest line there; None without one."""
+    there = np.isfinite(values)
+    if there.sum() < 1024:
+        return None
+    own, x = t[there], values[there]
+    step = float(np.median(np.diff(own)))
+    even = np.arange(own[0], own[-1], step)
+    frequency, density = spectrum(np.interp(even, own, x), 1.0 / step)
+    bins = np.flatnonzero(frequency > ABOVE * BAND_HZ)
+    bins = bins[(bins >= BESIDE) & (bins < len(density) - ASIDE)]
+    if len(bins) < 2 * BESIDE:
+        return None
+    peak = int(bins[np.argmax(density[bins])])
+    around = np.r_[peak - BESIDE : peak - ASIDE, peak + ASIDE + 1 : min(peak + BESIDE + 1, len(density))]
+    level, width = float(np.median(density[around])), float(frequency[1])
+    if density[peak] < SHARP * level:
+        return None
+    power = float(np.sum(density[peak - 2 : peak + 3] - level)) * width
+    total = float(np.sum(density[frequency > BAND_HZ])) * width
+    return float(frequency[peak]), float(np.sqrt(max(power, 0.0))), min(power / max(total, 1e-300), 1.0)
+
+
+def _known(data: ResidualSet, s: Signals, row: Row) -> Mask:
+    there = s.filtered(s.known[row[0]][:, row[1]]) > 0.9
+    reference = data.layout.reference(row)
+    return there & (s.filtered(s.known[reference][:, row[1]]) > 0.9) if reference else there
+
+
+def _hit(data: ResidualSet) -> Mask:
+    return np.asarray(np.any([np.zeros(sum(data.lengths), bool), *data.impacts.values()], axis=0))

@@ -1,0 +1,100 @@
+"""Gauss-Newton steps: fit the terms, evaluate their columns about the fit, fit again until both agree."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gcomp.arrays import Array
+from sim_gap.search.column_store import ColumnStore
+from sim_gap.search.feasible import pins
+from sim_gap.search.normal_equations import NormalEquations
+from sim_gap.search.stepwise import Search
+from sim_gap.search.term import Term
+
+STEPS = 10
+"""Most steps."""
+AGREED = 5e-3
+"""Largest change of a row's prediction by a step, as a share of the residual beside it and the relevance floor."""
+WORSE = 1e-3
+"""Increase of the score from which a step is halved."""
+HALVED = 3
+
+Values = dict[Term, Array]
+
+
+def converged(
+    nominal: ColumnStore, terms: Sequence[Term], start: Values | None = None
+) -> tuple[ColumnStore, list[Term]]:
+    """Columns of the terms about their own coefficients (`values` of the store), and the terms that remain plausible.
+
+    `nominal` has the columns about the nominal model. `start` holds coefficients to begin with; without it the first
+    step is about the nominal model.
+    """
+    terms = [term.start for term in terms]
+    values = {term: c for term, c in (start or {}).items() if term in terms}
+    best, kept, held = np.inf, values, Values()
+    arm = nominal.data.signals[0].arm
+    for _ in range(STEPS):
+        store = nominal.at(values)
+        search = Search(NormalEquations(store, terms), terms)
+        now = score(store, values, search.normal)
+        halved = 0
+        while values and now > best + WORSE and halved < HALVED:
+            values = {t: 0.5 * (c + kept.get(t, 0.0 * c)) for t, c in values.items()}
+            store = nominal.at(values)
+            search = Search(NormalEquations(store, terms), terms)
+            now, halved = score(store, values, search.normal), halved + 1
+        if values:
+            best, kept = now, values
+        held = pins(search, arm)
+        if held:
+            search.normal.pin(held)
+            search.reweigh()
+        terms, values = _step(search)
+        if kept and set(terms) == set(kept) and _agree(search, kept, values):
+            break
+    return nominal.at(values, {term: c for term, c in held.items() if term in values}), terms
+
+
+def _step(search: Search) -> tuple[list[Term], Values]:
+    """The terms of a fit, nonlinear ones at the size fitted, and their coefficients."""
+    index, coefficients = search.weighted.fit(search.active)
+    whole = np.zeros(search.normal.size)
+    whole[index] = coefficients
+    terms, values = [], {}
+    for term in search.active:
+        c = whole[search.normal.at[term]]
+        new = term if term.form.signature.moves is not None else term.relinearised(c)
+        if new != term and term.form.signature.offset is None:  # a secant over its own size
+            c = np.ones_like(c)
+        terms.append(new)
+        values[new] = c
+    return terms, values
+
+
+def score(store: ColumnStore, values: Values, normal: NormalEquations) -> float:
+    """Σ ½ log(R² + floor²) over the rows with the exact prediction of the estimate."""
+    if not values:
+        return float("inf")
+    data = store.data
+    squares = np.zeros(len(normal.rows))
+    for r, row in enumerate(normal.rows):
+        rest, valid = data.values[row].copy(), data.valid[row]
+        for term, c in values.items():
+            if row in (columns := store.columns(term)):
+                rest -= columns[row] @ c
+                if beside := store.offset(term):
+                    rest -= beside[row][:, 0]
+        squares[r] = np.mean(rest[valid] ** 2) if valid.any() else 0.0
+    return float(0.5 * np.log(squares + normal.floor**2)[normal.seen].sum())
+
+
+def _agree(search: Search, old: Values, new: Values) -> bool:
+    """Whether a step changes no row's prediction by much."""
+    normal = search.normal
+    change = np.zeros(normal.size)
+    for term, c in new.items():
+        change[normal.at[term]] = c - old[term]
+    moved = normal.power(change)
+    left = normal.mean_square(*search.weighted.fit(search.active))
+    return bool(np.all(moved[normal.seen] <= AGREED**2 * (left + normal.floor**2)[normal.seen]))

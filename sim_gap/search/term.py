@@ -1,0 +1,68 @@
+"""A term of a fit: one effect at one place with one shape."""
+
+from dataclasses import dataclass
+
+from gcomp.arrays import Array
+from sim_gap.effects.effect import Effect, Key, Shape
+from sim_gap.effects.registry import effects
+from sim_gap.residuals.layout import Layout
+
+
+@dataclass(frozen=True)
+class Term:
+    """One effect at one place with one shape."""
+
+    effect: str
+    place: int
+    shape: Shape = ()
+
+    @property
+    def form(self) -> Effect:
+        """The inverse form of its effect."""
+        return effects()[self.effect]
+
+    @property
+    def key(self) -> Key:
+        """Effect and place, for every shape."""
+        return self.effect, self.place
+
+    def reshaped(self, entry: int, value: float) -> "Term":
+        """The same term with one entry of its shape replaced."""
+        return Term(self.effect, self.place, (*self.shape[:entry], value, *self.shape[entry + 1 :]))
+
+    @property
+    def free(self) -> int | None:
+        """The one entry of its shape that is fitted in addition to its coefficients; None if there is none."""
+        hints = self.form.hints
+        entries = [i for i in range(len(self.shape)) if i not in hints.discrete]
+        return entries[0] if len(entries) == 1 and hints.linearised_at is None else None
+
+    def covers(self, layout: Layout) -> tuple[Key, ...]:
+        """Keys of the terms that it contains."""
+        return self.form.hints.covers(layout, self.place)
+
+    def alternatives(self, layout: Layout) -> tuple[Key, ...]:
+        """Keys of the simpler terms that together could replace it."""
+        return self.form.hints.alternatives(layout, self.place, self.shape)
+
+    def relinearised(self, coefficients: Array) -> "Term":
+        """The same term, linearised at its fitted size; unchanged if it is linear."""
+        if self.form.hints.linearised_at is None:
+            return self
+        return Term(self.effect, self.place, self.form.hints.relinearise(coefficients, self.shape))
+
+    @property
+    def bound(self) -> tuple[int, ...]:
+        """Numbers of the recordings that it is present in, from 1; empty if it belongs to the arm."""
+        return self.form.signature.recordings(self.shape)
+
+    @property
+    def start(self) -> "Term":
+        """The term whose columns an estimate evaluates about itself: without the secant of a moved position."""
+        nonlinear = self.form.hints.linearised_at is not None and self.form.signature.moves is not None
+        return Term(self.effect, self.place, (0.0,) * len(self.shape)) if nonlinear else self
+
+    @property
+    def beneath(self) -> tuple[Key, ...]:
+        """Keys of the terms that it needs."""
+        return tuple((name, self.place) for name in self.form.needs)

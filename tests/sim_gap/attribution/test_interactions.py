@@ -1,0 +1,120 @@
+"""Effects that act on each other: columns are evaluated about the estimate, and large angles are exact."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+from wrong_arms import THREE, Wrong, model, record
+
+from sim_gap.attribution.diagnose import diagnose
+from sim_gap.effects.base import angles_of, tilted
+from sim_gap.effects.inertials import moved, of_pseudo_inertia, point, point_slopes, pseudo_inertia
+
+GRAVITY = np.array([0.0, 0.0, -9.81])
+
+
+def value(answer, effect: str, place: str, name: str):
+    (cause,) = [cause for cause in answer.causes if cause.effect == effect]
+    return cause.parameters[place][name]
+
+
+def test_a_payload_and_friction_that_grows_with_the_load_it_adds():
+    wrong = Wrong(payload=3.0, load=np.array([0.10, 0.0, 0.0]))
+    train, other = (record(model(), wrong, seed=s, seconds=40, channels=("tau_motor",)) for s in (1, 2))
+    answer = diagnose(model(), [train], [other])
+    friction = value(answer, "friction.load", "joint_1", "coefficient")
+    assert friction.low < 0.10 < friction.high
+    assert friction.value == pytest.approx(0.10, rel=0.05)
+    assert value(answer, "link.payload", "arm", "mass").value == pytest.approx(3.0, rel=0.03)
+
+
+def test_a_sensors_gain_and_a_payload():
+    wrong = Wrong(payload=2.0, gain=np.array([1.2, 1.0, 1.0]))
+    train, other = (record(model(), wrong, seed=s, seconds=40) for s in (1, 2))
+    answer = diagnose(model(), [train], [other])
+    gain = value(answer, "torque.gain", "joint_1", "gain")
+    assert gain.value == pytest.approx(1.2, abs=0.01)
+    assert gain.low < 1.2 < gain.high
+    assert value(answer, "link.payload", "arm", "mass").value == pytest.approx(2.0, rel=0.03)
+
+
+@pytest.mark.parametrize("degrees", [30.0, 90.0, 150.0])
+def test_a_base_that_is_turned_far(degrees):
+    angles = np.radians(degrees) * np.array([0.8, -0.6])
+    real = mujoco.MjModel.from_xml_string(THREE)
+    real.opt.gravity[:] = tilted(GRAVITY, angles)
+    train, other = (record(real, Wrong(coulomb=np.full(3, 0.3)), seed=s, seconds=40) for s in (1, 2))
+    answer = diagnose(_upright(), [train], [other])
+    assert answer.causes[0].effect == "base.tilt"
+    found = np.array([value(answer, "base.tilt", "arm", f"angle_{k}").value for k in (1, 2)])
+    between = np.degrees(np.arccos(np.clip(tilted(GRAVITY, found) @ tilted(GRAVITY, angles) / 9.81**2, -1, 1)))
+    assert between < 0.5
+    assert {c.effect for c in answer.causes if c.confidence > 0.5} == {"base.tilt", "friction.coulomb"}
+
+
+def _upright() -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(THREE)
+
+
+def test_gravity_turns_as_the_rotation_vector_says():
+    quarter = tilted(GRAVITY, np.array([np.pi / 2, 0.0]))
+    np.testing.assert_allclose(quarter, [0.0, -9.81, 0.0], atol=1e-12)
+    for angles in np.random.default_rng(0).uniform(-2.0, 2.0, (20, 2)):
+        np.testing.assert_allclose(angles_of(GRAVITY, tilted(GRAVITY, angles)), angles, atol=1e-6)
+
+
+def test_bodies_that_are_moved_or_added_can_exist():
+    link = np.array([2.0, 0.1, 0.2, -0.3, 0.3, 0.01, 0.0, 0.3, 0.02, 0.2])
+    assert np.linalg.eigvalsh(pseudo_inertia(link)).min() > 0.0
+    far = moved(link, np.array([1.0, -2.0, 0.5]))
+    assert np.linalg.eigvalsh(pseudo_inertia(far)).min() > 0.0
+    np.testing.assert_allclose(of_pseudo_inertia(pseudo_inertia(far)), far)
+    assert np.linalg.eigvalsh(pseudo_inertia(link + point(1.5, np.array([0.2, 0.0, 0.3])))).min() > 0.0
+
+
+def test_slopes_of_a_point_mass_are_those_of_differences():
+    mass, moment, step = -0.7, np.array([0.1, -0.05, 0.2]), 1e-6
+    slopes = point_slopes(mass, moment)
+    for k, unit in enumerate(np.eye(4)):
+        up, down = (point(mass + s * step * unit[0], moment + s * step * unit[1:]) for s in (1, -1))
+        np.testing.assert_allclose(slopes[:, k], (up - down) / (2 * step), atol=1e-6)
+
+
+def test_a_body_of_the_model_that_the_arm_lacks_is_a_payload_of_negative_mass():
+    loaded = mujoco.MjModel.from_xml_string(THREE)
+    loaded.body_mass[-1], loaded.body_inertia[-1] = 2.5, [0.02, 0.02, 0.01]
+    train, other = (record(_upright(), Wrong(), seed=s, seconds=40, channels=("tau_motor",)) for s in (1, 2))
+    answer = diagnose(loaded, [train], [other])
+    assert answer.causes[0].effect == "link.payload"
+    assert value(answer, "link.payload", "arm", "mass").value == pytest.approx(-1.0, rel=0.05)
+    assert any("the arm lacks" in note for note in answer.notes)
+
+
+@pytest.mark.parametrize("groups", [(), ("loaded=b,c",)])
+def test_a_payload_of_one_training_and_of_the_held_out_recording(groups):
+    """Two recordings of three have it, the held-out one among them."""
+    arm = Wrong(coulomb=np.full(3, 0.3))
+    loaded = replace(arm, payload=1.2)
+    made = [
+        record(model(), wrong, seed=s, seconds=30, channels=("tau_motor",))
+        for s, wrong in enumerate((arm, loaded, loaded))
+    ]
+    answer = diagnose(model(), made[:2], made[2:], labels=["a", "b", "c"], groups=groups)
+    assert value(answer, "link.payload", "arm", "mass").value == pytest.approx(1.2, rel=0.05)
+    assert "link.payload is present in b and c alone" in answer.notes
+    assert np.all(answer.heldout_after < 0.1)
+
+
+def test_a_hum_above_the_band_is_no_true_model():
+    def hums(seed: int):
+        clean = record(model(), Wrong(), seed=seed, seconds=30, rate=250.0)
+        wave = 0.5 * np.sin(2 * np.pi * 50.0 * clean.t)
+        return replace(clean, motor_torque=clean.motor_torque + wave[:, None] * np.array([0.0, 1.0, 0.0]))
+
+    answer = diagnose(model(), [hums(1)], [hums(2)]).to_json()
+    assert answer["verdict"] == "unexplained"
+    (band,) = [place for place in answer["where"] if place["regime"] == "band"]
+    assert (band["joint"], band["channel"]) == ("joint_2", "tau_motor")
+    assert band["hz"] == pytest.approx(50.0, abs=0.5)
+    assert band["rms"] == pytest.approx(0.5 / np.sqrt(2), rel=0.1)
