@@ -38,7 +38,8 @@ class SlowNode:
 @pytest.mark.parametrize("behind", [0, 1, 2])
 def test_late_responses_are_not_taken_for_those_of_the_next_request(behind: int) -> None:
     node = SlowNode(behind)
-    services = joint_services(node.network, load_arm("sarcos"), node.pump)[0]
+    arm = load_arm("sarcos")
+    services = joint_services(node.network, arm, arm.require_link().joints, node.pump)[0]
     for number in range(5):
         gain, record = 0.9 + 0.01 * number, 100 + number
         services.write_checked(objects.STAGED_GAIN, gain)
