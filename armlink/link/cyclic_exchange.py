@@ -51,7 +51,7 @@ class Loop:
         """Takes frames that no drive of ours sends, such as those of another host."""
         self._port, self._clock = port, clock
         self._patience = 0.0 if lock_step else COLLECT_SHARE * period
-        self._alone = self.groups[0] if len(self.groups) == 1 and values.plain else None
+        self._alone = self.groups[0] if len(self.groups) == 1 else None
         traits = traits_of(self.groups, self.n)
         cadences = {each.cadence for each in traits}
         self._pass_time: Callable[[float], None] | None = None
@@ -199,7 +199,7 @@ class Loop:
     def _encode(self, orders: Sequence[Order], now: float) -> list[Frame]:
         """Frames of the orders, every group's; what their bytes say is checked before they may leave."""
         group = self._alone
-        if group is not None and not self.withheld:
+        if group is not None and self.values.plain and not self.withheld:
             frames = group.drives.frames(orders, now)
         else:
             frames = []

@@ -169,7 +169,7 @@ ROWS = (
         "time-out",
         None,
         "not powered",
-        "no answer from joint_2 (node 12) on …: is it powered, and its node id right?",
+        "no answer from joint_2 (node 12) on …: is it powered, and its id right?",
     ),
     Row(
         "mode refused",

@@ -75,7 +75,7 @@ def test_only_the_door_calls_write_calibration() -> None:
 
 
 def test_only_a_forwarder_asks_the_bus_process_to_write() -> None:
-    said = {(path, function) for path, function, kind in mentions("write") if kind is ast.Constant}
+    said = {(path, function) for path, function, kind in mentions("write_calibration") if kind is ast.Constant}
     asking = {(path, function) for path, function in said if path.startswith("calib/daemon/") and function}
     assert {function for _, function in asking - {("calib/daemon/loop/arm_loop.py", "_do")}} == {"write_calibration"}
 
