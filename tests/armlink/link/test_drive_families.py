@@ -1,0 +1,63 @@
+"""The link with each family's drives, on a simulated arm: walk, hold, and calibration in the host."""
+
+import numpy as np
+import pytest
+
+from armlink.arm_file import load_arm
+from armlink.drives.orders import Power
+from armlink.errors import BadInput
+from armlink.link.link import Link
+from armlink.link.types import Calibration, Command
+from sim_bus.bus.lock_step import LockStepBus
+
+FROM_CURRENT = ("six-damiao", "six-moteus", "six-odrive", "six-robstride")
+SHOULDER = 1
+
+
+def hold(link, command, cycles):
+    return [link.cycle(command) for _ in range(cycles)]
+
+
+@pytest.mark.parametrize("name", [*FROM_CURRENT, "six-cia402"])
+def test_enable_hold_disable(name):
+    with Link(load_arm(name), LockStepBus(name)) as link:
+        link.start()
+        command = Command.hold(link.enable().position)
+        samples = hold(link, command, 100)
+        assert np.abs(samples[-1].position - command.position).max() < 2e-3
+        assert all(np.isfinite(sample.torque).all() for sample in samples[5:])
+        link.disable()
+        states = [group.drives.power(drive) for group in link.groups for drive in range(len(group.places))]
+        assert set(states) == {Power.OFF}
+
+
+@pytest.mark.parametrize("name", FROM_CURRENT)
+def test_a_calibration_in_the_host_corrects_reading_and_command(name):
+    """A drive that makes (τ_told − offset) / gain gets gain · τ + offset for τ."""
+    arm, calibration = load_arm(name), Calibration(1.25, 0.5, 1)
+    with Link(arm, LockStepBus(name)) as link:
+        link.start()
+        position = link.enable().position
+        wanted = np.zeros(link.n)
+        mode = Command.hold(position).mode.copy()
+        mode[SHOULDER] = 10
+        command = Command(mode, wanted, position)
+        hold(link, command, 40)
+        before = link.torque_sent[SHOULDER]
+        assert before == pytest.approx(0.0, abs=0.02)
+        assert link.write_calibration(SHOULDER, calibration) == calibration
+        assert link.read_calibration(SHOULDER) == calibration
+        samples = hold(link, command, 40)
+        assert link.torque_sent[SHOULDER] == pytest.approx(calibration.offset, abs=0.02)
+        told = np.mean([sample.torque[SHOULDER] for sample in samples[10:]])
+        assert told == pytest.approx(0.0, abs=0.05)
+        assert link.commander.limits[SHOULDER].max_torque == pytest.approx(
+            (arm.link.joints[SHOULDER].max_torque - calibration.offset) / calibration.gain
+        )
+
+
+def test_a_calibration_that_cannot_be_is_not_put_into_force():
+    with Link(load_arm("six-damiao"), LockStepBus("six-damiao")) as link:
+        with pytest.raises(BadInput, match="gain 9"):
+            link.write_calibration(SHOULDER, Calibration(9.0, 0.0, 1))
+        assert link.read_calibration(SHOULDER).is_blank
