@@ -207,7 +207,7 @@ class Loop:
             for each in self.groups:
                 own = each.drives.frames([driven[place] for place in each.places], now)
                 frames += [(can_id | each.tag, data) for can_id, data in own] if each.tag else own
-        if frames != self._leaving or any([order.kp for order in orders]):  # with gains the joint's place counts too
+        if frames != self._leaving or any(order.kp for order in orders):  # with gains the joint's place counts too
             self._leaving = []
             for each in self.groups:
                 for joint, place in enumerate(each.places):
