@@ -85,6 +85,24 @@ def fit_model(model: Array, motion: Motion) -> RigidFit:
     return RigidFit(*(np.array(values) for values in zip(*fits, strict=True)))
 
 
+def as_mounted(arm: RigidArm, motion: Motion) -> RigidArm:
+    """The arm with gravity along the axis that fits best, if that is better than the nominal one.
+
+    A tilted base is an effect of the arm, which the diagnosis finds; no fault of the data must be seen in it.
+    """
+    still = np.zeros_like(motion.q)
+    inertia = arm.torque(motion.q, motion.v, motion.a, np.zeros(3))
+    columns = np.stack([arm.torque(motion.q, still, still, axis) for axis in np.eye(3)], axis=-1)
+    weight = 1.0 / (motion.reading.std(0) + 1e-9)
+    left = ((motion.reading - inertia) * weight).ravel()
+    gravity = np.linalg.lstsq((columns * weight[:, None]).reshape(-1, 3), left, rcond=None)[0]
+    size, nominal = float(np.linalg.norm(gravity)), float(np.linalg.norm(arm.gravity))
+    if size < 1e-6 or nominal < 1e-6:
+        return arm
+    turned = replace(arm, gravity=gravity * nominal / size)
+    return turned if fit_rigid(turned, motion).cost.sum() < fit_rigid(arm, motion).cost.sum() else arm
+
+
 def _joint(model: Array, motion: Motion, j: int) -> tuple[float, ...]:
     y = motion.reading[:, j] - motion.reading[:, j].mean()
     spread = float(y.std())
