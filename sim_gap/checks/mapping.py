@@ -48,7 +48,7 @@ def find_mapping(arm: RigidArm, motion: Motion, stated: Corrections, follows: Se
     `follows` are the channels (of `dq`, `q_cmd`) whose columns agree with the positions' as they are recorded, so that
     what is wrong with a position is wrong with theirs. All findings are corrected, or none is.
     """
-    fit = fit_rigid(as_mounted(arm, motion), motion)
+    fit = fit_rigid(as_mounted(arm, motion), motion, springs=True)
     taken: list[tuple[Hypothesis, float]] = []
     for _ in range(2 * arm.n):
         best = _best(arm, motion, fit, list(hypotheses(arm, motion.channel, stated, follows)))
