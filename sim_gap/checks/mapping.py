@@ -8,7 +8,7 @@ the diagnosis either.
 
 import math
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -27,6 +27,8 @@ FITS = 0.65
 """Share of variance that the joints concerned must have explained after a correction (median), and strong ones each."""
 PLAUSIBLE = 0.4, 2.5
 """Coefficient of the model's torque on a strong joint after a correction."""
+SPRUNG = 0.97
+"""Share of variance explained from which a joint has a spring; a turned sign looks like one by less."""
 TURN = math.pi / 180.0
 
 
@@ -48,7 +50,7 @@ def find_mapping(arm: RigidArm, motion: Motion, stated: Corrections, follows: Se
     `follows` are the channels (of `dq`, `q_cmd`) whose columns agree with the positions' as they are recorded, so that
     what is wrong with a position is wrong with theirs. All findings are corrected, or none is.
     """
-    fit = fit_rigid(as_mounted(arm, motion), motion, springs=True)
+    fit = _as_an_arm(arm, motion)
     taken: list[tuple[Hypothesis, float]] = []
     for _ in range(2 * arm.n):
         best = _best(arm, motion, fit, list(hypotheses(arm, motion.channel, stated, follows)))
@@ -59,6 +61,13 @@ def find_mapping(arm: RigidArm, motion: Motion, stated: Corrections, follows: Se
         taken.append((hypothesis, fall))
     sure = _is_sound(fit, {joint for hypothesis, _ in taken for joint in hypothesis.joints})
     return [_finding(arm, hypothesis, fit, fall, sure) for hypothesis, fall in taken]
+
+
+def _as_an_arm(arm: RigidArm, motion: Motion) -> RigidFit:
+    """The fit as it stands, gravity and springs included where they explain a joint: those are effects of the arm."""
+    mounted = as_mounted(arm, motion)
+    plain, sprung = fit_rigid(mounted, motion), fit_rigid(mounted, motion, springs=True)
+    return replace(plain, explained=np.where(sprung.explained > SPRUNG, sprung.explained, plain.explained))
 
 
 def _best(

@@ -22,6 +22,10 @@ MOVING_SHARE = 0.3
 """Share of rows in motion from which the sign of friction counts."""
 FLOOR = 0.02
 """Share of a reading's variance below which what is left does not count: noise, and effects of every arm."""
+MOUNTED = 0.1
+"""Share of the readings' variance that may be left (geometric mean) for gravity along another axis to count."""
+UPSIDE_DOWN = 0.98
+"""Cosine from which gravity is nearly opposite: then a turned sign of all torques is as good, and far more common."""
 STRONG_SHARE, STRONG_CORRELATION = 0.2, 0.8
 """A joint is strong if the model's own part is this share of the reading, and correlates with it so."""
 
@@ -99,7 +103,12 @@ def as_mounted(arm: RigidArm, motion: Motion) -> RigidArm:
     if size < 1e-6 or nominal < 1e-6:
         return arm
     turned = replace(arm, gravity=gravity * nominal / size)
-    return turned if fit_rigid(turned, motion).cost.sum() < fit_rigid(arm, motion).cost.sum() else arm
+    found, plain = fit_rigid(turned, motion).cost, fit_rigid(arm, motion).cost
+    opposite = fit_rigid(arm, replace(motion, reading=-motion.reading)).cost
+    upside_down = float(gravity @ arm.gravity) < -UPSIDE_DOWN * size * nominal
+    if found.sum() > plain.sum() or found.mean() > np.log(MOUNTED + FLOOR):
+        return arm
+    return arm if upside_down and opposite.sum() < found.sum() + 0.3 else turned
 
 
 def _joint(model: Array, motion: Motion, j: int, spring: bool) -> tuple[float, ...]:
