@@ -35,6 +35,10 @@ class Section(BaseModel):
 S = TypeVar("S", bound=Section)
 
 
+Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f\x7f/\\]*$")]
+"""A name that goes into file names and reports: one line, no path."""
+
+
 class BadKeys(BadInput):
     """Keys of an arm file that cannot be used; the message names the first."""
 
@@ -42,10 +46,6 @@ class BadKeys(BadInput):
         """`keys` are (key, what is wrong with it), all of them."""
         super().__init__(f"{path}: {first}")
         self.keys = keys
-
-
-Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f\x7f/\\]*$")]
-"""A name that goes into file names and reports: one line, no path."""
 
 
 class DhJoint(Section):
@@ -298,16 +298,6 @@ def load_arm(arm: str | Path) -> ArmFile:
     return parse_arm(content, path)
 
 
-def _no_arm_file(path: Path) -> str:
-    bundled, folder = sorted(bundled_arms()), path.parent
-    beside = [str(each) for each in folder.glob("*.y*ml")] if folder.is_dir() else []
-    close = meant(str(path), [*bundled, *beside])
-    hint = close if "mean" in close else ""
-    if path.is_dir():
-        return f"{path}: is a folder: give the arm file in it, or a bundled arm ({', '.join(bundled)})"
-    return f"no arm file {path}: give a path, or a bundled arm ({', '.join(bundled)}){hint}"
-
-
 def read_yaml(path: Path) -> Any:
     """Content of a YAML file; raises BadInput, in one line, where it is none, OSError where it cannot be read."""
     try:
@@ -316,6 +306,16 @@ def read_yaml(path: Path) -> Any:
         raise BadInput(f"{path}: not YAML that can be used: nested too deeply") from None
     except (yaml.YAMLError, ValueError, OverflowError) as error:  # a date or number that does not exist, for example
         raise BadInput(f"{path}: not YAML: {' '.join(str(error).split())}") from None
+
+
+def _no_arm_file(path: Path) -> str:
+    bundled, folder = sorted(bundled_arms()), path.parent
+    beside = [str(each) for each in folder.glob("*.y*ml")] if folder.is_dir() else []
+    close = meant(str(path), [*bundled, *beside])
+    hint = close if "mean" in close else ""
+    if path.is_dir():
+        return f"{path}: is a folder: give the arm file in it, or a bundled arm ({', '.join(bundled)})"
+    return f"no arm file {path}: give a path, or a bundled arm ({', '.join(bundled)}){hint}"
 
 
 def parse_arm(content: dict[str, Any], path: Path) -> ArmFile:

@@ -1,4 +1,4 @@
-"""The drive families that are installed, and what their drives are like."""
+"""Lists the drive families that are installed, and what their drives are like."""
 
 from pathlib import Path
 from typing import Annotated

@@ -137,7 +137,8 @@ class Link(TorqueSensorRecords):
         Raises Refused for another controller than the arm file states, BusFault, BadInput.
         """
         self._hold = self._hold or ArmHold(self.bus, self.nodes)
-        missing = [f"{each.joint} (node {each.node})" for each in self.services if not each.present()]
+        silent = [each for each in self.services if not each.present()]
+        missing = [f"{each.joint} (node {each.node})" for each in silent if not each.present()]  # a busy one gets two
         if missing:
             channel = self.bus.channel_info
             raise BusFault(f"no answer from {', '.join(missing)} on {channel}: is it powered, and its node id right?")

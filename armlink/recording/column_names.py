@@ -29,12 +29,16 @@ STEMS = {
 """Channel → words that name it, the most telling first; the channels in the order in which they are tried."""
 
 
+LONGEST_NAME, LONGEST_MAP = 60, 2000
+"""Characters beyond which a name is none that a person gave, and a suggestion none to paste."""
+
+
 def suggested_map(header: Sequence[str]) -> str:
     """A `--map` option for a table's header row, or empty where no position can be recognised."""
     groups: dict[tuple[str, str], list[tuple[int | str, str]]] = defaultdict(list)
     time = next((column for column in header if _plain(column) in TIMES), "")
     for column in header:
-        if column == time:
+        if column == time or len(column) > LONGEST_NAME:
             continue
         stem, key = _parts(column)
         for channel, words in STEMS.items():
@@ -55,7 +59,8 @@ def suggested_map(header: Sequence[str]) -> str:
                 columns, key=lambda pair: (isinstance(pair[0], str), pair[0] if isinstance(pair[0], int) else 0)
             )
             pairs += [f"{channel}_{i}={column}" for i, (_, column) in enumerate(ordered, start=1)]
-    return "--map " + ",".join(f"'{pair}'" if " " in pair else pair for pair in pairs)
+    text = "--map " + ",".join(f"'{pair}'" if " " in pair else pair for pair in pairs)
+    return text if len(text) <= LONGEST_MAP else ""
 
 
 def _plain(column: str) -> str:
@@ -65,7 +70,7 @@ def _plain(column: str) -> str:
 def _parts(column: str) -> tuple[str, int | str]:
     """Stem of a column's name without its number, and the number; without one, the channel word and the whole name."""
     plain = _plain(column)
-    number = re.search(r"(\d+)(?!.*\d)", plain)
+    number = re.search(r"(?<!\d)(\d{1,9})(?!.*\d)", plain)
     if number:
         return re.sub(r"_+", "_", plain[: number.start()] + plain[number.end() :]).strip("_"), int(number.group(1))
     words = plain.split("_")

@@ -10,7 +10,7 @@ from armlink.recording.recording import Recording, take_joints
 SUFFIXES = (".csv", ".csv.gz", ".parquet", ".mcap")
 
 
-def load_recording(path: str | Path, stated: Corrections = AS_IT_IS) -> Recording:
+def load_recording(path: str | Path, stated: Corrections | None = None) -> Recording:
     """Load one recording (docs/formats.md): a file, or the folder of a ROS 2 bag.
 
     `stated` are corrections of the file's columns, signs, units and clocks. Raises BadInput that names row or column,
@@ -22,8 +22,9 @@ def load_recording(path: str | Path, stated: Corrections = AS_IT_IS) -> Recordin
     return next(iter(found.values()))
 
 
-def load_recordings(path: str | Path, stated: Corrections = AS_IT_IS) -> dict[str, Recording]:
+def load_recordings(path: str | Path, stated: Corrections | None = None) -> dict[str, Recording]:
     """All recordings of a file or folder, by label; `FOLDER#2` is episode 2 of a LeRobot data set."""
+    stated = stated or AS_IT_IS
     folder, _, episode = str(path).rpartition("#")
     found = _loaded(Path(folder) if episode.isdigit() and folder else Path(path), stated)
     if episode.isdigit() and folder:

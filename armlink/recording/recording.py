@@ -85,6 +85,16 @@ class Recording:
         return self
 
 
+def require_width(columns: Sequence[str], source: str) -> int:
+    """The highest joint number of the columns, at least 1; raises BadInput where no recording has so many."""
+    if len(columns) > MOST_COLUMNS:
+        raise BadInput(f"{source}: {len(columns)} columns, expected at most {MOST_COLUMNS}")
+    n = max((index for column in columns if (index := _joint_index(column)) is not None), default=1)
+    if n > MOST_JOINTS:
+        raise BadInput(f"{source}: a column is of joint {n}, expected at most {MOST_JOINTS} joints")
+    return n
+
+
 def require_size(size: int, source: str) -> None:
     """Raise BadInput where a recording holds more bytes than it may."""
     if size > MOST_BYTES:
@@ -116,12 +126,7 @@ def channels_of(columns: Mapping[str, Array], source: str) -> dict[str, Array | 
 
 def joint_count(columns: list[str], source: str) -> int:
     """Number of joints that the column names describe; raises BadInput that names a missing column."""
-    if len(columns) > MOST_COLUMNS:
-        raise BadInput(f"{source}: {len(columns)} columns, expected at most {MOST_COLUMNS}")
-    indices = [index for column in columns if (index := _joint_index(column)) is not None]
-    n = max(indices, default=1)
-    if n > MOST_JOINTS:
-        raise BadInput(f"{source}: a column is of joint {n}, expected at most {MOST_JOINTS} joints")
+    n = require_width(columns, source)
     present = set(columns)
     for name, prefix in COLUMNS.items():
         wanted = [f"{prefix}_{i}" for i in range(1, n + 1)]

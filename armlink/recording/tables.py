@@ -28,6 +28,7 @@ from armlink.recording.recording import (
     is_channel,
     joint_count,
     require_size,
+    require_width,
 )
 
 _LOOK_BACK = 20_000  # bytes at the end of a CSV file that show how long its numbers are
@@ -46,7 +47,9 @@ def load_csv(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> R
     """
     _require_header(path)
     content, cut = _content(path)
-    header = _renamed(_header(path, content), columns, path)
+    header = _header(path, content)
+    require_width(header, str(path))
+    header = _renamed(header, columns, path)
     wanted = [column for column in header if is_channel(column)]
     try:
         table = pa_csv.read_csv(
@@ -69,13 +72,12 @@ def load_parquet(path: Path, columns: Mapping[str, str] = MappingProxyType({})) 
     """Load Parquet with the columns of docs/formats.md, joint names from the schema's metadata; raises BadInput."""
     try:
         schema = pa_parquet.read_schema(path)
-        read = list(schema.names)
-        header = _renamed(read, columns, path)
-        wanted = [column for column in header if is_channel(column)]
+        require_width(schema.names, str(path))
+        header = _renamed(list(schema.names), columns, path)
+        wanted = {column: name for column, name in zip(header, schema.names, strict=True) if is_channel(column)}
         require_size(8 * len(wanted) * pa_parquet.read_metadata(path).num_rows, str(path))
-        theirs = dict(zip(header, read, strict=True))
-        table = pa_parquet.read_table(path, columns=[theirs[column] for column in wanted]).rename_columns(wanted)
-        table = table.select(wanted).cast(pa.schema([(column, pa.float64()) for column in wanted]))
+        table = pa_parquet.read_table(path, columns=list(wanted.values())).select(list(wanted.values()))
+        table = table.rename_columns(list(wanted)).cast(pa.schema([(column, pa.float64()) for column in wanted]))
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise BadInput(f"{path}: {_first_line(error)}") from None
     return _recording(table, header, str(path), _names((schema.metadata or {}).get(NAMES_KEY), str(path)))
@@ -107,7 +109,7 @@ def _renamed(header: list[str], columns: Mapping[str, str], path: Path) -> list[
     try:
         joint_count(header, str(path))
     except BadInput as error:
-        suggestion = suggested_map(header) if not foreign else ""
+        suggestion = suggested_map([name for name in header if len(name) <= 100]) if not foreign else ""
         if not suggestion:
             raise
         raise BadInput(f"{error}; if its columns have other names, try {suggestion}") from None

@@ -113,10 +113,11 @@ class CauseTest:
         evidence["misfit"] = self._misfit(best.chi2 - inexact, winner.columns.shape[1])
         if evidence["misfit"] > config.misfit or (winner.cause == "payload" and not self._weighs(best)):
             return self._two_drifts() or self._all_zeros() or answer("unknown", None, name)
-        if winner.cause in OF_AN_ARM and self._is_small(best):
-            return answer("none", None, "none")
         near = [fit.entry for fit in fits[1:] if fit.bic - best.bic < config.evidence]
         rivals = tuple(dict.fromkeys(class_of(entry) for entry in near if not kin(entry, winner)))
+        sensor_or_load = any(entry.cause in (*DRIFT, "payload") for entry in near)
+        if winner.cause in OF_AN_ARM and not sensor_or_load and self._is_small(best):
+            return answer("none", None, "none")
         if rivals:
             return answer("ambiguous", best, name, rivals)
         return answer(winner.cause, best, name)

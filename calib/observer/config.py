@@ -96,6 +96,10 @@ class ObserverConfig:
     """Discrepancy of the gravity model expected before the first row, as a share of rated torque; if the calibration
     says how large it is, that counts."""
 
+    zero_wander: float = 3e-3
+    """Most that a zero moves with temperature (standard deviation), as a share of rated torque: a sensor of class 0.15,
+    three times worse than good ones, by 20 K. Where the arm's discrepancy is small, less is assumed."""
+
     tool_windows: int = 60
     """Consecutive windows that find the same payload until it counts as a tool: half an hour of stops."""
 

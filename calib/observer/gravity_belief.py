@@ -77,10 +77,12 @@ class GravityBelief:
         position_std: float = 0.0,
         level: Level | None = None,
         first_rows: int = FIRST_ROWS,
+        wander: Array | float = np.inf,
     ) -> None:
         """beta (2n,) [kg·m], covariance (2n, 2n) [kg²·m²], with zero rows for what gravity does not determine.
 
-        position_std [rad] is that of a position sensor's zero; without a level the model has no other errors.
+        position_std [rad] is that of a position sensor's zero; without a level the model has no other errors. wander
+        (n,) [N·m]: most that zeros move with temperature (standard deviation).
         """
         self.arm = arm
         self.beta: Array = np.array(beta, dtype=float)
@@ -88,7 +90,7 @@ class GravityBelief:
         kept = values > 1e-12 * max(values[-1], 1e-300)
         self._factor: Array = vectors[:, kept] * np.sqrt(values[kept])
         self._tool: Array = np.empty((self.beta.size, 0))
-        self._position_std = position_std
+        self._position_std, self._wander = position_std, wander
         self.mass = 0.0
         """Mass of the loads that the model has taken over as tools [kg]."""
         self.level = Level.none(arm.n) if level is None else level
@@ -124,7 +126,7 @@ class GravityBelief:
         if self._posterior is None:
             self._posterior = self._learn(self._reference.rows)
         mean, blocks, columns = self._posterior.predict(self.kernel.points(q, side), self._columns(q))
-        blocks += (WANDER * self.level.total[:, None, None]) ** 2
+        blocks += np.minimum(WANDER * self.level.total, self._wander)[:, None, None] ** 2
         flat = columns.swapaxes(0, 1).reshape(q.size, -1)
         tool = (gravity_regressor(self.arm, q) @ self._tool).reshape(q.size, -1)
         return Expected(mean, blocks, np.hstack([flat, tool]))

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from calib.motion.static_reading import StaticReading
+from calib.observer.audit import DOUBTED, audit, confirmed, may_adapt
 from calib.observer.cause_test import CauseTest, Verdict
 from calib.observer.config import ObserverConfig
 from calib.observer.decision import Agreeing, Finding, agreed, decide
@@ -18,16 +19,14 @@ from calib.observer.discrepancy.level import Level
 from calib.observer.events import Event, verdict_evidence
 from calib.observer.gravity_belief import GravityBelief
 from calib.observer.investigation import Investigation
-from calib.observer.limits import Limits
 from calib.observer.rest_detector import RestDetector
+from calib.observer.tracking.limits import Limits
 from calib.observer.tracking.sensor_filter import Estimate
 from calib.observer.tracking.tracking import Tracking
 from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 
-DOUBTED = 2
-"""Windows in a row that nothing explains after which the level of the discrepancy is adapted to them."""
 SCHEMA = 1
 """Version of the saved format."""
 
@@ -56,9 +55,11 @@ class Observer:
         self._position_gain = np.ones(arm.n) if position_gain is None else position_gain
         self._position_offset = np.zeros(arm.n) if position_offset is None else position_offset
         self._rest = RestDetector(arm.n, self.config)
-        expected = level or Level.expected(self.config.discrepancy_share / self.config.noise_share * np.asarray(sigma))
+        rated, settings = np.asarray(sigma, dtype=float) / self.config.noise_share, self.config
+        expected = level or Level.expected(settings.discrepancy_share * rated)
+        wander = settings.zero_wander * rated
         belief = GravityBelief(
-            arm, beta, beta_covariance, self.config.position_std, expected, self.config.baseline_rows
+            arm, beta, beta_covariance, settings.position_std, expected, settings.baseline_rows, wander
         )
         self._tracking = Tracking(belief, sigma, self.config)
         self._investigation = Investigation(arm.n, self.config)
@@ -109,7 +110,10 @@ class Observer:
             return self._repeat(row.t)
         if not self._investigation.is_due():
             return []
-        return self._test(row.t) if self._investigation.held else self._audit(row.t)
+        if self._investigation.held:
+            return self._test(row.t)
+        audit(self._tracking, self._investigation, self.config)
+        return []
 
     def estimate(self) -> Estimate:
         """Current gain and offset of every joint against the installed calibration."""
@@ -154,43 +158,17 @@ class Observer:
         """True angles of position readings."""
         return np.asarray(self._position_gain * position + self._position_offset)
 
-    def _audit(self, t: float) -> list[Event]:
-        """No alarm is open: test the last rows for effects that are too small or too slow for an alarm."""
-        state, tracking = self._investigation, self._tracking
-        window = state.window[-self.config.longest_window :]
-        if not tracking.belief.learnt:
-            if len(window) < self.config.window:
-                return []
-            tracking.adapt(window)
-        verdict = tracking.cause_test(window).verdict()
-        if verdict.cause == "unknown":
-            state.doubtful += 1
-            if state.doubtful >= DOUBTED:  # an alarm would be open if it were a contact
-                tracking.adapt(window)
-                verdict = tracking.cause_test(window).verdict()
-        if verdict.cause == "none":
-            state.doubtful = 0
-            tracking.learn(state.settled(tracking.belief.is_first))
-            return []
-        del state.window[: -self.config.longest_window]
-        state.learned = min(state.learned, len(state.window))
-        if verdict.cause in ("unknown", "ambiguous"):
-            return []  # an alarm follows if it lasts
-        state.start(silent=True)
-        return []
-
     def _test(self, t: float) -> list[Event]:
         """An alarm is open and its window is full: report the cause; propose once two windows agree on a drift."""
         state = self._investigation
         test = self._tracking.cause_test(state.window)
-        verdict = test.verdict()
-        if state.silent and verdict.cause == "unknown" and self._may_adapt(state.window):
+        if state.silent and test.verdict().cause == "unknown" and may_adapt(self._tracking, state.window, self.config):
             self._tracking.adapt(state.window)
             test = self._tracking.cause_test(state.window)
-            verdict = test.verdict()
+        verdict = test.verdict()
         if verdict.cause == "ambiguous" and len(state.window) < self.config.longest_window:
             return []  # more rows may decide
-        if state.silent and not self._confirmed(test, verdict):
+        if state.silent and not confirmed(self._tracking, state, test, verdict, self.config):
             return []
         found, state.silent = state.silent and verdict.is_drift, False
         window, state.window = state.window, []
@@ -210,24 +188,6 @@ class Observer:
         state.carrying = 0
         alarms = [self._event(t, "alarm", joint, channel=verdict.cause) for joint in verdict.joints if found]
         return alarms + self._report(t, verdict) + self._confirm(t, window, test, verdict)
-
-    def _may_adapt(self, window: list[StaticReading]) -> bool:
-        """Whether rows that nothing explains show the discrepancy rather than a contact, for which an alarm is open."""
-        return not self._tracking.belief.learnt or len(window) >= DOUBTED * self.config.window
-
-    def _confirmed(self, test: CauseTest, verdict: Verdict) -> bool:
-        """Whether fresh rows twice find what an audit or a suspicion was about; nothing is told before."""
-        state = self._investigation
-        if verdict.cause in ("none", "unknown", "ambiguous"):
-            if len(state.window) >= self.config.longest_window:
-                self._resume()
-            return False
-        suspected, state.suspected = state.suspected, ("drift" if verdict.is_drift else verdict.cause, verdict.joints)
-        if suspected == state.suspected:
-            return True
-        state.first = Agreeing(state.window, test, frozenset(verdict.joints)) if verdict.is_drift else None
-        state.window = []
-        return False
 
     def _carried(self, t: float, verdict: Verdict) -> list[Event]:
         """A payload that stays is a tool: the model takes it over and watching resumes; likewise when it is removed."""

@@ -51,7 +51,7 @@ def _identity(done: Calibrated) -> Section:
     record, findings = done.record, done.fit.goodness.findings
     broken = sorted({each.joint for each in findings if each.breaks_model})
     verdict = f"the model does not hold: {', '.join(broken)}" if broken else "the model holds"
-    html = f'<p><span class="verdict">{escape(verdict)}</span></p>'
+    html = f'<p><span class="verdict">{escape(verdict)}</span></p>' + paragraph(_advice(done, broken))
     html += "".join(paragraph(each.text) for each in findings)
     rows = [
         ["arm", escape(f"{record.arm}, serial {record.serial}")],
@@ -68,6 +68,25 @@ def _identity(done: Calibrated) -> Section:
         when = f"{data.manifest.created:%Y-%m-%d %H:%M} UTC"
         rows.append([f"sweeps {escape(data.path.name)}", f"{load}, {when}<br><small>SHA-256 {data.digest}</small>"])
     return Section("Calibration", html, (), [ReportTable(("", ""), rows, texts=2)])
+
+
+def _advice(done: Calibrated, broken: list[str]) -> str:
+    """What a person does with this calibration, in a few sentences."""
+    fit = done.fit
+    half = fit.quantile * fit.std("gain")
+    known, unknown = (
+        half[np.isfinite(half)],
+        [name for name, each in zip(fit.names, half, strict=True) if np.isnan(each)],
+    )
+    exactly = (
+        f"Torque gains are known to ± {known.min():.2%} to ± {known.max():.2%}" if known.size else "No gain is known"
+    )
+    without = f"; not of {', '.join(unknown)}, see below" if unknown else ""
+    if broken:
+        return f"Do not write it yet: look at {', '.join(broken)} first, then sweep again. {exactly}{without}."
+    if done.record.confirmed_by:
+        return f"It is confirmed for the controllers; verify it with armlink verify. {exactly}{without}."
+    return f"It can be written to the controllers: armlink calibrate --apply. {exactly}{without}."
 
 
 def _sensors(done: Calibrated) -> Section:

@@ -45,7 +45,7 @@ FLOOR_KNOWN = 1.05
 class _Scorer:
     def __init__(self, estimate: Estimate, heldout: ResidualSet) -> None:
         self.estimate, self.heldout = estimate, heldout
-        self.normal = NormalEquations(estimate.on(heldout), estimate.terms)
+        self.normal = NormalEquations(estimate.on(heldout), estimate.terms, estimate.normal)
         self.joint = np.array([row[1] for row in self.normal.rows])
         self.counts = self.normal.count.sum(0) > 0
 

@@ -27,7 +27,7 @@ def steadiness(estimate: Estimate, heldout: ResidualSet, terms: Sequence[Term]) 
         touching = [term for term in estimate.terms if row in store.columns(term)]
         if not valid.any() or not any(row in store.columns(term) for term in terms):
             continue
-        columns = store.wide(touching, row)[valid]
+        columns = store.wide(touching, row, estimate.normal.fixed)[valid]
         index = estimate.normal.index(touching)
         left, more = (heldout.values[row][valid] - columns @ c[index] for c in (with_them, without))
         falls = np.bincount(heldout.blocks[valid], more**2 - left**2)

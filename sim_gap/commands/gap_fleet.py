@@ -29,7 +29,7 @@ def diagnose_fleet(
     from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 
     from armlink.commands.output import write_json
-    from sim_gap.fleet.cluster import cluster
+    from sim_gap.fleet.cluster import cluster, open_to_all
     from sim_gap.fleet.fleet import Answers, diagnose_fleet, find_cases
     from sim_gap.fleet.fleet import table as table_of
 
@@ -40,6 +40,8 @@ def diagnose_fleet(
     if len(left) < len(cases):
         console.print(f"{answers.path}: {len(cases) - len(left)} of {len(cases)} cases are done already")
     columns = (*Progress.get_default_columns()[:2], MofNCompleteColumn(), TimeRemainingColumn())
+    if left and open_to_all(scheduler):
+        console.print(open_to_all(scheduler), style="yellow")
     if left:
         with cluster(scheduler, min(workers, len(left))) as client, Progress(*columns, console=console) as bars:
             task = bars.add_task("diagnosing", total=len(left))

@@ -3,6 +3,17 @@
 from sim_gap.attribution.diagnosis import Diagnosis
 
 
+def advice(answer: Diagnosis) -> str:
+    """What a person does about it, in a sentence."""
+    if answer.verdict == "no_gap":
+        return "Nothing needs to be changed: the simulator agrees with the arm within the noise of the recordings."
+    if answer.verdict == "unexplained":
+        return "Change nothing yet: look at where the gap is, check cabling, payload and model there, and record again."
+    if answer.verdict == "ambiguous":
+        return "Record one more motion, which tells the candidates apart: armlink gap plan makes it of this answer."
+    return "Add these effects to the simulator: armlink gap diagnose --out-model writes the corrected model."
+
+
 def sentence(answer: Diagnosis) -> str:
     """The verdict in a sentence, without a full stop."""
     if answer.verdict == "no_gap":

@@ -8,8 +8,16 @@ from armlink.effect_catalogue import CATALOGUE
 from calib.report.page import ReportTable, Section, paragraph, render
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
 from sim_gap.report.cause_figures import cause_figure
-from sim_gap.report.effect_text import sentence
+from sim_gap.report.effect_text import advice, sentence
 from sim_gap.report.figures import gap_bars, residual_panels, rollout_bars
+
+WORDS = {
+    "explained": "explained",
+    "ambiguous": "ambiguous",
+    "unexplained": "not explained",
+    "no_gap": "no gap",
+}
+"""Verdicts as a heading."""
 
 
 def sections(answer: Diagnosis) -> list[Section]:
@@ -26,8 +34,8 @@ def write_report(answer: Diagnosis, path: Path, title: str = "Sim-to-real gap", 
 
 
 def _verdict(answer: Diagnosis) -> Section:
-    html = f'<p><span class="verdict">{escape(answer.verdict)}</span> {escape(sentence(answer))}.</p>'
-    html += "".join(paragraph(note) for note in answer.notes)
+    html = f'<p><span class="verdict">{escape(WORDS[answer.verdict])}</span> {escape(sentence(answer))}.</p>'
+    html += paragraph(advice(answer)) + "".join(paragraph(note) for note in answer.notes)
     tables = []
     if answer.causes:
         tables.append(
@@ -46,7 +54,7 @@ def _verdict(answer: Diagnosis) -> Section:
                 texts=3,
             )
         )
-    return Section("Causes of the gap", html, (), tables)
+    return Section("Verdict and causes", html, (), tables)
 
 
 def _cause_row(cause: Cause) -> list[str]:

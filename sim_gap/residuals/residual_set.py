@@ -1,6 +1,6 @@
 """Residuals of a set of recordings: one row per channel and joint, with its noise floor, valid samples and folds."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,7 +10,7 @@ from scipy.ndimage import minimum_filter1d
 
 from gcomp.arrays import Array
 from sim_gap.residuals.gear_impacts import near_impacts
-from sim_gap.residuals.layout import Columns, Layout, Row, layout_of
+from sim_gap.residuals.layout import Layout, Row, layout_of
 from sim_gap.residuals.preprocess import Signals
 
 MODEL_FLOOR = 1e-3
@@ -161,11 +161,6 @@ class ResidualSet:
             first += int(own[-1]) + 1
         return np.concatenate(out)
 
-    def columns(self, of: Callable[[Signals, Layout], Columns]) -> Columns:
-        """A term's columns at the work rate, filtered like the readings, (K, p) per row that it touches."""
-        parts = [_filtered(s, self.layout.compared(of(s, self.layout))) for s in self.signals]
-        return {row: np.concatenate([part[row] for part in parts]) for row in parts[0]}
-
     @cached_property
     def margin(self) -> dict[Row, float]:
         """RMS of each row from which it is a gap [N·m]: twice the noise floor plus the smallest relevant gap.
@@ -209,13 +204,6 @@ def sliding(s: Signals) -> NDArray[np.bool_]:
     settled = minimum_filter1d(moving.astype(np.uint8), width, axis=0, mode="nearest") > 0
     enough = settled.mean(0) >= SETTLED_LEAST * moving.mean(0)
     return np.where(enough, settled, moving)
-
-
-def _filtered(s: Signals, columns: Columns) -> Columns:
-    """Columns of all rows, filtered together."""
-    ends = np.cumsum([x.shape[1] for x in columns.values()])[:-1]
-    pieces = np.split(s.filtered(np.hstack(list(columns.values()))), ends, axis=1)
-    return dict(zip(columns, pieces, strict=True))
 
 
 def root_mean_square(x: Array) -> float:

@@ -1,6 +1,6 @@
 """Columns of terms on one residual set about an estimate, filtered like the readings, each computed once."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -81,14 +81,14 @@ class ColumnStore:
             self._compute(term)
         return self._offsets[term]
 
-    def wide(self, terms: Sequence[Term], row: Row) -> Array:
-        """Columns of these terms in one row, then those beside them, in the order of `NormalEquations.index`."""
+    def wide(self, terms: Sequence[Term], row: Row, nonlinear: Collection[Term]) -> Array:
+        """Columns of terms in one row, then those beside the nonlinear ones, ordered as `NormalEquations.index`."""
         total = sum(self.data.lengths)
         parts = [self.columns(term).get(row) for term in terms]
         own = [
             np.zeros((total, _width(self.columns(t)))) if x is None else x for t, x in zip(terms, parts, strict=True)
         ]
-        beside = [self.offset(term).get(row, np.zeros((total, 1))) for term in terms if self.offset(term)]
+        beside = [self.offset(term).get(row, np.zeros((total, 1))) for term in terms if term in nonlinear]
         return np.hstack([*own, *beside, np.zeros((total, 0))])
 
     def _compute(self, term: Term) -> None:

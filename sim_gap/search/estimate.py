@@ -68,7 +68,7 @@ class Estimate:
             valid = data.valid[row]
             x = np.zeros((len(valid), self.normal.size + len(shaped)))
             touching = [term for term in self.terms if row in self.store.columns(term)]
-            x[:, self.normal.index(touching)] = self.store.wide(touching, row)
+            x[:, self.normal.index(touching)] = self.store.wide(touching, row, self.normal.fixed)
             for k, (term, i) in enumerate(shaped):
                 if row in self.store.columns(term):
                     assert i is not None

@@ -23,6 +23,7 @@ def select_model(store: ColumnStore, library: Sequence[str]) -> Search:
     for _ in range(ROUNDS):
         search = about_itself(store, chosen, offered, values)
         keys = {term.key for term in search.active}
+        search.least = AGAIN
         search.run()
         if {term.key for term in search.active} == keys:
             return search
@@ -43,6 +44,9 @@ def about_itself(nominal: ColumnStore, chosen: list[Term], offered: Sequence[Ter
     return Search(NormalEquations(store, [*chosen, *rivals]), chosen)
 
 
+AGAIN = 0.06
+"""Least improvement of the score by a term that only a search about the estimate adds: five coefficients' price, for on
+real arms a little of many effects looks like what is left."""
 ROUNDS = 2
 """How often the library is searched again about the estimate."""
 

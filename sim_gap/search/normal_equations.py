@@ -23,7 +23,8 @@ CORRELATED = 8.0
 class NormalEquations:
     """Gram matrices of the terms' columns with each other and with the residuals, per fold and row."""
 
-    def __init__(self, store: ColumnStore, terms: Sequence[Term]) -> None:
+    def __init__(self, store: ColumnStore, terms: Sequence[Term], like: "NormalEquations | None" = None) -> None:
+        """`like` has the same coefficients, on other data."""
         data = store.data
         self.store = store
         self.terms = [term for term in terms if store.columns(term)]
@@ -33,8 +34,8 @@ class NormalEquations:
         widths = [next(iter(store.columns(term).values())).shape[1] for term in self.terms]
         ends = np.cumsum([0, *widths])
         self.at = {term: np.arange(ends[i], ends[i + 1]) for i, term in enumerate(self.terms)}
-        held = [term for term in self.terms if store.offset(term)]
-        self.fixed = {term: int(ends[-1]) + k for k, term in enumerate(held)}
+        held = [term for term in self.terms if (term in like.fixed if like else store.offset(term))]
+        self.fixed: dict[Term, int] = {term: int(ends[-1]) + k for k, term in enumerate(held)}
         """Index of the column that a nonlinear term has beside its own; its coefficient is one."""
         self.size = int(ends[-1]) + len(held)
         self.folds = int(data.folds.max()) + 1
@@ -87,7 +88,7 @@ class NormalEquations:
         touching = [term for term in self.terms if row in store.columns(term)]
         valid, y = data.valid[row], data.values[row]
         index = self.index(touching)
-        x = store.wide(touching, row)
+        x = store.wide(touching, row, self.fixed)
         gram, side = np.zeros((self.folds, len(index), len(index))), np.zeros((self.folds, len(index)))
         for fold in range(self.folds):
             pick = valid & (data.folds == fold)

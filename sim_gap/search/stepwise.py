@@ -33,6 +33,8 @@ class Search:
     active: list[Term] = field(default_factory=list)
     added: Counter[Key] = field(default_factory=Counter)
     """How often each effect and place was added, which bounds the search."""
+    least: float = 1e-4
+    """Least improvement of the score by a term that is added."""
 
     def __post_init__(self) -> None:
         self.reweigh()
@@ -105,7 +107,7 @@ class Search:
         trials = (
             self.with_beneath(term, self.active) for _, term in shortlist(self.weighted.screen(self.active, inactive))
         )
-        chosen = self._best(self._judged(trials), self.score - 1e-4)
+        chosen = self._best(self._judged(trials), self.score - self.least)
         return chosen is not None and len(chosen) <= MOST_TERMS and self.accept(chosen)
 
     def backward(self) -> bool:
@@ -116,7 +118,7 @@ class Search:
 
     def swap(self) -> bool:
         """Exchange one term for another that scores better in its place."""
-        chosen = self._best(self._judged(self._exchanges()), self.score - 1e-3)
+        chosen = self._best(self._judged(self._exchanges()), self.score - max(1e-3, self.least))
         return chosen is not None and self.accept(chosen)
 
     def dissolve(self) -> bool:

@@ -130,6 +130,7 @@ class Walk:
             self.pipe.write_text("mass 0\n")
         print(f"{page}: {line}: exit {status}, {time.monotonic() - begin:.0f} s", flush=True)
         if status:
+            print("   ", *said.strip().splitlines()[-1:], flush=True)
             self.wrong.append(f"{page}: {line}: exit {status}: {' '.join(said.split())[-300:]}")
         self.wrong += [f"{page}: {line}: {text}" for text in said.splitlines() if any(word in text for word in FALSE)]
 

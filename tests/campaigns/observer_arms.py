@@ -198,7 +198,7 @@ def slow(level: int, given: argparse.Namespace) -> list[str]:
             f"{estimate:.2%}, written {sorted(written)}",
             flush=True,
         )
-        wrong += [f"level {level}, draw {seed}: slow drift"] * (worst > max(0.005, 1.5 * limit))
+        wrong += [f"level {level}, draw {seed}: slow drift"] * bool(worst > max(0.005, 1.5 * limit))
         wrong += [f"level {level}, draw {seed}: another joint written"] * bool(written - {arm.arm.names[joint]})
     return wrong
 
@@ -225,7 +225,7 @@ def noticed(level: int, given: argparse.Namespace) -> list[str]:
         print(f"noticed: level {level}: of {factor} times the limit {count} of {given.draws} found")
         share = count / given.draws
         bad = share < NOTICED if factor > 1 else share > MISSED
-        wrong += [f"level {level}: {factor} times the limit: {count} of {given.draws}"] * bad
+        wrong += [f"level {level}: {factor} times the limit: {count} of {given.draws}"] * bool(bad)
     return wrong
 
 

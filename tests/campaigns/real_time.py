@@ -33,6 +33,7 @@ FALSE = re.compile(r"encoder|cable|too weak|TPDO|babbles|second node|stuck", re.
 """What no message may say of this sound arm."""
 FLOAT_SECONDS = 60
 DRIFT_GAIN = 1.03
+START_SECONDS = 120
 OBSERVING_SECONDS, DAEMON_SECONDS = 60, 900
 """Longest waits for the daemon to observe, and to correct the drift [s]."""
 GAIN_BOUND, OFFSET_BOUND = 0.005, 0.05
@@ -82,9 +83,10 @@ class Run:
         words = ["sim", self.arm, "--bus", self.bus, "--seed", str(self.seed), "--control", str(self._pipe)]
         with (self.folder / "sim.log").open("w") as log:
             self._arm = subprocess.Popen([ARMLINK, *words], stdout=log, stderr=log)
-        while not self._pipe.exists():
-            time.sleep(0.1)
-        time.sleep(1.0)
+        end, scan = time.monotonic() + START_SECONDS, [ARMLINK, "scan", self.arm, "--bus", self.bus]
+        while subprocess.run(scan, capture_output=True, check=False).returncode:
+            if time.monotonic() > end:
+                raise Failed(f"the simulated arm has not answered within {START_SECONDS} s")
         return self
 
     def __exit__(self, *error: object) -> None:

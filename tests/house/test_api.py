@@ -15,7 +15,7 @@ import armlink
 ROOT = Path(__file__).parents[2]
 SIGNATURES = {
     "load_arm": "(arm)",
-    "load_recording": "(path)",
+    "load_recording": "(path, stated=None)",
     "open_link": "(arm, bus=None, *, simulated=False, load=0.0)",
     "sweep": "(arm, out, *, bus=None, simulated=False, reference_mass=0.0, resume=False, seed=0, progress=None)",
     "calibrate": "(*sweeps, arm=None)",

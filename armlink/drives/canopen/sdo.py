@@ -26,6 +26,8 @@ ABSENT = (0x06020000, 0x06090011)
 MALFORMED = (struct.error, IndexError, ValueError, TypeError)
 """Exceptions that canopen's SDO client raises on malformed frames."""
 
+RESPONSE_TO = {1: 3, 2: 2}
+"""Command specifiers that begin a transfer, and those of their responses: download, upload (CiA 301, 7.2.4.3)."""
 SDO_LENGTH = 8
 """Length of every SDO frame [bytes] (CiA 301, 7.2.4.3)."""
 
@@ -40,15 +42,27 @@ class PumpedNetwork(canopen.Network):  # type: ignore[misc]
     def __init__(self, send: Send) -> None:
         super().__init__(bus=None)
         self._send = send
+        self._asked: dict[int, tuple[int, bytes]] = {}
+        """Newest request to each node: the kind of response that it brings, and its index and sub-index."""
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
         """Send one frame."""
+        if can_id & 0x780 == 0x600 and data[0] >> 5 in RESPONSE_TO:
+            self._asked[can_id & 0x7F] = (RESPONSE_TO[data[0] >> 5], bytes(data[1:4]))
         self._send(can_id, bytes(data))
 
     def notify(self, can_id: int, data: bytearray, timestamp: float) -> None:
-        """Take in an SDO response; other frames are ignored: canopen's handlers raise on truncated ones."""
-        if 0x580 < can_id < 0x600 and len(data) == SDO_LENGTH:
-            super().notify(can_id, data, timestamp)
+        """Take in an SDO response to the newest request; other frames are ignored.
+
+        A request that was repeated brings two responses; the second may come after the next request, and is not for it.
+        canopen's handlers raise on truncated frames.
+        """
+        if not (0x580 < can_id < 0x600 and len(data) == SDO_LENGTH):
+            return
+        kind, asked = data[0] >> 5, self._asked.get(can_id & 0x7F)
+        if asked is not None and kind in RESPONSE_TO.values() and asked != (kind, bytes(data[1:4])):
+            return
+        super().notify(can_id, data, timestamp)
 
 
 class PumpedResponses:

@@ -9,12 +9,14 @@ import mujoco
 import pyarrow.parquet as pq
 import pytest
 import wrong_arms
+from distributed import Client
+from distributed.security import Security
 from typer.testing import CliRunner
 
 from armlink.errors import BadInput
 from armlink.recording.files import save_recording
 from sim_gap.commands.gap import app
-from sim_gap.fleet.cluster import cluster
+from sim_gap.fleet.cluster import cluster, open_to_all
 from sim_gap.fleet.fleet import Answers, Case, diagnose_case, diagnose_fleet, find_cases
 
 
@@ -103,6 +105,25 @@ def test_a_worker_killed_in_the_middle_loses_nothing(tmp_path: Path, monkeypatch
         answers = dict(diagnose_fleet(cases, client))
     assert set(answers) == {"case_0", "case_1"}
     assert all(answer == {"verdict": "no_gap", "causes": []} for answer in answers.values())
+
+
+def test_nobody_else_can_run_code_through_the_scheduler() -> None:
+    """Neither without TLS nor with keys of one's own."""
+    with cluster(None, 1) as client:
+        address = client.scheduler.address
+        assert address.startswith("tls://")
+        assert client.submit(sum, [1, 2]).result() == 3
+        with pytest.raises(OSError, match=r"(?i)timed out|closed|connect"):
+            Client(address.replace("tls://", "tcp://"), timeout=1, set_as_default=False)
+        with pytest.raises(OSError, match=r"(?i)timed out|certificate|ssl|connect"):
+            Client(address, timeout=1, security=Security.temporary(), set_as_default=False)
+
+
+def test_a_scheduler_without_tls_is_said() -> None:
+    assert "can run code" in open_to_all("tcp://192.0.2.1:8786")
+    assert "can run code" in open_to_all("192.0.2.1:8786")
+    assert not open_to_all("tls://192.0.2.1:8786")
+    assert not open_to_all(None)
 
 
 def test_no_scheduler_at_an_address_is_one_line() -> None:

@@ -9,7 +9,7 @@ const MOST = 1500; // per joint, cached until everything is fetched again, thinn
 const history = new Map();
 const events = [];
 const live = new Map(); // the present estimate: the last point of each line
-let seconds = 3600;
+let seconds = 600;
 let now = Date.now();
 let drawn = false;
 

@@ -37,7 +37,9 @@ function nice(largest) {
   return [1, 2, 5, 10].map((step) => step * ten).find((value) => value >= largest);
 }
 
-export function showJoints(joints) {
+export function showJoints(joints, moving = false) {
+  by("joints").classList.toggle("moving", moving);
+  put(by("moving"), moving ? "The arm moves: residuals count again at rest." : "");
   const largest = Math.max(...joints.map((joint) => Math.abs(joint.residual ?? 0)), 0.1);
   scale = largest > scale || largest < scale / 4 ? nice(largest) : scale;
   put(by("bar-scale"), `±${scale} N·m`);

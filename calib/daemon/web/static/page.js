@@ -4,6 +4,7 @@ import { blob, forgetToken, get, stream, token } from "./api.js";
 import { addEvent, draw, drawIfChanged, fetchNew, initRanges, overviewQuery, setHistory, setLive, setNow } from "./drift.js";
 import { showEvent } from "./events.js";
 import { by, clock, duration, put, whole } from "./format.js";
+import { addSample, drawLive, initLive, moves } from "./live.js";
 import { showEstimates, showJoints, verdict } from "./joints.js";
 import { fetchProposals, showProposals } from "./proposals.js";
 
@@ -11,6 +12,13 @@ const SLOW = 2000; // ms between updates of what changes slowly
 let status = null;
 let connected = false;
 let summary = "";
+
+let liveDrawn = 0;
+function drawSometimes() { // the stream is faster than eyes
+  if (document.hidden || performance.now() - liveDrawn < 500) return;
+  liveDrawn = performance.now();
+  drawLive();
+}
 
 const WORDS = { lost: "NO CONNECTION", fault: "FAULT", alarm: "ALARM", decide: "DECISION NEEDED" };
 
@@ -98,7 +106,9 @@ const on = {
     setNow(item.time);
     if (status.state !== item.state) status.detail = ""; // it belonged to the previous state
     status = { ...status, state: item.state, bus: item.bus, time: item.time };
-    showJoints(item.joints);
+    addSample(item);
+    showJoints(item.joints, moves());
+    drawSometimes();
     showBus(item.bus);
     showState(item.state, item.bus.fault || status.detail || "");
   },
@@ -143,6 +153,7 @@ async function start() {
   for (const event of all.events) { addEvent(event); showEvent(event); }
   draw();
   initRanges();
+  initLive();
   document.body.dataset.shown = Math.round(performance.now()); // ms until everything was shown
   stream(on, status.last_event);
   forEver();

@@ -30,12 +30,24 @@ function pending(one) {
   return card;
 }
 
+// What speaks for it, for who decides away from the arm: numbers, and the joint's estimate over time as the page draws it.
+function evidence(one) {
+  const facts = [
+    ["change", change(one)], ["rests of the arm", String(one.rows)], ["confidence", percent(one.confidence)],
+    ["found", clock(one.time)], ["record", `${one.record} replaces ${one.base}`],
+  ];
+  const list = make("dl", {}, ...facts.map(([name, value]) => make("div", {}, make("dt", {}, name), make("dd", {}, value))));
+  const drawn = document.getElementById(`chart-${one.joint}`)?.querySelector("svg")?.cloneNode(true);
+  return drawn ? [list, drawn] : [list];
+}
+
 function decide(one, verb) {
   const dialog = by("ask-decision");
   by("decision-title").textContent = verb === "approve" ? `Write the new calibration to ${one.joint}?` : `Drop the proposal for ${one.joint}?`;
   by("decision-text").textContent = verb === "approve"
     ? `Record ${one.record} goes to the controller and is read back: ${change(one)}. The arm does not move. armlink rollback undoes it.`
     : `${change(one)} stays uncorrected; nothing is written.`;
+  by("decision-evidence").replaceChildren(...evidence(one));
   by("decision-yes").textContent = verb === "approve" ? "Approve" : "Reject";
   by("decision-error").textContent = "";
   by("by").value = localStorage.getItem(NAME) ?? "";

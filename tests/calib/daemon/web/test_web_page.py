@@ -14,6 +14,7 @@ from playwright.sync_api import Browser, Page, expect
 from served_page import TOKEN, Served, open_page, served
 from small_arm import small_arm
 
+from armlink.recording.files import load_recording
 from calib.daemon.settings import DaemonSection
 from calib.daemon.view.api_models import HistoryPoint, State
 from calib.records.records import CalibrationRecord
@@ -195,8 +196,9 @@ def test_history_has_intervals_and_events_on_one_time_axis(browser: Browser, ser
     assert at_event == pytest.approx(times[15], abs=1.0)  # the point of the same 300 s
     same = [card.get_attribute("x1") for card in page.locator("#charts line.event.load").all()]
     assert len(set(same)) == 1
-    page.click("#ranges [data-seconds='600']")
     expect(page.locator("#ranges [data-seconds='600']")).to_have_attribute("aria-pressed", "true")
+    page.click("#ranges [data-seconds='3600']")
+    expect(page.locator("#ranges [data-seconds='3600']")).to_have_attribute("aria-pressed", "true")
     expect(chart.locator("polyline.gain").first).not_to_have_attribute("points", first_line)
 
 
@@ -234,3 +236,48 @@ def test_a_daemon_that_goes_is_missed_and_found_again(browser: Browser, tmp_path
         expect(page.locator("#state")).to_have_text("observing")
     expect(page.locator("#state")).to_have_text("NO CONNECTION")
     expect(page.locator("#detail")).to_contain_text("The values below are old")
+
+
+def test_live_torque_beside_the_model_and_its_window_as_a_recording(
+    browser: Browser, server: Served, view: MadeUpView, tmp_path: Path
+) -> None:
+    page = open_page(browser, server)
+    expect(page.locator("#joints tbody tr")).to_have_count(len(NAMES))
+
+    def tick_until(shown: str) -> None:
+        for _ in range(200):
+            server.do(view.tick)
+            page.wait_for_timeout(20)
+            if page.locator(shown).count():
+                return
+
+    tick_until("#joints.moving")  # the made-up arm swings
+    tick_until("#live-joint_7 svg polyline.torque")
+    expect(page.locator("#joints")).to_have_class("moving")
+    expect(page.locator("#moving")).to_contain_text("at rest")
+    expect(page.locator("#live .chart")).to_have_count(len(NAMES))
+    expect(page.locator("#live-joint_1 svg")).to_have_attribute(
+        "aria-label", re.compile(r"joint_1: sensor .* model .* N·m")
+    )
+    with page.expect_download() as got:
+        page.click("#download")
+    got.value.save_as(tmp_path / "window.csv")
+    run = load_recording(tmp_path / "window.csv")
+    assert (run.n, run.torque is not None) == (len(NAMES), True)
+    assert len(run.t) > 5
+    assert page.complaints == []
+
+
+def test_a_decision_shows_its_evidence(browser: Browser, server: Served, view: MadeUpView) -> None:
+    server.do(view.propose)
+    page = open_page(browser, server, 390, is_mobile=True, has_touch=True)
+    page.click(".proposal button.main")
+    shown = page.locator("#decision-evidence")
+    for word in ("change", "rests of the arm", "confidence", "record"):
+        expect(shown).to_contain_text(word)
+    expect(shown.locator("svg")).to_have_count(1)
+    box = page.locator("#ask-decision").bounding_box()
+    assert box is not None
+    assert box["x"] >= 0
+    assert box["x"] + box["width"] <= 390
+    page.click("#decision-no")

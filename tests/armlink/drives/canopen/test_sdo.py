@@ -1,0 +1,46 @@
+"""SDO with a node that is slow: a request is repeated, and both responses come, one of them to the next request."""
+
+import struct
+from collections import deque
+from collections.abc import Callable
+
+import pytest
+
+from armlink.arm_file import load_arm
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen.sdo import PumpedNetwork, joint_services
+
+
+class SlowNode:
+    """Answers each request once `behind` requests more have come, with what the object held."""
+
+    def __init__(self, behind: int) -> None:
+        self.behind = behind
+        self.waiting: deque[bytes] = deque()
+        self.values: dict[bytes, bytes] = {}
+        self.network = PumpedNetwork(self.take)
+
+    def take(self, can_id: int, data: bytes) -> None:
+        place = data[1:4]
+        if data[0] >> 5 == 1:
+            self.values[place] = data[4:8]
+            self.waiting.append(b"\x60" + place + bytes(4))
+        elif data[0] >> 5 == 2:
+            self.waiting.append(b"\x43" + place + self.values.get(place, bytes(4)))
+
+    def pump(self, done: Callable[[], bool], timeout: float) -> bool:
+        """What is due comes in; nothing else passes the time."""
+        while len(self.waiting) > self.behind and not done():
+            self.network.notify(0x581, bytearray(self.waiting.popleft()), 0.0)
+        return done()
+
+
+@pytest.mark.parametrize("behind", [0, 1, 2])
+def test_late_responses_are_not_taken_for_those_of_the_next_request(behind: int) -> None:
+    node = SlowNode(behind)
+    services = joint_services(node.network, load_arm("sarcos"), node.pump)[0]
+    for number in range(5):
+        gain, record = 0.9 + 0.01 * number, 100 + number
+        services.write_checked(objects.STAGED_GAIN, gain)
+        services.write_checked(objects.RECORD_ID, record)
+        assert services.read(objects.STAGED_GAIN) == struct.unpack("<f", struct.pack("<f", gain))[0]
