@@ -169,8 +169,10 @@ class LinkJoint(Section):
 
     @model_validator(mode="after")
     def _one_drive(self) -> "LinkJoint":
-        if (self.node is None) == (self.drive is None):
-            raise ValueError(f"{self.name}: give either drive ({{family: …}}) or node, and not both")
+        if self.node is None and self.drive is None:
+            raise ValueError(f"{self.name}: give node or drive ({{family: …}})")
+        if self.node is not None and self.drive is not None:
+            raise ValueError(f"{self.name}: give node or drive, not both")
         return self
 
     @property

@@ -22,7 +22,7 @@ with Link(arm, bus) as link:
     link.enable()
     limits = kinematics.lower, kinematics.upper, np.ones(3)  # rad, rad, rad/s
     work = work_targets(link.position_sent, *limits, link.period, np.random.default_rng(1))
-    watch(link, observer, work, seconds=20.0)
+    watch(link, observer, work, seconds=120.0)  # it learns first how far the arm is from its model
     bus.arm.drift("elbow", gain=1.03, offset=0.3)  # 3 % and 0.3 N·m
     history = watch(link, observer, work, seconds=90.0)
 for event in history.events:

@@ -2,9 +2,9 @@
 
 from typing import Literal
 
-from pydantic import FiniteFloat, PositiveFloat
+from pydantic import FiniteFloat
 
-from armlink.arm_file import Section
+from armlink.arm_file import Positive, Section
 from armlink.drives.traits import CalibrationPlace
 
 
@@ -16,7 +16,7 @@ class DriveSettings(Section):
     """Sense of the drive's output against the joint's."""
     zero: FiniteFloat = 0.0
     """Reading of the drive at joint position 0 [rad], at the drive's output."""
-    gear: PositiveFloat = 1.0
+    gear: Positive = 1.0
     """Turns of the drive's output for one of the joint, where a further gear follows it."""
     calibration: CalibrationPlace | None = None
     """Who applies gain and offset of the torque reading; None: as the family's traits have it."""

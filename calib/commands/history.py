@@ -76,7 +76,8 @@ def _print(title: str, rows: list[dict[str, Any]], log: "list[Activation]", writ
         return
     table = Table("", "record", "kind", "created", "replaces", "confirmed by", "note", title=title)
     for row in rows:
-        shown = (row["id"], row["kind"], row["created"], row["parent"] or "", row["confirmed_by"] or "", row["note"])
+        created = row["created"][:19] + row["created"][-6:]  # whole seconds
+        shown = (row["id"], row["kind"], created, row["parent"] or "", row["confirmed_by"] or "", row["note"])
         table.add_row("current" if row["current"] else "", *shown)
     console.print(table)
     lines = Table("when", "what", "record", "by", "why", title="Current records and controller writes")

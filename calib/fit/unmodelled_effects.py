@@ -60,7 +60,8 @@ def strongest_effect(kinematics: Arm, rows: SweepReadings, kept: Mask, refined: 
     """
     counted = rows.readings.counted & kept
     linear, best, most = refined.linear, None, 0.0
-    squares = np.bincount(linear.joint, linear.residual**2, minlength=kinematics.n)
+    total = float(linear.residual @ np.linalg.solve(linear.precision, linear.residual))  # rᵀr of the whitened residual
+    freedom = float(np.trace(np.linalg.solve(linear.precision, linear.annihilator)))
     for effect in _candidates(kinematics, rows, refined):
         columns = np.column_stack([extra.column[counted] for extra in effect.extras]) / linear.sigma[:, None]
         if not np.abs(columns).max(initial=0.0) > 0:
@@ -71,11 +72,10 @@ def strongest_effect(kinematics: Arm, rows: SweepReadings, kept: Mask, refined: 
         along = columns.T @ linear.residual
         coefficient = np.linalg.lstsq(told, along, rcond=1e-10)[0]
         gain, m = float(along @ coefficient), len(effect.extras)
-        touched = np.unique(linear.joint[np.abs(columns).max(axis=1) > 1e-3 * np.abs(columns).max()])
-        free = float(refined.freedom[touched].sum()) - m
+        free = freedom - m
         if free < 4:
             continue
-        left = max(float(squares[touched].sum()) - gain, 1e-6 * float(squares[touched].sum()) + 1e-9)
+        left = max(total - gain, 1e-6 * total + 1e-9)
         ratio = (gain / m) / (left / free)
         p_value = float(stats.f.sf(ratio, m, free))
         own = linear.joint == effect.joint

@@ -45,6 +45,7 @@ class Record(_Frozen):
     description_hash: str
     """SHA-256 of the arm's kinematics; the numbers are valid for this description only."""
     created: AwareDatetime
+    """With fractions of a second, so that records made within one second keep their order."""
     software: str
     sources: dict[str, str] = {}
     """Name and SHA-256 of every data set and recording used."""
@@ -229,7 +230,7 @@ def provenance(arm: ArmFile, sources: dict[str, str] | None = None, created: dat
         "arm": arm.name,
         "serial": arm.serial,
         "description_hash": arm.description_hash,
-        "created": (created or datetime.now(UTC)).replace(microsecond=0),
+        "created": created or datetime.now(UTC),
         "software": f"armlink {version('armlink')}",
         "sources": sources or {},
     }

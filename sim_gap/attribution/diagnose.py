@@ -98,12 +98,13 @@ def _checked(
     hinges = list(hinges_of(compiled_model))
     matched, findings = [], []
     for recording, label in zip(recordings, labels, strict=False):
-        require_length(recording, label)
         taken, found = match_joints(recording, hinges, stated, label)
         matched.append(taken)
         findings += [finding for finding in found if finding not in findings]
     names = () if matched[0].names == default_names(matched[0].n) else matched[0].names
     sim = load_model(source if isinstance(source, str | Path) else compiled_model, names, matched[0].n)
+    for recording, label in zip(matched, labels, strict=False):
+        require_length(recording, label)
     checked, found = check_recordings(sim.arm, matched, labels[: len(matched)], stated)
     return sim, checked, (*findings, *found)
 

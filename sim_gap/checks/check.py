@@ -13,7 +13,7 @@ from armlink.recording.recording import Recording
 from sim_gap.checks.clock import even_times, without_repeats
 from sim_gap.checks.finding import Finding
 from sim_gap.checks.mapping import SURE, find_mapping
-from sim_gap.checks.rigid_fit import fit_rigid, motion_of
+from sim_gap.checks.rigid_fit import as_mounted, fit_rigid, motion_of
 from sim_gap.checks.torque_source import find_delay, find_scale, find_source, find_unsigned
 from sim_gap.checks.velocity import follows_position, sound_velocity
 from sim_gap.model.rigid_body import RigidArm
@@ -66,12 +66,13 @@ def _torque_findings(
     """Findings on one torque channel and the positions; those that a correction could hide are looked for after it."""
     s = prepare(recording, arm, label)
     motion = motion_of(s, channel)
-    unsigned = find_unsigned(arm, motion, stated)
+    mounted = as_mounted(arm, motion)
+    unsigned = find_unsigned(mounted, motion, stated)
     if unsigned:
         return unsigned
     follows = follows_position(recording)
     mapping = find_mapping(arm, motion, stated, follows)
-    delay, fall = find_delay(arm, motion, (len(motion.q) - 1) / max(s.t[-1] - 2.0 * TRIM_S, 1e-9), stated)
+    delay, fall = find_delay(mounted, motion, (len(motion.q) - 1) / max(s.t[-1] - 2.0 * TRIM_S, 1e-9), stated)
     if delay and fall > SURE + sum(finding.fall for finding in mapping):
         recording = _corrected(recording, delay[0], label)
         s = prepare(recording, arm, label)
@@ -84,7 +85,7 @@ def _torque_findings(
         recording = _corrected(recording, finding, label)
     s = prepare(recording, arm, label)
     motion = motion_of(s, channel)
-    fit = fit_rigid(arm, motion)
+    fit = fit_rigid(as_mounted(arm, motion), motion)
     return [*delay, *mapping, *find_scale(arm, fit, motion, stated), *find_source(fit, s, motion, stated)]
 
 

@@ -8,7 +8,7 @@ the diagnosis either.
 
 import math
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -16,7 +16,7 @@ import numpy as np
 from armlink.recording.corrections import Corrections
 from gcomp.arrays import Array
 from sim_gap.checks.finding import Finding, Kind
-from sim_gap.checks.rigid_fit import STRONG_SHARE, Motion, RigidFit, changed, fit_model, fit_rigid
+from sim_gap.checks.rigid_fit import STRONG_SHARE, Motion, RigidFit, as_mounted, changed, fit_rigid
 from sim_gap.model.rigid_body import RigidArm
 
 SURE = 0.7
@@ -27,6 +27,8 @@ FITS = 0.65
 """Share of variance that the joints concerned must have explained after a correction (median), and strong ones each."""
 PLAUSIBLE = 0.4, 2.5
 """Coefficient of the model's torque on a strong joint after a correction."""
+SPRUNG = 0.97
+"""Share of variance explained from which a joint has a spring; a turned sign looks like one by less."""
 TURN = math.pi / 180.0
 
 
@@ -48,7 +50,7 @@ def find_mapping(arm: RigidArm, motion: Motion, stated: Corrections, follows: Se
     `follows` are the channels (of `dq`, `q_cmd`) whose columns agree with the positions' as they are recorded, so that
     what is wrong with a position is wrong with theirs. All findings are corrected, or none is.
     """
-    fit = _with_free_gravity(arm, motion)
+    fit = _as_an_arm(arm, motion)
     taken: list[tuple[Hypothesis, float]] = []
     for _ in range(2 * arm.n):
         best = _best(arm, motion, fit, list(hypotheses(arm, motion.channel, stated, follows)))
@@ -59,6 +61,13 @@ def find_mapping(arm: RigidArm, motion: Motion, stated: Corrections, follows: Se
         taken.append((hypothesis, fall))
     sure = _is_sound(fit, {joint for hypothesis, _ in taken for joint in hypothesis.joints})
     return [_finding(arm, hypothesis, fit, fall, sure) for hypothesis, fall in taken]
+
+
+def _as_an_arm(arm: RigidArm, motion: Motion) -> RigidFit:
+    """The fit as it stands, gravity and springs included where they explain a joint: those are effects of the arm."""
+    mounted = as_mounted(arm, motion)
+    plain, sprung = fit_rigid(mounted, motion), fit_rigid(mounted, motion, springs=True)
+    return replace(plain, explained=np.where(sprung.explained > SPRUNG, sprung.explained, plain.explained))
 
 
 def _best(
@@ -81,22 +90,6 @@ def _contradicts(fit: RigidFit, joints: Sequence[int]) -> bool:
     if len(touched) == len(fit.scale) > 2:
         return False
     return bool(np.any((fit.own_share[touched] > 2.0 * STRONG_SHARE) & (fit.scale[touched] < 0.5 * PLAUSIBLE[0])))
-
-
-def _with_free_gravity(arm: RigidArm, motion: Motion) -> RigidFit:
-    """The fit as it is, or with gravity along any axis where that is better: a tilted base is an effect of the arm."""
-    plain = fit_rigid(arm, motion)
-    still = np.zeros_like(motion.q)
-    inertia = arm.torque(motion.q, motion.v, motion.a, np.zeros(3))
-    columns = np.stack([arm.torque(motion.q, still, still, axis) for axis in np.eye(3)], axis=-1)
-    weight = 1.0 / (motion.reading.std(0) + 1e-9)
-    left = ((motion.reading - inertia) * weight).ravel()
-    gravity = np.linalg.lstsq((columns * weight[:, None]).reshape(-1, 3), left, rcond=None)[0]
-    size, nominal = float(np.linalg.norm(gravity)), float(np.linalg.norm(arm.gravity))
-    if size < 1e-6 or nominal < 1e-6:
-        return plain
-    free = fit_model(inertia + columns @ (gravity * nominal / size), motion)
-    return free if free.cost.sum() < plain.cost.sum() else plain
 
 
 def hypotheses(arm: RigidArm, channel: str, stated: Corrections, follows: Sequence[str]) -> Iterator[Hypothesis]:

@@ -22,6 +22,10 @@ MOVING_SHARE = 0.3
 """Share of rows in motion from which the sign of friction counts."""
 FLOOR = 0.02
 """Share of a reading's variance below which what is left does not count: noise, and effects of every arm."""
+MOUNTED = 0.1
+"""Share of the readings' variance that may be left (geometric mean) for gravity along another axis to count."""
+UPSIDE_DOWN = 0.98
+"""Cosine from which gravity is nearly opposite: then a turned sign of all torques is as good, and far more common."""
 STRONG_SHARE, STRONG_CORRELATION = 0.2, 0.8
 """A joint is strong if the model's own part is this share of the reading, and correlates with it so."""
 
@@ -73,19 +77,41 @@ def motion_of(s: Signals, channel: str) -> Motion:
     return Motion(q, v, a, reading, channel)
 
 
-def fit_rigid(arm: RigidArm, motion: Motion) -> RigidFit:
-    """Fit the reading of every joint by the model's torque at the motion."""
-    model = arm.torque(motion.q, motion.v, motion.a)
-    return fit_model(model, motion)
+def fit_rigid(arm: RigidArm, motion: Motion, springs: bool = False) -> RigidFit:
+    """Fit the reading of every joint by the model's torque at the motion; with `springs`, of either sign, too."""
+    return fit_model(arm.torque(motion.q, motion.v, motion.a), motion, springs)
 
 
-def fit_model(model: Array, motion: Motion) -> RigidFit:
-    """Fit the reading of every joint by a model torque (K, n)."""
-    fits = [_joint(model[:, j], motion, j) for j in range(model.shape[1])]
+def fit_model(model: Array, motion: Motion, springs: bool = False) -> RigidFit:
+    """Fit the reading of every joint by a model torque (K, n); with `springs`, of either sign, too."""
+    fits = [_joint(model[:, j], motion, j, springs) for j in range(model.shape[1])]
     return RigidFit(*(np.array(values) for values in zip(*fits, strict=True)))
 
 
-def _joint(model: Array, motion: Motion, j: int) -> tuple[float, ...]:
+def as_mounted(arm: RigidArm, motion: Motion) -> RigidArm:
+    """The arm with gravity along the axis that fits best, if that is better than the nominal one.
+
+    A tilted base is an effect of the arm, which the diagnosis finds; no fault of the data must be seen in it.
+    """
+    still = np.zeros_like(motion.q)
+    inertia = arm.torque(motion.q, motion.v, motion.a, np.zeros(3))
+    columns = np.stack([arm.torque(motion.q, still, still, axis) for axis in np.eye(3)], axis=-1)
+    weight = 1.0 / (motion.reading.std(0) + 1e-9)
+    left = ((motion.reading - inertia) * weight).ravel()
+    gravity = np.linalg.lstsq((columns * weight[:, None]).reshape(-1, 3), left, rcond=None)[0]
+    size, nominal = float(np.linalg.norm(gravity)), float(np.linalg.norm(arm.gravity))
+    if size < 1e-6 or nominal < 1e-6:
+        return arm
+    turned = replace(arm, gravity=gravity * nominal / size)
+    found, plain = fit_rigid(turned, motion).cost, fit_rigid(arm, motion).cost
+    opposite = fit_rigid(arm, replace(motion, reading=-motion.reading)).cost
+    upside_down = float(gravity @ arm.gravity) < -UPSIDE_DOWN * size * nominal
+    if found.sum() > plain.sum() or found.mean() > np.log(MOUNTED + FLOOR):
+        return arm
+    return arm if upside_down and opposite.sum() < found.sum() + 0.3 else turned
+
+
+def _joint(model: Array, motion: Motion, j: int, spring: bool) -> tuple[float, ...]:
     y = motion.reading[:, j] - motion.reading[:, j].mean()
     spread = float(y.std())
     columns = np.column_stack([model, np.clip(motion.v[:, j] / TURNING, -1.0, 1.0), motion.v[:, j], motion.a[:, j]])
@@ -102,6 +128,9 @@ def _joint(model: Array, motion: Motion, j: int) -> tuple[float, ...]:
     unsigned = motion.channel == "tau" or np.mean(np.abs(motion.v[:, j]) > TURNING) < MOVING_SHARE
     if unsigned:  # a link sensor feels no gear, and a joint at rest no friction: their sign says nothing
         scaled = np.column_stack([scaled, -scaled[:, 1:]])
+    if spring and motion.q[:, j].std() > 1e-6:
+        turned = (motion.q[:, j] - motion.q[:, j].mean()) / motion.q[:, j].std()
+        scaled = np.column_stack([scaled, turned, -turned])
     coefficients, rest = nnls(scaled, y)
     explained = 1.0 - rest**2 / float(y @ y)
     own_share = float(own.std() * units[0]) / spread

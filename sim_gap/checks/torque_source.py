@@ -22,6 +22,8 @@ LAG, LAG_STEP = 1.5, 0.02
 OWN_LAG = 0.12
 """Delay up to which it is an effect of drive or sensor, which the diagnosis finds by itself [s]."""
 SURE = 0.7
+UNRELATED = 0.4
+"""Correlation with the model's torque below which a reading that never changes its sign does not follow it."""
 
 
 def find_scale(arm: RigidArm, fit: RigidFit, motion: Motion, stated: Corrections) -> list[Finding]:
@@ -56,7 +58,8 @@ def find_unsigned(arm: RigidArm, motion: Motion, stated: Corrections) -> list[Fi
         never = min(np.mean(y > 0.02 * y.std()), np.mean(y < -0.02 * y.std())) < 0.005
         crosses = min(np.mean(m > 0.0), np.mean(m < 0.0)) > 0.1
         folded, plain = (abs(np.corrcoef(np.abs(y), x)[0, 1]) for x in (np.abs(m), m))
-        if never and crosses and both_ways and folded > max(plain + 0.2, 0.6):
+        unrelated = motion.channel != "tau" and plain < UNRELATED  # friction of a motor changes its sign too
+        if never and crosses and both_ways and (folded > max(plain + 0.2, 0.6) or unrelated):
             evidence = f"never changes its sign, though the model's torque does; it follows its amount ({folded:.2f})"
             option = f"record signed torque, or --sign {motion.channel}_{j + 1}=1 if it is right"
             found.append(Finding("unsigned", motion.channel, arm.names[j], evidence, option, False))

@@ -9,7 +9,10 @@ import pytest
 
 pytestmark = pytest.mark.slow
 SEED = 3
-SECTIONS = ("Sensor calibration", "Sweeps", "Gravity model", "Drift", "gap")
+SECTIONS = (
+    *("In short", "Sensor calibration", "Sweeps", "Gravity model", "Drift"),
+    *("Verdict and causes", "Gap before and after", "The causes one by one", "Residuals"),
+)
 
 
 @pytest.fixture(scope="module")

@@ -77,7 +77,7 @@ WRONG = [
     (edited("mass: 8.0", "mass: 0.0"), ARM, ["sim.links.0.mass", "greater than 0"]),
     (edited("lower: -0.8726646260", "lower: 2.5"), ARM, ["joint_1", "lower 2.5 must be less"]),
     # arm files: missing parts
-    (edited("name: joint_1, node: 1", "name: joint_1"), ARM, ["link.joints.0.node", "add it"]),
+    (edited("name: joint_1, node: 1", "name: joint_1"), ARM, ["link.joints.0", "joint_1: give node or drive"]),
     (edited("name: sarcos\n", ""), ARM, ["key name", "add it"]),
     (edited("interface: armlink_sim, channel: sarcos", "interface: armlink_sim, channel: nobody"), ARM, ["nobody"]),
     (edited("name: joint_2, node: 2", "name: joint_2, node: 1"), ARM, ["stands twice", "unique"]),

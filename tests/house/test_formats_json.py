@@ -84,8 +84,8 @@ def test_answers_that_name_their_schema():
 
 
 def split_keys(number: str) -> set[str]:
-    """What the keys of a section consist of."""
-    return {piece for key in keyed(number) for piece in re.split(r"\[\]\.|\.", key)}
+    """Names that the keys of a section consist of; a key of a list's entries begins with none."""
+    return {piece for key in keyed(number) for piece in re.split(r"\[\]\.|\.", key) if piece}
 
 
 def test_no_key_of_an_answer_is_made_up():
@@ -137,6 +137,7 @@ def workplace(tmp_path_factory):
         ("6.15", "torque arm.xml --q q.csv"),
         ("6.17", "history sarcos --store records.db --import a.yaml --activate"),
         ("6.18", "diff a.yaml b.yaml --store records.db"),
+        ("6.24", "drives"),
         ("6.19", "gap plan sarcos --joint joint_2 --poses 1 --out motion.csv"),
     ],
 )

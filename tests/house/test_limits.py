@@ -9,11 +9,13 @@ from pydantic import TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
 from armlink.arm_file import LinkJoint, LinkSection, Section
+from armlink.drives.registry import family, family_names
 from calib.arm.sweep_section import SweepSection
 from calib.daemon.settings import DaemonSection, RecordingSettings
 from sim_bus.sim_section import SimSection
 
-KNOWN = (LinkJoint, LinkSection, SweepSection, DaemonSection, RecordingSettings, SimSection)
+FAMILIES = tuple(family(name).settings for name in family_names())
+KNOWN = (LinkJoint, LinkSection, SweepSection, DaemonSection, RecordingSettings, SimSection, *FAMILIES)
 
 
 def kinds(base: type[Section]) -> Iterator[type[Section]]:

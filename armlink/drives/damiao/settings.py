@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, FiniteFloat
 
 from armlink.drives.settings import DriveSettings
 
@@ -17,9 +17,9 @@ class DamiaoSettings(DriveSettings):
     """Reply id (MST_ID, register 7)."""
     model: str = ""
     """Model as on its label, for example DM8009; it is for people, the scales are read from the drive."""
-    kp: Annotated[float, Field(ge=0, le=500)]
+    kp: Annotated[FiniteFloat, Field(ge=0, le=500)]
     """Stiffness under position control, at the drive's output [N·m/rad]."""
-    kd: Annotated[float, Field(ge=0, le=5)]
+    kd: Annotated[FiniteFloat, Field(ge=0, le=5)]
     """Damping under position control [N·m·s/rad]; 0 with kp makes the motor oscillate."""
 
     @property

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, FiniteFloat, model_validator
 
 from armlink.drives.robstride.frames import RANGES
 from armlink.drives.settings import DriveSettings
@@ -18,9 +18,9 @@ class RobStrideSettings(DriveSettings):
     """Our id, to which it replies."""
     model: Literal["RS00", "RS01", "RS02", "RS03", "RS04", "RS05", "RS06"]
     """Model as on its label: its frames are scaled by it, and the drive has no register that tells it."""
-    kp: Annotated[float, Field(ge=0)]
+    kp: Annotated[FiniteFloat, Field(ge=0)]
     """Stiffness under position control, at the drive's output [N·m/rad]."""
-    kd: Annotated[float, Field(ge=0)]
+    kd: Annotated[FiniteFloat, Field(ge=0)]
     """Damping under position control [N·m·s/rad]."""
 
     @model_validator(mode="after")

@@ -26,6 +26,8 @@ MOST_CONNECTIONS = 640
 """More than all that `admission` lets in together."""
 ACCEPTED_AT_ONCE = 32
 """Connections accepted in one go: those that find no room are closed before the next go."""
+WAITING = 512
+"""Connections that the kernel holds until they are accepted; beyond it connect() on the Unix socket fails."""
 FILES = 4096
 """Open files that the daemon asks the system for, as far as its hard limit allows."""
 CLOSING_SECONDS = 2
@@ -119,7 +121,13 @@ def _identity(path: Path) -> tuple[int, int] | None:
 
 
 class _Server(uvicorn.Server):
-    """uvicorn's server without its signal handlers: the service has its own."""
+    """uvicorn's server without its signal handlers (the service has its own), and with a queue longer than one go."""
+
+    async def startup(self, sockets: list[sockets.socket] | None = None) -> None:
+        """As uvicorn's, whose backlog is both the kernel's queue and what is accepted in one go."""
+        await super().startup(sockets)
+        for listening in sockets or ():
+            listening.listen(WAITING)
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:

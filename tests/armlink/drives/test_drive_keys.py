@@ -48,8 +48,8 @@ def test_a_torque_sensor_at_an_input_of_the_device(tmp_path):
         (drive(family="stepper", node=1), "key link.joints.0.drive: no drive family 'stepper'; there are canopen"),
         (drive(node=1), "key link.joints.0.drive: expected a mapping with the key family"),
         (drive(family="canopen", node=1, torque="motor", calibration="controller"), "calibration: controller needs"),
-        (lambda joints: joints[0].update(drive={"family": "canopen", "node": 1}), "give either drive"),
-        (lambda joints: joints[0].pop("node"), "give either drive"),
+        (lambda joints: joints[0].update(drive={"family": "canopen", "node": 1}), "give node or drive"),
+        (lambda joints: joints[0].pop("node"), "give node or drive"),
         (drive(family="canopen", node=2), "'node 2' stands twice"),
     ],
 )

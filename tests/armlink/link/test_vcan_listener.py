@@ -10,6 +10,7 @@ import pytest
 from fake_joints import FakeBus
 
 from armlink.arm_file import Bus
+from armlink.bus.bus_group import BusGroup
 from armlink.bus.open import open_bus, open_link_bus
 from armlink.link.listener import Listener
 from armlink.link.types import Calibration
@@ -62,12 +63,14 @@ def test_two_buses_are_taken_in_the_order_of_their_frames(arm_of):
     section = section.model_copy(update={"bus": VCAN0, "buses": {"hand": VCAN1}, "joints": joints})
     arm = arm.model_copy(update={"link": section})
     group = open_link_bus(None, section)
+    assert isinstance(group, BusGroup)
     with Listener(arm, open_link_bus(None, section)) as listener:
         controller = group.open_port()
         for cycle in range(30):
-            controller.send(0x80, b"")  # on each bus
-            for node in (1, 2):
-                controller.send(0x180 + node, READING.pack(cycle, 1_000_000 * cycle))
+            for tag in group.tags.values():
+                controller.send(0x80 | tag, b"")
+            for node, bus in ((1, ""), (2, "hand")):
+                controller.send(0x180 + node | group.tags[bus], READING.pack(cycle, 1_000_000 * cycle))
         samples = taken(listener)
         assert len(samples) == 29
         for joint in range(2):

@@ -22,6 +22,8 @@ from calib.records.store import RecordStore
 ROOT = Path(__file__).parents[3]
 PACKAGES = ("armlink", "calib", "gcomp", "sim_bus", "sim_gap")
 DOOR, GATES = "calib/install/journaled_write.py", "calib/install/plausibility.py"
+LOOP, ASKS = "calib/daemon/loop/arm_loop.py", ("calib/daemon/loop/loop_process.py", "armlink/loop/remote_link.py")
+"""What answers the service's calls of the bus process, and where each of the two bus processes is called."""
 WIRE = "armlink/drives/canopen/torque_sensor_record.py"
 DRIVES = "armlink/drives/canopen/drives.py"
 OBJECTS = ("STAGED_GAIN", "STAGED_OFFSET", "ACTIVATE")
@@ -63,6 +65,20 @@ def users(name: str) -> set[tuple[str, str]]:
     return {(path, function) for path, function, _ in mentions(name)}
 
 
+def calls(*names: str) -> Iterator[tuple[str, str, ast.expr | None]]:
+    """(File, function, first argument) of every call of a function or method of these names."""
+
+    def visit(node: ast.AST, path: str, function: str) -> Iterator[tuple[str, str, ast.expr | None]]:
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.Call) and set(names) & set(names_in(child.func)):
+                yield path, function, child.args[0] if child.args else None
+            inner = child.name if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef) else function
+            yield from visit(child, path, inner)
+
+    for path, tree in trees().items():
+        yield from visit(tree, path, "")
+
+
 # ---- by the source
 
 
@@ -71,13 +87,24 @@ def test_only_the_door_calls_write_calibration() -> None:
     callers = users("write_calibration")
     assert {function for path, function in callers if path == DOOR} == {"_write", "_restore"}
     others = {(path, function) for path, function in callers if path != DOOR and function != "write_calibration"}
-    assert others <= {("calib/daemon/loop/arm_loop.py", "_do")}
+    assert others <= {(LOOP, "_do")}
 
 
 def test_only_a_forwarder_asks_the_bus_process_to_write() -> None:
+    """By name, in a `Call`; functions in a `Call` (`RemoteLink.inside`) are subject to the test above."""
     said = {(path, function) for path, function, kind in mentions("write_calibration") if kind is ast.Constant}
-    asking = {(path, function) for path, function in said if path.startswith("calib/daemon/") and function}
-    assert {function for _, function in asking - {("calib/daemon/loop/arm_loop.py", "_do")}} == {"write_calibration"}
+    assert said == {(LOOP, "_do"), *((path, "write_calibration") for path in ASKS)}
+
+
+def test_a_call_of_the_bus_process_spells_its_name_out() -> None:
+    """Otherwise a name put together at run time would pass the test above."""
+    service, job = ASKS
+    made = {(path, function) for path, function, _ in calls("Call")}
+    assert made == {(service, "_tour"), (service, "_call"), (job, "_call")}
+    asked = [call for call in calls("_call", "_enabled") if call[0] in ASKS]
+    assert {what.value for _, _, what in asked if isinstance(what, ast.Constant)} >= {"write_calibration", "enable"}
+    passed_on = {(path, function) for path, function, what in asked if not isinstance(what, ast.Constant)}
+    assert passed_on == {(job, "inside"), (job, "_enabled")}
 
 
 def test_only_write_calibration_uses_the_wire_format() -> None:

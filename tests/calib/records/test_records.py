@@ -13,7 +13,14 @@ from pydantic import ValidationError
 
 from armlink.errors import BadInput, Refused
 from calib.records.database import default_url
-from calib.records.records import CalibrationRecord, Discrepancy, GravityRecord, JointCalibration, parse_record
+from calib.records.records import (
+    CalibrationRecord,
+    Discrepancy,
+    GravityRecord,
+    JointCalibration,
+    parse_record,
+    provenance,
+)
 from calib.records.store import RecordStore, export_yaml
 
 
@@ -51,6 +58,12 @@ def test_a_record_with_a_discrepancy_comes_back_and_one_without_keeps_its_conten
     assert store.get(store.add(record)) == record
     assert parse_record(yaml.safe_load(record.to_yaml()), "yaml") == record
     assert record.discrepancy("length", missing=1.0).tolist() == [0.8, 1.0]
+
+
+def test_records_of_one_second_are_listed_in_the_order_they_were_made(store: RecordStore) -> None:
+    made = [calibration().model_copy(update=provenance(ARM)) for _ in range(20)]
+    assert len({store.add(record) for record in made}) == 20
+    assert [record.id for record in store.history(ARM)] == [record.id for record in made]
 
 
 def test_sizes_are_checked() -> None:

@@ -62,9 +62,14 @@ def test_a_hum_below_the_pass_band_is_blamed_on_nothing():
     assert not answer.causes
 
 
-def test_mains_hum_above_the_pass_band_is_no_gap():
+def test_mains_hum_above_the_pass_band_is_a_band_and_blames_nothing():
     hum = lambda r: replace(r, torque=r.torque + np.sin(2 * np.pi * 18.7 * r.t)[:, None] * [0, 1, 0])  # noqa: E731
-    assert diagnosed(hum).verdict == "no_gap"
+    answer = diagnosed(hum)
+    assert answer.verdict == "unexplained"
+    (line,) = [place for place in answer.where if place.regime == "band"]
+    assert (line.joint, line.channel) == ("joint_2", "tau")
+    assert line.hz == pytest.approx(18.7, abs=0.3)
+    assert not [cause for cause in answer.causes if cause.confidence > 0.5]
 
 
 def stuck(recording: Recording) -> Recording:

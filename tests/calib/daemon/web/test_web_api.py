@@ -155,7 +155,7 @@ def test_nothing_commands_torque_or_motion(server: Served, view: MadeUpView) -> 
     known = {*described, "/openapi.json", *page_files()}
     assert all(path in known for path in route_paths(app.routes))
     offered, decided = ({name for name in vars(seen) if not name.startswith("_")} for seen in (DaemonView, Decisions))
-    reading = {"status", "joints", "estimates", "events", "history", "proposals", "subscribe"}
+    reading = {"status", "joints", "estimates", "events", "history", "history_pages", "proposals", "subscribe"}
     assert offered == reading | {"decisions"}
     assert decided == {"approve", "reject"}
 

@@ -1,6 +1,7 @@
 """The stream: joints and events as they come, resumed where it broke off; no client holds up another or the daemon."""
 
 import asyncio
+import contextlib
 import json
 import socket
 from collections.abc import Iterator
@@ -17,6 +18,7 @@ from small_arm import small_arm
 
 from calib.daemon.service_view import ServiceView
 from calib.daemon.web import stream as stream_module
+from calib.daemon.web.server import ACCEPTED_AT_ONCE
 from calib.daemon.web.stream import Streams
 
 
@@ -110,6 +112,23 @@ def test_fifty_clients_get_every_item_and_it_is_encoded_once(server: Served, vie
     seen = asyncio.run(run())
     assert all(times == pytest.approx([0, 0.1, 0.2, 0.3, 0.4, 0.5]) for times in seen)
     assert len({id(data) for data in encoded[-50:]}) == 1
+
+
+def test_clients_that_connect_while_the_service_is_busy_are_let_in(server: Served) -> None:
+    """More than are accepted in one go, and none of them waits in connect()."""
+    with contextlib.ExitStack() as opened:
+        clients = [opened.enter_context(socket.socket(socket.AF_UNIX)) for _ in range(5 * ACCEPTED_AT_ONCE)]
+
+        def connect() -> None:
+            for each in clients:
+                each.setblocking(False)
+                each.connect(str(server.path))
+                each.sendall(b"GET /api/status HTTP/1.1\r\nHost: localhost\r\n\r\n")
+
+        server.do(connect)  # on the event loop's own thread: nothing is accepted meanwhile
+        for each in clients:
+            each.settimeout(30)
+            assert each.recv(12) == b"HTTP/1.1 200"
 
 
 def test_fifty_clients_cost_the_bus_no_cycle(tmp_path: Path) -> None:
