@@ -15,6 +15,10 @@ DAMPING_SHARE = 0.9
 """Damping takes at most this share of the torque limit; the rest is for rounding."""
 
 
+SOFTER, SOFTER_STEPS = 0.8, 30
+"""Factor by which both gains are lowered, again and again, while the sum of the law is beyond the limit."""
+
+
 class Ranges(NamedTuple):
     """Ends of the packed ranges: ±position [rad], ±velocity [rad/s], ±torque [N·m], 0 to kp and 0 to kd."""
 
@@ -141,9 +145,7 @@ def round_within(
     if told.kp > 0 and limits.lower <= command.position <= limits.upper:
         command = command._replace(position=_inwards(told.position, limits, ranges.position_quantum))
         told = coded(command)
-    total = told.torque
-    if math.isfinite(position) and math.isfinite(velocity):
-        total += told.kp * (told.position - position) + told.kd * (told.velocity - velocity)
+    total = _law(told, position, velocity) if math.isfinite(position + velocity) else told.torque
     beyond = max(total - most, told.torque - most, 0.0) or min(total + most, told.torque + most, 0.0)
     if beyond:
         steps = math.copysign(math.ceil(abs(beyond) / torque_quantum), beyond)
@@ -152,7 +154,18 @@ def round_within(
         told = coded(command)
         if abs(told.torque) > most:  # the limit lies between two steps
             command = command._replace(torque=told.torque - math.copysign(torque_quantum, told.torque))
-    return command
+    if not math.isfinite(position + velocity):
+        return command
+    for _ in range(SOFTER_STEPS):  # where the torque, limited by itself, cannot keep the sum within the limit
+        if abs(_law(coded(command), position, velocity)) <= most:
+            return command
+        command = command._replace(kp=SOFTER * command.kp, kd=SOFTER * command.kd)
+    return command._replace(kp=0.0, kd=0.0)
+
+
+def _law(told: MitCommand, position: float, velocity: float) -> float:
+    """Torque that a drive makes of a command where it stands [N·m]."""
+    return told.kp * (told.position - position) + told.kd * (told.velocity - velocity) + told.torque
 
 
 def damping(kd: float, position: float, velocity: float, most: float) -> MitCommand:
