@@ -2,9 +2,9 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field, FiniteFloat, PositiveFloat, model_validator
+from pydantic import Field, FiniteFloat, model_validator
 
-from armlink.arm_file import Section
+from armlink.arm_file import Positive, Section
 from armlink.drives.settings import DriveSettings
 
 TYPES = {"int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "real32": "f"}
@@ -42,9 +42,9 @@ class CanopenSettings(DriveSettings):
     torque: Literal["record", "motor"] | TorqueObject = "record"
     """Where the joint torque is read: our record 2100h, the drive's own estimate 6077h, or an object of the device."""
 
-    position_unit: PositiveFloat | None = None
+    position_unit: Positive | None = None
     """Radians of one count of 6064h at the drive's output; by default as 6092h, 60A8h or 608Fh tell."""
-    velocity_unit: PositiveFloat | None = None
+    velocity_unit: Positive | None = None
     """Radians a second of one count of 606Ch; by default as 60A9h tells, else counts of 6064h a second."""
 
     @model_validator(mode="after")
