@@ -48,7 +48,8 @@ def test_two_buses_one_of_them_can_fd_are_one(arm_of):
         can.Bus(interface="socketcan", channel="vcan1", fd=True) as hand,
     ):
         port = group.open_port()
-        port.send_all([(0x201, b"one"), (0x202, b"two"), (0x80, b"")])
+        tag = group.tags["hand"]
+        port.send_all([(0x201, b"one"), (0x80, b""), (tag | 0x202, b"two"), (tag | 0x80, b"")])
         heard = {bus: [bus.recv(1.0), bus.recv(1.0)] for bus in (base, hand)}
         assert [m.arbitration_id for m in heard[base]] == [0x201, 0x80]
         assert [(m.arbitration_id, m.is_fd, m.bitrate_switch) for m in heard[hand]] == [
@@ -57,5 +58,5 @@ def test_two_buses_one_of_them_can_fd_are_one(arm_of):
         ]
         hand.send(can.Message(arbitration_id=0x182, data=b"fd", is_extended_id=False, is_fd=True))
         base.send(can.Message(arbitration_id=0x181, data=b"classic", is_extended_id=False))
-        assert {port.receive(1.0), port.receive(1.0)} == {(0x182, b"fd"), (0x181, b"classic")}
+        assert {port.receive(1.0), port.receive(1.0)} == {(tag | 0x182, b"fd"), (0x181, b"classic")}
     group.shutdown()
