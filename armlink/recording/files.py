@@ -36,12 +36,13 @@ def load_recordings(path: str | Path, stated: Corrections | None = None) -> dict
 
 def _loaded(path: Path, stated: Corrections) -> dict[str, Recording]:
     """The recordings of a path as they stand in it, but for their columns' names."""
-    from armlink.recording.lerobot import is_lerobot, load_lerobot
-    from armlink.recording.ros_bag import is_bag, load_bag
+    if (path / "meta" / "info.json").is_file():
+        from armlink.recording.lerobot import load_lerobot
 
-    if is_lerobot(path):
         return load_lerobot(path)
-    if is_bag(path):
+    if (path / "metadata.yaml").is_file() or path.suffix == ".db3":
+        from armlink.recording.ros_bag import load_bag
+
         return {str(path): load_bag(path, stated.topic)}
     if path.is_dir():
         raise BadInput(
@@ -53,8 +54,11 @@ def _loaded(path: Path, stated: Corrections) -> dict[str, Recording]:
     if suffix == ".mcap":
         from armlink.recording.mcap import has_our_topics, load_mcap
 
-        ours = not stated.topic and has_our_topics(path)
-        return {str(path): load_mcap(path) if ours else load_bag(path, stated.topic)}
+        if not stated.topic and has_our_topics(path):
+            return {str(path): load_mcap(path)}
+        from armlink.recording.ros_bag import load_bag
+
+        return {str(path): load_bag(path, stated.topic)}
     from armlink.recording.tables import load_csv, load_parquet
 
     return {str(path): (load_parquet if suffix == ".parquet" else load_csv)(path, stated.columns)}

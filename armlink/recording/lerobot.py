@@ -14,25 +14,24 @@ import pyarrow.parquet as pa_parquet
 
 from armlink.arrays import Array
 from armlink.errors import BadInput
-from armlink.recording.recording import Recording
+from armlink.recording.recording import MOST_JOINTS, Recording, require_size
 
 STATE, ACTION = "observation.state", "action"
 _COLUMNS = ("episode_index", "timestamp", STATE, ACTION)
 
 
-def is_lerobot(path: Path) -> bool:
-    """Whether a folder is a LeRobot data set."""
-    return (path / "meta" / "info.json").is_file()
-
-
 def load_lerobot(path: Path) -> dict[str, Recording]:
     """Recordings of all episodes by label (`FOLDER#EPISODE`). Raises BadInput that names what is missing."""
     names = _names(path)
-    tables = []
+    if len(names) > MOST_JOINTS:
+        raise BadInput(f"{path}: {len(names)} joints in {STATE}, expected at most {MOST_JOINTS}")
+    tables, size = [], 0
     for file in sorted((path / "data").rglob("*.parquet")):
         try:
+            size += 8 * (2 * len(names) + 2) * pa_parquet.read_metadata(file).num_rows
+            require_size(size, str(path))
             table = pa_parquet.read_table(file, columns=list(_COLUMNS))
-        except (pa.ArrowInvalid, pa.ArrowNotImplementedError, KeyError, OSError) as error:
+        except (pa.ArrowException, KeyError, OSError) as error:
             raise BadInput(f"{file}: not the data of a LeRobot data set: {str(error).partition(chr(10))[0]}") from None
         missing = [column for column in _COLUMNS if column not in table.column_names]
         if missing:

@@ -6,7 +6,7 @@ temperatures go as effort on `/joint_temperatures` [°C].
 """
 
 import struct
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +25,7 @@ from zstandard import ZstdDecompressor, ZstdError
 
 from armlink.arrays import Array
 from armlink.errors import BadInput
+from armlink.recording.joint_messages import left_out, main_joints, nearest_rows
 from armlink.recording.recording import MOST_BYTES, MOST_JOINTS, Recording, require_size
 from armlink.recording.ros_joint_state import SCHEMA, SCHEMA_NAME, JointState, JointStateDecoder, joint_state_encoder
 
@@ -108,21 +109,18 @@ def load_mcap(path: Path) -> Recording:
     if not states:
         raise BadInput(f"{path}: no {SCHEMA_NAME} on /joint_states{f'; {cut}' if cut else ''}")
     stamps = np.array([state.stamp for state in states], dtype=np.int64)
-    counts = Counter(state.names for state in states)
-    names = max(counts, key=lambda each: counts[each] * len(each))
-    alone = sorted({name for each in counts if not set(names) <= set(each) for name in each} - set(names))
+    names, alone = main_joints([state.names for state in states])
     if alone:
-        cut = "; ".join(filter(None, (cut, f"joints in messages of their own, left out: {', '.join(alone)}")))
+        cut = "; ".join(filter(None, (cut, left_out(alone))))
         states = [state for state in states if set(names) <= set(state.names)]
         stamps = np.array([state.stamp for state in states], dtype=np.int64)
     if len(names) > MOST_JOINTS:
         raise BadInput(f"{path}: {len(names)} joints in /joint_states, expected at most {MOST_JOINTS}")
     channels = _channels_of("/joint_states", states, names, str(path))
-    half = np.median(np.diff(stamps)) / 2 if stamps.size > 1 else 0.0
     for topic, others in messages.items():
         times = np.array([state.stamp for state in others], dtype=np.int64)
         for name, values in _channels_of(topic, others, names, str(path)).items():
-            channels[name] = _align(values, times, stamps, half)
+            channels[name] = nearest_rows(values, times, stamps)
     if "position" not in channels:
         raise BadInput(f"{path}: /joint_states carry no position")
     return Recording(t=(stamps - stamps[0]) / _NANO, names=names, warning=cut, **channels)
@@ -239,14 +237,3 @@ def _channels_of(topic: str, states: list[JointState], names: tuple[str, ...], s
 def _order(message: tuple[str, ...], names: tuple[str, ...]) -> tuple[list[int], list[int]]:
     both = [name for name in names if name in message]
     return [names.index(name) for name in both], [message.index(name) for name in both]
-
-
-def _align(values: Array, times: Any, stamps: Any, half: float) -> Array:
-    """Values at the rows' stamps: from the nearest message within `half` nanoseconds, else NaN."""
-    order = np.argsort(times, kind="stable")
-    times, values = times[order], values[order]
-    after = np.clip(np.searchsorted(times, stamps), 0, times.size - 1)
-    before = np.clip(after - 1, 0, None)
-    nearest = np.where(np.abs(times[before] - stamps) <= np.abs(times[after] - stamps), before, after)
-    aligned: Array = np.where((np.abs(times[nearest] - stamps) <= half)[:, None], values[nearest], np.nan)
-    return aligned

@@ -5,7 +5,7 @@
 `/joint_temperatures` add their channels as in `armlink.recording.mcap`.
 """
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,8 @@ from rosbags.typesys import Stores, TypesysError, get_typestore
 
 from armlink.arrays import Array
 from armlink.errors import BadInput
-from armlink.recording.recording import Recording
+from armlink.recording.joint_messages import left_out, main_joints, nearest_rows
+from armlink.recording.recording import MOST_JOINTS, Recording, require_size
 
 TOPICS = {"/motor_states": "motor_torque", "/joint_commands": "torque_command", "/joint_temperatures": "temperature"}
 """Topics beside the states → channel that their efforts hold."""
@@ -35,11 +36,6 @@ class Sample:
     channels: Mapping[str, Sequence[float]]
 
 
-def is_bag(path: Path) -> bool:
-    """Whether a path is a ROS 2 bag other than a single MCAP file."""
-    return (path / "metadata.yaml").is_file() or path.suffix == ".db3"
-
-
 def load_bag(path: Path, topic: str = "") -> Recording:
     """Load a bag: the joint states of `topic`, by default `/joint_states` or the only topic that carries some.
 
@@ -51,8 +47,11 @@ def load_bag(path: Path, topic: str = "") -> Recording:
             readable = [connection for connection in reader.connections if _short(connection.msgtype) in _READERS]
             states = _state_connections(readable, topic, reader.connections, path)
             samples: dict[str, list[Sample]] = defaultdict(list)
+            size = 0
             wanted = [*states, *(c for c in readable if c.topic in TOPICS and c not in states)]
             for connection, receipt, raw in reader.messages(connections=wanted):
+                size += len(raw)
+                require_size(size, str(path))
                 message = reader.deserialize(raw, connection.msgtype)
                 samples[connection.topic].append(_READERS[_short(connection.msgtype)](message, receipt))
     except (AnyReaderError, ReaderError, SerdeError, TypesysError, OSError, KeyError, ValueError) as error:
@@ -79,27 +78,24 @@ def _state_connections(readable: Sequence[Any], topic: str, all_of_them: Iterabl
 
 
 def _recording(main: list[Sample], others: dict[str, list[Sample]], source: str) -> Recording:
-    counts = Counter(sample.names for sample in main)
-    names = max(counts, key=lambda each: counts[each] * len(each))
-    left_out = sorted({name for each in counts if each != names for name in each} - set(names))
+    names, alone = main_joints([sample.names for sample in main])
+    if len(names) > MOST_JOINTS:
+        raise BadInput(f"{source}: {len(names)} joints in the joint states, expected at most {MOST_JOINTS}")
     main = sorted((s for s in main if set(names) <= set(s.names)), key=lambda s: s.stamp)
     stamps, rows = np.unique(np.array([s.stamp for s in main], dtype=np.int64), return_index=True)
     main = [main[row] for row in rows]
     channels = _channels(main, names, source)
-    half = float(np.median(np.diff(stamps))) / 2 if stamps.size > 1 else 0.0
     for topic, samples in others.items():
-        samples = sorted(samples, key=lambda s: s.stamp)
         values = _channels(samples, names, source)
         times = np.array([s.stamp for s in samples], dtype=np.int64)
         effort = values.pop("torque", None)
         if effort is not None:
-            channels[TOPICS[topic]] = _nearest(effort, times, stamps, half)
+            channels[TOPICS[topic]] = nearest_rows(effort, times, stamps)
         if topic == "/joint_commands" and "position" in values:
-            channels["position_command"] = _nearest(values["position"], times, stamps, half)
+            channels["position_command"] = nearest_rows(values["position"], times, stamps)
     if "position" not in channels:
         raise BadInput(f"{source}: the joint states carry no position")
-    warning = f"joints in messages of their own, left out: {', '.join(left_out)}" if left_out else ""
-    return Recording(t=(stamps - stamps[0]) / _NANO, names=names, warning=warning, **channels)
+    return Recording(t=(stamps - stamps[0]) / _NANO, names=names, warning=left_out(alone), **channels)
 
 
 def _channels(samples: list[Sample], names: tuple[str, ...], source: str) -> dict[str, Array]:
@@ -117,15 +113,6 @@ def _channels(samples: list[Sample], names: tuple[str, ...], source: str) -> dic
             place = {name: i for i, name in enumerate(sample.names)}
             table[row] = [values[place[name]] if name in place else np.nan for name in names]
     return found
-
-
-def _nearest(values: Array, times: Any, stamps: Any, half: float) -> Array:
-    """Values at the rows' stamps: from the nearest message within `half` nanoseconds, else NaN."""
-    after = np.clip(np.searchsorted(times, stamps), 0, times.size - 1)
-    before = np.clip(after - 1, 0, None)
-    nearest = np.where(np.abs(times[before] - stamps) <= np.abs(times[after] - stamps), before, after)
-    aligned: Array = np.where((np.abs(times[nearest] - stamps) <= half)[:, None], values[nearest], np.nan)
-    return aligned
 
 
 def _stamp(message: Any, receipt: int) -> int:

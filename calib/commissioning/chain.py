@@ -1,15 +1,12 @@
 """Which joints of a model are the arm: the longest chain of driven revolute joints, without its gripper."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from armlink.errors import BadInput
 from calib.commissioning.model_joints import ModelJoint
-
-HAND = re.compile(r"grip|finger|hand|jaw|thumb|claw", re.IGNORECASE)
-"""Names of joints that grasp rather than move the arm."""
+from gcomp.arm.model_tree import HAND
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import numpy as np
 
 from armlink.errors import BadInput
 from gcomp.arm.load import compile_model
+from gcomp.arm.model_tree import coupled_joints, upwards
 
 if TYPE_CHECKING:
     import mujoco
@@ -45,12 +46,12 @@ def model_joints(path: Path) -> tuple[list[ModelJoint], tuple[float, float, floa
         mujoco.mjtJoint.mjJNT_SLIDE: "prismatic",
         mujoco.mjtJoint.mjJNT_BALL: "ball",
     }
-    coupled, speeds = _coupled(model), _urdf_speeds(path)
+    coupled, speeds = coupled_joints(model), _urdf_speeds(path)
     joints: list[ModelJoint] = []
     of_body: dict[int, list[int]] = {}
     for joint in range(model.njnt):
         body = int(model.jnt_bodyid[joint])
-        parents = tuple(sorted(place for up in _upwards(model, body) for place in of_body.get(up, [])))
+        parents = tuple(sorted(place for up in upwards(model, body) for place in of_body.get(up, [])))
         of_body.setdefault(body, []).append(joint)
         name = model.joint(joint).name
         limits = tuple(map(float, model.jnt_range[joint])) if model.jnt_limited[joint] else None
@@ -70,25 +71,6 @@ def model_joints(path: Path) -> tuple[list[ModelJoint], tuple[float, float, floa
         raise BadInput(f"{path}: the model has no joint: give the URDF or MJCF of an arm")
     x, y, z = (float(value) for value in model.opt.gravity)
     return joints, (x, y, z)
-
-
-def _upwards(model: "mujoco.MjModel", body: int) -> list[int]:
-    found = [body]
-    while found[-1]:
-        found.append(int(model.body_parentid[found[-1]]))
-    return found
-
-
-def _coupled(model: "mujoco.MjModel") -> dict[str, str]:
-    """Joint → joint that it is coupled with, both ways."""
-    import mujoco
-
-    pairs: dict[str, str] = {}
-    for equality in range(model.neq):
-        if model.eq_type[equality] == mujoco.mjtEq.mjEQ_JOINT and model.eq_obj2id[equality] >= 0:
-            first, second = (model.joint(each[equality]).name for each in (model.eq_obj1id, model.eq_obj2id))
-            pairs |= {first: second, second: first}
-    return pairs
 
 
 def _effort(model: "mujoco.MjModel", joint: int) -> float | None:

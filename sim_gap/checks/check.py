@@ -17,7 +17,7 @@ from sim_gap.checks.rigid_fit import as_mounted, fit_rigid, motion_of
 from sim_gap.checks.torque_source import find_delay, find_scale, find_source, find_unsigned
 from sim_gap.checks.velocity import follows_position, sound_velocity
 from sim_gap.model.rigid_body import RigidArm
-from sim_gap.residuals.preprocess import TRIM_S, prepare
+from sim_gap.residuals.preprocess import TRIM_S, Signals, prepare
 
 
 def check_recordings(
@@ -48,45 +48,45 @@ def check_recording(
     recording, repeated = without_repeats(recording)
     recording, jitter = even_times(recording, stated)
     found = [*repeated, *jitter]
-    channels = list(prepare(recording, arm, label).reading)
-    for channel in channels:
-        findings = _torque_findings(arm, recording, label, channel, stated)
-        for finding in findings:
-            if not finding.corrected:
-                raise BadInput(f"{label}: {finding.sentence()}")
-            recording = _corrected(recording, finding, label)
-        found += findings
+    s = prepare(recording, arm, label)
+    for channel in s.channels:
+        for look in (_unsigned, _mapping, _source):
+            findings = look(arm, s, channel, recording, stated)
+            found += findings
+            for finding in findings:
+                if not finding.corrected:
+                    raise BadInput(f"{label}: {finding.sentence()}")
+                recording = _corrected(recording, finding, label)
+            if findings:
+                s = prepare(recording, arm, label)
+            if channel not in s.channels:  # taken for another one
+                break
     recording, velocity = sound_velocity(recording, stated)
     return recording, [*found, *velocity]
 
 
-def _torque_findings(
-    arm: RigidArm, recording: Recording, label: str, channel: str, stated: Corrections
-) -> list[Finding]:
-    """Findings on one torque channel and the positions; those that a correction could hide are looked for after it."""
-    s = prepare(recording, arm, label)
+def _unsigned(arm: RigidArm, s: Signals, channel: str, _: Recording, stated: Corrections) -> list[Finding]:
     motion = motion_of(s, channel)
-    mounted = as_mounted(arm, motion)
-    unsigned = find_unsigned(mounted, motion, stated)
-    if unsigned:
-        return unsigned
-    follows = follows_position(recording)
+    return find_unsigned(as_mounted(arm, motion), motion, stated)
+
+
+def _mapping(arm: RigidArm, s: Signals, channel: str, recording: Recording, stated: Corrections) -> list[Finding]:
+    """Findings on clock, order, sign, zero and angle unit, in the order in which they are corrected."""
+    motion, follows = motion_of(s, channel), follows_position(recording)
     mapping = find_mapping(arm, motion, stated, follows)
-    delay, fall = find_delay(mounted, motion, (len(motion.q) - 1) / max(s.t[-1] - 2.0 * TRIM_S, 1e-9), stated)
-    if delay and fall > SURE + sum(finding.fall for finding in mapping):
-        recording = _corrected(recording, delay[0], label)
-        s = prepare(recording, arm, label)
-        mapping = find_mapping(arm, motion_of(s, channel), stated, follows)
-    else:
-        delay = []
-    if any(not finding.corrected for finding in mapping):
-        return [*delay, *mapping]
-    for finding in mapping:
-        recording = _corrected(recording, finding, label)
-    s = prepare(recording, arm, label)
+    rate = (len(motion.q) - 1) / max(s.t[-1] - 2.0 * TRIM_S, 1e-9)
+    delay, fall = find_delay(as_mounted(arm, motion), motion, rate, stated)
+    if not delay or fall <= SURE + sum(finding.fall for finding in mapping):
+        return mapping
+    in_time = prepare(_corrected(recording, delay[0], s.label), arm, s.label)
+    return [*delay, *find_mapping(arm, motion_of(in_time, channel), stated, follows)]
+
+
+def _source(arm: RigidArm, s: Signals, channel: str, _: Recording, stated: Corrections) -> list[Finding]:
+    """Findings on the channel's scale and on what it is a reading of."""
     motion = motion_of(s, channel)
     fit = fit_rigid(as_mounted(arm, motion), motion)
-    return [*delay, *mapping, *find_scale(arm, fit, motion, stated), *find_source(fit, s, motion, stated)]
+    return [*find_scale(arm, fit, motion, stated), *find_source(fit, s, motion, stated)]
 
 
 def _corrected(recording: Recording, finding: Finding, label: str) -> Recording:

@@ -45,7 +45,7 @@ def load_model(source: Any, names: tuple[str, ...] = (), count: int | None = Non
         joints = [known[name] for name in names]
     else:
         if count is not None and count != len(hinges):
-            hinges = list(arm_hinges(model, known).values())
+            hinges = list(arm_hinges(model).values())
         if count is not None and count != len(hinges):
             raise BadInput(
                 f"{label}: has {len(hinges)} hinge joints ({', '.join(map(str, known))}), the recording {count}: "
