@@ -102,6 +102,8 @@ class Diagnosis:
     """Share of the held-out samples that no row judges."""
     rollout: Rollout | None = None
     notes: tuple[str, ...] = ()
+    unit: str = "N·m"
+    """Of the gap: N·m, or rad where no recording has a torque channel."""
     checks: tuple[Finding, ...] = ()
     """Findings on mapping, units and clocks of the recordings."""
     internals: Any = field(default=None, repr=False, compare=False)
@@ -129,7 +131,7 @@ class Diagnosis:
             "minor": [_cause(cause) for cause in self.minor],
             "signs": [{name: _round(value) for name, value in vars(cause.signs).items()} for cause in self.causes],
             "gap": {
-                "unit": "N·m",
+                "unit": self.unit,
                 "joints": list(self.names),
                 "noise_floor": _list(self.noise_floor),
                 "margin": _list(self.margin),
