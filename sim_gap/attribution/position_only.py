@@ -11,15 +11,13 @@ from sim_gap.checks.finding import Finding
 from sim_gap.closed_loop.columns import shared_effects
 from sim_gap.closed_loop.compete import PRICE
 from sim_gap.closed_loop.identify import Identified, columns_of_effect, identify
-from sim_gap.closed_loop.judge import Stage, interval, undecided_scale
+from sim_gap.closed_loop.judge import LEAST_SHRINK, Stage, interval, undecided_scale
 from sim_gap.closed_loop.parameters import EFFECTS
 from sim_gap.closed_loop.replay import replay_rms
 from sim_gap.model.load import SimModel
 from sim_gap.residuals.where import Location
 from sim_gap.search.estimate import Value
 
-LEAST_SHRINK = 0.05
-"""Least relative fall of a joint's held-out RMS by a cause; less is a minor one."""
 EXPLAINED = 0.3
 """Largest share of the gap's RMS that may remain."""
 ALMOST = 0.97

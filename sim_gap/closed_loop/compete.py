@@ -7,7 +7,7 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.closed_loop.columns import shared_effects
-from sim_gap.closed_loop.fit import Fit, batch, evaluate, improve, jacobian, residuals
+from sim_gap.closed_loop.fit import LOGARITHMIC, Fit, batch, evaluate, improve, jacobian, residuals
 from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS, Scales
 from sim_gap.closed_loop.windows import WINDOW_S, Windows
 
@@ -17,6 +17,8 @@ PRICE = 4.0
 """Fall of the score that a parameter has to pay for."""
 LEAST_FALL = 0.025
 """Least relative fall of a joint's RMS by an effect."""
+DOUBTFUL = 4.0
+"""Expected loss, in prices, up to which it is tried whether an effect is needed."""
 TRIES = 2
 """Candidates per joint that are fitted in a round."""
 ROUNDS = 6
@@ -263,9 +265,11 @@ def _expected(
 
 def pruned(search: Search, fit: Fit) -> Fit:
     """The fit without effects whose removal costs less than their price."""
-    for _ in range(3):
+    for _ in range(2):
         before, best, changed = search.score(fit), fit, False
+        doubtful = _doubtful(search, fit)
         removable = [[e for e in effects_at(fit, j) if _removable(search, fit, e, j)] for j in range(search.data.joints)]
+        removable = [[e for e in each if (j, e) in doubtful] for j, each in enumerate(removable)]
         losses: list[list[tuple[float, str, Fit]]] = [[] for _ in removable]
         for rank in range(max((len(each) for each in removable), default=0)):
             tried = {j: each[rank] for j, each in enumerate(removable) if rank < len(each)}
@@ -286,6 +290,36 @@ def pruned(search: Search, fit: Fit) -> Fit:
             break
         fit = improve(search.data, best, search.scales, 4)
     return fit
+
+
+def _doubtful(search: Search, fit: Fit) -> set[tuple[int, str]]:
+    """Effects whose removal is expected to cost less than some times their price, from the slopes of the fit."""
+    now, slopes = jacobian(search.data, fit, search.scales, fit.active)
+    found = set[tuple[int, str]]()
+    for j, own in enumerate(fit.active):
+        flat = slopes[j].reshape(len(own), now[:, j].size)
+        total = max(float((now[:, j] ** 2).sum()), 1e-300)
+        spread = np.linalg.pinv(flat @ flat.T, rcond=1e-9, hermitian=True)
+        for effect in effects_at(fit, j):
+            names = EFFECTS[effect].parameters
+            index = [own.index(name) for name in names if name != "stribeck_velocity"]
+            away = np.array([_distance(search, fit, own[i], j) for i in index])
+            if not np.all(np.isfinite(away)):
+                found.add((j, effect))
+                continue
+            lost = float(away @ np.linalg.pinv(spread[np.ix_(index, index)]) @ away) / total
+            fall = 0.5 * float(search.samples[j]) * float(np.log1p(max(lost, 0.0)))
+            if fall < DOUBTFUL * price(search, len(names))[j]:
+                found.add((j, effect))
+    return found
+
+
+def _distance(search: Search, fit: Fit, name: str, joint: int) -> float:
+    """Distance of a parameter from the nominal one, in its own coordinate."""
+    value, nominal = float(fit.point[name][joint]), float(search.nominal[name][joint])
+    if name in LOGARITHMIC:
+        return float(np.log(value / nominal)) if nominal > 0.0 < value else float("inf")
+    return (value - nominal) / float(search.scales.of(name)[joint])
 
 
 def effects_at(fit: Fit, joint: int) -> list[str]:

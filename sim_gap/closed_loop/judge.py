@@ -14,6 +14,8 @@ from sim_gap.closed_loop.windows import Windows
 
 SYSTEMATIC = 0.02
 """Relative standard deviation of every parameter that no recording shows: sampling, command timing, the model's own."""
+LEAST_SHRINK = 0.05
+"""Least relative fall of a joint's held-out RMS by a cause; less is a minor one."""
 Group = tuple[str, tuple[int, ...]]
 """An effect with the joints that have it; no joints for one of the whole arm."""
 
@@ -74,22 +76,26 @@ class Stage:
 
 def stages(search: Search, fit: Fit, heldout: Windows) -> list[Stage]:
     """The groups in order of what each lowers when it is added to the nominal model and those above it."""
-    left = groups_of(fit, search)
+    groups = groups_of(fit, search)
     base = fit
-    for group in left:
+    for group in groups:
         base = taken_out(search, base, group)
     current = improve(search.data, base, search.scales, 4)
+    alone = [improve(search.data, _added(search, fit, current, group), search.scales, 3) for group in groups]
+    worth = [_worth(search, current, trial) for trial in alone]
     before, out = rms_on(heldout, current), []
-    while left:
-        trials = [improve(search.data, _added(search, fit, current, group), search.scales, 3) for group in left]
-        gains = [_worth(search, current, trial) for trial in trials]
-        best = int(np.argmax(gains))
-        group, current = left.pop(best), trials[best]
+    for group in [groups[i] for i in np.argsort(worth)[::-1]]:
+        current = improve(search.data, _added(search, fit, current, group), search.scales, 3)
         after = rms_on(heldout, current)
-        evidence, rivals = rivals_of(search, fit, group)
+        evidence, rivals = rivals_of(search, fit, group) if matters(before, after) else (0.0, ())
         out.append(Stage(group, before, after, evidence, rivals))
         before = after
     return out
+
+
+def matters(before: Array, after: Array) -> bool:
+    """Whether some joint's gap falls by a share that is worth naming."""
+    return bool(np.any(before - after > LEAST_SHRINK * before))
 
 
 def _worth(search: Search, current: Fit, trial: Fit) -> float:

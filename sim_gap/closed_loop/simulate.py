@@ -11,7 +11,7 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.closed_loop.windows import Windows
 
-CELLS = 40_000
+CELLS = 6_000
 """Most joints times windows times hypotheses that are simulated together, for the cache's sake."""
 Values = Mapping[str, Array]
 """Parameter → (P, J); the names are those of `parameters`, of `Windows.columns`, and `gain_of` (P, 1, W)."""
