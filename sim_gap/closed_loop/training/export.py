@@ -8,9 +8,9 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.better_model.with_effects import mujoco_quaternion, possible, spec_of, split
 from sim_gap.closed_loop.columns import turns
-from sim_gap.closed_loop.compete import Search, effect_there, without
 from sim_gap.closed_loop.fit import Fit, improve
 from sim_gap.closed_loop.parameters import EFFECTS
+from sim_gap.closed_loop.search import Search, effect_there, without
 from sim_gap.model.load import SimModel
 from sim_gap.model.rigid_body import inertial_of
 
@@ -56,6 +56,8 @@ def native_fit(search: Search, fit: Fit) -> Fit:
             if effect_there(fit, effect, j):
                 bare = without(search, bare, effect, j)
     bare = bare.with_values(kd=np.zeros(search.data.joints), feed=np.zeros(search.data.joints))
+    dry = fit.point["stribeck"] + fit.point["load"] * search.data.load.mean(axis=(0, 2))
+    bare = bare.with_values(coulomb=np.maximum(bare.point["coulomb"], fit.point["coulomb"] + dry))
     wanted = [(*own, *(n for n in ("coulomb", "viscous") if n not in own)) for own in bare.active]
     changed = bare.active != fit.active or any(np.any(fit.point[n] != 0.0) for n in ("kd", "feed"))
     if not changed:
@@ -88,7 +90,9 @@ def exported(sim: SimModel, search: Search, fit: Fit, native: Fit) -> Exported:
     spec.option.integrator = _implicit()
     spec.compile()
     note = "".join(f"\n  {line}" for line in left)
-    comment = f"<!-- Left out, MJCF has no field for them (the rest was fitted without them):{note}\n-->\n" if left else ""
+    comment = (
+        f"<!-- Left out, MJCF has no field for them (the rest was fitted without them):{note}\n-->\n" if left else ""
+    )
     return Exported(comment + spec.to_xml(), tuple(left))
 
 
@@ -121,7 +125,13 @@ def _set_actuator(spec: Any, joint: str, fit: Fit, j: int, search: Search, compi
     kp, ki = (float(fit.point[name][j] * fit.point["gain"][j]) for name in ("kp", "ki"))
     slew = float(fit.point["slew"][j])
     if ki > 0.0 or np.isfinite(slew):
-        made.set_to_pid(kp=kp, kv=0.0, ctrlspec=POSITION_INPUT, **({"ki": ki} if ki > 0.0 else {}), **({"slewmax": slew} if np.isfinite(slew) else {}))
+        made.set_to_pid(
+            kp=kp,
+            kv=0.0,
+            ctrlspec=POSITION_INPUT,
+            **({"ki": ki} if ki > 0.0 else {}),
+            **({"slewmax": slew} if np.isfinite(slew) else {}),
+        )
     else:
         made.set_to_position(kp=kp, kv=0.0)
     limit = float(fit.point["limit"][j])
@@ -139,7 +149,9 @@ def _link_changes(search: Search, fit: Fit) -> dict[int, Array]:
     """Change of the ten inertial parameters of each link, about its joint and in its frame."""
     n = search.data.joints
     changes: dict[int, Array] = {}
-    payload = [float(fit.point[f"payload.{p}"][0]) if f"payload.{p}" in fit.shared else 0.0 for p in ("mass", "x", "y", "z")]
+    payload = [
+        float(fit.point[f"payload.{p}"][0]) if f"payload.{p}" in fit.shared else 0.0 for p in ("mass", "x", "y", "z")
+    ]
     if any(payload):
         mass, moment = payload[0], np.array(payload[1:])
         centre = moment / mass if abs(mass) > 1e-6 else np.zeros(3)
