@@ -21,6 +21,8 @@ from sim_gap.search.estimate import Value
 
 EXPLAINED = 0.3
 """Largest share of the gap's RMS that may remain."""
+STRUCTURE = 2.0
+"""Remaining gap, in margins, from which an unknown controller may not be of the kind that was fitted."""
 ALMOST = 0.97
 """Highest confidence that positions alone give."""
 SEPARATE = {
@@ -92,11 +94,18 @@ def _verdict(found: Identified, causes: Sequence[Cause], share: float) -> Verdic
     if not causes and bool(np.all(found.heldout_before < 2.0 * found.margin)):
         return "no_gap"
     near = found.heldout_after < np.maximum(2.0 * found.margin, EXPLAINED * found.heldout_before)
+    if _structure_left(found):
+        return "unexplained"
     if not causes or np.sqrt(share) > 2.0 * EXPLAINED or not near.any():
         return "unexplained"
     if causes[0].confounded_with or causes[0].confidence < HINT:
         return "ambiguous"
     return "explained" if np.sqrt(share) <= EXPLAINED or bool(near.all()) else "unexplained"
+
+
+def _structure_left(found: Identified) -> bool:
+    """Whether the controller is unknown and some joint keeps a gap: then it may not be of the kind that was fitted."""
+    return found.search.open_controller and bool(np.any(found.heldout_after > STRUCTURE * found.margin))
 
 
 def _cause(found: Identified, stage: Stage, share: float) -> Cause:
@@ -111,6 +120,8 @@ def _cause(found: Identified, stage: Stage, share: float) -> Cause:
     confidence = ALMOST - 0.47 * float(np.exp(-0.35 * max(evidence - 1.0, 0.0)))
     if stage.rivals:
         confidence = min(confidence, 0.7)
+    if _structure_left(found):
+        confidence = min(confidence, HINT)
     return Cause(
         effect=name,
         joints=listed,

@@ -12,22 +12,25 @@ from sim_gap.closed_loop.compete import Progress
 from sim_gap.closed_loop.fit import Fit, batch, evaluate, improve, residuals
 from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS, Scales
 from sim_gap.closed_loop.search import PRICE, Search
-from sim_gap.closed_loop.windows import Windows
+from sim_gap.closed_loop.windows import Windows, thinned
 from sim_gap.model.load import SimModel
 
 STUCK = 0.0, 0.4
 """Least Coulomb friction that is tried with each, as a share of the gain times the RMS error."""
+FEW = 8
+"""Windows on which controllers are compared."""
 GRID = 12
 """Stiffnesses that are tried at the start."""
 KINDS: dict[str, tuple[str, ...]] = {
-    "P": (),
-    "PD": ("kd",),
-    "PID": ("kd", "ki"),
-    "P with feed-forward": ("feed",),
-    "PD with feed-forward": ("kd", "feed"),
-    "PID with feed-forward": ("kd", "ki", "feed"),
+    "P": ("delay",),
+    "PD": ("kd", "delay"),
+    "PID": ("kd", "ki", "delay"),
+    "P with feed-forward": ("feed", "delay"),
+    "PD with feed-forward": ("kd", "feed", "delay"),
+    "PID with feed-forward": ("kd", "ki", "feed", "delay"),
 }
-"""Controllers that are compared if the model has none: what they have besides a stiffness."""
+"""Controllers that are compared if the model has none: what they have besides a stiffness. The delay is that of the
+command, which may have been written before or after its row's time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,27 +97,28 @@ def starting_fit(search: Search, own: Nominal, progress: Progress) -> tuple[Sear
     With position actuators in the model the controller is of their kind; without, the simplest of `KINDS` that does not
     score clearly worse than the best.
     """
-    kinds = {"P": KINDS["P"]} if own.complete else KINDS
+    kinds = {"P": ()} if own.complete else KINDS
+    few = replace(search, data=thinned(search.data, FEW))
     fits: dict[str, Fit] = {}
     scores: dict[str, float] = {}
     for kind, parts in kinds.items():
         progress(f"controller: {kind}")
-        fits[kind] = improve(search.data, _from_grid(search, parts), search.scales, 5)
-        scores[kind] = float(search.score(fits[kind]).sum()) + PRICE * search.data.joints * len(parts)
+        fits[kind] = improve(few.data, _from_grid(few, parts), search.scales, 5)
+        scores[kind] = float(few.score(fits[kind]).sum()) + PRICE * search.data.joints * len(parts)
     kind = min(scores, key=lambda name: scores[name])
     kept = {"controller.stiffness"} | {
-        e.id for e in EFFECTS.values() if e.controller and e.parameters[0] in KINDS[kind]
+        e.id for e in EFFECTS.values() if e.controller and e.parameters[0] in kinds[kind]
     }
     left_out = {"controller.feed_forward"} if not own.complete else set()
-    if "feed" not in KINDS[kind]:
+    if "feed" not in kinds[kind]:
         left_out.add("actuator.gain")
     found = replace(search, kept=frozenset(kept), excluded=search.excluded | left_out)
     if not own.complete:
         point = dict(found.nominal)
-        for name in ("kp", *KINDS[kind]):
+        for name in ("kp", *kinds[kind]):
             point[name] = fits[kind].point[name]
         found = replace(found, nominal=point, open_controller=True)
-    return found, fits[kind], kind
+    return found, replace(fits[kind], rms=None), kind
 
 
 def _from_grid(search: Search, parts: Sequence[str]) -> Fit:
@@ -123,10 +127,10 @@ def _from_grid(search: Search, parts: Sequence[str]) -> Fit:
     e, v = data.command - data.recorded, data.v
     needed = data.gravity + data.coupling + (data.inertia + nominal["armature"][:, None]) * data.a
     feed = data.feed if "feed" in parts else np.zeros_like(data.feed)
-    size = np.sqrt(np.mean(needed**2, axis=(0, 2))) / np.maximum(np.sqrt(np.mean(e**2, axis=(0, 2))), 1e-6)
+    size = np.sqrt(np.mean((needed - feed) ** 2, axis=(0, 2))) / np.maximum(np.sqrt(np.mean(e**2, axis=(0, 2))), 1e-6)
     centre = np.maximum(size, search.scales.inertia * 25.0)
     points = []
-    for factor, stuck in product(np.geomspace(0.05, 50.0, GRID), STUCK):
+    for factor, stuck in product(np.geomspace(0.02, 50.0, GRID), STUCK):
         kp = centre * factor
         point = {name: values.copy() for name, values in nominal.items()}
         point["kp"] = kp

@@ -54,14 +54,17 @@ def _run(data: Windows, values: Values, count: int) -> Array:
     part = late - whole
     joints = np.arange(data.joints)[None, :]
     back = whole[:, :, 0]
-    delayed = "delay" in active
+    delayed, late_too = "delay" in active, (True, "kd" in active, "feed" in active)
     q = np.broadcast_to(data.start[0], shape).copy()
     v = np.broadcast_to(data.start[1], shape).copy()
     total = np.zeros(shape)
     if "ki" in active:
         begun = np.where(of("feed") > 0.5, data.first_torque[1], data.first_torque[0])
         total = np.broadcast_to(
-            data.error_sum + (begun / gain - kp * data.first_error) / np.maximum(ki, 1e-9) * (ki > 0), shape
+            data.error_sum
+            - of("delay") * data.travel
+            + (begun / gain - kp * data.first_error) / np.maximum(ki, 1e-9) * (ki > 0),
+            shape,
         ).copy()
     target = np.broadcast_to(data.command[0], shape).copy()
     out = np.empty((count, len(data.measured), data.joints, data.count))
@@ -70,11 +73,13 @@ def _run(data: Windows, values: Values, count: int) -> Array:
         if k >= data.warm and (k - data.warm) % data.stride == 0:
             out[:, kept] = q
             kept += 1
-        command = data.command[k]
+        command, speed, feed = data.command[k], data.speed[k], data.feed[k]
         if delayed:
-            at = np.clip(k - back, 0, steps - 1)
-            before = np.clip(k - back - 1, 0, steps - 1)
-            command = data.command[at, joints] * (1.0 - part) + data.command[before, joints] * part
+            at, before = np.clip(k - back, 0, steps - 1), np.clip(k - back - 1, 0, steps - 1)
+            command, speed, feed = (
+                x[at, joints] * (1.0 - part) + x[before, joints] * part if needed else x[k]
+                for x, needed in zip((data.command, data.speed, data.feed), late_too, strict=True)
+            )
         if slewed:
             target += np.clip(command - target, -slew * dt, slew * dt)
             command = target
@@ -85,12 +90,12 @@ def _run(data: Windows, values: Values, count: int) -> Array:
             error = error - np.clip(error, -dead, dead)
         torque = kp * error
         if "kd" in active:
-            torque = torque + kd * data.speed[k]
+            torque = torque + kd * speed
         if "ki" in active:
             total += dt * error * on
             torque = torque + ki * total
         if "feed" in active:
-            torque = torque + of("feed") * data.feed[k]
+            torque = torque + of("feed") * feed
         if "feed_gravity" in active:
             torque = torque + of("feed_gravity") * data.feed_gravity[k]
         free = on

@@ -13,7 +13,7 @@ from sim_gap.residuals.resampling import bridged, coverage, low_pass
 
 SMOOTH_HZ, SMOOTH_SHARE = 15.0, 0.16
 """Pass band of the recorded motion: at most this, and this share of the recording's rate [Hz]."""
-MODEL_HZ = 30.0
+MODEL_HZ = 50.0
 """Rate at which the model's torques are computed [Hz]; they are interpolated between."""
 
 
@@ -55,7 +55,7 @@ def track_of(arm: RigidArm, recording: Recording, label: str, dt: float) -> Trac
         few = torque(*(x[::rough] for x in motion))
         return np.column_stack([np.interp(t, t[::rough], column) for column in few.T])
 
-    still, sign = np.zeros_like(q), np.tanh(speed / 0.02)
+    still = np.zeros_like(q)
     gravity = along(arm.torque, q, still, still)
     own = along(lambda x: np.hstack(_own_terms(arm, x)), q)
     inertia, slope = own[:, : arm.n], own[:, arm.n :]
@@ -73,7 +73,7 @@ def track_of(arm: RigidArm, recording: Recording, label: str, dt: float) -> Trac
             "slope": slope,
             "coupling": whole - gravity - inertia * a,
             "load": np.abs(low_pass(min(3.0, 0.4 / dt), 1.0 / dt)(whole)),
-            "feed": along(arm.torque, path, speed, push) + arm.nominal_joint_torque(path, speed, push, sign),
+            "feed": along(arm.torque, path, speed, push) + arm.armature * push,
             "feed_gravity": along(arm.torque, path, still, still),
             "q": q,
             "v": v,

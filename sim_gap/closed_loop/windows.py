@@ -53,7 +53,7 @@ class Windows:
     load: Array
     """Amount of the links' torque on the gear [N·m]."""
     feed: Array
-    """Torque of the nominal model along the command [N·m]."""
+    """Torque of the nominal links and rotors along the command [N·m]."""
     feed_gravity: Array
     """Its gravity alone [N·m]."""
     measured: Array
@@ -64,6 +64,8 @@ class Windows:
     """Position and velocity at the first step, (2, J, W)."""
     error_sum: Array
     """Integral of command minus position from the start of the recording to that of the window, (J, W) [rad·s]."""
+    travel: Array
+    """Way of the command from the start of the recording to that of the window, (J, W) [rad]."""
     first_error: Array
     """Command minus position at the start of the recording, (J, W) [rad]."""
     first_torque: Array
@@ -149,6 +151,7 @@ def _cut(arm: RigidArm, track: Track, number: int, warm: int, length: int, strid
                 "weight": track.seen[inside] * (judged < rows - 1)[:, None],
                 "start": np.stack([track.signals["q"][start], track.signals["v"][start]]),
                 "error_sum": sums[start],
+                "travel": track.signals["command"][start] - track.signals["command"][0],
                 "first_error": first_error,
                 "first_torque": first_torque,
                 "recording": np.asarray(number),

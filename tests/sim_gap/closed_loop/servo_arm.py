@@ -1,0 +1,50 @@
+"""A two-joint arm with position servos in MuJoCo, as a stand-in for a real one; its recordings have no torque."""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from armlink.recording.recording import Recording
+
+JOINTS = ("shoulder", "elbow")
+
+
+def model_text(kp: float, friction: float, damping: float = 0.8) -> str:
+    """MJCF of the arm: gravity about both joints, gains in N·m/rad."""
+    sticks = 'solreffriction="0.01 1" solimpfriction="0.999 0.9999 0.001 0.5 2"'
+    joint = f'axis="0 1 0" damping="{damping}" frictionloss="{friction}" armature="0.02" {sticks}'
+    return f"""<mujoco model="servo_arm"><option timestep="0.002" integrator="implicitfast"/><worldbody>
+<body name="upper"><joint name="shoulder" {joint}/><inertial pos="0.1 0 0" mass="0.6" diaginertia="2e-3 2e-3 2e-3"/>
+<body name="fore" pos="0.2 0 0"><joint name="elbow" {joint}/>
+<inertial pos="0.08 0 0" mass="0.3" diaginertia="1e-3 1e-3 1e-3"/></body></body></worldbody><actuator>
+<position name="shoulder" joint="shoulder" kp="{kp}"/><position name="elbow" joint="elbow" kp="{kp}"/>
+</actuator></mujoco>"""
+
+
+def record(text: str, seed: int, seconds: float, rate: float = 50.0) -> Recording:
+    """Positions read with 12 bits, and the commands held from row to row: sines with rests between."""
+    random = np.random.default_rng(seed)
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    t = np.arange(0.0, seconds, 1.0 / rate)
+    waves = random.uniform(0.15, 0.9, (3, 2))
+    phase = random.uniform(0.0, 6.0, (3, 2))
+    command = 0.3 * np.sin(2 * np.pi * waves * t[:, None, None] + phase).sum(1)
+    command[(t % 7.0) > 6.0] = np.repeat(command[[0]], int(((t % 7.0) > 6.0).sum()), axis=0)
+    data.qpos[:] = command[0]
+    q, steps = np.empty_like(command), round(1.0 / rate / model.opt.timestep)
+    for k, row in enumerate(command):
+        q[k] = data.qpos
+        data.ctrl[:] = row
+        for _ in range(steps):
+            mujoco.mj_step(model, data)
+    count = 2 * np.pi / 4096
+    return Recording(t=t, position=np.rint(q / count) * count, position_command=command, names=JOINTS)
+
+
+def written(folder: Path, text: str) -> Path:
+    """The model as a file."""
+    path = folder / "sim.xml"
+    path.write_text(text, encoding="utf-8")
+    return path

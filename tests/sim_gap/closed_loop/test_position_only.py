@@ -1,0 +1,93 @@
+import json
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from armlink.errors import BadInput
+from armlink.recording.tables import write_table
+from sim_gap.attribution.diagnose import diagnose
+from sim_gap.closed_loop.identify import gain_scales
+from sim_gap.closed_loop.training.posterior import write_exported, write_samples
+from sim_gap.closed_loop.training.replay import replay_rms
+from sim_gap.report.page import write_report
+from tests.sim_gap.closed_loop.servo_arm import model_text, record, written
+
+REAL = model_text(kp=15.0, friction=0.25)
+
+
+@pytest.fixture(scope="module")
+def answer(tmp_path_factory):
+    sim = written(tmp_path_factory.mktemp("arm"), model_text(kp=120.0, friction=0.0))
+    return diagnose(sim, [record(REAL, 1, 28.0)], [record(REAL, 2, 14.0)])
+
+
+def test_names_the_controller_and_the_friction(answer) -> None:
+    named = {cause.effect: cause for cause in (*answer.causes, *answer.minor)}
+    assert answer.unit == "rad"
+    assert answer.verdict in ("explained", "ambiguous")
+    assert answer.causes[0].effect in ("controller.stiffness", "friction.coulomb")
+    for effect, name, value in (("controller.stiffness", "kp", 15.0), ("friction.coulomb", "torque", 0.25)):
+        for joint in ("shoulder", "elbow"):
+            found = named[effect].parameters[joint][name]
+            assert abs(found.value - value) < 0.15 * value
+            assert found.low < found.value < found.high
+    assert (answer.heldout_after < 0.25 * answer.heldout_before).all()
+
+
+def test_the_written_model_moves_like_the_arm(answer, tmp_path: Path) -> None:
+    write_exported(answer.internals, tmp_path / "closed.xml")
+    closed = mujoco.MjModel.from_xml_path(str(tmp_path / "closed.xml"))
+    other = [record(REAL, 3, 14.0)]
+    before = replay_rms(mujoco.MjModel.from_xml_string(model_text(kp=120.0, friction=0.0)), (0, 1), other)
+    assert (replay_rms(closed, (0, 1), other) < 0.3 * before).all()
+    assert answer.to_json()["rollout"]["closed_loop"] is True
+
+
+def test_samples_scatter_about_the_fit(answer, tmp_path: Path) -> None:
+    write_samples(answer.internals, 200, tmp_path / "draws.json")
+    rows = json.loads((tmp_path / "draws.json").read_text())["samples"]
+    gains = np.array([row["shoulder.kp"] for row in rows])
+    assert len(rows) == 200
+    assert gains.std() > 0.0
+    assert abs(np.median(gains) - answer.internals.fit.point["kp"][0]) < gains.std()
+    write_samples(answer.internals, 3, tmp_path / "draws.csv")
+    assert len((tmp_path / "draws.csv").read_text().splitlines()) == 4
+    with pytest.raises(BadInput, match=r"\.csv, \.json, \.parquet"):
+        write_samples(answer.internals, 3, tmp_path / "draws.txt")
+
+
+def test_report_shows_every_joint(answer, tmp_path: Path) -> None:
+    write_report(answer, tmp_path / "gap.html")
+    page = (tmp_path / "gap.html").read_text()
+    assert "Motion of every joint" in page
+    assert "controller.stiffness" in page
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda q, c: -c, "--sign q_cmd_1=-1"),
+        (lambda q, c: c[:, ::-1], "--map"),
+        (lambda q, c: np.rad2deg(c), "--units q_cmd_1=deg"),
+        (lambda q, c: np.full_like(c, np.nan), "neither a torque channel nor a commanded position"),
+    ],
+)
+def test_commands_that_do_not_belong_are_refused(change, message: str) -> None:
+    recording = record(REAL, 4, 14.0)
+    recording.position_command[:] = change(recording.position, recording.position_command.copy())
+    with pytest.raises(BadInput, match=message):
+        diagnose(mujoco.MjModel.from_xml_string(REAL), [recording], [recording])
+
+
+def test_gains_of_recordings() -> None:
+    labels = ["a/run_kp100.csv", "a/run_kp400.csv"]
+    assert gain_scales(["*kp100*=100", "*kp400*=400"], labels) == [1.0, 4.0]
+    with pytest.raises(BadInput, match="none given for a/run_kp400"):
+        gain_scales(["*kp100*=100"], labels)
+    with pytest.raises(BadInput, match="no recording of that name"):
+        gain_scales(["*kp9*=100"], labels)
+    with pytest.raises(BadInput, match="expected RECORDING=VALUE"):
+        gain_scales(["*kp100*=fast"], labels)

@@ -1,0 +1,53 @@
+import mujoco
+import numpy as np
+
+from sim_gap.closed_loop.controller import nominal_controller, nominal_point
+from sim_gap.closed_loop.fit import Fit, evaluate, jacobian
+from sim_gap.closed_loop.judge import joint_rms
+from sim_gap.closed_loop.parameters import Scales
+from sim_gap.closed_loop.windows import windows_of
+from sim_gap.model.load import load_model
+from tests.sim_gap.closed_loop.servo_arm import model_text, record
+
+TEXT = model_text(kp=15.0, friction=0.2)
+
+
+def _windows(text: str = TEXT):
+    sim = load_model(mujoco.MjModel.from_xml_string(text))
+    data = windows_of(sim.arm, [record(TEXT, 1, 20.0)], ["run"])
+    return data, nominal_point(data, nominal_controller(sim))
+
+
+def test_agrees_with_mujoco_on_a_servo_with_friction() -> None:
+    data, point = _windows()
+    found = evaluate(data, Fit(point, ((), ())))
+    moved = np.sqrt(np.mean((data.command - data.recorded) ** 2, axis=(0, 2)))
+    assert (joint_rms(data, found.rms) < np.maximum(0.03 * moved, 1.5e-3)).all()
+
+
+def test_another_gain_shows() -> None:
+    data, point = _windows(model_text(kp=30.0, friction=0.2))
+    found = evaluate(data, Fit(point, ((), ())))
+    assert (joint_rms(data, found.rms) > 0.01).all()
+
+
+def test_slopes_are_those_of_the_residual() -> None:
+    data, point = _windows()
+    one = np.ones(2)
+    scales = Scales(one, one, 0.02 * one, 0.05 * one)
+    fit = Fit(point, (("kp", "viscous"), ("kp", "viscous")))
+    now, slopes = jacobian(data, fit, scales, fit.active)
+    ahead = Fit({**point, "kp": point["kp"] * np.exp(0.03)}, fit.active)
+    change = jacobian(data, ahead, scales, ((), ()))[0] - now
+    for j in range(2):
+        expected = 0.03 * slopes[j][0]
+        assert np.linalg.norm(change[:, j] - expected) < 0.15 * np.linalg.norm(expected)
+
+
+def test_a_missing_command_switches_the_servo_off() -> None:
+    sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
+    recording = record(TEXT, 2, 12.0)
+    recording.position_command[300:] = np.nan
+    data = windows_of(sim.arm, [recording], ["run"])
+    assert data.served[:200].all()
+    assert not data.served[-1, :, -1].any()
