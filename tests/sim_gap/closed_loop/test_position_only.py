@@ -4,16 +4,14 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from servo_arm import model_text, record, written
 
 from armlink.errors import BadInput
-from armlink.recording.tables import write_table
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.closed_loop.identify import gain_scales
 from sim_gap.closed_loop.training.posterior import write_exported, write_samples
 from sim_gap.closed_loop.training.replay import replay_rms
 from sim_gap.report.page import write_report
-from tests.sim_gap.closed_loop.servo_arm import model_text, record, written
 
 REAL = model_text(kp=15.0, friction=0.25)
 

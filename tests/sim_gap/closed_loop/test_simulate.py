@@ -1,5 +1,6 @@
 import mujoco
 import numpy as np
+from servo_arm import model_text, record
 
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point
 from sim_gap.closed_loop.fit import Fit, evaluate, jacobian
@@ -7,7 +8,6 @@ from sim_gap.closed_loop.judge import joint_rms
 from sim_gap.closed_loop.parameters import Scales
 from sim_gap.closed_loop.windows import windows_of
 from sim_gap.model.load import load_model
-from tests.sim_gap.closed_loop.servo_arm import model_text, record
 
 TEXT = model_text(kp=15.0, friction=0.2)
 

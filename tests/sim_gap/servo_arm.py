@@ -30,8 +30,8 @@ def record(text: str, seed: int, seconds: float, rate: float = 50.0) -> Recordin
     t = np.arange(0.0, seconds, 1.0 / rate)
     waves = random.uniform(0.15, 0.9, (3, 2))
     phase = random.uniform(0.0, 6.0, (3, 2))
-    command = 0.3 * np.sin(2 * np.pi * waves * t[:, None, None] + phase).sum(1)
-    command[(t % 7.0) > 6.0] = np.repeat(command[[0]], int(((t % 7.0) > 6.0).sum()), axis=0)
+    moving = 6.0 * np.floor(t / 7.0) + np.minimum(t % 7.0, 6.0)  # a second of rest after six
+    command = 0.3 * np.sin(2 * np.pi * waves * moving[:, None, None] + phase).sum(1)
     data.qpos[:] = command[0]
     q, steps = np.empty_like(command), round(1.0 / rate / model.opt.timestep)
     for k, row in enumerate(command):
