@@ -223,6 +223,16 @@ class KeepsCalibration(Protocol):
 
 
 @runtime_checkable
+class TellsCurrent(Protocol):
+    """Drives whose current can be asked for, where the arm file has its torque constant."""
+
+    def torque_by_current(self, joint: int, ask: Ask) -> tuple[float, float] | None:
+        """Torque as the drive reports it, and current times torque constant, at one time [N·m]; None where the arm
+        file has no constant, or the drive does not answer."""
+        ...
+
+
+@runtime_checkable
 class Replays(Protocol):
     """Drives whose frames can be made again from a recording."""
 

@@ -28,6 +28,8 @@ DEFAULT_TIMEOUT = 0.1
 """servo.default_timeout_s [s]."""
 TIMEOUT_TORQUE = 5.0
 """servo.timeout_max_torque_Nm: largest torque of the zero-velocity mode [N·m]."""
+TORQUE_CONSTANT = 0.55
+"""Of the motor at its output [N·m/A]."""
 ENCODER_FAULT = 35
 NO_REGISTER = 1
 HOME_OUTPUT = 2
@@ -113,7 +115,7 @@ class MoteusDrive(SimulatedDrive):
             Register.POSITION: motor.position / TURN * self._shown("position"),
             Register.VELOCITY: motor.velocity / TURN * self._shown("velocity"),
             Register.TORQUE: motor.torque * self._shown("torque"),
-            Register.Q_CURRENT: motor.torque,
+            Register.Q_CURRENT: motor.torque / TORQUE_CONSTANT,
             0x005: 0.0,
             0x006: motor.position / TURN,
             0x007: 0.0,

@@ -18,7 +18,7 @@ from armlink.drives.canopen.eds_file import of_joints
 from armlink.drives.canopen.host_frames import HostFrames
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import RPDO1, RPDO2, TPDO1, TPDO2, TPDO3
-from armlink.drives.canopen.profile import examine, profile_of
+from armlink.drives.canopen.profile import Profile, examine, profile_of
 from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork, joint_services
 from armlink.drives.canopen.units import Units, assumed_units, read_units
 from armlink.drives.family import Ask
@@ -237,7 +237,7 @@ class CanopenDrives:
             position=services.read(objects.POSITION) * unit.position,
             torque=torque,
             position_step=max(unit.position, unit.encoder_step),
-            modes=frozenset(int(mode) for mode in Mode if supports(supported, mode)),
+            modes=usable_modes(supported, profile),
             lost=profile.lost,
             scales={"torque [N·m]": unit.torque, "position [rad]": unit.position, "velocity [rad/s]": unit.velocity},
         )
@@ -527,6 +527,14 @@ class CanopenDrives:
     def write_calibration(self, joint: int, ask: Ask, calibration: Calibration, store: bool = False) -> Calibration:
         """See KeepsCalibration."""
         return torque_sensor_record.write_record(self.services(ask)[joint], calibration, store)
+
+
+def usable_modes(supported: int, profile: Profile) -> frozenset[int]:
+    """Modes that a device can be ordered in while it cycles: where its mode cannot be mapped, the one it is left in."""
+    modes = frozenset(int(mode) for mode in Mode if supports(supported, mode))
+    if profile.modes_by_pdo:
+        return modes
+    return modes & {min((Mode.POSITION, Mode.PROFILE_POSITION), key=lambda mode: mode not in modes)}
 
 
 def check_fits(name: str, limits: Limits, unit: Units) -> None:

@@ -8,8 +8,9 @@ from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import Frame
 from armlink.drives.base import BasicDrives, no_order
 from armlink.drives.damiao import frames
-from armlink.drives.damiao.frames import Register, Special, State
-from armlink.drives.damiao.set_up import prepare, read_registers
+from armlink.drives.damiao.frames import READ, WRITE, Register, Special, State
+from armlink.drives.damiao.models import delivered
+from armlink.drives.damiao.set_up import LARGEST_RANGE, prepare, read_registers
 from armlink.drives.family import BROADCAST, Ask
 from armlink.drives.mit_packing import MitCommand, Ranges, damping, pack_command, round_within, unpack_command, unwrap
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
@@ -20,6 +21,12 @@ TRAITS = Traits(torque="current", calibration="host", silence="falls", bounds=()
 OTHER_MODES = {0x100: "position", 0x200: "velocity", 0x300: "force"}
 """Offsets of the command ids of the modes that armlink does not use."""
 IDENTITY = (Register.HARDWARE_VERSION, Register.SOFTWARE_VERSION, Register.SERIAL_NUMBER, Register.REPLY_ID)
+RANGE_FIELDS: dict[int, str] = {
+    Register.POSITION_RANGE: "position",
+    Register.VELOCITY_RANGE: "velocity",
+    Register.TORQUE_RANGE: "torque",
+}
+UNKNOWN_RANGES = Ranges(math.nan, math.nan, math.nan)
 FAULTS = {
     State.OVERVOLTAGE: "overvoltage",
     State.UNDERVOLTAGE: "undervoltage",
@@ -35,7 +42,7 @@ class _Known:
     """What is known of one drive."""
 
     ranges: Ranges | None = None
-    """By its registers; None before set_up()."""
+    """By its registers; before they are known those that its model is delivered with, None for an unknown model."""
     limits: Limits | None = None
     state: int | None = None
     position: float = math.nan
@@ -53,8 +60,10 @@ class DamiaoDrives(BasicDrives):
         """Nothing is sent."""
         super().__init__(joints, TRAITS)
         self._settings = [joint.settings for joint in joints]
-        self._known = [_Known() for _ in joints]
+        self._known = [_Known(delivered(settings.model)) for settings in self._settings]
         self._joint_of = {settings.id: joint for joint, settings in enumerate(self._settings)}
+        self._asked: tuple[int, int, int] | None = None
+        """Joint, READ or WRITE and register of the newest register request of another host."""
 
     def routes(self) -> Mapping[int, int]:
         """Reply ids; drives that share one are told apart by the id in their replies."""
@@ -121,6 +130,9 @@ class DamiaoDrives(BasicDrives):
     def _frame(self, joint: int, order: Order) -> Frame:
         known, drive = self._known[joint], self._settings[joint].id
         known.damping = False
+        if known.limits is None:
+            known.sent = None
+            return frames.REGISTERS_ID, frames.refresh_request(drive)
         on = known.state == State.ENABLED
         if order.power is Power.ON and on:
             return self._command(joint, order)
@@ -179,7 +191,11 @@ class DamiaoDrives(BasicDrives):
         if joint is None:
             return None
         known, drive = self._known[joint], self._settings[joint].id
-        if frames.register_answer(data, drive) is not None or known.ranges is None:
+        told = frames.register_answer(data, drive)
+        if told is not None:
+            self._overhear(joint, *told)
+            return None
+        if known.ranges is None:
             return None
         reply = frames.unpack_reply(data, known.ranges)
         if reply is None or reply.drive != drive & 0xF:
@@ -200,6 +216,18 @@ class DamiaoDrives(BasicDrives):
                 fault=_fault_text(reply.state),
             )
         )
+
+    def _overhear(self, joint: int, kind: int, register: int, value: float) -> None:
+        """A register answer to another host's request: a range that it tells holds from now on.
+
+        Without the request before it the bytes may as well be a reading near the lower end of the range.
+        """
+        known, asked = self._known[joint], self._asked
+        field = RANGE_FIELDS.get(register)
+        if asked != (joint, kind, register) or field is None or not 0.0 < value < LARGEST_RANGE:
+            return
+        self._asked = None
+        known.ranges = (known.ranges or UNKNOWN_RANGES)._replace(**{field: value})
 
     def _joint_of_reply(self, can_id: int, data: bytes) -> int | None:
         if len(data) != 8:
@@ -233,7 +261,11 @@ class DamiaoDrives(BasicDrives):
     # ---- listening
 
     def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
-        """See Drives."""
+        """See Drives; of register requests it is noted which register was asked for, so that the answer is known."""
+        if can_id == frames.REGISTERS_ID and len(data) == 8 and data[2] in (READ, WRITE):
+            asked = self._joint_of.get(data[0] | data[1] << 8)
+            self._asked = None if asked is None else (asked, data[2], data[3])
+            return None
         joint = self._joint_of.get(can_id)
         if joint is None or len(data) != 8:
             return None

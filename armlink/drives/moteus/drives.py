@@ -217,6 +217,14 @@ class MoteusDrives(BasicDrives):
             Register.COMMAND_ILIMIT_SCALE: stiff,
         }
 
+    def torque_by_current(self, joint: int, ask: Ask) -> tuple[float, float] | None:
+        """See TellsCurrent."""
+        constant = self._settings[joint].torque_constant
+        values = None if constant is None else self._ask(ask, joint, {}, (Register.TORQUE, Register.Q_CURRENT))
+        if values is None or constant is None:
+            return None
+        return values.get(Register.TORQUE, math.nan), constant * values.get(Register.Q_CURRENT, math.nan)
+
     def sent(self, joint: int) -> Order | None:
         """See Drives."""
         return self._known[joint].sent

@@ -64,6 +64,12 @@ class JointValues:
             values = np.where(self._current, self.calibration.invert(values), values)
         return values
 
+    def uncalibrated(self, motor: Array) -> Array:
+        """Motor torques (n,) of `motor` as the drives report them, at the joint [N·m]."""
+        if not self._calibrated or self._all_sensors:
+            return motor
+        return np.where(self._current, self.calibration.apply(motor), motor)
+
     def torque(self, sensor: Array, motor: Array) -> Array:
         """Joint torques [N·m] (n,): of the sensor, or the motor's (as `motor` gives it) where there is none."""
         mount = self._mounting
