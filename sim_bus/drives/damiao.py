@@ -29,6 +29,7 @@ from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, STAGE_TEMPERATURE,
 LEAST_RANGE = 1e-3
 """A range register of 0 counts as this."""
 STORE = 0xAA
+STAGE, MOTOR = int(STAGE_TEMPERATURE), int(MOTOR_TEMPERATURE)
 OTHER_MODES = 0x100, 0x200, 0x300
 """Offsets of the command ids of the position, velocity and force modes."""
 NO_COMMAND = MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -55,14 +56,23 @@ class DamiaoDrive(SimulatedDrive):
         self.registers = dict(self._stored)
         self.state = State.DISABLED
         self.command = NO_COMMAND
+        self._coded: object = None
+        """What `coding` was made of."""
+        self._coding = Ranges(position, velocity, torque)
 
     @property
     def coding(self) -> Ranges:
         """Ranges by which it really codes and decodes."""
-        position, velocity, torque = (max(self.registers[number], LEAST_RANGE) for number in (21, 22, 23))
-        return Ranges(
-            position * self.scale("position"), velocity * self.scale("velocity"), torque * self.scale("torque")
-        )
+        registers, faults = self.registers, self.faults
+        told = (registers[21], registers[22], registers[23])
+        made_of = (told, tuple(faults.items()) if faults else ())
+        if made_of != self._coded:
+            self._coded = made_of
+            position, velocity, torque = (max(each, LEAST_RANGE) for each in told)
+            self._coding = Ranges(
+                position * self.scale("position"), velocity * self.scale("velocity"), torque * self.scale("torque")
+            )
+        return self._coding
 
     @property
     def patience(self) -> float:
@@ -110,7 +120,7 @@ class DamiaoDrive(SimulatedDrive):
         motor, coding = self.motor, self.coding
         feedback = MitFeedback(_wrapped(motor.position, coding.position), motor.velocity, motor.torque)
         drive = int(self.registers[Register.COMMAND_ID])
-        reply = Reply(drive, self.state, feedback, int(STAGE_TEMPERATURE), int(MOTOR_TEMPERATURE))
+        reply = Reply(drive, self.state, feedback, STAGE, MOTOR)
         self.answer(int(self.registers[Register.REPLY_ID]), pack_reply(reply, coding))
 
     def _register(self, data: bytes) -> None:
