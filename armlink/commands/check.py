@@ -35,7 +35,7 @@ def check(
         str | None,
         typer.Option(
             help="Judge the scales of position, velocity and torque instead: hand (you turn every joint from stop to "
-            "stop, without power), move (all joints by 0.2 rad) or listen (another host moves the arm)."
+            "stop, without power), move (all joints by 0.35 rad) or listen (another host moves the arm)."
         ),
     ] = None,
     seconds: Annotated[
@@ -114,7 +114,7 @@ def _check_scales(
         if not console.is_terminal:
             raise BadInput("check --scales move: nobody to ask: give --yes, or --scales hand")
         typer.confirm(
-            f"All joints of {arm.name} will turn by 0.2 rad to both sides. Is it clear?", abort=True, err=True
+            f"All joints of {arm.name} will turn by 0.35 rad to both sides. Is it clear?", abort=True, err=True
         )
     return check_scales(console, arm, bus, how, seconds, json)  # type: ignore[arg-type]
 

@@ -102,7 +102,8 @@ def straight(start: Array, goal: Array, speed: Array, period: float) -> Array:
     seconds = PEAK * float(np.max(np.abs(goal - start) / speed, initial=0.0))
     count = max(1, math.ceil(seconds / period))
     s = np.arange(1, count + 1) / count
-    return start + (s**3 * (10 - 15 * s + 6 * s**2))[:, None] * (goal - start)
+    way: Array = s**3 * (10 - 15 * s + 6 * s**2)
+    return start + way[:, None] * (goal - start)
 
 
 def speeds(link: "Link", speed: float) -> Array:

@@ -18,13 +18,13 @@ from armlink.link.park import speeds, straight
 from armlink.link.types import Command, Sample, Setpoints, Tell
 from armlink.selftest.scales import Evidence, ScaleFinding, Track, gather, judge
 
-REACH = 0.2
+REACH = 0.35
 """This host moves every joint so far to both sides [rad]."""
-SPEED = 0.4
+SPEED = 0.6
 """At most [rad/s]."""
 CLEARANCE = 0.05
 """Distance that this host keeps from a stop [rad]."""
-REST_SECONDS = 0.3
+REST_SECONDS = 0.6
 """Rest at both ends of the motion [s]."""
 ASKED = 3
 """Currents that are asked for at each end."""

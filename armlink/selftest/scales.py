@@ -15,7 +15,7 @@ The fewest scales that explain all ratios are named. Pure: arrays in, findings o
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -164,8 +164,8 @@ def integrated(track: Track) -> Evidence | None:
     way = float(np.abs(turned).sum())
     if way < LEAST_WAY:
         return None
-    ratio = float((summed * turned).sum() / (turned**2).sum())
-    scatter = float(np.sqrt(np.average((summed / turned - ratio) ** 2, weights=np.abs(turned))))
+    ratio = _median(summed / turned, np.abs(turned))
+    scatter = 1.483 * _median(np.abs(summed / turned - ratio), np.abs(turned))
     text = f"velocity integrated over {way:.2f} rad of motion gives {ratio * way:.2f}"
     if ratio <= 0 or scatter > UNSTEADY * abs(ratio):
         return Evidence(f"{text}, unsteadily (± {scatter / max(abs(ratio), 1e-9):.0%})", -1.0, FLOOR, {"velocity": -1})
@@ -173,35 +173,75 @@ def integrated(track: Track) -> Evidence | None:
     return Evidence(text, ratio, sigma, {"position": 1, "velocity": -1})
 
 
+def _median(values: Array, weights: Array) -> float:
+    """Weighted median."""
+    order = np.argsort(values)
+    share = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(share, 0.5 * share[-1])])
+
+
+def _rounding(values: Array) -> float:
+    """Standard deviation of a reading's rounding, from the smallest step that it shows."""
+    steps = np.diff(np.unique(values[np.isfinite(values)]))
+    return float(steps.min()) / math.sqrt(12.0) if len(steps) else 0.0
+
+
 def law(track: Track) -> list[Evidence]:
-    """Torque against the law of gains, the command of the sample before; only coefficients that the motion shows."""
-    stiff = track.kp * (track.target - track.position)
-    damped = track.kd * (track.rate - track.velocity)
-    columns = np.column_stack([stiff, damped])[:-1]
+    """Torque against the law of gains, the command of the sample before with the readings of the torque's own sample;
+    only coefficients that the motion shows."""
+    stiff = track.kp[:-1] * (track.target[:-1] - track.position[1:])
+    damped = track.kd[:-1] * (track.rate[:-1] - track.velocity[1:])
+    columns = np.column_stack([stiff, damped])
     torque, told = track.torque[1:], track.ahead[:-1]
     rows = np.isfinite(columns).all(axis=1) & np.isfinite(torque + told) & (track.kp[:-1] > 0)
     if rows.sum() < LEAST_ROWS:
         return []
-    design = np.column_stack([columns[rows], told[rows], np.ones(int(rows.sum()))])
-    varies = design.std(axis=0) > 1e-9
-    varies[-1] = True
-    normal = design[:, varies]
-    answer, *_ = np.linalg.lstsq(normal, torque[rows], rcond=None)
-    left = torque[rows] - normal @ answer
-    try:
-        covariance = np.linalg.inv(normal.T @ normal) * float(left @ left) / max(len(left) - normal.shape[1], 1)
-    except np.linalg.LinAlgError:
-        return []
+    late = (track.kp[:-1] * track.velocity[1:])[rows]  # the torque was measured a little before the position
+    design = np.column_stack([columns[rows], told[rows], np.ones(int(rows.sum())), late])
+    rounding = np.array(
+        [
+            (_rounding(track.position) * track.kp[:-1][rows]).mean(),
+            (_rounding(track.velocity) * track.kd[:-1][rows]).mean(),
+        ]
+    )
+    stiffness, damping = _coefficients(design, torque[rows], rounding)
+    if not damping.known:  # what the damping really is would change the stiffness that is found
+        fixed = _coefficients(design[:, [0, 2, 3, 4]], torque[rows] - design[:, 1], rounding[:1])[0]
+        stiffness = replace(stiffness, sigma=math.hypot(stiffness.sigma, stiffness.value - fixed.value))
     found = []
-    names = [("stiffness", {"position": 1, "torque": -1}), ("damping", {"velocity": 1, "torque": -1})]
-    place = np.cumsum(varies) - 1
-    for column, (name, exponents) in enumerate(names):
-        if not varies[column]:
-            continue
-        value, sigma = float(answer[place[column]]), float(np.sqrt(covariance[place[column], place[column]]))
-        if value > 0 and sigma <= LAW_SIGMA * max(1.0, value):
-            text = f"torque follows {value:.3g} of the {name} that it was told"
-            found.append(Evidence(text, value, max(FLOOR, 2 * sigma / value), exponents))
+    for name, each, exponents in (
+        ("stiffness", stiffness, {"position": 1, "torque": -1}),
+        ("damping", damping, {"velocity": 1, "torque": -1}),
+    ):
+        if each.known:
+            text = f"torque follows {each.value:.3g} of the {name} that it was told"
+            found.append(Evidence(text, each.value, max(FLOOR, 2 * each.sigma / each.value), exponents))
+    return found
+
+
+@dataclass(frozen=True)
+class _Coefficient:
+    value: float
+    sigma: float
+
+    @property
+    def known(self) -> bool:
+        return self.value > 0 and self.sigma <= LAW_SIGMA * max(1.0, self.value)
+
+
+def _coefficients(design: Array, torque: Array, rounding: Array) -> list[_Coefficient]:
+    """The first coefficients of a linear fit; rounding of a reading flattens its coefficient by the share that it has
+    in what the motion shows of that reading alone."""
+    answer, *_ = np.linalg.lstsq(design, torque, rcond=None)
+    left = torque - design @ answer
+    variance = float(left @ left) / max(len(left) - design.shape[1], 1)
+    found = []
+    for column, noise in enumerate(rounding):
+        others = np.delete(design, column, axis=1)
+        alone = design[:, column] - others @ np.linalg.lstsq(others, design[:, column], rcond=None)[0]
+        shown = float(alone @ alone)
+        sigma = math.hypot(math.sqrt(variance / shown), noise**2 * len(left) / shown) if shown > 1e-9 else math.inf
+        found.append(_Coefficient(float(answer[column]), sigma))
     return found
 
 

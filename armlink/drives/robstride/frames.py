@@ -116,7 +116,8 @@ def motion_of_steps(drive: int, q: int, dq: int, kp: int, kd: int, torque: int) 
 
 def unpack_motion(can_id: int, data: bytes, ranges: Ranges) -> MitCommand:
     """A motion command as the drive understands it; `data` has eight bytes."""
-    return grid_of(ranges, MOTION_BITS).command(*MOTION.unpack(data), data_of(can_id))
+    q, dq, kp, kd = MOTION.unpack(data)
+    return grid_of(ranges, MOTION_BITS).command(q, dq, kp, kd, data_of(can_id))
 
 
 def enable_frame(drive: int, host: int) -> tuple[int, bytes]:
