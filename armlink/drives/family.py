@@ -132,8 +132,13 @@ class Drives(Protocol):
         """Newest power state of a drive."""
         ...
 
-    def ask_power(self, joint: int, ask: Ask) -> Power:
-        """Power state of a drive that has had no command, asked for without giving one."""
+    def state_request(self, joint: int) -> list[Frame]:
+        """Frames by which a drive tells its state although it is not commanded, and that are no command; empty where
+        it tells by itself."""
+        ...
+
+    def lets_go(self, joint: int) -> bool:
+        """Whether a drive, as it is now, leaves its motor without power."""
         ...
 
     def ready(self, joint: int) -> bool:

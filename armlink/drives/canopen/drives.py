@@ -474,10 +474,13 @@ class CanopenDrives:
         """See Drives."""
         return _POWERS.get(state_of(self.statuses[joint]), Power.UNKNOWN)
 
-    def ask_power(self, joint: int, ask: Ask) -> Power:
+    def state_request(self, joint: int) -> list[Frame]:
+        """See Drives: TPDO3 tells a change by itself."""
+        return []
+
+    def lets_go(self, joint: int) -> bool:
         """See Drives."""
-        self.statuses[joint] = int(self.services(ask)[joint].read(objects.STATUS_WORD))
-        return self.power(joint)
+        return self.power(joint) in (Power.OFF, Power.READY, Power.FAULT)
 
     def ready(self, joint: int) -> bool:
         """See Drives."""

@@ -239,6 +239,14 @@ class DamiaoDrives(BasicDrives):
         lost = self.own_stop()
         return Stall(lost) if lost else super().fault(modes, now)
 
+    def state_request(self, joint: int) -> list[Frame]:
+        """See Drives."""
+        return [(frames.REGISTERS_ID, frames.refresh_request(self._settings[joint].id))]
+
+    def lets_go(self, joint: int) -> bool:
+        """See Drives: in every state but enabled."""
+        return self._known[joint].state != ENABLED
+
     def own_stop(self) -> str:
         """See Drives."""
         for joint, known in enumerate(self._known):

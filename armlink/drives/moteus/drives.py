@@ -264,6 +264,10 @@ class MoteusDrives(BasicDrives):
         lost = self.own_stop()
         return Stall(lost) if lost else super().fault(modes, now)
 
+    def state_request(self, joint: int) -> list[Frame]:
+        """See Drives: a query."""
+        return [self.poll(first=False)[joint]]
+
     def own_stop(self) -> str:
         """See Drives."""
         for joint, known in enumerate(self._known):

@@ -271,6 +271,11 @@ class ODriveDrives(BasicDrives):
         lost = self.own_stop()
         return Stall(lost) if lost else super().fault(modes, now)
 
+    def lets_go(self, joint: int) -> bool:
+        """See Drives: in every state but closed loop."""
+        beat = self._known[joint].heartbeat
+        return beat is not None and beat.state != AxisState.CLOSED_LOOP
+
     def own_stop(self) -> str:
         """See Drives."""
         for joint, known in enumerate(self._known):

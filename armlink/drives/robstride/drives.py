@@ -188,6 +188,19 @@ class RobStrideDrives(BasicDrives):
                 return Stall(f"{self.where(joint)}: went to mode reset: its canTimeout ran out, the torque is off")
         return super().fault(modes, now)
 
+    def state_request(self, joint: int) -> list[Frame]:
+        """See Drives: the torque limit, written as it is, since a reading is answered without the mode."""
+        known, settings = self._known[joint], self._settings[joint]
+        if known.limits is None:
+            return []
+        most = min(known.limits.max_torque, known.ranges.torque)
+        can_id, data = frames.write_frame(settings.id, settings.host, frames.Parameter.LIMIT_TORQUE, most)
+        return [(can_id | EXTENDED, data)]
+
+    def lets_go(self, joint: int) -> bool:
+        """See Drives: in every mode but run."""
+        return self._known[joint].mode != frames.Mode.RUN
+
     def own_stop(self) -> str:
         """See Drives."""
         for joint, name in enumerate(self.names):
