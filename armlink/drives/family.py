@@ -238,6 +238,18 @@ class TellsCurrent(Protocol):
 
 
 @runtime_checkable
+class Guarded(Protocol):
+    """Drives whose command frames a guard of the bus can check by their bytes alone."""
+
+    def guard_rules(self, ask: Ask, limits: Sequence[Limits]) -> dict[str, Any]:
+        """`frames`, `stop` and `restarts` of a policy (armlink.guard.bus_guard); drives are read, and nothing is set.
+
+        Raises BusFault, BadInput.
+        """
+        ...
+
+
+@runtime_checkable
 class Replays(Protocol):
     """Drives whose frames can be made again from a recording."""
 

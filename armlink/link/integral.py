@@ -1,8 +1,8 @@
 """Integral term of position control, for drives that have none: it takes over what gravity asks for.
 
-The feed-forward τ grows by RATE · (kp (q* − q) + kd (v* − v)): what the drive's gains must still add becomes feed-forward
-within 1 / RATE. Without the velocity's share a joint of inertia J would be stable for RATE < kd / J alone, which the
-first joints of an arm come close to since MIT frames carry little damping.
+The feed-forward τ grows by RATE · (kp (q* − q) + kd (v* − v)): what the drive's gains must still add becomes
+feed-forward within 1 / RATE. Without the velocity's share a joint of inertia J would be stable for RATE < kd / J alone,
+which the first joints of an arm come close to, since MIT frames carry little damping.
 """
 
 import math

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Callable
 from dataclasses import replace
 from types import TracebackType
-from typing import TYPE_CHECKING, Concatenate, ParamSpec, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar
 
 import numpy as np
 
@@ -14,8 +14,9 @@ from armlink.bus.adapters import as_bus
 from armlink.bus.arm_hold import ArmHold
 from armlink.bus.can_bus import CanBus
 from armlink.clock import Clock, MonotonicClock
+from armlink.drives.family import Guarded
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Setup
-from armlink.errors import BusFault, Refused, Silence
+from armlink.errors import BadInput, BusFault, Refused, Silence
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.faults import bus_fault
@@ -212,9 +213,7 @@ class Link(Calibrations):
 
     def _set_up(self) -> None:
         """Set every drive up; what the first cycle starts from."""
-        period, deadline = self.period, self.section.deadline
-        pairs = zip(self.section.joints, self.windows, strict=True)
-        wanted = [drive_limits(row, window, period, deadline) for row, window in pairs]
+        wanted = self._wanted_limits()
         found: dict[int, Setup] = {}
         for group in self.groups:
             own = [self.values.limits(place, wanted[place]) for place in group.places]
@@ -227,6 +226,33 @@ class Link(Calibrations):
             torque = self.values.torque_of(joint, setup.torque)
             passed.append(start_from(limit, torque, self.values.position_of(joint, setup.position)))
         self.commander.begin(limits, passed, [each.modes for each in self.setups])
+
+    def _wanted_limits(self) -> list[Limits]:
+        """The arm file's limits of every joint."""
+        pairs = zip(self.section.joints, self.windows, strict=True)
+        return [drive_limits(row, window, self.period, self.section.deadline) for row, window in pairs]
+
+    def guard_rules(self) -> dict[str, Any]:
+        """What a guard of the bus may pass to these drives, as `armlink.guard.bus_guard` takes it; sets nothing.
+
+        Raises BusFault where a drive does not answer, BadInput for drives that no guard can check.
+        """
+        rules: dict[str, Any] = {"frames": {}, "stop": [], "restarts": {}}
+        wanted = self._wanted_limits()
+        for group in self.groups:
+            name, family = self.names[group.places[0]], group.family.name
+            if not isinstance(group.drives, Guarded):
+                raise BadInput(f"{name}: what frames to drives of family {family} command is not in their bytes alone")
+            if group.tag:
+                raise BadInput(f"{name}: a guard has one bus, this arm has several: describe each in a file of its own")
+            own = [self.values.limits(place, wanted[place]) for place in group.places]
+            found = group.drives.guard_rules(self._ask(group), own)
+            rules = {
+                "frames": rules["frames"] | found["frames"],
+                "stop": rules["stop"] + found["stop"],
+                "restarts": rules["restarts"] | found["restarts"],
+            }
+        return rules
 
     def _gate_limits(self, joint: int) -> JointLimits:
         wanted = self._limits[joint]

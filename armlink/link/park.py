@@ -108,4 +108,5 @@ def straight(start: Array, goal: Array, speed: Array, period: float) -> Array:
 
 def speeds(link: "Link", speed: float) -> Array:
     """The speed of a way to park, no joint beyond what it may turn at (n,) [rad/s]."""
-    return np.minimum(speed, np.array([joint.max_velocity for joint in link.section.joints]))
+    fastest: Array = np.minimum(speed, np.array([joint.max_velocity for joint in link.section.joints]))
+    return fastest

@@ -9,7 +9,7 @@ from calib.motion.trajectory import trajectory
 from gcomp.arrays import Array
 
 SLOW_SETTLING = 0.5
-"""A joint under MIT gains takes so much longer to settle [s]: its host's integral term unlearns the torque of braking."""
+"""A joint under MIT gains settles so much later [s]: its host's integral term has to forget the torque of braking."""
 
 
 @dataclass(frozen=True)

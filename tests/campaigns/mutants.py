@@ -1,4 +1,4 @@
-"""Campaign: mutants of the gate. Each changes one thing in the source; the tests must notice every one.
+"""Campaign: mutants of the gate and the bus guard. Each changes one thing; the tests must notice every one.
 
 python tests/campaigns/mutants.py [--only gate.py] [--list]
 Exit status 1 if a mutant survives that EXPLAINED does not name. A mutant that hangs counts as noticed.
@@ -33,6 +33,7 @@ ROOT = Path(__file__).parent.parent.parent
 TARGETS = {
     "armlink/link/gate.py": ["tests/armlink/link/test_gate.py"],
     "armlink/link/gate_limits.py": ["tests/armlink/link/test_gate_limits.py"],
+    "armlink/guard/bus_guard.py": ["tests/armlink/guard/test_bus_guard.py"],
     "armlink/drives/canopen/cia402.py": ["tests/armlink/drives/canopen/test_cia402.py"],
 }
 EXPLAINED = {

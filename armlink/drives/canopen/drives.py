@@ -15,6 +15,7 @@ from armlink.drives.canopen import emcy, faults, torque_sensor_record
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen.cia402 import Control, State, next_control, set_point_control, state_of, supports
 from armlink.drives.canopen.eds_file import of_joints
+from armlink.drives.canopen.guard_rules import NodeRules, shared_rules
 from armlink.drives.canopen.host_frames import HostFrames
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import RPDO1, RPDO2, TPDO1, TPDO2, TPDO3
@@ -215,6 +216,21 @@ class CanopenDrives:
         for node in self.nodes:
             self.send_nmt(ask, objects.NMT_START, node)
         return found
+
+    def guard_rules(self, ask: Ask, limits: Sequence[Limits]) -> dict[str, Any]:
+        """See Guarded: scales and objects as the devices tell them."""
+        rules: dict[str, Any] = {"frames": shared_rules(self.nodes, self.protection.host), "stop": [], "restarts": {}}
+        for row, services, limit in zip(self.rows, self.services(ask), limits, strict=True):
+            device.check_identity(services, row)
+            unit, profile = read_units(services, row), examine(services, row.settings)
+            check_fits(row.name, limit, unit)
+            sheet = list(services.remote.object_dictionary)
+            node = NodeRules(row.name, row.settings.node, profile, unit, limit, self.protection, sheet)
+            rules["frames"] |= node.frames()
+            rules["stop"].append(node.stop)
+            boot_up, answers = node.restart
+            rules["restarts"][f"{boot_up}"] = answers
+        return rules
 
     def nmt_targets(self) -> tuple[int, ...]:
         """Whom NMT commands go to: all, or these nodes where others may be on the bus."""
