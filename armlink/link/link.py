@@ -1,5 +1,6 @@
 """The link: an arm's joint controllers on a CAN bus; samples in SI units out, limited commands in."""
 
+import logging
 from collections.abc import Callable
 from dataclasses import replace
 from types import TracebackType
@@ -15,7 +16,7 @@ from armlink.bus.can_bus import CanBus
 from armlink.clock import Clock, MonotonicClock
 from armlink.drives.family import Guarded
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Setup
-from armlink.errors import BadInput, BusFault, Silence
+from armlink.errors import BadInput, BusFault, Refused, Silence
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.faults import bus_fault
@@ -26,11 +27,13 @@ from armlink.link.joints.ask import LinkAsk
 from armlink.link.joints.calibrations import Calibrations
 from armlink.link.joints.groups import Group, make_groups
 from armlink.link.joints.values import values_of
+from armlink.link.park import leave, park, require_deadman
 from armlink.link.types import Command, Controller, Sample, Samples, Setpoints, Stats, Tell
 
 if TYPE_CHECKING:
     import can
 
+log = logging.getLogger("armlink")
 PATIENCE = 2.5
 """Readings may be this many periods old while a motion goes on; a reply that comes a period late is within it."""
 LISTEN_PERIODS, LISTEN_SECONDS = 2, 0.1
@@ -47,7 +50,8 @@ P = ParamSpec("P")
 class Link(Calibrations):
     """Context manager: `with Link.open(arm) as link: link.start(); link.enable(); link.cycle(command)`.
 
-    Leaving it, however, leaves the joints in quick stop, where they hold, unless `disable` was called.
+    Leaving it, however, leaves the joints in quick stop, where they hold, unless `disable` was called. Where drives let
+    go without their host, leaving it in order parks the arm if its file says where (`link.park`).
     """
 
     def __init__(self, arm: ArmFile, bus: "CanBus | can.BusABC", clock: Clock | None = None) -> None:
@@ -89,8 +93,14 @@ class Link(Calibrations):
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        """Quick stop where joints are enabled, and close the bus."""
+        """Park where drives would let the arm fall, if the bus is sound; quick stop of joints that are still enabled,
+        and close the bus."""
         try:
+            if not isinstance(error, BusFault):
+                leave(self, lambda text: None)
+            self.stop()
+        except (BusFault, Refused) as failed:
+            log.warning("%s: not parked: %s", self.arm.name, failed)
             self.stop()
         finally:
             self.bus.shutdown()
@@ -127,15 +137,15 @@ class Link(Calibrations):
     @property
     def torque_sent(self) -> Array:
         """Target torque of the last frames [N·m], (n,)."""
-        return np.array([order.torque for order in self._sent])
+        return np.array([order.torque for order in self.orders_sent])
 
     @property
     def position_sent(self) -> Array:
         """Target position of the last frames [rad], (n,)."""
-        return np.array([order.position for order in self._sent])
+        return np.array([order.position for order in self.orders_sent])
 
     @property
-    def _sent(self) -> list[Order]:
+    def orders_sent(self) -> list[Order]:
         """Orders as their bytes tell them; as they passed where the bytes carry no target."""
         found = list(self.commander.passed)
         for group in self.groups:
@@ -257,9 +267,11 @@ class Link(Calibrations):
     def enable(self) -> Sample:
         """Walk every joint to ON, under position control where it stands, and return the last sample.
 
-        Faults are reset on the way. Raises BusFault naming the joint and the state it stays in.
+        Faults are reset on the way. Raises Refused for drives that nothing stops when this host dies, BusFault naming
+        the joint and the state it stays in.
         """
         self._require_start()
+        require_deadman(self)
         self._forget()
         self.commander.settle()
         sample = self.commander.walk(Power.ON)
@@ -292,6 +304,13 @@ class Link(Calibrations):
         self._loop.board.events.clear()
         for group in self.groups:
             group.drives.forget()
+
+    def park(self) -> None:
+        """Stow the arm in the pose `link.park` of its file and take the power from every joint there.
+
+        Raises BadInput where the file has none, Refused where a joint is blocked (the joints then hold), BusFault.
+        """
+        park(self, lambda text: None)
 
     def disable(self) -> None:
         """Take the power from every joint: a joint without a brake falls. Raises BusFault."""

@@ -19,7 +19,7 @@ from armlink.drives.canopen.guard_rules import NodeRules, shared_rules
 from armlink.drives.canopen.host_frames import HostFrames
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import RPDO1, RPDO2, TPDO1, TPDO2, TPDO3
-from armlink.drives.canopen.profile import examine, profile_of
+from armlink.drives.canopen.profile import Profile, examine, profile_of
 from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork, joint_services
 from armlink.drives.canopen.units import Units, assumed_units, read_units
 from armlink.drives.family import Ask
@@ -253,7 +253,7 @@ class CanopenDrives:
             position=services.read(objects.POSITION) * unit.position,
             torque=torque,
             position_step=max(unit.position, unit.encoder_step),
-            modes=frozenset(int(mode) for mode in Mode if supports(supported, mode)),
+            modes=usable_modes(supported, profile),
             lost=profile.lost,
             scales={"torque [N·m]": unit.torque, "position [rad]": unit.position, "velocity [rad/s]": unit.velocity},
         )
@@ -490,10 +490,13 @@ class CanopenDrives:
         """See Drives."""
         return _POWERS.get(state_of(self.statuses[joint]), Power.UNKNOWN)
 
-    def ask_power(self, joint: int, ask: Ask) -> Power:
+    def state_request(self, joint: int) -> list[Frame]:
+        """See Drives: TPDO3 tells a change by itself."""
+        return []
+
+    def lets_go(self, joint: int) -> bool:
         """See Drives."""
-        self.statuses[joint] = int(self.services(ask)[joint].read(objects.STATUS_WORD))
-        return self.power(joint)
+        return self.power(joint) in (Power.OFF, Power.READY, Power.FAULT)
 
     def ready(self, joint: int) -> bool:
         """See Drives."""
@@ -543,6 +546,14 @@ class CanopenDrives:
     def write_calibration(self, joint: int, ask: Ask, calibration: Calibration, store: bool = False) -> Calibration:
         """See KeepsCalibration."""
         return torque_sensor_record.write_record(self.services(ask)[joint], calibration, store)
+
+
+def usable_modes(supported: int, profile: Profile) -> frozenset[int]:
+    """Modes that a device can be ordered in while it cycles: where its mode cannot be mapped, the one it is left in."""
+    modes = frozenset(int(mode) for mode in Mode if supports(supported, mode))
+    if profile.modes_by_pdo:
+        return modes
+    return modes & {min((Mode.POSITION, Mode.PROFILE_POSITION), key=lambda mode: mode not in modes)}
 
 
 def check_fits(name: str, limits: Limits, unit: Units) -> None:

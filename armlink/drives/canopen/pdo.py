@@ -123,6 +123,14 @@ def write_mapping(pdo: Pdo, node: int, write: Write, deadline_ms: int | None = 0
     return [*settings, (count, len(pdo.entries)), (cob_id, value)]
 
 
+def try_mapping(pdo: Pdo, node: int, write: Write) -> None:
+    """Write the mapping of one PDO, which stays invalid; raises what `write` raises where the device refuses it."""
+    write(Entry(pdo.communication, 1, "I", f"{pdo.name} COB-ID"), pdo.cob_base + node | _INVALID)
+    write(Entry(pdo.mapping, 0, "B", f"{pdo.name} number of mapped objects"), 0)
+    for i, entry in enumerate(pdo.entries, 1):
+        write(Entry(pdo.mapping, i, "I", f"{pdo.name} mapping {i}"), entry.mapping)
+
+
 def foreign_rpdos(described: Iterable[int]) -> list[int]:
     """Communication records of RPDOs that the link does not use: the predefined ones and those in a data sheet."""
     ours = {RPDO1.communication, RPDO2.communication}
