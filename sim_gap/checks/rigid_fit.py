@@ -137,7 +137,7 @@ def _joint(model: Array, motion: Motion, j: int, spring: bool) -> tuple[float, .
 
 
 def _partial(columns: Array, y: Array) -> tuple[float, float]:
-    """Correlation of y with the first column, given the others, and the standard deviation of that column's own part."""
+    """Correlation of y with the first column given the others, and the standard deviation of that column's own part."""
     gram = np.column_stack([columns, y]).T @ np.column_stack([columns, y])
     through = _solved(gram[1:-1, 1:-1], gram[1:-1, [0, -1]])
     left = gram[np.ix_([0, -1], [0, -1])] - gram[[0, -1], 1:-1] @ through

@@ -87,6 +87,14 @@ class ColumnStore:
         return None
 
     @cached_property
+    def other_torques(self) -> NDArray[np.bool_]:
+        """Joints whose torque about the estimate is not close to the nominal model's, (n,)."""
+        pairs = [(one.signals.model, one.signals.read.model) for one in self.about]
+        moved = [np.sqrt(np.mean((now - nominal) ** 2, axis=0)) for now, nominal in pairs]
+        size = [np.sqrt(np.mean(nominal**2, axis=0)) for _, nominal in pairs]
+        return np.asarray(np.max(moved, axis=0) > CLOSE * np.max(size, axis=0))
+
+    @cached_property
     def about(self) -> list[About]:
         """Each recording about the estimate."""
         return [about(s, self.data.layout, self.values) for s in self.data.signals]

@@ -50,8 +50,21 @@ def about_itself(
         store, chosen = converged(nominal, refined, store.values)
     store = store.beside(near)
     keys = {term.key for term in chosen}
-    rivals = relinearised_in_place(store, chosen, [term for term in offered if term.key not in keys])
+    others = [term for term in with_levels(store, offered) if term.key not in keys]
+    rivals = relinearised_in_place(store, chosen, others)
     return Search(NormalEquations(store, [*chosen, *rivals]), chosen)
+
+
+def with_levels(store: ColumnStore, offered: Sequence[Term]) -> list[Term]:
+    """The terms offered, with levels of limits, plays and dead bands from the torques about an estimate."""
+    other, signals = store.other_torques, [one.signals for one in store.about]
+
+    def follows(term: Term) -> bool:
+        return term.form.signature.side == "distortion" and term.free is not None and bool(other[term.place])
+
+    keys = dict.fromkeys(term.key for term in offered if follows(term))
+    levels = [Term(name, j, shape) for name, j in keys for shape in effects()[name].hints.grid(signals, j)]
+    return [*(term for term in offered if not follows(term)), *levels]
 
 
 AGAIN = -0.5 * float(np.log(1.0 - SYSTEMATIC**2))

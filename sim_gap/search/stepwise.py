@@ -131,9 +131,7 @@ class Search:
         for term in list(self.active):
             rest = self.without(term, self.active)
             used = {*rest, term}
-            inactive = [
-                other for other in self.normal.terms if other not in used and self.added[other.key] < TRIES
-            ]
+            inactive = [other for other in self.normal.terms if other not in used and self.added[other.key] < TRIES]
             for _, other in shortlist(self.weighted.screen(rest, inactive))[:4]:
                 yield self.with_beneath(other, rest)
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from wrong_arms import THREE, Wrong, model, record
 
 from armlink.errors import BadInput
 from sim_gap.blind.real import KNOWN, judge_real, read_cases, run_real, score_real
 from sim_gap.effects.registry import library_without
-from wrong_arms import THREE, Wrong, model, record
 
 CASE = {
     "case": "arm",
@@ -33,7 +33,9 @@ def test_what_is_known_is_right_and_what_nobody_knows_does_not_count():
     row = judge_real(
         answer(cause("friction.coulomb"), cause("friction.stribeck"), cause("link.payload", mass=3.0)), CASE
     )
-    assert row["first_right"] and not row["false"] and not row["lacking"]
+    assert row["first_right"]
+    assert not row["false"]
+    assert not row["lacking"]
 
 
 def test_a_parameter_out_of_its_bounds_is_not_named():
@@ -42,7 +44,8 @@ def test_a_parameter_out_of_its_bounds_is_not_named():
 
 def test_a_withheld_effect_is_false_and_only_if_it_is_confident():
     sure, hint = (judge_real(answer(cause("torque.gain", c)), CASE, "link.payload") for c in (0.9, 0.5))
-    assert sure["false"] == ["torque.gain"] and not hint["false"]
+    assert sure["false"] == ["torque.gain"]
+    assert not hint["false"]
 
 
 def test_shares_over_all_answers():
@@ -54,7 +57,8 @@ def test_shares_over_all_answers():
     }
     score = score_real(answers, [CASE, refused])
     assert (score["right_first"], score["named"], score["refused_as_known"]) == (1.0, 1.0, 1.0)
-    assert score["false_confident"] == 0.5 and not score["meets"]
+    assert score["false_confident"] == 0.5
+    assert not score["meets"]
 
 
 def test_the_arms_that_are_published_name_effects_of_the_library():
@@ -86,5 +90,7 @@ def test_recordings_are_diagnosed_and_sealed(tmp_path):
         " true: [friction.coulomb, friction.viscous], withhold: [friction.coulomb]}"
     )
     score = run_real(tmp_path, tmp_path / "out", known)
-    assert score["right_first"] == 1.0 and score["sealed"] and not score["missing"]
+    assert score["right_first"] == 1.0
+    assert score["sealed"]
+    assert not score["missing"]
     assert [row["withheld"] for row in score["cases"]] == [None, "friction.coulomb"]
