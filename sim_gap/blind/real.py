@@ -1,6 +1,6 @@
 """The bench of real arms: recordings of a folder, diagnosed and sealed before what is known of the arms is read.
 
-What is known stands in `real_arms.yaml`, or in a file of the same form that is given: effects that an arm has (`true`),
+What is known stands in `real_arms.yaml`, or in a file of the same form that is given: effects that an arm has (`has`),
 of which one has to come first, those that have to be named, and those that nobody knows (`open`), which do not count.
 """
 
@@ -60,7 +60,7 @@ def read_cases(known: Path) -> list[Json]:
     for number, case in enumerate(cases if isinstance(cases, list) else [cases], start=1):
         lacking = [key for key in ("case", "sim", "train") if not isinstance(case, dict) or key not in case]
         if isinstance(case, dict) and not case.get("refused"):
-            lacking += [key for key in ("first", "true") if key not in case]
+            lacking += [key for key in ("first", "has") if key not in case]
         if lacking:
             raise BadInput(f"{known}: entry {number}: {', '.join(lacking)} missing: write it as in {KNOWN.name}")
     return list(cases)
@@ -111,7 +111,7 @@ def score_real(answers: Mapping[str, Mapping[str, Any]], cases: Sequence[Json]) 
 def judge_real(answer: Mapping[str, Any], case: Json, withheld: str = "") -> Json:
     """One answer against what is known of the arm: the first cause, false ones above 0.8, and what is lacking."""
     causes = answer["causes"]
-    fine = {*case.get("true", ()), *case.get("open", ())} - {withheld}
+    fine = {*case.get("has", ()), *case.get("open", ())} - {withheld}
     first = causes[0] if causes else None
     must = {} if withheld else case.get("must", {})
     return {
