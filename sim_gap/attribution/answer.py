@@ -13,7 +13,7 @@ from sim_gap.attribution.residual_laws import ResidualLaw, as_effects, residual_
 from sim_gap.attribution.rollout import roll_out
 from sim_gap.attribution.verdict import share_left, verdict
 from sim_gap.model.load import SimModel
-from sim_gap.residuals.besides import fast, left_out, slow
+from sim_gap.residuals.besides import fast, left_out, slides, slow
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.residuals.where import Location, by_joint, combined, locate
 from sim_gap.search.estimate import Estimate
@@ -81,7 +81,8 @@ def _aside(made: Internals, estimate: Estimate | None) -> list[Location]:
         if term.effect == "friction.coulomb":
             friction[term.place] += abs(estimate.of(term)[0]) if estimate is not None else 0.0
     explained = zero if estimate is None else estimate.predict(judge)
-    return [*slow(judge, explained, friction), *fast(judge, made.recordings)]
+    known = [row for row in made.train.rows if slides(made.train, row)]
+    return [*slow(judge, explained, friction, known), *fast(judge, made.recordings)]
 
 
 def _rolled(made: Internals, found: list[Cause], laws: Sequence[ResidualLaw]) -> Rollout | None:

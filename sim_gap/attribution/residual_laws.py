@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gcomp.arrays import Array
 from sim_gap.better_model.forward_effects import JointEffect
-from sim_gap.residuals.besides import regimes
+from sim_gap.residuals.besides import regimes, slides
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.preprocess import Signals
 from sim_gap.residuals.residual_set import RELEVANT_NM, ResidualSet, root_mean_square
@@ -26,6 +26,8 @@ LEAST = 0.3
 """Share of the squared residual above the noise that a law must take off the held-out data."""
 STIFF = 1e-3
 """Weight of the second differences of a law, as a share of its columns' power."""
+SMALLEST = 0.02
+"""Least range of a quantity for a law of it, in its unit."""
 FEWEST = 100
 """Number of samples from which a law is fitted."""
 COPIES = 2.0
@@ -102,7 +104,7 @@ def _samples(data: ResidualSet) -> dict[Row, Mask]:
     """Samples that laws are fitted to and judged on: those of the comparison, and those in creep, (K,) per row."""
     out = {row: valid.copy() for row, valid in data.valid.items()}
     for (row, regime), mask in regimes(data).items():
-        if regime == "creep":
+        if regime == "creep" and slides(data, row):
             out[row] |= mask
     return out
 
@@ -135,14 +137,14 @@ def _candidates(signals: Sequence[Signals], joint: int, friction: bool) -> Itera
         if quantity == "temperature" and any(s.temperature is None for s in signals):
             continue
         x = np.concatenate([_values(s, quantity, joint) for s in signals])
-        if np.ptp(x) < 1e-9:
+        if np.ptp(x) < SMALLEST:
             continue
         for directed in (False, True) if friction else (False,):
             amount = directed and quantity in ("velocity", "load")
             at = np.quantile(np.abs(x) if amount else x, np.linspace(0.0, 1.0, KNOTS))
             if amount and quantity == "velocity":
                 at = np.concatenate([NEAR_ZERO, at[at > 2.0 * NEAR_ZERO[-1]]])
-            at = np.unique(at)
+            at = at[np.r_[True, np.diff(at) > SMALLEST / KNOTS]]
             if len(at) > 2:
                 yield _Candidate(quantity, directed, at)
 
