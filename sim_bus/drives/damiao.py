@@ -122,7 +122,8 @@ class DamiaoDrive(SimulatedDrive):
         motor, coding = self.motor, self.coding
         feedback = MitFeedback(_wrapped(motor.position, coding.position), motor.velocity, motor.torque)
         drive = int(self.registers[Register.COMMAND_ID])
-        reply = Reply(drive, self.state, feedback, int(STAGE_TEMPERATURE), int(MOTOR_TEMPERATURE))
+        heat = motor.heating
+        reply = Reply(drive, self.state, feedback, int(STAGE_TEMPERATURE), int(MOTOR_TEMPERATURE + heat))
         self.answer(int(self.registers[Register.REPLY_ID]), pack_reply(reply, coding))
 
     def _register(self, data: bytes) -> None:
