@@ -238,6 +238,11 @@ class SimulatedArm:
             attachment=truth.attachment,
         )
 
+    @property
+    def true_friction(self) -> Array:
+        """True Coulomb friction (n,) [N·m], of the mean over position and both directions."""
+        return self._imperfections().coulomb
+
     # ---- internals
 
     def _set_torque_constants(self) -> None:

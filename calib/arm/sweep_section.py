@@ -22,10 +22,8 @@ class CreepSection(Section):
     """Poses of the other joints per swept joint."""
     bin: Positive = 0.08
     """Way over which readings are averaged [rad]: more than two periods of gear and cogging ripple."""
-    cut: Annotated[FiniteFloat, Field(ge=0)] = 0.03
-    """Way cut off at either end of a creep [rad]."""
     span: Positive = 2.0
-    """Longest way of one creep [rad]; a joint with more range creeps about the middle of what gravity changes most."""
+    """Longest way of one creep [rad], its ends included; where a joint has more range, the plan chooses the part."""
     contact_lead: Positive = 0.06
     """A creeping joint that is so far behind its target has touched something [rad]."""
     zero_std: Annotated[FiniteFloat, Field(gt=0)] = 0.03

@@ -8,6 +8,7 @@ of all sweeps of that joint; a sweep that stands out is left out of the fit and 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.creep.rows import CreepRows
 from gcomp.arm.arm import Arm
@@ -46,7 +47,8 @@ def disturbed_sweeps(arm: Arm, rows: CreepRows, residual: Array, rated: Array) -
     found = []
     for joint, name in enumerate(arm.names):
         own = np.flatnonzero(rows.joint == joint)
-        largest = {int(sweep): _largest(rows, residual, own[rows.sweep[own] == sweep]) for sweep in set(rows.sweep[own])}
+        sweeps = np.unique(rows.sweep[own]).tolist()
+        largest = {sweep: _largest(rows, residual, own[rows.sweep[own] == sweep]) for sweep in sweeps}
         if len(largest) < 3:
             continue
         usual = float(np.median([size for _, size in largest.values()]))
@@ -59,7 +61,7 @@ def disturbed_sweeps(arm: Arm, rows: CreepRows, residual: Array, rated: Array) -
     return [] if worst is None else [worst]
 
 
-def _largest(rows: CreepRows, residual: Array, own: Array) -> tuple[int, float]:
+def _largest(rows: CreepRows, residual: Array, own: NDArray[np.intp]) -> tuple[int, float]:
     """(Row, size) of the largest residual of one sweep, averaged over neighbouring bins of one direction."""
     best = (int(own[0]), 0.0)
     for side in (-1.0, 1.0):

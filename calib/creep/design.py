@@ -76,6 +76,7 @@ def _information(arm: Arm, x: Array, one: Candidate, speed: float, mass: float, 
         sweep=np.zeros(len(poses), dtype=np.int64),
         sweeps=("",),
         by_temperature=True,
+        warmest=np.zeros(arm.n),
     )
     _, jacobian = CreepModel(arm, rows).linearised(x)
     jacobian /= SCATTER_SHARE * rated[one.joint]

@@ -9,6 +9,9 @@ from gcomp.arrays import Array
 
 HARMONICS = 2
 """Friction over position: cosine and sine of so many multiples of the joint angle."""
+LAST_ZERO = 1e-6
+"""The last joint's zero is kept at 0 [rad]: turning the last link's frame is the same as turning its mass moment and
+the place of the mass (docs/theory.md, 4.1)."""
 FAMILIES = ("gain", "offset", "coulomb", "load", "viscous", "asymmetry", "warming", "zero", "uneven", "beta", "rho")
 """In the order of the vector."""
 
@@ -35,8 +38,10 @@ class Doubt:
     """Of rated torque."""
     load: float = 0.07
     """Friction per torque: a planetary gear of 0.9 efficiency has 0.1."""
-    viscous_share: float = 0.1
-    """Of rated torque, per rad/s."""
+    viscous_share: float = 0.02
+    """Of rated torque, per rad/s, about `viscous_mean`."""
+    viscous_mean: float = 0.015
+    """Of rated torque, per rad/s: 0.1 to 0.5 N·m·s/rad were measured on drives of 3 to 20 N·m."""
     asymmetry: float = 0.07
     """Friction of the two directions, half difference over mean."""
     warming: float = 0.001
@@ -59,6 +64,7 @@ def prior(arm: Arm, rated: Array, doubt: Doubt, by_temperature: bool, coulomb: A
     n, slices = arm.n, family_slices(arm.n)
     mean, std = np.zeros(slices["rho"].stop), np.empty(slices["rho"].stop)
     mean[slices["gain"]] = 1.0
+    mean[slices["viscous"]] = doubt.viscous_mean * rated
     if by_temperature:
         mean[slices["warming"]] = doubt.warming_mean
     gravity = float(np.linalg.norm(arm.gravity))
@@ -77,4 +83,5 @@ def prior(arm: Arm, rated: Array, doubt: Doubt, by_temperature: bool, coulomb: A
     }
     for family, value in values.items():
         std[slices[family]] = value
+    std[slices["zero"].stop - 1] = LAST_ZERO
     return mean, std

@@ -12,7 +12,7 @@ from calib.arm.sweep_section import SweepSection, sweep_section
 from calib.creep.design import Candidate, choose
 from calib.plan.collisions import POINTS, Geometry
 from calib.plan.poses import require_range
-from calib.plan.types import Sweep, SweepPlan
+from calib.plan.types import Side, Sweep, SweepPlan
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array
@@ -114,9 +114,36 @@ def plan_creep(arm_file: ArmFile, *, seed: int = 0) -> SweepPlan:
     )
 
 
+TRAVEL_SECONDS = 6.0
+"""Rough time from one creep to the next [s]."""
+
+
+def creep_seconds(plan: SweepPlan) -> float:
+    """Rough duration of a pass [s]."""
+    total = 0.0
+    for sweep in plan.sweeps:
+        speed = sweep.speed or 0.1
+        way = (sweep.steps[-1] - sweep.steps[0]) * (1 + 1 / (len(sweep.steps) - 1)) + 2 * lead_way(speed)
+        total += 2 * way / speed + TRAVEL_SECONDS
+    return total
+
+
+RAMP = 0.4
+"""Time over which a creep reaches its speed, and comes to rest [s]."""
+SETTLE = 0.4
+"""Time after that in which friction has turned round and the position loop has settled [s]."""
+
+
+def lead_way(speed: float) -> float:
+    """Way at either end of a creep that does not count [rad]."""
+    return speed * (RAMP / 2 + SETTLE)
+
+
+RESTING: Side = 0
+"""No joint rests on a stop."""
 VERTICAL = (
-    "its axis is vertical in every pose, so that gravity does not load it: its torque constant cannot be seen; mount the"
-    " base tilted by 10° or more and state kinematics.gravity accordingly"
+    "its axis is vertical in every pose, so that gravity does not load it: its torque constant cannot be seen; mount"
+    " the base tilted by 10° or more and state kinematics.gravity accordingly"
 )
 
 
@@ -127,17 +154,20 @@ def vertical(arm: Arm, joint: int) -> bool:
 
 
 def _sweep(ground: CreepGround, one: Candidate, number: int, speed: float) -> Sweep:
-    count = max(round((one.upper - one.lower) / ground.section.creep.bin), 4)
-    width = (one.upper - one.lower) / count
+    speed = min(speed, (one.upper - one.lower) / 4 / lead_way(1.0))
+    lead = lead_way(speed)
+    way = one.upper - one.lower - 2 * lead
+    count = max(round(way / ground.section.creep.bin), 4)
+    width = way / count
     rest = one.rest.copy()
     rest[one.joint] = one.lower
     lever = gravity_levers(ground.arm, one.poses(3))[:, one.joint].max() / np.linalg.norm(ground.arm.gravity)
     return Sweep(
         name=f"{ground.arm.names[one.joint]} creep {number + 1}",
         joint=one.joint,
-        stops=(0,) * ground.arm.n,
+        stops=tuple(RESTING for _ in range(ground.arm.n)),
         rest=tuple(rest.tolist()),
-        steps=tuple((one.lower + width * (np.arange(count) + 0.5)).tolist()),
+        steps=tuple((one.lower + lead + width * (np.arange(count) + 0.5)).tolist()),
         lever=float(lever),
         servo=(True,) * ground.arm.n,
         speed=speed,

@@ -37,6 +37,8 @@ class CreepRows:
     """Name of each sweep, with its pass."""
     by_temperature: bool
     """Whether `warmth` is in kelvin."""
+    warmest: Array
+    """Temperature of each joint's drive at which warmth is 0 (n,) [°C]; NaN where it is not in kelvin."""
 
     def __len__(self) -> int:
         """Rows."""
@@ -69,7 +71,7 @@ class CreepRows:
         rows = np.arange(len(joint))
         names = tuple(dict.fromkeys(name for *_, name in found))
         side = np.array([each.direction.sum() for each in readings])
-        warmth, by_temperature = _warmth(readings, joint, np.array([t for *_, t, _ in found]))
+        warmth, warmest = _warmth(readings, joint, np.array([t for *_, t, _ in found]), ordered)
         return cls(
             joint=joint,
             position=np.array([each.position for each in readings]),
@@ -79,18 +81,22 @@ class CreepRows:
             warmth=warmth,
             sweep=np.array([names.index(name) for *_, name in found], dtype=np.int64),
             sweeps=names,
-            by_temperature=by_temperature,
+            by_temperature=bool(np.isfinite(warmest).any()),
+            warmest=warmest,
         )
 
 
-def _warmth(readings: list[StaticReading], joint: NDArray[np.int64], t: Array) -> tuple[Array, bool]:
-    """(How much colder each row's drive was than at the end (R,), whether in kelvin)."""
+def _warmth(
+    readings: list[StaticReading], joint: NDArray[np.int64], t: Array, passes: Sequence[SweepData]
+) -> tuple[Array, Array]:
+    """(How much colder each row's drive was than at the end (R,), temperature of each drive then (n,) [°C] or NaN)."""
+    n = len(passes[0].manifest.names) if passes else 0
     temperature = np.array(
         [np.nan if each.temperature is None else each.temperature[j] for each, j in zip(readings, joint, strict=True)]
     )
     known = bool(np.isfinite(temperature).all())
     if known and np.ptp(temperature) >= COMMON_MODE:
-        warm = np.array([temperature[joint == j].max() for j in joint])
-        return temperature - warm, True
+        warm = np.array([temperature[joint == j].max(initial=-np.inf) for j in range(n)])
+        return temperature - warm[joint], np.where(np.isfinite(warm), warm, np.nan)
     span = max(float(np.ptp(t)), 1.0) if len(t) else 1.0
-    return (t - t.max(initial=0.0)) / span, False
+    return (t - t.max(initial=0.0)) / span, np.full(n, np.nan)

@@ -13,7 +13,7 @@ from armlink.loop.driver import ArmDriver
 from calib.arm.drive_limits import Limits
 from calib.arm.sweep_section import sweep_section
 from calib.creep.bins import bin_readings
-from calib.creep.plan import CreepGround, plan_creep
+from calib.creep.plan import RAMP, CreepGround, lead_way, plan_creep
 from calib.motion.mover import Mover, Stalled
 from calib.motion.static_reading import StaticReading
 from calib.plan.types import Sweep, SweepPlan
@@ -22,11 +22,7 @@ from calib.sweep.run import Progress, sparkline
 from calib.sweep.stalls import OnStall, bridged, give_up, restart, stall_line
 from gcomp.arrays import Array
 
-RAMP = 0.2
-"""Time over which a creep reaches its speed, and comes to rest [s]."""
-LEAD = 1.5
-"""A creep begins and ends this many times `sweep.creep.cut` beyond its bins."""
-PAUSE = 0.3
+PAUSE = 0.5
 """Rest before a creep [s]."""
 MOST_CONTACTS = 0.3
 """Share of the sweeps that may end in a contact before the pass is given up."""
@@ -117,7 +113,8 @@ class _Pass:
     def _both_ways(self, sweep: Sweep) -> list[StaticReading]:
         mover, joint = self._mover, sweep.joint
         middles = np.array(sweep.steps)
-        half = (middles[1] - middles[0]) / 2 + LEAD * self._creep.cut
+        speed = sweep.speed or 0.1
+        half = (middles[1] - middles[0]) / 2 + lead_way(speed)
         low, high = middles[0] - half, middles[-1] + half
         goal = np.array(sweep.rest)
         goal[joint] = low
@@ -130,7 +127,7 @@ class _Pass:
         temperature = self._temperature()
         count = len(middles)
         for side, end in ((1, high), (-1, low)):
-            samples = mover.follow(self._rows(joint, end, sweep.speed or 0.1), self._guard(joint))
+            samples = mover.follow(self._rows(joint, end, speed), self._guard(joint))
             for index, reading in enumerate(bin_readings(samples, joint, side, middles, temperature)):
                 if reading is not None:
                     place = index if side > 0 else 2 * count - 1 - index
@@ -172,8 +169,8 @@ class _Pass:
         self._contacts += 1
         mover.come_to_rest()
         text = (
-            f"{CONTACT}: {stalled.name}: met something at {stalled.position:.2f} rad on its way to"
-            f" {stalled.target:.2f}: the surroundings, the arm itself or a cable"
+            f"{CONTACT}: {stalled.name}: met something at {stalled.position:.2f} rad: the surroundings, the arm itself or"
+            " a cable"
         )
         line = StallLine(t=mover.seen_at, late_ms=None, reading=sweep.name, reason=text)
         self._writer.append(line)
@@ -187,7 +184,10 @@ class _Pass:
     def _bridge(self, stall: Stall, sweep: Sweep) -> None:
         mover = self._mover
         restart(
-            mover.link, self._on_stall, stall, lambda each: self._writer.append(stall_line(each, mover.seen_at, sweep.name))
+            mover.link,
+            self._on_stall,
+            stall,
+            lambda each: self._writer.append(stall_line(each, mover.seen_at, sweep.name)),
         )
         bridged(mover.link, self._on_stall, mover.resume)
 

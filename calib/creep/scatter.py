@@ -6,6 +6,7 @@ correlations ρ_k of residuals k bins apart, summed up to the first that is not 
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.creep.rows import CreepRows
 from gcomp.arrays import Array
@@ -33,7 +34,7 @@ def scatter(rows: CreepRows, residual: Array, rated: Array, freedom: float) -> t
     return sigma, factor
 
 
-def _inflation(rows: CreepRows, residual: Array, own: Array) -> float:
+def _inflation(rows: CreepRows, residual: Array, own: NDArray[np.intp]) -> float:
     """1 + 2 Σ ρ_k over the sweeps of one joint."""
     series = []
     for sweep in np.unique(rows.sweep[own]):

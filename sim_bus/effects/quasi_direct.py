@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 from armlink.arrays import Array
 from sim_bus.effects.state import Imperfections
 
-Pair = Annotated[tuple[FiniteFloat, ...], Field(min_length=2, max_length=2)]
+Pair = tuple[FiniteFloat, FiniteFloat]
 NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 
 

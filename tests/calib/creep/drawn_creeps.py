@@ -26,17 +26,22 @@ class DrawnCreep:
     truth: Truth
     state: Imperfections
     simulated: SimulatedArm
+    top: Array
+    """Highest reported rise of temperature of each joint (n,) [K]."""
 
     @property
     def warm_gain(self) -> Array:
-        """Reading per torque at the end of the last pass (n,)."""
-        return self.simulated.sensors.gain_at(self.simulated.time)
+        """Reading per torque (n,) at the temperatures that the drives reported last; they report whole kelvins."""
+        if not self.rows.by_temperature:
+            return self.simulated.sensors.gain_at(self.simulated.time)
+        fall, _, heating = self.state.warm_constant.T
+        return self.truth.gain / (1 - fall * (self.top + 0.5) / heating)
 
 
 def draw_creep(
     arm: ArmFile, plan: SweepPlan, seed: int, mass: float, order: str = "empty loaded empty", noise: float = 0.01
 ) -> DrawnCreep:
-    """Passes over the plan in this order; noise is what a bin's mean scatters by, as a share of its Coulomb friction."""
+    """Passes over the plan in this order; noise is the scatter of a bin's mean, as a share of Coulomb friction."""
     truth = Truth.draw(arm, seed)
     simulated = SimulatedArm(arm, truth, seed)
     state = simulated.plant._imperfections
@@ -59,15 +64,20 @@ def draw_creep(
                 reading = _readings(simulated, state, truth, q, sweep.joint, rate, times, rated, random, noise)
                 j = np.full(len(steps), sweep.joint)
                 heat = np.array([np.floor(simulated.sensors.heating(each)[sweep.joint]) for each in times])
-                parts.append([j, q, reading, np.full(len(j), rate), np.full(len(j), hung), heat, np.full(len(j), len(names) - 1)])
+                parts.append(
+                    [j, q, reading, np.full(len(j), rate), np.full(len(j), hung), heat, np.full(len(j), len(names) - 1)]
+                )
     simulated.time = t
-    joint, position, reading, velocity, masses, heat, sweep_of = (np.concatenate(each) for each in zip(*parts, strict=True))
+    joint, position, reading, velocity, masses, heat, sweep_of = (
+        np.concatenate(each) for each in zip(*parts, strict=True)
+    )
     top = np.array([heat[joint == j].max() for j in joint])
     warmth = heat - top if np.ptp(heat) >= 1 else np.linspace(-1, 0, len(heat))
     rows = CreepRows(
-        joint.astype(int), position, reading, velocity, masses, warmth, sweep_of.astype(int), tuple(names), bool(np.ptp(heat) >= 1)
-    )
-    return DrawnCreep(rows, truth, state, simulated)
+        joint.astype(int), position, reading, velocity, masses, warmth, sweep_of.astype(int), tuple(names),
+        bool(np.ptp(heat) >= 1), np.array([heat[joint == j].max() for j in range(len(rated))]),
+    )  # fmt: skip
+    return DrawnCreep(rows, truth, state, simulated, np.array([heat[joint == j].max() for j in range(len(rated))]))
 
 
 def _readings(
@@ -92,7 +102,6 @@ def _readings(
 def without(arm: ArmFile, **changes: float | tuple[float, float]) -> ArmFile:
     """The arm with other ranges of its quasi-direct drives."""
     sim = arm.sim
-    return arm.model_copy(update={"sim": sim.model_copy(update={"quasi_direct": sim.quasi_direct.model_copy(update=changes)})})
-
-
-
+    return arm.model_copy(
+        update={"sim": sim.model_copy(update={"quasi_direct": sim.quasi_direct.model_copy(update=changes)})}
+    )
