@@ -1,8 +1,9 @@
 """Sweeps in which something other than gravity and friction acted on the joint: a table, the arm itself, a cable.
 
-A push that depends on position shows as a residual that is large over neighbouring bins, and that other sweeps of the
-same joint do not have. Each sweep's residuals, averaged over neighbouring bins, are compared with the middle of those
-of all sweeps of that joint; a sweep that stands out is left out of the fit and named with its worst place.
+A push that depends on position shows as a residual that is alike in both directions, large over neighbouring bins, and
+that other sweeps of the same joint do not have. Each sweep's residuals, averaged over these, are compared with the
+middle of those of all sweeps of that joint; a sweep that stands out is left out of the fit and named with its worst
+place.
 """
 
 from dataclasses import dataclass
@@ -15,11 +16,10 @@ from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 
 SMOOTH = 3
-"""Neighbouring bins that are averaged."""
+"""Neighbouring bins that are averaged, those of both directions."""
 OUTSTANDING = 6.0
-"""A sweep is disturbed if its largest residual is so many times the usual one of its joint; a choice, drawn arms stay
-below 3."""
-LEAST_SHARE = 0.01
+"""A sweep is disturbed if its largest residual is so many times the usual one of its joint; a choice."""
+LEAST_SHARE = 0.02
 """Least torque that counts as a disturbance, as a share of rated torque."""
 
 
@@ -62,15 +62,10 @@ def disturbed_sweeps(arm: Arm, rows: CreepRows, residual: Array, rated: Array) -
 
 
 def _largest(rows: CreepRows, residual: Array, own: NDArray[np.intp]) -> tuple[int, float]:
-    """(Row, size) of the largest residual of one sweep, averaged over neighbouring bins of one direction."""
-    best = (int(own[0]), 0.0)
-    for side in (-1.0, 1.0):
-        each = own[rows.side[own] == side]
-        if each.size < SMOOTH:
-            continue
-        each = each[np.argsort(rows.position[each, rows.joint[each]])]
-        mean = np.convolve(residual[each], np.full(SMOOTH, 1 / SMOOTH), mode="valid")
-        place = int(np.argmax(np.abs(mean)))
-        if abs(mean[place]) > best[1]:
-            best = (int(each[place + SMOOTH // 2]), float(abs(mean[place])))
-    return best
+    """(Row, size) of the largest residual of one sweep, averaged over neighbouring bins and both directions."""
+    each = own[np.argsort(rows.position[own, rows.joint[own]])]
+    if each.size < 2 * SMOOTH:
+        return int(own[0]), 0.0
+    mean = np.convolve(residual[each], np.full(2 * SMOOTH, 0.5 / SMOOTH), mode="valid")
+    place = int(np.argmax(np.abs(mean)))
+    return int(each[place + SMOOTH]), float(abs(mean[place]))

@@ -38,7 +38,7 @@ class CreepFit:
     solution: Solution
     prior_std: Array
     sigma: Array
-    """Scatter of one bin's reading (n,) [N·m]."""
+    """Scatter of each row's reading (R,) [N·m]."""
     factor: Array
     """Factor of the standard deviations for what neighbouring bins have in common (n,)."""
     disturbed: tuple[Disturbed, ...]
@@ -71,7 +71,9 @@ class CreepFit:
         return np.sqrt(variance)
 
     def found(self, family: str) -> Mask:
-        """Parameters of a family that the data determine."""
+        """Parameters of a family that the data determine; without a mass nothing tells the scale of gains and masses."""
+        if family in ("gain", "beta") and not (self.rows.mass > 0).any():
+            return np.zeros(len(self.value(family)), dtype=bool)
         return np.asarray(self.std(family) < SEEN * self.prior_std[self.slices[family]], dtype=bool)
 
     def ci95(self, family: str) -> Array:
@@ -128,12 +130,12 @@ def _fit(
     arm: Arm, rows: CreepRows, rated: Array, doubt: Doubt, sources: dict[str, str], left_out: tuple[Disturbed, ...]
 ) -> CreepFit:
     model = CreepModel(arm, rows)
-    sigma, factor = 0.01 * rated, np.ones(arm.n)
+    sigma, factor = 0.01 * rated[rows.joint], np.ones(arm.n)
     coulomb = 0.02 * rated
     mean, std = prior(arm, rated, doubt, rows.by_temperature, coulomb)
     x = mean.copy()
     for _ in range(ROUNDS):
-        found = solve(model, (sigma * factor)[rows.joint], mean, std, x)
+        found = solve(model, sigma * factor[rows.joint], mean, std, x)
         x = found.x
         coulomb = np.abs(x[model.slices["coulomb"]])
         mean, std = prior(arm, rated, doubt, rows.by_temperature, coulomb)

@@ -67,7 +67,7 @@ def calibration_record(fit: CreepFit, arm_file: ArmFile) -> CalibrationRecord:
                 position_gain=1.0,
                 position_offset=zero,
                 not_identifiable=own,
-                residual_std=float(fit.sigma[joint]),
+                residual_std=float(fit.residual_rms[joint]) if np.isfinite(fit.residual_rms[joint]) else None,
                 motor=_motor(fit, joint),
             )
         )

@@ -169,8 +169,8 @@ class _Pass:
         self._contacts += 1
         mover.come_to_rest()
         text = (
-            f"{CONTACT}: {stalled.name}: met something at {stalled.position:.2f} rad: the surroundings, the arm itself or"
-            " a cable"
+            f"{CONTACT}: {stalled.name}: met something at {stalled.position:.2f} rad: the surroundings, the arm"
+            " itself or a cable"
         )
         line = StallLine(t=mover.seen_at, late_ms=None, reading=sweep.name, reason=text)
         self._writer.append(line)

@@ -13,24 +13,31 @@ from gcomp.arrays import Array
 
 LEAST_SHARE = 1e-4
 """Least standard deviation of a row, as a share of rated torque: rounding of the sums that the readings are."""
+USUAL_ROWS = 10
+"""Rows that the usual scatter of a joint's sweeps counts for, beside those of a sweep itself."""
 MOST = 16.0
 """Most that a variance is multiplied by; a choice, for sweeps of a dozen bins."""
 
 
 def scatter(rows: CreepRows, residual: Array, rated: Array, freedom: float) -> tuple[Array, Array]:
-    """(Standard deviation of a row by its joint (n,) [N·m], factor for what neighbours have in common (n,)).
+    """(Standard deviation of each row (R,) [N·m], factor for what neighbours have in common, by joint (n,)).
 
-    `freedom` is rows less unknowns, as a share of the rows.
+    A sweep in which the arm swung scatters more than others of its joint: its own scatter counts, drawn towards the
+    joint's as by `USUAL_ROWS` further rows. `freedom` is rows less unknowns, as a share of the rows.
     """
     n = len(rated)
-    sigma, factor = LEAST_SHARE * rated, np.ones(n)
+    sigma, factor = np.zeros(len(rows)), np.ones(n)
     for joint in range(n):
         own = np.flatnonzero(rows.joint == joint)
-        if own.size < 8:
+        if not own.size:
             continue
-        rms = float(np.sqrt(np.mean(residual[own] ** 2) / max(freedom, 0.2)))
-        sigma[joint] = max(sigma[joint], rms)
-        factor[joint] = np.sqrt(_inflation(rows, residual, own))
+        square = residual**2 / max(freedom, 0.2)
+        sweeps = [own[rows.sweep[own] == sweep] for sweep in np.unique(rows.sweep[own])]
+        usual = float(np.median([square[each].mean() for each in sweeps]))
+        for each in sweeps:
+            variance = (square[each].sum() + USUAL_ROWS * usual) / (each.size + USUAL_ROWS)
+            sigma[each] = max(float(np.sqrt(variance)), LEAST_SHARE * float(rated[joint]))
+        factor[joint] = np.sqrt(_inflation(rows, residual / sigma.clip(1e-12), own))
     return sigma, factor
 
 
