@@ -40,6 +40,7 @@ def select_model(store: ColumnStore, library: Sequence[str]) -> Search:
         near = search.normal.store
         values = near.values
         chosen = one_each([canonical(term) for term in search.active])
+    search.normal.store.beside(None)  # frees the columns of the estimate before
     return search
 
 
