@@ -207,7 +207,7 @@ class MoteusDrives(BasicDrives):
             Register.MODE: frames.Mode.POSITION,
             Register.COMMAND_POSITION: order.position / TURN if stiff else math.nan,
             Register.COMMAND_VELOCITY: order.velocity / TURN if stiff else 0.0,
-            Register.COMMAND_TORQUE: _float_within(order.torque, most),
+            Register.COMMAND_TORQUE: 0.0 if stiff else _float_within(order.torque, most),
             Register.COMMAND_KP_SCALE: stiff,
             Register.COMMAND_KD_SCALE: stiff,
             Register.COMMAND_MAX_TORQUE: _float_within(most, most),
