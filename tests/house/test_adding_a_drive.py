@@ -18,7 +18,7 @@ from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
 PAGE = (Path(__file__).parents[2] / "docs" / "adding-a-drive.md").read_text(encoding="utf-8")
-FILES = dict(re.findall(r"^```\w+ title="(\S+)"\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL))
+FILES = dict(re.findall(r'^```\w+ title="(\S+)"\n(.*?)^```$', PAGE, re.MULTILINE | re.DOTALL))
 MOST_LINES = 200
 
 
