@@ -64,8 +64,8 @@ blind: .venv/.dev ## Long campaign outside make test: the diagnosis against seal
 corruptions: .venv/.dev ## Long campaign outside make test: wrong columns, units and clocks in real recordings (ARGS="--draws 200")
 	$(BIN)/python tests/campaigns/corrupted_recordings.py $(ARGS)
 
-mutants: .venv/.dev ## Long campaign outside make test: each change of the gate's source must make a test fail
-	$(BIN)/python tests/campaigns/mutants.py $(ARGS)
+mutants: .venv/.dev ## Long campaign outside make test: changes of the source must make a test fail (MODULES="sim_gap/*/*.py" ARGS="--draw 50")
+	$(BIN)/python tests/campaigns/mutants.py $(if $(MODULES),--modules $(foreach each,$(MODULES),'$(each)')) $(ARGS)
 
 wheel: .venv/.dev ## Build the wheel into dist/ and run the demo from it in an empty environment (ARGS="python3.12 python3.13")
 	scripts/test-wheel $(ARGS)

@@ -34,6 +34,8 @@ from sim_bus.truth import Truth
 
 DRIVE_ERROR = 0x21
 """Error register: generic and device profile."""
+WARMING_STEP = 1.0
+"""Torque constants of drives that warm up are brought up to date so often [s]."""
 TARGETS = {(0x6071, 0), (0x607A, 0), (0x60FF, 0)}
 
 
@@ -45,6 +47,7 @@ class SimulatedArm:
         section, link = sim_section(arm), arm.require_link()
         self.arm, self.truth, self.names, self.n = arm, truth, arm.joint_names, len(arm.joint_names)
         self.time = 0.0
+        self._seed, self._warmed = seed, 0.0
         self.outbox: deque[Frame] = deque()
         self.default_period = self._period = 1.0 / link.rate
         self._entries: tuple[EffectSetting, ...] = section.effects
@@ -139,6 +142,8 @@ class SimulatedArm:
                 self._nmt.update()
             if self._watching:
                 self.drives.watch()
+            if self.sensors.warms and self.time >= self._warmed + WARMING_STEP:
+                self._set_torque_constants()
             if remaining > 1e-9:
                 self._sample()
             self._pdos.send_events()
@@ -241,12 +246,17 @@ class SimulatedArm:
         """True sensor parameters at present, drifts and effects included."""
         sensors, truth = self.sensors, self.truth
         return Truth(
-            sensors.gain,
+            sensors.gain_at(self.time),
             sensors.offset + sensors.cold_zero(self.time),
             sensors.position_gain,
             sensors.position_offset,
             attachment=truth.attachment,
         )
+
+    @property
+    def true_friction(self) -> Array:
+        """True Coulomb friction (n,) [N·m], of the mean over position and both directions."""
+        return self._imperfections().coulomb
 
     # ---- internals
 
@@ -254,7 +264,8 @@ class SimulatedArm:
         """A drive without a torque sensor makes as much torque too little as its reading is too large."""
         current = np.zeros(self.n, bool)
         current[list(self.drive_at)] = True
-        self.plant.torque_constant = np.where(current, self.sensors.gain, 1.0)
+        self._warmed = self.time
+        self.plant.torque_constant = np.where(current, self.sensors.gain_at(self.time), 1.0)
         self.drives.loops.imagined = np.where(current, self.sensors.offset, 0.0)
         self.drives.loops.reconfigure()
 
@@ -270,6 +281,9 @@ class SimulatedArm:
         state, realism = imperfections(self.names, self._entries), sim_section(self.arm).realism
         rated = self.arm.require_link().rated_torques
         add_realism(state, rated, realism.level, realism.seed)
+        drives = sim_section(self.arm).quasi_direct
+        if drives is not None:
+            drives.add_to(state, rated, self._seed)
         return state
 
     @contextmanager

@@ -34,8 +34,9 @@ def calibrate(
     Example: armlink calibrate unloaded loaded --json calibration.json
     """
     from armlink.commands.output import write_json
-    from armlink.errors import Refused
+    from armlink.errors import BadInput, Refused
     from calib.arm.kinematics import gcomp_arm
+    from calib.commands.creep.fits import all_creep, calibrate_creep
     from calib.commands.screen import print_lines
     from calib.commands.sweep_data import load_sweeps
     from calib.fit.felt_mass import felt_mass
@@ -45,6 +46,11 @@ def calibrate(
     from calib.records.store import RecordStore
 
     data, arm_file = load_sweeps("calibrate", directories, arm)
+    if all_creep(data):
+        if apply:
+            raise BadInput("--apply: the host keeps the calibration of these drives: the record is in force without it")
+        calibrate_creep(data, arm_file, store, json_file)
+        return
     fit = fit_sensors(arm_file, data)
     records = RecordStore(store)
     current = records.current(CalibrationRecord, arm_file)

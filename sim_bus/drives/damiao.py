@@ -29,7 +29,7 @@ from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, STAGE_TEMPERATURE,
 LEAST_RANGE = 1e-3
 """A range register of 0 counts as this."""
 STORE = 0xAA
-STAGE, MOTOR = int(STAGE_TEMPERATURE), int(MOTOR_TEMPERATURE)
+STAGE = int(STAGE_TEMPERATURE)
 OTHER_MODES = 0x100, 0x200, 0x300
 """Offsets of the command ids of the position, velocity and force modes."""
 NO_COMMAND = MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -120,7 +120,7 @@ class DamiaoDrive(SimulatedDrive):
         motor, coding = self.motor, self.coding
         feedback = MitFeedback(_wrapped(motor.position, coding.position), motor.velocity, motor.torque)
         drive = int(self.registers[Register.COMMAND_ID])
-        reply = Reply(drive, self.state, feedback, STAGE, MOTOR)
+        reply = Reply(drive, self.state, feedback, STAGE, int(MOTOR_TEMPERATURE + motor.heating))
         self.answer(int(self.registers[Register.REPLY_ID]), pack_reply(reply, coding))
 
     def _register(self, data: bytes) -> None:

@@ -21,8 +21,8 @@ class Readings:
         """Nothing is sampled before the first at()."""
         self._plant, self._sensors = plant, sensors
         self._time = -1.0
-        self.position, self.velocity, self.torque = (np.zeros(plant.n) for _ in range(3))
-        """By the drive's encoder [rad] and [rad/s]; current times torque constant [N·m]."""
+        self.position, self.velocity, self.torque, self.heating = (np.zeros(plant.n) for _ in range(4))
+        """By the drive's encoder [rad] and [rad/s]; current times torque constant [N·m]; temperature rise [K]."""
         self.started = np.zeros(plant.n)
         """Torque at the start of the present step (n,) [N·m]."""
         self._mean = np.zeros(plant.n)
@@ -45,6 +45,8 @@ class Readings:
             self.position = sensors.position_counts(plant.motor_position) * sensors.position_step
             self.velocity = plant.motor_velocity / sensors.position_gain
             self.torque = sensors.torque(self._mean, time)
+            if sensors.warms:
+                self.heating = sensors.heating(time)
         return self
 
 
@@ -80,6 +82,11 @@ class Motor:
     def torque(self) -> float:
         """Current times torque constant [N·m]."""
         return self._value(self._readings.at(self._time).torque) / self.ratio if self.powered else 0.0
+
+    @property
+    def heating(self) -> float:
+        """Rise of its temperature since power-on [K]."""
+        return self._value(self._readings.at(self._time).heating)
 
     def impede(
         self, kp: float, kd: float, position: float, velocity: float, torque: float, limit: float = np.inf

@@ -14,9 +14,9 @@ from armlink.drives.board import NO_STATUS, Board, Event
 from armlink.drives.canopen import controller_setup as device
 from armlink.drives.canopen import emcy, faults, torque_sensor_record
 from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen.check.guard_rules import NodeRules, shared_rules
 from armlink.drives.canopen.cia402 import Control, State, next_control, set_point_control, state_of, supports
 from armlink.drives.canopen.eds_file import of_joints
-from armlink.drives.canopen.guard_rules import NodeRules, shared_rules
 from armlink.drives.canopen.host_frames import HostFrames
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import RPDO1, RPDO2, STATUS_DECIMATION, TPDO1, TPDO2, TPDO3
