@@ -41,7 +41,7 @@ class Batch:
     channels: dict[str, Array]
     """Name of CHANNELS → (K, n), SI units, NaN if missing."""
     status: NDArray[np.int64]
-    """Newest status words (n,)."""
+    """Newest state codes (n,)."""
     age: Array
     """Time since position and torque last arrived (n,) [s]."""
     stats: Stats
