@@ -71,7 +71,7 @@ class CreepFit:
         return np.sqrt(variance)
 
     def found(self, family: str) -> Mask:
-        """Parameters of a family that the data determine; without a mass nothing tells the scale of gains and masses."""
+        """Parameters of a family that the data determine; without a mass nothing tells the scale."""
         if family in ("gain", "beta") and not (self.rows.mass > 0).any():
             return np.zeros(len(self.value(family)), dtype=bool)
         return np.asarray(self.std(family) < SEEN * self.prior_std[self.slices[family]], dtype=bool)

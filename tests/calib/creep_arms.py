@@ -164,7 +164,7 @@ def judge_creep(arm: ArmFile, simulated: SimulatedArm, data: list[SweepData], st
 
 
 def warm_gain(simulated: SimulatedArm, fit: CreepFit) -> Array:
-    """True reading per torque (n,) at the temperatures for which the fit states its gains; drives tell whole kelvins."""
+    """True reading per torque (n,) at the temperatures of the fit; drives tell whole kelvins."""
     if not fit.rows.by_temperature:
         return simulated.sensors.gain_at(simulated.time)
     fall, _, heating = simulated.plant._imperfections.warm_constant.T

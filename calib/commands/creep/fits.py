@@ -44,9 +44,7 @@ def calibrate_creep(data: list[SweepData], arm_file: ArmFile, store: str | None,
     record = calibration_record(fit, arm_file).model_copy(update={"parent": None if current is None else current.id})
     records.put(record, arm_file, by="armlink calibrate", reason="creep sweeps")
     _show(fit, data)
-    print_lines(
-        [f"record {record.id} is current: it corrects readings and commands when the arm is opened next"]
-    )
+    print_lines([f"record {record.id} is current: it corrects readings and commands when the arm is opened next"])
     write_json(json_file, {"schema": "armlink.creep/1", "record": record.id, **_answer(fit, data)})
 
 
