@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 export PYTHON
-CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host daemon_days daemon_kills fuzz_frames fuzz_drives kill_drives web
+CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host daemon_days daemon_kills fuzz_frames fuzz_drives fuzz_guard kill_drives web
 
 .DEFAULT_GOAL := help
 .PHONY: help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep
@@ -67,8 +67,8 @@ blind: .venv/.dev ## Long campaign outside make test: the diagnosis against seal
 corruptions: .venv/.dev ## Long campaign outside make test: wrong columns, units and clocks in real recordings (ARGS="--draws 200")
 	$(BIN)/python tests/campaigns/corrupted_recordings.py $(ARGS)
 
-mutants: .venv/.dev ## Long campaign outside make test: each change of the gate's source must make a test fail
-	$(BIN)/python tests/campaigns/mutants.py $(ARGS)
+mutants: .venv/.dev ## Long campaign outside make test: changes of the source must make a test fail (MODULES="sim_gap/*/*.py" ARGS="--draw 50")
+	$(BIN)/python tests/campaigns/mutants.py $(if $(MODULES),--modules $(foreach each,$(MODULES),'$(each)')) $(ARGS)
 
 wheel: .venv/.dev ## Build the wheel into dist/ and run the demo from it in an empty environment (ARGS="python3.12 python3.13")
 	scripts/test-wheel $(ARGS)

@@ -60,9 +60,13 @@ class BasicDrives:
         """See Drives."""
         return self.powers[joint]
 
-    def ask_power(self, joint: int, ask: Ask) -> Power:
-        """See Drives: the newest that it told."""
-        return self.powers[joint]
+    def state_request(self, joint: int) -> list[Frame]:
+        """See Drives: it tells by itself."""
+        return []
+
+    def lets_go(self, joint: int) -> bool:
+        """See Drives: by its power state; a family whose drives fall where they stop by themselves overrides it."""
+        return self.powers[joint] in (Power.OFF, Power.READY, Power.FAULT)
 
     def ready(self, joint: int) -> bool:
         """See Drives."""

@@ -132,8 +132,13 @@ class Drives(Protocol):
         """Newest power state of a drive."""
         ...
 
-    def ask_power(self, joint: int, ask: Ask) -> Power:
-        """Power state of a drive that has had no command, asked for without giving one."""
+    def state_request(self, joint: int) -> list[Frame]:
+        """Frames by which a drive tells its state although it is not commanded, and that are no command; empty where
+        it tells by itself."""
+        ...
+
+    def lets_go(self, joint: int) -> bool:
+        """Whether a drive, as it is now, leaves its motor without power."""
         ...
 
     def ready(self, joint: int) -> bool:
@@ -219,6 +224,28 @@ class KeepsCalibration(Protocol):
 
     def write_calibration(self, joint: int, ask: Ask, calibration: Calibration, store: bool = False) -> Calibration:
         """Make a calibration active (`store`: in flash too), read it back; raises BadInput, BusFault."""
+        ...
+
+
+@runtime_checkable
+class TellsCurrent(Protocol):
+    """Drives whose current can be asked for, where the arm file has its torque constant."""
+
+    def torque_by_current(self, joint: int, ask: Ask) -> tuple[float, float] | None:
+        """Torque as the drive reports it, and current times torque constant, at one time [N·m]; None where the arm
+        file has no constant, or the drive does not answer."""
+        ...
+
+
+@runtime_checkable
+class Guarded(Protocol):
+    """Drives whose command frames a guard of the bus can check by their bytes alone."""
+
+    def guard_rules(self, ask: Ask, limits: Sequence[Limits]) -> dict[str, Any]:
+        """`frames`, `stop` and `restarts` of a policy (armlink.guard.bus_guard); drives are read, and nothing is set.
+
+        Raises BusFault, BadInput.
+        """
         ...
 
 

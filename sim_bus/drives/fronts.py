@@ -5,8 +5,9 @@ from typing import Protocol
 from zlib import crc32
 
 from armlink.arm_file import ArmFile, LinkJoint
+from armlink.drives.damiao.models import MODELS
 from armlink.errors import BadInput
-from sim_bus.drives.damiao import MODELS, DamiaoDrive, DamiaoFront
+from sim_bus.drives.damiao import DamiaoDrive, DamiaoFront
 from sim_bus.drives.moteus import MoteusDrive, MoteusFront
 from sim_bus.drives.motor import Motor
 from sim_bus.drives.odrive import ODriveAxis, ODriveFront, cyclic_periods

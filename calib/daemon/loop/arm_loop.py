@@ -128,7 +128,11 @@ class ArmLoop:
 
     def _up(self, held: list[Calibration] | None) -> Up:
         self._reason = None
-        return Up(None if held is None else tuple((each.gain, each.offset, each.record_id) for each in held))
+        source = self._source
+        return Up(
+            None if held is None else tuple((each.gain, each.offset, each.record_id) for each in held),
+            () if source is None else source.uncalibrated,
+        )
 
     def _down(self, reason: str) -> list[Message]:
         self._reason = reason

@@ -84,6 +84,8 @@ class Up:
 
     held: tuple[tuple[float, float, int], ...] | None
     """Gain, offset [N·m] and record id in each controller; None if the loop only listens."""
+    uncalibrated: tuple[str, ...] = ()
+    """Joints whose calibration the host is to keep and that have no record in force."""
 
 
 @dataclass(frozen=True)

@@ -71,6 +71,9 @@ class Status(Answer):
     uptime_s: float
     bus: BusHealth
     records: RecordsInForce
+    uncalibrated: tuple[str, ...] = ()
+    """Joints whose calibration is kept in the host and that have no record in force: their torque is what the drive
+    takes it for."""
     held: bool = False
     """Whether an alarm is open, so that estimates are held until its cause is known."""
     rows: int = 0
