@@ -90,7 +90,7 @@ def _show(fit: CreepFit, data: list[SweepData]) -> None:
         columns[heading] = (value, QUANTILE * fit.std(family))
     print_intervals("Drives, ± half of the 95 % interval", fit.names, columns)
     print_lines([f"{joint} {parameter}: {reason}" for (joint, parameter), reason in reasons.items()])
-    print_lines([*(each.reason for one in data for each in contacts(one)), *map(str, fit.disturbed)], "yellow")
+    print_lines([*(each.reason for one in data for each in contacts(one)), *fit.findings], "yellow")
 
 
 def _answer(fit: CreepFit, data: list[SweepData]) -> dict[str, Any]:
@@ -107,7 +107,7 @@ def _answer(fit: CreepFit, data: list[SweepData]) -> dict[str, Any]:
         ],
         "disturbed": [
             *(each.reason for one in data for each in contacts(one)),
-            *(str(each) for each in fit.disturbed),
+            *fit.findings,
         ],
         "residual_rms": fit.residual_rms.tolist(),
         "temperature": [None if np.isnan(each) else each for each in fit.rows.warmest.tolist()],
