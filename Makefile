@@ -53,6 +53,7 @@ stalls: .venv/.dev ## Long campaign outside make test: sweeps while job, loop an
 	$(BIN)/python tests/campaigns/stalls.py $(ARGS)
 
 creep: .venv/.dev ## Long campaign outside make test: drawn arms without torque sensors (ARGS="--seeds 1 5 --no-steps")
+	$(BIN)/python tests/campaigns/creep_contacts.py
 	$(BIN)/python tests/campaigns/creep_arms.py $(ARGS)
 
 realism: .venv/.dev ## Long campaign outside make test: sensor fits of realistic arms, good and bad (ARGS="--seeds 1 5 --full")
