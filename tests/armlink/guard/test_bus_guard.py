@@ -4,6 +4,7 @@ import ast
 import copy
 import json
 import math
+import socket
 import struct
 import sys
 from pathlib import Path
@@ -16,7 +17,7 @@ from hypothesis import strategies as st
 
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.guard import bus_guard
-from armlink.guard.bus_guard import SCHEMA, Guard, Policy, PolicyError
+from armlink.guard.bus_guard import BATCH, SCHEMA, Field, Guard, Policy, PolicyError, Port, Source
 from armlink.link.link import Link
 from armlink.link.types import Calibration, Command
 
@@ -298,6 +299,105 @@ def test_a_wire_that_takes_nothing_closes_it():
     guard = Guard(Policy(CONTENT), Side(), wire, lambda text: None)
     guard._to_wire(0x80, b"", False)
     assert guard.closed.startswith("the wire takes no frames")
+
+
+class Wire:
+    """A port on one end of a socket pair, and the other end."""
+
+    def __init__(self):
+        own, self.other = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        own.setblocking(False)
+        self.other.settimeout(5)
+        self.port = Port.__new__(Port)
+        self.port.socket, self.port.fd = own, True
+
+    def say(self, can_id, data, size=8, flags=0):
+        self.other.send(struct.pack(f"=IBB2x{size}s", can_id, len(data), flags, data))
+
+    def hear(self):
+        raw = self.other.recv(100)
+        can_id, length, flags = struct.unpack_from("=IBB", raw)
+        return can_id, raw[8 : 8 + length], flags, len(raw)
+
+
+@pytest.fixture
+def wires():
+    pair = Wire(), Wire()
+    yield pair
+    for wire in pair:
+        wire.port.socket.close()
+        wire.other.close()
+
+
+def test_frames_pass_both_ways_as_they_are(wires):
+    program, wire = wires
+    guard = Guard(Policy(CONTENT), program.port, wire.port)
+    wire.say(0x181, b"12345678")
+    wire.say(0x281, bytes(range(64)), 64, 5)
+    program.say(0x80, b"")
+    program.say(0x601, bytes.fromhex("4064600000000000"))
+    guard.step(1.0)
+    assert program.hear() == (0x181, b"12345678", 0, 16)
+    assert program.hear() == (0x281, bytes(range(64)), 5, 72)
+    assert wire.hear() == (0x80, b"", 0, 16)
+    assert wire.hear() == (0x601, bytes.fromhex("4064600000000000"), 0, 16)
+    assert not guard.closed
+
+
+def test_error_and_remote_frames_of_the_wire_go_nowhere(wires):
+    program, wire = wires
+    guard = Guard(Policy(CONTENT), program.port, wire.port)
+    wire.say(0x181 | socket.CAN_RTR_FLAG, b"")
+    wire.say(socket.CAN_ERR_FLAG | 4, bytes(8))
+    wire.say(0x181 | socket.CAN_EFF_FLAG, b"7")
+    guard.step(1.0)
+    assert program.hear() == (0x181 | socket.CAN_EFF_FLAG, b"7", 0, 16)
+
+
+def test_each_side_gets_its_turn(wires):
+    program, wire = wires
+    guard = Guard(Policy(CONTENT), program.port, wire.port)
+    for _ in range(BATCH + 1):
+        program.port.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
+        wire.say(0x181, b"12345678")
+    guard.step(1.0)
+    heard = 0
+    program.other.setblocking(False)
+    while True:
+        try:
+            program.hear()
+        except BlockingIOError:
+            break
+        heard += 1
+    assert heard == BATCH == 64
+
+
+def test_a_full_queue_is_tried_for_a_while(wires, monkeypatch):
+    wire, times = wires[1], []
+    wire.port.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+    clock = iter(range(10_000))
+    monkeypatch.setattr(bus_guard.time, "monotonic", lambda: next(clock) * 0.01)
+    monkeypatch.setattr(bus_guard.time, "sleep", times.append)
+    while wire.port.send(0x80, b""):
+        assert len(times) < 10
+    assert 3 <= len(times) <= 7
+    wire.other.close()
+    assert not wire.port.send(0x80, b"")
+
+
+def test_a_reading_that_is_cut_short_is_none():
+    source = Source({"frame": 0x581, "prefix": "43646000", "at": 4, "code": "i"})
+    assert source.value(bytes.fromhex("4364600001000000")) == 1
+    assert source.value(bytes.fromhex("436460000100")) is None
+    assert source.value(bytes.fromhex("4364600101000000")) is None
+    assert Source({"frame": 1, "at": 0, "code": "b"}).value(b"") is None
+
+
+def test_one_side_of_a_range_may_be_left_open_by_nobody():
+    for bounds in ({"least": 0}, {"most": 0}, {"least": -math.inf, "most": 0}):
+        with pytest.raises(PolicyError, match="needs values, or least and most"):
+            Field({"name": "x", "at": 0, "code": "b", **bounds})
+    assert Field({"name": "x", "at": 0, "code": "b", "least": 0, "most": 0}).refusal(b"\0", 0.0) == ""
 
 
 def broken(change):
