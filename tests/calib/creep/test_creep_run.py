@@ -103,7 +103,9 @@ def test_a_joint_that_meets_something_is_led_back_and_the_sweep_is_noted(tmp_pat
     plan = plan_creep(arm())
     sweep = next(each for each in plan.sweeps if each.joint == 1)
     joint = simulated.plant.model.joint("fore").id
-    others = [each for each in plan.sweeps if each.joint == 0]
+    simulated.turn_by_hand("fore", sweep.steps[0])
+    clear = {"rest": (plan.sweeps[-1].rest[0], sweep.steps[0])}
+    others = [each.model_copy(update=clear) for each in plan.sweeps if each.joint == 0]
     others = [*others, others[0].model_copy(update={"name": "once more"})]
     with opened(simulated) as link:
         link.start()
