@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from armlink.recording.recording import Recording
-
-from sim_gap.attribution.diagnosis import Cause, Diagnosis, Rollout, Signs, Verdict
+from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, Rollout, Signs, Verdict
 from sim_gap.checks.finding import Finding
 from sim_gap.closed_loop.columns import shared_effects
 from sim_gap.closed_loop.identify import Identified, columns_of_effect, identify
@@ -18,9 +17,6 @@ from sim_gap.closed_loop.training.replay import replay_rms
 from sim_gap.model.load import SimModel
 from sim_gap.residuals.where import Location
 from sim_gap.search.estimate import Value
-
-HINT = 0.5
-"""A cause below this confidence is a hint, and explains nothing."""
 
 EXPLAINED = 0.3
 """Largest share of the gap's RMS that may remain."""
