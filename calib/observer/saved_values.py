@@ -4,6 +4,7 @@ Every part has `save() -> dict` and `restore(values) -> bool`; `restore` returns
 do not fit. Times are not saved, because clocks restart with the machine.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -30,10 +31,10 @@ def read_rows(values: Any, n: int) -> list[StaticReading]:
 
 def _row(n: int, t: Any, position: Any, torque: Any, direction: Any, temperature: Any = None) -> StaticReading:
     position, torque, direction = (as_array("row", column, (n,)) for column in (position, torque, direction))
-    told = as_array("row", [None] * n if temperature is None else temperature, (n,), finite=False)
+    told = as_array("row", [math.nan] * n if temperature is None else temperature, (n,), finite=False)
     return StaticReading.of(float(t), position, torque, direction, temperature=told)
 
 
 def known(values: Array) -> Any:
     """An array as JSON values, null for NaN; `as_array` reads it back."""
-    return np.where(np.isnan(values), None, values.astype(object)).tolist()
+    return np.where(np.isnan(values), np.array(None), values.astype(object)).tolist()

@@ -93,8 +93,10 @@ def diagnose(
             progress=progress,
         )
     ready = [
-        prepare(recording, sim.arm, *of)
-        for recording, *of in zip([*train, *heldout], labels, numbers, named, starts, strict=False)
+        prepare(recording, sim.arm, label, number, names, start)
+        for recording, label, number, names, start in zip(
+            [*train, *heldout], labels, numbers, named, starts, strict=False
+        )
     ]
     fit, judge = residual_sets(ready[: len(train)], ready[len(train) :])
     _require_motion(fit)

@@ -126,8 +126,8 @@ class Tracking:
     def learn(self, rows: list[StaticReading]) -> None:
         """Take rows that are free of drift as reference."""
         if rows:
-            *known, temperature = _arrays(rows)
-            self.belief.learn(*known, self.sigma, temperature)
+            position, torque, side, temperature = _arrays(rows)
+            self.belief.learn(position, torque, side, self.sigma, temperature)
             self._poses.forget()
 
     def adapt(self, rows: list[StaticReading]) -> None:
