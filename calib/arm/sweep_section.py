@@ -24,8 +24,9 @@ class CreepSection(Section):
     """Way over which readings are averaged [rad]: more than two periods of gear and cogging ripple."""
     span: Positive = 2.0
     """Longest way of one creep [rad], its ends included; where a joint has more range, the plan chooses the part."""
-    contact_lead: Positive = 0.06
-    """A creeping joint that is so far behind its target has touched something [rad]."""
+    contact_lead: Positive = 0.08
+    """A creeping joint that is so far behind its target has touched something [rad]; further for soft position loops,
+    until they pull by 1.5 N·m."""
     zero_std: Annotated[FiniteFloat, Field(gt=0)] = 0.03
     """Standard deviation of the position zeros beforehand, which such arms get by hand [rad]."""
 

@@ -88,7 +88,7 @@ def daemon(
 
 
 def _require_service() -> None:
-    """Raise ModuleNotFoundError, which names the extra, before anything is begun: to import them here takes too long."""
+    """Raise ModuleNotFoundError, by which the extra is named, before anything is begun; they are imported later."""
     for module in ("fastapi", "uvicorn", "prometheus_client"):
         if find_spec(module) is None:
             raise ModuleNotFoundError(f"No module named {module!r}", name=module)

@@ -1,7 +1,7 @@
 """Torque constants, friction, zeros and gravity from creep sweeps without and with a reference mass."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,6 +18,7 @@ from calib.creep.parameters import Doubt, family_slices, prior
 from calib.creep.rows import CreepRows
 from calib.creep.scatter import scatter
 from calib.creep.solve import Solution, solve
+from calib.creep.spring import WIDE_SHARE, Spring, springs
 from calib.sweep.dataset import SweepData
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
@@ -41,9 +42,11 @@ class CreepFit:
     """Scatter of each row's reading (R,) [N·m]."""
     factor: Array
     """Factor of the standard deviations for what neighbouring bins have in common (n,)."""
-    disturbed: tuple[Disturbed, ...]
+    disturbed: tuple[Disturbed, ...] = ()
     """Sweeps that were left out, and why."""
-    sources: dict[str, str]
+    springs: tuple[Spring, ...] = ()
+    """Joints on which something pulls in every sweep; the other values then hold beside it."""
+    sources: dict[str, str] = field(default_factory=dict)
     """Names and digests of the data sets."""
 
     @property
@@ -71,7 +74,7 @@ class CreepFit:
         return np.sqrt(variance)
 
     def found(self, family: str) -> Mask:
-        """Parameters of a family that the data determine; without a mass nothing tells the scale of gains and masses."""
+        """Parameters of a family that the data determine; without a mass nothing tells the scale."""
         if family in ("gain", "beta") and not (self.rows.mass > 0).any():
             return np.zeros(len(self.value(family)), dtype=bool)
         return np.asarray(self.std(family) < SEEN * self.prior_std[self.slices[family]], dtype=bool)
@@ -80,6 +83,11 @@ class CreepFit:
         """(…, 2) 95 % intervals."""
         half = QUANTILE * self.std(family)
         return np.stack([self.value(family) - half, self.value(family) + half], axis=-1)
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """What disturbed the sweeps, one sentence each."""
+        return tuple(str(each) for each in (*self.disturbed, *self.springs))
 
     @property
     def beta(self) -> Array:
@@ -114,26 +122,28 @@ def fit_rows(
     """Fit rows; rated torque (n,) [N·m] scales what is doubted beforehand. Disturbed sweeps are left out by name."""
     doubt = doubt or Doubt()
     left_out: tuple[Disturbed, ...] = ()
-    fit = _fit(arm, rows, rated, doubt, sources or {}, left_out)
+    plain = _fitted(arm, rows, rated, doubt)
     for _ in range(len(rows.sweeps)):
-        found = disturbed_sweeps(arm, fit.rows, fit.solution.residual, rated)
+        found = disturbed_sweeps(arm, plain.rows, plain.solution.residual, rated)
         if not found:
             break
         left_out = (*left_out, *found)
-        gone = [each.sweep for each in found]
-        rows = rows.kept(~np.isin(rows.sweep, gone))
-        fit = _fit(arm, rows, rated, doubt, sources or {}, left_out)
-    return fit
+        rows = rows.kept(~np.isin(rows.sweep, [each.sweep for each in found]))
+        plain = _fitted(arm, rows, rated, doubt)
+    plain = replace(plain, disturbed=left_out, sources=sources or {})
+    free = _fitted(arm, rows, rated, replace(doubt, spring_share=WIDE_SHARE), plain.solution.x)
+    pulled = springs(CreepModel(arm, rows), free.solution, rated)
+    if not pulled:
+        return plain
+    return replace(free, disturbed=left_out, springs=pulled, sources=sources or {})
 
 
-def _fit(
-    arm: Arm, rows: CreepRows, rated: Array, doubt: Doubt, sources: dict[str, str], left_out: tuple[Disturbed, ...]
-) -> CreepFit:
+def _fitted(arm: Arm, rows: CreepRows, rated: Array, doubt: Doubt, start: Array | None = None) -> CreepFit:
     model = CreepModel(arm, rows)
     sigma, factor = 0.01 * rated[rows.joint], np.ones(arm.n)
     coulomb = 0.02 * rated
     mean, std = prior(arm, rated, doubt, rows.by_temperature, coulomb)
-    x = mean.copy()
+    x = mean.copy() if start is None else start
     for _ in range(ROUNDS):
         found = solve(model, sigma * factor[rows.joint], mean, std, x)
         x = found.x
@@ -141,7 +151,7 @@ def _fit(
         mean, std = prior(arm, rated, doubt, rows.by_temperature, coulomb)
         freedom = 1 - _used(found, std) / len(rows)
         sigma, factor = scatter(rows, found.residual, rated, freedom)
-    return CreepFit(arm, rows, found, std, sigma, factor, left_out, sources)
+    return CreepFit(arm, rows, found, std, sigma, factor)
 
 
 def _used(found: Solution, std: Array) -> float:

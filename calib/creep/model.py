@@ -1,8 +1,9 @@
-"""The reading of a creeping joint whose torque is a current, and its derivatives (docs/theory.md, section 9).
+"""The reading of a creeping joint whose torque is a current, and its derivatives (docs/theory.md, section 11).
 
-    v = g (1 + w·warmth) (τ + (s + a)(F_c + μ|τ|) + s·u(q) + F_v q̇) + o
+    v = g (1 + w·warmth) (τ + (s + a)(F_c + μ|τ|) + s·u(q) + F_v q̇ + κ (q − q̄)) + o
 
-τ is the gravity torque of joint i at the angles q + zero, with the reference mass where it hangs; s the direction.
+κ is a spring's stiffness, which is 0 unless one is looked for; τ the gravity torque of joint i at the angles q + zero,
+with the reference mass where it hangs; s the direction.
 """
 
 import numpy as np
@@ -29,6 +30,8 @@ class CreepModel:
         own = rows.position[self._each, rows.joint]
         waves = [f(k * own) for k in range(1, HARMONICS + 1) for f in (np.cos, np.sin)]
         self._waves = np.stack(waves, axis=1)
+        means = [own[rows.joint == joint].mean() if (rows.joint == joint).any() else 0.0 for joint in range(self.n)]
+        self._stretch = own - np.array(means)[rows.joint]
 
     def gravity(self, x: Array) -> Array:
         """Gravity torque of each row's joint (R,) [N·m]."""
@@ -60,7 +63,7 @@ class CreepModel:
         uneven = x[at["uneven"]].reshape(self.n, -1)[j]
         level, both = coulomb + load * size, side + asymmetry
         motor = torque + both * level + side * (self._waves * uneven).sum(axis=1)
-        motor = motor + x[at["viscous"]][j] * rows.velocity
+        motor = motor + x[at["viscous"]][j] * rows.velocity + x[at["spring"]][j] * self._stretch
         scale = 1 + warming * rows.warmth
         predicted: Array = gain * scale * motor + x[at["offset"]][j]
         if not derive:
@@ -75,6 +78,7 @@ class CreepModel:
             "viscous": slope * rows.velocity,
             "asymmetry": slope * level,
             "warming": gain * rows.warmth * motor,
+            "spring": slope * self._stretch,
         }
         for family, column in own.items():
             jacobian[each, at[family].start + j] = column

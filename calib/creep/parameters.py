@@ -12,7 +12,9 @@ HARMONICS = 2
 LAST_ZERO = 1e-6
 """The last joint's zero is kept at 0 [rad]: turning the last link's frame is the same as turning its mass moment and
 the place of the mass (docs/theory.md, 4.1)."""
-FAMILIES = ("gain", "offset", "coulomb", "load", "viscous", "asymmetry", "warming", "zero", "uneven", "beta", "rho")
+FAMILIES = (
+    "gain", "offset", "coulomb", "load", "viscous", "asymmetry", "warming", "zero", "spring", "uneven", "beta", "rho",
+)  # fmt: skip
 """In the order of the vector."""
 
 
@@ -57,6 +59,8 @@ class Doubt:
     """Friction over position, as a share of the joint's Coulomb friction."""
     rho: float = 0.3
     """Place of the mass [m]."""
+    spring_share: float = 1e-5
+    """Pull that grows with position, of rated torque per rad: none, unless it is looked for."""
 
 
 def prior(arm: Arm, rated: Array, doubt: Doubt, by_temperature: bool, coulomb: Array) -> tuple[Array, Array]:
@@ -77,6 +81,7 @@ def prior(arm: Arm, rated: Array, doubt: Doubt, by_temperature: bool, coulomb: A
         "asymmetry": doubt.asymmetry,
         "warming": doubt.warming if by_temperature else doubt.warming_by_time,
         "zero": doubt.zero,
+        "spring": doubt.spring_share * rated,
         "uneven": np.repeat(doubt.uneven * np.maximum(coulomb, 1e-3 * rated), 2 * HARMONICS),
         "beta": np.repeat(3.0 * float(rated.max()) / gravity, 2 * n),
         "rho": doubt.rho,

@@ -31,7 +31,10 @@ def missing(fit: CreepFit) -> dict[tuple[str, Parameter], str]:
     loaded = bool((fit.rows.mass > 0).any())
     for joint, name in enumerate(fit.names):
         upright = vertical(fit.arm, joint)
-        if not found["gain"][joint]:
+        pull = next((each for each in fit.springs if each.joint == name), None)
+        if pull is not None:
+            reasons[name, "gain"] = str(pull).removeprefix(f"{name}: ")
+        elif not found["gain"][joint]:
             reasons[name, "gain"] = VERTICAL if upright else _no_gain(fit, joint, loaded)
         if not found["offset"][joint]:
             reasons[name, "offset"] = "no sweep of this joint tells it"

@@ -91,9 +91,7 @@ def _warmth(
 ) -> tuple[Array, Array]:
     """(How much colder each row's drive was than at the end (R,), temperature of each drive then (n,) [°C] or NaN)."""
     n = len(passes[0].manifest.names) if passes else 0
-    temperature = np.array(
-        [np.nan if each.temperature is None else each.temperature[j] for each, j in zip(readings, joint, strict=True)]
-    )
+    temperature = np.array([each.temperature[j] for each, j in zip(readings, joint, strict=True)])
     known = bool(np.isfinite(temperature).all())
     if known and np.ptp(temperature) >= COMMON_MODE:
         warm = np.array([temperature[joint == j].max(initial=-np.inf) for j in range(n)])

@@ -26,6 +26,8 @@ PAUSE = 0.5
 """Rest before a creep [s]."""
 MOST_CONTACTS = 0.3
 """Share of the sweeps that may end in a contact before the pass is given up."""
+CONTACT_TORQUE = 1.5
+"""Pull of a soft position loop that friction and gravity alone may ask for [N·m]."""
 CONTACT = "contact"
 """Begins the reason of a sweep that ended in one."""
 
@@ -151,7 +153,8 @@ class _Pass:
         """The creeping joint may be behind its target by `contact_lead`; the others' sag is no contact."""
         n = self._mover.link.n
         follow = np.full(n, np.inf)
-        follow[joint] = self._creep.contact_lead
+        stiffness = getattr(self._mover.link.arm.require_link().joints[joint].settings, "kp", None)
+        follow[joint] = max(self._creep.contact_lead, CONTACT_TORQUE / stiffness if stiffness else 0.0)
         return Guard(np.full(n, -np.inf), np.full(n, np.inf), follow)
 
     def _pause(self) -> None:

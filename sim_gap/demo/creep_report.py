@@ -60,7 +60,7 @@ def summary(result: CreepDemo) -> dict[str, Any]:
             },
         },
         "not_identifiable": {f"{joint}.{parameter}": reason for (joint, parameter), reason in missing(fit).items()},
-        "disturbed": [str(each) for each in fit.disturbed],
+        "disturbed": list(fit.findings),
         "gravity": {
             "poses": check.poses,
             "max_torque": _numbers(check.max_torque),
@@ -139,7 +139,7 @@ def _calibration(result: CreepDemo) -> Section:
     ]
     header = ("joint", "true reading per N·m", *(HEADINGS[family] for family, _ in SHOWN))
     reasons = [f"{joint}, {what.replace('_', ' ')}: {why}" for (joint, what), why in missing(result.fit).items()]
-    lines = [*reasons, *(str(each) for each in result.fit.disturbed)]
+    lines = [*reasons, *result.fit.findings]
     text = "Estimated ± half of the 95 % interval. The host keeps these values and corrects readings and commands."
     return Section(
         "Torque constants, zeros and friction",

@@ -155,7 +155,7 @@ def judge_creep(arm: ArmFile, simulated: SimulatedArm, data: list[SweepData], st
     wrong += [f"{fit.names[j]}: friction {friction[j]:+.3f}" for j in range(n) if abs(friction[j]) > bound[j]]
     wrong += [f"{fit.names[j]}: gravity {share[j]:.2%}" for j in range(n) if share[j] > GRAVITY]
     wrong += [f"{name}: vertical, but a gain is given" for name in upright if (name, "gain") not in lost]
-    wrong += [str(each) for each in fit.disturbed] + [each.reason for one in data for each in contacts(one)]
+    wrong += list(fit.findings) + [each.reason for one in data for each in contacts(one)]
     return CreepVerdict(
         fit.names, off, inside, other, friction, share,
         np.full(n, np.nan) if steps is None else np.where(loaded, steps / np.maximum(largest, 1e-9), np.nan),
@@ -164,7 +164,7 @@ def judge_creep(arm: ArmFile, simulated: SimulatedArm, data: list[SweepData], st
 
 
 def warm_gain(simulated: SimulatedArm, fit: CreepFit) -> Array:
-    """True reading per torque (n,) at the temperatures for which the fit states its gains; drives tell whole kelvins."""
+    """True reading per torque (n,) at the temperatures of the fit; drives tell whole kelvins."""
     if not fit.rows.by_temperature:
         return simulated.sensors.gain_at(simulated.time)
     fall, _, heating = simulated.plant._imperfections.warm_constant.T

@@ -44,9 +44,7 @@ def calibrate_creep(data: list[SweepData], arm_file: ArmFile, store: str | None,
     record = calibration_record(fit, arm_file).model_copy(update={"parent": None if current is None else current.id})
     records.put(record, arm_file, by="armlink calibrate", reason="creep sweeps")
     _show(fit, data)
-    print_lines(
-        [f"record {record.id} is current: it corrects readings and commands when the arm is opened next"]
-    )
+    print_lines([f"record {record.id} is current: it corrects readings and commands when the arm is opened next"])
     write_json(json_file, {"schema": "armlink.creep/1", "record": record.id, **_answer(fit, data)})
 
 
@@ -92,7 +90,7 @@ def _show(fit: CreepFit, data: list[SweepData]) -> None:
         columns[heading] = (value, QUANTILE * fit.std(family))
     print_intervals("Drives, ± half of the 95 % interval", fit.names, columns)
     print_lines([f"{joint} {parameter}: {reason}" for (joint, parameter), reason in reasons.items()])
-    print_lines([*(each.reason for one in data for each in contacts(one)), *map(str, fit.disturbed)], "yellow")
+    print_lines([*(each.reason for one in data for each in contacts(one)), *fit.findings], "yellow")
 
 
 def _answer(fit: CreepFit, data: list[SweepData]) -> dict[str, Any]:
@@ -109,7 +107,7 @@ def _answer(fit: CreepFit, data: list[SweepData]) -> dict[str, Any]:
         ],
         "disturbed": [
             *(each.reason for one in data for each in contacts(one)),
-            *(str(each) for each in fit.disturbed),
+            *fit.findings,
         ],
         "residual_rms": fit.residual_rms.tolist(),
         "temperature": [None if np.isnan(each) else each for each in fit.rows.warmest.tolist()],

@@ -137,3 +137,15 @@ def test_records_keep_friction_and_temperature() -> None:
     assert motor.temperature is not None
     assert record.std("gain").max() < 0.01
     assert record.joints[-1].position_offset is None
+
+
+def test_a_cable_that_pulls_in_every_sweep_is_named_and_no_constant_is_given() -> None:
+    made = drawn(9)
+    rows = made.rows
+    own = rows.joint == 3
+    pull = np.where(own, 0.8 * (rows.position[:, 3] - 1.0) * made.truth.gain[3], 0.0)
+    fit = fit_rows(gcomp_arm(arm()), replace(rows, reading=rows.reading + pull), arm().require_link().rated_torques)
+    assert [each.joint for each in fit.springs] == ["openarm_right_joint4"]
+    assert fit.springs[0].stiffness == pytest.approx(0.8, abs=0.3)
+    assert "cable" in missing(fit)["openarm_right_joint4", "gain"]
+    assert not fitted(made).findings
