@@ -73,8 +73,10 @@ def diagnose(
     if not heldout:
         train, heldout, labels, numbers, named, starts = *_split(train), labels * 2, numbers * 2, named * 2, starts * 2
     ready = [
-        prepare(recording, sim.arm, *of)
-        for recording, *of in zip([*train, *heldout], labels, numbers, named, starts, strict=False)
+        prepare(recording, sim.arm, label, number, names, start)
+        for recording, label, number, names, start in zip(
+            [*train, *heldout], labels, numbers, named, starts, strict=False
+        )
     ]
     fit, judge = residual_sets(ready[: len(train)], ready[len(train) :])
     _require_motion(fit)
