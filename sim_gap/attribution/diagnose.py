@@ -6,7 +6,7 @@ residuals (`sim_gap.residuals`), selection and fit of effects (`sim_gap.search`)
 result.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,13 @@ from sim_gap.attribution.answer import Internals, answer
 from sim_gap.attribution.bodies import groups_of, placed
 from sim_gap.attribution.causes import causes
 from sim_gap.attribution.diagnosis import Diagnosis
+from sim_gap.attribution.position_only import diagnose_positions
 from sim_gap.attribution.rivals import Rivals
 from sim_gap.attribution.verdict import is_quiet
 from sim_gap.checks.check import check_recordings
 from sim_gap.checks.finding import Finding
 from sim_gap.checks.joints import match_joints
+from sim_gap.checks.position_command import check_position_only, is_position_only
 from sim_gap.effects.registry import library_without
 from sim_gap.model.arm_joints import hinges_of
 from sim_gap.model.load import SimModel, load_compiled, load_model
@@ -47,6 +49,8 @@ def diagnose(
     withhold: Sequence[str] = (),
     stated: Corrections = AS_IT_IS,
     groups: Sequence[str] = (),
+    gains: Sequence[str] = (),
+    progress: Callable[[str], None] = lambda stage: None,
 ) -> Diagnosis:
     """Explain the gap between a simulation model and recordings of the real arm.
 
@@ -58,6 +62,10 @@ def diagnose(
         groups: `NAME=REC[,REC…]`: recordings (by label) that share a body; without any, it is found which do.
         withhold: ids of effects to leave out of the library (blind check).
         stated: corrections that the user stated when the recordings were loaded; the check leaves those as they are.
+        gains: `RECORDING=VALUE`: gain of the position controller in recordings that differ in it; only without torque.
+        progress: gets the stage that begins; used where no recording has a torque channel.
+
+    Without a torque channel in any recording, `q_cmd` and `q` are explained instead (`position_only`).
 
     Raises BadInput if the recordings cannot be used with the model.
     """
@@ -72,6 +80,18 @@ def diagnose(
     starts = [float(recording.t[0]) for recording in recordings]
     if not heldout:
         train, heldout, labels, numbers, named, starts = *_split(train), labels * 2, numbers * 2, named * 2, starts * 2
+    if all(is_position_only(recording) for recording in [*train, *heldout]):
+        return diagnose_positions(
+            sim,
+            train,
+            heldout,
+            labels,
+            withhold=withhold,
+            checks=findings,
+            heldout_is=heldout_is,
+            gains=gains,
+            progress=progress,
+        )
     ready = [
         prepare(recording, sim.arm, label, number, names, start)
         for recording, label, number, names, start in zip(
@@ -108,7 +128,10 @@ def _checked(
     sim = load_model(source if isinstance(source, str | Path) else compiled_model, names, matched[0].n)
     for recording, label in zip(matched, labels, strict=False):
         require_length(recording, label)
-    checked, found = check_recordings(sim.arm, matched, labels[: len(matched)], stated)
+    if all(is_position_only(recording) for recording in matched):
+        checked, found = check_position_only(matched, labels[: len(matched)], stated)
+    else:
+        checked, found = check_recordings(sim.arm, matched, labels[: len(matched)], stated)
     return sim, checked, (*findings, *found)
 
 

@@ -107,6 +107,8 @@ class Diagnosis:
     laws: tuple[ResidualLaw, ...] = ()
     """Laws of what is left, which no effect of the library accounts for."""
     notes: tuple[str, ...] = ()
+    unit: str = "N·m"
+    """Of the gap: N·m, or rad where no recording has a torque channel."""
     checks: tuple[Finding, ...] = ()
     """Findings on mapping, units and clocks of the recordings."""
     internals: Any = field(default=None, repr=False, compare=False)
@@ -134,7 +136,7 @@ class Diagnosis:
             "minor": [_cause(cause) for cause in self.minor],
             "signs": [{name: _round(value) for name, value in vars(cause.signs).items()} for cause in self.causes],
             "gap": {
-                "unit": "N·m",
+                "unit": self.unit,
                 "joints": list(self.names),
                 "noise_floor": _list(self.noise_floor),
                 "margin": _list(self.margin),

@@ -7,6 +7,7 @@ import typer
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.status import Status
 
     from sim_gap.attribution.diagnosis import Diagnosis
 
@@ -42,6 +43,20 @@ def diagnose(
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write the result here; - is standard output.")] = None,
     report: Annotated[Path | None, typer.Option(help="Write a self-contained HTML report here.")] = None,
+    gain: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="REC=VALUE",
+            help="Gain of the position controller in a recording (patterns allowed), in any unit; only if there is no "
+            "torque channel and recordings differ in it.",
+        ),
+    ] = None,
+    samples: Annotated[
+        int, typer.Option(min=0, help="Number of draws of all parameters to write, for domain randomisation.")
+    ] = 0,
+    out_samples: Annotated[
+        Path | None, typer.Option(help="Where the draws go: .csv, .json or .parquet. Default: samples.csv.")
+    ] = None,
     out_model: Annotated[
         Path | None,
         typer.Option(
@@ -63,7 +78,7 @@ def diagnose(
 
     console = Console(stderr=True)
     paths = [*train, *(heldout or [])]
-    for target in (None if str(json) == "-" else json, report, out_model):
+    for target in (None if str(json) == "-" else json, report, out_model, out_samples):
         if target is not None and not target.resolve().parent.is_dir():
             raise BadInput(f"{target}: its folder does not exist: create it first")
     stated = parse_corrections(
@@ -79,7 +94,7 @@ def diagnose(
     with console.status(f"reading {len(paths)} recordings"):
         fitted = {name: each for path in train for name, each in load_recordings(path, stated).items()}
         judged = {name: each for path in heldout or () for name, each in load_recordings(path, stated).items()}
-    with console.status("checking the data, and fitting effects to the gap"):
+    with console.status("checking the data, and fitting effects to the gap") as status:
         answer = diagnosis.diagnose(
             sim,
             list(fitted.values()),
@@ -87,6 +102,8 @@ def diagnose(
             labels=[*fitted, *judged],
             stated=stated,
             groups=group or (),
+            gains=gain or (),
+            progress=lambda stage: _progress(console, status, stage),
         )
     for name, recording in {**fitted, **judged}.items():
         if recording.warning:
@@ -101,10 +118,38 @@ def diagnose(
         console.print(f"report: {report}")
     if out_model is not None:
         _write_model(answer, out_model, console)
+    if samples:
+        _write_samples(answer, samples, out_samples, console)
     write_json(json, answer.to_json())
 
 
+def _progress(console: "Console", status: "Status", stage: str) -> None:
+    """Show the stage: on a terminal in place, else as a line."""
+    status.update(stage)
+    if not console.is_terminal:
+        console.print(stage, markup=False)
+
+
+def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: "Console") -> None:
+    from armlink.errors import BadInput
+    from sim_gap.closed_loop.identify import Identified
+    from sim_gap.closed_loop.training.posterior import write_samples
+
+    if not isinstance(answer.internals, Identified):
+        raise BadInput("--samples: draws are made where no recording has a torque channel (q_cmd and q): leave it out")
+    target = path or Path("samples.csv")
+    write_samples(answer.internals, count, target)
+    console.print(f"{count} draws of all parameters: {target}")
+
+
 def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
+    if answer.unit == "rad":
+        from sim_gap.closed_loop.training.posterior import write_exported
+
+        for line in write_exported(answer.internals, path):
+            console.print(f"not in MJCF: {line}", style="yellow", markup=False)
+        console.print(f"corrected model with its position actuators: {path}")
+        return
     from sim_gap.attribution.residual_laws import as_effects
     from sim_gap.better_model.effects_module import module_path
     from sim_gap.better_model.export import write_model
@@ -135,7 +180,7 @@ def _show(answer: "Diagnosis", console: "Console") -> None:
             numbers = f"{cause.gap_before:.3g}", f"{cause.gap_after:.3g}", f"{cause.confidence:.2f}"
             table.add_row(cause.effect, joints, *numbers, ", ".join(cause.confounded_with))
         console.print(table)
-    table = Table("joint", "noise floor", "before", "after", title=f"gap on {answer.heldout_is}, RMS in N·m")
+    table = Table("joint", "noise floor", "before", "after", title=f"gap on {answer.heldout_is}, RMS in {answer.unit}")
     for j, name in enumerate(answer.names):
         numbers = answer.noise_floor[j], answer.heldout_before[j], answer.heldout_after[j]
         table.add_row(name, *(f"{value:.3g}" for value in numbers))

@@ -1,0 +1,200 @@
+"""The answer from recordings without a torque channel: causes, verdict and notes in radians."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from armlink.recording.recording import Recording
+from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, Rollout, Signs, Verdict
+from sim_gap.checks.finding import Finding
+from sim_gap.closed_loop.columns import shared_effects
+from sim_gap.closed_loop.identify import Identified, columns_of_effect, identify
+from sim_gap.closed_loop.judge import LEAST_SHRINK, Stage, interval, undecided_scale
+from sim_gap.closed_loop.parameters import EFFECTS
+from sim_gap.closed_loop.search import PRICE
+from sim_gap.closed_loop.training.replay import replay_rms
+from sim_gap.model.load import SimModel
+from sim_gap.residuals.where import Location
+from sim_gap.search.estimate import Value
+
+EXPLAINED = 0.3
+"""Largest share of the gap's RMS that may remain."""
+ALMOST = 0.97
+"""Highest confidence that positions alone give."""
+SEPARATE = {
+    "controller.stiffness": "hold a known load with the joint, or record the motor's current",
+    "controller.dead_zone": "measure the play by hand with the servo holding, or read the motor's encoder",
+    "controller.delay": "command steps and a chirp up to 10 Hz",
+}
+OTHERWISE = "record slow and fast motion of this joint in both directions, with and without a known load"
+
+
+def diagnose_positions(
+    sim: SimModel,
+    train: Sequence[Recording],
+    heldout: Sequence[Recording],
+    labels: Sequence[str],
+    *,
+    withhold: Sequence[str],
+    checks: Sequence[Finding],
+    heldout_is: str,
+    progress: Callable[[str], None],
+    gains: Sequence[str] = (),
+) -> Diagnosis:
+    """Explain the gap between commanded and measured positions; arguments as of `diagnose.diagnose`."""
+    found = identify(sim, train, heldout, labels, withhold, progress, gains)
+    progress("replaying the corrected model")
+    share = _left(found)
+    made = [_cause(found, stage, share) for stage in found.stages]
+    causes = [c for c, stage in zip(made, found.stages, strict=True) if _matters(found, stage)]
+    minor = [c for c in made if c not in causes]
+    verdict = _verdict(found, causes, share)
+    if verdict == "no_gap":
+        causes, minor = [], [*causes, *minor]
+    capped = [_hint(cause) for cause in causes] if verdict == "unexplained" else causes
+    return Diagnosis(
+        verdict=verdict,
+        names=sim.arm.names,
+        where=_where(found),
+        causes=tuple(capped),
+        minor=tuple(minor),
+        noise_floor=found.search.floor,
+        train_before=found.train_before,
+        train_after=found.train_after,
+        heldout_before=found.heldout_before,
+        heldout_after=found.heldout_after,
+        unexplained=share,
+        margin=found.margin,
+        heldout_is=heldout_is,
+        rollout=_rollout(found),
+        notes=tuple(_notes(found)),
+        checks=tuple(checks),
+        unit="rad",
+        internals=found,
+    )
+
+
+def _left(found: Identified) -> float:
+    """Share of the squared gap beyond the noise that remains on held-out data."""
+    floor = found.search.floor**2
+    left = np.maximum(found.heldout_after**2 - floor, 0.0).sum()
+    return float(left / max(float(np.maximum(found.heldout_before**2 - floor, 0.0).sum()), 1e-18))
+
+
+def _matters(found: Identified, stage: Stage) -> bool:
+    fall = stage.before - stage.after
+    return bool(np.any((fall > LEAST_SHRINK * stage.before) & (fall > found.search.floor)))
+
+
+def _verdict(found: Identified, causes: Sequence[Cause], share: float) -> Verdict:
+    if not causes and bool(np.all(found.heldout_before < 2.0 * found.margin)):
+        return "no_gap"
+    near = found.heldout_after < np.maximum(2.0 * found.margin, EXPLAINED * found.heldout_before)
+    if not causes or np.sqrt(share) > 2.0 * EXPLAINED or not near.any():
+        return "unexplained"
+    if causes[0].confounded_with or causes[0].confidence < HINT:
+        return "ambiguous"
+    return "explained" if np.sqrt(share) <= EXPLAINED or bool(near.all()) else "unexplained"
+
+
+def _cause(found: Identified, stage: Stage, share: float) -> Cause:
+    effect, joints = stage.group
+    names = found.sim.arm.names
+    fall = stage.before - stage.after
+    places = list(joints) or [int(np.argmax(fall))]
+    before, after = (float(np.sqrt(np.mean(x[places] ** 2))) for x in (stage.before, stage.after))
+    name, _, link = effect.partition("@")
+    listed = tuple(names[j] for j in joints) or ((link,) if link else names)
+    evidence = stage.evidence / max(PRICE * _size(effect, found), 1.0)
+    confidence = ALMOST - 0.47 * float(np.exp(-0.35 * max(evidence - 1.0, 0.0)))
+    if stage.rivals:
+        confidence = min(confidence, 0.7)
+    return Cause(
+        effect=name,
+        joints=listed,
+        parameters=_parameters(found, stage),
+        gap_before=before,
+        gap_after=after,
+        confidence=confidence,
+        fall=float(fall.max()),
+        signs=Signs(
+            stage.evidence, float((after / max(before, 1e-12)) ** 2), after / float(found.margin[places].max()), share
+        ),
+        confounded_with=stage.rivals,
+        separate_by=SEPARATE.get(effect, OTHERWISE) if stage.rivals else None,
+    )
+
+
+def _size(effect: str, found: Identified) -> int:
+    return len(EFFECTS[effect].parameters) if effect in EFFECTS else len(columns_of_effect(found, effect))
+
+
+def _parameters(found: Identified, stage: Stage) -> dict[str, dict[str, Value]]:
+    effect, joints = stage.group
+    if not joints:
+        columns = columns_of_effect(found, effect)
+        place = effect.partition("@")[2] or "arm"
+        values = {c.partition(".")[2]: Value(*interval(found.search, found.fit, found.spread, -1, c)) for c in columns}
+        return {place: values}
+    own = EFFECTS[effect]
+    return {
+        found.sim.arm.names[j]: {
+            called: Value(*interval(found.search, found.fit, found.spread, j, name))
+            for name, called in zip(own.parameters, own.reported, strict=True)
+        }
+        for j in joints
+    }
+
+
+def _hint(cause: Cause) -> Cause:
+    return replace(cause, confidence=min(cause.confidence, HINT))
+
+
+def _where(found: Identified) -> tuple[Location, ...]:
+    """Position gap of each joint of the nominal model, largest first."""
+    total = max(float((found.heldout_before**2).sum()), 1e-18)
+    rows = [
+        Location(name, "q", "other", float(rms), float(noise), float(rms**2 / total))
+        for name, rms, noise in zip(found.sim.arm.names, found.heldout_before, found.search.floor, strict=True)
+    ]
+    return tuple(sorted(rows, key=lambda row: -row.rms))
+
+
+def _rollout(found: Identified) -> Rollout | None:
+    """Free-running replay of the nominal model and of the file that is exported."""
+    import mujoco
+
+    if found.export is None:
+        return None
+    corrected = mujoco.MjModel.from_xml_string(found.export.xml)
+    after = replay_rms(corrected, found.sim.joints, found.recordings)
+    before = after * np.nan
+    if found.nominal_has_controller:
+        before = replay_rms(found.sim.mujoco_model, found.sim.joints, found.recordings)
+    longest = max(float(r.t[-1] - r.t[0]) for r in found.recordings)
+    return Rollout(longest, before, after, closed_loop=True)
+
+
+def _notes(found: Identified) -> list[str]:
+    names = found.sim.arm.names
+    kind = "position actuators as in the model" if found.nominal_has_controller else found.controller
+    out = [f"no torque channel: controller ({kind}) and effects follow from q_cmd and q; the gap is in rad"]
+    if loose := undecided_scale(found.search, found.fit):
+        listed = ", ".join(names[j] for j in loose)
+        out.append(
+            f"{listed}: position alone shows ratios of gain, friction and inertia here, their common scale rests on "
+            "the model's inertia: hold a known load or record the current"
+        )
+    if any("viscous" in own for own in found.fit.active):
+        out.append(
+            "viscous friction, back-EMF and damping of the measured velocity act alike on a position: the sum is given"
+        )
+    if found.export is not None and found.export.lines:
+        out.append(f"the corrected model leaves out: {', '.join(found.export.lines)}")
+    return out
+
+
+def all_effects(sim: SimModel) -> tuple[str, ...]:
+    """Ids that a position-only diagnosis may name."""
+    return (*EFFECTS, *{effect.partition("@")[0] for effect in shared_effects(sim.arm)})

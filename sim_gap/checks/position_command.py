@@ -1,0 +1,93 @@
+"""Checks of recordings without a torque channel: times, and commanded against measured positions."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from armlink.errors import BadInput
+from armlink.recording.corrections import Corrections
+from armlink.recording.recording import TORQUE_CHANNELS, Recording
+from gcomp.arrays import Array
+from sim_gap.checks.clock import even_times, without_repeats
+from sim_gap.checks.finding import Finding
+
+FOLLOWS = 0.5
+"""Correlation of a command with its joint's position below which they do not belong together."""
+CLEARLY = 0.9
+"""Correlation with another joint's position from which the command is that joint's."""
+MOVES = 0.02
+"""Standard deviation of a command from which it can be judged [rad]."""
+SCALE = 0.2, 3.0
+"""Slope of position over command outside which the units differ."""
+
+
+def is_position_only(recording: Recording) -> bool:
+    """Whether no torque channel of a recording holds a number."""
+    channels = [getattr(recording, name) for name in TORQUE_CHANNELS]
+    return all(values is None or not np.isfinite(values).any() for values in channels)
+
+
+def check_position_only(
+    recordings: Sequence[Recording], labels: Sequence[str], stated: Corrections
+) -> tuple[list[Recording], list[Finding]]:
+    """Recordings on their sample times, without repeated rows, and the findings.
+
+    Raises BadInput where commands and positions do not belong together, with the option that settles it.
+    """
+    checked, found = [], []
+    for recording, label in zip(recordings, labels, strict=True):
+        if recording.position_command is None or not np.isfinite(recording.position_command).any():
+            raise BadInput(
+                f"{label}: neither a torque channel nor a commanded position holds a number: record tau_1 …, "
+                "tau_motor_1 … or tau_cmd_1 …, or q_cmd_1 …"
+            )
+        recording, repeated = without_repeats(recording)
+        recording, jitter = even_times(recording, stated)
+        _require_pairs(recording, label, stated)
+        checked.append(recording)
+        found += [finding for finding in (*repeated, *jitter) if finding not in found]
+    return checked, found
+
+
+def _require_pairs(recording: Recording, label: str, stated: Corrections) -> None:
+    """Raise BadInput for a command that another joint follows, or that its joint follows in another sign or unit."""
+    command, position = recording.position_command, recording.position
+    assert command is not None
+    there = np.isfinite(command).all(axis=1) & np.isfinite(position).all(axis=1)
+    x, y = command[there], position[there]
+    if len(x) < 20:
+        return
+    match, slope = _match(x, y), _slope(x, y)
+    for j, name in enumerate(recording.names):
+        if x[:, j].std() < MOVES or stated.states("columns", f"q_cmd_{j + 1}"):
+            continue
+        best = int(np.nanargmax(np.abs(match[j])))
+        column = f"q_cmd_{j + 1}"
+        if best != j and abs(match[j, best]) > CLEARLY and abs(match[j, j]) < FOLLOWS:
+            raise BadInput(
+                f"{label}: {name}: {column} is followed by q_{best + 1} (correlation {match[j, best]:.2f}), not by "
+                f"q_{j + 1} ({match[j, j]:.2f}): give the order, --map q_cmd_{best + 1}={column}"
+            )
+        if match[j, j] < -FOLLOWS and not stated.states("sign", column):
+            raise BadInput(
+                f"{label}: {name}: q_{j + 1} moves against {column} (correlation {match[j, j]:.2f}): --sign {column}=-1"
+            )
+        if match[j, j] > CLEARLY and not SCALE[0] < slope[j] < SCALE[1] and not stated.states("units", column):
+            unit = f"q_cmd_{j + 1}=deg" if slope[j] < 1.0 else f"q_{j + 1}=deg"
+            raise BadInput(
+                f"{label}: {name}: q_{j + 1} moves {slope[j]:.3g} times as far as {column}: if the unit differs, "
+                f"--units {unit}"
+            )
+
+
+def _match(x: Array, y: Array) -> Array:
+    """Correlation of each command with each position, (n, n); NaN where one does not move."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        n = x.shape[1]
+        return np.nan_to_num(np.corrcoef(x.T, y.T)[:n, n:])
+
+
+def _slope(x: Array, y: Array) -> Array:
+    """Slope of each position over its command, (n,)."""
+    dx, dy = x - x.mean(0), y - y.mean(0)
+    return np.asarray((dx * dy).sum(0) / np.maximum((dx**2).sum(0), 1e-18))

@@ -1,0 +1,57 @@
+"""Torque of changes to links and base along the recorded motion, as columns of the simulation."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from gcomp.arrays import Array
+from sim_gap.closed_loop.tracks import MODEL_HZ
+from sim_gap.closed_loop.windows import Windows
+from sim_gap.model.rigid_body import RigidArm
+
+UNIT = {"mass": "kg", "x": "kg·m", "y": "kg·m", "z": "kg·m", "angle_1": "rad", "angle_2": "rad"}
+
+
+def shared_effects(arm: RigidArm) -> dict[str, tuple[str, ...]]:
+    """Effects with one set of coefficients for the whole arm → names of their columns."""
+    effects = {"link.payload": tuple(f"payload.{part}" for part in ("mass", "x", "y", "z"))}
+    for link, name in enumerate(arm.names):
+        effects[f"link.mass_moment@{name}"] = tuple(f"moment{link}.{axis}" for axis in "xyz")
+    effects["base.tilt"] = ("tilt.angle_1", "tilt.angle_2")
+    return effects
+
+
+def with_columns(data: Windows) -> Windows:
+    """The windows with the columns of all `shared_effects`; those that move no joint are left out."""
+    arm, (steps, n, count) = data.arm, data.command.shape
+    few = np.unique(np.append(np.arange(0, steps, max(1, round(1.0 / (MODEL_HZ * data.dt)))), steps - 1))
+    q, v, a = (x[few].transpose(0, 2, 1).reshape(-1, n) for x in (data.q, data.v, data.a))
+    regressor = arm.regressor(q, v, a)
+    made: dict[str, Array] = {
+        f"payload.{part}": regressor[:, :, n - 1, k] for k, part in enumerate(("mass", "x", "y", "z"))
+    }
+    for link in range(n):
+        made |= {f"moment{link}.{axis}": regressor[:, :, link, 1 + k] for k, axis in enumerate("xyz")}
+    still = np.zeros_like(q)
+    for k, turn in enumerate(turns(arm.gravity)):
+        made[f"tilt.angle_{k + 1}"] = arm.torque(q, still, still, turn)
+    columns = {}
+    for name, rows in made.items():
+        if np.abs(rows).max() > 1e-9:
+            spread = rows.reshape(len(few), count, n).transpose(0, 2, 1)
+            columns[name] = _filled(spread, few, steps)
+    return replace(data, columns=columns)
+
+
+def turns(gravity: Array) -> list[Array]:
+    """Change of gravity per radian about two horizontal axes, (3,) each."""
+    axes = np.linalg.svd(gravity[None, :])[2][1:]
+    return [np.cross(axis, gravity) for axis in axes]
+
+
+def _filled(values: Array, few: Array, steps: int) -> Array:
+    """Values (k, J, W) at the steps `few`, linear between, (T, J, W)."""
+    place = np.arange(steps)
+    after = np.clip(np.searchsorted(few, place), 1, len(few) - 1)
+    share = ((place - few[after - 1]) / (few[after] - few[after - 1]))[:, None, None]
+    return np.asarray(values[after - 1] * (1.0 - share) + values[after] * share)

@@ -1,0 +1,156 @@
+"""The controller at the start: that of the model's own actuators, else the simplest one that follows the recording."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from gcomp.arrays import Array
+from sim_gap.closed_loop.compete import Progress
+from sim_gap.closed_loop.fit import Fit, batch, evaluate, improve, residuals
+from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS, Scales
+from sim_gap.closed_loop.search import PRICE, Search
+from sim_gap.closed_loop.windows import Windows
+from sim_gap.model.load import SimModel
+
+STUCK = 0.0, 0.4
+"""Least Coulomb friction that is tried with each, as a share of the gain times the RMS error."""
+GRID = 12
+"""Stiffnesses that are tried at the start."""
+KINDS: dict[str, tuple[str, ...]] = {
+    "P": (),
+    "PD": ("kd",),
+    "PID": ("kd", "ki"),
+    "P with feed-forward": ("feed",),
+    "PD with feed-forward": ("kd", "feed"),
+    "PID with feed-forward": ("kd", "ki", "feed"),
+}
+"""Controllers that are compared if the model has none: what they have besides a stiffness."""
+
+
+@dataclass(frozen=True, eq=False)
+class Nominal:
+    """Controller of the model's own position actuators, (J,) each; NaN at a joint without one."""
+
+    kp: Array
+    kv: Array
+    limit: Array
+
+    @property
+    def complete(self) -> bool:
+        """Whether every joint has one."""
+        return bool(np.isfinite(self.kp).all())
+
+
+def nominal_controller(sim: SimModel) -> Nominal:
+    """Gains and force limits of the model's position actuators."""
+    import mujoco
+
+    model: Any = sim.mujoco_model
+    kp, kv, limit = np.full(sim.n, np.nan), np.zeros(sim.n), np.full(sim.n, np.inf)
+    joints = {int(joint): j for j, joint in enumerate(sim.joints)}
+    for i in range(model.nu):
+        j = joints.get(int(model.actuator_trnid[i, 0]))
+        is_joint = model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
+        affine = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE
+        if j is None or not is_joint or not affine or model.actuator_biasprm[i, 1] >= 0.0:
+            continue
+        gear = float(model.actuator_gear[i, 0])
+        kp[j], kv[j] = -model.actuator_biasprm[i, 1] * gear**2, -model.actuator_biasprm[i, 2] * gear**2
+        if model.actuator_forcelimited[i]:
+            limit[j] = float(np.abs(model.actuator_forcerange[i]).max()) * abs(gear)
+    return Nominal(kp, kv, limit)
+
+
+def nominal_point(data: Windows, own: Nominal) -> dict[str, Array]:
+    """Parameters of the nominal model at every joint, neutral where it says nothing."""
+    arm, one = data.arm, np.ones(data.joints)
+    point = {name: p.neutral * one for name, p in PARAMETERS.items()}
+    point |= {"coulomb": arm.frictionloss.copy(), "armature": arm.armature.copy()}
+    point["viscous"] = arm.damping + np.where(np.isfinite(own.kp), own.kv, 0.0)
+    point["kp"] = np.where(np.isfinite(own.kp), own.kp, 1.0)
+    point["limit"] = own.limit.copy()
+    point["spring"], point["offset"] = arm.stiffness.copy(), -arm.stiffness * arm.rest
+    return point | {name: np.zeros(data.joints) for name in data.columns}
+
+
+def scales_of(data: Windows) -> Scales:
+    """Natural sizes of each joint along the recordings."""
+    flat = (0, 2)
+    accelerated = data.inertia * data.a
+    torque = np.sqrt(np.mean((data.gravity + data.coupling + accelerated) ** 2, axis=flat))
+    speed = np.sqrt(np.mean(data.v**2, axis=flat))
+    inertia = data.inertia.mean(flat) + data.arm.armature
+    torque = np.maximum(torque, inertia * np.sqrt(np.mean(data.a**2, axis=flat)) + 1e-6)
+    error = np.sqrt(np.mean((data.command - data.recorded) ** 2, axis=flat))
+    return Scales(torque, torque / np.maximum(speed, 0.05), inertia, np.maximum(error, 1e-4))
+
+
+def starting_fit(search: Search, own: Nominal, progress: Progress) -> tuple[Search, Fit, str]:
+    """A fit of controller, Coulomb and viscous friction; the search that keeps that controller; the controller's name.
+
+    With position actuators in the model the controller is of their kind; without, the simplest of `KINDS` that does not
+    score clearly worse than the best.
+    """
+    kinds = {"P": KINDS["P"]} if own.complete else KINDS
+    fits: dict[str, Fit] = {}
+    scores: dict[str, float] = {}
+    for kind, parts in kinds.items():
+        progress(f"controller: {kind}")
+        fits[kind] = improve(search.data, _from_grid(search, parts), search.scales, 5)
+        scores[kind] = float(search.score(fits[kind]).sum()) + PRICE * search.data.joints * len(parts)
+    kind = min(scores, key=lambda name: scores[name])
+    kept = {"controller.stiffness"} | {
+        e.id for e in EFFECTS.values() if e.controller and e.parameters[0] in KINDS[kind]
+    }
+    left_out = {"controller.feed_forward"} if not own.complete else set()
+    if "feed" not in KINDS[kind]:
+        left_out.add("actuator.gain")
+    found = replace(search, kept=frozenset(kept), excluded=search.excluded | left_out)
+    if not own.complete:
+        point = dict(found.nominal)
+        for name in ("kp", *KINDS[kind]):
+            point[name] = fits[kind].point[name]
+        found = replace(found, nominal=point, open_controller=True)
+    return found, fits[kind], kind
+
+
+def _from_grid(search: Search, parts: Sequence[str]) -> Fit:
+    """The best stiffness of a coarse grid at every joint, with damping and friction that go with it."""
+    data, nominal = search.data, search.nominal
+    e, v = data.command - data.recorded, data.v
+    needed = data.gravity + data.coupling + (data.inertia + nominal["armature"][:, None]) * data.a
+    feed = data.feed if "feed" in parts else np.zeros_like(data.feed)
+    size = np.sqrt(np.mean(needed**2, axis=(0, 2))) / np.maximum(np.sqrt(np.mean(e**2, axis=(0, 2))), 1e-6)
+    centre = np.maximum(size, search.scales.inertia * 25.0)
+    points = []
+    for factor, stuck in product(np.geomspace(0.05, 50.0, GRID), STUCK):
+        kp = centre * factor
+        point = {name: values.copy() for name, values in nominal.items()}
+        point["kp"] = kp
+        if "kd" in parts:
+            point["kd"] = 1.4 * np.sqrt(kp * search.scales.inertia)
+        if "ki" in parts:
+            point["ki"] = 0.5 * kp
+        if "feed" in parts:
+            point["feed"] = np.ones(data.joints)
+        for j in range(data.joints):
+            rest = kp[j] * e[:, j] + feed[:, j] - needed[:, j]
+            if "kd" in parts:
+                rest = rest + point["kd"][j] * (data.speed[:, j] - v[:, j])
+            columns = np.stack([np.tanh(v[:, j] / 0.02).ravel(), v[:, j].ravel()])
+            target = (rest * data.served[:, j]).ravel()
+            c = np.linalg.lstsq(columns.T, target, rcond=None)[0]
+            coulomb = max(float(c[0]), stuck * kp[j] * float(search.scales.angle[j]))
+            left = target - coulomb * columns[0]
+            viscous = float(columns[1] @ left) / max(float(columns[1] @ columns[1]), 1e-12)
+            point["coulomb"][j], point["viscous"][j] = coulomb, max(viscous, 1e-3 * kp[j])
+        points.append(point)
+    gaps = residuals(data, batch(points))
+    costs = np.einsum("ptjw,ptjw->pj", gaps, gaps)
+    best = costs.argmin(0)
+    point = {name: np.array([points[b][name][j] for j, b in enumerate(best)]) for name in points[0]}
+    active = ("kp", *(part for part in parts if part != "feed"), "coulomb", "viscous")
+    return evaluate(data, Fit(point, (active,) * data.joints))

@@ -1,0 +1,169 @@
+"""Controller and effects from recordings of commanded and measured positions: windows, search, fit, held-out stages."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatch
+from pathlib import Path
+
+import numpy as np
+
+from armlink.errors import BadInput
+from armlink.recording.recording import Recording
+from gcomp.arrays import Array
+from sim_gap.closed_loop.columns import shared_effects, with_columns
+from sim_gap.closed_loop.compete import select
+from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of, starting_fit
+from sim_gap.closed_loop.fit import Fit, evaluate, improve
+from sim_gap.closed_loop.judge import Covariance, Stage, covariance, rms_on, stages
+from sim_gap.closed_loop.parameters import EFFECTS
+from sim_gap.closed_loop.search import Search
+from sim_gap.closed_loop.training.export import Exported, exported, native_fit
+from sim_gap.closed_loop.windows import Windows, thinned, windows_of
+from sim_gap.model.load import SimModel
+
+SEARCHED, FITTED, JUDGED = 16, 32, 48
+"""Most windows of the search, of the final fit and of the judgement."""
+LEAST_FLOOR = 1e-5
+"""Least noise floor of a position gap [rad]."""
+TORQUE_MARGIN, SHARE_MARGIN = 0.08, 0.15
+"""Torque that matters [N·m], at most this share of a joint's torque: over the gain it is a gap of position."""
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """Everything behind a position-only diagnosis."""
+
+    sim: SimModel
+    search: Search
+    fit: Fit
+    heldout: Windows
+    controller: str
+    nominal_has_controller: bool
+    stages: tuple[Stage, ...]
+    spread: Covariance
+    train_before: Array
+    train_after: Array
+    heldout_before: Array
+    heldout_after: Array
+    tracking: Array
+    """RMS of command minus position on held-out data [rad], (J,)."""
+    margin: Array
+    native: Fit
+    export: Exported | None
+    """None if the model did not come from a file."""
+    recordings: tuple[Recording, ...]
+    """Held-out recordings."""
+
+
+def identify(
+    sim: SimModel,
+    train: Sequence[Recording],
+    heldout: Sequence[Recording],
+    labels: Sequence[str],
+    withhold: Sequence[str],
+    progress: Callable[[str], None],
+    gains: Sequence[str] = (),
+) -> Identified:
+    """Fit controller and effects to `train` and judge them on `heldout`; `labels` name both, train first.
+
+    `gains` are `RECORDING=VALUE`, the controller's gain in recordings that differ in it. Raises BadInput.
+    """
+    scale = gain_scales(gains, labels)
+    progress("reading motion and model torques")
+    whole = thinned(windows_of(sim.arm, train, labels[: len(train)], scales=scale[: len(train)]), FITTED)
+    fitted = with_columns(whole)
+    other = windows_of(sim.arm, heldout, labels[len(train) :], fitted.dt, scale[len(train) :])
+    judged = with_columns(thinned(other, JUDGED))
+    own = nominal_controller(sim)
+    nominal = nominal_point(fitted, own)
+    data = thinned(fitted, SEARCHED)
+    scales, floor = scales_of(fitted), noise_floor(fitted)
+    never = frozenset(withhold) | _frozen(sim)
+    search = Search(data, scales, nominal, floor, never)
+    search, fit, kind = starting_fit(search, own, progress)
+    fit = select(search, fit, progress)
+    progress("final fit")
+    search = replace(search, data=fitted)
+    fit = improve(fitted, replace(fit, rms=None), scales, 6)
+    progress("each effect on held-out data")
+    found = tuple(stages(replace(search, data=data), evaluate(data, fit), judged))
+    before = _bare(search, own.complete)
+    native = native_fit(search, fit)
+    margin = _margin(search, fit, floor)
+    return Identified(
+        sim=sim,
+        search=search,
+        fit=fit,
+        heldout=judged,
+        controller=kind,
+        nominal_has_controller=own.complete,
+        stages=found,
+        spread=covariance(search, fit),
+        train_before=rms_on(fitted, before),
+        train_after=rms_on(fitted, fit),
+        heldout_before=rms_on(judged, before),
+        heldout_after=rms_on(judged, fit),
+        tracking=np.sqrt(np.mean((judged.command - judged.recorded) ** 2, axis=(0, 2))),
+        margin=margin,
+        native=native,
+        export=exported(sim, search, fit, native) if sim.path is not None else None,
+        recordings=tuple(heldout),
+    )
+
+
+def gain_scales(gains: Sequence[str], labels: Sequence[str]) -> list[float]:
+    """Each recording's gain over that of the first, from `RECORDING=VALUE` with names or patterns such as *kp100*.
+
+    Raises BadInput for a text that is none, a pattern without a recording, or a recording without a gain.
+    """
+    if not gains:
+        return [1.0] * len(labels)
+    found: dict[int, float] = {}
+    for text in gains:
+        pattern, _, number = text.rpartition("=")
+        try:
+            value = float(number)
+        except ValueError:
+            value = 0.0
+        if not pattern or not np.isfinite(value) or value <= 0.0:
+            raise BadInput(f"--gain {text}: expected RECORDING=VALUE with a value above 0, such as *kp100*=100")
+        hits = [i for i, label in enumerate(labels) if fnmatch(label, pattern) or fnmatch(Path(label).name, pattern)]
+        if not hits:
+            raise BadInput(f"--gain {text}: no recording of that name: {', '.join(labels)}")
+        found |= dict.fromkeys(hits, value)
+    if missing := [label for i, label in enumerate(labels) if i not in found]:
+        raise BadInput(f"--gain: none given for {missing[0]}: state the gain of every recording")
+    return [found[i] / found[0] for i in range(len(labels))]
+
+
+def _bare(search: Search, complete: bool) -> Fit:
+    """The nominal model with its own controller, or with one that is fitted without any effect."""
+    point = {name: values.copy() for name, values in search.nominal.items()}
+    if complete:
+        return Fit(point, ((),) * search.data.joints)
+    names = tuple(n for e in EFFECTS.values() if e.id in search.kept for n in e.parameters if n != "feed")
+    return improve(search.data, Fit(point, (names,) * search.data.joints), search.scales, 6)
+
+
+def _frozen(sim: SimModel) -> frozenset[str]:
+    """Effects that this model cannot show: those that need gravity, or several links."""
+    return frozenset() if np.linalg.norm(sim.arm.gravity) > 1e-6 else frozenset({"base.tilt", "position.offset"})
+
+
+def noise_floor(data: Windows) -> Array:
+    """Standard deviation of the position readings about their smooth course, per joint (J,) [rad]."""
+    first = data.warm
+    smooth = data.recorded[first :: data.stride][: len(data.measured)]
+    rest = (data.measured[: len(smooth)] - smooth) * data.weight[: len(smooth)]
+    return np.asarray(np.maximum(np.sqrt(np.mean(rest**2, axis=(0, 2))), LEAST_FLOOR))
+
+
+def _margin(search: Search, fit: Fit, floor: Array) -> Array:
+    """RMS from which it is a gap, per joint (J,) [rad]."""
+    torque = np.minimum(TORQUE_MARGIN, SHARE_MARGIN * search.scales.torque)
+    return np.asarray(np.maximum(2.0 * floor, torque / fit.point["kp"]))
+
+
+def columns_of_effect(found: Identified, effect: str) -> tuple[str, ...]:
+    """Names of the fitted columns of an effect of the whole arm."""
+    return tuple(n for n in shared_effects(found.sim.arm)[effect] if n in found.fit.shared)

@@ -1,0 +1,251 @@
+"""What each effect is worth: its interval, what it lowers on held-out data, and which other effect would do as well."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gcomp.arrays import Array
+from sim_gap.closed_loop.candidates import ranked
+from sim_gap.closed_loop.columns import UNIT, shared_effects
+from sim_gap.closed_loop.fit import LOGARITHMIC, Fit, evaluate, improve, jacobian, moved
+from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS
+from sim_gap.closed_loop.search import PRICE, Search, effect_there, with_effect, without
+from sim_gap.closed_loop.windows import Windows
+
+SYSTEMATIC = 0.02
+"""Relative standard deviation of every parameter that no recording shows: sampling, command timing, the model's own."""
+LEAST_SHRINK = 0.05
+"""Least relative fall of a joint's held-out RMS by a cause; less is a minor one."""
+Group = tuple[str, tuple[int, ...]]
+"""An effect with the joints that have it; no joints for one of the whole arm."""
+
+
+def groups_of(fit: Fit, search: Search) -> list[Group]:
+    """Effects of the fit, without the controller that a model without actuators leaves open."""
+    own = [
+        (effect, tuple(j for j in range(search.data.joints) if effect_there(fit, effect, j)))
+        for effect in EFFECTS
+        if not (search.open_controller and effect in search.kept)
+    ]
+    return [group for group in own if group[1]] + [(effect, ()) for effect in shared_of(fit, search)]
+
+
+def shared_of(fit: Fit, search: Search) -> list[str]:
+    """Effects of the whole arm that a fit has."""
+    return [e for e, names in shared_effects(search.data.arm).items() if set(names) & set(fit.shared)]
+
+
+def taken_out(search: Search, fit: Fit, group: Group) -> Fit:
+    """The fit without a group."""
+    effect, joints = group
+    if not joints:
+        names = set(shared_effects(search.data.arm)[effect])
+        point = {name: 0.0 * x if name in names else x for name, x in fit.point.items()}
+        return replace(fit, point=point, shared=tuple(n for n in fit.shared if n not in names), rms=None)
+    for j in joints:
+        fit = without(search, fit, effect, j)
+    return fit
+
+
+def rms_on(data: Windows, fit: Fit) -> Array:
+    """RMS of the position gap of each joint [rad], (J,)."""
+    found = evaluate(data, fit).rms
+    assert found is not None
+    return joint_rms(data, found)
+
+
+def joint_rms(data: Windows, rms: Array) -> Array:
+    """RMS over all windows of each joint, (J,)."""
+    count = data.weight.sum(0)
+    return np.asarray(np.sqrt((rms**2 * count).sum(1) / np.maximum(count.sum(1), 1.0)))
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """One group added to those before it, on held-out data."""
+
+    group: Group
+    before: Array
+    after: Array
+    """(J,) [rad]."""
+    evidence: float
+    """Fall of the training score that nothing else would have brought."""
+    rivals: tuple[str, ...]
+    """Effects that would do as well."""
+
+
+def stages(search: Search, fit: Fit, heldout: Windows) -> list[Stage]:
+    """The groups in order of what each lowers when it is added to the nominal model and those above it."""
+    groups = groups_of(fit, search)
+    base = fit
+    for group in groups:
+        base = taken_out(search, base, group)
+    current = improve(search.data, base, search.scales, 4)
+    alone = [improve(search.data, _added(search, fit, current, group), search.scales, 3) for group in groups]
+    worth = [_worth(search, current, trial) for trial in alone]
+    before, out = rms_on(heldout, current), []
+    for group in [groups[i] for i in np.argsort(worth)[::-1]]:
+        current = improve(search.data, _added(search, fit, current, group), search.scales, 3)
+        after = rms_on(heldout, current)
+        evidence, rivals = rivals_of(search, fit, group) if matters(before, after) else (0.0, ())
+        out.append(Stage(group, before, after, evidence, rivals))
+        before = after
+    return out
+
+
+def matters(before: Array, after: Array) -> bool:
+    """Whether some joint's gap falls by a share that is worth naming."""
+    return bool(np.any(before - after > LEAST_SHRINK * before))
+
+
+def _worth(search: Search, current: Fit, trial: Fit) -> float:
+    """Largest fall of a joint's RMS in units of what matters there, by a group."""
+    assert current.rms is not None
+    assert trial.rms is not None
+    fall = joint_rms(search.data, current.rms) - joint_rms(search.data, trial.rms)
+    return float((fall / np.maximum(search.floor, 0.1 * search.scales.angle)).max())
+
+
+def _added(search: Search, final: Fit, current: Fit, group: Group) -> Fit:
+    """The current fit with a group of the final one, at its values there."""
+    effect, joints = group
+    point = {name: x.copy() for name, x in current.point.items()}
+    active = list(current.active)
+    if not joints:
+        names = tuple(n for n in shared_effects(search.data.arm)[effect] if n in final.shared)
+        return replace(current, point={**point, **{n: final.point[n] for n in names}}, shared=(*current.shared, *names))
+    for j in joints:
+        for name in EFFECTS[effect].parameters:
+            point[name][j] = final.point[name][j]
+        active[j] = (*active[j], *EFFECTS[effect].parameters)
+    return replace(current, point=point, active=tuple(active), rms=None)
+
+
+def rivals_of(search: Search, fit: Fit, group: Group) -> tuple[float, tuple[str, ...]]:
+    """Loss of the score with the best other effect in a group's place, and those effects that lose next to nothing."""
+    effect, joints = group
+    assert fit.rms is not None
+    base = search.score(fit)
+    bare = improve(search.data, taken_out(search, fit, group), search.scales, 4)
+    loss = float((search.score(bare) - base).sum())
+    if effect == "controller.stiffness":
+        return loss, _scale_rivals(search, fit)
+    others = [e for e in EFFECTS if e != effect and e not in search.excluded and e != "transmission.ripple"]
+    j = max(joints, key=lambda i: float((search.score(bare) - base)[i]), default=-1)
+    close: list[str] = list(_ALWAYS.get(effect, ()))
+    least = loss
+    places = [j] if j >= 0 else [int(np.argmax(search.score(bare) - base))]
+    whole = float((search.score(bare) - base)[places[0]]) if j >= 0 else loss
+    for place in places:
+        for _, other in ranked(search, bare, others)[place][:2]:
+            trial = with_effect(search, bare, other, place)
+            only = replace(
+                trial, active=tuple(own if k == place else () for k, own in enumerate(trial.active)), shared=()
+            )
+            score = search.score(improve(search.data, only, search.scales, 4))
+            lost = float(score[place] - base[place]) if j >= 0 else float((score - base).sum())
+            least = min(least, lost + max(loss - whole, 0.0))
+            if lost < max(PRICE, 0.1 * whole):
+                close.append(other)
+    return least, tuple(dict.fromkeys(close))
+
+
+_ALWAYS = {
+    "controller.dead_zone": ("transmission.backlash",),
+    "actuator.delay": ("controller.delay",),
+}
+"""Effects that positions alone never separate."""
+
+
+def _scale_rivals(search: Search, fit: Fit) -> tuple[str, ...]:
+    """`actuator.rotor_inertia` if some joint's gain can be half as large again with all else fitted around it."""
+    point = {name: x.copy() for name, x in fit.point.items()}
+    active = [tuple(dict.fromkeys((*(n for n in own if n != "kp"), "armature"))) for own in fit.active]
+    point["kp"] = point["kp"] * 1.5
+    for name in ("coulomb", "viscous", "kd", "ki", "stribeck", "armature", "dead"):
+        point[name] = point[name] * (1.5 if name != "dead" else 1.0)
+    trial = improve(search.data, replace(fit, point=point, active=tuple(active), shared=(), rms=None), search.scales, 4)
+    lost = search.score(trial) - search.score(fit)
+    return ("actuator.rotor_inertia",) if bool((lost < PRICE).any()) else ()
+
+
+def undecided_scale(search: Search, fit: Fit) -> list[int]:
+    """Joints of which only ratios of gain, friction and inertia can be told."""
+    found = []
+    for j in range(search.data.joints):
+        if "kp" in fit.active[j]:
+            spread = covariance(search, fit)
+            at = spread.names.index((j, "kp"))
+            if float(spread.matrix[at, at]) > 0.35**2:
+                found.append(j)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Covariance:
+    """Covariance of the fitted parameters in their own coordinates (`fit.moved`)."""
+
+    names: list[tuple[int, str]]
+    """Joint (−1: whole arm) and name."""
+    matrix: Array
+
+
+def covariance(search: Search, fit: Fit) -> Covariance:
+    """Sandwich covariance over the windows, which holds for residuals that are correlated within each."""
+    now, slopes = jacobian(search.data, fit, search.scales, fit.active, fit.shared)
+    names = [(j, name) for j, own in enumerate(fit.active) for name in own] + [(-1, name) for name in fit.shared]
+    starts = np.concatenate([[0], np.cumsum([len(own) for own in fit.active])]).astype(int)
+    size, count = len(names), search.data.count
+    bread, scores = np.zeros((size, size)), np.zeros((count, size))
+    for j, x in enumerate(slopes):
+        r = now[:, j]
+        weight = 1.0 / max(float((r**2).sum()), 1e-300)
+        index = np.concatenate([np.arange(starts[j], starts[j + 1]), np.arange(starts[-1], size)]).astype(int)
+        bread[np.ix_(index, index)] += weight * np.einsum("atw,btw->ab", x, x)
+        scores[:, index] += weight * np.einsum("atw,tw->wa", x, r)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(bread), 1e-300))
+    prior = np.diag([1e-4] * size)  # a parameter that nothing shows keeps a finite spread
+    inverse = np.linalg.inv(bread * scale * scale[:, None] + prior) * scale * scale[:, None]
+    meat = scores.T @ scores
+    matrix = inverse @ meat @ inverse * count / max(count - size / max(search.data.joints, 1), 1.0)
+    own = np.array([1.0 if name in LOGARITHMIC else abs(_coordinate(search, fit, j, name)) for j, name in names])
+    return Covariance(names, matrix + np.diag((SYSTEMATIC * own) ** 2))
+
+
+def _coordinate(search: Search, fit: Fit, joint: int, name: str) -> float:
+    if joint < 0:
+        return float(fit.point[name][0])
+    return float(fit.point[name][joint]) / float(search.scales.of(name)[joint])
+
+
+def interval(search: Search, fit: Fit, spread: Covariance, joint: int, name: str) -> tuple[float, float, float, str]:
+    """Value, ends of its 95 % interval, and unit."""
+    half = 2.0 * float(np.sqrt(spread.matrix[(at := spread.names.index((joint, name))), at]))
+    if joint < 0:
+        value = float(fit.point[name][0])
+        return value, value - half, value + half, UNIT[name.partition(".")[2]]
+    value = float(fit.point[name][joint])
+    low, high = (moved(name, value, sign * half, search.scales, joint) for sign in (-1.0, 1.0))
+    return value, low, high, PARAMETERS[name].unit
+
+
+def draw(search: Search, fit: Fit, spread: Covariance, count: int, seed: int = 0) -> list[dict[str, float]]:
+    """Draws of all fitted parameters from their joint distribution, within their bounds: `joint.name` → value."""
+    random = np.random.default_rng(seed)
+    values, vectors = np.linalg.eigh(spread.matrix)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    steps = random.standard_normal((count, len(values))) @ root.T
+    return [_sample(search, fit, spread.names, row) for row in steps]
+
+
+def _sample(search: Search, fit: Fit, names: Sequence[tuple[int, str]], steps: Array) -> dict[str, float]:
+    out: dict[str, float] = {}
+    labels: Mapping[int, str] = dict(enumerate(search.data.arm.names))
+    for (joint, name), step in zip(names, steps, strict=True):
+        if joint < 0:
+            out[name] = float(fit.point[name][0] + step)
+        else:
+            value = moved(name, float(fit.point[name][joint]), float(step), search.scales, joint)
+            out[f"{labels[joint]}.{name}"] = value
+    return out

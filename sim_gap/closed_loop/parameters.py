@@ -1,0 +1,107 @@
+"""Parameters of controller and joint, and which effect each belongs to."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gcomp.arrays import Array
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of a joint's simulation."""
+
+    name: str
+    unit: str
+    neutral: float
+    """Value without the effect."""
+    trial: float
+    """Size at which it is tried, in units of the joint's own scale (`scale`)."""
+    low: float = 0.0
+    high: float = np.inf
+    scale: str = "1"
+    """`torque` (RMS torque of the joint), `damping`, `inertia`, `angle` (RMS of the error) or `1`."""
+
+
+PARAMETERS = {
+    p.name: p
+    for p in (
+        Parameter("kp", "N·m/rad", 0.0, 1.0, 1e-4),
+        Parameter("kd", "N·m·s/rad", 0.0, 0.05),
+        Parameter("ki", "N·m/(rad·s)", 0.0, 0.5),
+        Parameter("feed", "1", 0.0, 1.0, 0.0, 1.5),
+        Parameter("delay", "s", 0.0, 0.01, -0.02, 0.4),
+        Parameter("slew", "rad/s", np.inf, 1.0, 0.02),
+        Parameter("dead", "rad", 0.0, 0.5, 0.0, 0.2, "angle"),
+        Parameter("limit", "N·m", np.inf, 0.8, 1e-3, np.inf, "torque"),
+        Parameter("coulomb", "N·m", 0.0, 0.2, 0.0, np.inf, "torque"),
+        Parameter("viscous", "N·m·s/rad", 0.0, 0.2, 0.0, np.inf, "damping"),
+        Parameter("stribeck", "N·m", 0.0, 0.2, 0.0, np.inf, "torque"),
+        Parameter("stribeck_velocity", "rad/s", 0.1, 0.1, 0.01, 1.0),
+        Parameter("load", "N·m/(N·m)", 0.0, 0.1, 0.0, 2.0),
+        Parameter("asymmetry", "1", 0.0, 0.1, -0.95, 0.95),
+        Parameter("armature", "kg·m²", 0.0, 0.3, 0.0, np.inf, "inertia"),
+        Parameter("spring", "N·m/rad", 0.0, 0.1, -np.inf, np.inf, "torque"),
+        Parameter("offset", "N·m", 0.0, 0.1, -np.inf, np.inf, "torque"),
+        Parameter("zero", "rad", 0.0, 0.02, -0.5, 0.5),
+        Parameter("gain", "1", 1.0, 0.05, 0.2, 3.0),
+        Parameter("sine", "N·m", 0.0, 0.1, -np.inf, np.inf, "torque"),
+        Parameter("cosine", "N·m", 0.0, 0.1, -np.inf, np.inf, "torque"),
+    )
+}
+
+
+@dataclass(frozen=True)
+class LoopEffect:
+    """An effect of one joint: its parameters here, and how each is called in an answer."""
+
+    id: str
+    parameters: tuple[str, ...]
+    reported: tuple[str, ...]
+    needs: tuple[str, ...] = ()
+    """Effects that have to be there before."""
+    controller: bool = False
+    """Whether it belongs to the controller, which a model without actuators leaves open."""
+
+
+EFFECTS = {
+    e.id: e
+    for e in (
+        LoopEffect("controller.stiffness", ("kp",), ("kp",), controller=True),
+        LoopEffect("controller.damping", ("kd",), ("kd",), controller=True),
+        LoopEffect("controller.integral", ("ki",), ("ki",), controller=True),
+        LoopEffect("controller.feed_forward", ("feed",), ("share",), controller=True),
+        LoopEffect("controller.delay", ("delay",), ("time",), controller=True),
+        LoopEffect("controller.slew", ("slew",), ("limit",)),
+        LoopEffect("controller.dead_zone", ("dead",), ("width",)),
+        LoopEffect("actuator.saturation", ("limit",), ("limit",)),
+        LoopEffect("actuator.gain", ("gain",), ("gain",)),
+        LoopEffect("actuator.rotor_inertia", ("armature",), ("inertia",)),
+        LoopEffect("friction.coulomb", ("coulomb",), ("torque",)),
+        LoopEffect("friction.viscous", ("viscous",), ("damping",)),
+        LoopEffect(
+            "friction.stribeck", ("stribeck", "stribeck_velocity"), ("breakaway", "velocity"), ("friction.coulomb",)
+        ),
+        LoopEffect("friction.load", ("load",), ("coefficient",)),
+        LoopEffect("friction.asymmetric", ("asymmetry",), ("ratio",), ("friction.coulomb",)),
+        LoopEffect("transmission.spring", ("spring", "offset"), ("stiffness", "torque")),
+        LoopEffect("position.offset", ("zero",), ("angle",)),
+        LoopEffect("transmission.ripple", ("sine", "cosine"), ("sine", "cosine")),
+    )
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Scales:
+    """Natural sizes of each joint, (J,): torque [N·m], damping [N·m·s/rad], inertia [kg·m²], error [rad]."""
+
+    torque: Array
+    damping: Array
+    inertia: Array
+    angle: Array
+
+    def of(self, name: str) -> Array:
+        """Size at which a parameter is tried, (J,)."""
+        parameter = PARAMETERS[name]
+        one = np.ones_like(self.torque)
+        return np.asarray(parameter.trial * (one if parameter.scale == "1" else getattr(self, parameter.scale)))

@@ -1,0 +1,131 @@
+"""Simulation of position-controlled joints: all windows, joints and hypotheses at once.
+
+One step is implicit in position gain, damping and friction, so that it is stable for any gains, and a joint sticks
+where friction exceeds what drives it.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from gcomp.arrays import Array
+from sim_gap.closed_loop.windows import Windows
+
+CELLS = 6_000
+"""Most joints times windows times hypotheses that are simulated together, for the cache's sake."""
+Values = Mapping[str, Array]
+"""Parameter → (P, J); the names are those of `parameters`, of `Windows.columns`, and `gain_of` (P, 1, W)."""
+
+
+def simulate(data: Windows, values: Values) -> Array:
+    """Positions at the times of comparison for P hypotheses [rad], (P, To, J, W).
+
+    `values` have shapes (P, J); a parameter that is absent has its neutral value.
+    """
+    count = max(len(x) for x in values.values())
+    size = max(1, CELLS // (data.joints * data.count))
+    parts = []
+    for first in range(0, count, size):
+        some = {name: x[first : first + size] if len(x) > 1 else x for name, x in values.items()}
+        parts.append(_run(data, some, min(size, count - first)))
+    return np.concatenate(parts) if len(parts) > 1 else parts[0]
+
+
+def _run(data: Windows, values: Values, count: int) -> Array:
+    shape = (count, data.joints, data.count)
+    dt, steps = data.dt, len(data.command)
+    given = {
+        name: np.ascontiguousarray(np.broadcast_to(x[:, :, None], (count, data.joints, 1)))
+        for name, x in values.items()
+    }
+    active = {name for name, x in given.items() if np.any(x != 0.0)}
+
+    def of(name: str, neutral: float = 0.0) -> Array:
+        return given[name] if name in given else np.full((1, 1, 1), neutral)
+
+    kp, kd, ki = (of(name) * data.scale if np.any(data.scale != 1.0) else of(name) for name in ("kp", "kd", "ki"))
+    armature, viscous, gain = of("armature"), of("viscous"), of("gain", 1.0)
+    coulomb, asymmetry = of("coulomb"), of("asymmetry")
+    limit, slew = of("limit", np.inf), of("slew", np.inf)
+    clipped, slewed = bool(np.isfinite(limit).any()), bool(np.isfinite(slew).any())
+    linear = [name for name in data.columns if name in active]
+    late = of("delay") / dt
+    whole = np.floor(late).astype(int)
+    part = late - whole
+    joints = np.arange(data.joints)[None, :]
+    back = whole[:, :, 0]
+    delayed = "delay" in active
+    q = np.broadcast_to(data.start[0], shape).copy()
+    v = np.broadcast_to(data.start[1], shape).copy()
+    total = np.zeros(shape)
+    if "ki" in active:
+        begun = np.where(of("feed") > 0.5, data.first_torque[1], data.first_torque[0])
+        total = np.broadcast_to(
+            data.error_sum + (begun / gain - kp * data.first_error) / np.maximum(ki, 1e-9) * (ki > 0), shape
+        ).copy()
+    target = np.broadcast_to(data.command[0], shape).copy()
+    out = np.empty((count, len(data.measured), data.joints, data.count))
+    kept, stiff, damped = 0, dt * dt * kp * gain, dt * kd * gain
+    for k in range(steps):
+        if k >= data.warm and (k - data.warm) % data.stride == 0:
+            out[:, kept] = q
+            kept += 1
+        command = data.command[k]
+        if delayed:
+            at = np.clip(k - back, 0, steps - 1)
+            before = np.clip(k - back - 1, 0, steps - 1)
+            command = data.command[at, joints] * (1.0 - part) + data.command[before, joints] * part
+        if slewed:
+            target += np.clip(command - target, -slew * dt, slew * dt)
+            command = target
+        error = command - q
+        on = data.served[k]
+        if "dead" in active:
+            dead = of("dead")
+            error = error - np.clip(error, -dead, dead)
+        torque = kp * error
+        if "kd" in active:
+            torque = torque + kd * data.speed[k]
+        if "ki" in active:
+            total += dt * error * on
+            torque = torque + ki * total
+        if "feed" in active:
+            torque = torque + of("feed") * data.feed[k]
+        if "feed_gravity" in active:
+            torque = torque + of("feed_gravity") * data.feed_gravity[k]
+        free = on
+        if clipped:
+            wish = torque - kd * v
+            over = np.abs(wish) > limit
+            torque = np.where(over, np.clip(wish, -limit, limit), torque)
+            free = on * ~over
+        torque = torque * (gain * on)
+        mass = data.inertia[k] + armature
+        x = np.clip(q - data.recorded[k], -1.5, 1.5)
+        square = x * x
+        torque -= data.gravity[k] * (1.0 - 0.5 * square) + data.slope[k] * x * (1.0 - square / 6.0)
+        torque -= data.coupling[k]
+        if "zero" in active:
+            torque -= of("zero") * data.slope[k]
+        if "spring" in active:
+            torque -= of("spring") * q
+        if "offset" in active:
+            torque -= of("offset")
+        if "sine" in active or "cosine" in active:
+            turn = of("cycles") * q
+            torque -= of("sine") * np.sin(turn) + of("cosine") * np.cos(turn)
+        for name in linear:
+            torque -= of(name) * data.columns[name][k]
+        effective = mass + dt * viscous + free * (damped + stiff)
+        v = (mass * v + dt * torque) / effective
+        hold = coulomb
+        if "load" in active:
+            hold = hold + of("load") * data.load[k]
+        if "stribeck" in active:
+            hold = hold + of("stribeck") * np.exp(-((v / of("stribeck_velocity", 0.1)) ** 2))
+        if "asymmetry" in active:
+            hold = hold * (1.0 + asymmetry * np.sign(v))
+        hold = hold * (dt / effective)
+        v -= np.clip(v, -hold, hold)
+        q += dt * v
+    return out

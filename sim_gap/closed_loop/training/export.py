@@ -1,0 +1,188 @@
+"""The corrected model as MJCF with native position actuators: gains, delay, limits, friction, inertials, gravity."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from gcomp.arrays import Array
+from sim_gap.better_model.with_effects import mujoco_quaternion, possible, spec_of, split
+from sim_gap.closed_loop.columns import turns
+from sim_gap.closed_loop.fit import Fit, improve
+from sim_gap.closed_loop.parameters import EFFECTS
+from sim_gap.closed_loop.search import Search, effect_there, without
+from sim_gap.model.load import SimModel
+from sim_gap.model.rigid_body import inertial_of
+
+NATIVE = {
+    "controller.stiffness": "actuator kp",
+    "controller.delay": "actuator delay",
+    "controller.slew": "actuator slewmax",
+    "controller.integral": "actuator ki",
+    "actuator.saturation": "actuator forcerange",
+    "actuator.rotor_inertia": "joint armature",
+    "friction.coulomb": "joint frictionloss",
+    "friction.viscous": "joint damping",
+    "transmission.spring": "joint stiffness and springref",
+    "link.payload": "body inertial",
+    "link.mass_moment": "body inertial",
+    "base.tilt": "option gravity",
+}
+"""Effects that a field of MJCF holds."""
+STICKS = {"solref_friction": [0.01, 1.0], "solimp_friction": [0.999, 0.9999, 0.001, 0.5, 2.0]}
+"""Solver parameters with which a joint under friction rests; with MuJoCo's usual ones it creeps to where no friction is
+needed, within a tenth of a second on a small arm."""
+LEAST_DELAY_S = 0.001
+MOST_SAMPLES = 1000
+POSITION_INPUT = 1
+"""MuJoCo's code of an actuator whose only input is a position."""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A corrected model: its text, and a line per effect that it cannot hold."""
+
+    xml: str
+    lines: tuple[str, ...]
+
+
+def native_fit(search: Search, fit: Fit) -> Fit:
+    """The fit with what MJCF holds alone, the rest fitted anew around it."""
+    bare = fit
+    for effect in EFFECTS:
+        if effect in NATIVE:
+            continue
+        for j in range(search.data.joints):
+            if effect_there(fit, effect, j):
+                bare = without(search, bare, effect, j)
+    bare = bare.with_values(kd=np.zeros(search.data.joints), feed=np.zeros(search.data.joints))
+    dry = fit.point["stribeck"] + fit.point["load"] * search.data.load.mean(axis=(0, 2))
+    bare = bare.with_values(coulomb=np.maximum(bare.point["coulomb"], fit.point["coulomb"] + dry))
+    wanted = [(*own, *(n for n in ("coulomb", "viscous") if n not in own)) for own in bare.active]
+    changed = bare.active != fit.active or any(np.any(fit.point[n] != 0.0) for n in ("kd", "feed"))
+    if not changed:
+        return fit
+    return improve(search.data, replace(bare, active=tuple(wanted), rms=None), search.scales, 6)
+
+
+def exported(sim: SimModel, search: Search, fit: Fit, native: Fit) -> Exported:
+    """MJCF of the native fit, and the effects of the whole fit that it leaves out."""
+    spec = spec_of(sim)
+    left = sorted(
+        {
+            f"{effect} {sim.arm.names[j]}"
+            for effect in EFFECTS
+            for j in range(sim.n)
+            if effect not in NATIVE and effect_there(fit, effect, j)
+        }
+    )
+    compiled = spec.compile()
+    for j, joint in enumerate(sim.joints):
+        _set_joint(spec.joints[joint], native, j)
+        _set_actuator(spec, spec.joints[joint].name, native, j, search, compiled)
+    for link, change in _link_changes(search, native).items():
+        _set_body(spec, compiled, sim.joints[link], change)
+    gravity = sim.arm.gravity.copy()
+    for k, turn in enumerate(turns(sim.arm.gravity)):
+        gravity += float(native.point.get(f"tilt.angle_{k + 1}", np.zeros(1))[0]) * turn
+    spec.option.gravity = gravity
+    spec.option.timestep = min(float(spec.option.timestep), 0.002)
+    spec.option.integrator = _implicit()
+    spec.compile()
+    note = "".join(f"\n  {line}" for line in left)
+    comment = (
+        f"<!-- Left out, MJCF has no field for them (the rest was fitted without them):{note}\n-->\n" if left else ""
+    )
+    return Exported(comment + spec.to_xml(), tuple(left))
+
+
+def _implicit() -> Any:
+    import mujoco
+
+    return mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+
+
+def _set_joint(joint: Any, fit: Fit, j: int) -> None:
+    joint.frictionloss, joint.armature = float(fit.point["coulomb"][j]), float(fit.point["armature"][j])
+    joint.solref_friction, joint.solimp_friction = STICKS["solref_friction"], STICKS["solimp_friction"]
+    joint.damping[0] = float(fit.point["viscous"][j])
+    stiffness = float(fit.point["spring"][j])
+    if stiffness > 1e-9:
+        joint.stiffness[0] = stiffness
+        joint.springref = -float(fit.point["offset"][j]) / stiffness
+
+
+def _set_actuator(spec: Any, joint: str, fit: Fit, j: int, search: Search, compiled: Any) -> None:
+    """One position actuator at a joint, in the place of those that it has."""
+    import mujoco
+
+    old = [a for a in spec.actuators if a.target == joint and a.trntype == mujoco.mjtTrn.mjTRN_JOINT]
+    name = old[0].name if old else f"position_{joint}"
+    control = list(old[0].ctrlrange) if old and old[0].ctrlrange[0] < old[0].ctrlrange[1] else None
+    for actuator in old:
+        spec.delete(actuator)
+    made = spec.add_actuator(name=name, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    kp, ki = (float(fit.point[name][j] * fit.point["gain"][j]) for name in ("kp", "ki"))
+    slew = float(fit.point["slew"][j])
+    if ki > 0.0 or np.isfinite(slew):
+        made.set_to_pid(
+            kp=kp,
+            kv=0.0,
+            ctrlspec=POSITION_INPUT,
+            **({"ki": ki} if ki > 0.0 else {}),
+            **({"slewmax": slew} if np.isfinite(slew) else {}),
+        )
+    else:
+        made.set_to_position(kp=kp, kv=0.0)
+    limit = float(fit.point["limit"][j])
+    if np.isfinite(limit):
+        made.forcelimited, made.forcerange = 1, [-limit, limit]
+    if control is not None:
+        made.ctrllimited, made.ctrlrange = 1, control
+    delay = float(fit.point["delay"][j])
+    if delay >= LEAST_DELAY_S:
+        made.delay = delay
+        made.nsample = min(MOST_SAMPLES, int(np.ceil(delay / 0.002)) + 2)
+
+
+def _link_changes(search: Search, fit: Fit) -> dict[int, Array]:
+    """Change of the ten inertial parameters of each link, about its joint and in its frame."""
+    n = search.data.joints
+    changes: dict[int, Array] = {}
+    payload = [
+        float(fit.point[f"payload.{p}"][0]) if f"payload.{p}" in fit.shared else 0.0 for p in ("mass", "x", "y", "z")
+    ]
+    if any(payload):
+        mass, moment = payload[0], np.array(payload[1:])
+        centre = moment / mass if abs(mass) > 1e-6 else np.zeros(3)
+        body = inertial_of(mass, centre, np.zeros((3, 3)))
+        body[1:4] = moment
+        changes[n - 1] = body
+    for link in range(n):
+        moment = np.array([float(fit.point.get(f"moment{link}.{axis}", np.zeros(1))[0]) for axis in "xyz"])
+        if moment.any():
+            changes[link] = changes.get(link, np.zeros(10))
+            changes[link][1:4] += moment
+    return changes
+
+
+def _set_body(spec: Any, compiled: Any, joint: int, change: Array) -> None:
+    """Add a change of inertial parameters to the body that a joint moves."""
+    import mujoco
+
+    index = int(compiled.jnt_bodyid[joint])
+    anchor, spin = compiled.jnt_pos[joint], np.zeros(9)
+    mujoco.mju_quat2Mat(spin, compiled.body_iquat[index])
+    axes = spin.reshape(3, 3)
+    inertia = axes @ np.diag(compiled.body_inertia[index]) @ axes.T
+    total = inertial_of(float(compiled.body_mass[index]), compiled.body_ipos[index] - anchor, inertia) + change
+    mass, centre, about = split(total)
+    values, turned = np.linalg.eigh(about)
+    turned[:, 2] *= np.sign(np.linalg.det(turned))
+    quaternion = np.zeros(4)
+    mujoco_quaternion(quaternion, turned)
+    body = spec.bodies[index]
+    body.explicitinertial = True
+    body.mass, body.ipos, body.iquat = mass, anchor + centre, quaternion
+    body.inertia = possible(values)
+    body.fullinertia = [np.nan] * 6

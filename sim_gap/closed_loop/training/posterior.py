@@ -1,0 +1,44 @@
+"""Files for training: the corrected model, and draws of all parameters from what the recordings leave open."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from armlink.errors import BadInput
+from sim_gap.closed_loop.identify import Identified
+from sim_gap.closed_loop.judge import draw
+
+SUFFIXES = (".csv", ".json", ".parquet")
+
+
+def write_samples(found: Identified, count: int, path: Path, seed: int = 0) -> None:
+    """Write draws of all fitted parameters, one row each, columns `JOINT.PARAMETER` in SI units. Raises BadInput."""
+    if path.suffix not in SUFFIXES:
+        raise BadInput(f"--out-samples {path}: expected a name that ends in {', '.join(SUFFIXES)}")
+    rows = draw(found.search, found.fit, found.spread, count, seed)
+    names = list(rows[0]) if rows else []
+    try:
+        if path.suffix == ".json":
+            path.write_text(json.dumps({"schema": "armlink.samples/1", "samples": rows}, indent=1), encoding="utf-8")
+        elif path.suffix == ".csv":
+            lines = [",".join(names), *(",".join(f"{row[name]:.9g}" for name in names) for row in rows)]
+            path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        else:
+            import pyarrow as pa
+            from pyarrow.parquet import write_table
+
+            write_table(pa.table({name: np.array([row[name] for row in rows]) for name in names}), path)
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def write_exported(found: Identified, path: Path) -> tuple[str, ...]:
+    """Write the corrected model as MJCF; a line per effect that it leaves out. Raises BadInput."""
+    if found.export is None:
+        raise BadInput("--out-model: the model did not come from a file: give MJCF, URDF or an arm file with --sim")
+    try:
+        path.write_text(found.export.xml, encoding="utf-8")
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be written: {error.strerror}") from None
+    return found.export.lines
