@@ -76,8 +76,7 @@ def _answer(folder: Path, case: Json, withheld: str) -> Json:
         train, heldout = ([load_recording(folder / name) for name in case.get(key, ())] for key in ("train", "heldout"))
         if "share" in case:
             train, heldout = _parts(train, case["share"])
-        judged: list[str] = case.get("heldout") or case["train"]
-        names: list[str] = [*case["train"], *judged]
+        names = [*case["train"], *(case["heldout"] if "heldout" in case else case["train"])]
         labels = [Path(name).name.split(".")[0] for name in names]
         made = diagnose(folder / case["sim"], train, heldout, labels=labels, withhold=[withheld] if withheld else [])
     except ArmlinkError as error:
