@@ -84,7 +84,7 @@ class SimulatedArm:
         self.drives.on_state, self.drives.on_fault = self._state_changed, self._faulted
         self.drives.take_commands()
         self.drives.sample(0.0, 0.0)
-        readings = Readings(self.plant, self.sensors)
+        self._readings = readings = Readings(self.plant, self.sensors)
         motors = [Motor(j, joint, self.drives.loops, self.sensors, readings) for j, joint in enumerate(link.joints)]
         self.fronts = build_fronts(arm, motors, self._sender)
         """Bus and drives of every family but CANopen."""
@@ -128,7 +128,10 @@ class SimulatedArm:
             piece = min(remaining, self.period)
             for drive in self.drive_at.values():
                 drive.control(piece)
-            self.drives.loops.advance(piece, self._synchronous)
+            if self.drive_at:
+                self._advance_drives(piece)
+            else:
+                self.drives.loops.advance(piece, self._synchronous)
             self._synchronous = False
             self.time += piece
             remaining -= piece
@@ -144,6 +147,18 @@ class SimulatedArm:
             if remaining > 1e-9:
                 self._sample()
             self._pdos.send_events()
+
+    def _advance_drives(self, piece: float) -> None:
+        """Physics of an arm with drives that are no CANopen nodes; their mean torque over the time is kept."""
+        loops, readings = self.drives.loops, self._readings
+        if self.nodes:
+            loops.advance(piece, self._synchronous)
+            readings.step_ends(0.5 * (readings.started + self.plant.drive_torque))
+            return
+        loops.advance(piece / 2, False)
+        middle = self.plant.drive_torque
+        loops.advance(piece / 2, False)
+        readings.step_ends(middle)
 
     def reboot(self, joint: int) -> None:
         """Power-cycle one joint's controller: volatile settings are lost."""

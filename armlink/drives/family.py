@@ -18,14 +18,16 @@ does not know a scale yet returns None.
 Everything runs in one thread. No method may block, but those that get an `Ask`.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from armlink.arm_file import ArmFile, LinkJoint
+from armlink.bus.can_bus import CanBus
 from armlink.bus.port import Frame
 from armlink.drives.board import Board
 from armlink.drives.findings import Result
+from armlink.drives.found import DriveFinding, FoundDrives
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup, power_name
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
@@ -180,6 +182,10 @@ class Drives(Protocol):
         """Temperature of a drive [°C], NaN if it has none."""
         ...
 
+    def cycle_bits(self) -> float:
+        """Bit times of the nominal rate that a cycle of these drives takes at most, all stuff bits included."""
+        ...
+
     def cycle_ids(self) -> frozenset[int]:
         """Identifiers of a frame that begins a cycle (SYNC); empty where none does."""
         ...
@@ -274,6 +280,11 @@ class Family:
     it goes further than the one for all families."""
     search: Callable[..., int] | None = None
     """`search(arm or None, bus or None, json, write)`: `armlink scan` of a whole bus; None: each drive is asked."""
+    find: Callable[[CanBus], FoundDrives] | None = None
+    """`find(bus)`: the drives on an open bus, asked without an arm file; None: they are found by their ids alone."""
+    examine: Callable[[ArmFile, CanBus, str], Iterator[DriveFinding]] | None = None
+    """`examine(arm, bus, name)`: what the drives of an arm with this family alone say against its file, on an open bus
+    of this name; they are only read. None: each drive is asked who it is."""
     state_name: Callable[[int], str] = power_name
     """State of a drive in words, from its code in `Sample.status`; by default an index of Power."""
     summary: str = ""

@@ -3,18 +3,16 @@
 import logging
 import math
 from contextlib import closing
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
+from armlink.arm_file import ArmFile, LinkSection
 from armlink.arrays import Array
 from armlink.errors import BadInput, Refused
 from armlink.link.guard import Crossed, Guard
-from armlink.link.joints.groups import traits_of
-from armlink.link.types import Command, Setpoints, Tell
-
-if TYPE_CHECKING:
-    from armlink.link.link import Link
+from armlink.link.joints.groups import Group, traits_of
+from armlink.link.types import Command, Sample, Samples, Setpoints, Tell
 
 PEAK = 1.875
 """Peak speed over mean speed of the path, whose parameter is 10 s³ − 15 s⁴ + 6 s⁵."""
@@ -29,13 +27,46 @@ TELL_EVERY = 0.5
 log = logging.getLogger("armlink")
 
 
-def let_go(link: "Link") -> list[str]:
+class Parked(Protocol):
+    """The part of a link that parking needs."""
+
+    arm: ArmFile
+    section: LinkSection
+    names: tuple[str, ...]
+    n: int
+    period: float
+    groups: tuple[Group, ...]
+
+    @property
+    def enabled(self) -> bool:
+        """Whether the joints are enabled."""
+        ...
+
+    @property
+    def latest_position(self) -> Array:
+        """Newest position readings (n,) [rad]."""
+        ...
+
+    def cycle(self, command: Command) -> Sample:
+        """One cycle."""
+        ...
+
+    def play(self, setpoints: Setpoints) -> Samples:
+        """One row a cycle."""
+        ...
+
+    def disable(self) -> None:
+        """Take the power from every joint."""
+        ...
+
+
+def let_go(link: Parked) -> list[str]:
     """Joints whose drives do not hold on their own when their host falls silent."""
     traits = traits_of(link.groups, link.n)
     return [name for name, each in zip(link.names, traits, strict=True) if each.silence != "holds"]
 
 
-def require_deadman(link: "Link") -> None:
+def require_deadman(link: Parked) -> None:
     """Raise Refused where a drive keeps its last command when its host dies."""
     traits = traits_of(link.groups, link.n)
     for name, each in zip(link.names, traits, strict=True):
@@ -46,7 +77,7 @@ def require_deadman(link: "Link") -> None:
             )
 
 
-def park(link: "Link", tell: Tell) -> None:
+def park(link: Parked, tell: Tell) -> None:
     """Move the arm to `link.park`, let it rest there, and take the power from every joint.
 
     The joints move together on a straight line in joint space, which must be clear. `tell` is told how far it is.
@@ -81,7 +112,7 @@ def park(link: "Link", tell: Tell) -> None:
     link.disable()
 
 
-def leave(link: "Link", tell: Tell) -> None:
+def leave(link: Parked, tell: Tell) -> None:
     """The end of work in order: park where drives would let the arm fall, else leave it as it is. Raises as `park`."""
     falling = let_go(link)
     if not link.enabled or not falling:
@@ -106,7 +137,7 @@ def straight(start: Array, goal: Array, speed: Array, period: float) -> Array:
     return start + way[:, None] * (goal - start)
 
 
-def speeds(link: "Link", speed: float) -> Array:
+def speeds(link: Parked, speed: float) -> Array:
     """The speed of a way to park, no joint beyond what it may turn at (n,) [rad/s]."""
     fastest: Array = np.minimum(speed, np.array([joint.max_velocity for joint in link.section.joints]))
     return fastest

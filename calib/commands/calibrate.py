@@ -103,6 +103,9 @@ def _answer(fit: "SensorFit", record: "CalibrationRecord", applied: bool) -> dic
             for found in fit.findings
         ],
         "doubtful": list(fit.doubtful),
+        "discrepancy": [
+            {"joint": name, **each.model_dump()} for name, each in zip(fit.names, fit.goodness.discrepancy, strict=True)
+        ],
         "left_out": [
             {"sweep": each.sweep, "joint": fit.names[each.joint], "rms": each.rms, "ratio": each.ratio}
             for each in fit.goodness.left_out
@@ -127,7 +130,7 @@ def _show(fit: "SensorFit") -> None:
     from calib.commands.screen import print_intervals, print_lines
 
     headings: dict[Parameter, str] = {"gain": "gain", "offset": "offset [N·m]", "position_gain": "position gain"}
-    columns = {heading: (fit.value(name), fit.quantile * fit.std(name)) for name, heading in headings.items()}
+    columns = {heading: (fit.value(name), fit.half95(name)) for name, heading in headings.items()}
     columns["locked friction [N·m]"] = (fit.friction, 0 * fit.friction)
     print_intervals("Sensors, ± half of the 95 % interval", fit.names, columns)
     lines = [f"{joint} {parameter}: {reason}" for (joint, parameter), reason in fit.reasons.items()]

@@ -28,7 +28,7 @@ def daemon(
         typer.Option(
             "--listen-only",
             help="Another controller commands the bus: send no SYNC and no commands. A recalibration that is applied"
-            " still writes object 2100h by SDO.",
+            " is still written to controllers that keep their calibration.",
         ),
     ] = False,
     socket: Annotated[

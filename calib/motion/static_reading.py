@@ -74,8 +74,12 @@ class StaticReading:
     """Temperatures of the drives (n,) [°C]; None, and not written, where they were not logged."""
     torque_error: Annotated[Vector, Field(exclude=True)] = field(default_factory=lambda: np.array(np.nan))
     """Standard error of the mean torque (n,) as the halves of the average show it [N·m]; NaN if not judged so."""
+    temperature: Annotated[Vector, Field(exclude=True)] = field(default_factory=lambda: np.array(np.nan))
+    """Of the drives (n,) [°C]; NaN where one does not tell it."""
 
     def __post_init__(self) -> None:
+        if np.ndim(self.temperature) == 0:
+            object.__setattr__(self, "temperature", np.full(len(self.position), np.nan))
         if np.ndim(self.direction) == 0:
             moved = np.arange(len(self.position)) == (-1 if self.joint is None else self.joint)
             object.__setattr__(self, "direction", np.where(moved, self.direction, 0.0))

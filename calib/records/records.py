@@ -59,12 +59,12 @@ class Record(_Frozen):
 
     @property
     def id(self) -> str:
-        """Eight hex digits of the content's SHA-256; as a number it fits the record id of object 2100h (UNSIGNED32)."""
+        """Eight hex digits of the content's SHA-256; as a number it fits 32 bits, as a controller keeps it."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:8]
 
     @property
     def number(self) -> int:
-        """`id` as the UNSIGNED32 that a controller keeps beside its gain and offset (2100h:07)."""
+        """`id` as the UNSIGNED32 that a controller keeps beside its gain and offset."""
         return int(self.id, 16)
 
     def require(self, arm: ArmFile) -> Self:

@@ -49,6 +49,7 @@ def diagnose(
     withhold: Sequence[str] = (),
     stated: Corrections = AS_IT_IS,
     groups: Sequence[str] = (),
+    gains: Sequence[str] = (),
     progress: Callable[[str], None] = lambda stage: None,
 ) -> Diagnosis:
     """Explain the gap between a simulation model and recordings of the real arm.
@@ -61,6 +62,7 @@ def diagnose(
         groups: `NAME=REC[,REC…]`: recordings (by label) that share a body; without any, it is found which do.
         withhold: ids of effects to leave out of the library (blind check).
         stated: corrections that the user stated when the recordings were loaded; the check leaves those as they are.
+        gains: `RECORDING=VALUE`: gain of the position controller in recordings that differ in it; only without torque.
         progress: gets the stage that begins; used where no recording has a torque channel.
 
     Without a torque channel in any recording, `q_cmd` and `q` are explained instead (`position_only`).
@@ -80,7 +82,15 @@ def diagnose(
         train, heldout, labels, numbers, named, starts = *_split(train), labels * 2, numbers * 2, named * 2, starts * 2
     if all(is_position_only(recording) for recording in [*train, *heldout]):
         return diagnose_positions(
-            sim, train, heldout, labels, withhold=withhold, checks=findings, heldout_is=heldout_is, progress=progress
+            sim,
+            train,
+            heldout,
+            labels,
+            withhold=withhold,
+            checks=findings,
+            heldout_is=heldout_is,
+            gains=gains,
+            progress=progress,
         )
     ready = [
         prepare(recording, sim.arm, *of)

@@ -1,6 +1,7 @@
 """The answer from recordings without a torque channel: causes, verdict and notes in radians."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -8,17 +9,15 @@ from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, Rollout, Signs, Verdict
 from sim_gap.checks.finding import Finding
 from sim_gap.closed_loop.columns import shared_effects
-from sim_gap.closed_loop.compete import PRICE
 from sim_gap.closed_loop.identify import Identified, columns_of_effect, identify
-from sim_gap.closed_loop.judge import Stage, interval, undecided_scale
+from sim_gap.closed_loop.judge import LEAST_SHRINK, Stage, interval, undecided_scale
 from sim_gap.closed_loop.parameters import EFFECTS
-from sim_gap.closed_loop.replay import replay_rms
+from sim_gap.closed_loop.search import PRICE
+from sim_gap.closed_loop.training.replay import replay_rms
 from sim_gap.model.load import SimModel
 from sim_gap.residuals.where import Location
 from sim_gap.search.estimate import Value
 
-LEAST_SHRINK = 0.05
-"""Least relative fall of a joint's held-out RMS by a cause; less is a minor one."""
 EXPLAINED = 0.3
 """Largest share of the gap's RMS that may remain."""
 ALMOST = 0.97
@@ -41,9 +40,10 @@ def diagnose_positions(
     checks: Sequence[Finding],
     heldout_is: str,
     progress: Callable[[str], None],
+    gains: Sequence[str] = (),
 ) -> Diagnosis:
     """Explain the gap between commanded and measured positions; arguments as of `diagnose.diagnose`."""
-    found = identify(sim, train, heldout, labels, withhold, progress)
+    found = identify(sim, train, heldout, labels, withhold, progress, gains)
     progress("replaying the corrected model")
     share = _left(found)
     made = [_cause(found, stage, share) for stage in found.stages]
@@ -83,8 +83,8 @@ def _left(found: Identified) -> float:
 
 
 def _matters(found: Identified, stage: Stage) -> bool:
-    fall = (stage.before - stage.after) / np.maximum(found.heldout_before, 1e-12)
-    return bool(np.any((fall > LEAST_SHRINK) & (stage.before - stage.after > 0.25 * found.margin)))
+    fall = stage.before - stage.after
+    return bool(np.any((fall > LEAST_SHRINK * stage.before) & (fall > found.search.floor)))
 
 
 def _verdict(found: Identified, causes: Sequence[Cause], share: float) -> Verdict:
@@ -118,7 +118,9 @@ def _cause(found: Identified, stage: Stage, share: float) -> Cause:
         gap_after=after,
         confidence=confidence,
         fall=float(fall.max()),
-        signs=Signs(stage.evidence, float((after / max(before, 1e-12)) ** 2), after / float(found.margin[places].max()), share),
+        signs=Signs(
+            stage.evidence, float((after / max(before, 1e-12)) ** 2), after / float(found.margin[places].max()), share
+        ),
         confounded_with=stage.rivals,
         separate_by=SEPARATE.get(effect, OTHERWISE) if stage.rivals else None,
     )
@@ -146,8 +148,6 @@ def _parameters(found: Identified, stage: Stage) -> dict[str, dict[str, Value]]:
 
 
 def _hint(cause: Cause) -> Cause:
-    from dataclasses import replace
-
     return replace(cause, confidence=min(cause.confidence, HINT))
 
 
@@ -183,11 +183,13 @@ def _notes(found: Identified) -> list[str]:
     if loose := undecided_scale(found.search, found.fit):
         listed = ", ".join(names[j] for j in loose)
         out.append(
-            f"{listed}: position alone shows ratios of gain, friction and inertia here, their common scale rests on the "
-            "model's inertia: hold a known load or record the current"
+            f"{listed}: position alone shows ratios of gain, friction and inertia here, their common scale rests on "
+            "the model's inertia: hold a known load or record the current"
         )
     if any("viscous" in own for own in found.fit.active):
-        out.append("viscous friction, back-EMF and damping of the measured velocity act alike on a position: their sum is given")
+        out.append(
+            "viscous friction, back-EMF and damping of the measured velocity act alike on a position: the sum is given"
+        )
     if found.export is not None and found.export.lines:
         out.append(f"the corrected model leaves out: {', '.join(found.export.lines)}")
     return out

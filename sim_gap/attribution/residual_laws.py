@@ -30,6 +30,11 @@ SMALLEST = 0.02
 """Least range of a quantity for a law of it, in its unit."""
 FEWEST = 100
 """Number of samples from which a law is fitted."""
+CLEARLY = 0.95
+"""Mean square that a law leaves, as a share of an earlier one's, from which it is taken instead: the order is that of
+velocity, position, load, temperature, time."""
+WARM_UPS = (6.0, 20.0, 60.0, 200.0)
+"""Time constants of laws of time [s]."""
 COPIES = 2.0
 """Standard deviations of the band about a law."""
 Mask = NDArray[np.bool_]
@@ -63,28 +68,41 @@ class _Candidate:
     quantity: str
     directed: bool
     at: Array
+    warm_up: float = 0.0
+    """Time constant of a law of time [s]; zero for any other law."""
+
+    def basis(self, x: Array) -> Array:
+        """Functions that are one at a point, zero at the others and linear between, constant beyond the ends, (K, m).
+
+        Of a law of time, a constant and what fades: parts left out tell nothing of a function that is free there. Of
+        temperature, a straight line for the same reason.
+        """
+        if self.quantity == "time":
+            return np.stack([np.ones_like(x), np.exp(-x / self.warm_up)], axis=1)
+        if self.quantity == "temperature":
+            return np.stack([np.ones_like(x), x - self.at[0]], axis=1)
+        return np.stack([np.interp(x, self.at, unit) for unit in np.eye(len(self.at))], axis=1)
 
     def columns(self, s: Signals, joint: int) -> Array:
-        """Hat functions of the quantity, filtered like the readings, (k, m)."""
+        """The basis along a recording, filtered like the readings, (k, m)."""
         x = _values(s, self.quantity, joint)
-        hats = _hats(np.abs(x) if self.directed and self.quantity in ("velocity", "load") else x, self.at)
-        return s.filtered(hats * s.direction[:, joint, None] if self.directed else hats)
+        own = self.basis(np.abs(x) if self.directed and self.quantity in ("velocity", "load") else x)
+        return s.filtered(own * s.direction[:, joint, None] if self.directed else own)
 
 
 def residual_laws(
     fit: ResidualSet, judge: ResidualSet, left_fit: Mapping[Row, Array], left: Mapping[Row, Array]
 ) -> list[ResidualLaw]:
     """The laws of what is left of training and held-out data, (K,) per row each, the largest first."""
-    masks, judged = _samples(fit), _samples(judge)
+    wide = _samples(fit), _samples(judge)
     found = []
     for row in fit.rows:
-        if min(masks[row].sum(), judged[row].sum()) < FEWEST:
-            continue
-        if root_mean_square(left[row][judged[row]]) <= judge.margin[row]:
-            continue
-        law = _best(fit, judge, row, (left_fit[row], left[row]), (masks[row], judged[row]))
-        if law is not None:
-            found.append(law)
+        for masks in ((fit.valid[row], judge.valid[row]), (wide[0][row], wide[1][row])):
+            enough = min(mask.sum() for mask in masks) >= FEWEST
+            if enough and root_mean_square(left[row][masks[1]]) > judge.margin[row]:
+                law = _best(fit, judge, row, (left_fit[row], left[row]), masks)
+                found += [law] if law is not None else []
+                break
     return sorted(found, key=lambda law: law.after - law.before)
 
 
@@ -101,7 +119,7 @@ def as_effects(laws: Sequence[ResidualLaw], names: Sequence[str]) -> list[JointE
 
 
 def _samples(data: ResidualSet) -> dict[Row, Mask]:
-    """Samples that laws are fitted to and judged on: those of the comparison, and those in creep, (K,) per row."""
+    """Samples of the comparison and those in creep, for a row that is quiet but for creep, (K,) per row."""
     out = {row: valid.copy() for row, valid in data.valid.items()}
     for (row, regime), mask in regimes(data).items():
         if regime == "creep" and slides(data, row):
@@ -118,18 +136,20 @@ def _best(
     for law in _candidates(fit.signals, joint, row[0] == fit.layout.motor_side):
         x = np.concatenate([law.columns(s, joint) for s in fit.signals])
         missed = _cross_validated(x[mask], left[0][mask], fit.folds[mask])
-        if missed < best:
+        if missed < CLEARLY * best:
             best, chosen = missed, (law, x)
     if chosen is None:
         return None
     law, x = chosen
-    torque, spread = _fitted(x[mask], left[0][mask], fit.blocks[mask])
-    y = np.concatenate([law.columns(s, joint) for s in judge.signals]) @ torque
+    c, covariance = _fitted(x[mask], left[0][mask], fit.blocks[mask])
+    y = np.concatenate([law.columns(s, joint) for s in judge.signals]) @ c
     before, after = (root_mean_square(rest[judged]) for rest in (left[1], left[1] - y))
     above = before**2 - judge.floor[row] ** 2
     if before**2 - after**2 < LEAST * above or before - after < RELEVANT_NM:
         return None
-    return ResidualLaw(law.quantity, joint, row[0], law.directed, law.at, torque, COPIES * spread, before, after)
+    at = law.basis(law.at)
+    band = COPIES * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", at, covariance, at), 0.0))
+    return ResidualLaw(law.quantity, joint, row[0], law.directed, law.at, at @ c, band, before, after)
 
 
 def _candidates(signals: Sequence[Signals], joint: int, friction: bool) -> Iterator[_Candidate]:
@@ -146,7 +166,9 @@ def _candidates(signals: Sequence[Signals], joint: int, friction: bool) -> Itera
                 at = np.concatenate([NEAR_ZERO, at[at > 2.0 * NEAR_ZERO[-1]]])
             at = at[np.r_[True, np.diff(at) > SMALLEST / KNOTS]]
             if len(at) > 2:
-                yield _Candidate(quantity, directed, at)
+                yield from (
+                    _Candidate(quantity, directed, at, tau) for tau in (WARM_UPS if quantity == "time" else (0.0,))
+                )
 
 
 def _values(s: Signals, quantity: str, joint: int) -> Array:
@@ -158,14 +180,9 @@ def _values(s: Signals, quantity: str, joint: int) -> Array:
     return np.asarray({"velocity": s.v, "position": s.q, "load": s.model}[quantity][:, joint])
 
 
-def _hats(x: Array, at: Array) -> Array:
-    """Functions that are one at a point, zero at the others and linear between, (K, m); constant beyond the ends."""
-    return np.stack([np.interp(x, at, unit) for unit in np.eye(len(at))], axis=1)
-
-
 def _solve(x: Array, y: Array) -> Array:
     gram = x.T @ x
-    bend = np.diff(np.eye(gram.shape[0]), 2, axis=0)
+    bend = np.diff(np.eye(len(gram)), 2, axis=0) if len(gram) > 2 else np.zeros((1, len(gram)))
     gram = gram + STIFF * np.trace(gram) / len(gram) * (bend.T @ bend + 1e-3 * np.eye(len(gram)))
     return np.asarray(np.linalg.solve(gram, x.T @ y))
 
@@ -182,11 +199,9 @@ def _cross_validated(x: Array, y: Array, folds: NDArray[np.intp]) -> float:
 
 
 def _fitted(x: Array, y: Array, blocks: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Torque at the points and its standard deviation, from sums over blocks of time."""
-    torque = _solve(x, y)
-    rest = y - x @ torque
+    """Coefficients of the columns (m,) and their covariance (m, m), from sums over blocks of time."""
+    c = _solve(x, y)
     scores = np.zeros((int(blocks.max()) + 1, x.shape[1]))
-    np.add.at(scores, blocks, x * rest[:, None])
+    np.add.at(scores, blocks, x * (y - x @ c)[:, None])
     inverse = np.linalg.pinv(x.T @ x + STIFF * np.trace(x.T @ x) / x.shape[1] * np.eye(x.shape[1]))
-    covariance = inverse @ scores.T @ scores @ inverse
-    return torque, np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return c, np.asarray(inverse @ scores.T @ scores @ inverse)

@@ -75,7 +75,8 @@ def _require_pairs(recording: Recording, label: str, stated: Corrections) -> Non
         if match[j, j] > CLEARLY and not SCALE[0] < slope[j] < SCALE[1] and not stated.states("units", column):
             unit = f"q_cmd_{j + 1}=deg" if slope[j] < 1.0 else f"q_{j + 1}=deg"
             raise BadInput(
-                f"{label}: {name}: q_{j + 1} moves {slope[j]:.3g} times as far as {column}: another unit? --units {unit}"
+                f"{label}: {name}: q_{j + 1} moves {slope[j]:.3g} times as far as {column}: if the unit differs, "
+                f"--units {unit}"
             )
 
 

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.closed_loop.windows import MODEL_HZ, Windows
+from sim_gap.closed_loop.tracks import MODEL_HZ
+from sim_gap.closed_loop.windows import Windows
 from sim_gap.model.rigid_body import RigidArm
 
 UNIT = {"mass": "kg", "x": "kg·m", "y": "kg·m", "z": "kg·m", "angle_1": "rad", "angle_2": "rad"}
@@ -26,7 +27,9 @@ def with_columns(data: Windows) -> Windows:
     few = np.unique(np.append(np.arange(0, steps, max(1, round(1.0 / (MODEL_HZ * data.dt)))), steps - 1))
     q, v, a = (x[few].transpose(0, 2, 1).reshape(-1, n) for x in (data.q, data.v, data.a))
     regressor = arm.regressor(q, v, a)
-    made: dict[str, Array] = {f"payload.{part}": regressor[:, :, n - 1, k] for k, part in enumerate(("mass", "x", "y", "z"))}
+    made: dict[str, Array] = {
+        f"payload.{part}": regressor[:, :, n - 1, k] for k, part in enumerate(("mass", "x", "y", "z"))
+    }
     for link in range(n):
         made |= {f"moment{link}.{axis}": regressor[:, :, link, 1 + k] for k, axis in enumerate("xyz")}
     still = np.zeros_like(q)

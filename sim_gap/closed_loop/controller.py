@@ -2,17 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.closed_loop.compete import PRICE, Progress, Search
+from sim_gap.closed_loop.compete import Progress
 from sim_gap.closed_loop.fit import Fit, batch, evaluate, improve, residuals
 from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS, Scales
+from sim_gap.closed_loop.search import PRICE, Search
 from sim_gap.closed_loop.windows import Windows
 from sim_gap.model.load import SimModel
 
+STUCK = 0.0, 0.4
+"""Least Coulomb friction that is tried with each, as a share of the gain times the RMS error."""
 GRID = 12
 """Stiffnesses that are tried at the start."""
 KINDS: dict[str, tuple[str, ...]] = {
@@ -98,7 +102,9 @@ def starting_fit(search: Search, own: Nominal, progress: Progress) -> tuple[Sear
         fits[kind] = improve(search.data, _from_grid(search, parts), search.scales, 5)
         scores[kind] = float(search.score(fits[kind]).sum()) + PRICE * search.data.joints * len(parts)
     kind = min(scores, key=lambda name: scores[name])
-    kept = {"controller.stiffness"} | {e.id for e in EFFECTS.values() if e.controller and e.parameters[0] in KINDS[kind]}
+    kept = {"controller.stiffness"} | {
+        e.id for e in EFFECTS.values() if e.controller and e.parameters[0] in KINDS[kind]
+    }
     left_out = {"controller.feed_forward"} if not own.complete else set()
     if "feed" not in KINDS[kind]:
         left_out.add("actuator.gain")
@@ -107,7 +113,7 @@ def starting_fit(search: Search, own: Nominal, progress: Progress) -> tuple[Sear
         point = dict(found.nominal)
         for name in ("kp", *KINDS[kind]):
             point[name] = fits[kind].point[name]
-        found = replace(found, nominal=point)
+        found = replace(found, nominal=point, open_controller=True)
     return found, fits[kind], kind
 
 
@@ -120,7 +126,7 @@ def _from_grid(search: Search, parts: Sequence[str]) -> Fit:
     size = np.sqrt(np.mean(needed**2, axis=(0, 2))) / np.maximum(np.sqrt(np.mean(e**2, axis=(0, 2))), 1e-6)
     centre = np.maximum(size, search.scales.inertia * 25.0)
     points = []
-    for factor in np.geomspace(0.05, 50.0, GRID):
+    for factor, stuck in product(np.geomspace(0.05, 50.0, GRID), STUCK):
         kp = centre * factor
         point = {name: values.copy() for name, values in nominal.items()}
         point["kp"] = kp
@@ -135,11 +141,15 @@ def _from_grid(search: Search, parts: Sequence[str]) -> Fit:
             if "kd" in parts:
                 rest = rest + point["kd"][j] * (data.speed[:, j] - v[:, j])
             columns = np.stack([np.tanh(v[:, j] / 0.02).ravel(), v[:, j].ravel()])
-            c = np.linalg.lstsq(columns.T, (rest * data.served[:, j]).ravel(), rcond=None)[0]
-            point["coulomb"][j], point["viscous"][j] = np.maximum(c, (0.0, 1e-3 * kp[j]))
+            target = (rest * data.served[:, j]).ravel()
+            c = np.linalg.lstsq(columns.T, target, rcond=None)[0]
+            coulomb = max(float(c[0]), stuck * kp[j] * float(search.scales.angle[j]))
+            left = target - coulomb * columns[0]
+            viscous = float(columns[1] @ left) / max(float(columns[1] @ columns[1]), 1e-12)
+            point["coulomb"][j], point["viscous"][j] = coulomb, max(viscous, 1e-3 * kp[j])
         points.append(point)
-    left = residuals(data, batch(points))
-    costs = np.einsum("ptjw,ptjw->pj", left, left)
+    gaps = residuals(data, batch(points))
+    costs = np.einsum("ptjw,ptjw->pj", gaps, gaps)
     best = costs.argmin(0)
     point = {name: np.array([points[b][name][j] for j, b in enumerate(best)]) for name in points[0]}
     active = ("kp", *(part for part in parts if part != "feed"), "coulomb", "viscous")

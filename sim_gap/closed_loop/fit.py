@@ -73,8 +73,7 @@ def jacobian(
             if k < len(own):
                 point[own[k]][j] = moved(own[k], fit.point[own[k]][j], _difference(own[k]), scales, j)
         points.append(point)
-    for name in shared:
-        points.append({**fit.point, name: fit.point[name] + DIFFERENCE})
+    points += [{**fit.point, name: fit.point[name] + DIFFERENCE} for name in shared]
     all_residuals = residuals(data, batch(points))
     now, out = all_residuals[0], []
     for j, own in enumerate(names):
@@ -116,10 +115,7 @@ def improve(data: Windows, fit: Fit, scales: Scales, iterations: int = 6) -> Fit
         trials = [_stepped(fit, names, now, slopes, damping, scales) for damping in DAMPINGS]
         left = residuals(data, batch(trials))
         costs = np.einsum("ptjw,ptjw->pj", left, left)
-        if fit.shared:
-            best = np.full(data.joints, int(costs.sum(1).argmin()))
-        else:
-            best = costs.argmin(0)
+        best = np.full(data.joints, int(costs.sum(1).argmin())) if fit.shared else costs.argmin(0)
         chosen = costs[best, np.arange(data.joints)]
         better = chosen < cost if not fit.shared else np.full(data.joints, chosen.sum() < cost.sum())
         point = {
@@ -181,5 +177,5 @@ def solve(
         right[index] -= weight * flat @ r
     diagonal = np.diag(normal).copy()
     normal[np.diag_indices(total)] += damping * diagonal + 1e-9 * max(float(diagonal.max(initial=0.0)), 1e-30)
-    step = np.linalg.solve(normal, right) if total else np.zeros(0)
+    step: Array = np.asarray(np.linalg.solve(normal, right)) if total else np.zeros(0)
     return [step[starts[j] : starts[j + 1]] for j in range(len(names))], step[starts[-1] :]

@@ -2,18 +2,22 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatch
+from pathlib import Path
 
 import numpy as np
 
+from armlink.errors import BadInput
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.closed_loop.columns import shared_effects, with_columns
-from sim_gap.closed_loop.compete import Search, select
+from sim_gap.closed_loop.compete import select
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of, starting_fit
-from sim_gap.closed_loop.export import Exported, exported, native_fit
 from sim_gap.closed_loop.fit import Fit, evaluate, improve
 from sim_gap.closed_loop.judge import Covariance, Stage, covariance, rms_on, stages
 from sim_gap.closed_loop.parameters import EFFECTS
+from sim_gap.closed_loop.search import Search
+from sim_gap.closed_loop.training.export import Exported, exported, native_fit
 from sim_gap.closed_loop.windows import Windows, thinned, windows_of
 from sim_gap.model.load import SimModel
 
@@ -58,12 +62,18 @@ def identify(
     labels: Sequence[str],
     withhold: Sequence[str],
     progress: Callable[[str], None],
+    gains: Sequence[str] = (),
 ) -> Identified:
-    """Fit controller and effects to `train` and judge them on `heldout`; `labels` name both, train first."""
+    """Fit controller and effects to `train` and judge them on `heldout`; `labels` name both, train first.
+
+    `gains` are `RECORDING=VALUE`, the controller's gain in recordings that differ in it. Raises BadInput.
+    """
+    scale = gain_scales(gains, labels)
     progress("reading motion and model torques")
-    whole = thinned(windows_of(sim.arm, train, labels[: len(train)]), FITTED)
+    whole = thinned(windows_of(sim.arm, train, labels[: len(train)], scales=scale[: len(train)]), FITTED)
     fitted = with_columns(whole)
-    judged = with_columns(thinned(windows_of(sim.arm, heldout, labels[len(train) :], fitted.dt), JUDGED))
+    other = windows_of(sim.arm, heldout, labels[len(train) :], fitted.dt, scale[len(train) :])
+    judged = with_columns(thinned(other, JUDGED))
     own = nominal_controller(sim)
     nominal = nominal_point(fitted, own)
     data = thinned(fitted, SEARCHED)
@@ -99,6 +109,31 @@ def identify(
         export=exported(sim, search, fit, native) if sim.path is not None else None,
         recordings=tuple(heldout),
     )
+
+
+def gain_scales(gains: Sequence[str], labels: Sequence[str]) -> list[float]:
+    """Each recording's gain over that of the first, from `RECORDING=VALUE` with names or patterns such as *kp100*.
+
+    Raises BadInput for a text that is none, a pattern without a recording, or a recording without a gain.
+    """
+    if not gains:
+        return [1.0] * len(labels)
+    found: dict[int, float] = {}
+    for text in gains:
+        pattern, _, number = text.rpartition("=")
+        try:
+            value = float(number)
+        except ValueError:
+            value = 0.0
+        if not pattern or not np.isfinite(value) or value <= 0.0:
+            raise BadInput(f"--gain {text}: expected RECORDING=VALUE with a value above 0, such as *kp100*=100")
+        hits = [i for i, label in enumerate(labels) if fnmatch(label, pattern) or fnmatch(Path(label).name, pattern)]
+        if not hits:
+            raise BadInput(f"--gain {text}: no recording of that name: {', '.join(labels)}")
+        found |= dict.fromkeys(hits, value)
+    if missing := [label for i, label in enumerate(labels) if i not in found]:
+        raise BadInput(f"--gain: none given for {missing[0]}: state the gain of every recording")
+    return [found[i] / found[0] for i in range(len(labels))]
 
 
 def _bare(search: Search, complete: bool) -> Fit:

@@ -6,14 +6,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gcomp.arrays import Array
+from sim_gap.closed_loop.candidates import ranked
 from sim_gap.closed_loop.columns import UNIT, shared_effects
-from sim_gap.closed_loop.compete import PRICE, Search, effect_there, ranked, with_effect, without
 from sim_gap.closed_loop.fit import LOGARITHMIC, Fit, evaluate, improve, jacobian, moved
 from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS
+from sim_gap.closed_loop.search import PRICE, Search, effect_there, with_effect, without
 from sim_gap.closed_loop.windows import Windows
 
 SYSTEMATIC = 0.02
 """Relative standard deviation of every parameter that no recording shows: sampling, command timing, the model's own."""
+LEAST_SHRINK = 0.05
+"""Least relative fall of a joint's held-out RMS by a cause; less is a minor one."""
 Group = tuple[str, tuple[int, ...]]
 """An effect with the joints that have it; no joints for one of the whole arm."""
 
@@ -23,7 +26,7 @@ def groups_of(fit: Fit, search: Search) -> list[Group]:
     own = [
         (effect, tuple(j for j in range(search.data.joints) if effect_there(fit, effect, j)))
         for effect in EFFECTS
-        if not (effect in search.kept and search.kept != {"controller.stiffness"} and EFFECTS[effect].controller)
+        if not (search.open_controller and effect in search.kept)
     ]
     return [group for group in own if group[1]] + [(effect, ()) for effect in shared_of(fit, search)]
 
@@ -74,27 +77,32 @@ class Stage:
 
 def stages(search: Search, fit: Fit, heldout: Windows) -> list[Stage]:
     """The groups in order of what each lowers when it is added to the nominal model and those above it."""
-    left = groups_of(fit, search)
+    groups = groups_of(fit, search)
     base = fit
-    for group in left:
+    for group in groups:
         base = taken_out(search, base, group)
     current = improve(search.data, base, search.scales, 4)
+    alone = [improve(search.data, _added(search, fit, current, group), search.scales, 3) for group in groups]
+    worth = [_worth(search, current, trial) for trial in alone]
     before, out = rms_on(heldout, current), []
-    while left:
-        trials = [improve(search.data, _added(search, fit, current, group), search.scales, 3) for group in left]
-        gains = [_worth(search, current, trial) for trial in trials]
-        best = int(np.argmax(gains))
-        group, current = left.pop(best), trials[best]
+    for group in [groups[i] for i in np.argsort(worth)[::-1]]:
+        current = improve(search.data, _added(search, fit, current, group), search.scales, 3)
         after = rms_on(heldout, current)
-        evidence, rivals = rivals_of(search, fit, group)
+        evidence, rivals = rivals_of(search, fit, group) if matters(before, after) else (0.0, ())
         out.append(Stage(group, before, after, evidence, rivals))
         before = after
     return out
 
 
+def matters(before: Array, after: Array) -> bool:
+    """Whether some joint's gap falls by a share that is worth naming."""
+    return bool(np.any(before - after > LEAST_SHRINK * before))
+
+
 def _worth(search: Search, current: Fit, trial: Fit) -> float:
     """Largest fall of a joint's RMS in units of what matters there, by a group."""
-    assert current.rms is not None and trial.rms is not None
+    assert current.rms is not None
+    assert trial.rms is not None
     fall = joint_rms(search.data, current.rms) - joint_rms(search.data, trial.rms)
     return float((fall / np.maximum(search.floor, 0.1 * search.scales.angle)).max())
 
@@ -132,7 +140,9 @@ def rivals_of(search: Search, fit: Fit, group: Group) -> tuple[float, tuple[str,
     for place in places:
         for _, other in ranked(search, bare, others)[place][:2]:
             trial = with_effect(search, bare, other, place)
-            only = replace(trial, active=tuple(own if k == place else () for k, own in enumerate(trial.active)), shared=())
+            only = replace(
+                trial, active=tuple(own if k == place else () for k, own in enumerate(trial.active)), shared=()
+            )
             score = search.score(improve(search.data, only, search.scales, 4))
             lost = float(score[place] - base[place]) if j >= 0 else float((score - base).sum())
             least = min(least, lost + max(loss - whole, 0.0))
@@ -151,9 +161,7 @@ _ALWAYS = {
 def _scale_rivals(search: Search, fit: Fit) -> tuple[str, ...]:
     """`actuator.rotor_inertia` if some joint's gain can be half as large again with all else fitted around it."""
     point = {name: x.copy() for name, x in fit.point.items()}
-    active = []
-    for own in fit.active:
-        active.append((*(n for n in own if n != "kp"), *(() if "armature" in own else ("armature",))))
+    active = [tuple(dict.fromkeys((*(n for n in own if n != "kp"), "armature"))) for own in fit.active]
     point["kp"] = point["kp"] * 1.5
     for name in ("coulomb", "viscous", "kd", "ki", "stribeck", "armature", "dead"):
         point[name] = point[name] * (1.5 if name != "dead" else 1.0)
@@ -203,7 +211,6 @@ def covariance(search: Search, fit: Fit) -> Covariance:
     matrix = inverse @ meat @ inverse * count / max(count - size / max(search.data.joints, 1), 1.0)
     own = np.array([1.0 if name in LOGARITHMIC else abs(_coordinate(search, fit, j, name)) for j, name in names])
     return Covariance(names, matrix + np.diag((SYSTEMATIC * own) ** 2))
-
 
 
 def _coordinate(search: Search, fit: Fit, joint: int, name: str) -> float:

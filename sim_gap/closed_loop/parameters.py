@@ -79,7 +79,9 @@ EFFECTS = {
         LoopEffect("actuator.rotor_inertia", ("armature",), ("inertia",)),
         LoopEffect("friction.coulomb", ("coulomb",), ("torque",)),
         LoopEffect("friction.viscous", ("viscous",), ("damping",)),
-        LoopEffect("friction.stribeck", ("stribeck", "stribeck_velocity"), ("breakaway", "velocity"), ("friction.coulomb",)),
+        LoopEffect(
+            "friction.stribeck", ("stribeck", "stribeck_velocity"), ("breakaway", "velocity"), ("friction.coulomb",)
+        ),
         LoopEffect("friction.load", ("load",), ("coefficient",)),
         LoopEffect("friction.asymmetric", ("asymmetry",), ("ratio",), ("friction.coulomb",)),
         LoopEffect("transmission.spring", ("spring", "offset"), ("stiffness", "torque")),

@@ -11,7 +11,7 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.closed_loop.windows import Windows
 
-CELLS = 40_000
+CELLS = 6_000
 """Most joints times windows times hypotheses that are simulated together, for the cache's sake."""
 Values = Mapping[str, Array]
 """Parameter → (P, J); the names are those of `parameters`, of `Windows.columns`, and `gain_of` (P, 1, W)."""
@@ -31,18 +31,19 @@ def simulate(data: Windows, values: Values) -> Array:
     return np.concatenate(parts) if len(parts) > 1 else parts[0]
 
 
-def _run(data: Windows, values: Values, count: int) -> Array:  # noqa: PLR0915 - one loop, unrolled for speed
+def _run(data: Windows, values: Values, count: int) -> Array:
     shape = (count, data.joints, data.count)
     dt, steps = data.dt, len(data.command)
     given = {
-        name: np.ascontiguousarray(np.broadcast_to(x[:, :, None], (count, data.joints, 1))) for name, x in values.items()
+        name: np.ascontiguousarray(np.broadcast_to(x[:, :, None], (count, data.joints, 1)))
+        for name, x in values.items()
     }
     active = {name for name, x in given.items() if np.any(x != 0.0)}
 
     def of(name: str, neutral: float = 0.0) -> Array:
         return given[name] if name in given else np.full((1, 1, 1), neutral)
 
-    kp, kd, ki = of("kp"), of("kd"), of("ki")
+    kp, kd, ki = (of(name) * data.scale if np.any(data.scale != 1.0) else of(name) for name in ("kp", "kd", "ki"))
     armature, viscous, gain = of("armature"), of("viscous"), of("gain", 1.0)
     coulomb, asymmetry = of("coulomb"), of("asymmetry")
     limit, slew = of("limit", np.inf), of("slew", np.inf)

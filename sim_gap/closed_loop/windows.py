@@ -7,17 +7,17 @@ terms is taken at the recorded motion.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from armlink.errors import BadInput
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
+from sim_gap.closed_loop.tracks import Track, period_of, track_of
 from sim_gap.model.rigid_body import RigidArm
-from sim_gap.residuals.resampling import bridged, coverage, low_pass
 
 STEP_S = 0.0051
 """Longest step of the simulation [s]; the recording's period is a multiple of the step."""
@@ -25,10 +25,6 @@ WINDOW_S, WARM_S = 6.0, 1.5
 """Judged length of a window, and the simulated time before it that is not judged [s]."""
 JUDGED_HZ = 50.0
 """Highest rate at which simulated and measured positions are compared [Hz]."""
-SMOOTH_HZ, SMOOTH_SHARE = 15.0, 0.16
-"""Pass band of the recorded motion: at most this, and this share of the recording's rate [Hz]."""
-MODEL_HZ = 30.0
-"""Rate at which the model's torques are computed [Hz]; they are interpolated between."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +70,8 @@ class Windows:
     """Torque that the links need there, less the feed-forward's, (2, J, W) [N·m]: without, with it."""
     recording: NDArray[np.intp]
     """Number of the recording from 0 of each window, (W,)."""
+    scale: Array
+    """The controller's gains in each window over those in the first recording, (W,)."""
     period: float
     """Longest sampling period of the recordings [s]."""
     time: Array
@@ -97,122 +95,34 @@ class Windows:
         return int(self.command.shape[2])
 
 
-@dataclass(frozen=True, eq=False)
-class Track:
-    """One recording on the even time base of the simulation, (K, n) each."""
+def windows_of(
+    arm: RigidArm,
+    recordings: Sequence[Recording],
+    labels: Sequence[str],
+    step: float = 0.0,
+    scales: Sequence[float] = (),
+) -> Windows:
+    """Cut recordings into windows. Raises BadInput for one that holds no commanded position.
 
-    t: Array
-    signals: dict[str, Array]
-    seen: Array
-    period: float
-
-
-def windows_of(arm: RigidArm, recordings: Sequence[Recording], labels: Sequence[str], step: float = 0.0) -> Windows:
-    """Cut recordings into windows. Raises BadInput for one that holds no commanded position."""
-    period = max(_period(recording) for recording in recordings)
-    dt = step or min(_period(r) / math.ceil(_period(r) / STEP_S - 1e-6) for r in recordings)
+    `step` is the simulation's [s], by default a whole fraction of the recordings' period; `scales` are the controller's
+    gains in each recording relative to the first, by default 1.
+    """
+    period = max(period_of(recording) for recording in recordings)
+    dt = step or min(period_of(r) / math.ceil(period_of(r) / STEP_S - 1e-6) for r in recordings)
     stride = max(1, math.ceil(max(period, 1.0 / JUDGED_HZ) / dt - 1e-6))
     warm, length = (stride * round(s / dt / stride) for s in (WARM_S, WINDOW_S))
     parts: list[dict[str, Array]] = []
     for number, (recording, label) in enumerate(zip(recordings, labels, strict=True)):
-        track = _track(arm, recording, label, dt)
+        track = track_of(arm, recording, label, dt)
         parts += _cut(arm, track, number, warm, length, stride)
-    stacked = {name: np.stack([part[name] for part in parts], axis=-1) for name in parts[0]}
-    stacked["recording"] = stacked["recording"].astype(np.intp)
-    return Windows(dt=dt, stride=stride, warm=warm, period=period, arm=arm, **stacked)
-
-
-def _period(recording: Recording) -> float:
-    return float(np.median(np.diff(recording.t)))
-
-
-def _track(arm: RigidArm, recording: Recording, label: str, dt: float) -> Track:
-    """Motion, command and the model's torques along both, on an even time base."""
-    if recording.position_command is None or not np.isfinite(recording.position_command).any():
-        raise BadInput(f"{label}: neither a torque channel nor a commanded position: record tau_1 … or q_cmd_1 …")
-    period = _period(recording)
-    t = np.arange(recording.t[0], recording.t[-1], dt)
-    raw = bridged(recording.t, recording.position, t, label, "q")
-    cut = min(SMOOTH_HZ, SMOOTH_SHARE / period, 0.4 / dt)
-    smooth = low_pass(cut, 1.0 / dt)
-    q = smooth(raw)
-    v = np.gradient(q, dt, axis=0)
-    a = np.gradient(v, dt, axis=0)
-    held, served = held_command(recording, t, dt)
-    path = smooth(held)
-    speed = np.gradient(path, dt, axis=0)
-    push = np.gradient(speed, dt, axis=0)
-    rough = max(1, round(1.0 / (MODEL_HZ * dt)))
-
-    def along(torque: Callable[..., Array], *motion: Array) -> Array:
-        """A torque of the model at a lower rate, interpolated."""
-        few = torque(*(x[::rough] for x in motion))
-        return np.column_stack([np.interp(t, t[::rough], column) for column in few.T])
-
-    still = np.zeros_like(q)
-    gravity = along(arm.torque, q, still, still)
-    own = along(lambda x: np.hstack(_own_terms(arm, x)), q)
-    inertia, slope = own[:, : arm.n], own[:, arm.n :]
-    whole = along(arm.torque, q, v, a)
-    needed = whole + arm.nominal_joint_torque(q, v, a, still)
-    return Track(
-        t,
-        {
-            "command": held,
-            "served": served,
-            "speed": speed,
-            "recorded": q,
-            "inertia": np.maximum(inertia, 1e-7),
-            "gravity": gravity,
-            "slope": slope,
-            "coupling": whole - gravity - inertia * a,
-            "load": np.abs(low_pass(min(3.0, 0.4 / dt), 1.0 / dt)(whole)),
-            "feed": along(arm.torque, path, speed, push) + arm.nominal_joint_torque(path, speed, push, np.tanh(speed / 0.02)),
-            "feed_gravity": along(arm.torque, path, still, still),
-            "q": q,
-            "v": v,
-            "a": a,
-            "needed": needed,
-            "raw": raw,
-        },
-        coverage(recording.t, recording.position, t),
-        period,
+    number_of = np.array([part["recording"] for part in parts], dtype=np.intp)
+    stacked: dict[str, Array] = {
+        name: np.stack([part[name] for part in parts], axis=-1) for name in parts[0] if name != "recording"
+    }
+    scale = np.array([*scales] or [1.0] * len(recordings), float)[number_of]
+    return Windows(
+        dt=dt, stride=stride, warm=warm, period=period, arm=arm, recording=number_of, scale=scale, columns={}, **stacked
     )
-
-
-def _own_terms(arm: RigidArm, q: Array) -> tuple[Array, Array]:
-    """M_jj and the derivative of gravity's torque with respect to the joint's own angle, (K, n) each."""
-    still, step = np.zeros_like(q), 1e-4
-    gravity = arm.torque(q, still, still)
-    slope, inertia = np.empty_like(q), np.empty_like(q)
-    for j in range(arm.n):
-        ahead, unit = q.copy(), still.copy()
-        ahead[:, j] += step
-        unit[:, j] = 1.0
-        slope[:, j] = (arm.torque(ahead, still, still)[:, j] - gravity[:, j]) / step
-        inertia[:, j] = arm.torque(q, still, unit, np.zeros(3))[:, j]
-    return inertia, slope
-
-
-def held_command(recording: Recording, t: Array, dt: float) -> tuple[Array, Array]:
-    """Mean of the command over each step from t to t + dt, held from row to row; 1 where there is one, else 0."""
-    given = recording.position_command
-    assert given is not None
-    last = np.clip(np.searchsorted(recording.t, t + 1e-9, side="right") - 1, 0, len(recording.t) - 1)
-    served = np.isfinite(given[last]).astype(float)
-    filled = given.copy()
-    for j in range(filled.shape[1]):
-        there = np.isfinite(filled[:, j])
-        order = np.maximum.accumulate(np.where(there, np.arange(len(there)), 0))
-        filled[:, j] = filled[order, j] if there.any() else 0.0
-        first = int(np.argmax(there))
-        filled[:first, j] = filled[first, j]
-    span = np.diff(recording.t, append=recording.t[-1] + dt)
-    area = np.concatenate([np.zeros((1, filled.shape[1])), np.cumsum(filled * span[:, None], axis=0)])
-    ends = np.append(recording.t, recording.t[-1] + dt)
-    edges = np.append(t, t[-1] + dt)
-    whole = np.column_stack([np.interp(edges, ends, column) for column in area.T])
-    return np.diff(whole, axis=0) / dt, served
 
 
 def _cut(arm: RigidArm, track: Track, number: int, warm: int, length: int, stride: int) -> list[dict[str, Array]]:
@@ -253,7 +163,7 @@ def thinned(data: Windows, count: int) -> Windows:
     if data.count <= count:
         return data
     chosen = np.unique(np.linspace(0, data.count - 1, count).round().astype(int))
-    values = {name: x[..., chosen] for name, x in vars(data).items() if isinstance(x, np.ndarray)}
+    values: dict[str, Any] = {name: x[..., chosen] for name, x in vars(data).items() if isinstance(x, np.ndarray)}
     return replace(data, **values, columns={name: x[..., chosen] for name, x in data.columns.items()})
 
 
@@ -261,5 +171,5 @@ def of_joints(data: Windows, joints: Sequence[int]) -> Windows:
     """The windows of some joints."""
     chosen = list(joints)
     arrays = {name: x for name, x in vars(data).items() if isinstance(x, np.ndarray) and x.ndim >= 2}
-    values = {name: x[..., chosen, :] for name, x in arrays.items()}
+    values: dict[str, Any] = {name: x[..., chosen, :] for name, x in arrays.items()}
     return replace(data, **values, columns={name: x[:, chosen] for name, x in data.columns.items()})

@@ -46,12 +46,12 @@ def bench(
         raise BadInput(f"--json {json}: its folder does not exist: create it first")
     console = Console(stderr=True)
     with TemporaryDirectory(prefix="armlink-bench-") as scratch, Progress(console=console) as bars:
-        known: dict[str, TaskID] = {}
+        stages: dict[str, TaskID] = {}
 
         def progress(stage: str, done: int, total: int) -> None:
-            if stage not in known:
-                known[stage] = bars.add_task(stage, total=total)
-            bars.update(known[stage], completed=done)
+            if stage not in stages:
+                stages[stage] = bars.add_task(stage, total=total)
+            bars.update(stages[stage], completed=done)
 
         if real is not None:
             result = run_real(real, out or Path(scratch), known or KNOWN, progress)

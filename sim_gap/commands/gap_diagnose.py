@@ -43,6 +43,14 @@ def diagnose(
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write the result here; - is standard output.")] = None,
     report: Annotated[Path | None, typer.Option(help="Write a self-contained HTML report here.")] = None,
+    gain: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="REC=VALUE",
+            help="Gain of the position controller in a recording (patterns allowed), in any unit; only if there is no "
+            "torque channel and recordings differ in it.",
+        ),
+    ] = None,
     samples: Annotated[
         int, typer.Option(min=0, help="Number of draws of all parameters to write, for domain randomisation.")
     ] = 0,
@@ -94,6 +102,7 @@ def diagnose(
             labels=[*fitted, *judged],
             stated=stated,
             groups=group or (),
+            gains=gain or (),
             progress=lambda stage: _progress(console, status, stage),
         )
     for name, recording in {**fitted, **judged}.items():
@@ -124,7 +133,7 @@ def _progress(console: "Console", status: "Status", stage: str) -> None:
 def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: "Console") -> None:
     from armlink.errors import BadInput
     from sim_gap.closed_loop.identify import Identified
-    from sim_gap.closed_loop.posterior import write_samples
+    from sim_gap.closed_loop.training.posterior import write_samples
 
     if not isinstance(answer.internals, Identified):
         raise BadInput("--samples: draws are made where no recording has a torque channel (q_cmd and q): leave it out")
@@ -135,7 +144,7 @@ def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: 
 
 def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
     if answer.unit == "rad":
-        from sim_gap.closed_loop.posterior import write_exported
+        from sim_gap.closed_loop.training.posterior import write_exported
 
         for line in write_exported(answer.internals, path):
             console.print(f"not in MJCF: {line}", style="yellow", markup=False)

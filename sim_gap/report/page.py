@@ -11,6 +11,7 @@ from sim_gap.report.cause_figures import cause_figure
 from sim_gap.report.effect_text import advice, sentence
 from sim_gap.report.figures import gap_bars, residual_panels, rollout_bars
 from sim_gap.report.law_figure import law_figure
+from sim_gap.report.position_page import position_sections
 
 WORDS = {
     "explained": "explained",
@@ -23,6 +24,8 @@ WORDS = {
 
 def sections(answer: Diagnosis) -> list[Section]:
     """Sections for a separate page or for a part of another report."""
+    if answer.unit == "rad":
+        return position_sections(answer)
     out = [_verdict(answer), _gap(answer)]
     if answer.internals is not None:
         out += [*_causes(answer), *_laws(answer), *_residuals(answer)]

@@ -153,6 +153,11 @@ class Signals:
         """1 if a joint moves faster than the creeping speed, (K, n)."""
         return (np.abs(self.v) > CREEP).astype(float)
 
+    def release(self) -> None:
+        """Free what is large and can be computed again."""
+        for name in ("regressor", "gravity_columns", "_sensitivities"):
+            self.__dict__.pop(name, None)
+
     @property
     def step(self) -> int:
         """Decimation from the work rate to the rate of the comparison."""

@@ -99,6 +99,18 @@ class ColumnStore:
         """Each recording about the estimate."""
         return [about(s, self.data.layout, self.values) for s in self.data.signals]
 
+    def release(self) -> None:
+        """Free what the columns were computed from, apart from what belongs to the recordings as they were read."""
+        for one in self.__dict__.get("about", ()):
+            if one.signals.found is not None:
+                one.signals.release()
+
+    def keep(self, terms: Collection[Term]) -> None:
+        """Forget the columns of all other terms; they are evaluated again when they are asked for."""
+        kept = {*terms}
+        self._columns = {term: x for term, x in self._columns.items() if term in kept}
+        self._offsets = {term: x for term, x in self._offsets.items() if term in kept}
+
     def columns(self, term: Term) -> Columns:
         """Columns per row, (K, p) each; rows that the term does not touch are absent."""
         if term not in self._columns:

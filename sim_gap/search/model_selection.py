@@ -18,25 +18,39 @@ from sim_gap.search.term import Term
 
 def select_model(store: ColumnStore, library: Sequence[str]) -> Search:
     """Search the library, refine the shapes of the selected terms, and drop those that no longer earn their place."""
-    offered = candidates(store.data, library)
-    first = Search(NormalEquations(store, offered))
-    first.run()
-    first = without_doubtful(first)
-    offered = likely_shapes(first)
-    chosen = refine(store, one_each([canonical(term) for term in first.active]))
+    offered, active = first_search(store, library)
+    store.keep(offered)
+    chosen = refine(store, one_each([canonical(term) for term in active]))
     values: Values = {}
     near: ColumnStore | None = None
-    for _ in range(ROUNDS):
+    rounds = 0
+    for _ in range(MOST_ROUNDS):
         search = about_itself(store, chosen, offered, values, near)
         keys = {term.key for term in search.active}
+        gone = {term.key for term in chosen} - keys
+        if rounds == ROUNDS and not gone:
+            break
+        rounds += not gone
+        offered = [term for term in offered if term.key not in gone]  # it cannot exist about itself
+        search.added.update(dict.fromkeys(gone, TRIES))
         search.least = AGAIN
         search.run()
         if {term.key for term in search.active} == keys:
-            return search
+            break
         near = search.normal.store
         values = near.values
         chosen = one_each([canonical(term) for term in search.active])
-    return about_itself(store, chosen, offered, values, near)
+    search.normal.store.beside(None)  # frees the columns of the estimate before
+    return search
+
+
+def first_search(store: ColumnStore, library: Sequence[str]) -> tuple[list[Term], list[Term]]:
+    """The terms that are offered to the search about the estimate, and those that a search about the nominal model
+    selects."""
+    search = Search(NormalEquations(store, candidates(store.data, library)))
+    search.run()
+    search = without_doubtful(search)
+    return likely_shapes(search), search.active
 
 
 def about_itself(
@@ -72,8 +86,9 @@ AGAIN = -0.5 * float(np.log(1.0 - SYSTEMATIC**2))
 model has can mimic an effect up to the share SYSTEMATIC, and such an effect lowers ½ log R² by this."""
 SHAPES = 3
 """Number of shapes of an effect at one place that are evaluated about the estimate."""
-ROUNDS = 2
-"""How often the library is searched again about the estimate."""
+ROUNDS, MOST_ROUNDS = 2, 5
+"""How often the library is searched again about the estimate; more often where terms of a search turn out to be
+impossible about themselves."""
 
 
 def candidates(data: ResidualSet, library: Sequence[str]) -> list[Term]:

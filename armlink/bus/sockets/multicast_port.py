@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from armlink.bus.port import CLASSICAL, ERROR, REMOTE, Frame
 from armlink.bus.sockets.datagram_port import NAME, NOT_OURS, Batch, DatagramPort
 from armlink.bus.sockets.multicast_frames import LONGEST, Decoder, encode
+from armlink.bus.sockets.stamped_port import Stamping
 from armlink.errors import BusFault, Stall
 
 _IP_MULTICAST_ALL, _IPV6_MULTICAST_ALL = 49, 29
@@ -76,6 +77,10 @@ class MulticastPort(DatagramPort):
                     self._fd = found[2]
                 frames.append(found[:2])
         return frames
+
+
+class StampedMulticastPort(Stamping, MulticastPort):
+    """With the kernel's timestamps, for listeners."""
 
 
 def _connect(name: str, family: int, group: tuple[str, int], hop_limit: int) -> socket.socket:

@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 from armlink.arm_file import ArmFile, LinkJoint
+from armlink.bus.frame_bits import longest_frame_bits
 from armlink.bus.port import Frame
 from armlink.drives.board import NO_STATUS, Board, Event
 from armlink.drives.canopen import controller_setup as device
@@ -18,7 +19,7 @@ from armlink.drives.canopen.cia402 import Control, State, next_control, set_poin
 from armlink.drives.canopen.eds_file import of_joints
 from armlink.drives.canopen.host_frames import HostFrames
 from armlink.drives.canopen.object_dictionary import Entry
-from armlink.drives.canopen.pdo import RPDO1, RPDO2, TPDO1, TPDO2, TPDO3
+from armlink.drives.canopen.pdo import RPDO1, RPDO2, STATUS_DECIMATION, TPDO1, TPDO2, TPDO3
 from armlink.drives.canopen.profile import Profile, examine, profile_of
 from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork, joint_services
 from armlink.drives.canopen.units import Units, assumed_units, read_units
@@ -158,6 +159,12 @@ class CanopenDrives:
     def intrusion(self, can_id: int, data: bytes) -> str:
         """See Drives: what only a host sends, and SDO requests that write, but of settings and calibration."""
         return self._host_frames(can_id, data)
+
+    def cycle_bits(self) -> float:
+        """See Drives: RPDO1 and TPDO1 in every cycle, TPDO2 in every fourth, SYNC."""
+        each = sum(longest_frame_bits(pdo.layout.size) for pdo in (RPDO1, TPDO1))
+        slow = longest_frame_bits(TPDO2.layout.size) / STATUS_DECIMATION
+        return self.m * (each + slow) + longest_frame_bits(0)
 
     def cycle_ids(self) -> frozenset[int]:
         """See Drives."""

@@ -27,6 +27,9 @@ from armlink.errors import BadInput, BusFault, Stall
 TURN = 2 * math.pi
 TRAITS = Traits(torque="current", calibration="host", silence="damps", bounds=("torque",), cadence="reply", frame="fd")
 HOMED_AT_OUTPUT = 2
+NOMINAL_BITS, FAST_BITS, FASTER = 60, 40, 5
+"""Bits of a CAN FD frame at the nominal rate (29-bit identifier, end) and besides the payload at the fast one, and how
+many times faster that is."""
 LARGEST_POSITION = 1e4
 """No joint's position is larger [rev]; a larger one is no reading."""
 FAULTS = {
@@ -91,6 +94,11 @@ class MoteusDrives(BasicDrives):
             for settings, name in zip(self._settings, self.names, strict=True)
             for head in range(0x100)
         }
+
+    def cycle_bits(self) -> float:
+        """See Drives: identifiers at the nominal rate, the rest five times as fast."""
+        payload = CYCLE_COMMAND.size + CYCLE_REPLY.size
+        return self.m * (2 * NOMINAL_BITS + (8 * payload + 2 * FAST_BITS) * 1.25 / FASTER)
 
     def poll(self, first: bool) -> list[Frame]:
         """Queries alone."""
@@ -207,7 +215,7 @@ class MoteusDrives(BasicDrives):
             Register.MODE: frames.Mode.POSITION,
             Register.COMMAND_POSITION: order.position / TURN if stiff else math.nan,
             Register.COMMAND_VELOCITY: order.velocity / TURN if stiff else 0.0,
-            Register.COMMAND_TORQUE: _float_within(order.torque, most),
+            Register.COMMAND_TORQUE: 0.0 if stiff else _float_within(order.torque, most),
             Register.COMMAND_KP_SCALE: stiff,
             Register.COMMAND_KD_SCALE: stiff,
             Register.COMMAND_MAX_TORQUE: _float_within(most, most),

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from armlink.arm_file import ArmFile, LinkJoint
+from armlink.bus.frame_bits import longest_frame_bits
 from armlink.bus.port import REMOTE, Frame
 from armlink.drives.base import BasicDrives, no_order
 from armlink.drives.family import Ask
@@ -90,6 +91,10 @@ class ODriveDrives(BasicDrives):
             for node, joint in self._joint_of.items()
             for message in FROM_HOST
         }
+
+    def cycle_bits(self) -> float:
+        """See Drives: the input, and estimates and torques as often."""
+        return 3 * self.m * longest_frame_bits(8)
 
     def reading_ids(self) -> Mapping[int, int]:
         """See Drives."""

@@ -145,9 +145,9 @@ class ArmLoop:
         if isinstance(source, Listener):
             heard = tuple(source.emergencies)
             source.emergencies.clear()
-            messages: list[Message] = [Batch.of(rows, source.stats, heard)] if rows else []
+            messages: list[Message] = [Batch.of(rows, source.stats, heard, source.temperatures)] if rows else []
             return messages + self._silence(source, bool(rows))
-        messages = [Batch.of(rows, source.stats)]
+        messages = [Batch.of(rows, source.stats, temperature=source.temperatures)]
         if self._tour is not None and self._tour[0] != self._reported:
             self._reported = self._tour[0]
             messages.append(Progress(*self._tour))

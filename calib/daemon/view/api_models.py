@@ -102,7 +102,7 @@ class JointNow(Answer):
     residual: float | None
     """Torque minus model torque [N·m]; meaningful at rest."""
     state: str
-    """CiA 402 state in words; "unknown" before the first status word."""
+    """State of the drive in words; "unknown" before its first reading."""
     sample_age_s: float | None
     """Time since position and torque last arrived; None if they never did."""
 

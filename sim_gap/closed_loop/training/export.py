@@ -8,9 +8,9 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.better_model.with_effects import mujoco_quaternion, possible, spec_of, split
 from sim_gap.closed_loop.columns import turns
-from sim_gap.closed_loop.compete import Search, effect_there, without
 from sim_gap.closed_loop.fit import Fit, improve
 from sim_gap.closed_loop.parameters import EFFECTS
+from sim_gap.closed_loop.search import Search, effect_there, without
 from sim_gap.model.load import SimModel
 from sim_gap.model.rigid_body import inertial_of
 
@@ -29,8 +29,13 @@ NATIVE = {
     "base.tilt": "option gravity",
 }
 """Effects that a field of MJCF holds."""
+STICKS = {"solref_friction": [0.01, 1.0], "solimp_friction": [0.999, 0.9999, 0.001, 0.5, 2.0]}
+"""Solver parameters with which a joint under friction rests; with MuJoCo's usual ones it creeps to where no friction is
+needed, within a tenth of a second on a small arm."""
 LEAST_DELAY_S = 0.001
 MOST_SAMPLES = 1000
+POSITION_INPUT = 1
+"""MuJoCo's code of an actuator whose only input is a position."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +55,9 @@ def native_fit(search: Search, fit: Fit) -> Fit:
         for j in range(search.data.joints):
             if effect_there(fit, effect, j):
                 bare = without(search, bare, effect, j)
-    for name in ("kd", "feed"):
-        bare.point[name] = np.zeros(search.data.joints)
+    bare = bare.with_values(kd=np.zeros(search.data.joints), feed=np.zeros(search.data.joints))
+    dry = fit.point["stribeck"] + fit.point["load"] * search.data.load.mean(axis=(0, 2))
+    bare = bare.with_values(coulomb=np.maximum(bare.point["coulomb"], fit.point["coulomb"] + dry))
     wanted = [(*own, *(n for n in ("coulomb", "viscous") if n not in own)) for own in bare.active]
     changed = bare.active != fit.active or any(np.any(fit.point[n] != 0.0) for n in ("kd", "feed"))
     if not changed:
@@ -84,7 +90,9 @@ def exported(sim: SimModel, search: Search, fit: Fit, native: Fit) -> Exported:
     spec.option.integrator = _implicit()
     spec.compile()
     note = "".join(f"\n  {line}" for line in left)
-    comment = f"<!-- Left out, MJCF has no field for them (the rest was fitted without them):{note}\n-->\n" if left else ""
+    comment = (
+        f"<!-- Left out, MJCF has no field for them (the rest was fitted without them):{note}\n-->\n" if left else ""
+    )
     return Exported(comment + spec.to_xml(), tuple(left))
 
 
@@ -96,6 +104,7 @@ def _implicit() -> Any:
 
 def _set_joint(joint: Any, fit: Fit, j: int) -> None:
     joint.frictionloss, joint.armature = float(fit.point["coulomb"][j]), float(fit.point["armature"][j])
+    joint.solref_friction, joint.solimp_friction = STICKS["solref_friction"], STICKS["solimp_friction"]
     joint.damping[0] = float(fit.point["viscous"][j])
     stiffness = float(fit.point["spring"][j])
     if stiffness > 1e-9:
@@ -109,14 +118,20 @@ def _set_actuator(spec: Any, joint: str, fit: Fit, j: int, search: Search, compi
 
     old = [a for a in spec.actuators if a.target == joint and a.trntype == mujoco.mjtTrn.mjTRN_JOINT]
     name = old[0].name if old else f"position_{joint}"
-    control = list(old[0].ctrlrange) if old and old[0].ctrllimited == 1 else None
+    control = list(old[0].ctrlrange) if old and old[0].ctrlrange[0] < old[0].ctrlrange[1] else None
     for actuator in old:
         spec.delete(actuator)
     made = spec.add_actuator(name=name, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     kp, ki = (float(fit.point[name][j] * fit.point["gain"][j]) for name in ("kp", "ki"))
     slew = float(fit.point["slew"][j])
     if ki > 0.0 or np.isfinite(slew):
-        made.set_to_pid(kp=kp, kv=0.0, **({"ki": ki} if ki > 0.0 else {}), **({"slewmax": slew} if np.isfinite(slew) else {}))
+        made.set_to_pid(
+            kp=kp,
+            kv=0.0,
+            ctrlspec=POSITION_INPUT,
+            **({"ki": ki} if ki > 0.0 else {}),
+            **({"slewmax": slew} if np.isfinite(slew) else {}),
+        )
     else:
         made.set_to_position(kp=kp, kv=0.0)
     limit = float(fit.point["limit"][j])
@@ -134,7 +149,9 @@ def _link_changes(search: Search, fit: Fit) -> dict[int, Array]:
     """Change of the ten inertial parameters of each link, about its joint and in its frame."""
     n = search.data.joints
     changes: dict[int, Array] = {}
-    payload = [float(fit.point[f"payload.{p}"][0]) if f"payload.{p}" in fit.shared else 0.0 for p in ("mass", "x", "y", "z")]
+    payload = [
+        float(fit.point[f"payload.{p}"][0]) if f"payload.{p}" in fit.shared else 0.0 for p in ("mass", "x", "y", "z")
+    ]
     if any(payload):
         mass, moment = payload[0], np.array(payload[1:])
         centre = moment / mass if abs(mass) > 1e-6 else np.zeros(3)

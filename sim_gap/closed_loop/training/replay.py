@@ -63,6 +63,9 @@ def _commanded(recording: Recording) -> int:
 
 
 def _actuator(model: Any, joint: int) -> int:
-    """Index of the actuator that drives a joint."""
-    own = np.flatnonzero(model.actuator_trnid[:, 0] == joint)
-    return int(own[0])
+    """Place in `ctrl` of the position command of the actuator that drives a joint."""
+    import mujoco
+
+    own = (model.actuator_trnid[:, 0] == joint) & (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
+    index = int(np.flatnonzero(own)[0])
+    return int(np.reshape(getattr(model, "actuator_ctrladr", np.arange(model.nu)), -1)[index])

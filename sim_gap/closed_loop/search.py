@@ -1,0 +1,110 @@
+"""What the competition of effects works on, and an effect put into a fit or taken out of it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gcomp.arrays import Array
+from sim_gap.closed_loop.fit import Fit
+from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS, Scales
+from sim_gap.closed_loop.windows import Windows
+
+INDEPENDENT_S = 0.5
+"""Time over which residuals are correlated [s]."""
+PRICE = 4.0
+"""Fall of the score that a parameter has to pay for."""
+LEAST_FALL = 0.025
+"""Least relative fall of a joint's RMS by an effect."""
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """What the competition works on."""
+
+    data: Windows
+    scales: Scales
+    nominal: dict[str, Array]
+    """Parameters of the nominal model, to which one returns that is taken out, (J,) each."""
+    floor: Array
+    """RMS below which nothing can be seen, per joint (J,) [rad]."""
+    excluded: frozenset[str] = frozenset()
+    """Effects that do not take part."""
+    kept: frozenset[str] = frozenset({"controller.stiffness"})
+    """Effects that are not taken out."""
+    open_controller: bool = False
+    """Whether the nominal model has no controller, so that the fitted one is no cause of a gap."""
+
+    def score(self, fit: Fit) -> Array:
+        """Half the logarithm of the mean square, times independent samples, per joint (J,); less is better."""
+        assert fit.rms is not None
+        count = self.data.weight.sum(0)
+        mean = (fit.rms**2 * count).sum(1) / np.maximum(count.sum(1), 1.0)
+        return np.asarray(0.5 * self.samples * np.log(mean + self.floor**2))
+
+    @property
+    def samples(self) -> Array:
+        """Independent samples of each joint, (J,)."""
+        judged = self.data.weight.sum(0).sum(1) * self.data.stride * self.data.dt
+        return np.asarray(judged / INDEPENDENT_S)
+
+
+def price(search: Search, count: int) -> Array:
+    """Least fall of the score for `count` more parameters, per joint (J,)."""
+    return np.asarray(np.maximum(PRICE * count, search.samples * LEAST_FALL))
+
+
+def with_effect(search: Search, fit: Fit, effect: str, joint: int) -> Fit:
+    """The fit with an effect at one joint, at the size at which it is tried."""
+    names = EFFECTS[effect].parameters
+    active = list(fit.active)
+    active[joint] = (*active[joint], *names)
+    point = {name: values.copy() for name, values in fit.point.items()}
+    for name in names:
+        if not np.isfinite(point[name][joint]) or point[name][joint] == PARAMETERS[name].neutral:
+            point[name][joint] = start_of(search, name, joint)
+    return replace(fit, active=tuple(active), point=point, rms=None)
+
+
+def start_of(search: Search, name: str, joint: int) -> float:
+    """Value at which a parameter enters a fit."""
+    if name == "slew":
+        return 0.8 * float(np.abs(search.data.speed[:, joint]).max())
+    if name in ("stribeck_velocity", "gain"):
+        return PARAMETERS[name].neutral
+    return float(np.clip(search.scales.of(name)[joint], PARAMETERS[name].low, PARAMETERS[name].high))
+
+
+def without(search: Search, fit: Fit, effect: str, joint: int) -> Fit:
+    """The fit without an effect at one joint: its parameters are those of the nominal model."""
+    names = EFFECTS[effect].parameters
+    point = {name: values.copy() for name, values in fit.point.items()}
+    for name in names:
+        point[name][joint] = search.nominal[name][joint]
+    active = list(fit.active)
+    active[joint] = tuple(name for name in active[joint] if name not in names)
+    return replace(fit, point=point, active=tuple(active), rms=None)
+
+
+def effect_there(fit: Fit, effect: str, joint: int) -> bool:
+    """Whether a joint has an effect among its fitted parameters."""
+    return EFFECTS[effect].parameters[0] in fit.active[joint]
+
+
+def effects_at(fit: Fit, joint: int) -> list[str]:
+    """Effects that are fitted at a joint."""
+    return [effect for effect in EFFECTS if effect_there(fit, effect, joint)]
+
+
+def only(fit: Fit, tried: dict[int, str]) -> Fit:
+    """The fit with the parameters of other joints held."""
+    return replace(fit, active=tuple(own if j in tried else () for j, own in enumerate(fit.active)), shared=())
+
+
+def merged(fit: Fit, other: Fit, joint: int) -> Fit:
+    """The fit with one joint's parameters from another."""
+    point = {name: values.copy() for name, values in fit.point.items()}
+    for name in point:
+        point[name][joint] = other.point[name][joint]
+    active = list(fit.active)
+    active[joint] = other.active[joint]
+    return replace(fit, point=point, active=tuple(active), rms=None)
