@@ -2,10 +2,10 @@
 PYTHON ?= python3
 BIN := .venv/bin
 export PYTHON
-CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host daemon_days daemon_kills fuzz_frames fuzz_drives kill_drives web
+CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host daemon_days daemon_kills fuzz_frames fuzz_drives fuzz_guard kill_drives web
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour
+.PHONY: help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep
 
 help: ## Say what can be done
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
@@ -52,6 +52,10 @@ observer: .venv/.dev ## Long campaign outside make test: the observer on arms th
 stalls: .venv/.dev ## Long campaign outside make test: sweeps while job, loop and arm are stopped, and on a busy machine
 	$(BIN)/python tests/campaigns/stalls.py $(ARGS)
 
+creep: .venv/.dev ## Long campaign outside make test: drawn arms without torque sensors (ARGS="--seeds 1 5 --no-steps")
+	$(BIN)/python tests/campaigns/creep_contacts.py
+	$(BIN)/python tests/campaigns/creep_arms.py $(ARGS)
+
 realism: .venv/.dev ## Long campaign outside make test: sensor fits of realistic arms, good and bad (ARGS="--seeds 1 5 --full")
 	$(BIN)/python tests/campaigns/realism.py $(ARGS)
 
@@ -64,8 +68,8 @@ blind: .venv/.dev ## Long campaign outside make test: the diagnosis against seal
 corruptions: .venv/.dev ## Long campaign outside make test: wrong columns, units and clocks in real recordings (ARGS="--draws 200")
 	$(BIN)/python tests/campaigns/corrupted_recordings.py $(ARGS)
 
-mutants: .venv/.dev ## Long campaign outside make test: each change of the gate's source must make a test fail
-	$(BIN)/python tests/campaigns/mutants.py $(ARGS)
+mutants: .venv/.dev ## Long campaign outside make test: changes of the source must make a test fail (MODULES="sim_gap/*/*.py" ARGS="--draw 50")
+	$(BIN)/python tests/campaigns/mutants.py $(if $(MODULES),--modules $(foreach each,$(MODULES),'$(each)')) $(ARGS)
 
 wheel: .venv/.dev ## Build the wheel into dist/ and run the demo from it in an empty environment (ARGS="python3.12 python3.13")
 	scripts/test-wheel $(ARGS)

@@ -181,6 +181,15 @@ class LinkJoint(Section):
         return self.drive if self.node is None else _parse_drive({"family": "canopen", "node": self.node})
 
 
+class Park(Section):
+    """Where the arm is stowed before drives that do not hold without their host lose their power."""
+
+    pose: tuple[FiniteFloat, ...]
+    """Position of every joint, in joint order [rad]: one in which the arm rests without power."""
+    speed: Positive = 0.2
+    """Speed of the fastest joint on the way there [rad/s]; no joint exceeds its max_velocity."""
+
+
 class LinkSection(Section):
     """The link: bus, rate and joint controllers in joint order."""
 
@@ -192,11 +201,19 @@ class LinkSection(Section):
     deadline: Annotated[FiniteFloat, Field(ge=0.01, le=10)] = 0.1
     """A joint that hears no command for this long goes to quick stop; a reading this old is a fault [s]."""
     joints: tuple[LinkJoint, ...]
+    park: Park | None = None
+    """Pose in which the arm is stowed; None: it is left where it stands."""
 
     @property
     def rated_torques(self) -> Array:
         """Rated torque of every joint (n,) [N·m]."""
         return np.array([joint.rated_torque for joint in self.joints])
+
+    @model_validator(mode="after")
+    def _park_names_every_joint(self) -> "LinkSection":
+        if self.park is not None and len(self.park.pose) != len(self.joints):
+            raise ValueError(f"park.pose has {len(self.park.pose)} positions, expected {len(self.joints)}: one a joint")
+        return self
 
     @model_validator(mode="after")
     def _nodes_are_unique(self) -> "LinkSection":
@@ -234,6 +251,11 @@ class ArmFile(Section):
         linked = [joint.name for joint in self.link.joints] if self.link else described
         if described and linked != described:
             raise ValueError(f"link.joints are {linked}, but kinematics.joints are {described}: same names, same order")
+        if described and self.link and self.link.park:
+            for joint, position in zip(self.kinematics.joints, self.link.park.pose, strict=True):
+                if not joint.lower <= position <= joint.upper:
+                    where = f"expected {joint.lower:g} to {joint.upper:g}"
+                    raise ValueError(f"link.park.pose: {joint.name}: {position:g} rad, {where}")
         return self
 
     @property

@@ -15,6 +15,8 @@ from armlink.loop.open import open_arm
 from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording
 from calib.arm.kinematics import gcomp_arm
+from calib.creep.choice import sweep_motion
+from calib.creep.run import run_creep
 from calib.fit.gravity_fit import GravityFit, identify_gravity
 from calib.fit.sensor_fit import SensorFit, fit_sensors
 from calib.observer.config import ObserverConfig
@@ -101,10 +103,11 @@ def sweep(
     Raises BadInput, Refused where the arm cannot be swept, BusFault.
     """
     arm_file = _arm(arm)
+    run = run_creep if sweep_motion(arm_file) == "creep" else run_sweep
     with open_link(arm_file, bus, simulated=simulated, load=reference_mass if simulated else 0.0) as link:
         link.start()
         link.enable()
-        return run_sweep(
+        return run(
             link, arm_file, Path(out), reference_mass=reference_mass, resume=resume, seed=seed, progress=progress
         )
 

@@ -7,6 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError,
 from armlink.arm_file import ArmFile, Positive, Section
 from armlink.errors import BadInput
 from armlink.key_errors import describe
+from sim_bus.effects.quasi_direct import QuasiDirect
 from sim_bus.effects.registry import check_entry
 
 Vector3 = Annotated[tuple[FiniteFloat, ...], Field(min_length=3, max_length=3)]
@@ -111,6 +112,8 @@ class SimSection(Section):
     """Which CiA 402 devices the joints have; default: ours, or a stock one if the arm file reads torque elsewhere."""
     realism: Realism = Realism(level=0.0)
     """Small troubles of a real arm, on top of `effects`."""
+    quasi_direct: QuasiDirect | None = None
+    """Torque constants, zeros, friction and warming of quasi-direct drives, drawn; on top of `effects`."""
     servo: Servo = Servo()
     stops: Stops = Stops()
     step: Annotated[FiniteFloat, Field(gt=0, le=0.005)] = 0.001

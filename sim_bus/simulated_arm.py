@@ -34,6 +34,8 @@ from sim_bus.truth import Truth
 
 DRIVE_ERROR = 0x21
 """Error register: generic and device profile."""
+WARMING_STEP = 1.0
+"""Torque constants of drives that warm up are brought up to date so often [s]."""
 TARGETS = {(0x6071, 0), (0x607A, 0), (0x60FF, 0)}
 
 
@@ -45,6 +47,7 @@ class SimulatedArm:
         section, link = sim_section(arm), arm.require_link()
         self.arm, self.truth, self.names, self.n = arm, truth, arm.joint_names, len(arm.joint_names)
         self.time = 0.0
+        self._seed, self._warmed = seed, 0.0
         self.outbox: deque[Frame] = deque()
         self.default_period = self._period = 1.0 / link.rate
         self._entries: tuple[EffectSetting, ...] = section.effects
@@ -81,7 +84,7 @@ class SimulatedArm:
         self.drives.on_state, self.drives.on_fault = self._state_changed, self._faulted
         self.drives.take_commands()
         self.drives.sample(0.0, 0.0)
-        readings = Readings(self.plant, self.sensors)
+        self._readings = readings = Readings(self.plant, self.sensors)
         motors = [Motor(j, joint, self.drives.loops, self.sensors, readings) for j, joint in enumerate(link.joints)]
         self.fronts = build_fronts(arm, motors, self._sender)
         """Bus and drives of every family but CANopen."""
@@ -125,7 +128,10 @@ class SimulatedArm:
             piece = min(remaining, self.period)
             for drive in self.drive_at.values():
                 drive.control(piece)
-            self.drives.loops.advance(piece, self._synchronous)
+            if self.drive_at:
+                self._advance_drives(piece)
+            else:
+                self.drives.loops.advance(piece, self._synchronous)
             self._synchronous = False
             self.time += piece
             remaining -= piece
@@ -136,9 +142,23 @@ class SimulatedArm:
                 self._nmt.update()
             if self._watching:
                 self.drives.watch()
+            if self.sensors.warms and self.time >= self._warmed + WARMING_STEP:
+                self._set_torque_constants()
             if remaining > 1e-9:
                 self._sample()
             self._pdos.send_events()
+
+    def _advance_drives(self, piece: float) -> None:
+        """Physics of an arm with drives that are no CANopen nodes; their mean torque over the time is kept."""
+        loops, readings = self.drives.loops, self._readings
+        if self.nodes:
+            loops.advance(piece, self._synchronous)
+            readings.step_ends(0.5 * (readings.started + self.plant.drive_torque))
+            return
+        loops.advance(piece / 2, False)
+        middle = self.plant.drive_torque
+        loops.advance(piece / 2, False)
+        readings.step_ends(middle)
 
     def reboot(self, joint: int) -> None:
         """Power-cycle one joint's controller: volatile settings are lost."""
@@ -226,12 +246,17 @@ class SimulatedArm:
         """True sensor parameters at present, drifts and effects included."""
         sensors, truth = self.sensors, self.truth
         return Truth(
-            sensors.gain,
+            sensors.gain_at(self.time),
             sensors.offset + sensors.cold_zero(self.time),
             sensors.position_gain,
             sensors.position_offset,
             attachment=truth.attachment,
         )
+
+    @property
+    def true_friction(self) -> Array:
+        """True Coulomb friction (n,) [N·m], of the mean over position and both directions."""
+        return self._imperfections().coulomb
 
     # ---- internals
 
@@ -239,7 +264,8 @@ class SimulatedArm:
         """A drive without a torque sensor makes as much torque too little as its reading is too large."""
         current = np.zeros(self.n, bool)
         current[list(self.drive_at)] = True
-        self.plant.torque_constant = np.where(current, self.sensors.gain, 1.0)
+        self._warmed = self.time
+        self.plant.torque_constant = np.where(current, self.sensors.gain_at(self.time), 1.0)
         self.drives.loops.imagined = np.where(current, self.sensors.offset, 0.0)
         self.drives.loops.reconfigure()
 
@@ -255,6 +281,9 @@ class SimulatedArm:
         state, realism = imperfections(self.names, self._entries), sim_section(self.arm).realism
         rated = self.arm.require_link().rated_torques
         add_realism(state, rated, realism.level, realism.seed)
+        drives = sim_section(self.arm).quasi_direct
+        if drives is not None:
+            drives.add_to(state, rated, self._seed)
         return state
 
     @contextmanager

@@ -1,11 +1,12 @@
 """Hidden truth of a simulated arm: true sensor parameters, which a fit must find without seeing them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
+from sim_bus.effects.quasi_direct import QuasiDirect
 from sim_bus.sim_section import sim_section
 
 GAIN_RANGE = (0.9, 1.1)
@@ -39,7 +40,10 @@ class Truth:
     @classmethod
     def of(cls, arm: ArmFile) -> "Truth":
         """The truth stated in the arm file's `sim.sensors`. Raises BadInput."""
-        n, sensors = len(arm.joint_names), sim_section(arm).sensors
+        n, section = len(arm.joint_names), sim_section(arm)
+        sensors = section.sensors
+        if section.quasi_direct is not None:
+            return cls._of_drives(arm, section.quasi_direct, section.quasi_direct.seed)
 
         def values(given: tuple[float, ...] | None, default: float) -> Array:
             return np.full(n, default) if given is None else np.array(given)
@@ -57,12 +61,14 @@ class Truth:
         """Draw a truth from uniform distributions.
 
         Gains 0.9 to 1.1, offsets ±5 % of rated torque, position gains 0.99 to 1.01. The reference mass
-        is up to 0.15 m to the side of the flange. Raises BadInput.
+        is up to 0.15 m to the side of the flange. With `sim.quasi_direct` its ranges count. Raises BadInput.
         """
         random, stated = np.random.default_rng(seed), cls.of(arm)
-        rated = arm.require_link().rated_torques
+        rated, drives = arm.require_link().rated_torques, sim_section(arm).quasi_direct
         n = len(rated)
         lateral = random.uniform(-ATTACHMENT_RANGE, ATTACHMENT_RANGE, 2)
+        if drives is not None:
+            return replace(cls._of_drives(arm, drives, seed), attachment=stated.attachment + np.array([*lateral, 0.0]))
         return cls(
             gain=random.uniform(*GAIN_RANGE, n),
             offset=random.uniform(-OFFSET_SHARE, OFFSET_SHARE, n) * rated,
@@ -70,6 +76,14 @@ class Truth:
             position_offset=stated.position_offset,
             attachment=stated.attachment + np.array([*lateral, 0.0]),
         )
+
+    @classmethod
+    def _of_drives(cls, arm: ArmFile, drives: QuasiDirect, seed: int) -> "Truth":
+        """The truth of quasi-direct drives, drawn; the reference mass at the flange."""
+        rated = arm.require_link().rated_torques
+        n = len(rated)
+        zeros = drives.zeros(n, seed)
+        return cls(drives.gains(n, seed), drives.offsets(rated, seed), np.ones(n), zeros, flange(arm))
 
 
 def flange(arm: ArmFile) -> Array:

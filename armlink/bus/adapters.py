@@ -1,7 +1,7 @@
 """Adapters of python-can's buses: SocketCAN and udp_multicast through their sockets, others through messages."""
 
 from types import TracebackType
-from typing import Self, cast
+from typing import TYPE_CHECKING, Self, cast
 
 import can
 
@@ -9,10 +9,12 @@ from armlink.bus.can_bus import CanBus, MessageBus
 from armlink.bus.in_process import InProcessBus
 from armlink.bus.message_port import MessagePort
 from armlink.bus.port import Port
-from armlink.bus.sockets.multicast_port import MulticastPort
 from armlink.bus.sockets.socket_port import SocketPort
-from armlink.bus.sockets.stamped_port import StampedMulticastPort, StampedSocketPort
+from armlink.bus.sockets.stamped_port import StampedSocketPort
 from armlink.clock import Clock
+
+if TYPE_CHECKING:
+    from armlink.bus.sockets.multicast_port import MulticastPort
 
 
 class PythonCanBus:
@@ -68,7 +70,7 @@ class SocketCanBus(PythonCanBus):
 
 
 class MulticastBus(PythonCanBus):
-    """CAN over UDP multicast, in python-can's format."""
+    """CAN over UDP multicast, in python-can's format; its ports need the extra `simulator`."""
 
     def __init__(self, bus: can.BusABC, name: str = "") -> None:
         """Take ownership of a UdpMulticastBus of python-can."""
@@ -77,13 +79,17 @@ class MulticastBus(PythonCanBus):
 
     def open_port(self, as_node: bool = False) -> Port:
         """See CanBus; raises BusFault if there is no route to the group."""
+        from armlink.bus.sockets.multicast_port import MulticastPort
+
         return self._open(MulticastPort, as_node)
 
     def open_listening_port(self) -> Port:
         """See CanBus; raises BusFault if there is no route to the group."""
+        from armlink.bus.sockets.multicast_port import StampedMulticastPort
+
         return self._open(StampedMulticastPort)
 
-    def _open(self, kind: type[MulticastPort], as_node: bool = False) -> Port:
+    def _open(self, kind: "type[MulticastPort]", as_node: bool = False) -> Port:
         inner = self.bus._multicast  # python-can has no public access to the group
         port = kind(inner._socket, (inner.group, inner.port), inner.hop_limit, self.channel_info, self.fd, as_node)
         self._ports.append(port)

@@ -31,7 +31,16 @@ def check(
     host: Annotated[
         bool, typer.Option("--host", help="Measure how well this machine keeps the cycle instead; needs no bus.")
     ] = False,
-    seconds: Annotated[float, typer.Option(min=1.0, max=3600.0, help="How long --host measures [s].")] = 20.0,
+    scales: Annotated[
+        str | None,
+        typer.Option(
+            help="Judge the scales of position, velocity and torque instead: hand (you turn every joint from stop to "
+            "stop, without power), move (all joints by 0.35 rad) or listen (another host moves the arm)."
+        ),
+    ] = None,
+    seconds: Annotated[
+        float, typer.Option(min=1.0, max=3600.0, help="How long --host measures, and --scales hand or listen [s].")
+    ] = 20.0,
     json: Annotated[Path | None, typer.Option(help="Write the answer here; - is standard output.")] = None,
 ) -> int:
     """Check identity, objects, PDO mapping, limits, calibration; then, with power, quick stop, deadline and heartbeat.
@@ -42,6 +51,8 @@ def check(
 
     With --host nothing is sent anywhere: cycles are made at the arm's rate while a job computes and writes beside them;
     exit status 1 if this machine is too late for the arm's deadline or rate.
+
+    With --scales readings are judged while the arm moves: exit status 1 if a scale of a drive is off by a tenth.
 
     Example: armlink check sarcos --bus socketcan:vcan0 --yes --json -
     """
@@ -58,6 +69,8 @@ def check(
     described = load_arm(arm)
     if host:
         return _check_host(console, described, seconds, json)
+    if scales is not None:
+        return _check_scales(console, described, bus, scales, seconds, yes, json)
     with open_arm(described, bus) as link:
         simulated = isinstance(link, Link) and link.bus.clock is not None
         if not (passive or yes or simulated):
@@ -85,6 +98,25 @@ def check(
             f"check: {len(failed)} of {len(results)} failed, first {first.joint}: {first.check}: {first.found}"
         )
     return 0
+
+
+def _check_scales(
+    console: "Console", arm: "ArmFile", bus: str | None, how: str, seconds: float, yes: bool, json: Path | None
+) -> int:
+    """Scales of the drives' readings; asks before this host moves the arm."""
+    from armlink.commands.scale_report import check_scales
+    from armlink.errors import BadInput
+    from armlink.loop.open import is_in_process
+
+    if how not in ("hand", "move", "listen"):
+        raise BadInput(f"check --scales {how}: expected hand, move or listen")
+    if how == "move" and not yes and not is_in_process(arm, bus):
+        if not console.is_terminal:
+            raise BadInput("check --scales move: nobody to ask: give --yes, or --scales hand")
+        typer.confirm(
+            f"All joints of {arm.name} will turn by 0.35 rad to both sides. Is it clear?", abort=True, err=True
+        )
+    return check_scales(console, arm, bus, how, seconds, json)  # type: ignore[arg-type]
 
 
 def _check_host(console: "Console", arm: "ArmFile", seconds: float, json: Path | None) -> int:

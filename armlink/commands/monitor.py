@@ -1,15 +1,22 @@
 """Shows an arm's joints live: position, torque, state, age, bus load; commands nothing."""
 
+import contextlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
-    from rich.console import Group
+    from rich.console import Console, Group
+
+    from armlink.arm_file import ArmFile
+    from armlink.link.types import Sample
+    from armlink.monitor.monitor import Monitor, View
 
 REFRESH_SECONDS = 0.2
 ONCE_SECONDS = 0.5
+STREAM_SECONDS = 0.02
 COLUMNS = ("joint", "node", "position\nrad", "torque\nN·m", "motor\nN·m", "state", "NMT", "age\ns")
 
 
@@ -22,13 +29,18 @@ def monitor(
     stats: Annotated[
         bool, typer.Option("--stats", help="Period, jitter, latency (p50, p99, p99.9), missed cycles, exact bus load.")
     ] = False,
+    foxglove: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, metavar="PORT", help="Serve readings to Foxglove; 0: a free port."),
+    ] = None,
     json: Annotated[Path | None, typer.Option(help="Write the last state here; - is standard output.")] = None,
 ) -> int:
     """Show what an arm's joints send; exit status 3 where no joint is heard.
 
     It listens beside the host that runs the arm. Scales are the arm file's rated torques and 2^20 units a turn. With
     --stats every frame's time stamp counts (the interface's own; the monitor's clock with --sync): latency is from SYNC
-    to the last joint's reading, and the load has its stuff bits.
+    to the last joint's reading, and the load has its stuff bits. With --foxglove 8765 open ws://localhost:8765 in
+    Foxglove: /joint_states and /motor_states as in a recording, 50 times a second.
 
     Example: armlink monitor sarcos --bus socketcan:vcan0 --stats
     """
@@ -50,9 +62,12 @@ def monitor(
         watcher = Monitor(arm_file, opened, sync, stats)
         refreshes = 1 if once else cycles
         shown = 0
-        with Live(console=console, auto_refresh=False, transient=True) as live:
+        with (
+            Live(console=console, auto_refresh=False, transient=True) as live,
+            _stream(arm_file, foxglove, console) as send,
+        ):
             while not refreshes or shown < refreshes:
-                answer = watcher.describe(watcher.watch(ONCE_SECONDS if once else REFRESH_SECONDS))
+                answer = watcher.describe(_watch(watcher, ONCE_SECONDS if once else REFRESH_SECONDS, send))
                 shown += 1
                 if console.is_terminal:
                     live.update(_table(title, answer), refresh=True)
@@ -64,6 +79,30 @@ def monitor(
     if all(joint["state"] is None and joint["position"] != joint["position"] for joint in answer["joints"]):
         raise BusFault(f"{title}: no joint is heard: does a host send SYNC? (--sync sends it)")
     return 0
+
+
+@contextlib.contextmanager
+def _stream(arm: "ArmFile", port: int | None, console: "Console") -> "Iterator[Callable[[Sample], None] | None]":
+    """Where samples go besides the table; None: nowhere."""
+    if port is None:
+        yield None
+        return
+    from armlink.monitor.foxglove_stream import FoxgloveStream
+
+    names = tuple(joint.name for joint in arm.require_link().joints)
+    with FoxgloveStream(arm.name, names, port) as stream:
+        console.print(f"Foxglove: open ws://localhost:{stream.port}", markup=False, highlight=False)
+        yield stream.send
+
+
+def _watch(watcher: "Monitor", seconds: float, send: "Callable[[Sample], None] | None") -> "View":
+    """Watch for `seconds`; with `send` in short pieces, each sent on. The view is of the last piece."""
+    if send is None:
+        return watcher.watch(seconds)
+    for _ in range(round(seconds / STREAM_SECONDS)):
+        view = watcher.watch(STREAM_SECONDS)
+        send(view.sample)
+    return view
 
 
 def _table(title: str, answer: dict[str, Any]) -> "Group":

@@ -5,11 +5,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from armlink.arm_file import LinkJoint
+from armlink.bus.frame_bits import longest_frame_bits
 from armlink.bus.port import Frame
 from armlink.drives.family import Ask
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading
 from armlink.drives.traits import Traits
 from armlink.errors import BusFault, Stall
+
+LONG_IDENTIFIER = 25
+"""Bits that an identifier of 29 bits takes more than one of 11, stuff bits included."""
 
 
 class BasicDrives:
@@ -60,9 +64,13 @@ class BasicDrives:
         """See Drives."""
         return self.powers[joint]
 
-    def ask_power(self, joint: int, ask: Ask) -> Power:
-        """See Drives: the newest that it told."""
-        return self.powers[joint]
+    def state_request(self, joint: int) -> list[Frame]:
+        """See Drives: it tells by itself."""
+        return []
+
+    def lets_go(self, joint: int) -> bool:
+        """See Drives: by its power state; a family whose drives fall where they stop by themselves overrides it."""
+        return self.powers[joint] in (Power.OFF, Power.READY, Power.FAULT)
 
     def ready(self, joint: int) -> bool:
         """See Drives."""
@@ -123,6 +131,11 @@ class BasicDrives:
     def identify(self, ask: Ask) -> list[DriveIdentity]:
         """See Drives."""
         raise NotImplementedError
+
+    def cycle_bits(self) -> float:
+        """See Drives: a command and a reply of eight bytes each."""
+        longer = sum(LONG_IDENTIFIER for traits in self._traits if traits.frame == "29")
+        return 2 * (self.m * longest_frame_bits(8) + longer)
 
     def cycle_ids(self) -> frozenset[int]:
         """See Drives: none."""

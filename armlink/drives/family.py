@@ -18,14 +18,16 @@ does not know a scale yet returns None.
 Everything runs in one thread. No method may block, but those that get an `Ask`.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from armlink.arm_file import ArmFile, LinkJoint
+from armlink.bus.can_bus import CanBus
 from armlink.bus.port import Frame
 from armlink.drives.board import Board
 from armlink.drives.findings import Result
+from armlink.drives.found import DriveFinding, FoundDrives
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup, power_name
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
@@ -132,8 +134,13 @@ class Drives(Protocol):
         """Newest power state of a drive."""
         ...
 
-    def ask_power(self, joint: int, ask: Ask) -> Power:
-        """Power state of a drive that has had no command, asked for without giving one."""
+    def state_request(self, joint: int) -> list[Frame]:
+        """Frames by which a drive tells its state although it is not commanded, and that are no command; empty where
+        it tells by itself."""
+        ...
+
+    def lets_go(self, joint: int) -> bool:
+        """Whether a drive, as it is now, leaves its motor without power."""
         ...
 
     def ready(self, joint: int) -> bool:
@@ -173,6 +180,10 @@ class Drives(Protocol):
 
     def temperature(self, joint: int, ask: Ask) -> float:
         """Temperature of a drive [°C], NaN if it has none."""
+        ...
+
+    def cycle_bits(self) -> float:
+        """Bit times of the nominal rate that a cycle of these drives takes at most, all stuff bits included."""
         ...
 
     def cycle_ids(self) -> frozenset[int]:
@@ -223,6 +234,28 @@ class KeepsCalibration(Protocol):
 
 
 @runtime_checkable
+class TellsCurrent(Protocol):
+    """Drives whose current can be asked for, where the arm file has its torque constant."""
+
+    def torque_by_current(self, joint: int, ask: Ask) -> tuple[float, float] | None:
+        """Torque as the drive reports it, and current times torque constant, at one time [N·m]; None where the arm
+        file has no constant, or the drive does not answer."""
+        ...
+
+
+@runtime_checkable
+class Guarded(Protocol):
+    """Drives whose command frames a guard of the bus can check by their bytes alone."""
+
+    def guard_rules(self, ask: Ask, limits: Sequence[Limits]) -> dict[str, Any]:
+        """`frames`, `stop` and `restarts` of a policy (armlink.guard.bus_guard); drives are read, and nothing is set.
+
+        Raises BusFault, BadInput.
+        """
+        ...
+
+
+@runtime_checkable
 class Replays(Protocol):
     """Drives whose frames can be made again from a recording."""
 
@@ -247,6 +280,11 @@ class Family:
     it goes further than the one for all families."""
     search: Callable[..., int] | None = None
     """`search(arm or None, bus or None, json, write)`: `armlink scan` of a whole bus; None: each drive is asked."""
+    find: Callable[[CanBus], FoundDrives] | None = None
+    """`find(bus)`: the drives on an open bus, asked without an arm file; None: they are found by their ids alone."""
+    examine: Callable[[ArmFile, CanBus, str], Iterator[DriveFinding]] | None = None
+    """`examine(arm, bus, name)`: what the drives of an arm with this family alone say against its file, on an open bus
+    of this name; they are only read. None: each drive is asked who it is."""
     state_name: Callable[[int], str] = power_name
     """State of a drive in words, from its code in `Sample.status`; by default an index of Power."""
     summary: str = ""

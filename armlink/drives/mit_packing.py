@@ -6,17 +6,11 @@ Each field is an unsigned number of steps from the lower end of its range; the r
 """
 
 import math
-from collections.abc import Callable
+from functools import lru_cache
 from typing import NamedTuple
 
-from armlink.drives.orders import Limits
-
-DAMPING_SHARE = 0.9
-"""Damping takes at most this share of the torque limit; the rest is for rounding."""
-
-
-SOFTER, SOFTER_STEPS = 0.8, 30
-"""Factor by which both gains are lowered, again and again, while the sum of the law is beyond the limit."""
+MIT_BITS = (16, 12, 12, 12, 12)
+"""Bits of q, dq, kp, kd and τ in an MIT command; other frames of the same fields have others."""
 
 
 class Ranges(NamedTuple):
@@ -59,124 +53,117 @@ class MitFeedback(NamedTuple):
     torque: float
 
 
-def to_steps(value: float, lowest: float, highest: float, bits: int) -> int:
-    """Nearest step of `value` between `lowest` (0) and `highest` (all ones); beyond the range its end.
+class Grid:
+    """The values that packed fields can have, of ranges and bits that do not change; see `grid_of`.
 
-    Raises ValueError for a number that is not finite.
+    A field with b bits has 2^b − 1 steps from its lowest to its highest value.
     """
-    if not math.isfinite(value):
-        raise ValueError(f"{value} cannot be packed: expected a finite number")
-    most = (1 << bits) - 1
-    return max(0, min(most, round((value - lowest) / (highest - lowest) * most)))
+
+    __slots__ = (
+        "kd",
+        "kd_most",
+        "kp",
+        "kp_most",
+        "q",
+        "q_most",
+        "q_span",
+        "t",
+        "t_most",
+        "t_span",
+        "v",
+        "v_most",
+        "v_span",
+    )
+
+    def __init__(self, ranges: Ranges, bits: tuple[int, int, int, int, int]) -> None:
+        """`bits` of position, velocity, kp, kd and torque."""
+        self.q, self.v, self.t, self.kp, self.kd = (
+            ranges.position, ranges.velocity, ranges.torque, ranges.kp, ranges.kd,
+        )  # fmt: skip
+        self.q_span, self.v_span, self.t_span = 2 * self.q, 2 * self.v, 2 * self.t
+        self.q_most, self.v_most, self.kp_most, self.kd_most, self.t_most = (float((1 << each) - 1) for each in bits)
+
+    def steps(self, command: MitCommand) -> tuple[int, int, int, int, int]:
+        """Nearest steps of a command's values, beyond a range its end. Raises ValueError for numbers not finite."""
+        position, velocity, kp, kd, torque = command
+        if not math.isfinite(position + velocity + kp + kd + torque):
+            raise ValueError(f"{command} cannot be packed: expected finite numbers")
+        return (
+            _nearest((position + self.q) / self.q_span * self.q_most, self.q_most),
+            _nearest((velocity + self.v) / self.v_span * self.v_most, self.v_most),
+            _nearest(kp / self.kp * self.kp_most, self.kp_most),
+            _nearest(kd / self.kd * self.kd_most, self.kd_most),
+            _nearest((torque + self.t) / self.t_span * self.t_most, self.t_most),
+        )
+
+    def command(self, q: int, dq: int, kp: int, kd: int, torque: int) -> MitCommand:
+        """The command that steps stand for."""
+        return MitCommand(
+            q * self.q_span / self.q_most - self.q,
+            dq * self.v_span / self.v_most - self.v,
+            kp * self.kp / self.kp_most,
+            kd * self.kd / self.kd_most,
+            torque * self.t_span / self.t_most - self.t,
+        )
+
+    def feedback_steps(self, feedback: MitFeedback) -> tuple[int, int, int]:
+        """Nearest steps of feedback. Raises ValueError for numbers not finite."""
+        position, velocity, torque = feedback
+        if not math.isfinite(position + velocity + torque):
+            raise ValueError(f"{feedback} cannot be packed: expected finite numbers")
+        return (
+            _nearest((position + self.q) / self.q_span * self.q_most, self.q_most),
+            _nearest((velocity + self.v) / self.v_span * self.v_most, self.v_most),
+            _nearest((torque + self.t) / self.t_span * self.t_most, self.t_most),
+        )
+
+    def feedback(self, q: int, dq: int, torque: int) -> MitFeedback:
+        """The feedback that steps stand for."""
+        return MitFeedback(
+            q * self.q_span / self.q_most - self.q,
+            dq * self.v_span / self.v_most - self.v,
+            torque * self.t_span / self.t_most - self.t,
+        )
 
 
-def from_steps(steps: int, lowest: float, highest: float, bits: int) -> float:
-    """Value of a packed number of steps."""
-    return lowest + steps * (highest - lowest) / ((1 << bits) - 1)
+def _nearest(steps: float, most: float) -> int:
+    return round(steps) if 0.0 <= steps <= most else 0 if steps < 0.0 else int(most)
+
+
+@lru_cache(maxsize=256)
+def grid_of(ranges: Ranges, bits: tuple[int, int, int, int, int] = MIT_BITS) -> Grid:
+    """The grid of ranges, made once."""
+    return Grid(ranges, bits)
+
+
+def pack_steps(q: int, dq: int, kp: int, kd: int, torque: int) -> bytes:
+    """The eight bytes of a command's steps."""
+    return (q << 48 | dq << 36 | kp << 24 | kd << 12 | torque).to_bytes(8, "big")
 
 
 def pack_command(command: MitCommand, ranges: Ranges) -> bytes:
     """The eight bytes of a command. Raises ValueError for numbers that are not finite."""
-    q = to_steps(command.position, -ranges.position, ranges.position, 16)
-    dq = to_steps(command.velocity, -ranges.velocity, ranges.velocity, 12)
-    kp = to_steps(command.kp, 0.0, ranges.kp, 12)
-    kd = to_steps(command.kd, 0.0, ranges.kd, 12)
-    torque = to_steps(command.torque, -ranges.torque, ranges.torque, 12)
-    return (q << 48 | dq << 36 | kp << 24 | kd << 12 | torque).to_bytes(8, "big")
+    return pack_steps(*grid_of(ranges).steps(command))
 
 
 def unpack_command(data: bytes, ranges: Ranges) -> MitCommand:
     """A command as the drive understands it; `data` has eight bytes."""
     bits = int.from_bytes(data[:8], "big")
-    return MitCommand(
-        from_steps(bits >> 48, -ranges.position, ranges.position, 16),
-        from_steps(bits >> 36 & 0xFFF, -ranges.velocity, ranges.velocity, 12),
-        from_steps(bits >> 24 & 0xFFF, 0.0, ranges.kp, 12),
-        from_steps(bits >> 12 & 0xFFF, 0.0, ranges.kd, 12),
-        from_steps(bits & 0xFFF, -ranges.torque, ranges.torque, 12),
-    )
+    return grid_of(ranges).command(bits >> 48, bits >> 36 & 0xFFF, bits >> 24 & 0xFFF, bits >> 12 & 0xFFF, bits & 0xFFF)
 
 
 def pack_feedback(feedback: MitFeedback, ranges: Ranges) -> bytes:
     """Bytes 1 to 5 of a reply: q 16 | dq 12 | τ 12 bits."""
-    q = to_steps(feedback.position, -ranges.position, ranges.position, 16)
-    dq = to_steps(feedback.velocity, -ranges.velocity, ranges.velocity, 12)
-    torque = to_steps(feedback.torque, -ranges.torque, ranges.torque, 12)
+    q, dq, torque = grid_of(ranges).feedback_steps(feedback)
     return (q << 24 | dq << 12 | torque).to_bytes(5, "big")
 
 
 def unpack_feedback(data: bytes, ranges: Ranges) -> MitFeedback:
     """Feedback from bytes 1 to 5 of a reply (`data` has at least five bytes)."""
     bits = int.from_bytes(data[:5], "big")
-    return MitFeedback(
-        from_steps(bits >> 24, -ranges.position, ranges.position, 16),
-        from_steps(bits >> 12 & 0xFFF, -ranges.velocity, ranges.velocity, 12),
-        from_steps(bits & 0xFFF, -ranges.torque, ranges.torque, 12),
-    )
+    return grid_of(ranges).feedback(bits >> 24, bits >> 12 & 0xFFF, bits & 0xFFF)
 
 
 def unwrap(position: float, near: float, span: float) -> float:
     """The position that differs from the packed one by whole `span`s and is nearest to `near` [rad]."""
     return position + span * round((near - position) / span)
-
-
-def round_within(
-    command: MitCommand,
-    coded: Callable[[MitCommand], MitCommand],
-    ranges: Ranges,
-    torque_quantum: float,
-    limits: Limits,
-    position: float,
-    velocity: float,
-) -> MitCommand:
-    """The command, moved by as few steps as it takes to stay within `limits` after rounding.
-
-    `coded` gives a command as its bytes tell it. `position` and `velocity` are the newest readings (NaN if there are
-    none), by which the sum of the law is bounded; the torque alone and the target position are bounded in any case.
-
-    Raises ValueError for numbers that are not finite.
-    """
-    if not all(math.isfinite(value) for value in command):
-        raise ValueError(f"{command} cannot be packed: expected finite numbers")
-    most = limits.max_torque
-    torque = max(-most, min(most, command.torque))
-    command = command._replace(torque=torque)
-    told = coded(command)
-    if told.kp > 0 and limits.lower <= command.position <= limits.upper:
-        command = command._replace(position=_inwards(told.position, limits, ranges.position_quantum))
-        told = coded(command)
-    total = _law(told, position, velocity) if math.isfinite(position + velocity) else told.torque
-    beyond = max(total - most, told.torque - most, 0.0) or min(total + most, told.torque + most, 0.0)
-    if beyond:
-        steps = math.copysign(math.ceil(abs(beyond) / torque_quantum), beyond)
-        lowest = told.torque - steps * torque_quantum
-        command = command._replace(torque=max(-most, min(most, lowest)))
-        told = coded(command)
-        if abs(told.torque) > most:  # the limit lies between two steps
-            command = command._replace(torque=told.torque - math.copysign(torque_quantum, told.torque))
-    if not math.isfinite(position + velocity):
-        return command
-    for _ in range(SOFTER_STEPS):  # where the torque, limited by itself, cannot keep the sum within the limit
-        if abs(_law(coded(command), position, velocity)) <= most:
-            return command
-        command = command._replace(kp=SOFTER * command.kp, kd=SOFTER * command.kd)
-    return command._replace(kp=0.0, kd=0.0)
-
-
-def _law(told: MitCommand, position: float, velocity: float) -> float:
-    """Torque that a drive makes of a command where it stands [N·m]."""
-    return told.kp * (told.position - position) + told.kd * (told.velocity - velocity) + told.torque
-
-
-def damping(kd: float, position: float, velocity: float, most: float) -> MitCommand:
-    """A command that damps with at most `kd`, and with no more torque than `most` [N·m] at the present velocity."""
-    if abs(velocity) * kd > DAMPING_SHARE * most:
-        kd = DAMPING_SHARE * most / abs(velocity)
-    return MitCommand(position if math.isfinite(position) else 0.0, 0.0, 0.0, kd, 0.0)
-
-
-def _inwards(position: float, limits: Limits, quantum: float) -> float:
-    """A coded position, a step back where rounding led out of the window."""
-    if position > limits.upper:
-        return position - quantum
-    return position + quantum if position < limits.lower else position

@@ -3,7 +3,9 @@
 from functools import cache
 from importlib.metadata import entry_points
 
+from armlink.bus.can_bus import CanBus
 from armlink.drives.family import Family
+from armlink.drives.found import FoundDrives
 from armlink.errors import BadInput
 
 GROUP = "armlink.drives"
@@ -22,3 +24,14 @@ def family(name: str) -> Family:
         raise BadInput(f"no drive family {name!r}; there are {', '.join(family_names())}")
     found: Family = next(iter(points)).load()
     return found
+
+
+def found_drives(bus: CanBus) -> FoundDrives:
+    """The drives on an open bus of the first family whose drives can be found without an arm file; raises BusFault."""
+    for name in family_names():
+        find = family(name).find
+        if find is not None:
+            return find(bus)
+    raise BadInput(
+        f"drives of the families {', '.join(family_names())} can only be found by an arm file with their ids"
+    )

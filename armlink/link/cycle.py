@@ -100,7 +100,8 @@ class Commander:
         for joint, integral in enumerate(self._integrals):
             if integral is not None:
                 limits, mode = self.limits[joint], modes[joint]
-                torque = integral.update(limits, mode, self.passed[joint].position, seen[joint])
+                passed = self.passed[joint]
+                torque = integral.update(limits, mode, passed.position, passed.velocity, seen[joint])
                 if mode == POSITION:
                     torques[joint] = torque
 
@@ -125,7 +126,7 @@ class Commander:
                 else:
                     torque = 0.0
                     if on:
-                        torque = integral.update(limits, POSITION, position, seen[place])
+                        torque = integral.update(limits, POSITION, position, 0.0, seen[place])
                     else:
                         integral.reset()
                     order = hold_at(limits, torque, position, seen[place])

@@ -45,7 +45,7 @@ def refusal(
         if why == gate.BAD_NUMBER:
             return f"{name}: target position is {command.position[joint]}, expected a finite number"
         if why == gate.VELOCITY and math.isnan(now.velocity):
-            return f"{name}: no velocity (606Ch, TPDO2) has come of late, and torque control needs to know it"
+            return f"{name}: no velocity has come of late, and torque control needs to know it"
         if why == gate.VELOCITY and command.mode[joint] in gate.POSITION_MODES:
             return (
                 f"{name}: turns at {now.velocity:.3g} rad/s under position control, limit {limit.servo_overspeed:.3g} "
@@ -68,7 +68,7 @@ def refusal(
                 "its stop or its position sensor is not where the arm file has it"
             )
         if why == gate.ENTRY:
-            return f"{name}: the torque now produced (6077h) is not known, and torque control would start from zero"
+            return f"{name}: the torque now produced is not known, and torque control would start from zero"
     return None
 
 

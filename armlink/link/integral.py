@@ -1,11 +1,16 @@
-"""Integral term of position control, for drives that have none: it takes over what gravity asks for."""
+"""Integral term of position control, for drives that have none: it takes over what gravity asks for.
+
+The feed-forward τ grows by RATE · (kp (q* − q) + kd (v* − v)): what the drive's gains must still add becomes
+feed-forward within 1 / RATE. Without the velocity's share a joint of inertia J would be stable for RATE < kd / J alone,
+which the first joints of an arm come close to, since MIT frames carry little damping.
+"""
 
 import math
 
 from armlink.link.gate import LEASH, POSITION_MODES, JointLimits, Seen
 
-RATE = 4.0
-"""Integral gain over proportional gain [1/s]."""
+RATE = 5.0
+"""[1/s]."""
 DEADBAND = 5e-4
 """Errors below this are not integrated, against hunting under stiction [rad]."""
 
@@ -19,8 +24,8 @@ class Integral:
         """[N·m]."""
         self._active = False
 
-    def update(self, limits: JointLimits, mode: int, target: float, seen: Seen) -> float:
-        """The feed-forward for this cycle [N·m]; `target` is the position that passed in the last one [rad].
+    def update(self, limits: JointLimits, mode: int, target: float, rate: float, seen: Seen) -> float:
+        """The feed-forward for this cycle [N·m]; `target` [rad] and `rate` [rad/s] are what passed in the last one.
 
         Under another mode it follows the torque that is produced, so that position control takes over without a jump.
         """
@@ -34,7 +39,9 @@ class Integral:
             self.torque = produced
         if abs(error) > DEADBAND:
             most = limits.max_torque * LEASH
-            self.torque = max(-most, min(most, self.torque + RATE * limits.kp * limits.period * error))
+            short = rate - seen.velocity if math.isfinite(seen.velocity) else 0.0
+            grown = self.torque + RATE * limits.period * (limits.kp * error + limits.kd * short)
+            self.torque = max(-most, min(most, grown))
         return self.torque
 
     def reset(self) -> None:

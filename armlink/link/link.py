@@ -1,9 +1,10 @@
 """The link: an arm's joint controllers on a CAN bus; samples in SI units out, limited commands in."""
 
+import logging
 from collections.abc import Callable
 from dataclasses import replace
 from types import TracebackType
-from typing import TYPE_CHECKING, Concatenate, ParamSpec, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar
 
 import numpy as np
 
@@ -13,8 +14,9 @@ from armlink.bus.adapters import as_bus
 from armlink.bus.arm_hold import ArmHold
 from armlink.bus.can_bus import CanBus
 from armlink.clock import Clock, MonotonicClock
+from armlink.drives.family import Guarded
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Setup
-from armlink.errors import BusFault, Silence
+from armlink.errors import BadInput, BusFault, Refused, Silence
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.faults import bus_fault
@@ -25,11 +27,13 @@ from armlink.link.joints.ask import LinkAsk
 from armlink.link.joints.calibrations import Calibrations
 from armlink.link.joints.groups import Group, make_groups
 from armlink.link.joints.values import values_of
+from armlink.link.park import leave, park, require_deadman
 from armlink.link.types import Command, Controller, Sample, Samples, Setpoints, Stats, Tell
 
 if TYPE_CHECKING:
     import can
 
+log = logging.getLogger("armlink")
 PATIENCE = 2.5
 """Readings may be this many periods old while a motion goes on; a reply that comes a period late is within it."""
 LISTEN_PERIODS, LISTEN_SECONDS = 2, 0.1
@@ -46,7 +50,8 @@ P = ParamSpec("P")
 class Link(Calibrations):
     """Context manager: `with Link.open(arm) as link: link.start(); link.enable(); link.cycle(command)`.
 
-    Leaving it, however, leaves the joints in quick stop, where they hold, unless `disable` was called.
+    Leaving it, however, leaves the joints in quick stop, where they hold, unless `disable` was called. Where drives let
+    go without their host, leaving it in order parks the arm if its file says where (`link.park`).
     """
 
     def __init__(self, arm: ArmFile, bus: "CanBus | can.BusABC", clock: Clock | None = None) -> None:
@@ -88,8 +93,14 @@ class Link(Calibrations):
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        """Quick stop where joints are enabled, and close the bus."""
+        """Park where drives would let the arm fall, if the bus is sound; quick stop of joints that are still enabled,
+        and close the bus."""
         try:
+            if not isinstance(error, BusFault):
+                leave(self, lambda text: None)
+            self.stop()
+        except (BusFault, Refused) as failed:
+            log.warning("%s: not parked: %s", self.arm.name, failed)
             self.stop()
         finally:
             self.bus.shutdown()
@@ -126,15 +137,15 @@ class Link(Calibrations):
     @property
     def torque_sent(self) -> Array:
         """Target torque of the last frames [N·m], (n,)."""
-        return np.array([order.torque for order in self._sent])
+        return np.array([order.torque for order in self.orders_sent])
 
     @property
     def position_sent(self) -> Array:
         """Target position of the last frames [rad], (n,)."""
-        return np.array([order.position for order in self._sent])
+        return np.array([order.position for order in self.orders_sent])
 
     @property
-    def _sent(self) -> list[Order]:
+    def orders_sent(self) -> list[Order]:
         """Orders as their bytes tell them; as they passed where the bytes carry no target."""
         found = list(self.commander.passed)
         for group in self.groups:
@@ -202,9 +213,7 @@ class Link(Calibrations):
 
     def _set_up(self) -> None:
         """Set every drive up; what the first cycle starts from."""
-        period, deadline = self.period, self.section.deadline
-        pairs = zip(self.section.joints, self.windows, strict=True)
-        wanted = [drive_limits(row, window, period, deadline) for row, window in pairs]
+        wanted = self._wanted_limits()
         found: dict[int, Setup] = {}
         for group in self.groups:
             own = [self.values.limits(place, wanted[place]) for place in group.places]
@@ -217,6 +226,33 @@ class Link(Calibrations):
             torque = self.values.torque_of(joint, setup.torque)
             passed.append(start_from(limit, torque, self.values.position_of(joint, setup.position)))
         self.commander.begin(limits, passed, [each.modes for each in self.setups])
+
+    def _wanted_limits(self) -> list[Limits]:
+        """The arm file's limits of every joint."""
+        pairs = zip(self.section.joints, self.windows, strict=True)
+        return [drive_limits(row, window, self.period, self.section.deadline) for row, window in pairs]
+
+    def guard_rules(self) -> dict[str, Any]:
+        """What a guard of the bus may pass to these drives, as `armlink.guard.bus_guard` takes it; sets nothing.
+
+        Raises BusFault where a drive does not answer, BadInput for drives that no guard can check.
+        """
+        rules: dict[str, Any] = {"frames": {}, "stop": [], "restarts": {}}
+        wanted = self._wanted_limits()
+        for group in self.groups:
+            name, family = self.names[group.places[0]], group.family.name
+            if not isinstance(group.drives, Guarded):
+                raise BadInput(f"{name}: what frames to drives of family {family} command is not in their bytes alone")
+            if group.tag:
+                raise BadInput(f"{name}: a guard has one bus, this arm has several: describe each in a file of its own")
+            own = [self.values.limits(place, wanted[place]) for place in group.places]
+            found = group.drives.guard_rules(self._ask(group), own)
+            rules = {
+                "frames": rules["frames"] | found["frames"],
+                "stop": rules["stop"] + found["stop"],
+                "restarts": rules["restarts"] | found["restarts"],
+            }
+        return rules
 
     def _gate_limits(self, joint: int) -> JointLimits:
         wanted = self._limits[joint]
@@ -231,9 +267,11 @@ class Link(Calibrations):
     def enable(self) -> Sample:
         """Walk every joint to ON, under position control where it stands, and return the last sample.
 
-        Faults are reset on the way. Raises BusFault naming the joint and the state it stays in.
+        Faults are reset on the way. Raises Refused for drives that nothing stops when this host dies, BusFault naming
+        the joint and the state it stays in.
         """
         self._require_start()
+        require_deadman(self)
         self._forget()
         self.commander.settle()
         sample = self.commander.walk(Power.ON)
@@ -266,6 +304,13 @@ class Link(Calibrations):
         self._loop.board.events.clear()
         for group in self.groups:
             group.drives.forget()
+
+    def park(self) -> None:
+        """Stow the arm in the pose `link.park` of its file and take the power from every joint there.
+
+        Raises BadInput where the file has none, Refused where a joint is blocked (the joints then hold), BusFault.
+        """
+        park(self, lambda text: None)
 
     def disable(self) -> None:
         """Take the power from every joint: a joint without a brake falls. Raises BusFault."""

@@ -19,6 +19,7 @@ from armlink.bus.can_bus import CanBus
 from armlink.bus.port import StampedPort
 from armlink.clock import Clock, MonotonicClock
 from armlink.drives.board import Event
+from armlink.drives.orders import Order
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.joints.ask import LinkAsk
 from armlink.link.joints.calibrations import Calibrations
@@ -92,6 +93,11 @@ class Listener(Calibrations):
     def position_sent(self) -> Array:
         """Likewise target position [rad]."""
         return self._commands[1]
+
+    @property
+    def orders_sent(self) -> list[Order | None]:
+        """Orders of the other controller for the last sample of `next`, at the joint; None for a joint without."""
+        return self._host.orders(self._sent)
 
     @property
     def _commands(self) -> tuple[Array, Array]:

@@ -84,13 +84,13 @@ class Sample:
     t: float
     """Time of the SYNC that asked for it, since the link's first [s]."""
     position: Array
-    """Position sensor [rad], (n,); each cycle (TPDO1)."""
+    """Position sensor [rad], (n,); in every cycle."""
     velocity: Array
-    """[rad/s], (n,); each fourth cycle (TPDO2), NaN in the others."""
+    """[rad/s], (n,); as often as the drives send it, NaN in other cycles."""
     torque: Array
-    """Link-side torque sensor as the controller calibrates it [N·m], (n,); each cycle (TPDO1)."""
+    """Link-side torque sensor as the controller calibrates it [N·m], (n,); in every cycle."""
     motor_torque: Array
-    """Torque actual value 6077h [N·m], (n,); each fourth cycle (TPDO2), NaN in the others."""
+    """Motor torque by the drive's own estimate [N·m], (n,); as often as the drives send it, NaN in other cycles."""
     status: NDArray[np.int64]
     """Newest state code of each drive, (n,), by its family (`armlink.link.joints.groups.state_name` has the words)."""
     age: Array
@@ -117,7 +117,7 @@ class Stats:
     """Frames sent and received."""
     cycles: int = 0
     missed: int = 0
-    """Sensor frames (TPDO1) that did not come in their cycle."""
+    """Readings that did not come in their cycle."""
     late: int = 0
     """Cycles that began more than a tenth of a period late."""
     lateness: Lateness = field(default_factory=Lateness)

@@ -76,6 +76,10 @@ class ArmDriver(Protocol):
         """Take the power from every joint; raises BusFault."""
         ...
 
+    def park(self) -> None:
+        """Stow the arm in the pose `link.park` of its file and take the power there; raises BadInput, Refused."""
+        ...
+
     def stop(self) -> None:
         """Quick stop of every joint."""
         ...
@@ -109,6 +113,11 @@ class ArmDriver(Protocol):
 
     def read_calibration(self, joint: int) -> Calibration:
         """The torque sensor record that joint 0 … n−1 works with; raises BusFault."""
+        ...
+
+    @property
+    def uncalibrated(self) -> tuple[str, ...]:
+        """Joints whose calibration the host is to keep and that have no record in force."""
         ...
 
     def read_temperatures(self) -> Array:

@@ -1,8 +1,9 @@
 """The process that owns an arm's bus and keeps its cycle: `python -m armlink.loop.process FD`, started by a RemoteLink.
 
 It makes every cycle on time whatever the job is doing: it plays what the job has sent ahead, and keeps the last command
-when there is nothing left. When the job ends or is killed the joints are stopped. When the job falls silent while
-joints are under torque control, they are held where they stand; under position control they keep their targets.
+when there is nothing left. When the job ends or is killed the joints are stopped, or the arm is parked where its drives
+would let it fall. When the job falls silent while joints are under torque control, they are held where they stand;
+under position control they keep their targets.
 """
 
 import pickle
@@ -46,6 +47,8 @@ class DriveLoop:
         self._id, self._row = 0, -1
         self._controlled = False
         """Whether a controller is being run."""
+        self.called = False
+        """Whether a function of the job is being called."""
         self._beside = ThreadPoolExecutor(1)
         self._unpickled: Future[Controller] | None = None
         """A controller that is on its way."""
@@ -92,12 +95,14 @@ class DriveLoop:
         try:
             kwargs = dict(call.kwargs)
             if callable(call.what):
+                self.called = True
                 answer = Answer(call.id, call.what(link, lambda text: self._tell(call.id, text), *call.args, **kwargs))
             else:
                 found = getattr(link, call.what)
                 answer = Answer(call.id, found(*call.args, **kwargs) if callable(found) else found)
         except ArmlinkError as error:
             answer = Answer(call.id, error=error)
+        self.called = False
         if link.enabled and (callable(call.what) or call.what in ENABLING):
             self._begin(0)
             self._last = link.last
@@ -169,7 +174,12 @@ def main(number: int) -> None:
         with link:
             channel.put(Answer(0, prepare()))
             sys.setswitchinterval(SWITCH)
-            DriveLoop(channel, link).run(ending)
+            loop = DriveLoop(channel, link)
+            try:
+                loop.run(ending)
+            except Closed:
+                if loop.called:  # interrupted a second time: the joints stop where they are
+                    link.stop()
     except Closed:
         return
 

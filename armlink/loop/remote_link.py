@@ -2,6 +2,7 @@
 
 import contextlib
 import itertools
+import logging
 import pickle
 import socket
 import subprocess
@@ -16,12 +17,14 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.drives.orders import DriveIdentity
-from armlink.errors import BusFault
+from armlink.errors import BusFault, Refused
+from armlink.link.park import leave, park
 from armlink.link.types import Calibration, Command, Controller, Sample, Samples, Setpoints, Stats, Tell
 from armlink.loop.channel import Channel, Closed
 from armlink.loop.messages import Alive, Answer, Call, Cut, Open, Play, Run, Stopped, Told, unpack
 from armlink.loop.realtime import Realtime
 
+log = logging.getLogger("armlink")
 CHUNK = 50
 """Rows of one message: unpickling more would hold up a cycle."""
 TOLD_EVERY = 0.2
@@ -69,11 +72,20 @@ class RemoteLink:
         """The link itself."""
         return self
 
-    def __exit__(self, *error: object) -> None:
-        """Stop the joints, close the bus, end the process."""
-        with contextlib.suppress(BusFault):
-            self.stop()
-        self._end()
+    def __exit__(self, kind: object, error: object, tb: object) -> None:
+        """As Link: park where drives would let the arm fall, stop, close the bus, end the process.
+
+        After an interruption (Ctrl-C) the arm is parked too; a second one stops it where it is.
+        """
+        try:
+            if not isinstance(error, BusFault):
+                self.inside(leave, lambda text: None)
+        except (BusFault, Refused) as failed:
+            log.warning("%s: not parked: %s", self.arm.name, failed)
+        finally:
+            with contextlib.suppress(BusFault):
+                self.stop()
+            self._end()
 
     @property
     def pid(self) -> int:
@@ -132,6 +144,10 @@ class RemoteLink:
         self._in_force = Command.hold(self._position_sent)
         return sample
 
+    def park(self) -> None:
+        """As Link.park."""
+        self.inside(park, lambda text: None)
+
     def disable(self) -> None:
         """As Link.disable."""
         self._call("disable")
@@ -143,6 +159,12 @@ class RemoteLink:
     def read_calibration(self, joint: int) -> Calibration:
         """As Link.read_calibration."""
         found: Calibration = self._call("read_calibration", joint)
+        return found
+
+    @property
+    def uncalibrated(self) -> tuple[str, ...]:
+        """As Link.uncalibrated."""
+        found: tuple[str, ...] = self._call("uncalibrated")
         return found
 
     def read_temperatures(self) -> Array:

@@ -33,7 +33,7 @@ class CycleReport:
     """Standard deviation of the period."""
     longest_period_ms: float
     latency_p50_ms: float
-    """Time from SYNC to the last joint's TPDO1, in complete cycles."""
+    """Time from the start of a cycle to the last joint's reading, in complete cycles."""
     latency_p99_ms: float
     latency_p999_ms: float
     latency_max_ms: float

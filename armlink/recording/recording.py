@@ -43,9 +43,9 @@ class Recording:
     torque: Array | None = None
     """Joint torque sensor, link side of the transmission [N·m], shape (K, n)."""
     motor_torque: Array | None = None
-    """The drive's own estimate (6077h) [N·m], shape (K, n)."""
+    """The drive's own estimate [N·m], shape (K, n)."""
     torque_command: Array | None = None
-    """Target torque (6071h) [N·m], shape (K, n)."""
+    """Target torque [N·m], shape (K, n)."""
     position_command: Array | None = None
     """[rad], shape (K, n)."""
     temperature: Array | None = None

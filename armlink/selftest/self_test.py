@@ -11,14 +11,15 @@ import numpy as np
 from armlink.drives.findings import Outcome, Result
 from armlink.drives.orders import Power
 from armlink.drives.traits import Silence
-from armlink.errors import ArmlinkError, BusFault
+from armlink.errors import ArmlinkError, BusFault, Refused
 from armlink.link.faults import bus_fault
 from armlink.link.gate_limits import drive_limits
 from armlink.link.joints.groups import traits_of
 from armlink.link.link import Link
+from armlink.link.park import let_go, park
 from armlink.link.types import Sample, Tell
 
-CHECKS = ("set-up", "answers", "enables and holds", "silence")
+CHECKS = ("set-up", "answers", "enables and holds", "silence", "park")
 CYCLES = 50
 """Cycles without power, to see whether each is answered."""
 ANSWERED = 0.9
@@ -30,13 +31,9 @@ FELL = 0.5
 """A joint whose drive falls free may move this far in the test of its silence [rad]."""
 PATIENCE = 3.0
 """So many deadlines are waited for a reaction."""
-EXPECTED: dict[Silence, tuple[Power, ...]] = {
-    "holds": (Power.STOPPED,),
-    "damps": (Power.STOPPED, Power.FAULT),
-    "falls": (Power.OFF, Power.FAULT),
-    "keeps on": (),
-}
-"""What a drive may be in after its host was silent, by its trait."""
+KEEPS_ON = "nothing stops this joint when its host dies: do not drive it"
+ASKED_CYCLES = 5
+"""Cycles that a drive has to tell its state when it is asked."""
 
 
 def self_test(link: Link, tell: Tell, power: bool) -> tuple[list[Result], str]:
@@ -52,6 +49,7 @@ class SelfTest:
         self.link, self.progress = link, progress
         self.results: list[Result] = []
         self._reached: set[tuple[str, str]] = set()
+        self._parked = False
 
     def run(self, power: bool) -> list[Result]:
         """All checks; those with power only where `power`, and where all before them passed.
@@ -68,14 +66,16 @@ class SelfTest:
         try:
             if not self._identified():
                 reason = "a drive does not answer, or is another"
-            elif self._started() and power:
-                self._with_power()
+            elif not self._started():
+                reason = "a check without power failed"
+            elif power:
+                reason = self._watched() or self._with_power()
         except ArmlinkError as error:
             reason = str(error)
             if self.results and all(each.outcome != "failed" for each in self.results):
                 self._add(link.names[0], "answers", "failed", reason)
         finally:
-            if link.commander.passed:
+            if link.commander.passed and not self._parked:
                 link.commander.stop()
         for check in CHECKS:
             for name in link.names:
@@ -119,6 +119,7 @@ class SelfTest:
             self._add(name, "set-up", "passed", "; ".join((*setup.notes, scales)) or "read back")
             for lost in setup.lost:
                 self._add(name, f"lacks: {lost.partition(':')[0]}", "absent", lost)
+        self._calibrations()
         came = np.zeros(link.n, int)
         for _ in range(CYCLES):
             came += np.isfinite(link.commander.stand([Power.OFF] * link.n).position)
@@ -127,7 +128,29 @@ class SelfTest:
             self._add(name, "answers", "passed" if good else "failed", f"{came[joint]} of {CYCLES} cycles answered")
         return bool((came >= ANSWERED * CYCLES).all())
 
-    def _with_power(self) -> None:
+    def _calibrations(self) -> None:
+        """Calibrations that the host keeps: which record is in force, or that there is none."""
+        link = self.link
+        for joint, (name, traits) in enumerate(zip(link.names, traits_of(link.groups, link.n), strict=True)):
+            if traits.calibration != "host":
+                continue
+            held = link.read_calibration(joint)
+            if name in link.uncalibrated:
+                self._add(name, "calibration", "absent", "no record in force: torque is what the drive takes it for")
+            else:
+                told = f"gain {held.gain:.6g}, offset {held.offset:.4g} N·m, record {held.record_id}"
+                self._add(name, "calibration", "passed", told)
+
+    def _watched(self) -> str:
+        """Why the joints are not driven: a drive that is known to keep on when its host falls silent; else empty."""
+        for name, traits in zip(self.link.names, traits_of(self.link.groups, self.link.n), strict=True):
+            if traits.silence == "keeps on":
+                self._add(name, "silence", "failed", KEEPS_ON)
+        keeping = [each.joint for each in self.results if each.check == "silence"]
+        return f"{keeping[0]} is not driven: it would keep on after its host died" if keeping else ""
+
+    def _with_power(self) -> str:
+        """Enable, hold, silence of each drive, stow; returns why what is left is not run."""
         link = self.link
         self.progress("enable, and hold")
         start = link.clock.now()
@@ -143,6 +166,27 @@ class SelfTest:
             self._add(name, "enables and holds", "passed", found, seconds)
         for joint in range(link.n):
             self._silence(joint)
+        return self._park()
+
+    def _park(self) -> str:
+        """Stow the arm where drives let go without their host; returns why it is not stowed."""
+        link = self.link
+        falling = let_go(link)
+        if link.section.park is None and falling:
+            for name in falling:
+                self._add(name, "park", "absent", "link.park: the joint sinks or falls when the work ends")
+        if link.section.park is None or not falling:
+            return "every drive holds on its own" if not falling else "no link.park"
+        start = link.clock.now()
+        try:
+            park(link, self.progress)
+        except Refused as error:
+            self._add(link.names[0], "park", "failed", str(error))
+            return str(error)
+        self._parked, seconds = True, link.clock.now() - start
+        for name in link.names:
+            self._add(name, "park", "passed", "stowed, power off", seconds)
+        return ""
 
     def _silence(self, joint: int) -> None:
         """No command for one joint, all others commanded as before: what does its drive do, and is that its trait?"""
@@ -151,26 +195,43 @@ class SelfTest:
         group = next(group for group in link.groups if joint in group.places)
         drive, trait = group.places.index(joint), traits_of(link.groups, link.n)[joint].silence
         self.progress(f"{name}: no commands for {limit * 1e3:.0f} ms")
-        standing = np.array(link.commander.loop.latest_position)
-        link.commander.loop.withheld = frozenset([joint])
+        loop, on = link.commander.loop, [Power.ON] * link.n
+        standing = np.array(loop.latest_position)
+        loop.withheld = frozenset([joint])
         found, seconds = Power.ON, 0.0
         start = link.clock.now()
         try:
             while found is Power.ON and seconds < PATIENCE * limit:
-                self._cycle([Power.ON] * link.n, standing, FELL)
+                self._cycle(on, standing, FELL)
                 seconds = link.clock.now() - start
                 found = group.drives.power(drive)
             if found is Power.ON:  # a drive that answers commands alone is asked
-                found = group.drives.ask_power(drive, link.ask.on(group.tag))
+                for can_id, data in group.drives.state_request(drive):
+                    loop.send(can_id | group.tag, data)
+                for _ in range(ASKED_CYCLES):
+                    self._cycle(on, standing, FELL)
+                found = group.drives.power(drive)
+            does = self._reaction(
+                found, group.drives.lets_go(drive), float(abs(loop.latest_position - standing)[joint])
+            )
         finally:
-            link.commander.loop.withheld = frozenset()
-        good = found in EXPECTED[trait]
-        what = "keeps on" if found is Power.ON else found.value
-        told = f"power is {what} after {seconds * 1e3:.0f} ms without a command, by its trait it {trait}"
-        if trait == "keeps on" or found is Power.ON:
-            told += ": nothing stops this joint when its host dies: do not drive it"
+            loop.withheld = frozenset()
+        told = f"{does} within {seconds * 1e3:.0f} ms without a command, by its trait it {trait}"
+        if does == "keeps on":
+            told += f": {KEEPS_ON}"
+        good = does == trait or (does, trait) == ("holds", "damps")
         self._add(name, "silence", "passed" if good else "failed", told, seconds)
-        link.recover()
+        link.commander.settle()
+        link.commander.walk(Power.ON)
+
+    @staticmethod
+    def _reaction(found: Power, free: bool, moved: float) -> Silence:
+        """What a drive did that is in a power state, whose motor is `free`, and that moved so far [rad]."""
+        if found is Power.ON:
+            return "keeps on"
+        if free:
+            return "falls"
+        return "holds" if moved < HELD else "damps"
 
     def _cycle(self, power: list[Power], standing: np.typing.NDArray[np.float64], most: float) -> Sample:
         """One cycle; raises BusFault where the bus has a fault or a joint moves too far."""

@@ -12,9 +12,32 @@ from gcomp.identify.parameters import Prior
 Share = Annotated[FiniteFloat, Field(gt=0, lt=1)]
 
 
+class CreepSection(Section):
+    """How a joint creeps, for arms whose torque is a motor current (docs/no-torque-sensors.md)."""
+
+    speeds: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=4)] = (0.1, 0.2)
+    """Speeds of the swept joint, one a pose in turn [rad/s]: slow enough that inertia does not show, fast enough that
+    friction is beyond its minimum (Stribeck)."""
+    poses: Annotated[int, Field(ge=1, le=8)] = 2
+    """Poses of the other joints per swept joint."""
+    bin: Positive = 0.08
+    """Way over which readings are averaged [rad]: more than two periods of gear and cogging ripple."""
+    span: Positive = 2.0
+    """Longest way of one creep [rad], its ends included; where a joint has more range, the plan chooses the part."""
+    contact_lead: Positive = 0.08
+    """A creeping joint that is so far behind its target has touched something [rad]; further for soft position loops,
+    until they pull by 1.5 N·m."""
+    zero_std: Annotated[FiniteFloat, Field(gt=0)] = 0.03
+    """Standard deviation of the position zeros beforehand, which such arms get by hand [rad]."""
+
+
 class SweepSection(Section):
     """Steps, poses, settle rule, averaging and how resting joints are held."""
 
+    motion: Literal["creep", "steps"] | None = None
+    """Creep at constant speed, or steps at rest; by default creep where every drive's torque is a motor current."""
+    creep: CreepSection = CreepSection()
+    """How joints creep."""
     steps: Annotated[int, Field(ge=5, le=200)] = 6
     """Positions per sweep; each is read on the way up and on the way down."""
     poses: Annotated[int, Field(ge=1, le=8)] = 2

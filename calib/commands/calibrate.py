@@ -34,8 +34,9 @@ def calibrate(
     Example: armlink calibrate unloaded loaded --json calibration.json
     """
     from armlink.commands.output import write_json
-    from armlink.errors import Refused
+    from armlink.errors import BadInput, Refused
     from calib.arm.kinematics import gcomp_arm
+    from calib.commands.creep.fits import all_creep, calibrate_creep
     from calib.commands.screen import print_lines
     from calib.commands.sweep_data import load_sweeps
     from calib.fit.felt_mass import felt_mass
@@ -45,6 +46,11 @@ def calibrate(
     from calib.records.store import RecordStore
 
     data, arm_file = load_sweeps("calibrate", directories, arm)
+    if all_creep(data):
+        if apply:
+            raise BadInput("--apply: the host keeps the calibration of these drives: the record is in force without it")
+        calibrate_creep(data, arm_file, store, json_file)
+        return
     fit = fit_sensors(arm_file, data)
     records = RecordStore(store)
     current = records.current(CalibrationRecord, arm_file)
@@ -97,6 +103,9 @@ def _answer(fit: "SensorFit", record: "CalibrationRecord", applied: bool) -> dic
             for found in fit.findings
         ],
         "doubtful": list(fit.doubtful),
+        "discrepancy": [
+            {"joint": name, **each.model_dump()} for name, each in zip(fit.names, fit.goodness.discrepancy, strict=True)
+        ],
         "left_out": [
             {"sweep": each.sweep, "joint": fit.names[each.joint], "rms": each.rms, "ratio": each.ratio}
             for each in fit.goodness.left_out
@@ -121,7 +130,7 @@ def _show(fit: "SensorFit") -> None:
     from calib.commands.screen import print_intervals, print_lines
 
     headings: dict[Parameter, str] = {"gain": "gain", "offset": "offset [N·m]", "position_gain": "position gain"}
-    columns = {heading: (fit.value(name), fit.quantile * fit.std(name)) for name, heading in headings.items()}
+    columns = {heading: (fit.value(name), fit.half95(name)) for name, heading in headings.items()}
     columns["locked friction [N·m]"] = (fit.friction, 0 * fit.friction)
     print_intervals("Sensors, ± half of the 95 % interval", fit.names, columns)
     lines = [f"{joint} {parameter}: {reason}" for (joint, parameter), reason in fit.reasons.items()]

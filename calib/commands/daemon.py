@@ -1,6 +1,7 @@
 """Runs the service that watches the arm, keeps its torque sensors true, and serves a page and an API."""
 
 from enum import StrEnum
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -27,7 +28,7 @@ def daemon(
         typer.Option(
             "--listen-only",
             help="Another controller commands the bus: send no SYNC and no commands. A recalibration that is applied"
-            " still writes object 2100h by SDO.",
+            " is still written to controllers that keep their calibration.",
         ),
     ] = False,
     socket: Annotated[
@@ -56,6 +57,7 @@ def daemon(
     from calib.daemon.options import Options, state_directory
     from calib.records.file_lock import locked_directory
 
+    _require_service()
     described = load_arm(arm)
     resolve_bus(bus, described.require_link().bus)
     directory = state_directory(state, described)
@@ -83,6 +85,13 @@ def daemon(
 
         run_daemon(options, described, directory, host)
     return 0
+
+
+def _require_service() -> None:
+    """Raise ModuleNotFoundError, by which the extra is named, before anything is begun; they are imported later."""
+    for module in ("fastapi", "uvicorn", "prometheus_client"):
+        if find_spec(module) is None:
+            raise ModuleNotFoundError(f"No module named {module!r}", name=module)
 
 
 def _token(path: Path | None) -> str | None:

@@ -25,6 +25,7 @@ def identify(
     """
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
+    from calib.commands.creep.fits import all_creep, identify_creep
     from calib.commands.sweep_data import load_sweeps
     from calib.fit.gravity_fit import identify_gravity
     from calib.fit.sensor_fit import SensorFit, fit_sensors
@@ -32,6 +33,9 @@ def identify(
     from calib.records.store import RecordStore
 
     data, arm_file = load_sweeps("identify", directories, arm)
+    if all_creep(data):
+        identify_creep(data, arm_file, store, json_file)
+        return
     records = RecordStore(store)
     sensors: SensorFit | CalibrationRecord
     used: CalibrationRecord | None

@@ -18,6 +18,7 @@ from armlink.link.lateness import Lateness
 from calib.plan.types import SweepPlan
 
 if TYPE_CHECKING:
+    from armlink.loop.driver import ArmDriver
     from calib.sweep.dataset import SweepData
     from calib.sweep.preflight import Preflight
 
@@ -150,6 +151,14 @@ def warn_late(arm: ArmFile, lateness: Lateness) -> None:
     """A line if this machine was late enough to come near the arm's deadline."""
     warning = lateness.near(arm.require_link().deadline, arm.name)
     print_lines([warning] if warning else [], "yellow")
+
+
+def say_uncalibrated(link: "ArmDriver") -> None:
+    """Name the joints whose calibration the host keeps and that have no record in force."""
+    names = link.uncalibrated
+    if names:
+        text = f"{link.arm.name}: no calibration record is in force for {', '.join(names)}: torque is the drives' own"
+        print_lines([text], "yellow")
 
 
 def _short(names: tuple[str, ...]) -> list[str]:

@@ -53,7 +53,7 @@ def sweep(
     from armlink.errors import BadInput
     from calib.api import open_link
     from calib.arm.sweep_section import with_hold
-    from calib.commands.screen import SweepScreen, confirm, warn_late
+    from calib.commands.screen import SweepScreen, confirm, say_uncalibrated, warn_late
     from calib.sweep.dataset import require_vacant
 
     arm_file = with_hold(load_arm(arm), hold)
@@ -68,6 +68,7 @@ def sweep(
     load = reference_mass if dry_run else 0.0
     with open_link(arm_file, None if dry_run else bus, simulated=dry_run, load=load) as link:
         link.start()
+        say_uncalibrated(link)
         with SweepScreen(f"{arm_file.name}, {reference_mass:g} kg attached") as screen:
             found, data = _run(
                 link,
@@ -90,11 +91,19 @@ def _plan(arm_file: "ArmFile", seed: int, picture: Path | None) -> dict[str, Any
     """Print and check the plan, and draw it if asked to; the answer for machines."""
     from calib.arm.kinematics import model_arm
     from calib.commands.screen import print_lines, print_plan
+    from calib.creep.choice import sweep_motion
+    from calib.creep.plan import creep_seconds, plan_creep
     from calib.plan.collisions import check_plan
     from calib.plan.drawing import draw_plan, pass_seconds
     from calib.plan.rough_gravity import guess_of_model
     from calib.plan.sweep_plan import plan_sweep
 
+    if sweep_motion(arm_file) == "creep":
+        planned = plan_creep(arm_file, seed=seed)
+        print_plan(arm_file, planned)
+        took = creep_seconds(planned)
+        print_lines([f"{len(planned.sweeps)} creeps both ways, about {took / 60:.0f} min a pass"])
+        return {**planned.model_dump(mode="json"), "seconds": took, "picture": None}
     model = None if arm_file.model_path is None else model_arm(arm_file)
     planned = plan_sweep(arm_file, None if model is None else guess_of_model(model.arm, model.beta), seed=seed)
     print_plan(arm_file, planned)
@@ -120,6 +129,8 @@ def _run(
     check_stops: bool,
 ) -> "tuple[Preflight, SweepData]":
     """Enable the arm, check it and sweep it."""
+    from calib.creep.choice import sweep_motion
+    from calib.creep.run import run_creep
     from calib.sweep.preflight import find_stops, listen
     from calib.sweep.run import run_sweep
     from calib.sweep.stalls import bridged
@@ -127,10 +138,11 @@ def _run(
     link.enable()
     on_stall = screen.on_stall(keep_going)
     heard = bridged(link, on_stall, lambda: listen(link, arm_file))
-    found = heard
-    if check_stops:
+    found, creeping = heard, sweep_motion(arm_file) == "creep"
+    if check_stops and not creeping:
         found = bridged(link, on_stall, lambda: find_stops(link, arm_file, heard, screen.count))
-    data = run_sweep(
+    run = run_creep if creeping else run_sweep
+    data = run(
         link,
         arm_file,
         out,
@@ -150,6 +162,10 @@ def _show(arm: str, arm_file: "ArmFile", found: "Preflight", data: "SweepData", 
     print_preflight(found)
     print_plan(arm_file, data.plan)
     print_lines([*unsettled_said(data), *stalls_said(data)], "yellow")
+    if data.manifest.reference_mass and data.plan.sweeps[0].speed is not None:
+        again = data.path.with_name(f"{data.path.name}-again")
+        screen.say(f"{data.path} is complete. Now take the mass off and sweep once more without it:")
+        screen.say(shlex.join(["armlink", "sweep", arm, "--out", str(again)]))
     if not data.manifest.reference_mass:
         mass = data.plan.reference_mass
         loaded = data.path.with_name(f"{data.path.name}-loaded")

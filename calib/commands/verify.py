@@ -32,6 +32,8 @@ def verify(
     from armlink.commands.output import write_json
     from armlink.loop.open import open_arm
     from calib.commands.screen import SweepScreen
+    from calib.creep.choice import sweep_motion
+    from calib.creep.verify import verify_creeping
     from calib.records.store import RecordStore
     from calib.sweep.verify import run_verify
 
@@ -41,7 +43,12 @@ def verify(
         link.start()
         with SweepScreen(f"{arm_file.name}: verify") as screen:
             link.enable()
-            result = run_verify(link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=screen.count)
+            if sweep_motion(arm_file) == "creep" and calibration is not None:
+                result = verify_creeping(
+                    link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=screen.count
+                )
+            else:
+                result = run_verify(link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=screen.count)
     _show(result)
     if report is not None:
         from calib.report.verification import write_report

@@ -3,15 +3,13 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from armlink.arm_file import SIMULATED, ArmFile, Bus
-from armlink.bus.frame_bits import longest_frame_bits
+from armlink.arm_file import SIMULATED, ArmFile, Bus, LinkJoint
+from armlink.bus.can_bus import CanBus
 from armlink.bus.open import open_link_bus, resolve_bus
-from armlink.drives.canopen import pdo
-from armlink.drives.canopen.check.found_drives import Drives, FoundDrive
-from armlink.drives.canopen.controller_setup import identity_mismatches
-from armlink.drives.canopen.eds_file import expected_identity, of_joints
-from armlink.drives.canopen.units import RATED_TORQUE_TOLERANCE
+from armlink.drives.registry import family
 from armlink.errors import ArmlinkError
+from armlink.link.joints.groups import make_groups
+from armlink.link.link import Link
 from calib.commissioning.finding import SetupFinding
 
 INTERFACES = Path("/sys/class/net")
@@ -38,7 +36,7 @@ def bus_findings(arm_file: ArmFile, spec: str | None = None) -> Iterator[SetupFi
         yield SetupFinding("error", reason or what, name, remedy)
         return
     try:
-        yield from _drives(arm_file, Drives(opened).found, name)
+        yield from _drives(arm_file, opened, name)
     except ArmlinkError as error:
         yield SetupFinding("error", str(error), name, "check power, wiring and bit rate; armlink scan shows more")
     finally:
@@ -54,13 +52,19 @@ def _load(arm_file: ArmFile) -> Iterator[SetupFinding]:
     for bus in dict.fromkeys(joint.bus for joint in link.joints):
         count = sum(joint.bus == bus for joint in link.joints)
         rate = link.buses[bus].bitrate if bus else link.bus.bitrate
-        each = [longest_frame_bits(frame.layout.size) for frame in (pdo.RPDO1, pdo.TPDO1)]
-        slow = longest_frame_bits(pdo.TPDO2.layout.size) / pdo.STATUS_DECIMATION
-        load = link.rate * (count * (sum(each) + slow) + longest_frame_bits(0)) / rate
+        load = link.rate * _cycle_bits(arm_file, [joint for joint in link.joints if joint.bus == bus]) / rate
         if load > HIGH_LOAD:
             what = f"{count} joints at {link.rate:g} Hz load the bus by up to {load:.0%} of {rate} bit/s"
             remedy = f"lower link.rate to {int(link.rate * HIGH_LOAD / load)} Hz, or spread the joints over link.buses"
             yield SetupFinding("error" if load > 1 else "warning", what, f"{arm_file.path}: link.rate", remedy)
+
+
+def _cycle_bits(arm_file: ArmFile, joints: list[LinkJoint]) -> float:
+    """Bit times that a cycle of the joints of one bus takes at most."""
+    found = 0.0
+    for name in dict.fromkeys(joint.settings.family for joint in joints):
+        found += family(name).build(arm_file, [each for each in joints if each.settings.family == name]).cycle_bits()
+    return found
 
 
 def _absent_interface(bus: Bus) -> SetupFinding | None:
@@ -79,28 +83,19 @@ def _absent_interface(bus: Bus) -> SetupFinding | None:
     return SetupFinding("error", "the interface is down", name, f"sudo ip link set {bus.channel} up{set_up}")
 
 
-def _drives(arm_file: ArmFile, found: list[FoundDrive], bus: str) -> Iterator[SetupFinding]:
-    link, by_node = arm_file.require_link(), {each.node: each for each in found}
-    spare = [each.node for each in found if each.node not in {joint.node for joint in link.joints}]
-    unknown = f"; nodes {', '.join(map(str, spare))} answer and are in no joint" if spare else ""
-    for joint, sheet in zip(link.joints, of_joints(arm_file, link.joints), strict=True):
-        where = f"{joint.name} (node {joint.node})"
-        drive = by_node.get(joint.node) if joint.node is not None else None
-        if drive is None:
-            remedy = f"check its power, wiring and node id{unknown}; armlink new with --bus finds the drives"
-            yield SetupFinding("error", f"no answer on {bus}", where, remedy)
-            continue
-        for differs in identity_mismatches(expected_identity(joint, sheet), vars(drive.identity)):
-            remedy = "connect the right arm, or correct identity under link.joints"
-            yield SetupFinding("error", f"another controller: {differs}", where, remedy)
-        if abs(drive.rated_torque - joint.rated_torque) > RATED_TORQUE_TOLERANCE * joint.rated_torque:
-            what = f"its rated torque (6076h) is {drive.rated_torque:g} N·m, the arm file has {joint.rated_torque:g}"
-            yield SetupFinding(
-                "error", what, where, f"set rated_torque: {drive.rated_torque:g}, or connect its own drive"
-            )
-        if drive.max_torque < joint.max_torque * (1 - RATED_TORQUE_TOLERANCE):
-            what = f"the drive allows {drive.max_torque:g} N·m (6072h), max_torque is {joint.max_torque:g}"
-            yield SetupFinding("warning", what, where, f"lower max_torque to {drive.max_torque:g}, or raise 6072h")
-    if spare and len(found) - len(spare) == len(link.joints):
-        what = f"nodes {', '.join(map(str, spare))} answer and belong to no joint"
-        yield SetupFinding("hint", what, bus, "a gripper or another arm: nothing is sent to them")
+def _drives(arm_file: ArmFile, opened: CanBus, bus: str) -> Iterator[SetupFinding]:
+    """What the drives on the open bus say against the arm file."""
+    groups = make_groups(arm_file, opened)
+    kind = groups[0].family
+    if len(groups) == 1 and kind.examine is not None:
+        for finding in kind.examine(arm_file, opened, bus):
+            yield SetupFinding(finding.level, finding.what, finding.where, finding.remedy)
+        return
+    link = Link(arm_file, opened)
+    for each in link.scan():
+        where = f"{link.names[each.joint]} ({each.address})"
+        if not each.present:
+            yield SetupFinding("error", f"no answer on {bus}", where, "check its power, wiring and id")
+        elif each.mismatch:
+            remedy = "connect the right arm, or correct its drive under link.joints"
+            yield SetupFinding("error", each.mismatch, where, remedy)

@@ -105,7 +105,7 @@ def _joint(place: int, chain: Chain, given: tuple[float, float] | None, need: fl
         notes.append(f"rated_torque assumed: {LOAD_FACTOR:g} times the load, the model states no effort limit")
     else:
         effort = round(joint.effort, 4)
-        notes.append("rated_torque assumed to be the model's effort limit: 6076h of the drive must be the same")
+        notes.append("rated_torque assumed to be the model's effort limit: the drive's own rating must be the same")
     stops = given
     if given is None and joint.limits is None:
         stops = (-ASSUMED_STOP, ASSUMED_STOP)

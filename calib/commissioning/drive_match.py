@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from armlink.drives.canopen.check.found_drives import Drives, FoundDrive
+from armlink.drives.found import FoundDrive, FoundDrives
 from armlink.errors import BadInput, BusFault
 from calib.commissioning.finding import SetupFinding
 
@@ -13,7 +13,7 @@ CLEAR = 3.0
 """The turned joint's drive must read so many times the motion of any other; a choice."""
 SCALE_TOLERANCE = 0.1
 """Share by which the angle between the stops may read differently: calibration corrects a few per cent; a choice."""
-POLARITY_REMEDY = "turn the direction round in the drive (607Eh polarity, bit 7), or the axis in the model"
+POLARITY_REMEDY = "turn the direction round in the drive (its polarity), or the axis in the model"
 
 Ask = Callable[[str], None]
 """Shows a person what to do and returns when it is done."""
@@ -39,7 +39,7 @@ class Match:
     by_hand: bool
 
 
-def match_in_order(names: Sequence[str], drives: Drives, bus: str) -> list[Match]:
+def match_in_order(names: Sequence[str], drives: FoundDrives, bus: str) -> list[Match]:
     """Joints base to tip take the drives in the order of their node ids; raises BusFault where they are too few."""
     found = drives.found
     _require(names, found, bus)
@@ -53,7 +53,7 @@ def match_in_order(names: Sequence[str], drives: Drives, bus: str) -> list[Match
 
 
 def match_by_hand(
-    joints: Sequence[TurnedJoint], drives: Drives, bus: str, ask: Ask
+    joints: Sequence[TurnedJoint], drives: FoundDrives, bus: str, ask: Ask
 ) -> tuple[list[Match], list[SetupFinding]]:
     """Ask for each joint to be turned from stop to stop; the drive that reads the motion is its drive.
 
@@ -109,6 +109,6 @@ def _judge(joint: TurnedJoint, node: int, turned: float) -> list[SetupFinding]:
         findings.append(SetupFinding("error", what, where, POLARITY_REMEDY))
     if abs(abs(ratio) - 1) > SCALE_TOLERANCE:
         what = f"from stop to stop it read {abs(turned):.2f} rad, the model has {expected:.2f} ({abs(ratio):.3g} times)"
-        remedy = f"correct the drive's gear ratio (6091h) by the factor {abs(ratio):.3g}, or the stops in the arm file"
+        remedy = f"correct the drive's gear ratio by the factor {abs(ratio):.3g}, or the stops in the arm file"
         findings.append(SetupFinding("error", what, where, remedy))
     return findings

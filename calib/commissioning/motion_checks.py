@@ -31,7 +31,7 @@ def motion_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
     for joint in arm_file.link.joints:
         if joint.max_torque > 3 * joint.rated_torque:
             what = f"max_torque {joint.max_torque:g} N·m is more than three times rated_torque {joint.rated_torque:g}"
-            yield SetupFinding("warning", what, joint.name, "check both: 6076h and 6072h of the drive")
+            yield SetupFinding("warning", what, joint.name, "check both against the drive's own rating and limit")
         if joint.max_torque_rate > FASTEST_RATE * joint.max_torque:
             what = f"max_torque_rate {joint.max_torque_rate:g} N·m/s: full torque within {1e3 / FASTEST_RATE:.0f} ms"
             yield SetupFinding("hint", what, joint.name, f"about {2.5 * joint.max_torque:.3g} N·m/s is usual")

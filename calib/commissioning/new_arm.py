@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import yaml
 
 from armlink.arm_file import MODEL_SUFFIXES, ArmFile, parse_arm
-from armlink.drives.canopen.check.found_drives import Drives
+from armlink.drives.found import FoundDrives
 from armlink.errors import BadInput
 from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.arm_text import arm_text
@@ -110,7 +110,7 @@ def _given_stops(
     return stops
 
 
-def match_drives(made: NewArm, drives: Drives, bus: str, ask: Ask | None) -> list[Match]:
+def match_drives(made: NewArm, drives: FoundDrives, bus: str, ask: Ask | None) -> list[Match]:
     """Find the drive of every joint and take its node, identity and ratings into the draft; raises BusFault, BadInput.
 
     With `ask` each joint is turned by hand, else the order of node ids counts.
@@ -132,7 +132,7 @@ def match_drives(made: NewArm, drives: Drives, bus: str, ask: Ask | None) -> lis
         joint.node, joint.rated_torque = drive.node, drive.rated_torque
         joint.max_torque = min(joint.max_torque, drive.max_torque) if from_model else drive.max_torque
         joint.max_torque_rate = float(f"{2.5 * joint.max_torque:.3g}")
-        joint.identity = {"vendor": drive.identity.vendor, "product": drive.identity.product}
+        joint.identity = {"vendor": drive.vendor, "product": drive.product}
         joint.notes = [note for note in joint.notes if not note.startswith("rated_torque")]
         joint.notes.append(
             "node found by turning the joint by hand" if match.by_hand else "node assumed: in the order of node ids"

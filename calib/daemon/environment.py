@@ -24,7 +24,7 @@ class Port(Protocol):
 
     @property
     def controllers(self) -> Controllers:
-        """Reads and writes object 2100h of every joint; waits for the answer, so only for work that runs aside."""
+        """Reads and writes the calibration of every joint; waits for the answer, so only for work that runs aside."""
         ...
 
     def sweep(self, poses: int, seed: int, /) -> Answer | None:

@@ -141,6 +141,7 @@ class Service:
                 self.records.observation.handle(message)
         elif isinstance(message, Up):
             self.arm_state.up()
+            self.arm_state.uncalibrated = message.uncalibrated
             self.records.held(message.held)
         elif isinstance(message, Down):
             self.tours.stopped()

@@ -60,6 +60,7 @@ class ServiceView:
                 calibration=None if observation is None else observation.feed.calibration.id,
                 gravity=None if observation is None else observation.feed.gravity.id,
             ),
+            uncalibrated=arm_state.uncalibrated,
             held=observation is not None and observation.feed.observer.held,
             rows=0 if observation is None else observation.feed.observer.rows,
             pending_proposals=service.journal.pending(),

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calib.fit.findings import Finding, effect_finding, encoder_findings, outlier_findings, scatter_findings
+from calib.fit.lags import Lags
 from calib.fit.position_field import PositionField
 from calib.fit.refinement import Extra, Refined, refine
 from calib.fit.remaining_doubt import remaining_doubt
@@ -17,7 +18,7 @@ from calib.records.records import Discrepancy
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
 from gcomp.identify.global_fit import GlobalFit
-from gcomp.identify.parameters import Prior
+from gcomp.identify.parameters import Parameters, Prior
 from gcomp.identify.sensor_model import predict
 
 MOST_EFFECTS = 6
@@ -72,7 +73,7 @@ def examine(
     """
     rows, findings = _without_plateaus(kinematics.names, rows)
     encoders = encoder_findings(kinematics.names, rows)
-    setting = _setting(kinematics, rows, rated)
+    setting = _setting(kinematics, rows, rated, fit.complete)
     effects, sound = list[Effect](), rows.readings.sigma
     outliers = np.zeros(sound.shape, dtype=bool)
 
@@ -104,10 +105,11 @@ def examine(
     return Goodness(refined, tuple(final), outliers, leave_out(refined, rows), doubt)
 
 
-def _setting(kinematics: Arm, rows: SweepReadings, rated: Array) -> Setting:
+def _setting(kinematics: Arm, rows: SweepReadings, rated: Array, parameters: Parameters) -> Setting:
     counted, poses = rows.readings.counted, rows.readings.position
     fields = tuple(PositionField.over(poses[counted[:, joint]], 1.0) for joint in range(kinematics.n))
-    return Setting(kinematics, rated, fields, (float(rows.time.min()), float(rows.time.max())))
+    lags = Lags.of(kinematics, rows, parameters, rated)
+    return Setting(kinematics, rated, fields, (float(rows.time.min()), float(rows.time.max())), lags)
 
 
 def _sized(effects: list[Effect], refined: Refined) -> Iterator[tuple[Effect, Array]]:

@@ -8,17 +8,17 @@ from scipy import linalg
 
 from gcomp.arrays import Array
 
-ROUNDS = 40
-SETTLED = 0.02
-"""Largest relative change of a level at which the iteration ends."""
-LEAST, WEIGHT, FEW = 0.1, 2.0, 5.0
-"""Beforehand a level is the arm's common one, at least LEAST, and that is worth WEIGHT coefficients: an arm is good or
-bad in all that it is, and a family that hardly shows keeps a level instead of none, which would make the intervals
-certain of what the readings do not tell. The common level is the mean of the logarithms, in which a family counts as
-much as it has coefficients that the readings tell, and at most FEW."""
-
-LARGEST = 5.0
-"""Largest level: bad arms have 3. A trouble that asks for more is not small: it stands out, is named and taken out."""
+ROUNDS, SETTLED, LONGEST = 30, 0.01, 1.0
+"""Steps at most; longest and last step, in the logarithm of a level."""
+WEIGHT = 2.0
+"""Coefficients that the arm's common level counts for in each family: an arm is good or bad in all that it is, and a
+family that hardly shows keeps a level instead of none, which would make the intervals certain of what the readings do
+not tell."""
+UNKNOWN = 2.0
+"""Standard deviation beforehand of the common level's logarithm about that of good arms: a factor of seven."""
+LEAST, LARGEST = 0.02, 5.0
+"""Range of a level. A trouble fifty times smaller than on good arms is none; bad arms have 3: a trouble that asks
+for more than 5 is not small: it stands out, is named and taken out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,38 +63,44 @@ class Levels:
     """One a family, in its unit (F,)."""
     freedom: Array
     """How many coefficients of each family the readings tell (F,)."""
-    criterion: float
-    """Twice the negative restricted log-likelihood, up to a constant."""
+    covariance: Array
+    """Of the levels' logarithms (F, F)."""
 
 
 def learn(effects: Effects, start: Array) -> Levels:
-    """Levels of all families (F,) by MacKay's iteration from `start`; a family without effects keeps its start."""
-    level, freedom = start.copy(), np.zeros(effects.families)
-    places = [np.flatnonzero(effects.family == family) for family in range(effects.families)]
-    criterion = np.inf
+    """Levels of all families (F,) by Fisher scoring in their logarithms from `start`, with the arm's common level.
+
+    A family has the inverse χ² prior of WEIGHT coefficients at the common level, which is unknown within the range.
+    """
+    count = effects.families
+    theta = np.append(np.log(start), np.log(start).mean())
     for _ in range(ROUNDS):
-        spread, solution, criterion = _solved(effects, level)
-        before, counts = level.copy(), np.clip(freedom, 0.1, FEW)
-        common = max(LEAST, float(np.exp(counts @ np.log(level) / counts.sum())))
-        for family, at in enumerate(places):
-            if len(at):
-                freedom[family] = len(at) - spread[at].sum() / level[family] ** 2
-                told = solution[at] @ solution[at] + WEIGHT * common**2
-                level[family] = min(np.sqrt(told / (max(freedom[family], 0.0) + WEIGHT)), LARGEST)
-        if np.abs(level / before - 1).max() < SETTLED:
+        score, told, hessian = _scored(effects, theta)
+        step = np.clip(-np.linalg.solve(hessian, score), -LONGEST, LONGEST)
+        before, theta = theta, np.clip(theta + step, np.log(LEAST), np.log(LARGEST))
+        if np.abs(theta - before).max() < SETTLED:
             break
-    return Levels(level, freedom, criterion)
+    covariance = np.asarray(2 * np.linalg.inv(hessian)[:count, :count], dtype=np.float64)
+    return Levels(np.exp(theta[:count]), told, covariance)
 
 
-def _solved(effects: Effects, level: Array) -> tuple[Array, Array, float]:
-    """(Variances of the effects, their values, criterion)."""
-    of_each = level[effects.family]
+def _scored(effects: Effects, theta: Array) -> tuple[Array, Array, Array]:
+    """Of (M) and the prior at log levels (F + 1,), the common one last: gradient, freedom (F,), expected Hessian."""
+    count, family = effects.families, effects.family
+    level = np.exp(theta[:count])
+    of_each = level[family]
     square = of_each[:, None] * effects.square * of_each
     square[np.diag_indices_from(square)] += 1.0
-    root = np.asarray(linalg.cholesky(square, lower=True, check_finite=False))
-    inverse, _ = linalg.lapack.dtrtri(root, lower=1)
-    whitened = inverse @ (of_each * effects.right)
-    spread = of_each**2 * np.einsum("ij,ij->j", inverse, inverse)
-    solution: Array = of_each * (inverse.T @ whitened)
-    size = 2 * np.log(np.diag(root)).sum()
-    return spread, solution, float(effects.rest - whitened @ whitened + size)
+    inverse = linalg.cho_solve(linalg.cho_factor(square, lower=True, check_finite=False), np.eye(len(square)))
+    shown = np.eye(len(square)) - inverse
+    value = inverse @ (of_each * effects.right)  # in levels
+    member = (family == np.arange(count)[:, None]).astype(float)
+    freedom = member @ np.diag(shown)
+    pull = np.exp(2 * np.minimum(theta[-1] - theta[:count], 1.0))
+    gradient = np.append(2 * (freedom - member @ value**2 + WEIGHT * (1 - pull)), 2 * WEIGHT * (pull - 1).sum())
+    gradient[-1] += 2 * theta[-1] / UNKNOWN**2
+    hessian = np.zeros((count + 1, count + 1))
+    hessian[:count, :count] = 4 * member @ shown**2 @ member.T + 4 * WEIGHT * np.eye(count)
+    hessian[:count, -1] = hessian[-1, :count] = -4 * WEIGHT
+    hessian[-1, -1] = 4 * WEIGHT * count + 2 / UNKNOWN**2
+    return gradient, freedom, hessian

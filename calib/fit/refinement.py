@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy import linalg
 
 from calib.fit.levels import Effects, Levels, learn
-from calib.fit.small_troubles import FAMILIES, HELD, UNITS, Setting, Troubles, troubles
+from calib.fit.small_troubles import FAMILIES, ROUGHLY, UNITS, Setting, Troubles, troubles
 from calib.fit.sweep_readings import SweepReadings
 from gcomp.arrays import Array
 from gcomp.identify.global_fit import GlobalFit
@@ -91,6 +91,8 @@ class Refined:
     levels: Levels
     """Of the small troubles."""
     troubles: Troubles
+    certainty: Parameters
+    """Degrees of freedom of each parameter's standard deviation, since noise and levels are estimates."""
 
 
 def refine(
@@ -133,9 +135,35 @@ def refine(
         dof=round(float(freedom.sum())),
     )
     spread = np.sqrt(np.abs(np.diag(found.covariance)[behind]))
+    certainty = np.full(len(vector), 1.0)
+    certainty[problem.free] = _certainty(step, np.nan_to_num(covariance), refined.dof)
     return Refined(
-        refined, factor, raw * used, step.linear, step.solution[behind], spread, freedom, step.levels, step.troubles
+        refined,
+        factor,
+        raw * used,
+        step.linear,
+        step.solution[behind],
+        spread,
+        freedom,
+        step.levels,
+        step.troubles,
+        Parameters.from_vector(certainty, kinematics.n),
     )
+
+
+def _certainty(step: "_Step", covariance: Array, free: int) -> Array:
+    """Degrees of freedom (p,) of the parameters' variances, by Satterthwaite: 2 v² over the variance of v.
+
+    v consists of the noise's part, known from `free` readings, and one part a family, in proportion to its level's
+    square. Extra columns are left out of account.
+    """
+    linear, families = step.linear, np.arange(len(FAMILIES))
+    across = linear.effects.T @ (linear.precision @ (linear.design @ covariance))
+    parts = (step.troubles.family == families[:, None]).astype(float) @ across**2
+    variance = np.maximum(np.diag(covariance), 1e-300)
+    spread = 4 * np.einsum("fp,fg,gp->p", parts, step.levels.covariance, parts) + 2 * variance**2 / max(free, 1)
+    certainty: Array = 2 * variance**2 / np.maximum(spread, 1e-300)
+    return np.maximum(certainty, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +208,7 @@ class _Problem:
         """Solve the problem linearised at a parameter vector (6n + 3,), noise times factor (n,)."""
         readings, free = self.readings, int(self.free.sum())
         modelled, jacobian, slope = predict_and_jacobian(self.arm, Parameters.from_vector(vector, self.arm.n), readings)
-        lag = HELD * level[FAMILIES.index("direction")] * UNITS["direction"][0] * self.setting.rated[self.joint]
+        lag = ROUGHLY * level[FAMILIES.index("direction")] * UNITS["direction"][0] * self.setting.rated[self.joint]
         own = self.rows.swept[self.row] == self.joint
         sigma = np.hypot(readings.sigma[readings.counted], np.where(own, 0.0, lag)) * factor[self.joint]
         rounding = _rounding_columns(readings, self.resolution, slope / sigma[:, None])

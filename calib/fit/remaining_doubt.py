@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from calib.fit.lags import Lags
 from calib.fit.refinement import Refined
 from calib.fit.small_troubles import FAMILIES, HELD, UNITS, Setting, troubles
 from calib.fit.sweep_readings import SweepReadings
@@ -59,6 +60,7 @@ def _moments(
         time=np.full(2 * count, setting.span[1]),
         felt=np.full((2 * count, n), np.nan),
     )
+    setting = replace(setting, lags=Lags.unknown(2 * count, n))
     effects = troubles(setting, here, complete, refined.troubles.kept)
     columns = effects.columns * refined.levels.level[effects.family]
     free = np.isin(parameter_names(setting.arm), refined.fit.names)

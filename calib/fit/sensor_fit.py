@@ -19,7 +19,7 @@ from calib.records.records import PARAMETERS, CalibrationRecord, JointCalibratio
 from calib.sweep.dataset import SweepData
 from gcomp.arrays import Array
 from gcomp.identify.global_fit import GlobalFit, identify_global
-from gcomp.identify.parameters import Prior
+from gcomp.identify.parameters import Parameters, Prior
 from gcomp.identify.sensor_model import predict
 
 WIDE = 0.005
@@ -48,8 +48,8 @@ class SensorFit:
     that of the sensors (n,) [N·m]; NaN if the drives report none."""
     goodness: Goodness
     """Whether the sensor model holds, with findings."""
-    quantile: float
-    """Student quantile of a 95 % interval."""
+    quantile: Parameters
+    """Student quantiles of 95 % intervals, one a parameter."""
     reasons: dict[tuple[str, Parameter], str]
     """(joint, parameter) → why it has no value."""
     gain_ratio: Array | None
@@ -69,9 +69,14 @@ class SensorFit:
         spread: Array = getattr(self.fit.std, parameter)
         return np.where(np.isnan(self.value(parameter)), np.nan, spread)
 
+    def half95(self, parameter: Parameter) -> Array:
+        """Half widths (n,) of the 95 % intervals, NaN if not identifiable."""
+        half: Array = getattr(self.quantile, parameter) * self.std(parameter)
+        return half
+
     def ci95(self, parameter: Parameter) -> Array:
         """95 % intervals (n, 2), NaN if not identifiable."""
-        half = self.quantile * self.std(parameter)
+        half = self.half95(parameter)
         return np.stack([self.value(parameter) - half, self.value(parameter) + half], axis=1)
 
     @property
@@ -94,7 +99,7 @@ class SensorFit:
         if not any(self.rows.masses):
             return None
         point = self.fit.values.rho
-        return point, np.where(np.isnan(point), np.nan, self.quantile * self.fit.std.rho)
+        return point, np.where(np.isnan(point), np.nan, self.quantile.rho * self.fit.std.rho)
 
     @property
     def attachment_text(self) -> str:
@@ -113,7 +118,7 @@ class SensorFit:
     @property
     def imprecise(self) -> dict[str, str]:
         """Joint → why its gain, though determined, is less precise than `WIDE`."""
-        half = self.quantile * self.std("gain") / np.abs(self.value("gain"))
+        half = self.half95("gain") / np.abs(self.value("gain"))
         common = bool(np.all(half[np.isfinite(half)] > WIDE))
         why = COMMON if common else "give its sweeps more poses, or the arm a heavier reference mass"
         return {
@@ -180,11 +185,16 @@ def fit_sensors(arm_file: ArmFile, data: Sequence[SweepData]) -> SensorFit:
         hysteresis=_half_difference(rows.readings.torque - _modelled(arm_file, fit, rows), rows),
         friction=_friction(fit, rows),
         goodness=good,
-        quantile=float(stats.t.ppf(0.975, max(fit.dof, 1))),
+        quantile=_quantiles(good.refined.certainty),
         reasons=missing_values(fit, rows),
         gain_ratio=gain_ratio,
         sources={each.path.name: each.digest for each in data},
     )
+
+
+def _quantiles(freedom: Parameters) -> Parameters:
+    """Student quantiles of 95 % intervals at degrees of freedom."""
+    return Parameters.from_vector(stats.t.ppf(0.975, freedom.vector), len(freedom.gain))
 
 
 def _fit(arm_file: ArmFile, rows: SweepReadings, **extra: Prior) -> Goodness:

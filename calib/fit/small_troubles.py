@@ -6,13 +6,16 @@ level. Units are chosen so that a level of 1 is what good arms have.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import numpy.typing as npt
 
+from calib.fit.lags import Lags
 from calib.fit.position_field import PositionField
 from calib.fit.sweep_readings import SweepReadings
 from gcomp.arm.arm import Arm, bar_frames
+from gcomp.arm.mass_moments import base_parameter_names
 from gcomp.arrays import Array, Mask
 from gcomp.gravity.torque import composite_moments
 from gcomp.identify.parameters import Parameters
@@ -35,9 +38,12 @@ BASE = 2.0
 """Tilt of the base over the tilt of one axis against the next."""
 REST = 0.2
 """Where a cable is at rest: standard deviation from the middle of the range [rad]."""
-HELD = 0.8
-"""Standard deviation, in levels of `direction`, of what a sensor and a cable lag while their joint is held: anywhere
-between both sides, each of them (twice 0.58²)."""
+HELD, ROUGHLY = 0.8, 0.3
+"""Standard deviation, in levels of `direction`, of what a sensor and a cable lag where the way is not known: anywhere
+between both sides, each of them (twice 0.58²); and for joints that are held during a sweep, whose way is roughly known.
+"""
+BESIDE = 0.5
+"""Bend of a cable per turn of the joint beside it, over that of its own."""
 WAVES = 5
 """Terms of the drift in time."""
 
@@ -69,6 +75,8 @@ class Setting:
     """One a joint."""
     span: tuple[float, float]
     """First and last time of the readings [s]."""
+    lags: Lags
+    """Of sensors and cables at the readings."""
 
 
 def troubles(setting: Setting, rows: SweepReadings, parameters: Parameters, keep: Mask | None = None) -> Troubles:
@@ -108,17 +116,37 @@ def _dense(setting: Setting, rows: SweepReadings, parameters: Parameters) -> Ite
     torque = np.einsum("kid,kid->ki", frames.lever, composite)
     felt = np.where(np.isnan(rows.felt), torque, (rows.felt - parameters.offset) / gain)
     turned = np.cross(frames.rotation[..., 2], composite)
+    along = readings.load[:, None] * _along_axes(arm, parameters.rho)
+    whole = composite + along[:, :, None] * frames.rotation[..., 2]  # β takes what the links' own moments along do
 
     def turn(joint: int, axis: Array) -> Array:
         """Change of true torque as all from a joint on turns about an axis (K, 3) [N·m/rad]."""
         beyond = np.einsum("kd,kid->ki", np.cross(axis, arm.gravity), turned)
-        before = np.einsum("kid,kd->ki", frames.lever, np.cross(axis, composite[:, joint]))
+        before = np.einsum("kid,kd->ki", frames.lever, np.cross(axis, whole[:, joint]))
         change: Array = np.where(np.arange(n) >= joint, beyond, before)
         return change
 
+    upright = n - len(base_parameter_names(arm)) // 2  # leading joints along gravity, whose moments nothing tells
+    unseen = float(np.sqrt((torque**2).mean(axis=0)).max()) / float(np.linalg.norm(arm.gravity))
+
+    def swung(joint: int, axis: Array, moment: Array, upto: int) -> Array:
+        """The same (K, n) by a moment (K, 3) [kg·m] fixed to link `upto`, which acts as the joint's axis turns."""
+        felt_by = np.cross(frames.rotation[..., 2], moment[:, None])
+        change = np.einsum("kd,kid->ki", np.cross(axis, arm.gravity), felt_by)
+        return np.where((np.arange(n) >= joint) & (np.arange(n) <= upto), change, 0.0)
+
     for joint in range(n):
+        base = BASE if joint == 0 else 1.0
         for label, axis in zip("xy", _crossing(arm, frames.rotation, joint), strict=True):
-            yield "axes", joint, label, gain * turn(joint, axis) * (BASE if joint == 0 else 1.0)
+            yield "axes", joint, label, gain * turn(joint, axis) * base
+            for link, across in product(range(joint, upright), range(2)):
+                moment = unseen * frames.rotation[:, link, :, across]
+                yield (
+                    "axes",
+                    joint,
+                    f"{label} of link {link} {'xy'[across]}",
+                    gain * swung(joint, axis, moment, link) * base,
+                )
         stiffness = gain * turn(joint, frames.rotation[:, joint, :, 2])
         angle = readings.position[:, joint]
         yield "eccentricity", joint, "sin", stiffness * np.sin(angle)[:, None]
@@ -142,14 +170,27 @@ def _dense(setting: Setting, rows: SweepReadings, parameters: Parameters) -> Ite
             yield "spring", joint, arm.names[other], here * gain[joint] * rated[joint] * bent
         yield "spring", joint, "rest", here * gain[joint] * rated[joint] * REST * bare
         side = np.where(rows.swept == joint, readings.direction[:, joint], 0.0)[:, None]
-        rising = np.sign(np.einsum("kd,kd->k", turned[:, joint], frames.lever[:, joint]))[:, None]
-        yield "direction", joint, "position", here * rated[joint] * side
-        yield "direction", joint, "torque", here * rated[joint] * side * rising
+        yield "direction", joint, "side", here * rated[joint] * side
+        yield "direction", joint, "sensor", here * rated[joint] * setting.lags.sensor[:, joint, None]
+        for number, lag in enumerate(setting.lags.cable):
+            yield "direction", joint, f"cable {number}", here * rated[joint] * lag[:, joint, None]
+            for other in {joint - 1, joint + 1} & set(range(n)):
+                beside = BESIDE * lag[:, other, None]
+                yield "direction", joint, f"cable {number} {arm.names[other]}", here * rated[joint] * beside
         share = (readings.position[:, joint] - middle[joint])[:, None] / ((arm.upper - arm.lower)[joint] / 2)
         for bend in (share, 1.5 * share**2 - 0.5, 2.5 * share**3 - 1.5 * share):
             yield "direction", joint, "bend", here * rated[joint] * side * bend
         for number, wave in enumerate(since):
             yield "drift", joint, f"{number}", here * gain[joint] * rated[joint] * wave[:, None]
+
+
+def _along_axes(arm: Arm, rho: Array) -> Array:
+    """Moment of a unit mass at ρ (3,) [m] along each joint's axis, from the origin on it (n,) [m]; section 2.1."""
+    along = np.empty(arm.n)
+    along[-1] = rho[2]
+    for link in reversed(range(arm.n - 1)):
+        along[link] = np.cos(arm.alpha[link]) * along[link + 1] + arm.d[link]
+    return along
 
 
 def _crossing(arm: Arm, rotation: Array, joint: int) -> tuple[Array, Array]:

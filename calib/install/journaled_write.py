@@ -2,9 +2,9 @@
 
 In this order, so that a process killed at any moment leaves either the old record in force or the new one, and a
 journal of what the controllers held: the gates were passed (`Admitted`), the record is kept, the journal line is on
-disk, each controller's calibration is staged, read back bit for bit and made active
-(2100h), the check is made, flash is written if that was asked for, the record becomes
-current and the journal line ends, both in one transaction. If any step fails, every controller gets back what it held.
+disk, each controller's calibration is staged, read back bit for bit and made active, the check is made, flash is
+written if that was asked for, the record becomes current and the journal line ends, both in one transaction. If any
+step fails, every controller gets back what it held.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -20,7 +20,7 @@ from calib.records.store import ControllerWrite, RecordStore
 
 
 class Controllers(Protocol):
-    """Access to the torque sensor record 2100h of every joint's controller (`armlink.link.link.Link`)."""
+    """Access to the calibration of every joint, in its controller or in the host (`armlink.link.link.Link`)."""
 
     def read_calibration(self, joint: int) -> Calibration:
         """The active calibration of joint j; raises BusFault."""

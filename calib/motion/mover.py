@@ -189,6 +189,10 @@ class Mover:
         self._learn_resolution(seen)
         self._encoders.judge(np.reshape(seen, path.shape), path, movable, self.resolution)
 
+    def follow(self, rows: Array, guard: Guard) -> list[Sample]:
+        """The samples along targets (K, n) [rad], every joint under position control; raises Stalled, EncoderFault."""
+        return list(self._play(Setpoints(self.command.mode, self.command.torque, rows, guard)))
+
     def press(self, stops: npt.NDArray[np.int64], bias: Array) -> None:
         """Creep the joints with stops ±1 onto them, then press with bias (n,) [N·m]; raises Refused, Slipped."""
         joints = stops != 0

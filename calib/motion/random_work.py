@@ -8,6 +8,9 @@ import numpy as np
 from calib.motion.trajectory import trajectory
 from gcomp.arrays import Array
 
+SLOW_SETTLING = 0.5
+"""A joint under MIT gains settles so much later [s]: its host's integral term has to forget the torque of braking."""
+
 
 @dataclass(frozen=True)
 class WorkMotion:
@@ -23,6 +26,11 @@ class WorkMotion:
     """[rad/s²]"""
     rest: float = 0.5
     """Rest at each waypoint [s]: settling and average of the rest detection, and a little more."""
+
+    @classmethod
+    def of_drives(cls, with_integral: bool) -> "WorkMotion":
+        """Work of an arm whose drives have an integral term, or of one whose host adds it: that one settles later."""
+        return cls() if with_integral else cls(rest=cls.rest + SLOW_SETTLING)
 
 
 def work_targets(

@@ -32,6 +32,10 @@ def _swept_side(direction: Array) -> int:
     return int(direction.sum())
 
 
+def _all_nan(values: Array) -> bool:
+    return bool(np.isnan(values).all())
+
+
 Vector = Annotated[Array, _Json(list[float])]
 
 
@@ -68,10 +72,16 @@ class StaticReading:
     """Standard deviation of one sample (n,) [N·m]."""
     motor_torque: Vector
     """Mean of the drives' own torque estimate (n,) [N·m]; NaN if a drive reports none."""
+    speed: Annotated[float | None, Field(exclude_if=lambda value: value is None)] = None
+    """Mean speed of the swept joint, which crept through the average [rad/s]; None, and not written, at rest."""
+    temperature: Annotated[Vector, Field(exclude_if=_all_nan)] = field(default_factory=lambda: np.array(np.nan))
+    """Of the drives (n,) [°C], NaN where one does not tell it; not written where none does."""
     torque_error: Annotated[Vector, Field(exclude=True)] = field(default_factory=lambda: np.array(np.nan))
     """Standard error of the mean torque (n,) as the halves of the average show it [N·m]; NaN if not judged so."""
 
     def __post_init__(self) -> None:
+        if np.ndim(self.temperature) == 0:
+            object.__setattr__(self, "temperature", np.full(len(self.position), np.nan))
         if np.ndim(self.direction) == 0:
             moved = np.arange(len(self.position)) == (-1 if self.joint is None else self.joint)
             object.__setattr__(self, "direction", np.where(moved, self.direction, 0.0))

@@ -66,10 +66,16 @@ class _Fit:
 class CauseTest:
     """The dictionary fitted to one window, with model error marginalised: the belief's covariance and σ²I."""
 
-    def __init__(self, belief: GravityBelief, window: StaticReadings, config: ObserverConfig) -> None:
-        """Of K rows with true angles, torques as installed and their standard deviations."""
+    def __init__(
+        self,
+        belief: GravityBelief,
+        window: StaticReadings,
+        config: ObserverConfig,
+        temperature: Array | None = None,
+    ) -> None:
+        """Of K rows with true angles, torques as installed, their standard deviations, temperatures (K, n) if told."""
         self.belief, self.window, self._config = belief, window, config
-        expected = belief.expected(window.position, window.direction)
+        expected = belief.expected(window.position, window.direction, temperature)
         residual = window.torque - belief.torque(window.position) - expected.mean
         covariance = expected.covariance.copy()
         covariance[np.diag_indices_from(covariance)] += window.sigma.ravel() ** 2

@@ -22,6 +22,9 @@ LEVEL_ROWS = 120
 WANDER = 0.5
 """How far a zero may have moved with temperature since the reference, as a share of the discrepancy's level: a sensor
 of class 0.05 moves by 0.1 % of rated torque in 20 K, and an arm of such sensors has a discrepancy of 0.2 to 0.4 %."""
+THERMAL, TOLD = 1.0, 0.3
+"""Where drives tell their temperature: how far a zero follows a rise of 20 K, as a share of the level, and the share of
+WANDER that is left, since the sensor's own temperature is another."""
 LEVEL_ARRAYS = ("smooth", "rough", "before", "spread")
 FIRST_ROWS = 120
 """Rows of the first epoch unless told otherwise."""
@@ -121,12 +124,15 @@ class GravityBelief:
         torque: Array = gravity_regressor(self.arm, q) @ self.beta
         return torque
 
-    def expected(self, q: Array, side: Array) -> Expected:
-        """What residuals to expect at poses q (K, n) [rad] approached from sides (K, n)."""
+    def expected(self, q: Array, side: Array, temperature: Array | None = None) -> Expected:
+        """What residuals to expect at poses q [rad], sides of approach and temperatures [°C], (K, n) each."""
         if self._posterior is None:
             self._posterior = self._learn(self._reference.rows)
-        mean, blocks, columns = self._posterior.predict(self.kernel.points(q, side), self._columns(q))
-        blocks += np.minimum(WANDER * self.level.total, self._wander)[:, None, None] ** 2
+        warmer = np.full(q.shape, np.nan) if temperature is None else temperature - self._reference.temperature
+        points = self.kernel.points(q, side, np.nan_to_num(warmer))
+        mean, blocks, columns = self._posterior.predict(points, self._columns(q))
+        untold = np.where(np.isfinite(warmer).all(axis=0), TOLD, 1.0)
+        blocks += (untold * np.minimum(WANDER * self.level.total, self._wander))[:, None, None] ** 2
         flat = columns.swapaxes(0, 1).reshape(q.size, -1)
         tool = (gravity_regressor(self.arm, q) @ self._tool).reshape(q.size, -1)
         return Expected(mean, blocks, np.hstack([flat, tool]))
@@ -150,9 +156,11 @@ class GravityBelief:
         self._reference.close()
         self._kernel = self._posterior = None
 
-    def learn(self, q: Array, torque: Array, side: Array, noise: Array) -> None:
-        """Take K rows free of drift as reference: q (K, n) [rad], torque (K, n) [N·m], side (K, n), noise (n,)."""
-        if not self._reference.add(q, torque - self.torque(q), side):
+    def learn(self, q: Array, torque: Array, side: Array, noise: Array, temperature: Array | None = None) -> None:
+        """Take K rows free of drift as reference: q (K, n) [rad], torque (K, n) [N·m], side (K, n), noise (n,) [N·m],
+        temperature (K, n) [°C]."""
+        told = np.full(q.shape, np.nan) if temperature is None else temperature
+        if not self._reference.add(q, torque - self.torque(q), side, told):
             return
         self._noise, self._posterior = noise, None
         self._fit_level(self._reference.rows)
@@ -160,7 +168,8 @@ class GravityBelief:
     def adapt(self, q: Array, torque: Array, side: Array, noise: Array) -> None:
         """Adapt the level alone, to rows that may have an offset, a gain or a payload that is not known."""
         self._noise, self._posterior = noise, None
-        self._fit_level(self._reference.rows.and_then(q, torque - self.torque(q), side, -1))
+        untold = np.full(q.shape, np.nan)
+        self._fit_level(self._reference.rows.and_then(q, torque - self.torque(q), side, untold, epoch=-1))
 
     def close(self) -> None:
         """A sensor was corrected: rows from now on tell nothing of gains and offsets."""
@@ -191,11 +200,12 @@ class GravityBelief:
         self.level = self.level.fitted(unit, rows.residual.T, self._noise, known, columns)
 
     def _learn(self, rows: Rows) -> Posterior:
-        data = Data(
-            self.kernel.points(rows.position, rows.side), rows.residual, self._columns(rows.position), rows.epoch
-        )
+        warmer = np.nan_to_num(rows.temperature - self._reference.temperature)
+        points = self.kernel.points(rows.position, rows.side, warmer)
+        data = Data(points, rows.residual, self._columns(rows.position), rows.epoch)
         free = 0.1 * self.kernel.typical + 20 * self._noise
-        return Posterior(self.kernel, self.level, self._noise, free, data, self._factor.shape[1] + self.arm.n)
+        thermal, shared = np.minimum(THERMAL * self.level.total, self._wander), self._factor.shape[1] + self.arm.n
+        return Posterior(self.kernel, self.level, self._noise, free, thermal, data, shared)
 
     def _columns(self, q: Array) -> Array:
         """Columns (K, n, P) of the model's stated uncertainty: of β and of the position sensors' zeros."""

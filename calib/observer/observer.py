@@ -92,10 +92,15 @@ class Observer:
         level = Level.of_record(calibration, config.discrepancy_share * np.asarray(rated_torque, dtype=float))
         return cls(arm, np.array(gravity.beta), np.array(gravity.covariance), sigma, config, *position, level)
 
-    def handle(self, t: float, position: Array, torque: Array) -> list[Event]:
-        """Take one sample: readings (n,) in SI units, NaN if missing; returns events, usually none."""
+    def handle(self, t: float, position: Array, torque: Array, temperature: Array | None = None) -> list[Event]:
+        """Take one sample: readings (n,) in SI units, NaN if missing; returns events, usually none.
+
+        temperature (n,) [°C] as the drives tell it; NaN or None where they do not.
+        """
         row = self._rest.handle(t, position, torque)
-        return [] if row is None else self.handle_row(row)
+        if row is None:
+            return []
+        return self.handle_row(row if temperature is None else replace(row, temperature=temperature))
 
     def handle_row(self, row: StaticReading) -> list[Event]:
         """Take one row: the average over one stop, as the rest detector makes it."""

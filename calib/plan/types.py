@@ -30,6 +30,8 @@ class Sweep(_Model):
     """Resting joints that are held by their drive's position loop instead of a stop."""
     bias: tuple[FiniteFloat, ...] | None = None
     """Signed torque (n,) that presses each resting joint on its stop [N·m]; None until the scout has been made."""
+    speed: Annotated[FiniteFloat | None, Field(gt=0, exclude_if=lambda value: value is None)] = None
+    """Speed at which the joint creeps through the steps, which are then the middles of bins [rad/s]; None: at rest."""
     acceleration: FiniteFloat = 1.0
     """Peak acceleration of the swept joint, so that its reaction moves no resting joint off its stop [rad/s²]."""
 

@@ -59,12 +59,12 @@ class Record(_Frozen):
 
     @property
     def id(self) -> str:
-        """Eight hex digits of the content's SHA-256; as a number it fits the record id of object 2100h (UNSIGNED32)."""
+        """Eight hex digits of the content's SHA-256; as a number it fits 32 bits, as a controller keeps it."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:8]
 
     @property
     def number(self) -> int:
-        """`id` as the UNSIGNED32 that a controller keeps beside its gain and offset (2100h:07)."""
+        """`id` as the UNSIGNED32 that a controller keeps beside its gain and offset."""
         return int(self.id, 16)
 
     def require(self, arm: ArmFile) -> Self:
@@ -104,6 +104,26 @@ class Discrepancy(_Frozen):
     """Distance in position over which it is alike [rad]."""
 
 
+class MotorTorque(_Frozen):
+    """What else is known of a joint whose torque is a motor current: friction, and what temperature does to the gain.
+
+    v = gain (τ + s (coulomb + load |τ|)(1 + s·asymmetry) + viscous q̇) + offset, with s the direction of motion.
+    """
+
+    coulomb: tuple[FiniteFloat, FiniteFloat]
+    """Value and standard deviation [N·m], as the others here."""
+    load: tuple[FiniteFloat, FiniteFloat]
+    """Friction per transmitted torque [1]."""
+    viscous: tuple[FiniteFloat, FiniteFloat]
+    """[N·m·s/rad]"""
+    asymmetry: tuple[FiniteFloat, FiniteFloat]
+    """Half the difference of the two directions' friction over their mean [1]."""
+    temperature: FiniteFloat | None = None
+    """Temperature of the drive at which the gain holds [°C]; None where none was logged."""
+    gain_per_kelvin: tuple[FiniteFloat, FiniteFloat] | None = None
+    """Relative change of the gain per kelvin."""
+
+
 class JointCalibration(_Frozen):
     """Sensor parameters of one joint: v = gain·τ + offset, θ = position_gain·φ + position_offset.
 
@@ -123,6 +143,8 @@ class JointCalibration(_Frozen):
     discrepancy: Annotated[Discrepancy | None, Field(exclude_if=lambda value: value is None)] = None
     """What the fit doubts beyond its covariance; None, and not written, in records made without an estimate of it, so
     that these keep their content and with it their id."""
+    motor: Annotated[MotorTorque | None, Field(exclude_if=lambda value: value is None)] = None
+    """Friction of a joint whose torque is a motor current; None, and not written, for the others."""
 
     @model_validator(mode="after")
     def _none_has_a_reason(self) -> Self:

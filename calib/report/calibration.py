@@ -73,7 +73,7 @@ def _identity(done: Calibrated) -> Section:
 def _advice(done: Calibrated, broken: list[str]) -> str:
     """What a person does with this calibration, in a few sentences."""
     fit = done.fit
-    half = fit.quantile * fit.std("gain")
+    half = fit.half95("gain")
     known, unknown = (
         half[np.isfinite(half)],
         [name for name, each in zip(fit.names, half, strict=True) if np.isnan(each)],
@@ -99,7 +99,7 @@ def _sensors(done: Calibrated) -> Section:
     ]
     rows = []
     for j, name in enumerate(fit.names):
-        cells = [_interval(fit.value(key)[j], fit.quantile * fit.std(key)[j]) for key, _, _ in PARAMETERS]
+        cells = [_interval(fit.value(key)[j], fit.half95(key)[j]) for key, _, _ in PARAMETERS]
         rows.append([escape(name), *cells, f"{fit.residual_rms[j]:.4f}", f"{fit.hysteresis[j]:.4f}"])
     table = ReportTable(header, rows, "Estimates ± half of the 95 % interval; reading = gain · torque + offset.")
     reasons = [f"{joint}, {parameter.replace('_', ' ')}: {why}." for (joint, parameter), why in fit.reasons.items()]

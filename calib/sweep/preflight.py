@@ -96,7 +96,7 @@ def _check_readings(names: tuple[str, ...], before: Stats, after: Stats, torque:
             empty = int((np.isnan(values) & ~(np.isnan(torque[:, joint]) & np.isnan(position[:, joint]))).sum())
             if max(lost, empty) > MISSING * asked:
                 raise Refused(
-                    f"{name}: {max(lost, empty)} of {asked} {what} readings are missing: check its TPDO and cable"
+                    f"{name}: {max(lost, empty)} of {asked} {what} readings are missing: check its drive and cable"
                 )
             if missing > LATE * len(values):
                 raise Refused(

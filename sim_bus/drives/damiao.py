@@ -21,26 +21,15 @@ from armlink.drives.damiao.frames import (
     special_of,
     unpack_value,
 )
+from armlink.drives.damiao.models import MODELS
 from armlink.drives.mit_packing import MitCommand, MitFeedback, Ranges, unpack_command
 from sim_bus.drives.motor import Motor
 from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
 
-MODELS = {
-    "DM3507": (12.566, 50.0, 5.0),
-    "DM4310": (12.5, 30.0, 10.0),
-    "DM4310P": (12.5, 50.0, 10.0),
-    "DM4340": (12.5, 10.0, 28.0),
-    "DM4340P": (12.5, 10.0, 28.0),
-    "DM6006": (12.5, 45.0, 20.0),
-    "DM8006": (12.5, 45.0, 40.0),
-    "DM8009": (12.5, 45.0, 54.0),
-    "DM10010": (12.5, 20.0, 200.0),
-    "DM6248P": (12.566, 20.0, 120.0),
-}
-"""Registers PMAX, VMAX, TMAX as the maker delivers each model."""
 LEAST_RANGE = 1e-3
 """A range register of 0 counts as this."""
 STORE = 0xAA
+STAGE = int(STAGE_TEMPERATURE)
 OTHER_MODES = 0x100, 0x200, 0x300
 """Offsets of the command ids of the position, velocity and force modes."""
 NO_COMMAND = MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -55,7 +44,7 @@ class DamiaoDrive(SimulatedDrive):
     ) -> None:
         """As the maker delivers it, but for the ids: the deadman is off, the mode is MIT."""
         super().__init__(motor, send)
-        position, velocity, torque = MODELS[model]
+        position, velocity, torque, _, _ = MODELS[model]
         self._stored: dict[int, float] = {
             0: 15.0, 1: 1.2, 2: 100.0, 3: 0.95, 4: 50.0, 5: -50.0, 6: 200.0, 7: reply, 8: drive, 9: 0, 10: MIT_MODE,
             11: 1e-4, 12: 1e-4, 13: 3, 14: 5016, 15: serial, 16: 14, 17: 0.6, 18: 4e-4, 19: 0.005, 20: 10.0,
@@ -67,14 +56,23 @@ class DamiaoDrive(SimulatedDrive):
         self.registers = dict(self._stored)
         self.state = State.DISABLED
         self.command = NO_COMMAND
+        self._coded: object = None
+        """What `coding` was made of."""
+        self._coding = Ranges(position, velocity, torque)
 
     @property
     def coding(self) -> Ranges:
         """Ranges by which it really codes and decodes."""
-        position, velocity, torque = (max(self.registers[number], LEAST_RANGE) for number in (21, 22, 23))
-        return Ranges(
-            position * self.scale("position"), velocity * self.scale("velocity"), torque * self.scale("torque")
-        )
+        registers, faults = self.registers, self.faults
+        told = (registers[21], registers[22], registers[23])
+        made_of = (told, tuple(faults.items()) if faults else ())
+        if made_of != self._coded:
+            self._coded = made_of
+            position, velocity, torque = (max(each, LEAST_RANGE) for each in told)
+            self._coding = Ranges(
+                position * self.scale("position"), velocity * self.scale("velocity"), torque * self.scale("torque")
+            )
+        return self._coding
 
     @property
     def patience(self) -> float:
@@ -122,7 +120,7 @@ class DamiaoDrive(SimulatedDrive):
         motor, coding = self.motor, self.coding
         feedback = MitFeedback(_wrapped(motor.position, coding.position), motor.velocity, motor.torque)
         drive = int(self.registers[Register.COMMAND_ID])
-        reply = Reply(drive, self.state, feedback, int(STAGE_TEMPERATURE), int(MOTOR_TEMPERATURE))
+        reply = Reply(drive, self.state, feedback, STAGE, int(MOTOR_TEMPERATURE + motor.heating))
         self.answer(int(self.registers[Register.REPLY_ID]), pack_reply(reply, coding))
 
     def _register(self, data: bytes) -> None:

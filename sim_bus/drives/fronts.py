@@ -1,12 +1,14 @@
 """The simulated drives of an arm that are no CANopen nodes, by family and bus."""
 
 from collections.abc import Callable, Sequence
+from importlib.metadata import entry_points
 from typing import Protocol
 from zlib import crc32
 
 from armlink.arm_file import ArmFile, LinkJoint
+from armlink.drives.damiao.models import MODELS
 from armlink.errors import BadInput
-from sim_bus.drives.damiao import MODELS, DamiaoDrive, DamiaoFront
+from sim_bus.drives.damiao import DamiaoDrive, DamiaoFront
 from sim_bus.drives.moteus import MoteusDrive, MoteusFront
 from sim_bus.drives.motor import Motor
 from sim_bus.drives.odrive import ODriveAxis, ODriveFront, cyclic_periods
@@ -76,7 +78,14 @@ FAMILIES: dict[str, Callable[[ArmFile, Sequence[Joint], Send], Front]] = {
     "moteus": _moteus,
     "odrive": _odrive,
 }
-"""Families that are simulated, besides canopen."""
+"""Families that are simulated here, besides canopen."""
+GROUP = "armlink.simulated_drives"
+"""Entry-point group of functions like those of FAMILIES, for families of other packages."""
+
+
+def simulated_families() -> dict[str, Callable[[ArmFile, Sequence[Joint], Send], Front]]:
+    """Families that are simulated, by name."""
+    return FAMILIES | {point.name: point.load() for point in entry_points(group=GROUP)}
 
 
 def build_fronts(arm: ArmFile, motors: Sequence[Motor], send: Callable[[str], Send]) -> list[tuple[str, Front]]:
@@ -84,18 +93,18 @@ def build_fronts(arm: ArmFile, motors: Sequence[Motor], send: Callable[[str], Se
 
     Raises BadInput for a family that is not simulated.
     """
-    groups: dict[tuple[str, str], list[Joint]] = {}
+    known, groups = simulated_families(), dict[tuple[str, str], list[Joint]]()
     for joint, motor in zip(arm.require_link().joints, motors, strict=True):
         family = joint.settings.family
         if family == "canopen":
             continue
-        if family not in FAMILIES:
+        if family not in known:
             raise BadInput(
                 f"{arm.path}: {joint.name}: drives of family {family!r} are not simulated; there are canopen, "
-                f"{', '.join(FAMILIES)}"
+                f"{', '.join(known)}"
             )
         groups.setdefault((joint.bus, family), []).append((joint, motor))
-    return [(bus, FAMILIES[family](arm, joints, send(bus))) for (bus, family), joints in groups.items()]
+    return [(bus, known[family](arm, joints, send(bus))) for (bus, family), joints in groups.items()]
 
 
 def _serial(arm: ArmFile, joint: LinkJoint) -> int:

@@ -5,6 +5,8 @@ from collections.abc import Callable
 
 from armlink.bus.port import EXTENDED, REMOTE
 from armlink.drives.moteus.frames import (
+    CYCLE_COMMAND,
+    CYCLE_REPLY,
     FLOAT,
     INT32,
     READ,
@@ -28,6 +30,8 @@ DEFAULT_TIMEOUT = 0.1
 """servo.default_timeout_s [s]."""
 TIMEOUT_TORQUE = 5.0
 """servo.timeout_max_torque_Nm: largest torque of the zero-velocity mode [N·m]."""
+TORQUE_CONSTANT = 0.55
+"""Of the motor at its output [N·m/A]."""
 ENCODER_FAULT = 35
 NO_REGISTER = 1
 HOME_OUTPUT = 2
@@ -80,6 +84,12 @@ class MoteusDrive(SimulatedDrive):
     def receive(self, can_id: int, data: bytes) -> None:
         """A frame whose destination is this controller."""
         source, replies = can_id >> 8 & 0x7F, can_id >> 8 & REPLY_WANTED
+        usual = CYCLE_COMMAND.unpack(data) if replies else None
+        if usual is not None:
+            self._write(usual)
+            if "feedback.lost" not in self.faults or self.fault_code:
+                self._reply(source, CYCLE_REPLY.pack(self._shown_in_cycles()))
+            return
         frames = list(unpack(data))
         errors = self._write({each.register: each.value for each in frames if each.kind == WRITE})
         asked = [each for each in frames if each.kind == READ]
@@ -87,9 +97,12 @@ class MoteusDrive(SimulatedDrive):
             return
         try:
             shown = self._shown_registers() if asked else {}
-            content = pack_reply([*errors, *(_reply(each, shown) for each in asked)])
+            content = pack_reply([*errors, *(_shown(each, shown) for each in asked)])
         except ValueError:  # more than a frame holds: the controller sends none
             return
+        self._reply(source, content)
+
+    def _reply(self, source: int, content: bytes) -> None:
         answer = identifier(self.drive, source)
         self.answer(answer | EXTENDED * (answer > 0x7FF), content)
 
@@ -106,29 +119,39 @@ class MoteusDrive(SimulatedDrive):
             self.command |= known
         return [Subframe(WRITE_ERROR, number, NO_REGISTER) for number in unknown]
 
-    def _shown_registers(self) -> dict[int, float]:
+    def _shown_in_cycles(self) -> dict[int, float]:
+        """Registers of the reply to a host's usual frame."""
         motor = self.motor
-        return self.command | {
+        return {
             Register.MODE: self.mode,
             Register.POSITION: motor.position / TURN * self._shown("position"),
             Register.VELOCITY: motor.velocity / TURN * self._shown("velocity"),
             Register.TORQUE: motor.torque * self._shown("torque"),
-            Register.Q_CURRENT: motor.torque,
-            0x005: 0.0,
-            0x006: motor.position / TURN,
-            0x007: 0.0,
-            Register.MOTOR_TEMPERATURE: MOTOR_TEMPERATURE,
-            0x00B: 1,
-            Register.HOME_STATE: HOME_OUTPUT,
-            Register.VOLTAGE: BUS_VOLTAGE,
             Register.TEMPERATURE: STAGE_TEMPERATURE,
             Register.FAULT: self.fault_code,
-            Register.MODEL: 1,
-            Register.FIRMWARE: 0x0104,
-            Register.SERIAL1: self.serial & 0x7FFFFFFF,
-            Register.SERIAL2: 0,
-            Register.SERIAL3: 0,
         }
+
+    def _shown_registers(self) -> dict[int, float]:
+        motor = self.motor
+        return (
+            self.command
+            | self._shown_in_cycles()
+            | {
+                Register.Q_CURRENT: motor.torque / TORQUE_CONSTANT,
+                0x005: 0.0,
+                0x006: motor.position / TURN,
+                0x007: 0.0,
+                Register.MOTOR_TEMPERATURE: MOTOR_TEMPERATURE,
+                0x00B: 1,
+                Register.HOME_STATE: HOME_OUTPUT,
+                Register.VOLTAGE: BUS_VOLTAGE,
+                Register.MODEL: 1,
+                Register.FIRMWARE: 0x0104,
+                Register.SERIAL1: self.serial & 0x7FFFFFFF,
+                Register.SERIAL2: 0,
+                Register.SERIAL3: 0,
+            }
+        )
 
     def _shown(self, quantity: str) -> float:
         return 1.0 / self.scale(quantity)
@@ -209,7 +232,7 @@ class MoteusDrive(SimulatedDrive):
         self.motor.free()
 
 
-def _reply(asked: Subframe, shown: dict[int, float]) -> Subframe:
+def _shown(asked: Subframe, shown: dict[int, float]) -> Subframe:
     value = shown.get(asked.register)
     if value is None:
         return Subframe(READ_ERROR, asked.register, NO_REGISTER)

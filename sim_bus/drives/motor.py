@@ -21,8 +21,21 @@ class Readings:
         """Nothing is sampled before the first at()."""
         self._plant, self._sensors = plant, sensors
         self._time = -1.0
-        self.position, self.velocity, self.torque = (np.zeros(plant.n) for _ in range(3))
-        """By the drive's encoder [rad] and [rad/s]; current times torque constant [N·m]."""
+        self.position, self.velocity, self.torque, self.heating = (np.zeros(plant.n) for _ in range(4))
+        """By the drive's encoder [rad] and [rad/s]; current times torque constant [N·m]; temperature rise [K]."""
+        self.started = np.zeros(plant.n)
+        """Torque at the start of the present step (n,) [N·m]."""
+        self._mean = np.zeros(plant.n)
+
+    def step_ends(self, middle: Array) -> None:
+        """A step of the arm has ended, in whose middle the torques were `middle` (n,) [N·m]: a drive tells the mean of
+        its many cycles within it (Simpson's rule), not the last one.
+
+        A stiff drive whose target stands still for a step while the joint moves on makes less and less torque in it.
+        """
+        ended = self._plant.drive_torque
+        self._mean = (self.started + 4.0 * middle + ended) / 6.0
+        self.started = ended.copy()
 
     def at(self, time: float) -> "Readings":
         """The readings at `time` [s]."""
@@ -31,7 +44,9 @@ class Readings:
             self._time = time
             self.position = sensors.position_counts(plant.motor_position) * sensors.position_step
             self.velocity = plant.motor_velocity / sensors.position_gain
-            self.torque = sensors.torque(plant.drive_torque, time)
+            self.torque = sensors.torque(self._mean, time)
+            if sensors.warms:
+                self.heating = sensors.heating(time)
         return self
 
 
@@ -68,6 +83,11 @@ class Motor:
         """Current times torque constant [N·m]."""
         return self._value(self._readings.at(self._time).torque) / self.ratio if self.powered else 0.0
 
+    @property
+    def heating(self) -> float:
+        """Rise of its temperature since power-on [K]."""
+        return self._value(self._readings.at(self._time).heating)
+
     def impede(
         self, kp: float, kd: float, position: float, velocity: float, torque: float, limit: float = np.inf
     ) -> None:
@@ -79,7 +99,9 @@ class Motor:
         at_zero = self._zero - turn * offset
         level = kp * (position - at_zero) + kd * velocity + torque
         self.powered = True
-        self._loops.impede(joint, kp * turn * ratio, kd * turn * ratio, level * ratio, limit * abs(ratio))
+        law = kp * turn * ratio, kd * turn * ratio, level * ratio, limit * abs(ratio)
+        self._loops.impede(joint, *law)
+        self._readings.started[joint] = self._loops.torque_by(joint, *law)
 
     @property
     def tuned(self) -> tuple[float, float, float]:
@@ -93,6 +115,7 @@ class Motor:
         if self.powered:
             self.powered = False
             self._loops.release(self.joint)
+            self._readings.started[self.joint] = 0.0
 
     def _value(self, values: Array) -> float:
         return float(values[self.joint])

@@ -88,6 +88,12 @@ class Imperfections:
     uneven: Array = field(init=False)
     """Coulomb friction: amplitude over a turn as a share and its phase [rad], friction per transmitted torque, and the
     share by which it is higher when cold (n, 4)."""
+    leaning: Array = field(init=False)
+    """Like `asymmetry`, for friction that is brought up to date once a cycle [1]."""
+    cogging: Array = field(init=False)
+    """Like `ripple`, brought up to date once a cycle: for joints that move slowly (n, 3)."""
+    warm_constant: Array = field(init=False)
+    """Loss of the torque constant when warm [1], time constant [s] and rise of temperature [K] of warming up (n, 3)."""
 
     def __post_init__(self) -> None:
         """Start with a perfect arm."""
@@ -106,6 +112,8 @@ class Imperfections:
             "frame_turn": (n, 3),
             "frame_shift": (n, 3),
             "uneven": (n, 4),
+            "cogging": (n, 3),
+            "warm_constant": (n, 3),
         }
         initial = {"stribeck_velocity": 0.01, "actuator_gain": 1.0, "torque_gain": 1.0, "position_gain": 1.0}
         initial |= {"actuator_saturation": np.inf, "torque_saturation": np.inf, "elasticity": np.inf}

@@ -17,11 +17,13 @@ def dry_friction(state: Imperfections, velocity: Array, load: Array, motor_torqu
     return np.asarray(np.maximum(level * (1.0 + state.asymmetry * heading), 0.0))
 
 
-def unevenness(state: Imperfections, position: Array, load: Array, time: float) -> Array:
-    """Friction (n,) [N·m] added by position [rad], transmitted torque `load` [N·m] and a cold gear at `time` [s]."""
+def unevenness(state: Imperfections, position: Array, velocity: Array, load: Array, time: float) -> Array:
+    """Friction (n,) [N·m] added by position [rad], direction of motion, transmitted torque `load` [N·m] and a cold gear
+    at `time` [s]."""
     amplitude, phase, by_load, cold = state.uneven.T
     factor = (1 + amplitude * np.sin(position + phase)) * (1 + cold * coldness(state, time))
-    added: Array = state.coulomb * (factor - 1) + by_load * np.abs(load)
+    level = state.coulomb * factor + by_load * np.abs(load)
+    added: Array = level * (1 + state.leaning * np.sign(velocity)) - state.coulomb
     return added
 
 

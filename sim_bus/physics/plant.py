@@ -126,7 +126,8 @@ class Plant:
         self._cables = None
         if imperfections.cable.any():
             self._cables = Cables(imperfections, (self.lower + self.upper) / 2, self.position)
-        self._changing = bool(imperfections.uneven.any() or imperfections.compliance.any()) or self._cables is not None
+        slow = imperfections.uneven, imperfections.leaning, imperfections.cogging, imperfections.compliance
+        self._changing = any(each.any() for each in slow) or self._cables is not None
         self._steady_friction = imperfections.steady_friction
         self._motors = None if imperfections.prompt_motors else LateMotors(imperfections, self.motor_torque)
         self._plain = self._steady_friction and self._motors is None and self._gears is None
@@ -273,11 +274,14 @@ class Plant:
         """Bring cables, sag and uneven friction up to date; once a step, as they change slowly."""
         position, torque = self.position, self.link_torque
         self._pulled = np.zeros(self.n) if self._cables is None else self._cables.torque(position)
+        amplitude, cycles, phase = self._imperfections.cogging.T
+        self._cogged = amplitude * np.sin(cycles * position + phase)
+        self._pulled = self._pulled - self._cogged
         if self._gears is None:
             self.data.qfrc_applied[self._dof] = self._pulled - self._lost
         self._sag = self._imperfections.compliance * torque
-        if self._imperfections.uneven.any():
-            self._uneven = unevenness(self._imperfections, position, torque, self.data.time)
+        if self._imperfections.uneven.any() or self._imperfections.leaning.any():
+            self._uneven = unevenness(self._imperfections, position, self.velocity, torque, self.data.time)
             self._set_friction()
 
     def _set_friction(self) -> None:

@@ -52,6 +52,8 @@ class Sensors:
             or state.warm_up.any()
             or np.isfinite(state.torque_saturation).any()
         )
+        self.warms = bool(state.warm_constant[:, 0].any())
+        """Whether gains change as the drives warm up."""
         self._delayed = bool(state.torque_delay.any())
         self._eccentric = bool(state.eccentricity.any())
 
@@ -67,7 +69,8 @@ class Sensors:
             link_torque = self._delay(link_torque, time)
         if self._bent:
             link_torque = self._bend(link_torque)
-        reading = self.gain * link_torque + self.offset
+        gain = self.gain_at(time) if self.warms else self.gain
+        reading = gain * link_torque + self.offset
         if self._bent:
             reading += self._imperfections.torque_drift * time + self.cold_zero(time)
         if self._next == NOISE_BLOCK:
@@ -83,6 +86,22 @@ class Sensors:
         """Shift of the torque sensors' zero (n,) at `time` [s], which vanishes as they warm up [N·m]."""
         shift: Array = -self._imperfections.warm_up[:, 0] * coldness(self._imperfections, time)
         return shift
+
+    def gain_at(self, time: float) -> Array:
+        """Gains (n,) at `time` [s]: a drive whose torque constant falls reads too much."""
+        gain: Array = self.gain / (1.0 - self._imperfections.warm_constant[:, 0] * self.warmth(time))
+        return gain
+
+    def warmth(self, time: float) -> Array:
+        """How warm each drive is (n,) at `time` [s]: 0 at power-on, 1 in the end."""
+        constant = self._imperfections.warm_constant[:, 1]
+        warm: Array = 1.0 - np.exp(-time / np.where(constant > 0, constant, np.inf))
+        return warm
+
+    def heating(self, time: float) -> Array:
+        """Rise of the drives' temperatures (n,) [K] at `time` [s] since power-on."""
+        rise: Array = self._imperfections.warm_constant[:, 2] * self.warmth(time)
+        return rise
 
     def position_counts(self, angle: Array) -> Array:
         """Readings `φ` of true angles in whole encoder increments."""

@@ -1,18 +1,19 @@
 """The answer of a diagnosis around its causes: verdict, gap before and after, roll-out, notes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from armlink.recording.recording import Recording
 from sim_gap.attribution.causes import left_over
-from sim_gap.attribution.confidence import HINT
-from sim_gap.attribution.diagnosis import Cause, Diagnosis, Rollout
-from sim_gap.attribution.notes import besides_notes, notes
+from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, Rollout
+from sim_gap.attribution.notes import besides_notes, law_notes, notes
+from sim_gap.attribution.residual_laws import ResidualLaw, as_effects, residual_laws
 from sim_gap.attribution.rollout import roll_out
 from sim_gap.attribution.verdict import share_left, verdict
 from sim_gap.model.load import SimModel
-from sim_gap.residuals.besides import fast, left_out, slow
+from sim_gap.residuals.besides import fast, left_out, slides, slow
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.residuals.where import Location, by_joint, combined, locate
 from sim_gap.search.estimate import Estimate
@@ -41,8 +42,8 @@ def answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: 
     )
     stuck = [each for s in (*fit.signals, *judge.signals) for each in s.stuck]
     sets = [(judge, left), *([(fit, left_fit)] if found else [])]
-    aside = _aside(made, estimate)
-    result = verdict(found, sets, unsettled=any(place.clear for place in aside))
+    aside, laws = _aside(made, estimate), residual_laws(fit, judge, left_fit, left)
+    result = verdict(found, sets, unsettled=bool(laws) or any(place.clear for place in aside))
     if stuck or (fit.impacts and not any(cause.effect == "transmission.backlash" for cause in found)):
         result = "unexplained"
     return Diagnosis(
@@ -60,8 +61,13 @@ def answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: 
         unexplained=share_left(judge, left),
         margin=combined(judge, judge.margin),
         heldout_is=heldout_is,
-        rollout=_rolled(made, found),
-        notes=(*notes(found, stuck, estimate, fit, judge, left), *besides_notes(aside)),
+        rollout=_rolled(made, found, laws),
+        laws=tuple(laws),
+        notes=(
+            *notes(found, stuck, estimate, fit, judge, left),
+            *besides_notes(aside),
+            *law_notes(laws, made.model.arm.names),
+        ),
         internals=made,
     )
 
@@ -75,14 +81,23 @@ def _aside(made: Internals, estimate: Estimate | None) -> list[Location]:
         if term.effect == "friction.coulomb":
             friction[term.place] += abs(estimate.of(term)[0]) if estimate is not None else 0.0
     explained = zero if estimate is None else estimate.predict(judge)
-    return [*slow(judge, explained, friction), *fast(judge, made.recordings)]
+    known = [row for row in made.train.rows if slides(made.train, row)]
+    return [*slow(judge, explained, friction, known), *fast(judge, made.recordings)]
 
 
-def _rolled(made: Internals, found: list[Cause]) -> Rollout | None:
+def _rolled(made: Internals, found: list[Cause], laws: Sequence[ResidualLaw]) -> Rollout | None:
     """Roll-outs of the exported files along the held-out recordings."""
     if made.nominal is None or not made.recordings:
         return None
-    return roll_out(made.model, made.heldout, made.recordings, made.estimate, found, made.nominal)
+    return roll_out(
+        made.model,
+        made.heldout,
+        made.recordings,
+        made.estimate,
+        found,
+        made.nominal,
+        as_effects(laws, made.model.arm.names),
+    )
 
 
 def _hints(found: list[Cause]) -> list[Cause]:

@@ -18,8 +18,6 @@ FOUNDED = 0.3
 """If no cause reaches this confidence, general laws disregarded, the gap is unexplained."""
 BETTER, WORSE = 0.07, 0.9
 """Bounds of the feature `outside`: a general law that fits better or worse than this carries no more information."""
-HINT = 0.5
-"""Largest confidence of a cause in an answer that leaves structure unexplained."""
 
 
 def confidence(signs: Signs, rivals: int) -> float:

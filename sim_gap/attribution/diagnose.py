@@ -77,8 +77,9 @@ def diagnose(
     heldout_is = "the recordings given" if heldout else f"the last {OWN_HELDOUT:.0%} of each training recording"
     numbers = list(range(1, len(train) + len(heldout) + 1))
     named = groups_of(groups, labels)
+    starts = [float(recording.t[0]) for recording in recordings]
     if not heldout:
-        train, heldout, labels, numbers, named = *_split(train), labels * 2, numbers * 2, named * 2
+        train, heldout, labels, numbers, named, starts = *_split(train), labels * 2, numbers * 2, named * 2, starts * 2
     if all(is_position_only(recording) for recording in [*train, *heldout]):
         return diagnose_positions(
             sim,
@@ -92,8 +93,10 @@ def diagnose(
             progress=progress,
         )
     ready = [
-        prepare(recording, sim.arm, label, number, names)
-        for recording, label, number, names in zip([*train, *heldout], labels, numbers, named, strict=False)
+        prepare(recording, sim.arm, label, number, names, start)
+        for recording, label, number, names, start in zip(
+            [*train, *heldout], labels, numbers, named, starts, strict=False
+        )
     ]
     fit, judge = residual_sets(ready[: len(train)], ready[len(train) :])
     _require_motion(fit)

@@ -6,10 +6,13 @@ from typing import Any, Literal
 import numpy as np
 
 from gcomp.arrays import Array
+from sim_gap.attribution.residual_laws import ResidualLaw
 from sim_gap.checks.finding import Finding
 from sim_gap.residuals.where import Location
 from sim_gap.search.estimate import Value
 
+HINT = 0.5
+"""Largest confidence of a cause in an answer that leaves structure unexplained, and of a law."""
 SCHEMA = "armlink.gap/2"
 Verdict = Literal["no_gap", "explained", "ambiguous", "unexplained"]
 
@@ -101,6 +104,8 @@ class Diagnosis:
     left_out: float = 0.0
     """Share of the held-out samples that no row judges."""
     rollout: Rollout | None = None
+    laws: tuple[ResidualLaw, ...] = ()
+    """Laws of what is left, which no effect of the library accounts for."""
     notes: tuple[str, ...] = ()
     unit: str = "N·m"
     """Of the gap: N·m, or rad where no recording has a torque channel."""
@@ -127,7 +132,7 @@ class Diagnosis:
                 }
                 for place in self.where
             ],
-            "causes": [_cause(cause) for cause in self.causes],
+            "causes": [*(_cause(cause) for cause in self.causes), *(_law(law, self.names) for law in self.laws)],
             "minor": [_cause(cause) for cause in self.minor],
             "signs": [{name: _round(value) for name, value in vars(cause.signs).items()} for cause in self.causes],
             "gap": {
@@ -179,6 +184,29 @@ def _cause(cause: Cause) -> dict[str, Any]:
         "confidence": _round(cause.confidence),
         "confounded_with": list(cause.confounded_with),
         "separate_by": cause.separate_by,
+    }
+
+
+def _law(law: ResidualLaw, names: tuple[str, ...]) -> dict[str, Any]:
+    """A law among the causes: named after its quantity, and never surer than a hint."""
+    low, high = law.torque - law.band, law.torque + law.band
+    return {
+        "effect": f"law.{law.quantity}",
+        "joints": [names[law.joint]],
+        "parameters": {},
+        "gap_before": _round(law.before),
+        "gap_after": _round(law.after),
+        "shrink": _round(1.0 - law.after / law.before),
+        "confidence": _round(min(law.share, HINT)),
+        "confounded_with": [],
+        "separate_by": None,
+        "law": {
+            "channel": law.channel,
+            "directed": law.directed,
+            "at": _list(law.at),
+            "torque": _list(law.torque),
+            "band": [_list(low), _list(high)],
+        },
     }
 
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from gcomp.arrays import Array
 from sim_gap.attribution.bodies import recordings_with
 from sim_gap.attribution.diagnosis import Cause
+from sim_gap.attribution.residual_laws import ResidualLaw
 from sim_gap.attribution.verdict import row_rms
 from sim_gap.effects.laws import LAWS
 from sim_gap.residuals.layout import Row
@@ -114,4 +115,14 @@ def besides_notes(aside: Sequence[Location]) -> tuple[str, ...]:
         + ("" if at.hz else ", more than known friction: breakaway, hysteresis or backlash")
         for at in aside
         if at.clear
+    )
+
+
+def law_notes(laws: Sequence[ResidualLaw], names: Sequence[str]) -> tuple[str, ...]:
+    """A note for each law that takes what the library leaves."""
+    return tuple(
+        f"{names[law.joint]}: what is left of {law.channel} follows a law of {law.quantity} of {names[law.joint]}"
+        + (" that opposes the motion" if law.directed else "")
+        + f" ({law.before:.2g} to {law.after:.2g} N·m on held-out data); its cause is not in the library"
+        for law in laws
     )

@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from armlink.recording.recording import Recording
-from sim_gap.attribution.confidence import HINT
-from sim_gap.attribution.diagnosis import Cause, Diagnosis, Rollout, Signs, Verdict
+from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, Rollout, Signs, Verdict
 from sim_gap.checks.finding import Finding
 from sim_gap.closed_loop.columns import shared_effects
 from sim_gap.closed_loop.identify import Identified, columns_of_effect, identify

@@ -16,6 +16,7 @@ from sim_gap.attribution.diagnosis import Cause, EffectRollout, Rollout
 from sim_gap.better_model import forward_effects
 from sim_gap.better_model.effects_module import joint_effects
 from sim_gap.better_model.export import Written, written
+from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.better_model.with_effects import with_effects
 from sim_gap.model.load import SimModel
 from sim_gap.residuals.preprocess import CHANNELS
@@ -34,9 +35,15 @@ class RollOuts:
     """Simulations of the exported files along held-out recordings."""
 
     def __init__(
-        self, sim: SimModel, heldout: ResidualSet, recordings: Sequence[Recording], estimate: Estimate
+        self,
+        sim: SimModel,
+        heldout: ResidualSet,
+        recordings: Sequence[Recording],
+        estimate: Estimate,
+        laws: Sequence[JointEffect] = (),
     ) -> None:
-        self.sim, self.recordings, self.estimate = sim, recordings, estimate
+        """`laws` go with every simulation of effects, none with that of the nominal model."""
+        self.sim, self.recordings, self.estimate, self.laws = sim, recordings, estimate, tuple(laws)
         self.numbers = [s.number for s in heldout.signals]
         self.channel = CHANNELS[heldout.layout.motor_side]
         self.source = {"tau_motor": "motor", "tau_cmd": "command", "tau": "sensor"}[heldout.layout.motor_side]
@@ -59,10 +66,10 @@ class RollOuts:
         """Model, module and effects with these terms as they are written for one recording."""
         if self.sim.path is None:  # a compiled model has no file to write
             corrected = with_effects(self.sim, self.estimate, terms, number)
-            entries = joint_effects(self.sim, self.estimate, corrected.not_held)
+            entries = [*joint_effects(self.sim, self.estimate, corrected.not_held), *(self.laws if terms else ())]
             own = forward_effects.Effects(corrected.model, entries, self.sim.arm.names)
             return corrected.model, forward_effects, own
-        files = written(self.sim, self.estimate, NAME, terms, number)
+        files = written(self.sim, self.estimate, NAME, terms, number, self.laws if terms else ())
         model, module = _compiled(files), _loaded(files)
         return model, module, module.Effects(model, module.EFFECTS, module.JOINTS or self.sim.arm.names)
 
@@ -74,12 +81,13 @@ def roll_out(
     estimate: Estimate | None,
     causes: Sequence[Cause],
     nominal: Estimate,
+    laws: Sequence[JointEffect] = (),
 ) -> Rollout:
     """Position gap per joint of the nominal model, of the whole correction, and with each cause added or left out.
 
     `estimate` is None if there is no gap; `nominal` stands for it then. Effects whose absence costs most come first.
     """
-    runs = RollOuts(sim, heldout, recordings, estimate or nominal)
+    runs = RollOuts(sim, heldout, recordings, estimate or nominal, laws)
     horizon, windows = forward_effects.HORIZON_S, forward_effects.WINDOWS
     before = runs.of((), windows)
     if estimate is None:

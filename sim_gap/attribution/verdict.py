@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.attribution.confidence import HINT, founded
-from sim_gap.attribution.diagnosis import Cause, Verdict
+from sim_gap.attribution.confidence import founded
+from sim_gap.attribution.diagnosis import HINT, Cause, Verdict
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
 

@@ -33,11 +33,17 @@ class Written:
 
 
 def written(
-    sim: SimModel, estimate: Estimate | None, name: str, terms: Sequence[Term] | None = None, number: int = 0
+    sim: SimModel,
+    estimate: Estimate | None,
+    name: str,
+    terms: Sequence[Term] | None = None,
+    number: int = 0,
+    laws: Sequence[JointEffect] = (),
 ) -> Written:
     """The files of the model with the effects of an estimate, or with some of its terms; `name` is the MJCF's.
 
-    A body that only some recordings have is left out, except for the one with this `number`.
+    A body that only some recordings have is left out, except for the one with this `number`. `laws` are torques
+    without a known cause.
     """
     chosen = () if estimate is None else estimate.terms if terms is None else tuple(terms)
     spec, corrected = spec_of(sim), with_effects(sim, estimate, chosen, number)
@@ -55,21 +61,23 @@ def written(
     left = [t for t in corrected.not_held if t.effect != "actuator.gain" or sim.arm.names[t.place] not in driven]
     lines = [] if estimate is None else [_line(sim, estimate, term) for term in left]
     lines += [f"{name}: its link as fitted cannot exist; the file has one that can" for name in corrected.changed]
+    lines += [f"{law} {joint}: a torque without a known cause" for law, joint, _ in laws]
     module = module_path(Path(name)).name
     comment = xml_comment([f"Effects that MJCF cannot hold ({module} applies them):", *lines]) if lines else ""
     effects = [] if estimate is None else joint_effects(sim, estimate, left)
     effects += [(GEARED, joint, {"gain": gain}) for joint, gain in gains.items() if joint in driven]
+    effects += laws
     source = module_text(sim, effects, name) if effects else ""
     return Written(comment + spec.to_xml(), source, spec, lines, effects)
 
 
-def write_model(sim: SimModel, estimate: Estimate | None, path: Path) -> list[str]:
-    """Write the model with the effects as MJCF, and beside it a module for those that MJCF cannot hold, if any.
+def write_model(sim: SimModel, estimate: Estimate | None, path: Path, laws: Sequence[JointEffect] = ()) -> list[str]:
+    """Write the model with the effects as MJCF, and beside it a module for those that MJCF cannot hold, and for laws.
 
     Returns a line per effect that MJCF cannot hold; the file lists them in a comment. Raises BadInput if the nominal
     model did not come from a file or a file cannot be written.
     """
-    files = written(sim, estimate, path.name)
+    files = written(sim, estimate, path.name, laws=laws)
     try:
         path.write_text(files.xml, encoding="utf-8")
         if files.module:

@@ -24,15 +24,20 @@ import numpy as np
 
 from gcomp.arrays import Array
 
-JointEffect = tuple[str, str, dict[str, float]]
-"""Effect, joint, parameters."""
+JointEffect = tuple[str, str, dict[str, Any]]
+"""Effect, joint, parameters: a number each; of a law, its points `at`, the `torque` there, and whether it is `directed`
+against the motion."""
 MODEL = ""
 """File of the model that these effects belong to."""
 JOINTS: tuple[str, ...] = ()
 """Base to tip."""
 EFFECTS: tuple[JointEffect, ...] = ()
-PASSIVE = ("friction.stribeck", "friction.load", "friction.asymmetric", "transmission.ripple")
+LAWS = ("law.position", "law.velocity", "law.load", "law.time", "law.temperature")
+"""Torques that follow one quantity of their joint; what causes them is not known."""
+PASSIVE = ("friction.stribeck", "friction.load", "friction.asymmetric", "transmission.ripple", *LAWS)
 """Effects that act on the joints themselves."""
+CREEPING = 0.01
+"""Speed below which the direction of a motion is not defined [rad/s]."""
 GEARED = "actuator.gain in the model's gear"
 """A drive's gain that the model's actuators have; a torque that is applied past them needs it too."""
 HORIZON_S, WINDOWS, STEP_S = 0.5, 40, 0.002
@@ -63,6 +68,8 @@ class Effects:
         self._passed: list[tuple[float, Array]] = []
         self._play: Array = np.zeros(len(self.joints))
         self._whole: Array = np.zeros(model.nv)
+        self.temperature: Array | None = None
+        """Of the joints [°C], (n,), for laws of temperature; None leaves those out."""
 
     def values(self, effect: str, parameter: str, otherwise: float = 0.0) -> Array:
         """One parameter of an effect for every joint, (n,); `otherwise` for joints without the effect."""
@@ -93,7 +100,22 @@ class Effects:
         angle = self.values("transmission.ripple", "cycles") * data.qpos[self.places]
         ripple = np.sin(angle + self.values("transmission.ripple", "phase"))
         lost = self.values("transmission.ripple", "amplitude") * ripple + self.values("torque.offset", "lost")
-        data.qfrc_passive[self.dofs] -= lost
+        data.qfrc_passive[self.dofs] -= lost + self.lawful(data, carried)
+
+    def lawful(self, data: Any, carried: Array) -> Array:
+        """Torque that the laws take now, (n,)."""
+        angle, speed, out = data.qpos[self.places], data.qvel[self.dofs], np.zeros(len(self.joints))
+        time = np.full(len(out), data.time)
+        quantities = dict(zip(LAWS, (angle, speed, carried, time, self.temperature), strict=True))
+        for name, joint, law in self._effects:
+            value = quantities.get(name)
+            if value is None:
+                continue
+            k = self.joints.index(joint)
+            amount = law["directed"] and name in ("law.velocity", "law.load")
+            torque = np.interp(abs(value[k]) if amount else value[k], law["at"], law["torque"])
+            out[k] += torque * (np.clip(speed[k] / CREEPING, -1.0, 1.0) if law["directed"] else 1.0)
+        return out
 
     def carried(self, model: Any, data: Any) -> Array:
         """Torque on the links, M(q) a + C(q, v) v + gravity of the last step, (n,)."""
@@ -222,9 +244,8 @@ def roll_out(
         for start in starts.tolist():
             at = fit @ q[start - beside : start + beside + 1]
             state = effects.state(at[0], at[1], drive[start])
-            stray = _window(
-                model, effects, state, drive[start : start + steps + 1], q[start + 1 : start + steps + 1], step
-            )
+            rows = slice(start, start + steps + 1)
+            stray = _window(model, effects, state, drive[rows], q[rows][1:], step, start * step)
             squares += np.mean(stray**2, axis=0)
     finally:
         mujoco.set_mjcb_passive(None)
@@ -243,13 +264,20 @@ def _prepare(model: Any, effects: Effects) -> None:
 
 
 def _window(
-    model: Any, effects: Effects, state: tuple[Array, Array], drive: Array, reading: Array, step: float
+    model: Any,
+    effects: Effects,
+    state: tuple[Array, Array],
+    drive: Array,
+    reading: Array,
+    step: float,
+    time: float,
 ) -> Array:
-    """Simulated minus recorded reading over one window, (steps, n)."""
+    """Simulated minus recorded reading over one window that begins at `time`, (steps, n)."""
     each = max(1, int(np.ceil(step / STEP_S)))
     model.opt.timestep = step / each
     data = mujoco.MjData(model)
     data.qpos[effects.places], data.qvel[effects.dofs] = state
+    data.time = time
     out = np.empty_like(reading)
     for k in range(len(reading)):
         data.qfrc_applied[effects.dofs] = 0.5 * (drive[k] + drive[k + 1])

@@ -157,7 +157,9 @@ def exists(inertial: Array) -> bool:
 
 def in_model(term: Term, number: int) -> bool:
     """Whether a term belongs to the arm, or to the recording with this number."""
-    return (not term.bound and number != ABSENT) or term.form.signature.present(term.shape, number)
+    return not (term.bound or (number == ABSENT and term.form.signature.body)) or term.form.signature.present(
+        term.shape, number
+    )
 
 
 def _base(sim: SimModel, motors: list[CoupledMotor]) -> tuple[Any, bool]:

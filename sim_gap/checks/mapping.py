@@ -16,11 +16,13 @@ import numpy as np
 from armlink.recording.corrections import Corrections
 from gcomp.arrays import Array
 from sim_gap.checks.finding import Finding, Kind
-from sim_gap.checks.rigid_fit import STRONG_SHARE, Motion, RigidFit, as_mounted, changed, fit_rigid
+from sim_gap.checks.rigid_fit import STRONG_SHARE, Motion, RigidFit, as_mounted, changed, few_rows, fit_rigid
 from sim_gap.model.rigid_body import RigidArm
 
 SURE = 0.7
 """Fall of the summed cost from which a hypothesis is accepted; a wrong one reaches 0.1 on sound recordings."""
+SCREENED = 0.3
+"""Share of that fall that a hypothesis must reach on few rows."""
 MOST_WORSE = 0.5
 """Most that the cost of any joint may rise with a hypothesis, as a share of the fall of all."""
 FITS = 0.65
@@ -74,8 +76,10 @@ def _best(
     arm: RigidArm, motion: Motion, fit: RigidFit, possible: Sequence[Hypothesis]
 ) -> tuple[Hypothesis, RigidFit, float] | None:
     """The hypothesis that lowers the cost most, if by enough."""
-    best, most = None, SURE
+    best, most, few = None, SURE, few_rows(motion)
     for hypothesis in possible:
+        if float((fit.cost - fit_rigid(arm, hypothesis.change(few)).cost).sum()) < SCREENED * SURE:
+            continue
         better = fit_rigid(arm, hypothesis.change(motion))
         fall = float((fit.cost - better.cost).sum())
         worse = float(np.max(better.cost - fit.cost))

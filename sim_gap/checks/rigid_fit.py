@@ -4,6 +4,7 @@ A reading is fitted by the model's torque and the joint's own friction and rotor
 negative. A wrong sign, order or unit leaves most of the reading unexplained; wrong masses, friction or gains do not.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +17,8 @@ from sim_gap.residuals.preprocess import Signals
 
 ROWS = 1500
 """Rows that the fit looks at."""
+FEW = 5
+"""One in this many of them is enough to see that a hypothesis is wrong."""
 TURNING = 0.02
 """Speed from which friction has its full sign [rad/s]."""
 MOVING_SHARE = 0.3
@@ -121,20 +124,47 @@ def _joint(model: Array, motion: Motion, j: int, spring: bool) -> tuple[float, .
         return 1.0, 1.0, 0.0, 0.0, 0.0, spread
     units = np.where(size > 1e-9, size, 1.0)
     scaled = columns / units
-    others = scaled[:, 1:] @ np.linalg.lstsq(scaled[:, 1:], np.column_stack([y, scaled[:, 0]]), rcond=None)[0]
-    left, own = y - others[:, 0], scaled[:, 0] - others[:, 1]
-    correlation = float(left @ own / (np.linalg.norm(left) * np.linalg.norm(own) + 1e-12))
-    free = np.linalg.lstsq(scaled, y, rcond=None)[0] / units
+    correlation, own = _partial(scaled, y)
+    free = _solved(scaled.T @ scaled, scaled.T @ y) / units
     unsigned = motion.channel == "tau" or np.mean(np.abs(motion.v[:, j]) > TURNING) < MOVING_SHARE
-    if unsigned:  # a link sensor feels no gear, and a joint at rest no friction: their sign says nothing
-        scaled = np.column_stack([scaled, -scaled[:, 1:]])
+    signs = [(1.0,), *[(1.0, -1.0) if unsigned else (1.0,)] * 3]
     if spring and motion.q[:, j].std() > 1e-6:
         turned = (motion.q[:, j] - motion.q[:, j].mean()) / motion.q[:, j].std()
-        scaled = np.column_stack([scaled, turned, -turned])
-    coefficients, rest = nnls(scaled, y)
-    explained = 1.0 - rest**2 / float(y @ y)
-    own_share = float(own.std() * units[0]) / spread
+        scaled, signs = np.column_stack([scaled, turned]), [*signs, (1.0, -1.0)]
+    coefficients, explained = _positive_fit(scaled, y, signs)
+    own_share = own * float(units[0]) / spread
     return explained, float(coefficients[0] / units[0]), correlation, own_share, float(free[1]), spread
+
+
+def _partial(columns: Array, y: Array) -> tuple[float, float]:
+    """Correlation of y with the first column given the others, and the standard deviation of that column's own part."""
+    gram = np.column_stack([columns, y]).T @ np.column_stack([columns, y])
+    through = _solved(gram[1:-1, 1:-1], gram[1:-1, [0, -1]])
+    left = gram[np.ix_([0, -1], [0, -1])] - gram[[0, -1], 1:-1] @ through
+    own, rest = np.sqrt(np.maximum(np.diag(left), 0.0))
+    return float(left[0, 1] / (own * rest + 1e-12)), float(own / np.sqrt(len(y)))
+
+
+def _solved(gram: Array, side: Array) -> Array:
+    return np.asarray(np.linalg.lstsq(gram, side, rcond=1e-12)[0])
+
+
+def _positive_fit(columns: Array, y: Array, signs: Sequence[tuple[float, ...]]) -> tuple[Array, float]:
+    """Coefficients, not negative, of the columns with each of their signs, and the share of y's variance explained.
+
+    By the triangular factor of columns and y, which has the same least squares as they have. A sensor on the link feels
+    no gear, and a joint at rest no friction: then the sign of those columns says nothing, and they have both.
+    """
+    small: Array = np.asarray(np.linalg.qr(np.column_stack([columns, y]), mode="r"))
+    chosen = np.column_stack([sign * small[:, k] for k, both in enumerate(signs) for sign in both])
+    coefficients, rest = nnls(chosen, small[:, -1])
+    return coefficients, 1.0 - rest**2 / float(y @ y)
+
+
+def few_rows(motion: Motion) -> Motion:
+    """The motion with few rows, for a first look."""
+    q, v, a, reading = (x[::FEW] for x in (motion.q, motion.v, motion.a, motion.reading))
+    return Motion(q, v, a, reading, motion.channel)
 
 
 def changed(motion: Motion, **values: Array) -> Motion:

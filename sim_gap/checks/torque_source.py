@@ -7,7 +7,7 @@ import numpy as np
 from armlink.recording.corrections import Corrections
 from gcomp.arrays import Array
 from sim_gap.checks.finding import Finding
-from sim_gap.checks.rigid_fit import Motion, RigidFit, fit_model
+from sim_gap.checks.rigid_fit import FEW, FLOOR, Motion, RigidFit, fit_model
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.residuals.preprocess import Signals
 
@@ -21,7 +21,8 @@ LAG, LAG_STEP = 1.5, 0.02
 """Longest delay that is looked for, and its step [s]."""
 OWN_LAG = 0.12
 """Delay up to which it is an effect of drive or sensor, which the diagnosis finds by itself [s]."""
-SURE = 0.7
+SURE, SCREENED = 0.7, 0.3
+"""Fall of the cost from which a delay is certain; share of it that a delay must reach on few rows to be looked at."""
 UNRELATED = 0.4
 """Correlation with the model's torque below which a reading that never changes its sign does not follow it."""
 
@@ -89,8 +90,10 @@ def find_delay(arm: RigidArm, motion: Motion, rate: float, stated: Corrections) 
     model = arm.torque(motion.q, motion.v, motion.a)
     start = float(fit_model(model, motion).cost.sum())
     costs = {}
+    if start - arm.n * np.log(FLOOR) < SURE:
+        return [], 0.0
     for rows in np.unique(np.round(np.arange(-LAG, LAG + LAG_STEP, LAG_STEP) * rate).astype(int)):
-        if abs(rows) < len(model) // 4:
+        if abs(rows) < len(model) // 4 and start - _delayed_cost(model, motion, int(rows), FEW) > SCREENED * SURE:
             costs[rows / rate] = _delayed_cost(model, motion, int(rows))
     lag = min(costs, key=costs.__getitem__, default=0.0)
     fall = start - costs.get(lag, start)
@@ -101,15 +104,15 @@ def find_delay(arm: RigidArm, motion: Motion, rate: float, stated: Corrections) 
     return [Finding("clock", motion.channel, "all", evidence, option, True)], fall
 
 
-def _delayed_cost(model: Array, motion: Motion, rows: int) -> float:
-    """Cost with the reading taken `rows` later than the motion."""
+def _delayed_cost(model: Array, motion: Motion, rows: int, step: int = 1) -> float:
+    """Cost with the reading taken `rows` later than the motion, on every `step`-th row."""
     ahead, behind = max(0, -rows), max(0, rows)
     n = len(model) - abs(rows)
     moved = replace(
         motion,
-        q=motion.q[ahead : ahead + n],
-        v=motion.v[ahead : ahead + n],
-        a=motion.a[ahead : ahead + n],
-        reading=motion.reading[behind : behind + n],
+        q=motion.q[ahead : ahead + n : step],
+        v=motion.v[ahead : ahead + n : step],
+        a=motion.a[ahead : ahead + n : step],
+        reading=motion.reading[behind : behind + n : step],
     )
-    return float(fit_model(model[ahead : ahead + n], moved).cost.sum())
+    return float(fit_model(model[ahead : ahead + n : step], moved).cost.sum())

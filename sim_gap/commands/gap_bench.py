@@ -12,6 +12,13 @@ def bench(
     effects: Annotated[
         str, typer.Option(metavar="LOW-HIGH", help="Number of effects in every case; default: none, one or two.")
     ] = "",
+    real: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Diagnose the recordings of real arms in DIR instead; see --known."),
+    ] = None,
+    known: Annotated[
+        Path | None, typer.Option(help="What is known of these arms (YAML). Default: of the arms that are published.")
+    ] = None,
     json: Annotated[Path | None, typer.Option(help="Write the score here; - is standard output.")] = None,
     out: Annotated[Path | None, typer.Option(help="Keep cases, answers and labels in this new folder.")] = None,
     workers: Annotated[int, typer.Option(help="Number of processes.")] = 2,
@@ -21,6 +28,8 @@ def bench(
     Example: armlink gap bench --seed 3 --cases 60 --out bench-3 --json bench-3.json
 
     Many effects at once: armlink gap bench --effects 5-8 --cases 30 --seed 3
+
+    Real arms: armlink gap bench --real recordings/
     """
     from tempfile import TemporaryDirectory
 
@@ -30,21 +39,25 @@ def bench(
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
     from sim_gap.blind.bench import diagnose_files, run_bench
-    from sim_gap.blind.judging.tables import show
+    from sim_gap.blind.judging.tables import show, show_real
+    from sim_gap.blind.real import KNOWN, run_real
 
     if json is not None and str(json) != "-" and not json.resolve().parent.is_dir():
         raise BadInput(f"--json {json}: its folder does not exist: create it first")
     console = Console(stderr=True)
     with TemporaryDirectory(prefix="armlink-bench-") as scratch, Progress(console=console) as bars:
-        known: dict[str, TaskID] = {}
+        stages: dict[str, TaskID] = {}
 
         def progress(stage: str, done: int, total: int) -> None:
-            if stage not in known:
-                known[stage] = bars.add_task(stage, total=total)
-            bars.update(known[stage], completed=done)
+            if stage not in stages:
+                stages[stage] = bars.add_task(stage, total=total)
+            bars.update(stages[stage], completed=done)
 
-        result = run_bench(
-            diagnose_files, out or Path(scratch), seed, cases, workers, progress=progress, effects=effects
-        )
-    show(result, console)
+        if real is not None:
+            result = run_real(real, out or Path(scratch), known or KNOWN, progress)
+        else:
+            result = run_bench(
+                diagnose_files, out or Path(scratch), seed, cases, workers, progress=progress, effects=effects
+            )
+    (show if real is None else show_real)(result, console)
     write_json(json, result)

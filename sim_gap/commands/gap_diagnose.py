@@ -150,10 +150,13 @@ def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
             console.print(f"not in MJCF: {line}", style="yellow", markup=False)
         console.print(f"corrected model with its position actuators: {path}")
         return
+    from sim_gap.attribution.residual_laws import as_effects
     from sim_gap.better_model.effects_module import module_path
     from sim_gap.better_model.export import write_model
 
-    missing = write_model(answer.internals.model, answer.internals.estimate, path)
+    missing = write_model(
+        answer.internals.model, answer.internals.estimate, path, as_effects(answer.laws, answer.names)
+    )
     console.print(f"corrected model: {path}")
     for line in missing:
         console.print(f"not in MJCF: {line}", style="yellow")

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armlink.link.types import Sample
-from calib.motion.random_work import work_targets
+from calib.motion.random_work import WorkMotion, work_targets
 from calib.observer.observer import Observer
 from calib.observer.recalibrator import Recalibrator
 from calib.observer.watch_loop import WatchHistory, watch
@@ -71,7 +71,13 @@ def run_drift(
         link,
         observer,
         work_targets(
-            link.position_sent, described.lower, described.upper, speed, link.period, np.random.default_rng([seed, 8])
+            link.position_sent,
+            described.lower,
+            described.upper,
+            speed,
+            link.period,
+            np.random.default_rng([seed, 8]),
+            WorkMotion.of_drives(with_integral=all(setup.gains is None for setup in link.setups)),
         ),
         SECONDS,
         recalibrator,

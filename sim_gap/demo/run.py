@@ -8,6 +8,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -17,6 +18,7 @@ from armlink.recording.files import save_recording
 from armlink.recording.recording import Recording
 from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.new_arm import new_arm
+from calib.creep.choice import sweep_motion
 from calib.fit.gravity_fit import identify_gravity
 from calib.fit.sensor_fit import fit_sensors
 from calib.install.apply import Apply, admit_sweeps
@@ -27,16 +29,17 @@ from calib.sweep.dataset import SweepData
 from calib.sweep.run import run_sweep
 from calib.sweep.verify import run_verify
 from sim_bus.sim_section import with_realism
-from sim_gap.attribution.diagnose import diagnose
-from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.demo.bench import Bench, check_gravity
+from sim_gap.demo.creep_report import creep_table, write_creep_report
+from sim_gap.demo.creep_report import summary as creep_summary
+from sim_gap.demo.creep_run import CreepDemo, quick, run_creep_demo
 from sim_gap.demo.drift import run_drift
+from sim_gap.demo.gap import diagnose_recordings
 from sim_gap.demo.motion import multisine, record_motion, travel
 from sim_gap.demo.narrator import Narrator, Report
 from sim_gap.demo.report import write_report
 from sim_gap.demo.show import calibration_table, drift_line, gap_line, verify_table
 from sim_gap.demo.summary import DemoResult, summary
-from sim_gap.model.load import compiled
 
 TRAIN_SECONDS, HELDOUT_SECONDS = 40.0, 25.0
 """Length of the gap's recordings [s]."""
@@ -45,7 +48,7 @@ BY = "armlink demo"
 
 def run_demo(
     arm_name: str, *, seed: int, out: Path, json_path: Path | None, console: Console, realism: float | None = None
-) -> DemoResult:
+) -> DemoResult | CreepDemo:
     """Run it, write `report.html`, `summary.json` and the data into `out`; raises BadInput, Refused, BusFault."""
     teller = Narrator(console)
     if Path(arm_name).suffix.lower() in MODEL_SUFFIXES:
@@ -56,19 +59,35 @@ def run_demo(
     arm.require_link()
     data_folder = _fresh(out)
     teller.say(f"arm [bold]{arm.name}[/bold], hidden truth of seed {seed}, results in {out}")
+    creeping = sweep_motion(arm) == "creep"
+    arm = quick(arm) if creeping else arm
+    result: DemoResult | CreepDemo
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as other_core:
         bench = Bench.build(arm, gcomp_arm(arm), seed)
         store = RecordStore(str(data_folder / "records.sqlite"))
         with bench.link:
-            result = _work(bench, store, arm, seed, data_folder, teller, other_core)
+            if creeping:
+                result = run_creep_demo(bench, store, seed, data_folder, teller, other_core)
+            else:
+                result = _work(bench, store, arm, seed, data_folder, teller, other_core)
         store.close()
-    write_report(result, out / "report.html")
-    text = json.dumps(summary(result), indent=1, ensure_ascii=False) + "\n"
+    content = _told(result, out / "report.html", teller)
+    text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
     (out / "summary.json").write_text(text, encoding="utf-8")
     if json_path is not None:
         sys.stdout.write(text) if str(json_path) == "-" else json_path.write_text(text, encoding="utf-8")
     teller.say(f"done: open [bold]{out / 'report.html'}[/bold]; numbers in {out / 'summary.json'}")
     return result
+
+
+def _told(result: DemoResult | CreepDemo, report: Path, teller: Narrator) -> dict[str, Any]:
+    """Write the report; the summary."""
+    if isinstance(result, CreepDemo):
+        teller.show(creep_table(result))
+        write_creep_report(result, report)
+        return creep_summary(result)
+    write_report(result, report)
+    return summary(result)
 
 
 def _work(
@@ -104,7 +123,7 @@ def _work(
     teller.show(verify_table(link.names, check, gravity_check))
     with teller.stage("recording motion for the gap diagnosis") as report:
         recordings = _record(bench, record, folder, seed, report)
-    diagnosis = other_core.submit(_diagnose, arm.path, recordings)
+    diagnosis = other_core.submit(diagnose_recordings, arm.path, recordings)
     with teller.stage("ordinary work: a torque sensor will drift") as report:
         drift = run_drift(bench, store, gravity_record, check, seed, report)
     teller.say(drift_line(link.names, drift))
@@ -113,7 +132,7 @@ def _work(
             answer = diagnosis.result()
         except BrokenProcessPool:
             teller.say("the process that did it was killed: doing it again in this one")
-            answer = _diagnose(arm.path, recordings)
+            answer = diagnose_recordings(arm.path, recordings)
     teller.say(gap_line(answer))
     stats = link.stats
     link.disable()
@@ -160,11 +179,6 @@ def _record(
         found.append(record_motion(bench, targets, calibration, report, name))
         save_recording(found[-1], folder / f"{name}.mcap")
     return found[0], found[1]
-
-
-def _diagnose(arm_path: Path, recordings: tuple[Recording, Recording]) -> Diagnosis:
-    """In the other process: the recordings against the arm's nominal model."""
-    return diagnose(compiled(arm_path), recordings[:1], recordings[1:], labels=["train", "heldout"])
 
 
 def _from_model(model: Path, out: Path, teller: Narrator) -> Path:

@@ -46,6 +46,8 @@ class Signature:
     """Whether it belongs to the arm as a whole instead of to one joint or link."""
     recordings: Callable[[Shape], tuple[int, ...]] = lambda _shape: ()
     """Numbers (from 1) of the recordings that it is present in; empty if it belongs to the arm for good."""
+    body: bool = False
+    """Whether it is a body that recordings may lack."""
     side: Side = "link"
     moves: Moves | None = None
     """Of an effect that moves the true joint against its reading."""
@@ -56,9 +58,9 @@ class Signature:
     """Of a nonlinear effect: its columns about fitted coefficients."""
 
     def present(self, shape: Shape, number: int) -> bool:
-        """Whether recording `number` has it."""
+        """Whether recording `number` has it: what belongs to the arm is in all of them, a body not in those without."""
         numbers = self.recordings(shape)
-        return number != ABSENT and (not numbers or number in numbers)
+        return not self.body if number == ABSENT else not numbers or number in numbers
 
     def places(self, layout: Layout) -> range:
         """Joints or links at which it may be; empty if these channels cannot show it."""

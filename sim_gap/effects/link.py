@@ -131,7 +131,7 @@ EFFECTS = (
     ),
     Effect(
         "link.payload",
-        Signature(_payload, whole_arm=True, recordings=numbers, slopes=_payload_slopes),
+        Signature(_payload, whole_arm=True, recordings=numbers, body=True, slopes=_payload_slopes),
         Plausibility(
             prior_penalty=0, prior_std=lambda _signals, _place: np.array([20.0, 4.0, 4.0, 4.0]), allows=_near_the_tip
         ),

@@ -26,8 +26,8 @@ from sim_gap.residuals.preprocess import Signals
 EPSILON = 1e-4
 PART_OF_TURN = 2.0
 """Range [rad] from which an error with a period of one turn can be separated from a gain."""
-WORST_GAIN = 0.15
-"""Largest scale error of a position sensor."""
+WORST_GAIN, WORST_ECCENTRICITY = 0.15, 0.2
+"""Largest scale error of a position sensor, and largest amplitude of an error with a period of one turn [rad]."""
 
 Error = Callable[[Array], tuple[Array, ...]]
 """Errors δ(φ) of the reading φ per unit of each coefficient, then δ'(φ) of each, then δ''(φ), (K,) each."""
@@ -83,6 +83,10 @@ def _amplitude_and_phase(coefficients: Array, _shape: Shape, _beneath: Beneath) 
     return np.array([np.hypot(*coefficients), np.arctan2(coefficients[1], coefficients[0])])
 
 
+def _within_a_few_degrees(coefficients: Array, _shape: Shape, _beneath: Beneath) -> bool:
+    return bool(np.hypot(*coefficients) < WORST_ECCENTRICITY)
+
+
 def _small(_signals: Signals, _place: int) -> Array:
     return np.full(1, 0.2)
 
@@ -105,7 +109,7 @@ EFFECTS = (
     Effect(
         "position.eccentricity",
         moving(_reads(lambda q: (np.sin(q), np.cos(q), np.cos(q), -np.sin(q), -np.sin(q), -np.cos(q)))),
-        Plausibility(prior_std=lambda _signals, _place: np.full(2, 0.1)),
+        Plausibility(prior_std=lambda _signals, _place: np.full(2, 0.1), allows=_within_a_few_degrees),
         SearchHints(shapes_for=_far_enough),
         parameters_of=_amplitude_and_phase,
     ),

@@ -1,6 +1,6 @@
 """The verdict of a diagnosis in a sentence."""
 
-from sim_gap.attribution.diagnosis import Diagnosis
+from sim_gap.attribution.diagnosis import HINT, Diagnosis
 
 
 def advice(answer: Diagnosis) -> str:
@@ -23,6 +23,9 @@ def sentence(answer: Diagnosis) -> str:
     if answer.verdict == "unexplained":
         return f"Gap not explained: {answer.unexplained:.0%} of it remains that no effect of the library explains"
     first = answer.causes[0]
+    if answer.verdict == "ambiguous" and not first.confounded_with:
+        hints = ", ".join(cause.effect for cause in answer.causes if cause.confidence < HINT)
+        return f"Cause ambiguous: {first.effect} fits, but part of the explanation is only a hint: {hints}"
     if answer.verdict == "ambiguous":
         rivals = " or ".join(first.confounded_with)
         return f"Cause ambiguous: {first.effect} fits, and so does {rivals}; to separate them, {first.separate_by}"

@@ -10,6 +10,7 @@ from sim_gap.attribution.diagnosis import Cause, Diagnosis
 from sim_gap.report.cause_figures import cause_figure
 from sim_gap.report.effect_text import advice, sentence
 from sim_gap.report.figures import gap_bars, residual_panels, rollout_bars
+from sim_gap.report.law_figure import law_figure
 from sim_gap.report.position_page import position_sections
 
 WORDS = {
@@ -27,7 +28,7 @@ def sections(answer: Diagnosis) -> list[Section]:
         return position_sections(answer)
     out = [_verdict(answer), _gap(answer)]
     if answer.internals is not None:
-        out += [*_causes(answer), *_residuals(answer)]
+        out += [*_causes(answer), *_laws(answer), *_residuals(answer)]
     return out
 
 
@@ -116,6 +117,17 @@ def _causes(answer: Diagnosis) -> list[Section]:
         "orange the contribution of this cause. A correct cause follows the centre of the grey points."
     )
     return [Section("The causes one by one", paragraph(text), shown)]
+
+
+def _laws(answer: Diagnosis) -> list[Section]:
+    """A figure for every law outside the library."""
+    if not answer.laws:
+        return []
+    text = (
+        "What the effects of the library leave of these rows follows one quantity of the joint. The law was fitted to "
+        "the training data; grey are held-out data. It says how the torque varies, and not why."
+    )
+    return [Section("Laws outside the library", paragraph(text), [law_figure(answer, law) for law in answer.laws])]
 
 
 def _residuals(answer: Diagnosis) -> list[Section]:

@@ -1,6 +1,6 @@
 """What the comparison leaves aside: motor rows at rest and in creep, and lines of the spectrum above the pass band."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,17 +48,23 @@ def left_out(data: ResidualSet) -> float:
     return 1.0 - float(np.mean([mask.mean() for mask in judged.values()]))
 
 
-def slow(data: ResidualSet, explained: Mapping[Row, Array], friction: Array) -> list[Location]:
+def slides(data: ResidualSet, row: Row) -> bool:
+    """Whether a joint slides for long enough that its friction is known."""
+    return int(data.valid[row].sum()) >= FEWEST
+
+
+def slow(data: ResidualSet, explained: Mapping[Row, Array], friction: Array, known: Collection[Row]) -> list[Location]:
     """Rows at rest and in creep; `friction` (n,) is the known dry friction [N·m], which may take any value there.
 
-    A location is `clear` if more remains there than that friction and the row's margin.
+    A location is `clear` if more remains there than that friction and the row's margin. Of a joint that does not slide
+    in the training data, which `known` then does not hold, the friction is not known: nothing is clear there.
     """
     names, out = data.signals[0].arm.names, []
     for (row, regime), mask in regimes(data).items():
         if mask.sum() < FEWEST:
             continue
         raw, left = data.values[row][mask], (data.values[row] - explained[row])[mask]
-        clear = root_mean_square(left) > data.margin[row] + friction[row[1]]
+        clear = row in known and root_mean_square(left) > data.margin[row] + float(friction[row[1]])
         share = float(np.sum(raw**2) / max(np.sum(raw**2) + np.sum(data.values[row][data.valid[row]] ** 2), 1e-12))
         out.append(Location(names[row[1]], row[0], regime, root_mean_square(raw), data.floor[row], share, clear=clear))
     return out

@@ -61,6 +61,7 @@ class Signals:
     """Standard deviation of each channel's noise within the pass band [N·m], (n,)."""
     arm: RigidArm
     temperature: Array | None = None
+    """Of each joint [°C], (K, n)."""
     number: int = 0
     """Number from 1 of the recording that this is (a part of), training recordings first; 0 if it has none, ABSENT if
     it is known to lack the body that others have."""
@@ -152,6 +153,11 @@ class Signals:
         """1 if a joint moves faster than the creeping speed, (K, n)."""
         return (np.abs(self.v) > CREEP).astype(float)
 
+    def release(self) -> None:
+        """Free what is large and can be computed again."""
+        for name in ("regressor", "gravity_columns", "_sensitivities"):
+            self.__dict__.pop(name, None)
+
     @property
     def step(self) -> int:
         """Decimation from the work rate to the rate of the comparison."""
@@ -229,9 +235,17 @@ def require_length(recording: Recording, label: str) -> None:
 
 
 def prepare(
-    recording: Recording, arm: RigidArm, label: str = "recording", number: int = 0, groups: tuple[str, ...] = ()
+    recording: Recording,
+    arm: RigidArm,
+    label: str = "recording",
+    number: int = 0,
+    groups: tuple[str, ...] = (),
+    start: float | None = None,
 ) -> Signals:
-    """Prepare a recording for the comparison with `arm`. Raises BadInput if it cannot be used, with the reason."""
+    """Prepare a recording for the comparison with `arm`. Raises BadInput if it cannot be used, with the reason.
+
+    `start` is the time at which the recording that this is a part of began [s]; times count from there.
+    """
     if recording.n != arm.n:
         raise BadInput(f"{label}: has {recording.n} joints, the model {arm.n}: give the model of the recorded arm")
     raw_step = float(np.median(np.diff(recording.t)))
@@ -260,10 +274,20 @@ def prepare(
         noise[channel] = np.array([band_noise(recording.t, values[:, j], band) for j in range(arm.n)])
     if not reading:
         raise BadInput(f"{label}: no torque channel holds a number: at least one of tau, tau_motor, tau_cmd is needed")
-    clock = times - times[0]
-    signals = Signals(label, rate, band, clock, q, v, a, reading, known, noise, arm, recording.temperature, number)
-    signals = replace(signals, groups=groups)
+    clock = times - (times[0] if start is None else start)
+    temperature = _warmth(recording, times)
+    signals = Signals(label, rate, band, clock, q, v, a, reading, known, noise, arm, temperature, number, groups)
     return _without_stuck(signals, recording)
+
+
+def _warmth(recording: Recording, times: Array) -> Array | None:
+    """Temperatures at these times (K, n); None unless every joint has one."""
+    read = recording.temperature
+    if read is None or not np.isfinite(read).any(0).all():
+        return None
+    there = [np.isfinite(column) for column in read.T]
+    parts = [np.interp(times, recording.t[ok], column[ok]) for ok, column in zip(there, read.T, strict=True)]
+    return np.stack(parts, axis=1)
 
 
 def _without_stuck(s: Signals, recording: Recording) -> Signals:
@@ -274,7 +298,7 @@ def _without_stuck(s: Signals, recording: Recording) -> Signals:
         for joint in range(s.n):
             there = np.isfinite(values[:, joint])
             held = s.moving[:, joint] == 0.0 if channel != "tau" else np.zeros(len(s.t), bool)
-            own = recording.t[there] - recording.t[0]
+            own = recording.t[there] - recording.t[0] + s.t[0]
             still = stuck_intervals(s.t, s.model[:, joint], held, own, values[there, joint])
             if still:
                 marked = known[channel].copy()

@@ -4,6 +4,7 @@ from collections.abc import Collection, Sequence
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gcomp.arrays import Array
 from sim_gap.residuals.layout import Columns, Row
@@ -11,9 +12,11 @@ from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.about import About, Values, about
 from sim_gap.search.term import Term
 
-UNCHANGED = 1e-12
-CLOSE = 0.1
-"""Change of the torques, as a share of them, up to which columns of rivals on the links are the nominal model's."""
+UNCHANGED, LINEAR = 1e-12, 1e-9
+CLOSE, CLOSE_RAD = 0.1, 0.02
+"""Change of torques and gravity, as a share of them, and of angles [rad] between two estimates up to which columns of
+rivals serve for both."""
+GAINS = ("sensor_gain", "motor_gain", "motor_slope")
 UNAFFECTED = frozenset(
     {
         "friction.coulomb", "friction.viscous", "friction.stribeck", "friction.asymmetric", "actuator.rotor_inertia",
@@ -33,41 +36,80 @@ class ColumnStore:
         values: Values | None = None,
         nominal: "ColumnStore | None" = None,
         pins: Values | None = None,
+        slopes: "ColumnStore | None" = None,
     ) -> None:
         """`nominal` is the store about the nominal model, of which columns that the estimate does not change are;
-        `pins` are coefficients that every fit on these columns keeps."""
+        `pins` are coefficients that every fit on these columns keeps. `slopes` is a store about another estimate whose
+        derivatives stand in for this one's."""
         self.data, self.values, self.nominal, self.pins = data, dict(values or {}), nominal, dict(pins or {})
+        self.slopes = slopes
+        self.near: ColumnStore | None = None
         self._columns: dict[Term, Columns] = {}
         self._offsets: dict[Term, Columns] = {}
 
-    def at(self, values: Values, pins: Values | None = None) -> "ColumnStore":
+    def at(
+        self,
+        values: Values,
+        pins: Values | None = None,
+        slopes: "ColumnStore | None" = None,
+    ) -> "ColumnStore":
         """The columns about other values."""
-        return ColumnStore(self.data, values, self.nominal or self, pins)
+        return ColumnStore(self.data, values, self.nominal or self, pins, slopes=slopes)
+
+    def beside(self, near: "ColumnStore | None") -> "ColumnStore":
+        """This store, with columns of rivals from another one where both are close."""
+        self.near = near
+        if near is not None:
+            near.near = None
+        return self
 
     @cached_property
-    def _link_as_nominal(self) -> bool:
-        """Whether poses are the nominal ones and torques close to them, so that the links' columns are, too."""
-        for one in self.about:
-            s, read = one.signals, one.signals.read
-            if s.q is not read.q or not np.array_equal(s.arm.gravity, read.arm.gravity):
-                return False
-            moved = np.sqrt(np.mean((s.model - read.model) ** 2, axis=0))
-            if np.any(moved > CLOSE * np.sqrt(np.mean(read.model**2, axis=0))):
-                return False
-        return all(np.allclose(one.sensor_gain, np.eye(self.data.layout.n), atol=CLOSE) for one in self.about)
+    def _close(self) -> "list[tuple[ColumnStore, NDArray[np.bool_]]]":
+        """Stores about estimates with the same poses, gravity and gains, and the joints with the same torque, (n,)."""
+        stores = [store for store in (self.nominal, self.near) if store is not None]
+        found = [(store, _alike(self.about, store.about)) for store in stores]
+        return [(store, joints) for store, joints in found if joints is not None]
 
-    def _as_nominal(self, term: Term) -> bool:
-        """Whether a term's columns are those about the nominal model."""
+    def _source(self, term: Term) -> "ColumnStore | None":
+        """The store whose columns of a term are those about this estimate; None if they are its own."""
         if self.nominal is None:
-            return False
+            return None
         if term.effect in UNAFFECTED:
-            return all(one.motor_gain[term.place] == 1.0 for one in self.about)
-        return term not in self.values and term.form.signature.side == "link" and self._link_as_nominal
+            return self.nominal if all(one.motor_gain[term.place] == 1.0 for one in self.about) else None
+        if term in self.values or term.effect.startswith("law."):  # a law has to contain the effects that it contains
+            return None
+        signature = term.form.signature
+        rigid = signature.side == "link" and signature.moves is None
+        everywhere = signature.side == "link" or term.effect == "torque.crosstalk"
+        for store, same in self._close:
+            if rigid or (same.all() if everywhere else same[term.place]):
+                return store
+        return None
+
+    @cached_property
+    def other_torques(self) -> NDArray[np.bool_]:
+        """Joints whose torque about the estimate is not close to the nominal model's, (n,)."""
+        pairs = [(one.signals.model, one.signals.read.model) for one in self.about]
+        moved = [np.sqrt(np.mean((now - nominal) ** 2, axis=0)) for now, nominal in pairs]
+        size = [np.sqrt(np.mean(nominal**2, axis=0)) for _, nominal in pairs]
+        return np.asarray(np.max(moved, axis=0) > CLOSE * np.max(size, axis=0))
 
     @cached_property
     def about(self) -> list[About]:
         """Each recording about the estimate."""
         return [about(s, self.data.layout, self.values) for s in self.data.signals]
+
+    def release(self) -> None:
+        """Free what the columns were computed from, apart from what belongs to the recordings as they were read."""
+        for one in self.__dict__.get("about", ()):
+            if one.signals.found is not None:
+                one.signals.release()
+
+    def keep(self, terms: Collection[Term]) -> None:
+        """Forget the columns of all other terms; they are evaluated again when they are asked for."""
+        kept = {*terms}
+        self._columns = {term: x for term, x in self._columns.items() if term in kept}
+        self._offsets = {term: x for term, x in self._offsets.items() if term in kept}
 
     def columns(self, term: Term) -> Columns:
         """Columns per row, (K, p) each; rows that the term does not touch are absent."""
@@ -92,8 +134,14 @@ class ColumnStore:
         return np.hstack([*own, *beside, np.zeros((total, 0))])
 
     def _compute(self, term: Term) -> None:
-        if self.nominal is not None and self._as_nominal(term):
-            self._columns[term], self._offsets[term] = self.nominal.columns(term), self.nominal.offset(term)
+        source = self._source(term)
+        if source is not None:
+            self._columns[term], self._offsets[term] = source.columns(term), source.offset(term)
+            return
+        known = self._in_slopes(term)
+        if known is not None:
+            self._columns[term] = known
+            self._offsets[term] = self._beside(term)
             return
         found = [self._of(one, term) for one in self.about]
         rows = list(dict.fromkeys(row for own, _ in found for row in own))
@@ -111,6 +159,26 @@ class ColumnStore:
         whole = {row: np.concatenate(each) for row, each in parts.items()}
         self._columns[term] = {row: x[:, :width] for row, x in whole.items()}
         self._offsets[term] = {row: x[:, width:] for row, x in whole.items()} if nonlinear else {}
+
+    def _in_slopes(self, term: Term) -> Columns | None:
+        """The columns of a term of the estimate in the store whose derivatives stand in; None if it has none."""
+        if self.slopes is None or term not in self.values:
+            return None
+        if term.form.signature.offset is not None:  # its coefficients mean the same at every shape
+            term = next((other for other in self.slopes.values if other.key == term.key), term)
+        return self.slopes._columns.get(term)
+
+    def _beside(self, term: Term) -> Columns:
+        """What a term is beside derivatives that are not about its estimate, (K, 1) per row."""
+        own, layout = self._columns[term], self.data.layout
+        parts = []
+        for one in self.about:
+            share, none = layout.compared(one.shares[term]), np.zeros(len(one.signals.t))
+            parts.append(one.signals.filtered(np.stack([share.get(row, none) for row in own], axis=1)))
+        whole = np.concatenate(parts)
+        beside = {row: whole[:, k, None] - own[row] @ self.values[term][:, None] for k, row in enumerate(own)}
+        linear = np.abs(whole).max(initial=0.0) * LINEAR
+        return beside if any(np.abs(x).max(initial=0.0) > linear for x in beside.values()) else {}
 
     def _of(self, one: About, term: Term) -> tuple[Columns, Columns]:
         """Columns of a term in one recording and what it is beside them, at the work rate."""
@@ -156,6 +224,22 @@ class ColumnStore:
                 if np.abs(made - read).max(initial=0.0) > UNCHANGED:
                     out[layout.motor, i] = made - read
         return out
+
+
+def _alike(ours: Sequence[About], theirs: Sequence[About]) -> NDArray[np.bool_] | None:
+    """Joints with torques close in two estimates, (n,); None unless angles, gravity and gains are close."""
+    same = np.ones(len(ours[0].motor_gain), bool)
+    for one, other in zip(ours, theirs, strict=True):
+        s, at = one.signals, other.signals
+        if s.q is not at.q and np.abs(s.q - at.q).max() > CLOSE_RAD:
+            return None
+        if np.linalg.norm(s.arm.gravity - at.arm.gravity) > CLOSE * np.linalg.norm(at.arm.gravity):
+            return None
+        if any(np.abs(getattr(one, x) - getattr(other, x)).max() > CLOSE for x in GAINS):
+            return None
+        moved, size = (np.sqrt(np.mean(x**2, axis=0)) for x in (s.model - at.model, at.model))
+        same &= moved <= CLOSE * size
+    return same
 
 
 def _own_gain(one: About, joint: int) -> float:

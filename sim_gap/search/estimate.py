@@ -46,6 +46,7 @@ class Estimate:
         self.terms = tuple(self.normal.terms)
         self.search = Search(self.normal, list(self.terms))
         self.index, self.coefficients = self.search.weighted.fit(self.terms)
+        self._elsewhere: ColumnStore | None = None
 
     def of(self, term: Term) -> Array:
         """Coefficients of one term."""
@@ -195,4 +196,8 @@ class Estimate:
 
     def on(self, data: ResidualSet) -> ColumnStore:
         """The columns of another set about this estimate."""
-        return self.store if data is self.store.data else ColumnStore(data, self.store.values)
+        if data is self.store.data:
+            return self.store
+        if self._elsewhere is None or self._elsewhere.data is not data:
+            self._elsewhere = ColumnStore(data, self.store.values)
+        return self._elsewhere

@@ -1,4 +1,7 @@
-"""Gauss-Newton steps: fit the terms, evaluate their columns about the fit, fit again until both agree."""
+"""Gauss-Newton steps: fit the terms, evaluate their columns about the fit, fit again until both agree.
+
+Derivatives are kept from one step to the next while the steps shrink; the prediction itself is always exact.
+"""
 
 from collections.abc import Sequence
 
@@ -18,6 +21,8 @@ AGREED = 5e-3
 WORSE = 1e-3
 """Increase of the score from which a step is halved."""
 HALVED = 3
+SLOW = 0.5
+"""Change of a step, as a share of the last one's, from which derivatives are evaluated again."""
 
 Values = dict[Term, Array]
 
@@ -32,27 +37,32 @@ def converged(
     """
     terms = [term.start for term in terms]
     values = {term: c for term, c in (start or {}).items() if term in terms}
-    best, kept, held = np.inf, values, Values()
+    best, kept, held, last = np.inf, values, Values(), np.inf
     arm = nominal.data.signals[0].arm
+    slopes: ColumnStore | None = None
     for _ in range(STEPS):
-        store = nominal.at(values)
+        store = nominal.at(values, slopes=slopes)
         search = Search(NormalEquations(store, terms), terms)
         now = score(store, values, search.normal)
         halved = 0
         while values and now > best + WORSE and halved < HALVED:
             values = {t: 0.5 * (c + kept.get(t, 0.0 * c)) for t, c in values.items()}
-            store = nominal.at(values)
+            store = nominal.at(values, slopes=slopes)
             search = Search(NormalEquations(store, terms), terms)
             now, halved = score(store, values, search.normal), halved + 1
         if values:
-            best, kept = now, values
+            best, kept, slopes = now, values, slopes or store
         held = pins(search, arm)
         if held:
             search.normal.pin(held)
             search.reweigh()
         terms, values = _step(search)
-        if kept and set(terms) == set(kept) and _agree(search, kept, values):
-            break
+        if kept and set(terms) == set(kept):
+            change = _change(search, kept, values)
+            if change <= AGREED:
+                break
+            slopes = None if change > SLOW * last or halved else slopes
+            last = change
     return nominal.at(values, {term: c for term, c in held.items() if term in values}), terms
 
 
@@ -89,12 +99,11 @@ def score(store: ColumnStore, values: Values, normal: NormalEquations) -> float:
     return float(0.5 * np.log(squares + normal.floor**2)[normal.seen].sum())
 
 
-def _agree(search: Search, old: Values, new: Values) -> bool:
-    """Whether a step changes no row's prediction by much."""
+def _change(search: Search, old: Values, new: Values) -> float:
+    """Largest change of a row's prediction by a step, as a share of the residual beside it and the relevance floor."""
     normal = search.normal
     change = np.zeros(normal.size)
     for term, c in new.items():
         change[normal.at[term]] = c - old[term]
-    moved = normal.power(change)
-    left = normal.mean_square(*search.weighted.fit(search.active))
-    return bool(np.all(moved[normal.seen] <= AGREED**2 * (left + normal.floor**2)[normal.seen]))
+    left = normal.mean_square(*search.weighted.fit(search.active)) + normal.floor**2
+    return float(np.sqrt(np.max((normal.power(change) / left)[normal.seen], initial=0.0)))

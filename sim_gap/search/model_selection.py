@@ -1,12 +1,15 @@
 """Model selection: search the library, search again if simpler effects may suffice, refine the shapes."""
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from sim_gap.effects.effect import Key
 from sim_gap.effects.registry import effects
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
+from sim_gap.search.estimate import SYSTEMATIC
 from sim_gap.search.gauss_newton import Values, converged
 from sim_gap.search.normal_equations import NormalEquations, Weighted
 from sim_gap.search.stepwise import TRIES, Search, shortlist
@@ -15,40 +18,77 @@ from sim_gap.search.term import Term
 
 def select_model(store: ColumnStore, library: Sequence[str]) -> Search:
     """Search the library, refine the shapes of the selected terms, and drop those that no longer earn their place."""
-    offered = candidates(store.data, library)
-    first = Search(NormalEquations(store, offered))
-    first.run()
-    chosen = refine(store, one_each([canonical(term) for term in without_doubtful(first).active]))
+    offered, active = first_search(store, library)
+    store.keep(offered)
+    chosen = refine(store, one_each([canonical(term) for term in active]))
     values: Values = {}
-    for _ in range(ROUNDS):
-        search = about_itself(store, chosen, offered, values)
+    near: ColumnStore | None = None
+    rounds = 0
+    for _ in range(MOST_ROUNDS):
+        search = about_itself(store, chosen, offered, values, near)
         keys = {term.key for term in search.active}
+        gone = {term.key for term in chosen} - keys
+        if rounds == ROUNDS and not gone:
+            break
+        rounds += not gone
+        offered = [term for term in offered if term.key not in gone]  # it cannot exist about itself
+        search.added.update(dict.fromkeys(gone, TRIES))
         search.least = AGAIN
         search.run()
         if {term.key for term in search.active} == keys:
-            return search
-        values = search.normal.store.values
+            break
+        near = search.normal.store
+        values = near.values
         chosen = one_each([canonical(term) for term in search.active])
-    return about_itself(store, chosen, offered, values)
+    search.normal.store.beside(None)  # frees the columns of the estimate before
+    return search
 
 
-def about_itself(nominal: ColumnStore, chosen: list[Term], offered: Sequence[Term], start: Values) -> Search:
+def first_search(store: ColumnStore, library: Sequence[str]) -> tuple[list[Term], list[Term]]:
+    """The terms that are offered to the search about the estimate, and those that a search about the nominal model
+    selects."""
+    search = Search(NormalEquations(store, candidates(store.data, library)))
+    search.run()
+    search = without_doubtful(search)
+    return likely_shapes(search), search.active
+
+
+def about_itself(
+    nominal: ColumnStore, chosen: list[Term], offered: Sequence[Term], start: Values, near: ColumnStore | None = None
+) -> Search:
     """The chosen terms and their rivals with columns evaluated about the fit of the chosen ones, from coefficients
-    `start` on."""
+    `start` on. `near` is the store of an earlier fit, whose columns of rivals serve if it is close."""
     store, chosen = converged(nominal, chosen, start)
     refined = refine(store, chosen)
     if refined != chosen:
         store, chosen = converged(nominal, refined, store.values)
+    store = store.beside(near)
     keys = {term.key for term in chosen}
-    rivals = relinearised_in_place(store, chosen, [term for term in offered if term.key not in keys])
+    others = [term for term in with_levels(store, offered) if term.key not in keys]
+    rivals = relinearised_in_place(store, chosen, others)
     return Search(NormalEquations(store, [*chosen, *rivals]), chosen)
 
 
-AGAIN = 0.06
-"""Least improvement of the score by a term that only a search about the estimate adds: five coefficients' price, for on
-real arms a little of many effects looks like what is left."""
-ROUNDS = 2
-"""How often the library is searched again about the estimate."""
+def with_levels(store: ColumnStore, offered: Sequence[Term]) -> list[Term]:
+    """The terms offered, with levels of limits, plays and dead bands from the torques about an estimate."""
+    other, signals = store.other_torques, [one.signals for one in store.about]
+
+    def follows(term: Term) -> bool:
+        return term.form.signature.side == "distortion" and term.free is not None and bool(other[term.place])
+
+    keys = dict.fromkeys(term.key for term in offered if follows(term))
+    levels = [Term(name, j, shape) for name, j in keys for shape in effects()[name].hints.grid(signals, j)]
+    return [*(term for term in offered if not follows(term)), *levels]
+
+
+AGAIN = -0.5 * float(np.log(1.0 - SYSTEMATIC**2))
+"""Least improvement of the score by a term that only a search about the estimate adds: of one row's residual, what no
+model has can mimic an effect up to the share SYSTEMATIC, and such an effect lowers ½ log R² by this."""
+SHAPES = 3
+"""Number of shapes of an effect at one place that are evaluated about the estimate."""
+ROUNDS, MOST_ROUNDS = 2, 5
+"""How often the library is searched again about the estimate; more often where terms of a search turn out to be
+impossible about themselves."""
 
 
 def candidates(data: ResidualSet, library: Sequence[str]) -> list[Term]:
@@ -60,6 +100,18 @@ def candidates(data: ResidualSet, library: Sequence[str]) -> list[Term]:
         for place in effects()[name].signature.places(layout)
         for shape in effects()[name].hints.grid(data.signals, place)
     ]
+
+
+def likely_shapes(search: Search) -> list[Term]:
+    """The terms of a search, of each effect and place only the SHAPES that would help most beside the active ones."""
+    rest = [term for term in search.normal.terms if term not in search.active]
+    count = Counter[Key]()
+    kept = list(search.active)
+    for _, term in search.weighted.screen(search.active, rest):
+        count[term.key] += 1
+        if count[term.key] <= SHAPES:
+            kept.append(term)
+    return [term for term in search.normal.terms if term in set(kept)]
 
 
 def canonical(term: Term) -> Term:

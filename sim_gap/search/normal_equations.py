@@ -46,6 +46,7 @@ class NormalEquations:
         self.floor = np.array([data.relevance_floor[row] for row in self.rows])
         for r, row in enumerate(self.rows):
             self._accumulate(store, r, row)
+        store.release()
         self.seen = self.count.sum(0) > 25
         spreads = [term.form.plausibility.prior_std(data.signals[0], term.place) for term in self.terms]
         own = [np.broadcast_to(s, w) for s, w in zip(spreads, widths, strict=True)]

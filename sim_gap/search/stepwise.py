@@ -103,7 +103,8 @@ class Search:
 
     def forward(self) -> bool:
         """Add the term that helps most, if any earns its place."""
-        inactive = [term for term in self.normal.terms if term not in self.active and self.added[term.key] < TRIES]
+        active = {*self.active}
+        inactive = [term for term in self.normal.terms if term not in active and self.added[term.key] < TRIES]
         trials = (
             self.with_beneath(term, self.active) for _, term in shortlist(self.weighted.screen(self.active, inactive))
         )
@@ -129,11 +130,8 @@ class Search:
     def _exchanges(self) -> Iterator[list[Term]]:
         for term in list(self.active):
             rest = self.without(term, self.active)
-            inactive = [
-                other
-                for other in self.normal.terms
-                if other not in rest and other != term and self.added[other.key] < TRIES
-            ]
+            used = {*rest, term}
+            inactive = [other for other in self.normal.terms if other not in used and self.added[other.key] < TRIES]
             for _, other in shortlist(self.weighted.screen(rest, inactive))[:4]:
                 yield self.with_beneath(other, rest)
 

@@ -1,6 +1,7 @@
 """A term of a fit: one effect at one place with one shape."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 from gcomp.arrays import Array
 from sim_gap.effects.effect import Effect, Key, Shape
@@ -16,12 +17,23 @@ class Term:
     place: int
     shape: Shape = ()
 
-    @property
+    def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        return hash((self.effect, self.place, self.shape))
+
+    def __reduce__(self) -> "tuple[type[Term], tuple[str, int, Shape]]":
+        """Without what is cached: effects have functions, and hashes of texts differ from process to process."""
+        return Term, (self.effect, self.place, self.shape)
+
+    @cached_property
     def form(self) -> Effect:
         """The inverse form of its effect."""
         return effects()[self.effect]
 
-    @property
+    @cached_property
     def key(self) -> Key:
         """Effect and place, for every shape."""
         return self.effect, self.place
@@ -62,7 +74,7 @@ class Term:
         nonlinear = self.form.hints.linearised_at is not None and self.form.signature.moves is not None
         return Term(self.effect, self.place, (0.0,) * len(self.shape)) if nonlinear else self
 
-    @property
+    @cached_property
     def beneath(self) -> tuple[Key, ...]:
         """Keys of the terms that it needs."""
         return tuple((name, self.place) for name in self.form.needs)

@@ -144,7 +144,7 @@ def judge(arm: ArmFile, truth: Truth, data: list[SweepData], fit: SensorFit | No
     off = np.abs(fit.value("gain") / truth.gain - 1)
     gain = float(np.nanmax(off, initial=0.0))
     told = np.array([name in fit.imprecise for name in fit.names])  # known worse than asked, and said so
-    width = 1.5 * fit.quantile * fit.std("gain") / np.abs(truth.gain)
+    width = 1.5 * fit.half95("gain") / np.abs(truth.gain)
     beyond = off > np.where(told, np.maximum(width, GAIN), GAIN)
     loosest = float(np.max(width, where=told, initial=GRAVITY))
     offset = float(np.nanmax(np.abs(fit.value("offset") - truth.offset) / rated, initial=0.0))

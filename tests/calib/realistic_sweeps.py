@@ -47,17 +47,16 @@ class RestingArm:
 
     def go(self, pose: np.ndarray, pressed: np.ndarray) -> np.ndarray:
         """Take the motors to `pose` (n,) [rad]; torque (n,) that each sensor is under, `pressed` where not NaN."""
-        torque = np.zeros_like(pose)
-        for angle in np.linspace(self.angle, pose, WAY + 1)[1:]:
-            pull = self.cables.torque(angle)
-            free = self.plant.gravity_torque(angle)[0] - pull
-            torque = np.where(np.isnan(pressed), free, pressed)
-            bent = angle - self.state.compliance * torque
-            torque = np.where(np.isnan(pressed), self.plant.gravity_torque(bent)[0] - pull, pressed)
-            if self.sensors._bent:
-                self.sensors._bend(torque)
+        way = np.linspace(self.angle, pose, WAY + 1)[1:]
+        pull, free = np.array([self.cables.torque(angle) for angle in way]), np.isnan(pressed)
+        torque = np.where(free, self.plant.gravity_torque(way) - pull, pressed)
+        bent = way - self.state.compliance * torque
+        torque = np.where(free, self.plant.gravity_torque(bent) - pull, pressed)
+        if self.sensors._bent:
+            for each in torque:
+                self.sensors._bend(each)
         self.angle = np.asarray(pose, float)
-        return torque
+        return torque[-1]
 
     def read(self, pose: np.ndarray, pressed: np.ndarray, direction: int = 0, seconds: float = READING):
         """(Position reading, torque reading, motor torque), (n,) each, after coming to `pose` as read [rad]."""

@@ -46,6 +46,8 @@ class RestArm(FastArm):
     def __init__(self, arm: str | ArmFile = "sarcos", seed: int = 0) -> None:
         super().__init__(arm, seed)
         self.lacking: Callable[[np.ndarray, np.ndarray], np.ndarray] = lambda q, side: np.zeros_like(q)
+        self.temperature = np.full(self.n, np.nan)
+        """That the drives tell (n,) [°C]."""
 
     def row(self) -> StaticReading:
         """Move to another waypoint, and rest there."""
@@ -70,7 +72,7 @@ class RestArm(FastArm):
         raw = self.gain * self.scale * self.reading(goal, side) + self.offset + noise * self.random.normal(size=self.n)
         reading = (raw - self.held_offset) / self.held_gain
         error = np.abs(noise * self.random.normal(size=self.n))
-        return StaticReading.of(self.t, goal, reading, side, torque_error=error)
+        return StaticReading.of(self.t, goal, reading, side, torque_error=error, temperature=self.temperature)
 
     def reading(self, q: np.ndarray, side: np.ndarray) -> np.ndarray:
         """Torque (n,) [N·m] that ideal sensors read at a pose (n,) [rad] approached from sides (n,)."""

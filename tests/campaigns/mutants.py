@@ -1,7 +1,11 @@
-"""Campaign: mutants of the gate. Each changes one thing in the source; the tests must notice every one.
+"""Campaign: mutants of the gate and the bus guard. Each changes one thing; the tests must notice every one.
 
 python tests/campaigns/mutants.py [--only gate.py] [--list]
-Exit status 1 if a mutant survives that EXPLAINED does not name. A mutant that hangs counts as noticed.
+python tests/campaigns/mutants.py --modules 'sim_gap/attribution/*.py' [--draw 500] [--seed 0]
+
+With --modules those of any modules, by the tests that mirror each: its own file, then the rest of its folder; --draw
+takes so many of them at random. Exit status 1 if a mutant survives that EXPLAINED does not name. A mutant that hangs
+counts as noticed.
 
 Operators: comparisons, arithmetic, signs, and/or, not, conditions negated and fixed, numbers, empty texts, min/max,
 ceil/floor, round/int, abs left out, returned and assigned values replaced by None.
@@ -13,6 +17,7 @@ import copy
 import importlib.abc
 import importlib.util
 import os
+import random
 import signal
 import sys
 import time
@@ -33,8 +38,12 @@ ROOT = Path(__file__).parent.parent.parent
 TARGETS = {
     "armlink/link/gate.py": ["tests/armlink/link/test_gate.py"],
     "armlink/link/gate_limits.py": ["tests/armlink/link/test_gate_limits.py"],
+    "armlink/guard/bus_guard.py": ["tests/armlink/guard/test_bus_guard.py"],
     "armlink/drives/canopen/cia402.py": ["tests/armlink/drives/canopen/test_cia402.py"],
 }
+NEED_NO_CONFTEST = ("armlink/link/gate.py", "armlink/link/gate_limits.py", "armlink/drives/canopen/cia402.py")
+"""Targets whose tests start faster without."""
+PACKAGES = ("armlink", "calib", "gcomp", "sim_bus", "sim_gap")
 EXPLAINED = {
     "int becomes round": "a mode is a whole number, and round() of one is that number",
     "0x10, 0x20': 16 becomes 17": "bit 0 is set by enable already",
@@ -75,6 +84,10 @@ SWAPS: dict[type, tuple[type, ...]] = {
     ast.Or: (ast.And,),
 }
 CALLS = {"max": "min", "min": "max", "ceil": "floor", "floor": "ceil", "round": "int", "int": "round"}
+
+
+class Broken(Exception):
+    """A module whose tests fail as it is."""
 
 
 class Mutated(importlib.abc.MetaPathFinder, importlib.abc.SourceLoader):
@@ -188,10 +201,47 @@ def noticed(target: str, source: str, tests: list[str]) -> bool:
         os.dup2(silent, 2)
         name = target.removesuffix(".py").replace("/", ".")
         sys.meta_path.insert(0, Mutated(name, ROOT / target, source))
-        options = ["-x", "-q", "-p", "no:cacheprovider", "--noconftest", *tests]
+        options = ["-x", "-q", "-p", "no:cacheprovider", "-m", "not vcan"]
+        options += ["--noconftest"] * (target in NEED_NO_CONFTEST) + tests
         status = pytest.main([*options, "-k", f"not {SLOW}"]) or pytest.main([*options, "-k", SLOW])
         os._exit(0 if status in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED) else 1)
     return os.waitpid(child, 0)[1] != 0
+
+
+def mirrors(target: str) -> list[str]:
+    """Tests of a module: the file that mirrors it, and its folder's others after it; empty if there are none."""
+    folder = ROOT / "tests" / Path(target).parent
+    own = folder / f"test_{Path(target).name}"
+    others = sorted(path for path in folder.glob("test_*.py") if path != own)
+    return [str(path.relative_to(ROOT)) for path in ([own] if own.exists() else []) + others]
+
+
+def chosen(patterns: list[str], draw: int, seed: int) -> dict[str, list[tuple[str, str]]]:
+    """Module → its mutants, of the modules that match; `draw` of them all, 0 for every one."""
+    targets = [str(path.relative_to(ROOT)) for pattern in patterns for path in sorted(ROOT.glob(pattern))]
+    targets = [target for target in targets if target.split("/")[0] in PACKAGES and mirrors(target)]
+    pairs = [(target, mutant) for target in targets for mutant in mutants(ROOT / target)]
+    if draw and draw < len(pairs):
+        pairs = sorted(random.Random(seed).sample(pairs, draw), key=lambda pair: targets.index(pair[0]))
+    found: dict[str, list[tuple[str, str]]] = {}
+    for target, mutant in pairs:
+        found.setdefault(target, []).append(mutant)
+    return found
+
+
+def judged(target: str, found: list[tuple[str, str]], tests: list[str]) -> tuple[int, int]:
+    """How many mutants survive, and how many of them without an explanation; raises Broken."""
+    if noticed(target, (ROOT / target).read_text(encoding="utf-8"), tests):
+        raise Broken(f"{target}: its tests fail without a mutant")
+    alive = unexplained = 0
+    for what, source in found:
+        if noticed(target, source, tests):
+            continue
+        why = next((why for part, why in EXPLAINED.items() if part in what), "")
+        alive, unexplained = alive + 1, unexplained + (not why)
+        print(f"survives: {what}{f' (explained: {why})' if why else ''}", flush=True)
+    print(f"{target}: {len(found)} mutants, {len(found) - alive} noticed, {alive} survive", flush=True)
+    return alive, unexplained
 
 
 def main() -> int:
@@ -199,27 +249,32 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default="", help="file name, such as gate.py")
     parser.add_argument("--list", action="store_true", help="say what the mutants are, and end")
+    parser.add_argument("--modules", nargs="+", default=[], metavar="GLOB", help="modules, instead of the gate's")
+    parser.add_argument("--draw", type=int, default=0, help="this many mutants of the modules, at random")
+    parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     os.chdir(ROOT)
-    unexplained, start = 0, time.monotonic()
-    for target, tests in TARGETS.items():
-        if given.only and Path(target).name != given.only:
-            continue
-        found = list(mutants(ROOT / target))
-        if given.list:
-            print("\n".join(what for what, _ in found))
-            continue
-        if noticed(target, (ROOT / target).read_text(encoding="utf-8"), tests):
-            print(f"{target}: its tests fail without a mutant")
+    if given.modules:
+        work = [
+            (target, found, mirrors(target)) for target, found in chosen(given.modules, given.draw, given.seed).items()
+        ]
+    else:
+        targets = {target: tests for target, tests in TARGETS.items() if given.only in ("", Path(target).name)}
+        work = [(target, list(mutants(ROOT / target)), tests) for target, tests in targets.items()]
+    if given.list:
+        print("\n".join(what for _, found, _ in work for what, _ in found))
+        return 0
+    survivors = unexplained = total = 0
+    start = time.monotonic()
+    for target, found, tests in work:
+        try:
+            alive, unknown = judged(target, found, tests)
+        except Broken as broken:
+            print(broken)
             return 1
-        killed = [noticed(target, source, tests) for _, source in found]
-        alive = [what for (what, _), gone in zip(found, killed, strict=True) if not gone]
-        for what in alive:
-            why = next((why for part, why in EXPLAINED.items() if part in what), "")
-            unexplained += not why
-            print(f"survives: {what}{f' (explained: {why})' if why else ''}", flush=True)
-        print(f"{target}: {len(found)} mutants, {len(found) - len(alive)} noticed, {len(alive)} survive", flush=True)
-    print(f"{unexplained} survive unexplained; {time.monotonic() - start:.0f} s")
+        survivors, unexplained, total = survivors + alive, unexplained + unknown, total + len(found)
+    took = time.monotonic() - start
+    print(f"{total} mutants, {survivors} survive, {unexplained} of them unexplained; {took:.0f} s")
     return int(unexplained > 0)
 
 

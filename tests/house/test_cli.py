@@ -339,6 +339,12 @@ def test_a_missing_extra_is_named(command, capsys, module, extra):
     assert capsys.readouterr().err == f"armlink: work: {module} is not installed: pip install 'armlink[{extra}]'\n"
 
 
+def test_the_daemon_names_its_own_extra_before_it_begins_anything(monkeypatch, capsys):
+    monkeypatch.setattr("calib.commands.daemon.find_spec", lambda module: None if module == "uvicorn" else object())
+    assert cli.run(["daemon", "no-such-arm"]) == 2
+    assert capsys.readouterr().err == "armlink: daemon: uvicorn is not installed: pip install 'armlink[daemon]'\n"
+
+
 def test_another_missing_module_is_a_bug(command):
     command(raising(ModuleNotFoundError("No module named 'numpy'", name="numpy")))
     with pytest.raises(ModuleNotFoundError):

@@ -160,8 +160,12 @@ class DatagramPort(ABC):
                 raise BusFault(f"bus {self._name}: cannot send: {os.strerror(number)}")
             tries += 1
             if tries == _TRIES:
-                raise BusFault(f"bus {self._name}: transmit queue stays full: does any node acknowledge?")
+                raise self._full()
             select.select([], [], [], _RETRY)
+
+    def _full(self) -> BusFault:
+        """Nothing could be sent for 50 ms."""
+        return BusFault(f"bus {self._name}: transmit queue stays full: does any node acknowledge?")
 
     def receive(self, timeout: float) -> Frame | None:
         """The next frame that is no error frame, or None after `timeout` seconds."""

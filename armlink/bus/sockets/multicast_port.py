@@ -13,7 +13,8 @@ from collections.abc import Sequence
 from armlink.bus.port import CLASSICAL, ERROR, REMOTE, Frame
 from armlink.bus.sockets.datagram_port import NAME, NOT_OURS, Batch, DatagramPort
 from armlink.bus.sockets.multicast_frames import LONGEST, Decoder, encode
-from armlink.errors import BusFault
+from armlink.bus.sockets.stamped_port import Stamping
+from armlink.errors import BusFault, Stall
 
 _IP_MULTICAST_ALL, _IPV6_MULTICAST_ALL = 49, 29
 _IGNORED: Frame = (NOT_OURS, b"")
@@ -53,6 +54,10 @@ class MulticastPort(DatagramPort):
         for i, (can_id, data) in enumerate(frames):
             put(i, encode(can_id & 0xFFFFFFFF, data, fd and not can_id & (ERROR | REMOTE | CLASSICAL)))
 
+    def _full(self) -> BusFault:
+        """No node has a part in it: the datagrams loop back within this machine."""
+        return Stall(f"bus {self._name}: this machine took no datagrams for 50 ms: it has too much else to do")
+
     def _decode(self, count: int) -> list[Frame]:
         batch, own, decode = self._in, self._own, self._decoder.decode
         content, names, size = batch.content, batch.names, len(own)
@@ -72,6 +77,10 @@ class MulticastPort(DatagramPort):
                     self._fd = found[2]
                 frames.append(found[:2])
         return frames
+
+
+class StampedMulticastPort(Stamping, MulticastPort):
+    """With the kernel's timestamps, for listeners."""
 
 
 def _connect(name: str, family: int, group: tuple[str, int], hop_limit: int) -> socket.socket:

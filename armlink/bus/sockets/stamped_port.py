@@ -1,4 +1,4 @@
-"""Ports for listeners: batches of frames with the kernel's timestamps, on SocketCAN and udp_multicast."""
+"""Ports for listeners: batches of frames with the kernel's timestamps."""
 
 import ctypes
 import select
@@ -8,7 +8,6 @@ import time
 
 from armlink.bus.port import Stamped
 from armlink.bus.sockets.datagram_port import BATCH, CONTROL, NO_FRAME, DatagramPort
-from armlink.bus.sockets.multicast_port import MulticastPort
 from armlink.bus.sockets.socket_port import SocketPort
 
 MOST_BATCHES = 256
@@ -68,10 +67,6 @@ class Stamping(DatagramPort):
 
 class StampedSocketPort(Stamping, SocketPort):
     """SocketCAN with timestamps."""
-
-
-class StampedMulticastPort(Stamping, MulticastPort):
-    """udp_multicast with timestamps."""
 
 
 def _clocks() -> tuple[float, float]:

@@ -8,17 +8,19 @@ from functools import partial
 from typing import Any
 
 from armlink.arm_file import ArmFile, LinkJoint
+from armlink.bus.frame_bits import longest_frame_bits
 from armlink.bus.port import Frame
 from armlink.drives.board import NO_STATUS, Board, Event
 from armlink.drives.canopen import controller_setup as device
 from armlink.drives.canopen import emcy, faults, torque_sensor_record
 from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen.check.guard_rules import NodeRules, shared_rules
 from armlink.drives.canopen.cia402 import Control, State, next_control, set_point_control, state_of, supports
 from armlink.drives.canopen.eds_file import of_joints
 from armlink.drives.canopen.host_frames import HostFrames
 from armlink.drives.canopen.object_dictionary import Entry
-from armlink.drives.canopen.pdo import RPDO1, RPDO2, TPDO1, TPDO2, TPDO3
-from armlink.drives.canopen.profile import examine, profile_of
+from armlink.drives.canopen.pdo import RPDO1, RPDO2, STATUS_DECIMATION, TPDO1, TPDO2, TPDO3
+from armlink.drives.canopen.profile import Profile, examine, profile_of
 from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork, joint_services
 from armlink.drives.canopen.units import Units, assumed_units, read_units
 from armlink.drives.family import Ask
@@ -158,6 +160,12 @@ class CanopenDrives:
         """See Drives: what only a host sends, and SDO requests that write, but of settings and calibration."""
         return self._host_frames(can_id, data)
 
+    def cycle_bits(self) -> float:
+        """See Drives: RPDO1 and TPDO1 in every cycle, TPDO2 in every fourth, SYNC."""
+        each = sum(longest_frame_bits(pdo.layout.size) for pdo in (RPDO1, TPDO1))
+        slow = longest_frame_bits(TPDO2.layout.size) / STATUS_DECIMATION
+        return self.m * (each + slow) + longest_frame_bits(0)
+
     def cycle_ids(self) -> frozenset[int]:
         """See Drives."""
         return frozenset((objects.SYNC_ID,))
@@ -216,6 +224,21 @@ class CanopenDrives:
             self.send_nmt(ask, objects.NMT_START, node)
         return found
 
+    def guard_rules(self, ask: Ask, limits: Sequence[Limits]) -> dict[str, Any]:
+        """See Guarded: scales and objects as the devices tell them."""
+        rules: dict[str, Any] = {"frames": shared_rules(self.nodes, self.protection.host), "stop": [], "restarts": {}}
+        for row, services, limit in zip(self.rows, self.services(ask), limits, strict=True):
+            device.check_identity(services, row)
+            unit, profile = read_units(services, row), examine(services, row.settings)
+            check_fits(row.name, limit, unit)
+            sheet = list(services.remote.object_dictionary)
+            node = NodeRules(row.name, row.settings.node, profile, unit, limit, self.protection, sheet)
+            rules["frames"] |= node.frames()
+            rules["stop"].append(node.stop)
+            boot_up, answers = node.restart
+            rules["restarts"][f"{boot_up}"] = answers
+        return rules
+
     def nmt_targets(self) -> tuple[int, ...]:
         """Whom NMT commands go to: all, or these nodes where others may be on the bus."""
         return (0,) if all(row.settings.torque == "record" for row in self.rows) else self.nodes
@@ -237,7 +260,7 @@ class CanopenDrives:
             position=services.read(objects.POSITION) * unit.position,
             torque=torque,
             position_step=max(unit.position, unit.encoder_step),
-            modes=frozenset(int(mode) for mode in Mode if supports(supported, mode)),
+            modes=usable_modes(supported, profile),
             lost=profile.lost,
             scales={"torque [N·m]": unit.torque, "position [rad]": unit.position, "velocity [rad/s]": unit.velocity},
         )
@@ -474,10 +497,13 @@ class CanopenDrives:
         """See Drives."""
         return _POWERS.get(state_of(self.statuses[joint]), Power.UNKNOWN)
 
-    def ask_power(self, joint: int, ask: Ask) -> Power:
+    def state_request(self, joint: int) -> list[Frame]:
+        """See Drives: TPDO3 tells a change by itself."""
+        return []
+
+    def lets_go(self, joint: int) -> bool:
         """See Drives."""
-        self.statuses[joint] = int(self.services(ask)[joint].read(objects.STATUS_WORD))
-        return self.power(joint)
+        return self.power(joint) in (Power.OFF, Power.READY, Power.FAULT)
 
     def ready(self, joint: int) -> bool:
         """See Drives."""
@@ -527,6 +553,14 @@ class CanopenDrives:
     def write_calibration(self, joint: int, ask: Ask, calibration: Calibration, store: bool = False) -> Calibration:
         """See KeepsCalibration."""
         return torque_sensor_record.write_record(self.services(ask)[joint], calibration, store)
+
+
+def usable_modes(supported: int, profile: Profile) -> frozenset[int]:
+    """Modes that a device can be ordered in while it cycles: where its mode cannot be mapped, the one it is left in."""
+    modes = frozenset(int(mode) for mode in Mode if supports(supported, mode))
+    if profile.modes_by_pdo:
+        return modes
+    return modes & {min((Mode.POSITION, Mode.PROFILE_POSITION), key=lambda mode: mode not in modes)}
 
 
 def check_fits(name: str, limits: Limits, unit: Units) -> None:

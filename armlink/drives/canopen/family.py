@@ -1,15 +1,17 @@
 """CANopen drives with the CiA 402 profile."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from armlink.arm_file import ArmFile, LinkJoint
+from armlink.bus.can_bus import CanBus
 from armlink.drives.board import NO_STATUS
 from armlink.drives.canopen.cia402 import state_of
 from armlink.drives.canopen.settings import CanopenSettings
 from armlink.drives.family import Drives, Family
 from armlink.drives.findings import Result
+from armlink.drives.found import DriveFinding, FoundDrives
 from armlink.drives.orders import Limits
 from armlink.drives.traits import Traits
 
@@ -52,6 +54,20 @@ def state_name(code: int) -> str:
     return "unknown" if code == NO_STATUS else state_of(code).value
 
 
+def find(bus: CanBus) -> FoundDrives:
+    """Nodes on a bus with their ratings; see `armlink.drives.canopen.check.found_drives`."""
+    from armlink.drives.canopen.check.found_drives import Drives
+
+    return Drives(bus)
+
+
+def examine(arm: ArmFile, bus: CanBus, name: str) -> Iterator[DriveFinding]:
+    """What the nodes say against the arm file; see `armlink.drives.canopen.check.arm_findings`."""
+    from armlink.drives.canopen.check.arm_findings import arm_findings
+
+    return arm_findings(arm, bus, name)
+
+
 FAMILY = Family(
     name="canopen",
     traits=TRAITS,
@@ -59,6 +75,8 @@ FAMILY = Family(
     build=build,
     self_test=self_test,
     search=search,
+    find=find,
+    examine=examine,
     state_name=state_name,
     summary="CiA 402 (CANopen), with or without our torque sensor object 2100h",
 )

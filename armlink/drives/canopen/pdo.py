@@ -87,11 +87,21 @@ Read = Callable[[Entry], int]
 
 
 def configure(pdo: Pdo, node: int, write: Write, read: Read, deadline_ms: int | None = 0) -> None:
-    """Set one PDO of one node over SDO and read all of it back (CiA 301 section 7.5.2.36: invalid, count 0, entries).
+    """Set one PDO of one node over SDO and read all of it back; arguments as `write_mapping`.
 
-    `deadline_ms` is the RPDO deadline or TPDO event timer (sub-index 5), 0 for none, None for
-    a device without it. Raises MappingRefused if the
-    device does not hold what was written.
+    Raises MappingRefused if the device does not hold what was written.
+    """
+    for entry, setting in write_mapping(pdo, node, write, deadline_ms):
+        if entry.index == pdo.communication and entry.sub == 1:
+            _same(entry, setting & ~_NO_REMOTE, read(entry) & ~_NO_REMOTE)
+        else:
+            _same(entry, setting, read(entry))
+
+
+def write_mapping(pdo: Pdo, node: int, write: Write, deadline_ms: int | None = 0) -> list[tuple[Entry, int]]:
+    """Set one PDO of one node over SDO (CiA 301 section 7.5.2.36: invalid, count 0, entries); what it must then hold.
+
+    `deadline_ms` is the RPDO deadline or TPDO event timer (sub-index 5), 0 for none, None for a device without it.
     """
     cob_id = Entry(pdo.communication, 1, "I", f"{pdo.name} COB-ID")
     kind = Entry(pdo.communication, 2, "B", f"{pdo.name} transmission type")
@@ -110,9 +120,15 @@ def configure(pdo: Pdo, node: int, write: Write, read: Read, deadline_ms: int | 
         write(entry, setting)
     write(count, len(pdo.entries))
     write(cob_id, value)
-    for entry, setting in [*settings, (count, len(pdo.entries))]:
-        _same(entry, setting, read(entry))
-    _same(cob_id, value & ~_NO_REMOTE, read(cob_id) & ~_NO_REMOTE)
+    return [*settings, (count, len(pdo.entries)), (cob_id, value)]
+
+
+def try_mapping(pdo: Pdo, node: int, write: Write) -> None:
+    """Write the mapping of one PDO, which stays invalid; raises what `write` raises where the device refuses it."""
+    write(Entry(pdo.communication, 1, "I", f"{pdo.name} COB-ID"), pdo.cob_base + node | _INVALID)
+    write(Entry(pdo.mapping, 0, "B", f"{pdo.name} number of mapped objects"), 0)
+    for i, entry in enumerate(pdo.entries, 1):
+        write(Entry(pdo.mapping, i, "I", f"{pdo.name} mapping {i}"), entry.mapping)
 
 
 def foreign_rpdos(described: Iterable[int]) -> list[int]:

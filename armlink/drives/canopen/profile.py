@@ -10,6 +10,7 @@ from armlink.drives.canopen.pdo import Pdo
 from armlink.drives.canopen.sdo import NodeServices
 from armlink.drives.canopen.settings import TYPES, CanopenSettings, TorqueObject
 from armlink.drives.canopen.units import TORQUE_PER_MICRO
+from armlink.errors import BusFault
 
 LOST: Mapping[Entry, str] = {
     objects.RPDO_DEADLINE: "no deadline for commands: the heartbeat alone tells that the host is gone",
@@ -90,12 +91,21 @@ def profile_of(settings: CanopenSettings) -> Profile:
 def examine(services: NodeServices, settings: CanopenSettings) -> Profile:
     """The profile of a device, by asking it for each object; one with our record must have them all.
 
-    Raises BusFault where it does not answer.
+    The node is pre-operational, so that mappings can be tried. Raises BusFault where it does not answer.
     """
     if settings.torque == "record":
         return OURS
     absent = frozenset(entry for entry in LOST if not services.has(entry))
     sheet = services.remote.object_dictionary
     modes = [sheet.get_variable(entry.index, 0) for entry in (objects.MODE, objects.MODE_DISPLAY)]
-    by_pdo = all(each is None or each.pdo_mappable for each in modes)
+    by_pdo = all(each is None or each.pdo_mappable for each in modes) and _takes(services, pdo.RPDO2)
     return replace(profile_of(settings), absent=absent, modes_by_pdo=by_pdo)
+
+
+def _takes(services: NodeServices, each: Pdo) -> bool:
+    """Whether a device maps the objects of a PDO, by trying it; the PDO is left invalid."""
+    try:
+        pdo.try_mapping(each, services.node, services.write)
+    except BusFault:
+        return False
+    return True

@@ -8,10 +8,21 @@ from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import Frame
 from armlink.drives.base import BasicDrives, no_order
 from armlink.drives.damiao import frames
-from armlink.drives.damiao.frames import Register, Special, State
-from armlink.drives.damiao.set_up import prepare, read_registers
+from armlink.drives.damiao.frames import READ, WRITE, Register, Special, State
+from armlink.drives.damiao.models import delivered
+from armlink.drives.damiao.set_up import LARGEST_RANGE, prepare, read_registers
 from armlink.drives.family import BROADCAST, Ask
-from armlink.drives.mit_packing import MitCommand, Ranges, damping, pack_command, round_within, unpack_command, unwrap
+from armlink.drives.mit_leash import damping, round_within
+from armlink.drives.mit_packing import (
+    MitCommand,
+    Ranges,
+    grid_of,
+    pack_command,
+    pack_steps,
+    unpack_command,
+    unpack_feedback,
+    unwrap,
+)
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
 from armlink.drives.traits import Traits
 from armlink.errors import BusFault, Stall
@@ -20,6 +31,16 @@ TRAITS = Traits(torque="current", calibration="host", silence="falls", bounds=()
 OTHER_MODES = {0x100: "position", 0x200: "velocity", 0x300: "force"}
 """Offsets of the command ids of the modes that armlink does not use."""
 IDENTITY = (Register.HARDWARE_VERSION, Register.SOFTWARE_VERSION, Register.SERIAL_NUMBER, Register.REPLY_ID)
+REGISTER_KINDS = frozenset((READ, WRITE))
+ENABLED = int(State.ENABLED)
+POWERS: dict[int | None, Power] = {State.DISABLED: Power.OFF, State.LOST_COMMUNICATION: Power.STOPPED}
+RANGE_FIELDS: dict[int, str] = {
+    Register.POSITION_RANGE: "position",
+    Register.VELOCITY_RANGE: "velocity",
+    Register.TORQUE_RANGE: "torque",
+}
+NO_FAULTS = frozenset((int(State.DISABLED), int(State.ENABLED), int(State.LOST_COMMUNICATION)))
+UNKNOWN_RANGES = Ranges(math.nan, math.nan, math.nan)
 FAULTS = {
     State.OVERVOLTAGE: "overvoltage",
     State.UNDERVOLTAGE: "undervoltage",
@@ -35,7 +56,7 @@ class _Known:
     """What is known of one drive."""
 
     ranges: Ranges | None = None
-    """By its registers; None before set_up()."""
+    """By its registers; before they are known those that its model is delivered with, None for an unknown model."""
     limits: Limits | None = None
     state: int | None = None
     position: float = math.nan
@@ -53,8 +74,12 @@ class DamiaoDrives(BasicDrives):
         """Nothing is sent."""
         super().__init__(joints, TRAITS)
         self._settings = [joint.settings for joint in joints]
-        self._known = [_Known() for _ in joints]
+        self._known = [_Known(delivered(settings.model)) for settings in self._settings]
         self._joint_of = {settings.id: joint for joint, settings in enumerate(self._settings)}
+        self._replies = {(each.reply, each.id & 0xF): joint for joint, each in reversed([*enumerate(self._settings)])}
+        """Joint by reply id and by the id in a reply."""
+        self._asked: tuple[int, int, int] | None = None
+        """Joint, READ or WRITE and register of the newest register request of another host."""
 
     def routes(self) -> Mapping[int, int]:
         """Reply ids; drives that share one are told apart by the id in their replies."""
@@ -121,7 +146,10 @@ class DamiaoDrives(BasicDrives):
     def _frame(self, joint: int, order: Order) -> Frame:
         known, drive = self._known[joint], self._settings[joint].id
         known.damping = False
-        on = known.state == State.ENABLED
+        if known.limits is None:
+            known.sent = None
+            return frames.REGISTERS_ID, frames.refresh_request(drive)
+        on = known.state == ENABLED
         if order.power is Power.ON and on:
             return self._command(joint, order)
         if order.power is Power.STOPPED and on:
@@ -145,16 +173,7 @@ class DamiaoDrives(BasicDrives):
         asked = MitCommand(
             order.position, order.velocity, order.kp if stiff else 0.0, order.kd if stiff else 0.0, order.torque
         )
-        rounded = round_within(
-            asked,
-            lambda command: unpack_command(pack_command(command, ranges), ranges),
-            ranges,
-            ranges.torque_quantum,
-            limits,
-            known.position,
-            known.velocity,
-        )
-        data = pack_command(rounded, ranges)
+        data = pack_steps(*round_within(asked, grid_of(ranges), limits, known.position, known.velocity))
         known.sent = _order_of(unpack_command(data, ranges))
         return self._settings[joint].id, data
 
@@ -175,53 +194,58 @@ class DamiaoDrives(BasicDrives):
 
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
         """See Drives."""
-        joint = self._joint_of_reply(can_id, data)
+        joint = self._replies.get((can_id, data[0] & 0xF)) if len(data) == 8 else None
         if joint is None:
             return None
-        known, drive = self._known[joint], self._settings[joint].id
-        if frames.register_answer(data, drive) is not None or known.ranges is None:
+        known = self._known[joint]
+        if data[2] in REGISTER_KINDS:
+            told = frames.register_answer(data, self._settings[joint].id)
+            if told is not None:
+                self._overhear(joint, *told)
+                return None
+        ranges = known.ranges
+        if ranges is None:
             return None
-        reply = frames.unpack_reply(data, known.ranges)
-        if reply is None or reply.drive != drive & 0xF:
-            return None
-        known.state = reply.state
-        position = reply.feedback.position
-        if math.isfinite(known.position):
-            position = unwrap(position, known.position, 2 * known.ranges.position)
-        known.position, known.velocity = position, reply.feedback.velocity
-        return self.note(
-            Reading(
-                joint,
-                position,
-                reply.feedback.velocity,
-                reply.feedback.torque,
-                temperature=float(max(reply.stage_temperature, reply.rotor_temperature)),
-                power=self._power(known),
-                fault=_fault_text(reply.state),
-            )
-        )
+        position, velocity, torque = unpack_feedback(data[1:6], ranges)
+        known.state = state = data[0] >> 4
+        if abs(known.position - position) > ranges.position:
+            position = unwrap(position, known.position, 2 * ranges.position)
+        known.position, known.velocity = position, velocity
+        self.powers[joint] = power = self._power(known)
+        self.faults[joint] = fault = _fault_text(state)
+        self.temperatures[joint] = temperature = float(max(data[6], data[7]))
+        return Reading(joint, position, velocity, torque, math.nan, temperature, power, fault)
 
-    def _joint_of_reply(self, can_id: int, data: bytes) -> int | None:
-        if len(data) != 8:
-            return None
-        places = [
-            joint
-            for joint, settings in enumerate(self._settings)
-            if settings.reply == can_id and (data[0] & 0xF == settings.id & 0xF)
-        ]
-        return places[0] if places else None
+    def _overhear(self, joint: int, kind: int, register: int, value: float) -> None:
+        """A register answer to another host's request: a range that it tells holds from now on.
+
+        Without the request before it the bytes may as well be a reading near the lower end of the range.
+        """
+        known, asked = self._known[joint], self._asked
+        field = RANGE_FIELDS.get(register)
+        if asked != (joint, kind, register) or field is None or not 0.0 < value < LARGEST_RANGE:
+            return
+        self._asked = None
+        known.ranges = (known.ranges or UNKNOWN_RANGES)._replace(**{field: value})
 
     @staticmethod
     def _power(known: _Known) -> Power:
-        if known.state == State.ENABLED:
+        if known.state == ENABLED:
             return Power.STOPPED if known.damping else Power.ON
-        powers: dict[int | None, Power] = {State.DISABLED: Power.OFF, State.LOST_COMMUNICATION: Power.STOPPED}
-        return powers.get(known.state, Power.FAULT)
+        return POWERS.get(known.state, Power.FAULT)
 
     def fault(self, modes: Sequence[int], now: float) -> BusFault | None:
         """See Drives."""
         lost = self.own_stop()
         return Stall(lost) if lost else super().fault(modes, now)
+
+    def state_request(self, joint: int) -> list[Frame]:
+        """See Drives."""
+        return [(frames.REGISTERS_ID, frames.refresh_request(self._settings[joint].id))]
+
+    def lets_go(self, joint: int) -> bool:
+        """See Drives: in every state but enabled."""
+        return self._known[joint].state != ENABLED
 
     def own_stop(self) -> str:
         """See Drives."""
@@ -233,7 +257,11 @@ class DamiaoDrives(BasicDrives):
     # ---- listening
 
     def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
-        """See Drives."""
+        """See Drives; of register requests it is noted which register was asked for, so that the answer is known."""
+        if can_id == frames.REGISTERS_ID and len(data) == 8 and data[2] in (READ, WRITE):
+            asked = self._joint_of.get(data[0] | data[1] << 8)
+            self._asked = None if asked is None else (asked, data[2], data[3])
+            return None
         joint = self._joint_of.get(can_id)
         if joint is None or len(data) != 8:
             return None
@@ -246,7 +274,7 @@ class DamiaoDrives(BasicDrives):
 
 
 def _fault_text(state: int) -> str:
-    if state in (State.DISABLED, State.ENABLED, State.LOST_COMMUNICATION):
+    if state in NO_FAULTS:
         return ""
     words = FAULTS[State(state)] if state in FAULTS else "unknown state"
     return f"{words} (state {state:X}h)"

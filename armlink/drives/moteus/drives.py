@@ -9,7 +9,16 @@ from armlink.bus.port import EXTENDED, Frame
 from armlink.drives.base import BasicDrives, no_order
 from armlink.drives.family import Ask
 from armlink.drives.moteus import frames
-from armlink.drives.moteus.frames import READ, READ_ERROR, REPLY, WRITE, Register
+from armlink.drives.moteus.frames import (
+    COMMAND,
+    CYCLE_COMMAND,
+    CYCLE_REPLY,
+    QUERY,
+    READ_ERROR,
+    REPLY,
+    WRITE,
+    Register,
+)
 from armlink.drives.moteus.settings import MoteusSettings
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
 from armlink.drives.traits import Traits
@@ -17,17 +26,10 @@ from armlink.errors import BadInput, BusFault, Stall
 
 TURN = 2 * math.pi
 TRAITS = Traits(torque="current", calibration="host", silence="damps", bounds=("torque",), cadence="reply", frame="fd")
-QUERY = (
-    Register.MODE, Register.POSITION, Register.VELOCITY, Register.TORQUE, Register.TEMPERATURE, Register.FAULT,
-)  # fmt: skip
-COMMAND = (
-    Register.MODE, Register.COMMAND_POSITION, Register.COMMAND_VELOCITY, Register.COMMAND_TORQUE,
-    Register.COMMAND_KP_SCALE, Register.COMMAND_KD_SCALE, Register.COMMAND_MAX_TORQUE,
-    Register.COMMAND_STOP_POSITION, Register.COMMAND_WATCHDOG, Register.COMMAND_ILIMIT_SCALE,
-)  # fmt: skip
-CYCLE_COMMAND = frames.FixedPayload([(WRITE, COMMAND), (READ, QUERY)])
-CYCLE_REPLY = frames.FixedPayload([(REPLY, QUERY)])
 HOMED_AT_OUTPUT = 2
+NOMINAL_BITS, FAST_BITS, FASTER = 60, 40, 5
+"""Bits of a CAN FD frame at the nominal rate (29-bit identifier, end) and besides the payload at the fast one, and how
+many times faster that is."""
 LARGEST_POSITION = 1e4
 """No joint's position is larger [rev]; a larger one is no reading."""
 FAULTS = {
@@ -92,6 +94,11 @@ class MoteusDrives(BasicDrives):
             for settings, name in zip(self._settings, self.names, strict=True)
             for head in range(0x100)
         }
+
+    def cycle_bits(self) -> float:
+        """See Drives: identifiers at the nominal rate, the rest five times as fast."""
+        payload = CYCLE_COMMAND.size + CYCLE_REPLY.size
+        return self.m * (2 * NOMINAL_BITS + (8 * payload + 2 * FAST_BITS) * 1.25 / FASTER)
 
     def poll(self, first: bool) -> list[Frame]:
         """Queries alone."""
@@ -208,7 +215,7 @@ class MoteusDrives(BasicDrives):
             Register.MODE: frames.Mode.POSITION,
             Register.COMMAND_POSITION: order.position / TURN if stiff else math.nan,
             Register.COMMAND_VELOCITY: order.velocity / TURN if stiff else 0.0,
-            Register.COMMAND_TORQUE: _float_within(order.torque, most),
+            Register.COMMAND_TORQUE: 0.0 if stiff else _float_within(order.torque, most),
             Register.COMMAND_KP_SCALE: stiff,
             Register.COMMAND_KD_SCALE: stiff,
             Register.COMMAND_MAX_TORQUE: _float_within(most, most),
@@ -216,6 +223,14 @@ class MoteusDrives(BasicDrives):
             Register.COMMAND_WATCHDOG: limits.deadline,
             Register.COMMAND_ILIMIT_SCALE: stiff,
         }
+
+    def torque_by_current(self, joint: int, ask: Ask) -> tuple[float, float] | None:
+        """See TellsCurrent."""
+        constant = self._settings[joint].torque_constant
+        values = None if constant is None else self._ask(ask, joint, {}, (Register.TORQUE, Register.Q_CURRENT))
+        if values is None or constant is None:
+            return None
+        return values.get(Register.TORQUE, math.nan), constant * values.get(Register.Q_CURRENT, math.nan)
 
     def sent(self, joint: int) -> Order | None:
         """See Drives."""
@@ -256,6 +271,10 @@ class MoteusDrives(BasicDrives):
         """See Drives."""
         lost = self.own_stop()
         return Stall(lost) if lost else super().fault(modes, now)
+
+    def state_request(self, joint: int) -> list[Frame]:
+        """See Drives: a query."""
+        return [self.poll(first=False)[joint]]
 
     def own_stop(self) -> str:
         """See Drives."""

@@ -279,3 +279,17 @@ def _read_varuint(data: bytes, place: int) -> tuple[int | None, int]:
         if not data[place - 1] & 0x80:
             return value, place
     return None, place
+
+
+QUERY = (
+    Register.MODE, Register.POSITION, Register.VELOCITY, Register.TORQUE, Register.TEMPERATURE, Register.FAULT,
+)  # fmt: skip
+"""Registers that are asked for in every cycle."""
+COMMAND = (
+    Register.MODE, Register.COMMAND_POSITION, Register.COMMAND_VELOCITY, Register.COMMAND_TORQUE,
+    Register.COMMAND_KP_SCALE, Register.COMMAND_KD_SCALE, Register.COMMAND_MAX_TORQUE,
+    Register.COMMAND_STOP_POSITION, Register.COMMAND_WATCHDOG, Register.COMMAND_ILIMIT_SCALE,
+)  # fmt: skip
+"""Registers that are written in every cycle."""
+CYCLE_COMMAND = FixedPayload([(WRITE, COMMAND), (READ, QUERY)])
+CYCLE_REPLY = FixedPayload([(REPLY, QUERY)])

@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from armlink.arm_file import Positive
 from armlink.drives.settings import DriveSettings
 
 
@@ -15,6 +16,9 @@ class MoteusSettings(DriveSettings):
     """Controller id (id.id)."""
     source: Annotated[int, Field(ge=0, le=0x7F)] = 0
     """Our id, to which it replies."""
+    torque_constant: Positive | None = None
+    """Torque constant at its output [N·m/A], by which the scale check compares torque
+    with current; None: not compared."""
 
     @property
     def address(self) -> str:

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from armlink.arm_file import ArmFile, LinkJoint
+from armlink.bus.frame_bits import longest_frame_bits
 from armlink.bus.port import REMOTE, Frame
 from armlink.drives.base import BasicDrives, no_order
 from armlink.drives.family import Ask
@@ -90,6 +91,10 @@ class ODriveDrives(BasicDrives):
             for node, joint in self._joint_of.items()
             for message in FROM_HOST
         }
+
+    def cycle_bits(self) -> float:
+        """See Drives: the input, and estimates and torques as often."""
+        return 3 * self.m * longest_frame_bits(8)
 
     def reading_ids(self) -> Mapping[int, int]:
         """See Drives."""
@@ -228,6 +233,14 @@ class ODriveDrives(BasicDrives):
     def _message(self, joint: int, message: Message, *values: int) -> Frame:
         return identifier(self._settings[joint].node, message), pack(message, *values)
 
+    def torque_by_current(self, joint: int, ask: Ask) -> tuple[float, float] | None:
+        """See TellsCurrent."""
+        constant = self._settings[joint].torque_constant
+        if constant is None:
+            return None
+        torques, currents = self._request(ask, joint, Message.TORQUES), self._request(ask, joint, Message.CURRENT)
+        return None if torques is None or currents is None else (torques[1], constant * currents[1])
+
     def sent(self, joint: int) -> Order | None:
         """See Drives."""
         return self._known[joint].sent
@@ -262,6 +275,11 @@ class ODriveDrives(BasicDrives):
         """See Drives."""
         lost = self.own_stop()
         return Stall(lost) if lost else super().fault(modes, now)
+
+    def lets_go(self, joint: int) -> bool:
+        """See Drives: in every state but closed loop."""
+        beat = self._known[joint].heartbeat
+        return beat is not None and beat.state != AxisState.CLOSED_LOOP
 
     def own_stop(self) -> str:
         """See Drives."""

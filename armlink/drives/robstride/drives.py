@@ -8,7 +8,8 @@ from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import EXTENDED, Frame
 from armlink.drives.base import BasicDrives, no_order
 from armlink.drives.family import ANY, BROADCAST, Ask
-from armlink.drives.mit_packing import MitCommand, Ranges, damping, round_within
+from armlink.drives.mit_leash import damping, round_within
+from armlink.drives.mit_packing import MitCommand, Ranges, grid_of
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
 from armlink.drives.robstride import frames
 from armlink.drives.robstride.frames import RANGES, Type, fault_names
@@ -119,7 +120,7 @@ class RobStrideDrives(BasicDrives):
             known.damping = True
             assert known.limits is not None
             quiet = damping(settings.kd, known.position, known.velocity, known.limits.max_torque)
-            return self._motion(joint, quiet, Power.STOPPED)
+            return self._motion(joint, frames.motion_frame(settings.id, quiet, known.ranges), Power.STOPPED)
         known.sent = None
         known.was_on = known.was_on and order.power is Power.ON
         if order.power is Power.ON and order.walk and known.mode is not None and not known.faults:
@@ -137,20 +138,11 @@ class RobStrideDrives(BasicDrives):
             order.position, order.velocity, order.kp if stiff else 0.0, order.kd if stiff else 0.0, order.torque
         )
         ranges, drive = known.ranges, self._settings[joint].id
-        rounded = round_within(
-            asked,
-            lambda command: frames.unpack_motion(*frames.motion_frame(drive, command, ranges), ranges),
-            ranges,
-            2 * ranges.torque / 0xFFFF,
-            known.limits,
-            known.position,
-            known.velocity,
-        )
-        return self._motion(joint, rounded, Power.ON)
+        steps = round_within(asked, grid_of(ranges, frames.MOTION_BITS), known.limits, known.position, known.velocity)
+        return self._motion(joint, frames.motion_of_steps(drive, *steps), Power.ON)
 
-    def _motion(self, joint: int, command: MitCommand, power: Power) -> Frame:
+    def _motion(self, joint: int, frame: Frame, power: Power) -> Frame:
         known = self._known[joint]
-        frame = frames.motion_frame(self._settings[joint].id, command, known.ranges)
         known.sent = _order_of(frames.unpack_motion(*frame, known.ranges))._replace(power=power)
         return frame
 
@@ -195,6 +187,19 @@ class RobStrideDrives(BasicDrives):
             if mode and self._stopped_itself(joint):
                 return Stall(f"{self.where(joint)}: went to mode reset: its canTimeout ran out, the torque is off")
         return super().fault(modes, now)
+
+    def state_request(self, joint: int) -> list[Frame]:
+        """See Drives: the torque limit, written as it is, since a reading is answered without the mode."""
+        known, settings = self._known[joint], self._settings[joint]
+        if known.limits is None:
+            return []
+        most = min(known.limits.max_torque, known.ranges.torque)
+        can_id, data = frames.write_frame(settings.id, settings.host, frames.Parameter.LIMIT_TORQUE, most)
+        return [(can_id | EXTENDED, data)]
+
+    def lets_go(self, joint: int) -> bool:
+        """See Drives: in every mode but run."""
+        return self._known[joint].mode != frames.Mode.RUN
 
     def own_stop(self) -> str:
         """See Drives."""

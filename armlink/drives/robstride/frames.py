@@ -8,7 +8,7 @@ import struct
 from enum import IntEnum
 from typing import NamedTuple
 
-from armlink.drives.mit_packing import MitCommand, MitFeedback, Ranges, from_steps, to_steps
+from armlink.drives.mit_packing import MitCommand, MitFeedback, Ranges, grid_of
 
 RANGES = {
     "RS00": Ranges(12.57, 33.0, 14.0),
@@ -20,6 +20,9 @@ RANGES = {
     "RS06": Ranges(12.57, 50.0, 36.0, 5000.0, 100.0),
 }
 """Ranges by model, from the manuals: these drives have no register for them."""
+MOTION_BITS = (16, 16, 16, 16, 16)
+"""Bits of q, dq, kp, kd and τ in the private protocol."""
+MOTION = struct.Struct(">4H")
 NEVER_READ = 0x01
 """Bits 16 to 23 of the identifier that answers the reading of an unknown parameter."""
 
@@ -103,27 +106,18 @@ def data_of(can_id: int) -> int:
 
 def motion_frame(drive: int, command: MitCommand, ranges: Ranges) -> tuple[int, bytes]:
     """Motion command (type 1): the torque is in the identifier. Raises ValueError for numbers that are not finite."""
-    torque = to_steps(command.torque, -ranges.torque, ranges.torque, 16)
-    data = struct.pack(
-        ">4H",
-        to_steps(command.position, -ranges.position, ranges.position, 16),
-        to_steps(command.velocity, -ranges.velocity, ranges.velocity, 16),
-        to_steps(command.kp, 0.0, ranges.kp, 16),
-        to_steps(command.kd, 0.0, ranges.kd, 16),
-    )
-    return identifier(Type.MOTION, torque, drive), data
+    return motion_of_steps(drive, *grid_of(ranges, MOTION_BITS).steps(command))
+
+
+def motion_of_steps(drive: int, q: int, dq: int, kp: int, kd: int, torque: int) -> tuple[int, bytes]:
+    """Motion command of packed steps."""
+    return identifier(Type.MOTION, torque, drive), MOTION.pack(q, dq, kp, kd)
 
 
 def unpack_motion(can_id: int, data: bytes, ranges: Ranges) -> MitCommand:
     """A motion command as the drive understands it; `data` has eight bytes."""
-    q, dq, kp, kd = struct.unpack(">4H", data)
-    return MitCommand(
-        from_steps(q, -ranges.position, ranges.position, 16),
-        from_steps(dq, -ranges.velocity, ranges.velocity, 16),
-        from_steps(kp, 0.0, ranges.kp, 16),
-        from_steps(kd, 0.0, ranges.kd, 16),
-        from_steps(data_of(can_id), -ranges.torque, ranges.torque, 16),
-    )
+    q, dq, kp, kd = MOTION.unpack(data)
+    return grid_of(ranges, MOTION_BITS).command(q, dq, kp, kd, data_of(can_id))
 
 
 def enable_frame(drive: int, host: int) -> tuple[int, bytes]:
@@ -179,13 +173,8 @@ def pack_feedback(feedback: Feedback, host: int, ranges: Ranges, kind: int = Typ
     """Feedback to `host`."""
     head = feedback.drive | feedback.faults << 8 | feedback.mode << 14
     motion = feedback.motion
-    data = struct.pack(
-        ">4H",
-        to_steps(motion.position, -ranges.position, ranges.position, 16),
-        to_steps(motion.velocity, -ranges.velocity, ranges.velocity, 16),
-        to_steps(motion.torque, -ranges.torque, ranges.torque, 16),
-        round(feedback.temperature * 10) & 0xFFFF,
-    )
+    steps = grid_of(ranges, MOTION_BITS).feedback_steps(motion)
+    data = MOTION.pack(*steps, round(feedback.temperature * 10) & 0xFFFF)
     return identifier(kind, head, host), data
 
 
@@ -193,13 +182,9 @@ def unpack_feedback(can_id: int, data: bytes, ranges: Ranges) -> Feedback | None
     """Feedback or report in a frame, or None for another type or length."""
     if kind_of(can_id) not in (Type.FEEDBACK, Type.REPORT) or len(data) != 8:
         return None
-    q, dq, torque, temperature = struct.unpack(">4H", data)
+    q, dq, torque, temperature = MOTION.unpack(data)
     head = data_of(can_id)
-    motion = MitFeedback(
-        from_steps(q, -ranges.position, ranges.position, 16),
-        from_steps(dq, -ranges.velocity, ranges.velocity, 16),
-        from_steps(torque, -ranges.torque, ranges.torque, 16),
-    )
+    motion = grid_of(ranges, MOTION_BITS).feedback(q, dq, torque)
     return Feedback(head & 0xFF, head >> 8 & 0x3F, head >> 14, motion, temperature / 10)
 
 

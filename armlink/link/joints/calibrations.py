@@ -73,6 +73,14 @@ class Calibrations:
     def _ask(self, group: Group) -> LinkAsk:
         return self.ask.on(group.tag)
 
+    @property
+    def temperatures(self) -> Array:
+        """Temperatures (n,) [°C] that the drives tell with their readings; NaN for one that must be asked."""
+        told = np.full(self.n, np.nan)
+        for group in self.groups:
+            told[list(group.places)] = getattr(group.drives, "temperatures", np.nan)
+        return told
+
     def read_temperatures(self) -> Array:
         """Temperatures of the drives (n,) [°C]; NaN for a drive that does not report one. Raises BusFault."""
         found = np.full(self.n, np.nan)

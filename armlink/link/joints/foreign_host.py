@@ -7,6 +7,7 @@ import numpy as np
 from armlink.arrays import Array
 from armlink.bus.port import BUS_SHIFT, Frame
 from armlink.drives.family import ANY
+from armlink.drives.orders import Order
 from armlink.link.joints.groups import Group
 from armlink.link.joints.values import JointValues
 
@@ -70,7 +71,14 @@ class ForeignHost:
 
         Of a drive with gains the torque is feed-forward alone, as its frame has it.
         """
-        torque, position = np.full(self._n, np.nan), np.full(self._n, np.nan)
+        orders = self.orders(commands)
+        columns = [(np.nan, np.nan) if each is None else (each.torque, each.position) for each in orders]
+        torque, position = np.array(columns, dtype=np.float64).reshape(-1, 2).T.copy()
+        return torque, position
+
+    def orders(self, commands: Commands) -> list[Order | None]:
+        """What command frames order each joint (n,), at the joint; None for a joint without."""
+        ordered: list[Order | None] = [None] * self._n
         for can_id, data in commands:
             group = self._group_of.get(can_id)
             for each in self._unnamed if group is None else (group,):
@@ -79,7 +87,6 @@ class ForeignHost:
                     joints = range(len(each.places)) if found[0] < 0 else (found[0],)
                     for joint in joints:
                         place = each.places[joint]
-                        order = self._values.ordered(place, found[1])
-                        torque[place], position[place] = order.torque, order.position
+                        ordered[place] = self._values.ordered(place, found[1])
                     break
-        return torque, position
+        return ordered

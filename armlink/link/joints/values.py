@@ -27,6 +27,11 @@ class JointValues:
         self.calibration = TorqueCalibration(np.ones(n), np.zeros(n))
         """In force in the host; 1 and 0 for joints without."""
         self._calibrated = False
+        self._signs, self._zeros, self._gears = (
+            each.tolist() for each in (mounting.direction, mounting.zero, mounting.gear)
+        )
+        self._corrections = [(1.0, 0.0)] * n
+        """Gain and offset of each joint's command; 1 and 0 where the torque is not from current."""
 
     @property
     def plain(self) -> bool:
@@ -37,6 +42,8 @@ class JointValues:
         """Put gains and offsets (n,) into force."""
         self.calibration = calibration
         self._calibrated = bool((calibration.gain != 1).any() or (calibration.offset != 0).any())
+        pairs = zip(self._current, calibration.gain.tolist(), calibration.offset.tolist(), strict=True)
+        self._corrections = [(gain, offset) if current else (1.0, 0.0) for current, gain, offset in pairs]
 
     def position(self, values: Array) -> Array:
         """Joint positions [rad] of drive positions (n,)."""
@@ -48,7 +55,7 @@ class JointValues:
         mount = self._mounting
         if mount.plain:
             return value
-        return float(mount.direction[joint] * (value - mount.zero[joint]) / mount.gear[joint])
+        return float(self._signs[joint] * (value - self._zeros[joint]) / self._gears[joint])
 
     def velocity(self, values: Array) -> Array:
         """Joint velocities [rad/s] of drive velocities (n,)."""
@@ -63,6 +70,12 @@ class JointValues:
         if self._calibrated and not self._all_sensors:
             values = np.where(self._current, self.calibration.invert(values), values)
         return values
+
+    def uncalibrated(self, motor: Array) -> Array:
+        """Motor torques (n,) of `motor` as the drives report them, at the joint [N·m]."""
+        if not self._calibrated or self._all_sensors:
+            return motor
+        return np.where(self._current, self.calibration.apply(motor), motor)
 
     def torque(self, sensor: Array, motor: Array) -> Array:
         """Joint torques [N·m] (n,): of the sensor, or the motor's (as `motor` gives it) where there is none."""
@@ -111,17 +124,19 @@ class JointValues:
 
     def order(self, joint: int, order: Order) -> Order:
         """The order for a drive from that for its joint; the calibration corrects torque and gains of a motor."""
-        mount = self._mounting
-        gear, sign = float(mount.gear[joint]), float(mount.direction[joint])
-        gain, offset = 1.0, 0.0
-        if self._current[joint] and order.power is Power.ON:
-            gain, offset = float(self.calibration.gain[joint]), float(self.calibration.offset[joint])
-        return order._replace(
-            position=self._drive_position(joint, order.position),
-            velocity=sign * gear * order.velocity,
-            torque=sign * (gain * order.torque + offset) / gear,
-            kp=gain * order.kp / gear**2,
-            kd=gain * order.kd / gear**2,
+        gear, sign = self._gears[joint], self._signs[joint]
+        gain, offset = self._corrections[joint] if order.power is Power.ON else (1.0, 0.0)
+        power, walk, mode, position, velocity, torque, kp, kd, refused = order
+        return Order(
+            power,
+            walk,
+            mode,
+            sign * gear * position + self._zeros[joint],
+            sign * gear * velocity,
+            sign * (gain * torque + offset) / gear,
+            gain * kp / gear**2,
+            gain * kd / gear**2,
+            refused,
         )
 
     def ordered(self, joint: int, sent: Order) -> Order:
@@ -129,18 +144,22 @@ class JointValues:
         mount = self._mounting
         if mount.plain:
             return sent
-        gear, sign = float(mount.gear[joint]), float(mount.direction[joint])
-        return sent._replace(
-            position=self.position_of(joint, sent.position),
-            velocity=sign * sent.velocity / gear,
-            torque=sign * sent.torque * gear,
-            kp=sent.kp * gear**2,
-            kd=sent.kd * gear**2,
+        gear, sign = self._gears[joint], self._signs[joint]
+        power, walk, mode, position, velocity, torque, kp, kd, refused = sent
+        return Order(
+            power,
+            walk,
+            mode,
+            sign * (position - self._zeros[joint]) / gear,
+            sign * velocity / gear,
+            sign * torque * gear,
+            kp * gear**2,
+            kd * gear**2,
+            refused,
         )
 
     def _drive_position(self, joint: int, position: float) -> float:
-        mount = self._mounting
-        return float(mount.direction[joint] * mount.gear[joint] * position + mount.zero[joint])
+        return float(self._signs[joint] * self._gears[joint] * position + self._zeros[joint])
 
 
 def values_of(arm: ArmFile, groups: tuple[Group, ...]) -> JointValues:

@@ -80,12 +80,12 @@ def new(
         asked = Terminal(console) if interactive else None
         made = new_arm(model, out, tip=tip, stops=parse_stops(stops or []), name=name, questions=asked)
     if bus is not None:
-        from armlink.drives.canopen.check.found_drives import Drives
+        from armlink.drives.registry import found_drives
         from calib.commissioning.new_arm import match_drives
 
         opened = _open(bus)
         try:
-            match_drives(made, Drives(opened), str(opened.channel_info), hand(by_hand, interactive))
+            match_drives(made, found_drives(opened), str(opened.channel_info), hand(by_hand, interactive))
         finally:
             opened.shutdown()
         made.draft.bus = _bus_keys(bus, out)
@@ -104,7 +104,7 @@ def _rewire(console: Any, model: Path, out: Path, bus: str, ask: "Ask | None", j
 
     from armlink.arm_file import load_arm, parse_arm
     from armlink.commands.output import write_json
-    from armlink.drives.canopen.check.found_drives import Drives
+    from armlink.drives.registry import found_drives
     from calib.arm.kinematics import gcomp_arm
     from calib.commissioning.drive_match import TurnedJoint, match_by_hand, match_in_order
     from calib.commissioning.new_arm import rewired
@@ -114,7 +114,7 @@ def _rewire(console: Any, model: Path, out: Path, bus: str, ask: "Ask | None", j
     findings: list[SetupFinding] = []
     opened = _open(bus)
     try:
-        drives, channel = Drives(opened), str(opened.channel_info)
+        drives, channel = found_drives(opened), str(opened.channel_info)
         if ask is None:
             matches = match_in_order(arm.joint_names, drives, channel)
         else:

@@ -128,7 +128,11 @@ class ArmLoop:
 
     def _up(self, held: list[Calibration] | None) -> Up:
         self._reason = None
-        return Up(None if held is None else tuple((each.gain, each.offset, each.record_id) for each in held))
+        source = self._source
+        return Up(
+            None if held is None else tuple((each.gain, each.offset, each.record_id) for each in held),
+            () if source is None else source.uncalibrated,
+        )
 
     def _down(self, reason: str) -> list[Message]:
         self._reason = reason
@@ -141,9 +145,9 @@ class ArmLoop:
         if isinstance(source, Listener):
             heard = tuple(source.emergencies)
             source.emergencies.clear()
-            messages: list[Message] = [Batch.of(rows, source.stats, heard)] if rows else []
+            messages: list[Message] = [Batch.of(rows, source.stats, heard, source.temperatures)] if rows else []
             return messages + self._silence(source, bool(rows))
-        messages = [Batch.of(rows, source.stats)]
+        messages = [Batch.of(rows, source.stats, temperature=source.temperatures)]
         if self._tour is not None and self._tour[0] != self._reported:
             self._reported = self._tour[0]
             messages.append(Progress(*self._tour))

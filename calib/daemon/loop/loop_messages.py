@@ -41,12 +41,14 @@ class Batch:
     channels: dict[str, Array]
     """Name of CHANNELS → (K, n), SI units, NaN if missing."""
     status: NDArray[np.int64]
-    """Newest status words (n,)."""
+    """Newest state codes (n,)."""
     age: Array
     """Time since position and torque last arrived (n,) [s]."""
     stats: Stats
     emergencies: tuple[Event, ...] = ()
     """What drives told of themselves while only listening."""
+    temperature: Array | None = None
+    """Of the drives (n,) [°C]; NaN for one that does not tell it."""
 
     @classmethod
     def of(
@@ -54,6 +56,7 @@ class Batch:
         rows: list[tuple[float, Sample, Array, Array]],
         stats: Stats,
         emergencies: tuple[Event, ...] = (),
+        temperature: Array | None = None,
     ) -> "Batch":
         """From (t, sample, torque command, position command) of K > 0 cycles."""
         samples = [row[1] for row in rows]
@@ -68,6 +71,7 @@ class Batch:
             last.age.copy(),
             replace(stats),
             emergencies,
+            temperature,
         )
 
 
@@ -84,6 +88,8 @@ class Up:
 
     held: tuple[tuple[float, float, int], ...] | None
     """Gain, offset [N·m] and record id in each controller; None if the loop only listens."""
+    uncalibrated: tuple[str, ...] = ()
+    """Joints whose calibration the host is to keep and that have no record in force."""
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ def _tour(poses: int, seed: int) -> Call:
 
 
 class LoopControllers:
-    """Object 2100h of every joint through the bus loop; waits for the answer."""
+    """Calibrations of every joint through the bus loop; waits for the answer."""
 
     def __init__(self, ask: Ask) -> None:
         self._ask = ask

@@ -37,7 +37,7 @@ class Observation:
         samples = self.feed.decimate(batch)
         if self._jobs.busy:
             return  # the calibration changes under these readings
-        events = self.feed.observe(samples)
+        events = self.feed.observe(samples, batch.temperature)
         self._note_accepted()
         if events:
             self._report(events)

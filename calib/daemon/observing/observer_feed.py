@@ -82,11 +82,11 @@ class ObserverFeed:
             _mean(torque.reshape(-1, self._group, n)),
         )
 
-    def observe(self, samples: Samples) -> list[Event]:
-        """Give decimated samples to the observer; returns its events."""
+    def observe(self, samples: Samples, temperature: Array | None = None) -> list[Event]:
+        """Give decimated samples, and the drives' temperatures (n,) [°C] meanwhile, to the observer: its events."""
         events: list[Event] = []
         for t, position, torque in zip(*samples, strict=True):
-            events += self.observer.handle(float(t), position, torque)
+            events += self.observer.handle(float(t), position, torque, temperature)
         return events
 
     def point(self) -> dict[str, list[float]]:

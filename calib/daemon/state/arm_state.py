@@ -28,6 +28,8 @@ class ArmState:
         """Whether the joints answer; None until the bus loop has reported for the first time."""
         self.fault = ""
         """Why not, in one line."""
+        self.uncalibrated: tuple[str, ...] = ()
+        """Joints that the host is to calibrate and has no record for."""
         self.batch: Batch | None = None
         """The newest samples."""
         self._heard_at = -float("inf")

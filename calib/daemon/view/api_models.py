@@ -71,6 +71,9 @@ class Status(Answer):
     uptime_s: float
     bus: BusHealth
     records: RecordsInForce
+    uncalibrated: tuple[str, ...] = ()
+    """Joints whose calibration is kept in the host and that have no record in force: their torque is what the drive
+    takes it for."""
     held: bool = False
     """Whether an alarm is open, so that estimates are held until its cause is known."""
     rows: int = 0
@@ -99,7 +102,7 @@ class JointNow(Answer):
     residual: float | None
     """Torque minus model torque [N·m]; meaningful at rest."""
     state: str
-    """CiA 402 state in words; "unknown" before the first status word."""
+    """State of the drive in words; "unknown" before its first reading."""
     sample_age_s: float | None
     """Time since position and torque last arrived; None if they never did."""
 

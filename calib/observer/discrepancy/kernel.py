@@ -19,6 +19,8 @@ joint itself (a sensor that is not linear) and of the others (crosstalk)."""
 CONSTANT, SLOPE, SIDE = 0.1, 0.1, 0.05
 """Shares in the variance of each part: of an offset and a gain, which a calibration gets wrong by this much where there
 is discrepancy, and of the side of approach (hysteresis)."""
+WARM = 20.0
+"""Rise of temperature over which a zero moves by the size that is expected of it [K]: a joint that has warmed up."""
 POSES = 256
 """Random poses over the joint ranges from which the typical gravity torque is taken."""
 
@@ -33,6 +35,8 @@ class Points:
     """Gravity torque over its typical size (K, n)."""
     side: Array
     """Sign of each joint's last motion (K, n); 0 if unknown."""
+    warmth: Array
+    """Temperature above that of the reference (K, n), in units of WARM; 0 if it is not known."""
 
 
 class Kernel:
@@ -48,9 +52,10 @@ class Kernel:
         self.typical: Array = np.maximum(typical, 1e-3 * max(float(typical.max()), 1e-9))
         """Standard deviation of each joint's gravity torque over the joint ranges (n,) [N·m]; never 0."""
 
-    def points(self, position: Array, side: Array) -> Points:
-        """Poses (K, n) [rad] and sides of approach (K, n)."""
-        return Points(position, gravity_torque(self._arm, self._beta, position) / self.typical, side)
+    def points(self, position: Array, side: Array, warmer: Array | None = None) -> Points:
+        """Poses (K, n) [rad], sides of approach and temperatures above the reference's (K, n) [K]."""
+        warmth = np.zeros_like(position) if warmer is None else warmer / WARM
+        return Points(position, gravity_torque(self._arm, self._beta, position) / self.typical, side, warmth)
 
     def between(self, a: Points, b: Points) -> Array:
         """Covariance (parts, n, A, B) between two sets of poses, joint by joint."""

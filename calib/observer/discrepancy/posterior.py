@@ -25,19 +25,22 @@ class Data:
 class Posterior:
     """Residuals at other poses as reference rows predict them: mean and covariance, jointly over joints and poses."""
 
-    def __init__(self, kernel: Kernel, level: Level, noise: Array, free: Array, data: Data, shared: int) -> None:
-        """noise (n,) [N·m]: of one row. free (n,) [N·m]: size of an offset or gain's change between two epochs.
+    def __init__(
+        self, kernel: Kernel, level: Level, noise: Array, free: Array, thermal: Array, data: Data, shared: int
+    ) -> None:
+        """noise (n,) [N·m]: of one row. free (n,) [N·m]: size of an offset or gain's change between two epochs. thermal
+        (n,) [N·m]: how far a zero moves as the joint warms by `kernel.WARM`.
 
         In later epochs than the first the sensors may have drifted: those rows tell the discrepancy but for an offset
         and a gain of their own. `shared` is P.
         """
-        self._kernel, self._level, self._data = kernel, level, data
+        self._kernel, self._level, self._thermal, self._data = kernel, level, thermal, data
         self._whitener: Array | None = None
         self._mean: Array = np.zeros(shared)
         self._factor: Array = np.eye(shared)
         if not len(data.epoch):
             return
-        covariance = weighted(level.smooth, kernel.between(data.points, data.points))
+        covariance = self._between(data.points, data.points)
         t = data.points.torque.T
         later = (data.epoch[:, None] == data.epoch[None]) & (data.epoch[:, None] > 0)
         covariance += later * free[:, None, None] ** 2 * (1.0 + t[:, :, None] * t[:, None, :])
@@ -59,10 +62,10 @@ class Posterior:
         The last have unit prior and are shared by the joints.
         """
         at = columns.swapaxes(0, 1)
-        covariance = weighted(self._level.smooth, self._kernel.between(points, points))
+        covariance = self._between(points, points)
         mean = at @ self._mean
         if self._whitener is not None:
-            across = weighted(self._level.smooth, self._kernel.between(self._data.points, points))
+            across = self._between(self._data.points, points)
             known = self._whitener @ across
             covariance -= known.swapaxes(1, 2) @ known
             mean = mean + (known.swapaxes(1, 2) @ self._left)[:, :, 0]
@@ -70,3 +73,10 @@ class Posterior:
         index = np.arange(points.position.shape[0])
         covariance[:, index, index] += (self._level.rough**2)[:, None]
         return mean.T, covariance, at @ self._factor
+
+    def _between(self, a: Points, b: Points) -> Array:
+        """Covariance (n, A, B) of the discrepancy and of zeros that follow temperature [N²·m²]."""
+        smooth = weighted(self._level.smooth, self._kernel.between(a, b))
+        if a.warmth.any() and b.warmth.any():
+            smooth += self._thermal[:, None, None] ** 2 * a.warmth.T[:, :, None] * b.warmth.T[:, None, :]
+        return smooth

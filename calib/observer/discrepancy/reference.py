@@ -5,39 +5,37 @@ from typing import Any
 
 import numpy as np
 
-from calib.observer.saved_values import UNREADABLE
+from calib.observer.saved_values import UNREADABLE, known
 from gcomp.arrays import Array, as_array
 
 EPOCH_ROWS = 40
 """Rows of one epoch after the first: a minute or two, in which a drift of 0.5 % an hour is 0.02 %."""
 EPOCHS = 2
 """Later epochs kept, the newest ones. With the first one they are 240 rows, and cost 30 ms to take in."""
-ROWS = ("position", "residual", "side", "epoch")
+ROWS = ("position", "residual", "side", "temperature", "epoch")
 
 
 @dataclass(frozen=True)
 class Rows:
-    """N rows: pose [rad], reading less gravity model [N·m] and side of approach, (N, n) each; epoch (N,)."""
+    """N rows: pose [rad], reading less gravity model [N·m], side of approach and temperature [°C], (N, n) each; epoch
+    (N,)."""
 
     position: Array
     residual: Array
     side: Array
+    temperature: Array
     epoch: Array
 
     def __len__(self) -> int:
         return len(self.epoch)
 
     def __getitem__(self, kept: Any) -> "Rows":
-        return Rows(self.position[kept], self.residual[kept], self.side[kept], self.epoch[kept])
+        return Rows(*(getattr(self, name)[kept] for name in ROWS))
 
-    def and_then(self, position: Array, residual: Array, side: Array, epoch: int) -> "Rows":
-        """The same and more rows of one epoch."""
-        return Rows(
-            np.vstack([self.position, position]),
-            np.vstack([self.residual, residual]),
-            np.vstack([self.side, side]),
-            np.append(self.epoch, np.full(len(position), epoch)),
-        )
+    def and_then(self, *more: Array, epoch: int) -> "Rows":
+        """The same and more rows of one epoch: position, residual, side and temperature (K, n)."""
+        columns = [np.vstack([getattr(self, name), column]) for name, column in zip(ROWS[:-1], more, strict=True)]
+        return Rows(*[*columns, np.append(self.epoch, np.full(len(more[0]), epoch))])
 
 
 class Reference:
@@ -51,7 +49,7 @@ class Reference:
         """n joints; `most` rows in the first epoch."""
         self._most = most
         empty = np.empty((0, n))
-        self.rows = Rows(empty, empty, empty, np.empty(0, dtype=int))
+        self.rows = Rows(empty, empty, empty, empty, np.empty(0, dtype=int))
         """In use."""
         self._pending = self.rows
         self._epoch = 0
@@ -61,18 +59,23 @@ class Reference:
         """Whether the first epoch is still open."""
         return self._epoch == 0
 
-    def add(self, position: Array, residual: Array, side: Array) -> bool:
-        """Take rows (K, n); whether `rows` is another now."""
+    @property
+    def temperature(self) -> Array:
+        """That the zeros are measured against (n,) [°C]: of the first row; NaN if it was not told."""
+        return self.rows.temperature[0] if len(self.rows) else np.full(self.rows.position.shape[1], np.nan)
+
+    def add(self, *more: Array) -> bool:
+        """Take rows: position, residual, side and temperature (K, n); whether `rows` is another now."""
         if self.is_first:
-            self.rows = self.rows.and_then(position, residual, side, 0)
+            self.rows = self.rows.and_then(*more, epoch=0)
             self._epoch = int(len(self.rows) >= self._most)
             return True
-        self._pending = self._pending.and_then(position, residual, side, self._epoch)
+        self._pending = self._pending.and_then(*more, epoch=self._epoch)
         if len(self._pending) < EPOCH_ROWS:
             return False
         kept = self.rows[(self.rows.epoch == 0) | (self.rows.epoch > self._epoch - EPOCHS)]
         new = self._pending
-        self.rows = kept.and_then(new.position, new.residual, new.side, self._epoch)
+        self.rows = kept.and_then(new.position, new.residual, new.side, new.temperature, epoch=self._epoch)
         self._pending, self._epoch = new[:0], self._epoch + 1
         return True
 
@@ -92,7 +95,7 @@ class Reference:
 
     def save(self) -> dict[str, Any]:
         """Rows as JSON values."""
-        values = {name: [getattr(rows, name).tolist() for rows in (self.rows, self._pending)] for name in ROWS}
+        values = {name: [known(getattr(rows, name)) for rows in (self.rows, self._pending)] for name in ROWS}
         return {"reference": {**values, "open": self._epoch}}
 
     def restore(self, values: dict[str, Any]) -> bool:
@@ -103,7 +106,7 @@ class Reference:
             return True
         try:
             saved = values["reference"]
-            rows, pending = (_read({name: saved[name][part] for name in ROWS}, n) for part in (0, 1))
+            rows, pending = (_read({name: saved[name][part] for name in ROWS if name in saved}, n) for part in (0, 1))
             epoch = int(saved["open"])
         except UNREADABLE:
             return False
@@ -117,4 +120,6 @@ def _read(saved: dict[str, Any], n: int) -> Rows:
     position, residual, side = (
         as_array(name, np.reshape(saved[name], (-1, n)), (len(epoch), n)) for name in ("position", "residual", "side")
     )
-    return Rows(position, residual, side, epoch)
+    untold = np.full((len(epoch), n), np.nan)  # states of before it was kept
+    told = np.reshape(np.array(saved.get("temperature", untold), dtype=float), (-1, n))
+    return Rows(position, residual, side, as_array("temperature", told, (len(epoch), n), finite=False), epoch)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.observer.config import ObserverConfig
-from calib.observer.gravity_belief import GravityBelief
+from calib.observer.gravity_belief import Expected
 from gcomp.arrays import Array
 
 UNSEEN = 1.0
@@ -24,15 +24,13 @@ class Limits:
     """Rests at other poses after which they are noticed."""
 
 
-def limits(belief: GravityBelief, sigma: Array, poses: Array, side: Array, config: ObserverConfig, wait: int) -> Limits:
-    """Limits in work at such poses (K, n) [rad], approached from sides (K, n); sigma (n,) [N·m] is a row's noise.
+def limits(expected: Expected, torque: Array, sigma: Array, config: ObserverConfig, wait: int) -> Limits:
+    """Limits in work at K poses; torque (K, n) [N·m] of the model there, sigma (n,) [N·m] the noise of a row.
 
     A change is noticed if it stands out of a window of the longest kind, by the rule of the cause test, and rows after
     it confirm it. `wait` is the number of rests until the first test.
     """
-    count, n = poses.shape
-    expected = belief.expected(poses, side)
-    torque = belief.torque(poses)
+    count, n = torque.shape
     threshold = np.sqrt(config.evidence + np.log(config.longest_window * n))
     gain, offset = np.empty(n), np.empty(n)
     for j in range(n):

@@ -54,7 +54,7 @@ class Tracking:
         """Take a row while no alarm is open: update the filter unless the row raises an alarm."""
         q, noise = row.position, self.sigma**2
         torque = self.belief.torque(q[None])[0]
-        expected = self.belief.expected(q[None], row.direction[None])
+        expected = self.belief.expected(q[None], row.direction[None], row.temperature[None])
         residual, of_model = row.torque - torque - expected.mean[0], expected.variance[0]
         here, left = self._poses.expected(q, of_model, noise)
         self._since.append((row, self._poses.seen(q) >= self._config.place_rows))
@@ -86,9 +86,9 @@ class Tracking:
     def _recent(self, joint: int, count: int) -> tuple[Array, Array, Array]:
         """Of the last rows (K,): one joint's residual, its model torque, and the covariance (K, K) of the residual."""
         rows = [row for row, _ in self._since][-count:]
-        position, side = stack(rows, "position"), stack(rows, "direction")
-        torque, expected = self.belief.torque(position), self.belief.expected(position, side)
-        residual = (stack(rows, "torque") - torque - expected.mean)[:, joint]
+        position, torques, side, temperature = _arrays(rows)
+        torque, expected = self.belief.torque(position), self.belief.expected(position, side, temperature)
+        residual = (torques - torque - expected.mean)[:, joint]
         return residual, torque[:, joint], expected.of_joint(joint) + self.sigma[joint] ** 2 * np.eye(len(rows))
 
     def _are_outliers(self, joint: int) -> bool:
@@ -120,17 +120,19 @@ class Tracking:
 
     def cause_test(self, rows: list[StaticReading]) -> CauseTest:
         """The cause test of these rows, by the belief from rows before them."""
-        return CauseTest(self.belief.before(rows[0].position), batch(rows, self.sigma), self._config)
+        belief = self.belief.before(rows[0].position)
+        return CauseTest(belief, batch(rows, self.sigma), self._config, stack(rows, "temperature"))
 
     def learn(self, rows: list[StaticReading]) -> None:
         """Take rows that are free of drift as reference."""
         if rows:
-            self.belief.learn(*_arrays(rows), self.sigma)
+            position, torque, side, temperature = _arrays(rows)
+            self.belief.learn(position, torque, side, self.sigma, temperature)
             self._poses.forget()
 
     def adapt(self, rows: list[StaticReading]) -> None:
         """Adapt the discrepancy's level to rows whose cause nothing explains."""
-        self.belief.adapt(*_arrays(rows), self.sigma)
+        self.belief.adapt(*_arrays(rows)[:3], self.sigma)
         self._poses.forget()
 
     def carry(self, values: Array, covariance: Array) -> None:
@@ -156,14 +158,16 @@ class Tracking:
         config, arm = self._config, self.belief.arm
         wait = 0 if self.belief.level.is_known else max(0, config.window - self.rows)
         if len(rows) >= config.window:
-            position, side = stack(rows, "position"), stack(rows, "direction")
+            position, _, side, temperature = _arrays(rows)
         else:
             position, side = self.belief.kernel.poses[: config.longest_window], np.zeros((config.longest_window, arm.n))
-        return limits(self.belief, self.sigma, position, side, config, wait)
+            temperature = np.full(side.shape, np.nan)
+        expected = self.belief.expected(position, side, temperature)
+        return limits(expected, self.belief.torque(position), self.sigma, config, wait)
 
     def save(self) -> dict[str, Any]:
         """All parts as JSON values."""
-        since = [[*save_rows([row])[0], known] for row, known in self._since]
+        since = [[*save_rows([row])[0][:4], known, save_rows([row])[0][4]] for row, known in self._since]
         own: dict[str, Any] = {"sigma": self.sigma.tolist(), "rows": self.rows, "since": since}
         own["suspected_rows"] = self._suspected
         return own | self.belief.save() | self.filter.save() | self._cusum.save() | self._poses.save()
@@ -175,7 +179,7 @@ class Tracking:
         try:
             sigma, rows = as_array("sigma", values["sigma"], self.sigma.shape), int(values["rows"])
             saved = values.get("since", [])
-            since = read_rows([row[:4] for row in saved], len(sigma))
+            since = read_rows([[*row[:4], *row[5:]] for row in saved], len(sigma))
             known, suspected = [bool(row[4]) for row in saved], int(values.get("suspected_rows", 0))
         except UNREADABLE:
             return False
@@ -188,6 +192,6 @@ class Tracking:
         return True
 
 
-def _arrays(rows: list[StaticReading]) -> tuple[Array, Array, Array]:
-    """Positions, torques and sides of approach (K, n) of rows."""
-    return stack(rows, "position"), stack(rows, "torque"), stack(rows, "direction")
+def _arrays(rows: list[StaticReading]) -> tuple[Array, Array, Array, Array]:
+    """Positions, torques, sides of approach and temperatures (K, n) of rows."""
+    return stack(rows, "position"), stack(rows, "torque"), stack(rows, "direction"), stack(rows, "temperature")

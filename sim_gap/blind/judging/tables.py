@@ -48,5 +48,19 @@ def show(result: Mapping[str, Any], console: Console) -> None:
     console.print("all bounds met" if not missed else f"bounds not met: {', '.join(missed)}")
 
 
+def show_real(result: Mapping[str, Any], console: Console) -> None:
+    """Print the answers of a bench of real arms and their shares."""
+    table = Table("case", "without", "verdict", "first", "confidence", "false above 0.8", "not named")
+    for row in result["cases"]:
+        sure = "–" if row["confidence"] is None else f"{row['confidence']:.2f}"
+        cells = (row["case"], row["withheld"] or "", row["verdict"], row["first"] or "–", sure)
+        table.add_row(*cells, ", ".join(row["false"]), ", ".join(row["lacking"]))
+    console.print(table)
+    right, false, named = (_percent(result[key]) for key in ("right_first", "false_confident", "named"))
+    console.print(f"right first {right}, a false cause above 0.8 {false}, all that is known named {named}")
+    if result["missing"]:
+        console.print(f"recordings missing: {', '.join(result['missing'])}")
+
+
 def _percent(value: float | None) -> str:
     return "–" if value is None else f"{100 * value:.1f} %"

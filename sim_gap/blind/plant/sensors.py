@@ -36,7 +36,9 @@ def record(
         "t": t,
         "q": np.rint(position) * step,
         "tau": np.rint(np.clip(torque, -limit, limit) / resolution) * resolution,
-        "tau_motor": np.rint(motor / (1e-3 * truth.rated)) * 1e-3 * truth.rated,  # 6077h counts per mille
+        "tau_motor": np.rint(motor / (1e-3 * truth.rated))
+        * 1e-3
+        * truth.rated,  # a drive's estimate in per mille of rated torque
         "tau_cmd": log.command[last],
         "q_cmd": command[last],
     }

@@ -14,8 +14,9 @@ from armlink.bus.open import open_bus, open_link_bus
 from armlink.bus.port import BUS_SHIFT
 from armlink.bus.sockets import datagram_port
 from armlink.bus.sockets.datagram_port import BATCH
+from armlink.bus.sockets.multicast_port import MulticastPort
 from armlink.bus.sockets.socket_port import SocketPort
-from armlink.errors import BadInput, BusFault
+from armlink.errors import BadInput, BusFault, Stall
 
 
 class SocketBus:
@@ -100,6 +101,15 @@ def test_a_full_transmit_queue_is_waited_for_then_said(pair, monkeypatch):
     refusals[0] = 1000
     with pytest.raises(BusFault, match="transmit queue stays full: does any node acknowledge"):
         port.send(1, b"")
+
+
+def test_datagrams_that_this_machine_does_not_take_are_no_fault_of_a_node(monkeypatch):
+    port = MulticastPort.__new__(MulticastPort)
+    port._name = "udp_multicast:239.0.0.1"
+    error = port._full()
+    assert isinstance(error, Stall)
+    assert "this machine took no datagrams for 50 ms" in str(error)
+    assert "node" not in str(error)
 
 
 def test_a_socket_that_fails_is_a_bus_fault(pair):

@@ -18,9 +18,9 @@ from armlink.drives.mit_packing import (
     MitCommand,
     MitFeedback,
     Ranges,
+    grid_of,
     pack_command,
     pack_feedback,
-    to_steps,
     unpack_command,
     unpack_feedback,
     unwrap,
@@ -63,7 +63,8 @@ def test_what_is_not_finite_is_not_packed(wrong):
 
 @given(st.floats(-30, 30), st.sampled_from([12, 16]), st.floats(0.1, 100))
 def test_rounding_is_to_the_nearest_step_and_ends_at_the_range(value, bits, most):
-    steps = to_steps(value, -most, most, bits)
+    grid = grid_of(Ranges(1.0, 1.0, most), (16, 12, 12, 12, bits))
+    steps = grid.steps(MitCommand(0.0, 0.0, 0.0, 0.0, value))[4]
     quantum = 2 * most / (2**bits - 1)
     back = -most + steps * quantum
     assert abs(back - max(-most, min(most, value))) <= quantum / 2 * 1.0001

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from armlink.drives.mit_packing import MitCommand, Ranges, pack_command, round_within, unpack_command
+from armlink.drives.mit_leash import round_within
+from armlink.drives.mit_packing import MitCommand, Ranges, grid_of, pack_steps, unpack_command
 from armlink.drives.orders import Limits
 
 RANGES = Ranges(12.5, 10.0, 28.0)
@@ -11,10 +12,8 @@ LIMITS = Limits(10.8, 100.0, 1.0, -2.5, 2.5, 0.1, 0.004)
 
 
 def left(asked: MitCommand, position: float, velocity: float) -> MitCommand:
-    def coded(command: MitCommand) -> MitCommand:
-        return unpack_command(pack_command(command, RANGES), RANGES)
-
-    return coded(round_within(asked, coded, RANGES, RANGES.torque_quantum, LIMITS, position, velocity))
+    steps = round_within(asked, grid_of(RANGES), LIMITS, position, velocity)
+    return unpack_command(pack_steps(*steps), RANGES)
 
 
 def law(told: MitCommand, position: float, velocity: float) -> float:

@@ -12,6 +12,7 @@ import can
 import pytest
 
 from armlink.drives.canopen.cia402 import State, state_of
+from armlink.guard import bus_guard
 
 pytestmark = pytest.mark.vcan
 
@@ -174,3 +175,32 @@ def test_a_second_host_is_noticed(simulated, arm_file):
     assert "another host is on this bus: it sends " in second.stderr
     process.send_signal(signal.SIGINT)
     process.wait(timeout=30)
+
+
+@pytest.fixture
+def guard(simulated, arm_file, tmp_path):
+    """A guard between vcan1, for programs, and the arm's vcan0; its process."""
+    if not Path("/sys/class/net/vcan1").exists():
+        pytest.skip("needs a SocketCAN interface vcan1, which scripts/with-vcan makes where it makes vcan0")
+    policy = tmp_path / "policy.json"
+    written = armlink("guard", arm_file, "--out", policy)
+    assert written.returncode == 0, written.stderr
+    command = [sys.executable, "-I", bus_guard.__file__, str(policy), "vcan1", "vcan0"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert "vcan1 may command vcan0" in process.stderr.readline()
+        yield process
+        process.send_signal(signal.SIGTERM)
+        process.communicate(timeout=30)
+
+
+def test_a_guard_passes_a_host_and_closes_at_a_torque_beyond_the_limit(guard, arm_file, listener, tmp_path):
+    inside = tmp_path / "inside.yaml"
+    inside.write_text(arm_file.read_text().replace("channel: vcan0", "channel: vcan1"))
+    process = host(inside, 100_000)
+    assert process.stdout.readline() == "pushing\n"
+    with can.Bus(interface="socketcan", channel="vcan1") as intruder:
+        intruder.send(can.Message(arbitration_id=0x20C, data=struct.pack("<Hhi", 15, 1000, 0), is_extended_id=False))
+        assert "20Ch: target torque of joint_2 1000, allowed -750 to 750" in guard.stderr.readline()
+    assert states_of(listener, all_are(State.QUICK_STOP), 5.0) == {11: State.QUICK_STOP, 12: State.QUICK_STOP}
+    process.communicate(timeout=30)
+    assert process.returncode != 0

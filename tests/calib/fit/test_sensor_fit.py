@@ -19,7 +19,7 @@ from sim_bus.truth import Truth
 def scores(fit: SensorFit, truth: Truth) -> np.ndarray:
     """Estimate minus truth in half widths of the 95 % interval."""
     parameters = ("gain", "offset", "position_gain")
-    return np.array([(fit.value(p) - getattr(truth, p)) / (fit.quantile * fit.std(p)) for p in parameters])
+    return np.array([(fit.value(p) - getattr(truth, p)) / fit.half95(p) for p in parameters])
 
 
 @pytest.mark.parametrize(("seed", "n"), [(1, 3), (2, 4), (3, 5), (4, 6)])

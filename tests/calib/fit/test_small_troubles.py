@@ -9,6 +9,7 @@ from drawn_arms import drawn_arm
 from realistic_sweeps import RestingArm, both_passes, plans
 
 from calib.arm.kinematics import gcomp_arm
+from calib.fit.lags import Lags
 from calib.fit.levels import LARGEST, LEAST, Effects, learn
 from calib.fit.position_field import PositionField, kernel
 from calib.fit.sensor_fit import SensorFit, fit_sensors
@@ -76,7 +77,7 @@ def test_columns_of_turned_axes_are_the_changes_that_mujoco_gives() -> None:
     beta = np.linalg.lstsq(regressor, plain.ravel(), rcond=None)[0]
     rows = _unloaded(q)
     fields = tuple(PositionField.over(q[:2], 1.0) for _ in range(n))
-    setting = Setting(described, np.ones(n), fields, (0.0, 1.0))
+    setting = Setting(described, np.ones(n), fields, (0.0, 1.0), Lags.unknown(len(q), n))
     found = troubles(setting, rows, Parameters.nominal(n, beta=beta))
     assert gravity_torque(described, beta, q) == pytest.approx(plain, abs=1e-6)
     for joint in range(n):

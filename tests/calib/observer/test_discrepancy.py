@@ -91,6 +91,32 @@ def test_a_drift_of_later_rows_is_not_learned(sarcos, sarcos_beta) -> None:
     assert abs(change[0] - 0.02) < 4 * np.sqrt(covariance[0, 0]) < 0.016
 
 
+def warmed(sarcos, sarcos_beta, warmer: float, *, told: bool) -> CauseTest:
+    """40 rows, warmer than the reference; a zero has moved by 0.35 N·m, where 0.2 are expected of 20 K."""
+    random = np.random.default_rng(6)
+    level = Level.expected(np.full(7, 0.2))
+    belief = GravityBelief(sarcos, sarcos_beta, np.zeros((14, 14)), level=level)
+    q, side = rows(sarcos, 160, random)
+    torque = belief.torque(q) + field(belief.kernel, level, q, side, random) + NOISE * random.normal(size=q.shape)
+    temperature = np.full(q.shape, 30.0 if told else np.nan)
+    belief.learn(q[:120], torque[:120], side[:120], np.full(7, NOISE), temperature[:120])
+    torque[120:, 2] += 0.35
+    window = StaticReadings(q[120:], torque[120:], np.full(7, NOISE), direction=side[120:])
+    return CauseTest(belief, window, ObserverConfig(), temperature[120:] + warmer)
+
+
+def test_a_zero_that_moves_as_its_drive_warms_up_is_no_drift(sarcos, sarcos_beta) -> None:
+    cold, warm = (warmed(sarcos, sarcos_beta, warmer, told=True) for warmer in (0.0, 40.0))
+    assert cold.verdict().cause in ("offset", "ambiguous")
+    assert cold.verdict().joint == 2
+    assert warm.verdict().cause == "none"
+
+
+def test_told_that_it_is_as_warm_as_before_a_zero_is_watched_more_closely(sarcos, sarcos_beta) -> None:
+    told, untold = (warmed(sarcos, sarcos_beta, 0.0, told=told) for told in (True, False))
+    assert told.drift(2, "offset")[1][1, 1] < 0.5 * untold.drift(2, "offset")[1][1, 1]
+
+
 def lacking(share: float, seed: int) -> RestArm:
     arm = RestArm("sarcos", seed)
     shape = harmonics(arm, share, np.random.default_rng([seed, 3]))
@@ -130,6 +156,7 @@ def test_the_limit_falls_while_rows_are_learned() -> None:
 def test_an_observer_restored_while_it_learns_goes_on_the_same() -> None:
     def run(restart: bool) -> list[tuple[float, str]]:
         arm = lacking(0.0015, 4)
+        arm.temperature = np.append(np.full(6, 31.0), np.nan)
         observer = arm.observer()
         arm.work(observer, 150)
         if restart:

@@ -68,7 +68,7 @@ def test_the_report_says_what_from_what_and_per_joint_and_opens_without_complain
         assert said in document, said
     for name in ARM.joint_names:
         assert f"Sweeps of {name}" in document
-    gain, half = fit.value("gain")[1], fit.quantile * fit.std("gain")[1]
+    gain, half = fit.value("gain")[1], fit.half95("gain")[1]
     assert f"{gain:.4f}\u00a0±\u00a0{half:.4f}" in document.replace("&nbsp;", "\u00a0")
     change = next(
         each for each in differences(before, record) if (each.joint, each.parameter) == (ARM.joint_names[1], "gain")

@@ -1,7 +1,5 @@
 """Drives on a bus that no arm file describes yet: ratings, scales and positions, read by SDO; nothing is written."""
 
-from dataclasses import dataclass
-
 from armlink.bus.can_bus import CanBus
 from armlink.clock import MonotonicClock
 from armlink.drives.canopen import object_dictionary as objects
@@ -10,25 +8,8 @@ from armlink.drives.canopen.controller_setup import Identity
 from armlink.drives.canopen.eds_file import bundled
 from armlink.drives.canopen.sdo import NodeServices
 from armlink.drives.canopen.units import units_from
+from armlink.drives.found import FoundDrive
 from armlink.errors import BusFault
-
-
-@dataclass(frozen=True)
-class FoundDrive:
-    """One drive as it answers."""
-
-    identity: Identity
-    rated_torque: float
-    """6076h [N·m]"""
-    max_torque: float
-    """6072h [N·m]"""
-    unit: float
-    """One user unit of position [rad]."""
-
-    @property
-    def node(self) -> int:
-        """Its node id."""
-        return self.identity.node
 
 
 class Drives:
@@ -45,6 +26,8 @@ class Drives:
         self._services = {
             each.node: NodeServices(network, f"node {each.node}", each.node, bundled(), pump) for each in identities
         }
+        self.identities = {each.node: each for each in identities}
+        """By node id."""
         self.found = [self._read(each) for each in identities]
 
     def positions(self) -> dict[int, float]:
@@ -63,4 +46,5 @@ class Drives:
             )
         except ValueError as error:
             raise BusFault(f"node {identity.node}: no units: {error}: set up the drive first") from None
-        return FoundDrive(identity, rated * 1e-3, int(read(objects.MAX_TORQUE)) * units.torque, units.position)
+        most = int(read(objects.MAX_TORQUE)) * units.torque
+        return FoundDrive(identity.node, identity.vendor, identity.product, rated * 1e-3, most, units.position)

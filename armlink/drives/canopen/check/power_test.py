@@ -9,9 +9,11 @@ from armlink.drives.canopen import emcy
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen.cia402 import State, state_of
 from armlink.drives.canopen.drives import CanopenDrives
+from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import RPDO2
+from armlink.drives.canopen.profile import LOST
 from armlink.drives.orders import Mode, Power
-from armlink.errors import ArmlinkError, BusFault
+from armlink.errors import ArmlinkError, BusFault, Refused
 
 CYCLES = 50
 """SYNCs that are sent to see whether each is answered."""
@@ -47,6 +49,8 @@ class PowerTest:
         self.link, self.drives, self.commander, self.loop = link, drives, link.commander, link.commander.loop
         self._add, self._progress = add, progress
         self._harmed = ""
+        self._refused = False
+        """Whether the joints are not driven because of a drive that is told already."""
         self._reached: dict[str, set[str]] = {check: set() for check in self.CHECKS}
         self._standing = np.full(link.n, np.nan)
         self._last = 0.0
@@ -58,11 +62,13 @@ class PowerTest:
         try:
             self.link.start()
             self._without_torque()
+            self._require_watch()
             self._enable()
             for joint in range(self.link.n):
                 self._quick_stop(joint)
             for joint in range(self.link.n):
-                self._silence(joint)
+                if self._has(joint, objects.RPDO_DEADLINE, "RPDO deadline"):
+                    self._silence(joint)
             self._no_heartbeat()
         except ArmlinkError as error:
             reason = str(error)
@@ -70,12 +76,33 @@ class PowerTest:
             self.loop.withheld, self.drives.beating = frozenset(), True
             if self.commander.passed:
                 self.commander.stop()
-        told = False
+        told = self._refused
         for check, joints in self._reached.items():
             for name in self.link.names:
                 if name not in joints:
                     self._add(name, check, "not run" if told or not reason else "failed", reason or self._harmed)
                     told = True
+
+    def _require_watch(self) -> None:
+        """Raise Refused for a device that does not watch its host at all: its joint is not driven."""
+        for joint in range(self.link.n):
+            if self.drives.traits(joint).silence == "keeps on":
+                found = "watches neither commands (1400h:05) nor heartbeat (1016h) of its host: do not drive it"
+                self._tell(joint, "heartbeat of the host", False, found)
+        keeping = [name for name in self.link.names if name in self._reached["heartbeat of the host"]]
+        if keeping:
+            self._refused = True
+            raise Refused(f"{keeping[0]} is not driven: it would keep on after its host died")
+
+    def _has(self, joint: int, entry: Entry, check: str) -> bool:
+        """Whether a device has the object that a check is about; if not, the check is told to be absent."""
+        profile = self.drives.profiles[joint]
+        if profile.has(entry):
+            return True
+        name = self.link.names[joint]
+        self._reached[check].add(name)
+        self._add(name, check, "absent", f"{entry}: {LOST[entry]}")
+        return False
 
     def _tell(self, joint: int, check: str, passed: bool, found: str, seconds: float | None = None) -> None:
         name = self.link.names[joint]
@@ -204,12 +231,16 @@ class PowerTest:
         link, limit = self.link, self.drives.protection.heartbeat_ms * 1e-3
         if self._harmed:
             return
+        watching = [self._has(joint, objects.HEARTBEAT_CONSUMER, "heartbeat of the host") for joint in range(link.n)]
+        if not any(watching):
+            return
         self._progress(f"all joints: no heartbeat of the host for {limit * 1e3:.0f} ms")
         self.drives.beat(self.link.ask)
         self.drives.beating = False
         start, seconds = self._last, 0.0
         after: list[tuple[State, float] | None] = [None] * link.n
-        while None in after and seconds < PATIENCE * limit:
+        pairs = list(enumerate(watching))
+        while any(watches and after[joint] is None for joint, watches in pairs) and seconds < PATIENCE * limit:
             seconds = self._cycle([Power.ON] * link.n).t - start + link.period
             for joint, each in enumerate(after):
                 left = self.drives.node_states.get(joint, objects.OPERATIONAL) != objects.OPERATIONAL
@@ -217,6 +248,8 @@ class PowerTest:
                 if each is None and state is not State.ENABLED:
                     after[joint] = (state, seconds)
         for joint, each in enumerate(after):
+            if not watching[joint]:
+                continue
             self._judge(joint, "heartbeat of the host", *(each or (self._read(joint), seconds)), limit)
         self._again()
 

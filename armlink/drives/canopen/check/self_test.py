@@ -70,6 +70,7 @@ class SelfTest:
             self._modes(services)
             self._calibration(services)
             return
+        self.drives.send_nmt(self.link.ask, objects.NMT_PRE_OPERATIONAL, services.node)
         profile = examine(services, row.settings)
         self.profiles[self.drives.rows.index(row)] = profile
         for lost in profile.lost:
@@ -78,6 +79,9 @@ class SelfTest:
         found = ", ".join(f"{entry}: the device lacks it" for entry in needed)
         self._add(services.joint, "objects", "failed" if needed else "passed", found or "what the link needs is there")
         self._modes(services)
+        if row.name in self.link.uncalibrated:
+            found = "no record in force in the host: torque is what the device takes it for"
+            self._add(services.joint, "calibration", "absent", found)
 
     def _with_power(self, power: bool) -> None:
         failed = [each for each in self.results if each.outcome == "failed"]

@@ -16,8 +16,7 @@ from armlink.arm_file import Bus
 from armlink.bus.open import open_bus
 from armlink.bus.sockets.datagram_port import BATCH
 from armlink.bus.sockets.multicast_frames import ERROR, EXTENDED, HEADS_KEPT, REMOTE, Decoder, encode
-from armlink.bus.sockets.multicast_port import MulticastPort
-from armlink.bus.sockets.stamped_port import StampedMulticastPort
+from armlink.bus.sockets.multicast_port import MulticastPort, StampedMulticastPort
 
 GROUP = "239.74.163.47"
 PORT = 45200 + os.getpid() % 1000

@@ -1,0 +1,46 @@
+"""Writes the policy of a guard, which alone has the bus and passes only what the arm file's limits allow."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def guard(
+    arm: Annotated[str | None, typer.Argument(help="Bundled arm or path of an arm file.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Write the policy here (JSON).")] = None,
+    path: Annotated[bool, typer.Option("--path", help="Print where the guard's file is, and nothing else.")] = False,
+    bus: Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")] = None,
+) -> int:
+    """Write what a guard of this arm's bus may pass: identifiers, and bounds of torque, position and their rates.
+
+    The drives are read for their scales and objects; nothing is set. The guard itself is one file without dependencies:
+    it has the wire for itself and gives programs another interface, whose frames it checks one by one.
+
+    Example: armlink guard sarcos --bus socketcan:vcan0 --out sarcos.guard.json
+    """
+    from rich.console import Console
+
+    from armlink.arm_file import load_arm
+    from armlink.commands.output import write_json
+    from armlink.errors import BadInput
+    from armlink.guard import bus_guard
+    from armlink.link.link import Link
+
+    if path:
+        typer.echo(bus_guard.__file__)
+        return 0
+    if arm is None or out is None:
+        raise BadInput("guard: give an arm file and --out POLICY, or --path")
+    described = load_arm(arm)
+    with Link.open(described, bus) as link:
+        rules = link.guard_rules()
+    write_json(out, {"schema": bus_guard.SCHEMA, "arm": described.name, "serial": described.serial, **rules})
+    Console(stderr=True).print(
+        f"{len(rules['frames'])} identifiers; start the guard with\n  python3 -I {bus_guard.__file__} {out} arm0 can0\n"
+        "where arm0 is an interface of the programs' own (ip link add arm0 type vcan) and can0 is the arm's",
+        markup=False,
+        highlight=False,
+        soft_wrap=True,
+    )
+    return 0

@@ -1,0 +1,200 @@
+"""Rules of a bus guard for CiA 402 drives: frames of the cycle within limits, and the writes of the set-up."""
+
+import math
+from typing import Any
+
+from armlink.drives.canopen import controller_setup as device
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen import pdo
+from armlink.drives.canopen.object_dictionary import Entry
+from armlink.drives.canopen.pdo import Pdo
+from armlink.drives.canopen.profile import Profile
+from armlink.drives.canopen.units import Units
+from armlink.drives.orders import Limits, Mode
+from armlink.torque_calibration import GAIN_RANGE
+
+BURST = 5
+"""Cycles whose change may come at once, after the host was late."""
+READING_AGE = 5.0
+"""A reading stands for where a joint is for this long [s]; its set-up takes some seconds before the first cycle."""
+MOST_OFFSET = 1e4
+"""[N·m]."""
+_INVALID, _UINT32 = 1 << 31, (1 << 32) - 1
+_NMT_COMMANDS = (1, 2, 128, 129, 130)
+_ACKNOWLEDGED = 0x60
+_UPLOADED = {1: 0x4F, 2: 0x4B, 4: 0x43}
+"""First byte of the answer to an SDO read, by the size of the value (CiA 301, 7.2.4.3.6)."""
+_WRITE_2_BYTES = 0x2B
+QUICK_STOP, ENABLE_OPERATION, POWER_BITS = 0x02, 0x0F, 0x8F
+"""Control words, and the bits that make one a command (CiA 402-2)."""
+
+
+def shared_rules(nodes: tuple[int, ...], host: int) -> dict[str, Any]:
+    """Frames to all drives: NMT to these nodes, SYNC, the host's heartbeat."""
+    return {
+        f"{objects.NMT_ID}": {
+            "lengths": [2],
+            "fields": [
+                {"name": "NMT command", "at": 0, "code": "B", "values": list(_NMT_COMMANDS)},
+                {"name": "node", "at": 1, "code": "B", "values": [0, *nodes]},
+            ],
+        },
+        f"{objects.SYNC_ID}": {"lengths": [0]},
+        f"{objects.HEARTBEAT_ID + host}": {
+            "lengths": [1],
+            "fields": [{"name": "state of the host", "at": 0, "code": "B", "values": [objects.OPERATIONAL]}],
+        },
+    }
+
+
+class NodeRules:
+    """Rules of one node."""
+
+    def __init__(
+        self,
+        name: str,
+        node: int,
+        profile: Profile,
+        unit: Units,
+        limits: Limits,
+        protection: device.Protection,
+        described: list[int],
+    ) -> None:
+        """`unit` and `profile` as the device tells them, `described` the indices of its data sheet."""
+        self.name, self.node, self.profile, self.unit, self.limits = name, node, profile, unit, limits
+        self._protection, self._described = protection, described
+
+    @property
+    def stop(self) -> tuple[int, str]:
+        """The SDO write that quick-stops it, at once and without SYNC."""
+        word = objects.CONTROL_WORD
+        head = bytes([_WRITE_2_BYTES]) + word.index.to_bytes(2, "little") + bytes([word.sub])
+        return objects.SDO_REQUEST_ID + self.node, (head + bytes([QUICK_STOP, 0, 0, 0])).hex()
+
+    @property
+    def restart(self) -> tuple[int, int]:
+        """Identifier of its boot-up message, and of its SDO answers, which count no more after one."""
+        return objects.HEARTBEAT_ID + self.node, self._answers
+
+    @property
+    def _answers(self) -> int:
+        return 0x580 + self.node
+
+    def frames(self) -> dict[str, Any]:
+        """RPDO1, RPDO2 and SDO requests."""
+        rules: dict[str, Any] = {f"{objects.SDO_REQUEST_ID + self.node}": {"sdo": self._writes()}}
+        after = [[self._answers, self._written(entry)] for each in self.profile.pdos for entry in _mapping(each)]
+        for each in self.profile.pdos:
+            if each.name not in (pdo.RPDO1.name, pdo.RPDO2.name):
+                continue
+            fields = [
+                field
+                for entry, at in _places(each)
+                if (field := self._target(entry)) is not None and not field.update(at=at)
+            ]
+            rule = {"lengths": [each.layout.size], "fields": fields, "after": after}
+            power = [at for entry, at in _places(each) if entry == objects.CONTROL_WORD]
+            if power:
+                code = objects.CONTROL_WORD.code
+                rule["power"] = {"at": power[0], "code": code, "mask": POWER_BITS, "value": ENABLE_OPERATION}
+            rules[f"{each.cob_base + self.node}"] = rule
+        return rules
+
+    def _target(self, entry: Entry) -> dict[str, Any] | None:
+        """Bounds of one target; None for an object that commands no motion by itself."""
+        limits, period = self.limits, self.limits.period
+        if entry == objects.MODE:
+            return {"name": f"mode of {self.name}", "code": entry.code, "values": [int(mode) for mode in Mode]}
+        if entry == objects.TARGET_TORQUE:
+            step, reading = limits.torque_rate / self.unit.torque, objects.MOTOR_TORQUE
+            most = math.floor(limits.max_torque / self.unit.torque + 1e-9)
+            bounds, within, what = (-most, most), 2.0, "torque"
+        elif entry == objects.TARGET_POSITION:
+            step, reading = limits.max_velocity / self.unit.position, objects.POSITION
+            bounds = math.ceil(limits.lower / self.unit.position), math.floor(limits.upper / self.unit.position)
+            within, what = 2 + 2 * step * period + self.unit.encoder_step / self.unit.position, "position"
+        else:
+            return None
+        return {
+            "name": f"target {what} of {self.name}",
+            "code": entry.code,
+            "least": bounds[0],
+            "most": bounds[1],
+            "rate": step,
+            "slack": BURST * step * period + 2,
+            "near": self._readings(reading),
+            "within": within,
+            "age": READING_AGE,
+            "first": [0] if entry == objects.TARGET_TORQUE else [],
+        }
+
+    def _readings(self, entry: Entry) -> list[dict[str, Any]]:
+        """Where an object is read: in TPDOs, and in answers to SDO reads."""
+        size = entry.bits // 8
+        answer = bytes([_UPLOADED[size]]) + entry.index.to_bytes(2, "little") + bytes([entry.sub])
+        found = [{"frame": self._answers, "prefix": answer.hex(), "at": 4, "code": entry.code}]
+        for each in self.profile.pdos:
+            if each.communication >= 0x1800:
+                cob_id = each.cob_base + self.node
+                found += [{"frame": cob_id, "at": at, "code": entry.code} for e, at in _places(each) if e == entry]
+        return found
+
+    def _writes(self) -> dict[str, Any]:
+        """Objects that may be written, with the values that the set-up gives them."""
+        allowed: dict[Entry, dict[str, Any]] = {}
+        for index in pdo.foreign_rpdos(self._described):
+            allowed[Entry(index, 1, "I", "COB-ID of an RPDO that is off")] = {"least": _INVALID, "most": _UINT32}
+        for each in self.profile.pdos:
+
+            def write(entry: Entry, value: int) -> None:
+                values = allowed.setdefault(entry, {"values": []})["values"]
+                if value not in values:
+                    values.append(value)
+
+            is_command = each.communication == pdo.RPDO1.communication
+            watched = is_command and self.profile.has(objects.RPDO_DEADLINE)
+            for deadline in {self._protection.deadline_ms if watched else 0, None}:
+                pdo.write_mapping(each, self.node, write, deadline)
+        allowed[objects.TORQUE_OFFSET] = {"values": [0]}
+        allowed[objects.MODE] = {"values": [int(mode) for mode in Mode]}
+        every_mode = _UINT32
+        for entry, value in device.settings(self.unit, self.limits, self._protection, every_mode, self.profile):
+            allowed[entry] = {"values": [value]}
+        if self.profile.reading == objects.TORQUE_READING:
+            allowed |= _record_writes()
+        return {
+            f"{entry.index:X}:{entry.sub:X}": {"name": f"{entry} of {self.name}", "code": entry.code, **bounds}
+            for entry, bounds in allowed.items()
+        }
+
+    def _written(self, entry: Entry) -> str:
+        return (bytes([_ACKNOWLEDGED]) + entry.index.to_bytes(2, "little") + bytes([entry.sub])).hex()
+
+
+def _record_writes() -> dict[Entry, dict[str, Any]]:
+    """The torque sensor record: its values bounded, since a wrong gain would change every torque that is read."""
+    free = {"least": 0, "most": _UINT32}
+    return {
+        objects.STAGED_GAIN: {"least": GAIN_RANGE[0], "most": GAIN_RANGE[1]},
+        objects.STAGED_OFFSET: {"least": -MOST_OFFSET, "most": MOST_OFFSET},
+        objects.RECORD_ID: free,
+        objects.RECORD_DATE: free,
+        objects.RECORD_CRC: free,
+        objects.ACTIVATE: {"values": [1]},
+        objects.STORE_MANUFACTURER: {"values": [objects.STORE_SIGNATURE]},
+    }
+
+
+def _places(each: Pdo) -> list[tuple[Entry, int]]:
+    """The objects of a PDO and where they begin."""
+    places, at = [], 0
+    for entry in each.entries:
+        places.append((entry, at))
+        at += entry.bits // 8
+    return places
+
+
+def _mapping(each: Pdo) -> list[Entry]:
+    """The objects that make a PDO what it is: each mapped object, their number, the identifier."""
+    count, cob_id = Entry(each.mapping, 0, "B", "number"), Entry(each.communication, 1, "I", "COB-ID")
+    return [Entry(each.mapping, i, "I", "mapping") for i in range(1, len(each.entries) + 1)] + [count, cob_id]

@@ -1,0 +1,43 @@
+"""Drives on a bus that no arm file describes yet, and findings about those that one describes: they are only read."""
+
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+
+@dataclass(frozen=True)
+class FoundDrive:
+    """One drive as it answers."""
+
+    node: int
+    """Its id on the bus."""
+    vendor: int
+    product: int
+    rated_torque: float
+    """[N·m]"""
+    max_torque: float
+    """Most that it is set to [N·m]."""
+    unit: float
+    """One count of its position [rad]."""
+
+
+class FoundDrives(Protocol):
+    """The drives of an open bus."""
+
+    @property
+    def found(self) -> list[FoundDrive]:
+        """In the order of their ids."""
+        ...
+
+    def positions(self) -> dict[int, float]:
+        """Position reading of every drive by its id [rad]; raises BusFault."""
+        ...
+
+
+@dataclass(frozen=True)
+class DriveFinding:
+    """What is missing or doubtful about a drive, where, and how to put it right."""
+
+    level: Literal["error", "warning", "hint"]
+    what: str
+    where: str
+    remedy: str

@@ -1,0 +1,392 @@
+#!/usr/bin/env python3
+"""Guards the CAN interface of an arm: from a program's side to the wire it passes only what a policy allows.
+
+    python3 -I bus_guard.py POLICY PROGRAM_INTERFACE WIRE_INTERFACE
+
+The guard alone has the wire; whatever commands the arm has an interface of its own, such as a vcan. All that comes from
+the wire goes to the program. From the program to the wire go only identifiers that the policy names, with every field
+within its bounds. The first frame that is not allowed closes the guard: it sends the policy's stop frames, says what it
+was in one line, and passes nothing more until it is started again; the drives' own watches then see a silent host.
+
+One file on the standard library, so that no fault elsewhere can change what it does. The policy is written by
+`armlink guard`; `Policy` below says what it holds. Values in it are those of the bytes: whole numbers in drive units.
+"""
+
+import errno
+import json
+import math
+import select
+import signal
+import socket
+import struct
+import sys
+import time
+from collections.abc import Callable, Collection, Iterable
+from typing import Any
+
+SCHEMA = "armlink.guard/1"
+FRAME, FD_FRAME = struct.Struct("=IBB2x8s"), struct.Struct("=IBB2x64s")
+EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29
+FD_FLAGS = 0x05
+"""CAN FD with bit-rate switch."""
+FULL = 0.05
+"""A frame waits this long for a full transmit queue [s]."""
+BATCH = 64
+"""Frames taken from one side before the other is looked at."""
+NUMBERS = "bBhHiIqQf"
+"""Codes of `struct` that a field may have."""
+
+
+class PolicyError(Exception):
+    """A policy that cannot be used."""
+
+
+class Source:
+    """Where a reading stands: frame id, bytes that it begins with, place and code of the number."""
+
+    def __init__(self, found: dict[str, Any]) -> None:
+        """From the policy."""
+        self.id, self.prefix = int(found["frame"]), bytes.fromhex(found.get("prefix", ""))
+        self.at, self.number = int(found["at"]), _number(found["code"])
+
+    def value(self, data: bytes) -> float | None:
+        """The number in this frame, None if it has none."""
+        if not data.startswith(self.prefix) or len(data) < self.at + self.number.size:
+            return None
+        number: float = self.number.unpack_from(data, self.at)[0]
+        return number
+
+
+class Field:
+    """One number of a frame and its bounds.
+
+    `values`: the only ones allowed. `least`, `most`: its range, widened to where the joint stands (`near`). `rate`,
+    `slack`: it changes by at most `rate` a second, after a pause by `slack`; a change to within `within` of a reading
+    that is no older than `age` seconds is free, since it commands what is. Without power it is not followed: then its
+    range alone counts, and the first number with power must be near a reading or one of `first`.
+    """
+
+    def __init__(self, found: dict[str, Any]) -> None:
+        """From the policy; raises PolicyError for a field without bounds."""
+        self.name, self.at, self.number = str(found["name"]), int(found["at"]), _number(found["code"])
+        self.values = None if found.get("values") is None else frozenset(found["values"])
+        self.least, self.most = _bound(found, "least", -math.inf), _bound(found, "most", math.inf)
+        self.rate, self.slack = _bound(found, "rate", math.inf), _bound(found, "slack", 0.0)
+        self.near, self.within = [Source(each) for each in found.get("near", ())], _bound(found, "within", 0.0)
+        self.age, self.first = _bound(found, "age", 0.0), frozenset(found.get("first", ()))
+        if self.values is None and not (math.isfinite(self.least) and math.isfinite(self.most)):
+            raise PolicyError(f"{self.name}: needs values, or least and most")
+        self._last: float | None = None
+        self._reading: float | None = None
+        self._room, self._at, self._read_at = self.slack, -math.inf, -math.inf
+
+    def see(self, value: float, now: float) -> None:
+        """A reading came from the wire."""
+        self._reading, self._read_at = value, now
+
+    def refusal(self, data: bytes, now: float, power: bool = True) -> str:
+        """Why this frame's number is not allowed, or an empty text. Keeps nothing: see `keep`."""
+        value = self.number.unpack_from(data, self.at)[0]
+        if self.values is not None:
+            return "" if value in self.values else f"{self.name} {value}, not among the {len(self.values)} allowed"
+        reading = self._reading if now - self._read_at <= self.age else None
+        least = self.least if reading is None else min(self.least, reading - self.within)
+        most = self.most if reading is None else max(self.most, reading + self.within)
+        if not least <= value <= most:  # NaN too
+            return f"{self.name} {value}, allowed {self.least:g} to {self.most:g}"
+        if not power or self.rate == math.inf or (reading is not None and abs(value - reading) <= self.within):
+            return ""
+        if self._last is None:
+            return "" if value in self.first else f"{self.name} {value} with power, where no reading shows the joint"
+        if abs(value - self._last) <= self._room_at(now):
+            return ""
+        return f"{self.name} from {self._last} to {value} at once, allowed {self._room_at(now):g}"
+
+    def keep(self, data: bytes, now: float, power: bool = True) -> None:
+        """The frame passes: later ones start from its number."""
+        if not power:
+            self._last = None
+            return
+        value = self.number.unpack_from(data, self.at)[0]
+        if self.rate != math.inf:
+            spent = 0.0 if self._last is None else abs(value - self._last)
+            self._room, self._at = max(0.0, self._room_at(now) - spent), now
+        self._last = value
+
+    def _room_at(self, now: float) -> float:
+        return min(self.slack, self._room + self.rate * max(0.0, now - self._at))
+
+
+class Frame:
+    """Frames with one identifier: lengths, fields, and what a drive must have acknowledged before.
+
+    `power`: the number whose bits of `mask` are `value` in a frame that gives the drive power; without it all do.
+    """
+
+    def __init__(self, found: dict[str, Any]) -> None:
+        """From the policy; raises PolicyError for a field beyond the frame's bytes."""
+        self.lengths = frozenset(found["lengths"])
+        self.fields = [Field(each) for each in found.get("fields", ())]
+        self.after = frozenset((int(can_id), bytes.fromhex(data)) for can_id, data in found.get("after", ()))
+        power = found.get("power")
+        self._power = (
+            None if power is None else (Source({"frame": 0, **power}), int(power["mask"]), int(power["value"]))
+        )
+        shortest = min(self.lengths)
+        for field in self.fields:
+            if field.at < 0 or field.at + field.number.size > shortest:
+                raise PolicyError(f"{field.name}: beyond the {shortest} bytes of its frame")
+
+    def powers(self, data: bytes) -> bool:
+        """Whether the drive follows the numbers of a frame."""
+        if self._power is None:
+            return True
+        source, mask, value = self._power
+        return int(source.value(data) or 0) & mask == value
+
+    def pick(self, data: bytes) -> Iterable[Field] | None:
+        """The fields that a frame with these bytes has, None if it is not allowed at all."""
+        return self.fields if len(data) in self.lengths else None
+
+    def all_fields(self) -> Collection[Field]:
+        """Every field."""
+        return self.fields
+
+
+class Requests:
+    """SDO requests to one node: reads, and expedited writes of the objects named."""
+
+    UPLOAD, SEGMENTS, ABORT, DOWNLOAD = 0x40, (0x60, 0x70), 0x80, 0x23
+
+    def __init__(self, found: dict[str, Any]) -> None:
+        """From the policy."""
+        self.after: frozenset[tuple[int, bytes]] = frozenset()
+        self.writes: dict[bytes, Field] = {}
+        for place, each in found["sdo"].items():
+            index, sub = (int(part, 16) for part in place.split(":"))
+            self.writes[struct.pack("<HB", index, sub)] = Field({"at": 4, **each})
+
+    def powers(self, data: bytes) -> bool:
+        """A write counts at once."""
+        return True
+
+    def pick(self, data: bytes) -> Iterable[Field] | None:
+        """As Frame.pick."""
+        if len(data) != 8:
+            return None
+        command = data[0]
+        if command == self.UPLOAD or command == self.ABORT or command in self.SEGMENTS:
+            return ()
+        field = self.writes.get(data[1:4])
+        if field is None or command != self.DOWNLOAD | (4 - field.number.size) << 2 or field.number.size > 4:
+            return None
+        return (field,)
+
+    def all_fields(self) -> Collection[Field]:
+        """Every field."""
+        return self.writes.values()
+
+
+class Policy:
+    """What may pass: `frames` by identifier (with the flag of 29 bits in bit 31), `stop` frames, `restarts`.
+
+    A frame in `restarts` means that a drive has forgotten its set-up: what it acknowledged counts no more.
+    """
+
+    def __init__(self, content: Any) -> None:
+        """From the file's content; raises PolicyError."""
+        try:
+            if content["schema"] != SCHEMA:
+                raise PolicyError(f"schema {content['schema']!r}, expected {SCHEMA}")
+            self.frames: dict[int, Frame | Requests] = {
+                int(key): Requests(each) if "sdo" in each else Frame(each) for key, each in content["frames"].items()
+            }
+            self.stop = [(int(can_id), bytes.fromhex(data)) for can_id, data in content["stop"]]
+            self.restarts = {int(key): int(answers) for key, answers in content.get("restarts", {}).items()}
+        except (KeyError, TypeError, ValueError, AttributeError, struct.error) as error:
+            raise PolicyError(f"{type(error).__name__}: {error}") from None
+        self._sources: dict[int, list[tuple[Source, Field]]] = {}
+        for frame in self.frames.values():
+            for field in frame.all_fields():
+                for source in field.near:
+                    self._sources.setdefault(source.id, []).append((source, field))
+        self._awaited: dict[int, set[bytes]] = {}
+        for frame in self.frames.values():
+            for can_id, data in frame.after:
+                self._awaited.setdefault(can_id, set()).add(data)
+        self._acknowledged: set[tuple[int, bytes]] = set()
+
+    def hear(self, can_id: int, data: bytes, now: float) -> None:
+        """A frame came from the wire."""
+        for source, field in self._sources.get(can_id, ()):
+            value = source.value(data)
+            if value is not None:
+                field.see(value, now)
+        for prefix in self._awaited.get(can_id, ()):
+            if data.startswith(prefix):
+                self._acknowledged.add((can_id, prefix))
+        if can_id in self.restarts and data[:1] == b"\0":
+            answers = self.restarts[can_id]
+            self._acknowledged = {each for each in self._acknowledged if each[0] != answers}
+
+    def refusal(self, can_id: int, data: bytes, now: float) -> str:
+        """Why a frame of the program may not pass, or an empty text; what passes is kept as where the next starts."""
+        frame = self.frames.get(can_id)
+        if frame is None:
+            return f"identifier {can_id:X}h, which the policy does not name"
+        fields = frame.pick(data)
+        if fields is None:
+            return f"{can_id:X}h with {data.hex(' ') or 'no data'}: no request that the policy allows"
+        if not frame.after <= self._acknowledged:
+            return f"{can_id:X}h before the drive has acknowledged what it means"
+        power = frame.powers(data)
+        for field in fields:
+            why = field.refusal(data, now, power)
+            if why:
+                return f"{can_id:X}h: {why}"
+        for field in fields:
+            field.keep(data, now, power)
+        return ""
+
+
+class Port:
+    """One raw CAN socket."""
+
+    def __init__(self, interface: str) -> None:
+        """Raises OSError."""
+        self.socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        self.fd = True
+        try:
+            self.socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
+        except OSError:
+            self.fd = False
+        self.socket.bind((interface,))
+        self.socket.setblocking(False)
+
+    def receive(self) -> tuple[int, bytes, bool] | None:
+        """(identifier with flags, data, whether CAN FD), None if nothing is there."""
+        try:
+            raw = self.socket.recv(FD_FRAME.size)
+        except BlockingIOError:
+            return None
+        layout = FRAME if len(raw) == FRAME.size else FD_FRAME
+        can_id, length, _, data = layout.unpack(raw)
+        return can_id, data[:length], layout is FD_FRAME
+
+    def send(self, can_id: int, data: bytes, fd: bool = False) -> bool:
+        """Send; whether it left before a full queue made it wait too long."""
+        layout, flags = (FD_FRAME, FD_FLAGS) if fd else (FRAME, 0)
+        raw, end = layout.pack(can_id, len(data), flags, data), time.monotonic() + FULL
+        while True:
+            try:
+                self.socket.send(raw)
+            except OSError as error:
+                if error.errno not in (errno.ENOBUFS, errno.EAGAIN) or time.monotonic() > end:
+                    return False
+                time.sleep(5e-4)
+            else:
+                return True
+
+
+class Guard:
+    """Passes frames between the two sides until it is closed."""
+
+    def __init__(self, policy: Policy, program: Port, wire: Port, say: Callable[[str], object] | None = None) -> None:
+        """`say` gets one line when the guard closes."""
+        self.policy, self.program, self.wire, self._say = policy, program, wire, say or _say
+        self.closed = ""
+        """Why nothing more passes to the wire; empty while it is open."""
+
+    def step(self, seconds: float) -> None:
+        """Wait at most this long for frames of either side and pass them."""
+        ready, _, _ = select.select([self.wire.socket, self.program.socket], [], [], seconds)
+        for side in ready:
+            pass_on = self._to_program if side is self.wire.socket else self._to_wire
+            port = self.wire if side is self.wire.socket else self.program
+            for _ in range(BATCH):
+                frame = port.receive()
+                if frame is None:
+                    break
+                pass_on(*frame)
+
+    def _to_program(self, can_id: int, data: bytes, fd: bool) -> None:
+        if not can_id & (ERROR | REMOTE):
+            self.policy.hear(can_id, data, time.monotonic())
+            self.program.send(can_id, data, fd)
+
+    def _to_wire(self, can_id: int, data: bytes, fd: bool) -> None:
+        if self.closed:
+            return
+        why = "a remote or error frame" if can_id & (ERROR | REMOTE) else ""
+        why = why or self.policy.refusal(can_id, data, time.monotonic())
+        if why:
+            self.close(why)
+        elif not self.wire.send(can_id, data, fd):
+            self.close("the wire takes no frames: is it up, and does anything acknowledge?")
+
+    def close(self, why: str) -> None:
+        """Stop the joints and pass nothing more."""
+        self.closed = why
+        for can_id, data in self.policy.stop:
+            self.wire.send(can_id, data)
+        self._say(f"guard: closed: {why}; the joints were told to stop, start the guard again to open it")
+
+
+def _number(code: str) -> struct.Struct:
+    if len(code) != 1 or code not in NUMBERS:
+        raise PolicyError(f"code {code!r}, expected one of {', '.join(NUMBERS)}")
+    return struct.Struct("<" + code)
+
+
+def _bound(found: dict[str, Any], key: str, default: float) -> float:
+    value = float(found.get(key, default))
+    if math.isnan(value):
+        raise PolicyError(f"{found['name']}: {key} is no number")
+    return value
+
+
+def _say(text: str) -> None:
+    sys.stderr.write(text + "\n")
+    sys.stderr.flush()
+
+
+def main(words: list[str]) -> int:
+    """Run until SIGTERM or SIGINT, which close the guard; exit status 2 for a wrong policy or interface."""
+    if len(words) != 3:
+        _say(__doc__.splitlines()[2].strip())
+        return 2
+    path, program, wire = words
+    try:
+        with open(path, encoding="utf-8") as file:
+            policy = Policy(json.load(file))
+    except (OSError, ValueError, RecursionError, PolicyError) as error:
+        _say(f"guard: {path}: {error}: write it with armlink guard")
+        return 2
+    ports = []
+    for name in (program, wire):
+        try:
+            ports.append(Port(name))
+        except OSError as error:
+            _say(f"guard: {name}: {error.strerror}: expected a CAN interface that is up")
+            return 2
+    guard = Guard(policy, ports[0], ports[1])
+    ended: list[bool] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: ended.append(True))
+    _say(f"guard: {program} may command {wire} by {path}")
+    while not ended:
+        try:
+            guard.step(0.2)
+        except InterruptedError:
+            continue
+        except OSError as error:
+            if not guard.closed:
+                guard.close(f"an interface failed: {error.strerror}")
+            time.sleep(0.2)
+    if not guard.closed:
+        guard.close("it was told to end")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,159 @@
+"""Torque constants, friction, zeros and gravity from creep sweeps without and with a reference mass."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armlink.arm_file import ArmFile
+from armlink.errors import BadInput
+from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import gcomp_arm
+from calib.arm.sweep_section import sweep_section
+from calib.creep.contact import Disturbed, disturbed_sweeps
+from calib.creep.model import CreepModel
+from calib.creep.parameters import Doubt, family_slices, prior
+from calib.creep.rows import CreepRows
+from calib.creep.scatter import scatter
+from calib.creep.solve import Solution, solve
+from calib.creep.spring import WIDE_SHARE, Spring, springs
+from calib.sweep.dataset import SweepData
+from gcomp.arm.arm import Arm
+from gcomp.arrays import Array, Mask
+
+ROUNDS = 4
+"""Times that the scatter of the readings is estimated anew."""
+SEEN = 0.3
+"""A parameter is found if the data leave so much of what was doubted beforehand, as a share of it."""
+QUANTILE = 1.96
+
+
+@dataclass(frozen=True, eq=False)
+class CreepFit:
+    """Estimates with standard deviations. The gain is the drive's torque per true torque, g = 1/k."""
+
+    arm: Arm
+    rows: CreepRows
+    solution: Solution
+    prior_std: Array
+    sigma: Array
+    """Scatter of each row's reading (R,) [N·m]."""
+    factor: Array
+    """Factor of the standard deviations for what neighbouring bins have in common (n,)."""
+    disturbed: tuple[Disturbed, ...] = ()
+    """Sweeps that were left out, and why."""
+    springs: tuple[Spring, ...] = ()
+    """Joints on which something pulls in every sweep; the other values then hold beside it."""
+    sources: dict[str, str] = field(default_factory=dict)
+    """Names and digests of the data sets."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Joint names."""
+        return self.arm.names
+
+    @cached_property
+    def slices(self) -> dict[str, slice]:
+        """Place of each family in the vector."""
+        return family_slices(self.arm.n)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Of all parameters (P, P)."""
+        return self.solution.covariance
+
+    def value(self, family: str) -> Array:
+        """Estimates of one family, whether found or not."""
+        return self.solution.x[self.slices[family]]
+
+    def std(self, family: str) -> Array:
+        """Standard deviations of one family."""
+        variance: Array = np.diag(self.covariance)[self.slices[family]]
+        return np.sqrt(variance)
+
+    def found(self, family: str) -> Mask:
+        """Parameters of a family that the data determine; without a mass nothing tells the scale."""
+        if family in ("gain", "beta") and not (self.rows.mass > 0).any():
+            return np.zeros(len(self.value(family)), dtype=bool)
+        return np.asarray(self.std(family) < SEEN * self.prior_std[self.slices[family]], dtype=bool)
+
+    def ci95(self, family: str) -> Array:
+        """(…, 2) 95 % intervals."""
+        half = QUANTILE * self.std(family)
+        return np.stack([self.value(family) - half, self.value(family) + half], axis=-1)
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """What disturbed the sweeps, one sentence each."""
+        return tuple(str(each) for each in (*self.disturbed, *self.springs))
+
+    @property
+    def beta(self) -> Array:
+        """Mass moments (2n,) [kg·m]; 0 for those not found."""
+        return np.where(self.found("beta"), self.value("beta"), 0.0)
+
+    @cached_property
+    def residual_rms(self) -> Array:
+        """(n,) [N·m]."""
+        own = [self.solution.residual[self.rows.joint == joint] for joint in range(self.arm.n)]
+        return np.array([np.sqrt(np.mean(each**2)) if each.size else np.nan for each in own])
+
+    def gravity(self, rows: NDArray[np.intp] | slice = slice(None)) -> Array:
+        """Gravity torque that the fit has at its rows [N·m]."""
+        return CreepModel(self.arm, self.rows).gravity(self.solution.x)[rows]
+
+
+def fit_creep(arm_file: ArmFile, passes: Sequence[SweepData]) -> CreepFit:
+    """Fit passes of creep sweeps, with and without a reference mass; raises BadInput where there is no such data."""
+    rows = CreepRows.of(passes)
+    if not len(rows):
+        raise BadInput(f"{passes[0].path}: no creep sweeps: sweep with sweep.motion: creep")
+    doubt = Doubt(zero=sweep_section(arm_file).creep.zero_std)
+    return fit_rows(
+        gcomp_arm(arm_file), rows, Limits.of(arm_file).rated, doubt, {data.path.name: data.digest for data in passes}
+    )
+
+
+def fit_rows(
+    arm: Arm, rows: CreepRows, rated: Array, doubt: Doubt | None = None, sources: dict[str, str] | None = None
+) -> CreepFit:
+    """Fit rows; rated torque (n,) [N·m] scales what is doubted beforehand. Disturbed sweeps are left out by name."""
+    doubt = doubt or Doubt()
+    left_out: tuple[Disturbed, ...] = ()
+    plain = _fitted(arm, rows, rated, doubt)
+    for _ in range(len(rows.sweeps)):
+        found = disturbed_sweeps(arm, plain.rows, plain.solution.residual, rated)
+        if not found:
+            break
+        left_out = (*left_out, *found)
+        rows = rows.kept(~np.isin(rows.sweep, [each.sweep for each in found]))
+        plain = _fitted(arm, rows, rated, doubt)
+    plain = replace(plain, disturbed=left_out, sources=sources or {})
+    free = _fitted(arm, rows, rated, replace(doubt, spring_share=WIDE_SHARE), plain.solution.x)
+    pulled = springs(CreepModel(arm, rows), free.solution, rated)
+    if not pulled:
+        return plain
+    return replace(free, disturbed=left_out, springs=pulled, sources=sources or {})
+
+
+def _fitted(arm: Arm, rows: CreepRows, rated: Array, doubt: Doubt, start: Array | None = None) -> CreepFit:
+    model = CreepModel(arm, rows)
+    sigma, factor = 0.01 * rated[rows.joint], np.ones(arm.n)
+    coulomb = 0.02 * rated
+    mean, std = prior(arm, rated, doubt, rows.by_temperature, coulomb)
+    x = mean.copy() if start is None else start
+    for _ in range(ROUNDS):
+        found = solve(model, sigma * factor[rows.joint], mean, std, x)
+        x = found.x
+        coulomb = np.abs(x[model.slices["coulomb"]])
+        mean, std = prior(arm, rated, doubt, rows.by_temperature, coulomb)
+        freedom = 1 - _used(found, std) / len(rows)
+        sigma, factor = scatter(rows, found.residual, rated, freedom)
+    return CreepFit(arm, rows, found, std, sigma, factor)
+
+
+def _used(found: Solution, std: Array) -> float:
+    """Parameters that the data, and not the prior, determine."""
+    return float(np.sum(1 - np.diag(found.covariance) / std**2))

@@ -1,0 +1,210 @@
+"""Plan of a pass of creep sweeps, tip to base: free of collisions, within the drives' torque."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from armlink.arm_file import ArmFile
+from armlink.errors import BadInput
+from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import gcomp_arm, model_arm
+from calib.arm.sweep_section import SweepSection, sweep_section
+from calib.creep.design import Candidate, choose
+from calib.plan.collisions import POINTS, Geometry
+from calib.plan.poses import require_range
+from calib.plan.types import Side, Sweep, SweepPlan
+from gcomp.arm.arm import Arm
+from gcomp.arm.mass_moments import payload_columns
+from gcomp.arrays import Array
+from gcomp.gravity.torque import gravity_levers, gravity_regressor
+
+CANDIDATES = 24
+"""Creeps of each joint among which the plan chooses."""
+DRAWS = 40
+"""Draws for each candidate before too much of the range counts as blocked."""
+MASS_SHARE = 0.3
+"""Share of max_torque that the reference mass may take at the joint that it loads most."""
+WORST_CONSTANT = 1.6
+"""A drive may have to be asked for so many times the true torque."""
+HAND = 0.12
+"""Distance of the mass from the flange that the plan allows for [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class CreepGround:
+    """Arm, limits and surroundings in which creeps are planned."""
+
+    arm: Arm
+    section: SweepSection
+    limits: Limits
+    beta: Array
+    """Guess of the mass moments (2n,) [kg·m]."""
+    geometry: Geometry | None
+
+    @classmethod
+    def of(cls, arm_file: ArmFile) -> "CreepGround":
+        """Raises BadInput where a range is too short or the model cannot be used."""
+        arm, section, limits = gcomp_arm(arm_file), sweep_section(arm_file), Limits.of(arm_file)
+        require_range(section, limits, arm)
+        if arm_file.model_path is None:
+            share = 0.2 * limits.rated / float(np.linalg.norm(arm.gravity))
+            return cls(arm, section, limits, np.column_stack([share, 0 * share]).ravel(), None)
+        geometry = Geometry(arm_file)
+        return cls(arm, section, limits, model_arm(arm_file).beta, geometry if geometry.model.ngeom else None)
+
+    def range(self, joint: int) -> tuple[float, float]:
+        """Ends of a joint's way [rad]; they stay away from the stops by twice the doubt of the zero."""
+        margin = self.section.range_margin + 2 * self.section.creep.zero_std
+        return float(self.limits.lower[joint]) + margin, float(self.limits.upper[joint]) - margin
+
+    def free(self, poses: Array) -> bool:
+        """Whether nothing touches at any of the poses (K, n) [rad]."""
+        return self.geometry is None or bool(self.geometry.free(poses).all())
+
+    def way(self, begin: Array, end: Array) -> bool:
+        """Whether nothing touches on the straight way between two poses (n,) [rad]."""
+        shares = np.linspace(0, 1, POINTS + 1)[:, None]
+        return self.free(begin + shares * (end - begin))
+
+    def mass(self) -> float:
+        """Reference mass to attach [kg]."""
+        if self.section.reference_mass is not None:
+            return self.section.reference_mass
+        random = np.random.default_rng(0)
+        lower, upper = np.array([self.range(joint) for joint in range(self.arm.n)]).T
+        poses = random.uniform(lower, upper, (400, self.arm.n))
+        at_origin, by_point = payload_columns(self.arm)
+        each = gravity_regressor(self.arm, poses)
+        per_kg = np.abs(each @ at_origin) + HAND * np.linalg.norm(each @ by_point, axis=-1)
+        most = MASS_SHARE * self.limits.max_torque / np.maximum(per_kg.max(axis=0), 1e-9)
+        return float(f"{float(most.min()):.2g}")
+
+    def bearable(self, one: Candidate, mass: float) -> bool:
+        """Whether every drive can hold its joint along a creep with the mass, however wrong its constant may be."""
+        at_origin, by_point = payload_columns(self.arm)
+        each = gravity_regressor(self.arm, one.poses(6))
+        torque = np.abs(each @ (self.beta + mass * at_origin)) + mass * HAND * np.linalg.norm(each @ by_point, axis=-1)
+        return bool((WORST_CONSTANT * torque <= self.limits.max_torque).all())
+
+
+def plan_creep(arm_file: ArmFile, *, seed: int = 0) -> SweepPlan:
+    """The sweeps of one pass; every pass of an arm has the same ones. Raises BadInput where the arm cannot be swept."""
+    ground = CreepGround.of(arm_file)
+    creep, n, mass = ground.section.creep, ground.arm.n, ground.mass()
+    random = np.random.default_rng([seed, 19])
+    home = _home(ground, random)
+    lists = [_candidates(ground, joint, home, mass, random) for joint in reversed(range(n))]
+    chosen, promised = choose(
+        ground.arm, ground.beta, ground.limits.rated, lists, creep.poses, creep.speeds, mass, creep.zero_std
+    )
+    sweeps = []
+    for each in chosen:
+        for number, one in enumerate(each):
+            sweeps.append(_sweep(ground, one, number, creep.speeds[number % len(creep.speeds)]))
+    blind = [ground.arm.names[joint] for joint in range(n) if vertical(ground.arm, joint)]
+    notes = tuple(f"{name}: {VERTICAL}" for name in blind)
+    return SweepPlan(
+        sweeps=tuple(sweeps),
+        scout=(tuple(home.tolist()),),
+        reference_mass=mass,
+        standard_error=ground.section.standard_error,
+        travel_acceleration=min(ground.section.acceleration, 1.5),
+        gain_std=float(promised[[j for j in range(n) if ground.arm.names[j] not in blind]].max(initial=0.0)),
+        notes=notes,
+    )
+
+
+TRAVEL_SECONDS = 6.0
+"""Rough time from one creep to the next [s]."""
+
+
+def creep_seconds(plan: SweepPlan) -> float:
+    """Rough duration of a pass [s]."""
+    total = 0.0
+    for sweep in plan.sweeps:
+        speed = sweep.speed or 0.1
+        way = (sweep.steps[-1] - sweep.steps[0]) * (1 + 1 / (len(sweep.steps) - 1)) + 2 * lead_way(speed)
+        total += 2 * way / speed + TRAVEL_SECONDS
+    return total
+
+
+RAMP = 0.4
+"""Time over which a creep reaches its speed, and comes to rest [s]."""
+SETTLE = 0.4
+"""Time after that in which friction has turned round and the position loop has settled [s]."""
+
+
+def lead_way(speed: float) -> float:
+    """Way at either end of a creep that does not count [rad]."""
+    return speed * (RAMP / 2 + SETTLE)
+
+
+RESTING: Side = 0
+"""No joint rests on a stop."""
+VERTICAL = (
+    "its axis is vertical in every pose, so that gravity does not load it: its torque constant cannot be seen; mount"
+    " the base tilted by 10° or more and state kinematics.gravity accordingly"
+)
+
+
+def vertical(arm: Arm, joint: int) -> bool:
+    """Whether a joint's axis is along gravity in every pose."""
+    poses = np.random.default_rng(1).uniform(-1.5, 1.5, (20, arm.n))
+    return bool(np.all(gravity_levers(arm, poses)[:, joint] < 0.02 * np.linalg.norm(arm.gravity)))
+
+
+def _sweep(ground: CreepGround, one: Candidate, number: int, speed: float) -> Sweep:
+    speed = min(speed, (one.upper - one.lower) / 4 / lead_way(1.0))
+    lead = lead_way(speed)
+    way = one.upper - one.lower - 2 * lead
+    count = max(round(way / ground.section.creep.bin), 4)
+    width = way / count
+    rest = one.rest.copy()
+    rest[one.joint] = one.lower
+    lever = gravity_levers(ground.arm, one.poses(3))[:, one.joint].max() / np.linalg.norm(ground.arm.gravity)
+    return Sweep(
+        name=f"{ground.arm.names[one.joint]} creep {number + 1}",
+        joint=one.joint,
+        stops=tuple(RESTING for _ in range(ground.arm.n)),
+        rest=tuple(rest.tolist()),
+        steps=tuple((one.lower + lead + width * (np.arange(count) + 0.5)).tolist()),
+        lever=float(lever),
+        servo=(True,) * ground.arm.n,
+        speed=speed,
+    )
+
+
+def _home(ground: CreepGround, random: np.random.Generator) -> Array:
+    """A pose from which creeps are reached: the middle of the ranges, or the first free one drawn."""
+    ends = np.array([ground.range(joint) for joint in range(ground.arm.n)])
+    if ground.free(ends.mean(axis=1)[None]):
+        return np.asarray(ends.mean(axis=1))
+    for _ in range(20 * DRAWS):
+        pose = random.uniform(*ends.T)
+        if ground.free(pose[None]):
+            return np.asarray(pose)
+    raise BadInput("almost every pose within the joint range collides: narrow lower and upper in the arm file")
+
+
+def _candidates(
+    ground: CreepGround, joint: int, home: Array, mass: float, random: np.random.Generator
+) -> list[Candidate]:
+    ends = np.array([ground.range(each) for each in range(ground.arm.n)])
+    low, high = ends[joint]
+    span, found = min(high - low, ground.section.creep.span), list[Candidate]()
+    for _ in range(CANDIDATES * DRAWS):
+        lower = random.uniform(low, high - span) if high - low > span else low
+        one = Candidate(joint, random.uniform(*ends.T), lower, lower + span)
+        begin = one.poses(2)[0]
+        clear = ground.free(one.poses(POINTS + 1)) and ground.way(home, begin)
+        if clear and ground.bearable(one, mass):
+            found.append(one)
+            if len(found) == CANDIDATES:
+                break
+    if not found:
+        raise BadInput(
+            f"joint {ground.arm.names[joint]}: no creep of {span:.2f} rad is free of collisions and within max_torque"
+            f" with {mass:g} kg: shorten sweep.creep.span, choose a smaller sweep.reference_mass, or narrow lower and"
+            " upper of the others in the arm file"
+        )
+    return found

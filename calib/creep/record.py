@@ -1,0 +1,114 @@
+"""Records of a creep fit: a calibration with friction, kept by the host, and gravity."""
+
+from typing import Literal
+
+import numpy as np
+
+from armlink.arm_file import ArmFile
+from calib.creep.fit import CreepFit
+from calib.creep.plan import VERTICAL, vertical
+from calib.records.records import (
+    CalibrationRecord,
+    GravityRecord,
+    JointCalibration,
+    MotorTorque,
+    Parameter,
+    matrix,
+    provenance,
+)
+
+FAMILY: dict[Parameter, str] = {"gain": "gain", "offset": "offset", "position_offset": "zero"}
+"""Parameter of a record → family of the fit."""
+ZERO_SEEN = 0.9
+"""A zero counts as found if the data leave at most so much of its doubt."""
+
+
+def missing(fit: CreepFit) -> dict[tuple[str, Parameter], str]:
+    """(Joint, parameter) → why the data cannot determine it."""
+    reasons: dict[tuple[str, Parameter], str] = {}
+    found = {"gain": fit.found("gain"), "offset": fit.found("offset")}
+    zero = fit.std("zero") < ZERO_SEEN * fit.prior_std[fit.slices["zero"]]
+    loaded = bool((fit.rows.mass > 0).any())
+    for joint, name in enumerate(fit.names):
+        upright = vertical(fit.arm, joint)
+        pull = next((each for each in fit.springs if each.joint == name), None)
+        if pull is not None:
+            reasons[name, "gain"] = str(pull).removeprefix(f"{name}: ")
+        elif not found["gain"][joint]:
+            reasons[name, "gain"] = VERTICAL if upright else _no_gain(fit, joint, loaded)
+        if not found["offset"][joint]:
+            reasons[name, "offset"] = "no sweep of this joint tells it"
+        if joint == fit.arm.n - 1:
+            reasons[name, "position_offset"] = "turning the last link's frame is the same as turning its centre of mass"
+        elif not zero[joint]:
+            reasons[name, "position_offset"] = "the sweeps tell no more than was known before"
+    return reasons
+
+
+def _no_gain(fit: CreepFit, joint: int, loaded: bool) -> str:
+    if not (fit.rows.joint == joint).any():
+        return "no sweep of this joint was free of disturbance"
+    if not loaded:
+        return "without a reference mass only products of torque constant and mass are seen: sweep again with one"
+    return "gravity loads this joint too little in these sweeps: attach the mass further out, or add poses"
+
+
+def calibration_record(fit: CreepFit, arm_file: ArmFile) -> CalibrationRecord:
+    """Gains 1/k, offsets, zeros and friction of all joints; a value that the data do not determine has a reason."""
+    reasons = missing(fit)
+    joints = []
+    for joint, name in enumerate(fit.names):
+        own: dict[Parameter, str] = {parameter: reason for (of, parameter), reason in reasons.items() if of == name}
+        gain, offset, zero = (
+            None if parameter in own else float(fit.value(family)[joint]) for parameter, family in FAMILY.items()
+        )
+        joints.append(
+            JointCalibration(
+                name=name,
+                gain=gain,
+                offset=offset,
+                position_gain=1.0,
+                position_offset=zero,
+                not_identifiable=own,
+                residual_std=float(fit.residual_rms[joint]) if np.isfinite(fit.residual_rms[joint]) else None,
+                motor=_motor(fit, joint),
+            )
+        )
+    kept = [(name, p) for name in fit.names for p in FAMILY if (name, p) not in reasons]
+    places = [fit.slices[FAMILY[p]].start + fit.names.index(name) for name, p in kept]
+    return CalibrationRecord(
+        **provenance(arm_file, fit.sources),
+        joints=tuple(joints),
+        covariance_of=tuple(f"{name}.{p}" for name, p in kept),
+        covariance=matrix(fit.covariance[np.ix_(places, places)]),
+    )
+
+
+def _motor(fit: CreepFit, joint: int) -> MotorTorque:
+    def pair(family: Literal["coulomb", "load", "viscous", "asymmetry", "warming"]) -> tuple[float, float]:
+        return float(fit.value(family)[joint]), float(fit.std(family)[joint])
+
+    rows = fit.rows
+    return MotorTorque(
+        coulomb=pair("coulomb"),
+        load=pair("load"),
+        viscous=pair("viscous"),
+        asymmetry=pair("asymmetry"),
+        temperature=float(rows.warmest[joint]) if np.isfinite(rows.warmest[joint]) else None,
+        gain_per_kelvin=pair("warming") if rows.by_temperature else None,
+    )
+
+
+def gravity_record(fit: CreepFit, arm_file: ArmFile, calibration: CalibrationRecord | None) -> GravityRecord:
+    """Mass moments of the arm without the reference mass, in true kg·m, and their covariance."""
+    found, place = fit.found("beta"), fit.slices["beta"]
+    covariance = fit.covariance[place, place] * np.outer(found, found)
+    return GravityRecord(
+        **provenance(arm_file, fit.sources),
+        names=fit.names,
+        beta=tuple(fit.beta.tolist()),
+        covariance=matrix(covariance),
+        identifiable=tuple(bool(each) for each in found),
+        gravity=tuple(fit.arm.gravity.tolist()),
+        calibration=None if calibration is None else calibration.id,
+    )

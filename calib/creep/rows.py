@@ -1,0 +1,100 @@
+"""Readings of creep sweeps as one batch of rows: one averaged bin of one joint a row."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.motion.static_reading import StaticReading
+from calib.sweep.dataset import SweepData
+from gcomp.arrays import Array, Mask
+
+COMMON_MODE = 1.0
+"""Spread of the logged temperatures from which they, and not time, say how warm a drive is [K]."""
+
+
+@dataclass(frozen=True, eq=False)
+class CreepRows:
+    """R rows; the reading is the drive's own torque, before any calibration in the host."""
+
+    joint: NDArray[np.int64]
+    """Joint that crept (R,)."""
+    position: Array
+    """Mean position readings of all joints (R, n) [rad]."""
+    reading: Array
+    """Mean torque reading of the creeping joint (R,) [N·m]."""
+    velocity: Array
+    """Its mean velocity, with sign (R,) [rad/s]."""
+    mass: Array
+    """Reference mass attached (R,) [kg]."""
+    warmth: Array
+    """Temperature against that at the end of the last pass [K], or share of the time until then less 1 (R,)."""
+    sweep: NDArray[np.int64]
+    """Number of the sweep that a row belongs to, both ways, over all passes (R,)."""
+    sweeps: tuple[str, ...]
+    """Name of each sweep, with its pass."""
+    by_temperature: bool
+    """Whether `warmth` is in kelvin."""
+    warmest: Array
+    """Temperature of each joint's drive at which warmth is 0 (n,) [°C]; NaN where it is not in kelvin."""
+
+    def __len__(self) -> int:
+        """Rows."""
+        return len(self.joint)
+
+    @property
+    def side(self) -> Array:
+        """Direction of motion, ±1 (R,)."""
+        return np.sign(self.velocity)
+
+    def kept(self, mask: Mask) -> Self:
+        """Some of the rows."""
+        names = ("joint", "position", "reading", "velocity", "mass", "warmth", "sweep")
+        return replace(self, **{name: getattr(self, name)[mask] for name in names})
+
+    @classmethod
+    def of(cls, passes: Sequence[SweepData]) -> Self:
+        """All creep readings of the passes, in the order in which they were made."""
+        ordered = sorted(passes, key=lambda data: (data.manifest.created, data.path.name))
+        found: list[tuple[StaticReading, SweepData, float, str]] = []
+        clock = 0.0
+        for number, data in enumerate(ordered, start=1):
+            own = [each for each in data.readings if each.speed is not None]
+            shift = max(clock - min((each.t for each in own), default=clock), 0.0)
+            found += [(each, data, each.t + shift, f"pass {number}, {each.sweep}") for each in own]
+            clock = max((each.t + shift for each in own), default=clock)
+        readings = [each for each, *_ in found]
+        joint = np.array([each.joint for each in readings], dtype=np.int64)
+        raw = [data.manifest.installed.apply(each.torque) for each, data, *_ in found]
+        rows = np.arange(len(joint))
+        names = tuple(dict.fromkeys(name for *_, name in found))
+        side = np.array([each.direction.sum() for each in readings])
+        warmth, warmest = _warmth(readings, joint, np.array([t for *_, t, _ in found]), ordered)
+        return cls(
+            joint=joint,
+            position=np.array([each.position for each in readings]),
+            reading=np.array(raw)[rows, joint],
+            velocity=side * np.array([each.speed for each in readings]),
+            mass=np.array([data.manifest.reference_mass for _, data, *_ in found]),
+            warmth=warmth,
+            sweep=np.array([names.index(name) for *_, name in found], dtype=np.int64),
+            sweeps=names,
+            by_temperature=bool(np.isfinite(warmest).any()),
+            warmest=warmest,
+        )
+
+
+def _warmth(
+    readings: list[StaticReading], joint: NDArray[np.int64], t: Array, passes: Sequence[SweepData]
+) -> tuple[Array, Array]:
+    """(How much colder each row's drive was than at the end (R,), temperature of each drive then (n,) [°C] or NaN)."""
+    n = len(passes[0].manifest.names) if passes else 0
+    temperature = np.array([each.temperature[j] for each, j in zip(readings, joint, strict=True)])
+    known = bool(np.isfinite(temperature).all())
+    if known and np.ptp(temperature) >= COMMON_MODE:
+        warm = np.array([temperature[joint == j].max(initial=-np.inf) for j in range(n)])
+        return temperature - warm[joint], np.where(np.isfinite(warm), warm, np.nan)
+    span = max(float(np.ptp(t)), 1.0) if len(t) else 1.0
+    return (t - t.max(initial=0.0)) / span, np.full(n, np.nan)

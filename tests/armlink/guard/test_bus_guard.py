@@ -1,0 +1,451 @@
+"""The guard of a bus: what a link sends in its work passes, what a program sends beyond a limit does not."""
+
+import ast
+import copy
+import json
+import math
+import socket
+import struct
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_joints import FakeBus, make_arm
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.guard import bus_guard
+from armlink.guard.bus_guard import BATCH, SCHEMA, Field, Guard, Policy, PolicyError, Port, Source
+from armlink.link.link import Link
+from armlink.link.types import Calibration, Command
+
+N, RATED, MAX_TORQUE, SPEED, RATE, PERIOD = 2, 40.0, 30.0, 1.0, 200.0, 0.004
+UNIT = 2 * math.pi / 2**20
+WINDOW = (2.0 + 0.02 * 2.0 + 0.05) / UNIT
+JOINT = {"max_velocity": SPEED, "max_torque_rate": RATE}
+POSITION, TORQUE = 8, 10
+
+
+class GuardedBus(FakeBus):
+    """Nodes behind a guard, as one process: what is refused is noted and does not reach them."""
+
+    def __init__(self, nodes, policy=None):
+        super().__init__(nodes)
+        self.policy, self.refused = policy, []
+
+    def put(self, can_id, data):
+        why = self.policy.refusal(can_id, bytes(data), self.clock.time) if self.policy else ""
+        if why:
+            self.refused.append(why)
+        else:
+            super().put(can_id, data)
+
+    def take(self, timeout=0.0):
+        frame = super().take(timeout)
+        if frame and self.policy:
+            self.policy.hear(*frame, self.clock.time)
+        return frame
+
+
+def content_of(n=N, link=()):
+    with Link(make_arm(n, link, JOINT), FakeBus(range(1, n + 1))) as link:
+        return {"schema": SCHEMA, **json.loads(json.dumps(link.guard_rules()))}
+
+
+CONTENT = content_of()
+
+
+def guarded(content=CONTENT, n=N):
+    bus = GuardedBus(range(1, n + 1), Policy(content))
+    return bus, Link(make_arm(n, (), JOINT), bus)
+
+
+def command(mode, torque=0.0, position=0.0):
+    return Command(np.full(N, mode, np.int8), np.full(N, torque), np.full(N, position))
+
+
+def test_all_that_a_link_does_passes():
+    bus, link = guarded()
+    random = np.random.default_rng(4)
+    with link:
+        link.scan()
+        link.start()
+        link.enable()
+        link.write_calibration(1, Calibration(1.02, -0.3, 7, 20_000), store=True)
+        for _ in range(150):
+            for _ in range(6):
+                link.cycle(command(POSITION, position=random.uniform(-3, 3)))
+            for _ in range(6):
+                link.cycle(command(TORQUE, torque=random.uniform(-60, 60)))
+        for node in bus.nodes.values():  # moved by hand, without power
+            node.position += 4000
+        link.disable()
+        for node in bus.nodes.values():
+            node.position += 90_000
+        link.enable()
+        link.cycle(command(POSITION, position=0.1))
+        link.stop()
+    assert bus.refused == []
+    assert len(bus.sent) > 3 * 1800
+
+
+def test_sixty_three_joints_pass():
+    bus, link = guarded(content_of(63), 63)
+    with link:
+        link.start()
+        link.enable()
+    assert bus.refused == []
+
+
+def test_a_drive_must_have_acknowledged_its_mapping():
+    bus, link = guarded()
+    frame = struct.pack("<Hhi", 15, 0, 0)
+    assert "acknowledged" in bus.policy.refusal(0x201, frame, 10.0)
+    with link:
+        link.start()
+        link.enable()
+        now = bus.clock.time
+        assert bus.policy.refusal(0x201, frame, now) == ""
+        bus.policy.hear(0x701, b"\x00", now)  # boot-up: the node has the mapping of its maker again
+        assert "acknowledged" in bus.policy.refusal(0x201, frame, now)
+        assert bus.policy.refusal(0x202, frame, now) == ""
+
+
+def test_torque_and_position_are_bounded_in_size_and_rate():
+    bus, link = guarded()
+    with link:
+        link.start()
+        link.enable()
+        now, policy = bus.clock.time, bus.policy
+
+        def refused(torque, position, after=0.0):
+            return policy.refusal(0x201, struct.pack("<Hhi", 15, torque, position), now + after)
+
+        most, step = round(MAX_TORQUE / RATED * 1000), SPEED / UNIT
+        assert "target torque of joint_1 751, allowed -750 to 750" in refused(751, 0)
+        assert "at once" in refused(most, 0)
+        assert "target position of joint_1" in refused(50, int(WINDOW) + 2)
+        assert "at once" in refused(50, int(0.1 * step))
+        assert refused(50, int(0.015 * step)) == ""
+        assert "at once" in refused(50, int(0.030 * step), 0.001)
+        assert refused(50, int(0.024 * step), 0.012) == ""
+
+
+def test_a_joint_that_stands_outside_its_window_is_led_back():
+    bus, link = guarded()
+    for node in bus.nodes.values():
+        node.position = int(WINDOW + 0.2 / UNIT)
+    with link:
+        link.start()
+        link.enable()
+        for _ in range(200):
+            link.cycle(command(POSITION, position=0.0))
+    assert bus.refused == []
+    outside = struct.pack("<Hhi", 15, 50, int(WINDOW + 0.1 / UNIT))
+    assert "target position" in bus.policy.refusal(0x201, outside, bus.clock.time)
+
+
+@pytest.mark.parametrize(
+    ("index", "sub", "code", "value"),
+    [
+        (0x6072, 0, "H", 1000),  # maximum torque
+        (0x607D, 2, "i", 2**30),  # window
+        (0x607A, 0, "i", 10_000),  # target position beside the cycle
+        (0x6071, 0, "h", 10),
+        (0x60FF, 0, "i", 1),
+        (0x60B2, 0, "h", 1),  # torque offset
+        (0x6060, 0, "b", 3),  # velocity mode
+        (0x605A, 0, "h", 0),  # quick stop that lets go
+        (0x1600, 2, "I", 0x60FF0020),  # another mapping
+        (0x1402, 1, "I", 0x401),  # an RPDO of the program's own
+        (0x1016, 1, "I", 0),  # no watch for the host
+        (0x1400, 5, "H", 0),
+        (0x2100, 4, "f", 40.0),
+        (0x2100, 4, "f", math.nan),
+        (0x6040, 0, "H", 15),
+    ],
+)
+def test_writes_that_the_set_up_does_not_make_are_refused(index, sub, code, value):
+    size = struct.calcsize(code)
+    data = struct.pack("<BHB", 0x23 | (4 - size) << 2, index, sub) + struct.pack("<" + code, value).ljust(4, b"\0")
+    assert Policy(CONTENT).refusal(0x601, data, 10.0)
+
+
+def test_segmented_and_block_writes_are_refused():
+    policy = Policy(CONTENT)
+    for data in ("2172600000000000", "0172600000000000", "c672600002000000", "2272600000000000", "2372"):
+        assert policy.refusal(0x601, bytes.fromhex(data), 10.0)
+    assert policy.refusal(0x601, bytes.fromhex("4064600000000000"), 10.0) == ""
+
+
+hostile = st.one_of(
+    st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8)),
+    st.tuples(
+        st.sampled_from([0x201, 0x202]),
+        st.builds(
+            struct.Struct("<Hhi").pack,
+            st.integers(0, 0xFFFF),
+            st.integers(-900, 900),
+            st.one_of(st.integers(-(2**31), 2**31 - 1), st.integers(-400_000, 400_000)),
+        ),
+    ),
+    st.tuples(
+        st.sampled_from([0x601, 0x602]),
+        st.builds(
+            struct.Struct("<BHBi").pack,
+            st.sampled_from([0x23, 0x2B, 0x2F, 0x22, 0x21, 0x40, 0xC6]),
+            st.sampled_from([entry.index for entry in vars(objects).values() if isinstance(entry, objects.Entry)]),
+            st.integers(0, 9),
+            st.integers(-(2**31), 2**31 - 1),
+        ),
+    ),
+)
+
+
+def heard_while_enabling():
+    """What comes from the wire while a link enables its joints, each frame with its time, and the time after."""
+    bus, link = guarded()
+    heard, hear = [], bus.policy.hear
+
+    def note(can_id, data, now):
+        heard.append((can_id, bytes(data), now))
+        hear(can_id, data, now)
+
+    bus.policy.hear = note
+    with link:
+        link.start()
+        link.enable()
+        return heard, bus.clock.time
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.tuples(hostile, st.floats(0, 0.02)), max_size=40))
+def test_whatever_a_program_sends_no_joint_is_told_more_than_its_limits(frames):
+    policy = Policy(CONTENT)
+    for each in HEARD:
+        policy.hear(*each)
+    now, position_step, torque_step = ENABLED_AT, SPEED / UNIT, RATE / RATED * 1000
+    told = {}  # node → position, torque, time of the last frame with power
+    for (can_id, data), pause in frames:
+        now += pause
+        if policy.refusal(can_id, data, now):
+            continue
+        node = can_id & 0x7F
+        if can_id & 0x780 == 0x200:
+            word, torque, position = struct.unpack("<Hhi", data)
+            assert abs(torque) <= 1000 * MAX_TORQUE / RATED
+            assert abs(position) <= WINDOW + 1
+            if word & 0x8F != 0x0F:
+                told.pop(node, None)
+                continue
+            near, same = abs(position) <= 3 + 2 * PERIOD * position_step, abs(torque - 50) <= 2
+            if node in told:
+                last, pull, then = told[node]
+                elapsed = now - then + 5 * PERIOD
+                near = near or abs(position - last) <= position_step * elapsed + 3
+                same = same or abs(torque - pull) <= torque_step * elapsed + 3
+            assert near
+            assert same or (node not in told and torque == 0)
+            told[node] = position, torque, now
+        elif can_id & 0x780 == 0x600 and data[0] >> 5 == 1:
+            index, sub = struct.unpack_from("<HB", data, 1)
+            assert f"{index:X}:{sub:X}" in CONTENT["frames"][str(can_id)]["sdo"]
+        else:
+            assert can_id in (0x000, 0x080, 0x300 + node, 0x77F) or data[0] >> 5 in (2, 3, 4)
+
+
+HEARD, ENABLED_AT = heard_while_enabling()
+
+
+class Side:
+    """One side of a guard, without a socket."""
+
+    def __init__(self):
+        self.sent, self.full = [], False
+
+    def send(self, can_id, data, fd=False):
+        if not self.full:
+            self.sent.append((can_id, data))
+        return not self.full
+
+
+def test_the_first_frame_that_is_not_allowed_closes_it_and_stops_the_joints():
+    lines, program, wire = [], Side(), Side()
+    guard = Guard(Policy(CONTENT), program, wire, lines.append)
+    guard._to_wire(0x80, b"", False)
+    guard._to_wire(0x123, b"\x01", False)
+    guard._to_wire(0x80, b"", False)
+    assert wire.sent == [(0x80, b""), *((0x600 + node, bytes.fromhex("2b40600002000000")) for node in (1, 2))]
+    assert lines == ["guard: closed: identifier 123h, which the policy does not name; the joints were told to stop, "
+                     "start the guard again to open it"]  # fmt: skip
+    guard._to_program(0x181, bytes(8), False)
+    assert program.sent == [(0x181, bytes(8))]
+
+
+@pytest.mark.parametrize("flag", [bus_guard.REMOTE, bus_guard.ERROR, bus_guard.EXTENDED])
+def test_remote_error_and_extended_frames_do_not_pass(flag):
+    wire = Side()
+    guard = Guard(Policy(CONTENT), Side(), wire, lambda text: None)
+    guard._to_wire(0x80 | flag, b"", False)
+    assert guard.closed
+    assert (0x80 | flag, b"") not in wire.sent
+
+
+def test_a_wire_that_takes_nothing_closes_it():
+    wire = Side()
+    wire.full = True
+    guard = Guard(Policy(CONTENT), Side(), wire, lambda text: None)
+    guard._to_wire(0x80, b"", False)
+    assert guard.closed.startswith("the wire takes no frames")
+
+
+class Wire:
+    """A port on one end of a socket pair, and the other end."""
+
+    def __init__(self):
+        own, self.other = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        own.setblocking(False)
+        self.other.settimeout(5)
+        self.port = Port.__new__(Port)
+        self.port.socket, self.port.fd = own, True
+
+    def say(self, can_id, data, size=8, flags=0):
+        self.other.send(struct.pack(f"=IBB2x{size}s", can_id, len(data), flags, data))
+
+    def hear(self):
+        raw = self.other.recv(100)
+        can_id, length, flags = struct.unpack_from("=IBB", raw)
+        return can_id, raw[8 : 8 + length], flags, len(raw)
+
+
+@pytest.fixture
+def wires():
+    pair = Wire(), Wire()
+    yield pair
+    for wire in pair:
+        wire.port.socket.close()
+        wire.other.close()
+
+
+def test_frames_pass_both_ways_as_they_are(wires):
+    program, wire = wires
+    guard = Guard(Policy(CONTENT), program.port, wire.port)
+    wire.say(0x181, b"12345678")
+    wire.say(0x281, bytes(range(64)), 64, 5)
+    program.say(0x80, b"")
+    program.say(0x601, bytes.fromhex("4064600000000000"))
+    guard.step(1.0)
+    assert program.hear() == (0x181, b"12345678", 0, 16)
+    assert program.hear() == (0x281, bytes(range(64)), 5, 72)
+    assert wire.hear() == (0x80, b"", 0, 16)
+    assert wire.hear() == (0x601, bytes.fromhex("4064600000000000"), 0, 16)
+    assert not guard.closed
+
+
+def test_error_and_remote_frames_of_the_wire_go_nowhere(wires):
+    program, wire = wires
+    guard = Guard(Policy(CONTENT), program.port, wire.port)
+    wire.say(0x181 | socket.CAN_RTR_FLAG, b"")
+    wire.say(socket.CAN_ERR_FLAG | 4, bytes(8))
+    wire.say(0x181 | socket.CAN_EFF_FLAG, b"7")
+    guard.step(1.0)
+    assert program.hear() == (0x181 | socket.CAN_EFF_FLAG, b"7", 0, 16)
+
+
+def test_each_side_gets_its_turn(wires):
+    program, wire = wires
+    guard = Guard(Policy(CONTENT), program.port, wire.port)
+    for _ in range(BATCH + 1):
+        program.port.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
+        wire.say(0x181, b"12345678")
+    guard.step(1.0)
+    heard = 0
+    program.other.setblocking(False)
+    while True:
+        try:
+            program.hear()
+        except BlockingIOError:
+            break
+        heard += 1
+    assert heard == BATCH == 64
+
+
+def test_a_full_queue_is_tried_for_a_while(wires, monkeypatch):
+    wire, times = wires[1], []
+    wire.port.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+    clock = iter(range(10_000))
+    monkeypatch.setattr(bus_guard.time, "monotonic", lambda: next(clock) * 0.01)
+    monkeypatch.setattr(bus_guard.time, "sleep", times.append)
+    while wire.port.send(0x80, b""):
+        assert len(times) < 10
+    assert 3 <= len(times) <= 7
+    wire.other.close()
+    assert not wire.port.send(0x80, b"")
+
+
+def test_a_reading_that_is_cut_short_is_none():
+    source = Source({"frame": 0x581, "prefix": "43646000", "at": 4, "code": "i"})
+    assert source.value(bytes.fromhex("4364600001000000")) == 1
+    assert source.value(bytes.fromhex("436460000100")) is None
+    assert source.value(bytes.fromhex("4364600101000000")) is None
+    assert Source({"frame": 1, "at": 0, "code": "b"}).value(b"") is None
+
+
+def test_one_side_of_a_range_may_be_left_open_by_nobody():
+    for bounds in ({"least": 0}, {"most": 0}, {"least": -math.inf, "most": 0}):
+        with pytest.raises(PolicyError, match="needs values, or least and most"):
+            Field({"name": "x", "at": 0, "code": "b", **bounds})
+    assert Field({"name": "x", "at": 0, "code": "b", "least": 0, "most": 0}).refusal(b"\0", 0.0) == ""
+
+
+def broken(change):
+    content = copy.deepcopy(CONTENT)
+    change(content)
+    return content
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ([], "TypeError"),
+        ({}, "KeyError: 'schema'"),
+        ({"schema": "armlink.guard/9", "frames": {}, "stop": []}, "schema 'armlink.guard/9', expected armlink.guard/1"),
+        (broken(lambda c: c["frames"]["513"].pop("lengths")), "KeyError: 'lengths'"),
+        (broken(lambda c: c["frames"]["513"].update(lengths=[4])), "beyond the 4 bytes of its frame"),
+        (broken(lambda c: c["frames"]["513"]["fields"][0].update(code="q9")), "code 'q9', expected one of b, B"),
+        (broken(lambda c: c["frames"]["513"]["fields"][0].pop("most")), "needs values, or least and most"),
+        (broken(lambda c: c["frames"]["513"]["fields"][0].update(least=math.nan)), "least is no number"),
+        (broken(lambda c: c.update(stop=[[1, "xy"]])), "ValueError"),
+    ],
+)
+def test_a_wrong_policy_is_refused_in_one_line(content, said):
+    with pytest.raises(PolicyError) as caught:
+        Policy(content)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_it_stands_on_the_standard_library_alone():
+    tree = ast.parse(Path(bus_guard.__file__).read_text())
+    names = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+    names |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    assert {name.partition(".")[0] for name in names} <= sys.stdlib_module_names
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "bus_guard.py POLICY PROGRAM_INTERFACE WIRE_INTERFACE"),
+        (["missing.json", "a", "b"], "missing.json: [Errno 2]"),
+        (["policy.json", "no-such-can", "can9"], ": expected a CAN interface that is up"),
+    ],
+)
+def test_wrong_arguments_get_one_line(words, said, capfd, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("policy.json").write_text(json.dumps(CONTENT))
+    assert bus_guard.main(words) == 2
+    error = capfd.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1

@@ -1,0 +1,70 @@
+"""The live stream, read by a WebSocket client that speaks Foxglove's protocol."""
+
+import asyncio
+import json
+import struct
+
+import numpy as np
+import pytest
+from websockets.asyncio.client import connect
+
+from armlink.errors import BadInput
+from armlink.link.types import Sample
+from armlink.monitor.foxglove_stream import FoxgloveStream
+from armlink.recording.ros_joint_state import decode_joint_state
+
+NAMES = ("shoulder", "elbow")
+
+
+def sample(torque=0.5):
+    values = {"velocity": [0.1, np.nan], "torque": [torque, 2.0], "motor_torque": [0.4, 1.9]}
+    arrays = {name: np.array(each) for name, each in values.items()}
+    zero = np.zeros(2)
+    return Sample(t=0.0, position=np.array([1.0, -1.0]), status=zero.astype(int), age=zero, **arrays)
+
+
+async def first_messages(stream):
+    """Schema and message by topic, as a client gets them that subscribes to everything."""
+    found, topics = {}, {}
+    sending = asyncio.create_task(send_on(stream))
+    async with connect(f"ws://127.0.0.1:{stream.port}", subprotocols=["foxglove.sdk.v1"]) as socket:
+        while len(found) < 2:
+            content = await asyncio.wait_for(socket.recv(), 10)
+            if isinstance(content, str):
+                told = json.loads(content)
+                if told["op"] == "advertise":
+                    topics |= {each["id"]: each for each in told["channels"]}
+                    asked = [{"id": each["id"], "channelId": each["id"]} for each in told["channels"]]
+                    await socket.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
+            elif content[0] == 1:
+                number, _ = struct.unpack_from("<IQ", content, 1)
+                found[topics[number]["topic"]] = topics[number], content[13:]
+    sending.cancel()
+    return found
+
+
+async def send_on(stream):
+    while True:
+        stream.send(sample())
+        await asyncio.sleep(0.05)
+
+
+def test_a_client_gets_the_readings_as_joint_states():
+    with FoxgloveStream("pair", NAMES, 0) as stream:
+        found = asyncio.run(first_messages(stream))
+    channel, data = found["/joint_states"]
+    assert (channel["encoding"], channel["schemaName"]) == ("cdr", "sensor_msgs/msg/JointState")
+    state = decode_joint_state(data)
+    assert state.names == NAMES
+    np.testing.assert_array_equal(state.position, [1.0, -1.0])
+    np.testing.assert_array_equal(state.velocity, [0.1, np.nan])
+    np.testing.assert_array_equal(state.effort, [0.5, 2.0])
+    np.testing.assert_array_equal(decode_joint_state(found["/motor_states"][1]).effort, [0.4, 1.9])
+
+
+def test_a_port_that_is_taken_is_one_line():
+    with (
+        FoxgloveStream("pair", NAMES, 0) as stream,
+        pytest.raises(BadInput, match=f"--foxglove {stream.port}: cannot serve on 127.0.0.1: .*in use"),
+    ):
+        FoxgloveStream("pair", NAMES, stream.port)

@@ -1,0 +1,151 @@
+"""The creep fit: derivatives, recovery of drawn arms, what cannot be seen, sweeps with a contact."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from drawn_creeps import DrawnCreep, draw_creep, without
+
+from armlink.arm_file import ArmFile, Kinematics, load_arm
+from calib.arm.kinematics import gcomp_arm
+from calib.arm.sweep_section import CreepSection, SweepSection
+from calib.creep.fit import CreepFit, fit_rows
+from calib.creep.model import CreepModel
+from calib.creep.plan import plan_creep
+from calib.creep.record import calibration_record, gravity_record, missing
+from calib.plan.types import SweepPlan
+from gcomp.gravity.torque import gravity_torque
+
+SIDEWAYS = (0.0, -9.80665, 0.0)
+"""Along the first axis of OpenArm."""
+QUICK = CreepSection(span=1.2, bin=0.12, speeds=(0.2, 0.1))
+
+
+@cache
+def arm(upright: bool = False) -> ArmFile:
+    """OpenArm with short creeps; upright with its first axis along gravity."""
+    found = load_arm("openarm").model_copy(update={"sweep": SweepSection(creep=QUICK)})
+    if not upright:
+        return found
+    kinematics = Kinematics.model_validate({**found.kinematics.model_dump(exclude_unset=True), "gravity": SIDEWAYS})
+    return found.model_copy(update={"kinematics": kinematics})
+
+
+@cache
+def plan(upright: bool = False) -> SweepPlan:
+    return plan_creep(arm(upright))
+
+
+def drawn(seed: int, order: str = "empty loaded empty", **changes: object) -> DrawnCreep:
+    return draw_creep(without(arm(), **changes), plan(), seed, plan().reference_mass, order)
+
+
+def fitted(made: DrawnCreep) -> CreepFit:
+    return fit_rows(gcomp_arm(arm()), made.rows, arm().require_link().rated_torques)
+
+
+def test_derivatives_agree_with_finite_differences() -> None:
+    model, random = CreepModel(gcomp_arm(arm()), drawn(0).rows), np.random.default_rng(0)
+    x = 0.1 * random.standard_normal(model.size)
+    x[model.slices["gain"]] = 1.1
+    jacobian, step = model.linearised(x)[1], 1e-6
+    for k in range(model.size):
+        up, down = x.copy(), x.copy()
+        up[k] += step
+        down[k] -= step
+        slope = (model.predict(up) - model.predict(down)) / (2 * step)
+        np.testing.assert_allclose(jacobian[:, k], slope, atol=1e-6 * (1 + np.abs(slope).max()))
+
+
+def test_an_arm_exactly_as_the_model_is_found_to_a_few_parts_in_ten_thousand() -> None:
+    made = drawn(1, uneven=0.0, asymmetry=0.0, cogging=0.0, warming=0.0, heating=0.0)
+    fit = fitted(made)
+    np.testing.assert_allclose(fit.value("gain") / made.truth.gain, 1.0, atol=2e-3)
+    np.testing.assert_allclose(fit.value("coulomb"), made.state.coulomb, rtol=0.05, atol=0.01)
+    np.testing.assert_allclose(fit.value("load"), made.state.uneven[:, 2], atol=0.01)
+    assert not fit.disturbed
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_torque_constants_friction_and_gravity_of_a_drawn_arm(seed: int) -> None:
+    made = drawn(seed)
+    fit, described = fitted(made), gcomp_arm(arm())
+    assert np.abs(fit.value("gain") / made.warm_gain - 1).max() < 0.015
+    off = np.abs(fit.value("coulomb") - made.state.coulomb)
+    assert (off < np.maximum(0.1, 0.15 * made.state.coulomb)).all()
+    poses = np.random.default_rng(0).uniform(described.lower, described.upper, (200, 7))
+    made.simulated.detach_mass()
+    true = made.simulated.gravity_torque(poses)
+    reading = poses - made.truth.position_offset
+    found = gravity_torque(described, fit.beta, reading + fit.value("zero"))
+    assert (np.sqrt(np.mean((found - true) ** 2, axis=0)) < 0.02 * np.abs(true).max(axis=0)).all()
+
+
+def test_a_loaded_pass_alone_after_the_empty_one_passes_warming_off_as_scale() -> None:
+    """Without temperatures the repeated empty pass tells how much the drives warmed up."""
+    errors = {}
+    for order in ("empty loaded", "empty loaded empty"):
+        made = drawn(4, order, heating=0.0, warming_time=900.0)
+        assert not made.rows.by_temperature
+        fit = fitted(made)
+        errors[order] = np.abs(fit.value("gain") / made.warm_gain - 1)
+        assert (errors[order] < 4 * fit.std("gain") / made.warm_gain + 2e-3).all()
+    assert np.median(errors["empty loaded"]) > 2 * np.median(errors["empty loaded empty"])
+
+
+def test_without_a_mass_no_torque_constant_is_given() -> None:
+    reasons = missing(fitted(drawn(5, "empty empty")))
+    assert {joint for joint, parameter in reasons if parameter == "gain"} == set(arm().joint_names)
+    assert "reference mass" in reasons[arm().joint_names[3], "gain"]
+
+
+def test_a_vertical_axis_is_named_with_its_remedy() -> None:
+    rated = arm(True).require_link().rated_torques
+    assert any("openarm_right_joint1" in note and "tilted" in note for note in plan(True).notes)
+    made = draw_creep(arm(True), plan(True), 6, plan(True).reference_mass)
+    fit = fit_rows(gcomp_arm(arm(True)), made.rows, rated)
+    reasons = missing(fit)
+    assert "vertical" in reasons["openarm_right_joint1", "gain"]
+    assert [joint for joint, parameter in reasons if parameter == "gain"] == ["openarm_right_joint1"]
+    assert np.abs(fit.value("gain") / made.warm_gain - 1)[1:].max() < 0.015
+    record = calibration_record(fit, arm(True))
+    assert record.joints[0].gain is None
+    assert not any(gravity_record(fit, arm(True), record).identifiable[:2])
+
+
+def test_a_push_on_one_sweep_is_named_and_left_out() -> None:
+    made = drawn(7)
+    rows = made.rows
+    chosen = next(k for k, name in enumerate(rows.sweeps) if name == "pass 2, openarm_right_joint4 creep 1")
+    place = rows.position[:, 3]
+    own = rows.sweep == chosen
+    beyond = np.maximum(place - np.median(place[own]), 0.0)
+    pushed = replace(rows, reading=rows.reading + np.where(own, 4.0 * beyond, 0.0))
+    fit = fit_rows(gcomp_arm(arm()), pushed, arm().require_link().rated_torques)
+    assert [each.name for each in fit.disturbed] == ["pass 2, openarm_right_joint4 creep 1"]
+    assert "openarm_right_joint4" in str(fit.disturbed[0])
+    assert np.abs(fit.value("gain") / made.warm_gain - 1).max() < 0.015
+
+
+def test_records_keep_friction_and_temperature() -> None:
+    made = drawn(8)
+    record = calibration_record(fitted(made), arm())
+    motor = record.joints[1].motor
+    assert motor is not None
+    assert motor.coulomb[0] == pytest.approx(made.state.coulomb[1], abs=0.1)
+    assert motor.temperature is not None
+    assert record.std("gain").max() < 0.01
+    assert record.joints[-1].position_offset is None
+
+
+def test_a_cable_that_pulls_in_every_sweep_is_named_and_no_constant_is_given() -> None:
+    made = drawn(9)
+    rows = made.rows
+    own = rows.joint == 3
+    pull = np.where(own, 0.8 * (rows.position[:, 3] - 1.0) * made.truth.gain[3], 0.0)
+    fit = fit_rows(gcomp_arm(arm()), replace(rows, reading=rows.reading + pull), arm().require_link().rated_torques)
+    assert [each.joint for each in fit.springs] == ["openarm_right_joint4"]
+    assert fit.springs[0].stiffness == pytest.approx(0.8, abs=0.3)
+    assert "cable" in missing(fit)["openarm_right_joint4", "gain"]
+    assert not fitted(made).findings

@@ -1,0 +1,119 @@
+"""Creeps through the link of a small simulated arm: readings on disk, resuming, contacts, verification, records."""
+
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from armlink.arm_file import ArmFile, parse_arm
+from armlink.link.link import Link
+from calib.creep.choice import is_creep, sweep_motion
+from calib.creep.fit import fit_creep
+from calib.creep.plan import plan_creep
+from calib.creep.record import calibration_record, gravity_record
+from calib.creep.run import contacts, run_creep
+from calib.creep.verify import verify_creeping
+from calib.sweep.dataset import load_data
+from sim_bus.bus.lock_step import LockStepBus
+from sim_bus.simulated_arm import SimulatedArm
+from sim_bus.truth import Truth
+
+
+@cache
+def arm(motion: str | None = None) -> ArmFile:
+    """Two Damiao drives, both axes horizontal."""
+    names, half = ("upper", "fore"), np.pi / 2
+    joints = [
+        {"name": names[0], "a": 0.25, "alpha": 0.0, "lower": -1.4, "upper": 1.4},
+        {"name": names[1], "a": 0.2, "alpha": half, "lower": -1.6, "upper": 1.6},
+    ]
+    keys = {"family": "damiao", "model": "DM4340", "kp": 50, "kd": 5}
+    drives = [
+        {"name": name, "drive": {**keys, "id": i + 1, "reply": i + 17}, "rated_torque": 9.0, "max_torque": 22.0}
+        for i, name in enumerate(names)
+    ]
+    creep = {"span": 1.0, "speeds": [0.3, 0.2], "bin": 0.12}
+    content = {
+        "name": "two",
+        "kinematics": {"gravity": [9.80665, 0.0, 0.0], "joints": joints},
+        "link": {"rate": 50, "joints": drives},
+        "sweep": {"creep": creep, **({} if motion is None else {"motion": motion})},
+        "sim": {
+            "links": [
+                {"mass": 1.0, "com": [0.12, 0.01, 0.0], "inertia": [0.004] * 3},
+                {"mass": 0.6, "com": [0.1, -0.02, 0.0], "inertia": [0.002] * 3},
+            ],
+            "quasi_direct": {},
+            "step": 0.004,
+        },
+    }
+    return parse_arm(content, Path("two.yaml"))
+
+
+def opened(simulated: SimulatedArm) -> Link:
+    return Link(arm(), LockStepBus(arm=simulated))
+
+
+def test_the_drives_choose_the_motion_and_the_arm_file_overrides_it() -> None:
+    assert sweep_motion(arm()) == "creep"
+    assert sweep_motion(arm("steps")) == "steps"
+
+
+def test_passes_through_the_link_find_constants_that_verification_confirms(tmp_path: Path) -> None:
+    simulated = SimulatedArm(arm(), Truth.draw(arm(), 3), 3)
+    plan, passes = plan_creep(arm()), []
+    with opened(simulated) as link:
+        link.start()
+        link.enable()
+        for name, mass in (("empty", 0.0), ("loaded", plan.reference_mass), ("again", 0.0)):
+            simulated.attach_mass(mass, simulated.truth.attachment)
+            passes.append(run_creep(link, arm(), tmp_path / name, reference_mass=mass, plan=plan))
+        fit = fit_creep(arm(), passes)
+        record = calibration_record(fit, arm())
+        check = verify_creeping(link, arm(), gravity_record(fit, arm(), record), record, poses=3)
+        link.disable()
+    assert all(is_creep(data) and not contacts(data) for data in passes)
+    np.testing.assert_allclose(fit.value("gain") / simulated.true_sensors.gain, 1.0, atol=0.015)
+    assert not fit.findings
+    assert check.passed
+    line = json.loads((tmp_path / "empty" / "readings.jsonl").read_text().splitlines()[1])
+    assert line["speed"] == pytest.approx(0.3, abs=0.02)
+    assert len(line["temperature"]) == 2
+
+
+def test_a_pass_goes_on_after_what_is_on_disk(tmp_path: Path) -> None:
+    simulated = SimulatedArm(arm(), Truth.draw(arm(), 4), 4)
+    plan = plan_creep(arm())
+    half = plan.model_copy(update={"sweeps": plan.sweeps[:1]})
+    with opened(simulated) as link:
+        link.start()
+        link.enable()
+        run_creep(link, arm(), tmp_path / "pass", plan=half)
+        before = load_data(tmp_path / "pass").readings
+        made = run_creep(link, arm(), tmp_path / "pass", plan=half, resume=True)
+        link.disable()
+    assert len(made.readings) == len(before)
+
+
+def test_a_joint_that_meets_something_is_led_back_and_the_sweep_is_noted(tmp_path: Path) -> None:
+    """A stop that the arm file does not know of stands in the way of one creep."""
+    simulated = SimulatedArm(arm(), Truth.of(arm()), 5)
+    plan = plan_creep(arm())
+    sweep = next(each for each in plan.sweeps if each.joint == 1)
+    joint = simulated.plant.model.joint("fore").id
+    simulated.turn_by_hand("fore", sweep.steps[0])
+    clear = {"rest": (plan.sweeps[-1].rest[0], sweep.steps[0])}
+    others = [each.model_copy(update=clear) for each in plan.sweeps if each.joint == 0]
+    others = [*others, others[0].model_copy(update={"name": "once more"})]
+    with opened(simulated) as link:
+        link.start()
+        link.enable()
+        simulated.plant.model.jnt_range[joint][1] = sweep.steps[len(sweep.steps) // 2]
+        mixed = plan.model_copy(update={"sweeps": (*others, sweep)})
+        data = run_creep(link, arm(), tmp_path / "pass", plan=mixed)
+        link.disable()
+    assert [each.reading for each in contacts(data)] == [sweep.name]
+    assert "fore" in contacts(data)[0].reason
+    assert {each.joint for each in data.readings} == {0}
