@@ -1,7 +1,7 @@
 """Simulation of position-controlled joints: all windows, joints and hypotheses at once.
 
-One step is implicit in position gain, damping and friction, so that it is stable for any gains, and a joint sticks
-where friction exceeds what drives it.
+One step is implicit in damping and friction, and in the position gain where that is too high for the step, so that it is
+stable for any gains, and a joint sticks where friction exceeds what drives it.
 """
 
 from collections.abc import Mapping
@@ -11,6 +11,9 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.closed_loop.windows import Windows
 
+EXPLICIT = 0.5
+"""Square of frequency times step up to which the position gain is taken at the step's start, without the damping that an
+implicit step adds."""
 CELLS = 6_000
 """Most joints times windows times hypotheses that are simulated together, for the cache's sake."""
 Values = Mapping[str, Array]
@@ -69,6 +72,7 @@ def _run(data: Windows, values: Values, count: int) -> Array:
     target = np.broadcast_to(data.command[0], shape).copy()
     out = np.empty((count, len(data.measured), data.joints, data.count))
     kept, stiff, damped = 0, dt * dt * kp * gain, dt * kd * gain
+    stiff = stiff * np.clip(stiff / (data.inertia.mean(0) + armature) - EXPLICIT, 0.0, 1.0)
     for k in range(steps):
         if k >= data.warm and (k - data.warm) % data.stride == 0:
             out[:, kept] = q
