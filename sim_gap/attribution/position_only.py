@@ -8,7 +8,6 @@ import numpy as np
 from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, Rollout, Signs, Verdict
 from sim_gap.checks.finding import Finding
-from sim_gap.closed_loop.columns import shared_effects
 from sim_gap.closed_loop.identify import Identified, columns_of_effect, identify
 from sim_gap.closed_loop.judge import LEAST_SHRINK, Stage, interval, undecided_scale
 from sim_gap.closed_loop.parameters import EFFECTS
@@ -191,7 +190,7 @@ def _notes(found: Identified) -> list[str]:
     names = found.sim.arm.names
     kind = "position actuators as in the model" if found.nominal_has_controller else found.controller
     out = [f"no torque channel: controller ({kind}) and effects follow from q_cmd and q; the gap is in rad"]
-    if loose := undecided_scale(found.search, found.fit):
+    if loose := undecided_scale(found.fit, found.spread):
         listed = ", ".join(names[j] for j in loose)
         out.append(
             f"{listed}: position alone shows ratios of gain, friction and inertia here, their common scale rests on "
@@ -204,8 +203,3 @@ def _notes(found: Identified) -> list[str]:
     if found.export is not None and found.export.lines:
         out.append(f"the corrected model leaves out: {', '.join(found.export.lines)}")
     return out
-
-
-def all_effects(sim: SimModel) -> tuple[str, ...]:
-    """Ids that a position-only diagnosis may name."""
-    return (*EFFECTS, *{effect.partition("@")[0] for effect in shared_effects(sim.arm)})

@@ -20,7 +20,7 @@ Progress = Callable[[str], None]
 
 def select(search: Search, fit: Fit, progress: Progress = lambda text: None) -> Fit:
     """Add effects while they pay, joint by joint and for the whole arm, then take out what is not needed."""
-    own = [e for e in EFFECTS if e not in search.excluded and e != "transmission.ripple"]
+    own = [e for e in EFFECTS if e not in search.excluded]
     fit = improve(search.data, fit, search.scales)
     whole = {e: names for e, names in shared_effects(search.data.arm).items() if e.split("@")[0] not in search.excluded}
     open_joints = set(range(search.data.joints))

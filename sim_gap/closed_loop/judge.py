@@ -17,6 +17,8 @@ SYSTEMATIC = 0.02
 """Relative standard deviation of every parameter that no recording shows: sampling, command timing, the model's own."""
 LEAST_SHRINK = 0.05
 """Least relative fall of a joint's held-out RMS by a cause; less is a minor one."""
+LOOSE = 0.35
+"""Relative standard deviation of a gain from which its scale is not decided."""
 Group = tuple[str, tuple[int, ...]]
 """An effect with the joints that have it; no joints for one of the whole arm."""
 
@@ -131,7 +133,7 @@ def rivals_of(search: Search, fit: Fit, group: Group) -> tuple[float, tuple[str,
     loss = float((search.score(bare) - base).sum())
     if effect == "controller.stiffness":
         return loss, _scale_rivals(search, fit)
-    others = [e for e in EFFECTS if e != effect and e not in search.excluded and e != "transmission.ripple"]
+    others = [e for e in EFFECTS if e != effect and e not in search.excluded]
     j = max(joints, key=lambda i: float((search.score(bare) - base)[i]), default=-1)
     close: list[str] = list(_ALWAYS.get(effect, ()))
     least = loss
@@ -153,7 +155,6 @@ def rivals_of(search: Search, fit: Fit, group: Group) -> tuple[float, tuple[str,
 
 _ALWAYS = {
     "controller.dead_zone": ("transmission.backlash",),
-    "actuator.delay": ("controller.delay",),
 }
 """Effects that positions alone never separate."""
 
@@ -170,16 +171,10 @@ def _scale_rivals(search: Search, fit: Fit) -> tuple[str, ...]:
     return ("actuator.rotor_inertia",) if bool((lost < PRICE).any()) else ()
 
 
-def undecided_scale(search: Search, fit: Fit) -> list[int]:
+def undecided_scale(fit: Fit, spread: "Covariance") -> list[int]:
     """Joints of which only ratios of gain, friction and inertia can be told."""
-    found = []
-    for j in range(search.data.joints):
-        if "kp" in fit.active[j]:
-            spread = covariance(search, fit)
-            at = spread.names.index((j, "kp"))
-            if float(spread.matrix[at, at]) > 0.35**2:
-                found.append(j)
-    return found
+    places = {j: spread.names.index((j, "kp")) for j, own in enumerate(fit.active) if "kp" in own}
+    return [j for j, at in places.items() if float(spread.matrix[at, at]) > LOOSE**2]
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,8 +45,6 @@ PARAMETERS = {
         Parameter("offset", "N·m", 0.0, 0.1, -np.inf, np.inf, "torque"),
         Parameter("zero", "rad", 0.0, 0.02, -0.5, 0.5),
         Parameter("gain", "1", 1.0, 0.05, 0.2, 3.0),
-        Parameter("sine", "N·m", 0.0, 0.1, -np.inf, np.inf, "torque"),
-        Parameter("cosine", "N·m", 0.0, 0.1, -np.inf, np.inf, "torque"),
     )
 }
 
@@ -86,7 +84,6 @@ EFFECTS = {
         LoopEffect("friction.asymmetric", ("asymmetry",), ("ratio",), ("friction.coulomb",)),
         LoopEffect("transmission.spring", ("spring", "offset"), ("stiffness", "torque")),
         LoopEffect("position.offset", ("zero",), ("angle",)),
-        LoopEffect("transmission.ripple", ("sine", "cosine"), ("sine", "cosine")),
     )
 }
 

@@ -69,7 +69,7 @@ def _distance(search: Search, fit: Fit, name: str, joint: int) -> float:
     """Distance of a parameter from the nominal one, in its own coordinate."""
     value, nominal = float(fit.point[name][joint]), float(search.nominal[name][joint])
     if name in LOGARITHMIC:
-        return float(np.log(value / nominal)) if nominal > 0.0 < value else float("inf")
+        return float(np.log(value / nominal)) if np.isfinite(nominal) and min(nominal, value) > 0.0 else float("inf")
     return (value - nominal) / float(search.scales.of(name)[joint])
 
 

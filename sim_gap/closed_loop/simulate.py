@@ -1,7 +1,7 @@
 """Simulation of position-controlled joints: all windows, joints and hypotheses at once.
 
-One step is implicit in damping and friction, and in the position gain where that is too high for the step, so that it is
-stable for any gains, and a joint sticks where friction exceeds what drives it.
+One step is implicit in damping and friction, and in the position gain where that is too high for the step, so that it
+is stable for any gains, and a joint sticks where friction exceeds what drives it.
 """
 
 from collections.abc import Mapping
@@ -12,8 +12,8 @@ from gcomp.arrays import Array
 from sim_gap.closed_loop.windows import Windows
 
 EXPLICIT = 0.5
-"""Square of frequency times step up to which the position gain is taken at the step's start, without the damping that an
-implicit step adds."""
+"""Square of frequency times step up to which the position gain is taken at the step's start, without the damping that
+an implicit step adds."""
 CELLS = 6_000
 """Most joints times windows times hypotheses that are simulated together, for the cache's sake."""
 Values = Mapping[str, Array]
@@ -62,13 +62,7 @@ def _run(data: Windows, values: Values, count: int) -> Array:
     v = np.broadcast_to(data.start[1], shape).copy()
     total = np.zeros(shape)
     if "ki" in active:
-        begun = np.where(of("feed") > 0.5, data.first_torque[1], data.first_torque[0])
-        total = np.broadcast_to(
-            data.error_sum
-            - of("delay") * data.travel
-            + (begun / gain - kp * data.first_error) / np.maximum(ki, 1e-9) * (ki > 0),
-            shape,
-        ).copy()
+        total += _integral(data, of("feed"), of("delay"), kp, ki, gain)
     target = np.broadcast_to(data.command[0], shape).copy()
     out = np.empty((count, len(data.measured), data.joints, data.count))
     kept, stiff, damped = 0, dt * dt * kp * gain, dt * kd * gain
@@ -100,8 +94,6 @@ def _run(data: Windows, values: Values, count: int) -> Array:
             torque = torque + ki * total
         if "feed" in active:
             torque = torque + of("feed") * feed
-        if "feed_gravity" in active:
-            torque = torque + of("feed_gravity") * data.feed_gravity[k]
         free = on
         if clipped:
             wish = torque - kd * v
@@ -120,9 +112,6 @@ def _run(data: Windows, values: Values, count: int) -> Array:
             torque -= of("spring") * q
         if "offset" in active:
             torque -= of("offset")
-        if "sine" in active or "cosine" in active:
-            turn = of("cycles") * q
-            torque -= of("sine") * np.sin(turn) + of("cosine") * np.cos(turn)
         for name in linear:
             torque -= of(name) * data.columns[name][k]
         effective = mass + dt * viscous + free * (damped + stiff)
@@ -138,3 +127,10 @@ def _run(data: Windows, values: Values, count: int) -> Array:
         v -= np.clip(v, -hold, hold)
         q += dt * v
     return out
+
+
+def _integral(data: Windows, feed: Array, delay: Array, kp: Array, ki: Array, gain: Array) -> Array:
+    """Integral of the error at the start of each window: what holds the arm at first, and the error since then."""
+    begun = np.where(feed > 0.5, data.first_torque[1], data.first_torque[0])
+    held = (begun / gain - kp * data.first_error) / np.maximum(ki, 1e-9) * (ki > 0.0)
+    return np.asarray(data.error_sum - delay * data.travel + held)

@@ -74,7 +74,6 @@ def track_of(arm: RigidArm, recording: Recording, label: str, dt: float) -> Trac
             "coupling": whole - gravity - inertia * a,
             "load": np.abs(low_pass(min(3.0, 0.4 / dt), 1.0 / dt)(whole)),
             "feed": along(arm.torque, path, speed, push) + arm.armature * push,
-            "feed_gravity": along(arm.torque, path, still, still),
             "q": q,
             "v": v,
             "a": a,

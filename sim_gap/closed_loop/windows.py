@@ -54,8 +54,6 @@ class Windows:
     """Amount of the links' torque on the gear [N·m]."""
     feed: Array
     """Torque of the nominal links and rotors along the command [N·m]."""
-    feed_gravity: Array
-    """Its gravity alone [N·m]."""
     measured: Array
     """Measured position, (To, J, W) [rad]."""
     weight: Array
