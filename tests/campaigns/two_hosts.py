@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from armlink.arm_file import load_arm
+from armlink.errors import Stall
 from armlink.link.link import Link
 from armlink.link.park import straight
 from armlink.link.types import Command
@@ -51,8 +52,11 @@ def host(arm_name: str, bus: str, seconds: float) -> None:
         end, side = time.monotonic() + seconds, 1.0
         while time.monotonic() < end:
             goal = start + side * SWAY * np.where(start > 0, -1.0, 1.0)
-            for target in straight(link.position_sent, goal, np.full(link.n, SPEED), link.period):
-                link.cycle(Command.hold(target))
+            try:
+                for target in straight(link.position_sent, goal, np.full(link.n, SPEED), link.period):
+                    link.cycle(Command.hold(target))
+            except Stall:  # a busy machine
+                link.recover()
             side = 0.0 if side else 1.0
 
 
