@@ -162,6 +162,10 @@ def _show(arm: str, arm_file: "ArmFile", found: "Preflight", data: "SweepData", 
     print_preflight(found)
     print_plan(arm_file, data.plan)
     print_lines([*unsettled_said(data), *stalls_said(data)], "yellow")
+    if data.manifest.reference_mass and data.plan.sweeps[0].speed is not None:
+        again = data.path.with_name(f"{data.path.name}-again")
+        screen.say(f"{data.path} is complete. Now take the mass off and sweep once more without it:")
+        screen.say(shlex.join(["armlink", "sweep", arm, "--out", str(again)]))
     if not data.manifest.reference_mass:
         mass = data.plan.reference_mass
         loaded = data.path.with_name(f"{data.path.name}-loaded")

@@ -76,7 +76,7 @@ def _answer(folder: Path, case: Json, withheld: str) -> Json:
         train, heldout = ([load_recording(folder / name) for name in case.get(key, ())] for key in ("train", "heldout"))
         if "share" in case:
             train, heldout = _parts(train, case["share"])
-        names: list[str] = [*case["train"], *case.get("heldout", case["train"])]
+        names = [*case["train"], *(case["heldout"] if "heldout" in case else case["train"])]
         labels = [Path(name).name.split(".")[0] for name in names]
         made = diagnose(folder / case["sim"], train, heldout, labels=labels, withhold=[withheld] if withheld else [])
     except ArmlinkError as error:

@@ -155,7 +155,7 @@ def _positive_fit(columns: Array, y: Array, signs: Sequence[tuple[float, ...]]) 
     By the triangular factor of columns and y, which has the same least squares as they have. A sensor on the link feels
     no gear, and a joint at rest no friction: then the sign of those columns says nothing, and they have both.
     """
-    small: Array = np.linalg.qr(np.column_stack([columns, y]), mode="r")  # type: ignore[assignment]
+    small: Array = np.asarray(np.linalg.qr(np.column_stack([columns, y]), mode="r"))
     chosen = np.column_stack([sign * small[:, k] for k, both in enumerate(signs) for sign in both])
     coefficients, rest = nnls(chosen, small[:, -1])
     return coefficients, 1.0 - rest**2 / float(y @ y)
@@ -163,7 +163,8 @@ def _positive_fit(columns: Array, y: Array, signs: Sequence[tuple[float, ...]]) 
 
 def few_rows(motion: Motion) -> Motion:
     """The motion with few rows, for a first look."""
-    return Motion(motion.q[::FEW], motion.v[::FEW], motion.a[::FEW], motion.reading[::FEW], motion.channel)
+    q, v, a, reading = (x[::FEW] for x in (motion.q, motion.v, motion.a, motion.reading))
+    return Motion(q, v, a, reading, motion.channel)
 
 
 def changed(motion: Motion, **values: Array) -> Motion:

@@ -24,6 +24,10 @@ class Term:
     def _hash(self) -> int:
         return hash((self.effect, self.place, self.shape))
 
+    def __reduce__(self) -> "tuple[type[Term], tuple[str, int, Shape]]":
+        """Without what is cached: effects have functions, and hashes of texts differ from process to process."""
+        return Term, (self.effect, self.place, self.shape)
+
     @cached_property
     def form(self) -> Effect:
         """The inverse form of its effect."""
