@@ -40,6 +40,7 @@ class RestingArm:
         plant, self.sensors = self.simulated.plant, self.simulated.sensors
         self.plant, self.state = plant, plant._imperfections
         self.sensors.noise = self.sensors.noise / np.sqrt(SAMPLES)
+        self.sensors.torque_step = self.sensors.torque_step / np.sqrt(SAMPLES)  # the noise of a sample spreads it
         self.sensors._next = NOISE_BLOCK  # what is drawn already has the noise of one sample
         self.angle, self.time = plant.position, 0.0
         self.cables = Cables(self.state, (plant.lower + plant.upper) / 2, self.angle)
