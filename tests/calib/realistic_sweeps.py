@@ -67,7 +67,8 @@ class RestingArm:
         sag = self.state.compliance * torque
         shown = self.sensors.position_counts(self.angle) * self.sensors.position_step
         reading = self.sensors.torque(torque, self.time)
-        level = np.maximum(self.state.coulomb + unevenness(self.state, self.angle, torque, self.time), 0.0)
+        added = unevenness(self.state, self.angle, np.zeros_like(torque), torque, self.time)
+        level = np.maximum(self.state.coulomb + added, 0.0)
         self.angle = self.angle - sag
         return shown, reading, torque + direction * level
 
