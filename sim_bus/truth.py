@@ -1,6 +1,6 @@
 """Hidden truth of a simulated arm: true sensor parameters, which a fit must find without seeing them."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -68,7 +68,7 @@ class Truth:
         n = len(rated)
         lateral = random.uniform(-ATTACHMENT_RANGE, ATTACHMENT_RANGE, 2)
         if drives is not None:
-            return replace(cls._of_drives(arm, drives, seed), attachment=stated.attachment + np.array([*lateral, 0.0]))
+            return cls._of_drives(arm, drives, seed)
         return cls(
             gain=random.uniform(*GAIN_RANGE, n),
             offset=random.uniform(-OFFSET_SHARE, OFFSET_SHARE, n) * rated,
@@ -79,11 +79,12 @@ class Truth:
 
     @classmethod
     def _of_drives(cls, arm: ArmFile, drives: QuasiDirect, seed: int) -> "Truth":
-        """The truth of quasi-direct drives, drawn; the reference mass at the flange."""
+        """The truth of quasi-direct drives, drawn; the reference mass is up to 0.15 m to the side of the flange."""
         rated = arm.require_link().rated_torques
         n = len(rated)
-        zeros = drives.zeros(n, seed)
-        return cls(drives.gains(n, seed), drives.offsets(rated, seed), np.ones(n), zeros, flange(arm))
+        lateral = np.random.default_rng([seed, 55]).uniform(-ATTACHMENT_RANGE, ATTACHMENT_RANGE, 2)
+        place = flange(arm) + np.array([*lateral, 0.0])
+        return cls(drives.gains(n, seed), drives.offsets(rated, seed), np.ones(n), drives.zeros(n, seed), place)
 
 
 def flange(arm: ArmFile) -> Array:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
+from armlink.torque_calibration import GAIN_RANGE
 from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
@@ -27,6 +28,8 @@ ROUNDS = 4
 """Times that the scatter of the readings is estimated anew."""
 SEEN = 0.3
 """A parameter is found if the data leave so much of what was doubted beforehand, as a share of it."""
+LOOSEST = 0.05
+"""Largest standard deviation of a gain that is of use, as a share of it."""
 QUANTILE = 1.96
 
 
@@ -77,7 +80,12 @@ class CreepFit:
         """Parameters of a family that the data determine; without a mass nothing tells the scale."""
         if family in ("gain", "beta") and not (self.rows.mass > 0).any():
             return np.zeros(len(self.value(family)), dtype=bool)
-        return np.asarray(self.std(family) < SEEN * self.prior_std[self.slices[family]], dtype=bool)
+        seen = self.std(family) < SEEN * self.prior_std[self.slices[family]]
+        if family == "gain":
+            low, high = GAIN_RANGE
+            value = self.value(family)
+            seen = seen & (self.std(family) < LOOSEST * np.abs(value)) & (low <= value) & (value <= high)
+        return np.asarray(seen, dtype=bool)
 
     def ci95(self, family: str) -> Array:
         """(…, 2) 95 % intervals."""

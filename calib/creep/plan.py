@@ -24,6 +24,8 @@ DRAWS = 40
 """Draws for each candidate before too much of the range counts as blocked."""
 MASS_SHARE = 0.3
 """Share of max_torque that the reference mass may take at the joint that it loads most."""
+BLIND_SHARE = 0.15
+"""The same where no model file tells what the arm itself weighs."""
 WORST_CONSTANT = 1.6
 """A drive may have to be asked for so many times the true torque."""
 HAND = 0.12
@@ -40,6 +42,8 @@ class CreepGround:
     beta: Array
     """Guess of the mass moments (2n,) [kg·m]."""
     geometry: Geometry | None
+    weighed: bool = True
+    """Whether `beta` is of a model file."""
 
     @classmethod
     def of(cls, arm_file: ArmFile) -> "CreepGround":
@@ -48,7 +52,7 @@ class CreepGround:
         require_range(section, limits, arm)
         if arm_file.model_path is None:
             share = 0.2 * limits.rated / float(np.linalg.norm(arm.gravity))
-            return cls(arm, section, limits, np.column_stack([share, 0 * share]).ravel(), None)
+            return cls(arm, section, limits, np.column_stack([share, 0 * share]).ravel(), None, weighed=False)
         geometry = Geometry(arm_file)
         return cls(arm, section, limits, model_arm(arm_file).beta, geometry if geometry.model.ngeom else None)
 
@@ -76,7 +80,8 @@ class CreepGround:
         at_origin, by_point = payload_columns(self.arm)
         each = gravity_regressor(self.arm, poses)
         per_kg = np.abs(each @ at_origin) + HAND * np.linalg.norm(each @ by_point, axis=-1)
-        most = MASS_SHARE * self.limits.max_torque / np.maximum(per_kg.max(axis=0), 1e-9)
+        share = MASS_SHARE if self.weighed else BLIND_SHARE
+        most = share * self.limits.max_torque / np.maximum(per_kg.max(axis=0), 1e-9)
         return float(f"{float(most.min()):.2g}")
 
     def bearable(self, one: Candidate, mass: float) -> bool:

@@ -16,8 +16,9 @@ from gcomp.identify.parameters import Parameters
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict
 
-TURNS = (0.1, 0.3)
-"""Half widths of a cable's play [rad]: a short and a long one, between which real ones lie."""
+TURNS = (0.1, 0.3, 0.8)
+"""Half widths of a cable's play in a joint's turn [rad]: short and long ones, between which real ones lie; the longest
+for a cable that this joint bends less than another."""
 TORQUE = 5e-4
 """Half width of a sensor's play, as a share of rated torque: accuracy class 0.05."""
 STEPS = 4
@@ -29,7 +30,7 @@ class Lags:
     """Place of each play at K readings, -1 to 1; all zeros where the way is not known."""
 
     cable: Array
-    """Of each of TURNS and joint (2, K, n)."""
+    """Of each of TURNS and joint (3, K, n)."""
     sensor: Array
     """Of each joint's torque sensor (K, n)."""
 

@@ -1,6 +1,7 @@
 """The cause test: which single effect explains a window's torque residual, if any (docs/theory.md, section 6)."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import combinations, pairwise, product
 
 import numpy as np
@@ -134,22 +135,31 @@ class CauseTest:
         return bool((np.sqrt((size**2).mean(axis=0)) <= 2 * self.belief.level.total).all())
 
     def _fit(self, *indices: int) -> _Fit:
-        """Generalised least squares of entries together; columns that are collinear at these poses never win."""
+        """Generalised least squares of entries together; columns that are collinear at these poses never win.
+
+        But for a payload: of an arm with parallel axes no lever may show its mass, or where it is along them. These
+        parameters come with variance 0.
+        """
         columns = np.hstack([self._columns[index] for index in indices])
         entries = [self.entries[index] for index in indices]
         count = columns.shape[1]
         nothing = _Fit(entries[0], np.inf, np.inf, np.full(count, np.nan), np.full((count, count), np.nan))
         size = np.linalg.norm(columns, axis=0)
-        if (size < 1e-9).any():
-            return nothing
+        shown = size > 1e-9
+        size[~shown] = 1.0
         u, s, vt = np.linalg.svd(columns / size, full_matrices=False)
-        if s[-1] < 1e-6 * s[0]:
+        kept = s > max(1e-6 * s[0], 1e-12)
+        if not kept.any() or not (kept.all() or [entry.cause for entry in entries] == ["payload"]):
             return nothing
-        back = (vt.T / s) / size[:, None]
-        explained = u.T @ self._white
+        back = (vt[kept].T / s[kept]) / size[:, None]
+        explained = u[:, kept].T @ self._white
         chi2 = self.chi2_none - float(explained @ explained)
         price = sum(entry.columns.shape[1] if entry.price is None else entry.price for entry in entries)
-        return _Fit(entries[0], chi2 + price * np.log(len(self._white)), chi2, back @ explained, back @ back.T)
+        price -= int((~kept).sum())
+        covariance = back @ back.T
+        hidden = (np.abs(vt[~kept]) > 1e-3).any(axis=0)
+        covariance[hidden] = covariance[:, hidden] = 0.0
+        return _Fit(entries[0], chi2 + price * np.log(len(self._white)), chi2, back @ explained, covariance)
 
     def _two_drifts(self) -> Verdict | None:
         """Two joints that drift at once, if that alone explains the window; else None.
@@ -174,8 +184,9 @@ class CauseTest:
         return Verdict("drift", first, confidence, fit.values, fit.covariance, evidence, beside=second)
 
     def _weighs(self, payload: _Fit) -> bool:
-        """Whether a payload's mass is possible: positive, or no more taken off than the model carries as a tool."""
-        return bool(payload.values[0] > min(0.0, -1.2 * self.belief.mass))
+        """Whether a payload's mass is possible: positive, or no more taken off than the model carries as a tool; or no
+        lever shows it."""
+        return bool(payload.values[0] > min(0.0, -1.2 * self.belief.mass)) or payload.covariance[0, 0] == 0
 
     def _all_zeros(self) -> Verdict | None:
         """The zeros of several sensors moved together, as temperature moves them, if that alone explains the window."""
@@ -198,6 +209,25 @@ class CauseTest:
         values[at] = fit.values[: len(at)]
         covariance[np.ix_(at, at)] = fit.covariance[: len(at), : len(at)]
         return values, covariance
+
+    def noticed(self, cause: str, joint: int) -> float:
+        """Size of a gain's or offset's change that wins in one case of two: over "none", and over every rival."""
+        index = self._index(cause, joint)
+        winner, own = self.entries[index], self._columns[index][:, 0]
+        size, once = float(own @ own), float(np.log(len(self._white)))
+        needed = self._config.evidence + once
+        for entry, basis in zip(self.entries, self._bases, strict=True):
+            if size > 0 and basis.size and not kin(entry, winner):
+                alike = float(((basis.T @ own) ** 2).sum()) / size
+                ahead = (entry.columns.shape[1] if entry.price is None else entry.price) - 1
+                needed = max(needed, (self._config.evidence - ahead * once) / max(1 - alike, 1e-9))
+        return float(np.sqrt(needed / max(size, 1e-30)))
+
+    @cached_property
+    def _bases(self) -> list[Array]:
+        """An orthonormal basis of each entry's columns."""
+        kept = [columns[:, np.linalg.norm(columns, axis=0) > 1e-9] for columns in self._columns]
+        return [np.linalg.qr(columns)[0] for columns in kept]
 
     def of_model(self, joint: int) -> float:
         """Share of the model's own error in the variance of a joint's residuals."""

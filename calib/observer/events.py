@@ -24,12 +24,16 @@ class Event:
 def verdict_evidence(verdict: Verdict, names: tuple[str, ...]) -> dict[str, Any]:
     """A verdict as the evidence of an event: cause, confidence, BIC of the other classes, parameters.
 
-    A payload has `mass` [kg] and `com`, its centre of mass in the last link's bar frame [m].
+    A payload has `mass` [kg] and `com`, its centre of mass in the last link's bar frame [m]; None if no lever shows it.
     """
     beside: dict[str, Any] = {} if verdict.beside is None else {"beside": names[verdict.beside]}
     if verdict.cause in ("payload", "tool"):  # parameters: mass and first moment
-        mass = float(verdict.values[0])
-        beside = {"mass": mass, "com": (verdict.values[1:] / mass).tolist()}
+        mass, (shown, *told) = float(verdict.values[0]), (np.diag(verdict.covariance) > 0).tolist()
+        known = [shown and each for each in told]
+        place = [
+            moment / mass if here else None for moment, here in zip(verdict.values[1:].tolist(), known, strict=True)
+        ]
+        beside = {"mass": mass if shown else None, "com": place}
     return {
         "cause": verdict.cause,
         **beside,

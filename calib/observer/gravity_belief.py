@@ -151,7 +151,8 @@ class GravityBelief:
         at_origin, by_point = payload_columns(self.arm)
         columns = np.column_stack([at_origin, by_point])
         self.beta = self.beta + columns @ values
-        self._tool = columns @ np.linalg.cholesky(covariance)
+        square, vectors = np.linalg.eigh(covariance)  # 0 for what no lever shows
+        self._tool = columns @ (vectors * np.sqrt(np.maximum(square, 0.0)))
         self.mass += float(values[0])
         self._reference.close()
         self._kernel = self._posterior = None

@@ -126,8 +126,9 @@ class Plant:
         self._cables = None
         if imperfections.cable.any():
             self._cables = Cables(imperfections, (self.lower + self.upper) / 2, self.position)
-        slow = imperfections.uneven, imperfections.leaning, imperfections.cogging, imperfections.compliance
-        self._changing = any(each.any() for each in slow) or self._cables is not None
+        self._has_uneven = bool(imperfections.uneven.any() or imperfections.leaning.any())
+        slow = imperfections.cogging, imperfections.compliance
+        self._changing = self._has_uneven or any(each.any() for each in slow) or self._cables is not None
         self._steady_friction = imperfections.steady_friction
         self._motors = None if imperfections.prompt_motors else LateMotors(imperfections, self.motor_torque)
         self._plain = self._steady_friction and self._motors is None and self._gears is None
@@ -280,7 +281,7 @@ class Plant:
         if self._gears is None:
             self.data.qfrc_applied[self._dof] = self._pulled - self._lost
         self._sag = self._imperfections.compliance * torque
-        if self._imperfections.uneven.any() or self._imperfections.leaning.any():
+        if self._has_uneven:
             self._uneven = unevenness(self._imperfections, position, self.velocity, torque, self.data.time)
             self._set_friction()
 
@@ -288,7 +289,7 @@ class Plant:
         """Set dry friction for the present velocity and load, or the brake's."""
         state = self._imperfections
         level = state.coulomb
-        if not state.steady_friction:
+        if not self._steady_friction:
             velocity = self.velocity if self._gears is None else self._gears.turned(self._velocities)
             level = dry_friction(state, velocity, self.link_torque, self._motor_torques)
         self._seat("frictionloss", np.where(self._braked, self._brake_torque, np.maximum(level + self._uneven, 0.0)))

@@ -12,6 +12,8 @@ from sim_bus.truth import Truth
 TORQUE_RANGE = 2.0
 """The torque sensors saturate at this many rated torques."""
 NOISE_BLOCK = 512
+EXACT = 1e-13
+"""Error of a position reading that is as good as none [rad]."""
 
 
 class Sensors:
@@ -56,6 +58,8 @@ class Sensors:
         """Whether gains change as the drives warm up."""
         self._delayed = bool(state.torque_delay.any())
         self._eccentric = bool(state.eccentricity.any())
+        contraction = float(np.max(state.eccentricity[:, 0] / np.abs(self.position_gain)))
+        self._turns = 1 if contraction < 1e-15 else min(8, int(np.ceil(np.log(EXACT) / np.log(min(contraction, 0.5)))))
 
     def drift(self, joint: int, gain: float, offset: float) -> None:
         """Multiply the torque sensor's gain by `gain` and add `offset` [N·m] from now on."""
@@ -112,7 +116,7 @@ class Sensors:
         reading = (angle - self.position_offset) / self.position_gain
         if self._eccentric:
             amplitude, phase = self._imperfections.eccentricity.T
-            for _ in range(8):  # fixed-point iteration, contracts by amplitude / gain
+            for _ in range(self._turns):  # fixed-point iteration, contracts by amplitude / gain
                 bent = amplitude * np.sin(reading + phase)
                 reading = (angle - self.position_offset - bent) / self.position_gain
         return reading

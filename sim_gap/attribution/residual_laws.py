@@ -35,8 +35,8 @@ CLEARLY = 0.95
 velocity, position, load, temperature, time."""
 WARM_UPS = (6.0, 20.0, 60.0, 200.0)
 """Time constants of laws of time [s]."""
-COPIES = 2.0
-"""Standard deviations of the band about a law."""
+DEVIATIONS = 2.0
+"""Half the width of the band about a law, in standard deviations."""
 Mask = NDArray[np.bool_]
 
 
@@ -148,7 +148,7 @@ def _best(
     if before**2 - after**2 < LEAST * above or before - after < RELEVANT_NM:
         return None
     at = law.basis(law.at)
-    band = COPIES * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", at, covariance, at), 0.0))
+    band = DEVIATIONS * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", at, covariance, at), 0.0))
     return ResidualLaw(law.quantity, joint, row[0], law.directed, law.at, at @ c, band, before, after)
 
 

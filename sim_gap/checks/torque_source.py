@@ -1,5 +1,6 @@
 """Scale, sign of rectified readings and source of a torque channel, and its time against the positions'."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -23,6 +24,8 @@ OWN_LAG = 0.12
 """Delay up to which it is an effect of drive or sensor, which the diagnosis finds by itself [s]."""
 SURE, SCREENED = 0.7, 0.3
 """Fall of the cost from which a delay is certain; share of it that a delay must reach on few rows to be looked at."""
+REPEATS = 0.5
+"""Share of that fall by which any other minimum of the cost must be higher."""
 UNRELATED = 0.4
 """Correlation with the model's torque below which a reading that never changes its sign does not follow it."""
 
@@ -97,11 +100,19 @@ def find_delay(arm: RigidArm, motion: Motion, rate: float, stated: Corrections) 
             costs[rows / rate] = _delayed_cost(model, motion, int(rows))
     lag = min(costs, key=costs.__getitem__, default=0.0)
     fall = start - costs.get(lag, start)
-    if not OWN_LAG < abs(lag) < LAG - 2.0 * LAG_STEP or fall < SURE:
+    if not OWN_LAG < abs(lag) < LAG - 2.0 * LAG_STEP or fall < SURE or _repeats(costs, lag):
         return [], 0.0
     evidence = f"is {abs(lag):.2f} s {'late' if lag > 0 else 'early'} against the positions"
     option = f"--clock {motion.channel}={-lag:.3f}"
     return [Finding("clock", motion.channel, "all", evidence, option, True)], fall
+
+
+def _repeats(costs: Mapping[float, float], lag: float) -> bool:
+    """Whether the cost has another minimum nearly as low: in a motion that repeats, a delay by a period looks alike."""
+    order = sorted(costs)
+    values = [np.inf, *(costs[at] for at in order), np.inf]
+    minima = [at for k, at in enumerate(order, start=1) if values[k] <= min(values[k - 1], values[k + 1])]
+    return any(abs(at - lag) > OWN_LAG and costs[at] - costs[lag] < REPEATS * SURE for at in minima)
 
 
 def _delayed_cost(model: Array, motion: Motion, rows: int, step: int = 1) -> float:

@@ -40,6 +40,7 @@ class RestingArm:
         plant, self.sensors = self.simulated.plant, self.simulated.sensors
         self.plant, self.state = plant, plant._imperfections
         self.sensors.noise = self.sensors.noise / np.sqrt(SAMPLES)
+        self.sensors.torque_step = self.sensors.torque_step / np.sqrt(SAMPLES)  # the noise of a sample spreads it
         self.sensors._next = NOISE_BLOCK  # what is drawn already has the noise of one sample
         self.angle, self.time = plant.position, 0.0
         self.cables = Cables(self.state, (plant.lower + plant.upper) / 2, self.angle)
@@ -66,7 +67,8 @@ class RestingArm:
         sag = self.state.compliance * torque
         shown = self.sensors.position_counts(self.angle) * self.sensors.position_step
         reading = self.sensors.torque(torque, self.time)
-        level = np.maximum(self.state.coulomb + unevenness(self.state, self.angle, torque, self.time), 0.0)
+        added = unevenness(self.state, self.angle, np.zeros_like(torque), torque, self.time)
+        level = np.maximum(self.state.coulomb + added, 0.0)
         self.angle = self.angle - sag
         return shown, reading, torque + direction * level
 

@@ -71,6 +71,9 @@ def tell(verdicts: list[CreepVerdict], failed: list[int]) -> int:
     gains = gains[np.isfinite(gains)]
     inside = [hit for each in verdicts for hit in each.gain_inside]
     others = [hit for each in verdicts for hit in each.other_inside]
+    if not gains.size:
+        print(f"{len(verdicts)} arms, no gain given; out of bounds: {failed or 'none'}")
+        return int(bool(failed))
     median, share = float(np.median(gains)), (sum(inside) + sum(others)) / max(len(inside) + len(others), 1)
     print(
         f"{len(verdicts)} arms, {len(gains)} gains: worst {gains.max():.2%}, median {median:.2%}; intervals hold:"

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.observer.cause_test import CauseTest
 from calib.observer.config import ObserverConfig
-from calib.observer.gravity_belief import Expected
 from gcomp.arrays import Array
 
 UNSEEN = 1.0
@@ -24,21 +24,14 @@ class Limits:
     """Rests at other poses after which they are noticed."""
 
 
-def limits(expected: Expected, torque: Array, sigma: Array, config: ObserverConfig, wait: int) -> Limits:
-    """Limits in work at K poses; torque (K, n) [N·m] of the model there, sigma (n,) [N·m] the noise of a row.
+def limits(test: CauseTest, config: ObserverConfig, wait: int) -> Limits:
+    """Limits in work at poses like those of a test.
 
     A change is noticed if it stands out of a window of the longest kind, by the rule of the cause test, and rows after
     it confirm it. `wait` is the number of rests until the first test.
     """
-    count, n = torque.shape
-    threshold = np.sqrt(config.evidence + np.log(config.longest_window * n))
-    gain, offset = np.empty(n), np.empty(n)
-    for j in range(n):
-        covariance = expected.of_joint(j) + sigma[j] ** 2 * np.eye(count)
-        columns = np.column_stack([torque[:, j], np.ones(count)])
-        information = (
-            np.einsum("ka,ka->a", columns, np.linalg.solve(covariance, columns)) * config.longest_window / count
-        )
-        gain[j], offset[j] = threshold / np.sqrt(np.maximum(information, 1e-30))
-    gain[gain > UNSEEN] = np.nan
+    count, n = test.window.position.shape
+    longer = np.sqrt(config.longest_window / count)
+    gain, offset = (np.array([test.noticed(cause, j) for j in range(n)]) / longer for cause in ("gain", "offset"))
+    gain[~(gain <= UNSEEN)] = np.nan
     return Limits(gain, offset, wait + config.longest_window + 2 * config.window)

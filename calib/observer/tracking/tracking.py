@@ -17,6 +17,7 @@ from calib.observer.tracking.limits import Limits, limits
 from calib.observer.tracking.pose_memory import PoseMemory
 from calib.observer.tracking.sensor_filter import SensorFilter
 from gcomp.arrays import Array, as_array
+from gcomp.identify.readings import StaticReadings
 
 Alarm = tuple[str, int, dict[str, Any]]
 """Kind (alarm, suspicion or outliers), joint, evidence."""
@@ -155,15 +156,13 @@ class Tracking:
 
     def limits(self, rows: list[StaticReading]) -> Limits:
         """Limits in work like these rows; over the whole range while they are few."""
-        config, arm = self._config, self.belief.arm
-        wait = 0 if self.belief.level.is_known else max(0, config.window - self.rows)
+        config, belief = self._config, self.belief
+        wait = 0 if belief.level.is_known else max(0, config.window - self.rows)
         if len(rows) >= config.window:
-            position, _, side, temperature = _arrays(rows)
-        else:
-            position, side = self.belief.kernel.poses[: config.longest_window], np.zeros((config.longest_window, arm.n))
-            temperature = np.full(side.shape, np.nan)
-        expected = self.belief.expected(position, side, temperature)
-        return limits(expected, self.belief.torque(position), self.sigma, config, wait)
+            return limits(self.cause_test(rows), config, wait)
+        position = belief.kernel.poses[: config.longest_window]
+        anywhere = StaticReadings.of(position, belief.torque(position), self.sigma)
+        return limits(CauseTest(belief, anywhere, config), config, wait)
 
     def save(self) -> dict[str, Any]:
         """All parts as JSON values."""

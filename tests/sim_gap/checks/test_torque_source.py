@@ -1,0 +1,38 @@
+"""A torque channel's clock against the positions': found if it is one delay, not if several would do."""
+
+import mujoco
+import numpy as np
+import pytest
+from wrong_arms import THREE, motion
+
+from armlink.recording.corrections import AS_IT_IS
+from sim_gap.checks.rigid_fit import Motion
+from sim_gap.checks.torque_source import find_delay
+from sim_gap.model.load import load_model
+
+RATE, LATE = 25.0, 0.4
+PERIOD = 1.0
+
+
+def late(t: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray):
+    """Arm and motion, its torque read `LATE` seconds late."""
+    arm = load_model(mujoco.MjModel.from_xml_string(THREE)).arm
+    torque = arm.torque(q, v, a)
+    shifted = np.stack([np.interp(t - LATE, t, column) for column in torque.T], axis=1)
+    random = np.random.default_rng(1)
+    return arm, Motion(q, v, a, shifted + 0.01 * random.normal(size=q.shape), "tau")
+
+
+def test_a_late_channel_is_found():
+    arm, read = late(*motion(3, 60.0, RATE, seed=3))
+    (finding,), _ = find_delay(arm, read, RATE, AS_IT_IS)
+    assert float(finding.option.split("=")[1]) == pytest.approx(-LATE, abs=0.02)
+
+
+def test_a_motion_that_repeats_does_not_tell_by_how_many_periods():
+    t = np.arange(0.0, 12.0, 1.0 / RATE)
+    w, phase = 2.0 * np.pi / PERIOD, np.array([0.3, 1.5, 2.9])
+    q = 0.5 * np.sin(w * t[:, None] + phase)
+    v, a = 0.5 * w * np.cos(w * t[:, None] + phase), -w * w * q
+    findings, _ = find_delay(*late(t, q, v, a), RATE, AS_IT_IS)
+    assert not findings
