@@ -85,7 +85,22 @@ def _left(found: Identified) -> float:
 
 def _matters(found: Identified, stage: Stage) -> bool:
     fall = stage.before - stage.after
-    return bool(np.any((fall > LEAST_SHRINK * stage.before) & (fall > found.search.floor)))
+    falls = np.any((fall > LEAST_SHRINK * stage.before) & (fall > found.search.floor))
+    return bool(falls) and _differs(found, stage)
+
+
+def _differs(found: Identified, stage: Stage) -> bool:
+    """Whether some parameter's interval leaves out the nominal value."""
+    effect, joints = stage.group
+    if not joints:
+        places = [(-1, name) for name in columns_of_effect(found, effect)]
+    else:
+        places = [(j, name) for j in joints for name in EFFECTS[effect].parameters]
+    for j, name in places:
+        _, low, high, _ = interval(found.search, found.fit, found.spread, j, name)
+        if not low <= (float(found.search.nominal[name][j]) if j >= 0 else 0.0) <= high:
+            return True
+    return False
 
 
 def _verdict(found: Identified, causes: Sequence[Cause], share: float) -> Verdict:
