@@ -19,7 +19,7 @@ from armlink.link.types import Command, Sample, Setpoints, Tell
 from armlink.selftest.scales import Evidence, ScaleFinding, Track, gather, judge
 
 REACH = 0.35
-"""This host moves every joint so far to both sides [rad]."""
+"""Distance by which this host moves every joint to both sides [rad]."""
 SPEED = 0.6
 """At most [rad/s]."""
 CLEARANCE = 0.05

@@ -5,7 +5,7 @@ is), each piece of evidence is a ratio that sound scales make 1:
 
 - velocity integrated over time, against the change of position: s_position / s_velocity;
 - the way between the stops, against that of the arm file: 1 / s_position;
-- torque against the law kp (q* − q) + kd (v* − v) + τ of a drive that was told gains: s_position / s_torque for its
+- torque against the law kp (q* − q) + kd (v* − v) + τ of a drive that was given gains: s_position / s_torque for its
   stiffness, s_velocity / s_torque for its damping;
 - torque against current times torque constant: 1 / s_torque.
 
@@ -37,7 +37,7 @@ LONGEST_GAP = 0.05
 LEAST_TURN = 0.01
 """A window in which the joint turned less tells nothing [rad]."""
 LEAST_WAY = 0.3
-"""All windows together must cover so much [rad]."""
+"""All windows together must cover this much [rad]."""
 UNSTEADY = 0.25
 """Relative scatter of the windows' ratios from which a velocity is no velocity."""
 LEAST_ROWS = 200
@@ -50,7 +50,7 @@ PAST_STOP = 1.03
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Readings of one joint and what it was told at the time, all (K,), NaN where there was none."""
+    """Readings of one joint and what was commanded at the time, all (K,), NaN where there was none."""
 
     t: Array
     """[s]."""
@@ -61,11 +61,11 @@ class Track:
     torque: Array
     """Motor torque as the drive reports it [N·m], no calibration applied."""
     target: Array
-    """Position that it was told [rad]."""
+    """Commanded position [rad]."""
     rate: Array
-    """Velocity that it was told [rad/s]."""
+    """Commanded velocity [rad/s]."""
     ahead: Array
-    """Torque that it was told [N·m]."""
+    """Commanded torque [N·m]."""
     kp: Array
     """[N·m/rad]."""
     kd: Array
@@ -214,7 +214,7 @@ def law(track: Track) -> list[Evidence]:
         ("damping", damping, {"velocity": 1, "torque": -1}),
     ):
         if each.known:
-            text = f"torque follows {each.value:.3g} of the {name} that it was told"
+            text = f"torque follows {each.value:.3g} of the commanded {name}"
             found.append(Evidence(text, each.value, max(FLOOR, 2 * each.sigma / each.value), exponents))
     return found
 

@@ -25,7 +25,7 @@ from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
 
 ROUNDS = 4
-"""Times that the scatter of the readings is estimated anew."""
+"""Times that the scatter of the readings is estimated again."""
 SEEN = 0.3
 """A parameter is found if the data leave so much of what was doubted beforehand, as a share of it."""
 LOOSEST = 0.05

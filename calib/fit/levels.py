@@ -80,8 +80,8 @@ def learn(effects: Effects, start: Array) -> Levels:
         before, theta = theta, np.clip(theta + step, np.log(LEAST), np.log(LARGEST))
         if np.abs(theta - before).max() < SETTLED:
             break
-    covariance = np.asarray(2 * np.linalg.inv(hessian)[:count, :count], dtype=np.float64)
-    return Levels(np.exp(theta[:count]), told, covariance)
+    covariance: Array = np.asarray(2 * np.linalg.inv(hessian), dtype=np.float64)
+    return Levels(np.exp(theta[:count]), told, covariance[:count, :count])
 
 
 def _scored(effects: Effects, theta: Array) -> tuple[Array, Array, Array]:

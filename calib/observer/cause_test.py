@@ -149,7 +149,10 @@ class CauseTest:
         size[~shown] = 1.0
         u, s, vt = np.linalg.svd(columns / size, full_matrices=False)
         kept = s > max(1e-6 * s[0], 1e-12)
-        if not kept.any() or not (kept.all() or [entry.cause for entry in entries] == ["payload"]):
+        hidden_by_arm = [entry.cause for entry in entries] == [
+            "payload"
+        ] and kept.sum() == self.belief.kernel.payload_rank
+        if not kept.any() or not (kept.all() or hidden_by_arm):
             return nothing
         back = (vt[kept].T / s[kept]) / size[:, None]
         explained = u[:, kept].T @ self._white

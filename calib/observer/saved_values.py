@@ -4,7 +4,6 @@ Every part has `save() -> dict` and `restore(values) -> bool`; `restore` returns
 do not fit. Times are not saved, because clocks restart with the machine.
 """
 
-import math
 from typing import Any
 
 import numpy as np
@@ -17,24 +16,31 @@ UNREADABLE = (LookupError, TypeError, ValueError, OverflowError)
 
 
 def save_rows(rows: list[StaticReading]) -> list[list[Any]]:
-    """Rows as JSON values: time, position, torque, side of approach, and temperature, null where it is not known."""
+    """Rows as JSON values: time, position, torque, side of approach, and temperature if a drive tells it."""
     return [
-        [row.t, row.position.tolist(), row.torque.tolist(), row.direction.tolist(), known(row.temperature)]
+        [row.t, row.position.tolist(), row.torque.tolist(), row.direction.tolist(), *_told(row.temperature)]
         for row in rows
     ]
 
 
+def _told(temperature: Array) -> list[Any]:
+    return [known(temperature)] if np.isfinite(temperature).any() else []
+
+
 def read_rows(values: Any, n: int) -> list[StaticReading]:
-    """The rows of n joints that `save_rows` wrote, older ones without temperature; raises one of UNREADABLE."""
+    """The rows of n joints that `save_rows` wrote; raises one of UNREADABLE."""
     return [_row(n, *row) for row in values]
 
 
 def _row(n: int, t: Any, position: Any, torque: Any, direction: Any, temperature: Any = None) -> StaticReading:
     position, torque, direction = (as_array("row", column, (n,)) for column in (position, torque, direction))
-    told = as_array("row", [math.nan] * n if temperature is None else temperature, (n,), finite=False)
+    untold = np.full(n, np.nan)
+    told = as_array("row", untold if temperature is None else temperature, (n,), finite=False)
     return StaticReading.of(float(t), position, torque, direction, temperature=told)
 
 
 def known(values: Array) -> Any:
     """An array as JSON values, null for NaN; `as_array` reads it back."""
-    return np.where(np.isnan(values), np.array(None), values.astype(object)).tolist()
+    kept = values.astype(object)
+    kept[np.isnan(values)] = None
+    return kept.tolist()

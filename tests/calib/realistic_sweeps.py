@@ -57,7 +57,7 @@ class RestingArm:
             for each in torque:
                 self.sensors._bend(each)
         self.angle = np.asarray(pose, float)
-        return torque[-1]
+        return np.asarray(torque[-1])
 
     def read(self, pose: np.ndarray, pressed: np.ndarray, direction: int = 0, seconds: float = READING):
         """(Position reading, torque reading, motor torque), (n,) each, after coming to `pose` as read [rad]."""

@@ -1,12 +1,14 @@
 """Covariance of an arm's discrepancy, the torque that its gravity model lacks, between two poses (docs/theory.md)."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from gcomp.arm.arm import Arm
+from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array
-from gcomp.gravity.torque import gravity_torque
+from gcomp.gravity.torque import gravity_regressor, gravity_torque
 
 LOCAL_ANGLE = 0.5
 """Correlation length in a joint's own angle and in its neighbours' [rad]: cables, encoder eccentricity and gear errors
@@ -51,6 +53,15 @@ class Kernel:
         typical = gravity_torque(arm, beta, self.poses).std(axis=0)
         self.typical: Array = np.maximum(typical, 1e-3 * max(float(typical.max()), 1e-9))
         """Standard deviation of each joint's gravity torque over the joint ranges (n,) [N·m]; never 0."""
+
+    @cached_property
+    def payload_rank(self) -> int:
+        """How many of a payload's mass and first moments the arm's levers show, over its whole range."""
+        at_origin, by_point = payload_columns(self._arm)
+        columns = gravity_regressor(self._arm, self.poses) @ np.column_stack([at_origin, by_point])
+        flat = columns.reshape(-1, columns.shape[2])
+        size = np.linalg.norm(flat, axis=0)
+        return int(np.linalg.matrix_rank(flat / np.where(size > 1e-9, size, 1.0), tol=1e-6))
 
     def points(self, position: Array, side: Array, warmer: Array | None = None) -> Points:
         """Poses (K, n) [rad], sides of approach and temperatures above the reference's (K, n) [K]."""

@@ -34,8 +34,8 @@ class Rows:
 
     def and_then(self, *more: Array, epoch: int) -> "Rows":
         """The same and more rows of one epoch: position, residual, side and temperature (K, n)."""
-        columns = [np.vstack([getattr(self, name), column]) for name, column in zip(ROWS[:-1], more, strict=True)]
-        return Rows(*[*columns, np.append(self.epoch, np.full(len(more[0]), epoch))])
+        columns = {name: np.vstack([getattr(self, name), column]) for name, column in zip(ROWS[:-1], more, strict=True)}
+        return Rows(**columns, epoch=np.append(self.epoch, np.full(len(more[0]), epoch)))
 
 
 class Reference:

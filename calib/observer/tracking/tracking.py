@@ -166,7 +166,8 @@ class Tracking:
 
     def save(self) -> dict[str, Any]:
         """All parts as JSON values."""
-        since = [[*save_rows([row])[0][:4], known, save_rows([row])[0][4]] for row, known in self._since]
+        saved = save_rows([row for row, _ in self._since])
+        since = [[*row[:4], known, *row[4:]] for row, (_, known) in zip(saved, self._since, strict=True)]
         own: dict[str, Any] = {"sigma": self.sigma.tolist(), "rows": self.rows, "since": since}
         own["suspected_rows"] = self._suspected
         return own | self.belief.save() | self.filter.save() | self._cusum.save() | self._poses.save()

@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from drawn_arms import drawn_arm
 from effects_on_readings import CONFIG, SIGMA, payload
 
+from calib.arm.kinematics import gcomp_arm
 from calib.observer.cause_test import CauseTest, Verdict
 from calib.observer.effect_dictionary import dictionary
 from calib.observer.gravity_belief import GravityBelief
@@ -262,3 +264,21 @@ def test_a_vertical_joint_that_gravity_does_not_load_has_only_an_offset(sarcos, 
     belief = GravityBelief(upright, sarcos_beta, np.zeros((14, 14)))
     said = CauseTest(belief, window(q, v, random.choice([-1.0, 1.0], q.shape)), CONFIG).verdict()
     assert (said.cause, said.joint) == ("offset", 0)
+
+
+def test_a_payload_whose_mass_no_lever_shows_is_a_payload() -> None:
+    """All axes after the first meet in one point: only the payload's moment is felt."""
+    arm = gcomp_arm(drawn_arm(220)[0])
+    random = np.random.default_rng(8)
+    beta = 0.5 * random.normal(size=2 * arm.n)
+    q = random.uniform(arm.lower, arm.upper, (20, arm.n))
+    at_origin, by_point = payload_columns(arm)
+    torque = gravity_torque(arm, beta + 0.8 * (at_origin + by_point @ np.array([0.1, -0.05, 0.02])), q)
+    torque += SIGMA * random.normal(size=q.shape)
+    found = CauseTest(
+        GravityBelief(arm, beta, np.zeros((2 * arm.n, 2 * arm.n))), window(q, torque, np.ones_like(q)), CONFIG
+    )
+    verdict = found.verdict()
+    assert verdict.cause == "payload"
+    assert verdict.covariance[0, 0] == 0
+    assert verdict.values[1:3] == pytest.approx([0.08, -0.04], abs=0.02)
