@@ -26,7 +26,8 @@ SEARCHED, FITTED, JUDGED = 16, 32, 48
 LEAST_FLOOR = 1e-5
 """Least noise floor of a position gap [rad]."""
 TORQUE_MARGIN, SHARE_MARGIN = 0.08, 0.15
-"""Torque that matters [N·m], at most this share of a joint's torque: over the gain it is a gap of position."""
+"""Torque that matters [N·m], at most this share of a joint's torque; over the gain it is a gap of position, at most
+this share of the tracking error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +162,8 @@ def noise_floor(data: Windows) -> Array:
 def _margin(search: Search, fit: Fit, floor: Array) -> Array:
     """RMS from which it is a gap, per joint (J,) [rad]."""
     torque = np.minimum(TORQUE_MARGIN, SHARE_MARGIN * search.scales.torque)
-    return np.asarray(np.maximum(2.0 * floor, torque / fit.point["kp"]))
+    matters = np.minimum(torque / fit.point["kp"], SHARE_MARGIN * search.scales.angle)
+    return np.asarray(np.maximum(2.0 * floor, matters))
 
 
 def columns_of_effect(found: Identified, effect: str) -> tuple[str, ...]:

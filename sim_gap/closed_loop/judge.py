@@ -80,16 +80,21 @@ class Stage:
 def stages(search: Search, fit: Fit, heldout: Windows) -> list[Stage]:
     """The groups in order of what each lowers when it is added to the nominal model and those above it."""
     groups = groups_of(fit, search)
-    base = fit
-    for group in groups:
-        base = taken_out(search, base, group)
-    current = improve(search.data, base, search.scales, 4)
-    alone = [improve(search.data, _added(search, fit, current, group), search.scales, 3) for group in groups]
-    worth = [_worth(search, current, trial) for trial in alone]
+
+    def with_only(some: Sequence[Group]) -> Fit:
+        """The fit without the other groups, the rest fitted again from where it is."""
+        left = fit
+        for group in groups:
+            if group not in some:
+                left = taken_out(search, left, group)
+        return improve(search.data, left, search.scales, 4)
+
+    current = with_only(())
+    worth = [_worth(search, current, with_only((group,))) for group in groups]
+    ordered = [groups[i] for i in np.argsort(worth)[::-1]]
     before, out = rms_on(heldout, current), []
-    for group in [groups[i] for i in np.argsort(worth)[::-1]]:
-        current = improve(search.data, _added(search, fit, current, group), search.scales, 3)
-        after = rms_on(heldout, current)
+    for number, group in enumerate(ordered, start=1):
+        after = rms_on(heldout, fit if number == len(ordered) else with_only(ordered[:number]))
         evidence, rivals = rivals_of(search, fit, group) if matters(before, after) else (0.0, ())
         out.append(Stage(group, before, after, evidence, rivals))
         before = after
@@ -107,21 +112,6 @@ def _worth(search: Search, current: Fit, trial: Fit) -> float:
     assert trial.rms is not None
     fall = joint_rms(search.data, current.rms) - joint_rms(search.data, trial.rms)
     return float((fall / np.maximum(search.floor, 0.1 * search.scales.angle)).max())
-
-
-def _added(search: Search, final: Fit, current: Fit, group: Group) -> Fit:
-    """The current fit with a group of the final one, at its values there."""
-    effect, joints = group
-    point = {name: x.copy() for name, x in current.point.items()}
-    active = list(current.active)
-    if not joints:
-        names = tuple(n for n in shared_effects(search.data.arm)[effect] if n in final.shared)
-        return replace(current, point={**point, **{n: final.point[n] for n in names}}, shared=(*current.shared, *names))
-    for j in joints:
-        for name in EFFECTS[effect].parameters:
-            point[name][j] = final.point[name][j]
-        active[j] = (*active[j], *EFFECTS[effect].parameters)
-    return replace(current, point=point, active=tuple(active), rms=None)
 
 
 def rivals_of(search: Search, fit: Fit, group: Group) -> tuple[float, tuple[str, ...]]:
