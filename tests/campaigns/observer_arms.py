@@ -173,7 +173,8 @@ def warm_up(level: int, given: argparse.Namespace) -> list[str]:
         told += len(events)
         print(f"warm_up: level {level}, draw {seed}: {[(round(e.t), e.kind, e.joint) for e in events][:6]}", flush=True)
     print(f"warm_up: level {level}: {written} written, {told} events in {given.draws * hours:g} h")
-    return [f"level {level}: written while warming up: {written}"] * bool(written)
+    wrong = [f"level {level}: written while warming up: {written}"] * bool(written)
+    return wrong + [f"level {level}: {told} events while warming up"] * (told > max(1.0, given.draws * hours / 24))
 
 
 def slow(level: int, given: argparse.Namespace) -> list[str]:
