@@ -27,7 +27,7 @@ from small_pair import FALSE, SEED, describe, simulated
 
 ROOT = Path(__file__).parents[2]
 PAGES = ("first-run", "sweeps", "records", "observer", "daemon", "diagnosing-a-gap")
-FENCE = re.compile(r"^```sh(?: run)?\n(?P<text>.*?)^```$", re.MULTILINE | re.DOTALL)
+FENCE = re.compile(r"^```(?:sh|\{ \.sh \.run \})\n(?P<text>.*?)^```$", re.MULTILINE | re.DOTALL)
 LEFT_OUT = {
     "make demo": "tests/house/test_demo.py runs the demo",
     "armlink demo": "the same, for an arm file too",

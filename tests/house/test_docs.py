@@ -1,7 +1,7 @@
-"""The documentation holds: links lead somewhere, commands that it names exist, and blocks marked `sh run` run.
+"""The documentation holds: links lead somewhere, commands that it names exist, and blocks marked `.run` run.
 
-A fenced block that opens with ```sh run is executed, the blocks of one page in order and in one empty folder, with the
-commands of the virtual environment on the path. In every other ```sh block, each armlink command and option must exist.
+A fenced block that opens with ```{ .sh .run } is executed, the blocks of one page in order and in one empty folder,
+with the commands of the virtual environment on the path. In every other ```sh block, each armlink command and option must exist.
 """
 
 import os
@@ -30,8 +30,19 @@ def name(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
 
+RUN = "{ .sh .run }"
+INFO = re.compile(r"""(\w*( title="[^"]*")?|\{( \.\w+)+ \})""")
+"""What the site takes as the first line of a block; any other makes text of the block and of what follows."""
+
+
 def blocks(page: Path, info: str) -> list[str]:
     return [found["text"] for found in FENCE.finditer(page.read_text()) if found["info"].strip() == info]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_every_block_opens_as_the_site_wants_it(page):
+    for found in FENCE.finditer(page.read_text()):
+        assert INFO.fullmatch(found["info"].strip()), found["info"]
 
 
 def anchors(page: Path) -> set[str]:
@@ -44,7 +55,7 @@ def shell_lines() -> list[tuple[str, list[str]]]:
     """Page and words of each simple command in the sh blocks, comments and variable settings left out."""
     lines = []
     for page in PAGES:
-        for text in blocks(page, "sh") + blocks(page, "sh run"):
+        for text in blocks(page, "sh") + blocks(page, RUN):
             for line in text.replace("\\\n", " ").splitlines():
                 for simple in re.split(r"\s(?:\||&&|>|2>|;)\s", line):
                     words = shlex.split(simple, comments=True)
@@ -119,9 +130,9 @@ def test_arm_files_in_the_documentation_are_valid(page):
             assert parse_arm(yaml.safe_load(text), page).joint_names
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "sh run")], ids=name)
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, RUN)], ids=name)
 def test_the_commands_of_a_page_run(page, tmp_path):
-    script = "set -euo pipefail\n" + "\n".join(blocks(page, "sh run"))
+    script = "set -euo pipefail\n" + "\n".join(blocks(page, RUN))
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     environment = {**os.environ, "PATH": path, "XDG_STATE_HOME": str(tmp_path / "state"), "COLUMNS": "120"}
     done = subprocess.run(
