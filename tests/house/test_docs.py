@@ -1,7 +1,8 @@
 """The documentation holds: links lead somewhere, commands that it names exist, and blocks marked `.run` run.
 
 A fenced block that opens with ```{ .sh .run } is executed, the blocks of one page in order and in one empty folder,
-with the commands of the virtual environment on the path. In every other ```sh block, each armlink command and option must exist.
+with the commands of the virtual environment on the path. In every other ```sh block, each armlink command and option
+must exist.
 """
 
 import os
