@@ -33,7 +33,14 @@ CONTENT: dict[str, Any] = {
             {"name": "j2", "node": 2, "rated_torque": 30.0, "max_torque": 30.0, "max_velocity": 2.0},
         ],
     },
-    "sweep": {"steps": 5, "poses": 1, "gain_std": 0.01, "settle_timeout": 1.5, "approach_speed": 0.3},
+    "sweep": {
+        "steps": 5,
+        "poses": 1,
+        "gain_std": 0.01,
+        "settle_timeout": 1.5,
+        "approach_speed": 0.8,
+        "acceleration": 10.0,
+    },
     "sim": {
         "links": [
             {"mass": 3.0, "com": [-0.15, 0.02, 0.1], "inertia": [0.03, 0.03, 0.03]},

@@ -147,6 +147,7 @@ def test_answers_as_they_are_written(number, command, workplace, monkeypatch, ca
     page = set(keyed(number))
     if number == "6.9":
         page |= {key.removeprefix("plan.") for key in keyed("3.3") if key.startswith("plan.")} - {"sweeps"}
+    page -= {key.removeprefix("plan.") for key, row in keyed("3.3").items() if "left out" in row["meaning"]}
     written = paths_of(json.loads((workplace / "answer.json").read_text()), page)
     empty = tuple(path.rstrip("?") for path in written if path.endswith("?"))
     assert {path for path in written if not path.endswith("?")} <= page

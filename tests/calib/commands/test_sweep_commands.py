@@ -23,6 +23,8 @@ from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def arm_path(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -24,6 +24,8 @@ from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
+pytestmark = pytest.mark.slow
+
 
 class PowerCut(Exception):
     """What stops the first attempt."""

@@ -13,6 +13,10 @@ from small_pair import ARMLINK, FALSE, describe, simulated
 
 from calib.sweep.dataset import load_data
 
+pytestmark = pytest.mark.slow
+
+TRIES = 4
+
 
 def wait(what: str, done: Callable[[], bool], job: "subprocess.Popen[str]") -> None:
     """Until `done`; fails where the job ends first."""
@@ -42,11 +46,14 @@ def test_keep_going_repeats_the_reading_that_a_stall_interrupted(tmp_path: Path,
         wait("no reading", lambda: readings(tmp_path) >= 2, job)
         loop = int(Path(f"/proc/{job.pid}/task/{job.pid}/children").read_text().split()[0])
         pid = loop if who == "loop" else arm.pid
-        os.kill(pid, signal.SIGSTOP)
-        time.sleep(1.0)
-        os.kill(pid, signal.SIGCONT)
-        before = readings(tmp_path)
-        wait("no reading after the stall", lambda: readings(tmp_path) >= before + 3, job)
+        for _ in range(TRIES):  # one stop may fall into the recovery of a stall that this machine made by itself
+            os.kill(pid, signal.SIGSTOP)
+            time.sleep(1.0)
+            os.kill(pid, signal.SIGCONT)
+            before = readings(tmp_path)
+            wait("no reading after the stall", lambda: readings(tmp_path) >= before + 3, job)  # noqa: B023
+            if any((stall.late_ms is not None) == (who == "loop") for stall in load_data(tmp_path / "unloaded").stalls):
+                break
         job.send_signal(signal.SIGINT)
         said = " ".join(job.communicate(timeout=60)[1].split())
         assert job.returncode == 130, said
@@ -55,8 +62,7 @@ def test_keep_going_repeats_the_reading_that_a_stall_interrupted(tmp_path: Path,
     assert "enabling them again and repeating the reading" in said
     assert not any(word in said for word in FALSE), said
     data = load_data(tmp_path / "unloaded")
-    stall = data.stalls[0]
-    assert (stall.late_ms is not None) == (who == "loop")
+    (stall, *_) = [each for each in data.stalls if (each.late_ms is not None) == (who == "loop")]
     places = [f"{reading.sweep} {reading.index + 1}" for reading in data.readings]
     assert stall.reading in places, "the interrupted reading was made after all"
     assert len(set(places)) == len(places), "none was made twice"
