@@ -16,6 +16,7 @@ from calib.records.records import (
     matrix,
     provenance,
 )
+from gcomp.arrays import Mask
 
 FAMILY: dict[Parameter, str] = {"gain": "gain", "offset": "offset", "position_offset": "zero"}
 """Parameter of a record → family of the fit."""
@@ -43,6 +44,13 @@ def missing(fit: CreepFit) -> dict[tuple[str, Parameter], str]:
         elif not zero[joint]:
             reasons[name, "position_offset"] = "the sweeps tell no more than was known before"
     return reasons
+
+
+def told(fit: CreepFit, family: str) -> Mask:
+    """Joints for which the data determine a family's value (n,); of friction every joint."""
+    reasons = missing(fit)
+    parameter = next((each for each, of in FAMILY.items() if of == family), None)
+    return np.array([parameter is None or (name, parameter) not in reasons for name in fit.names])
 
 
 def _no_gain(fit: CreepFit, joint: int, loaded: bool) -> str:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from plotly.subplots import make_subplots
 from rich.table import Table
 
-from calib.creep.record import missing
+from calib.creep.record import missing, told
 from calib.report.figures import COLOURS, GREY, PANEL, verify_figure
 from calib.report.page import ReportTable, Section, paragraph, render
 from gcomp.arrays import Array
@@ -193,8 +193,7 @@ def _gravity(result: CreepDemo) -> Section:
 
 
 def _seen(result: CreepDemo, family: str) -> Array:
-    seen = result.fit.found(family) if family == "gain" else np.ones(len(result.names), dtype=bool)
-    return np.where(seen, result.fit.value(family), np.nan)
+    return np.where(told(result.fit, family), result.fit.value(family), np.nan)
 
 
 def _intervals(result: CreepDemo, family: str) -> list[list[float | None] | None]:
@@ -203,7 +202,7 @@ def _intervals(result: CreepDemo, family: str) -> list[list[float | None] | None
 
 
 def _cell(result: CreepDemo, family: str, joint: int) -> str:
-    if family == "gain" and not result.fit.found("gain")[joint]:
+    if not told(result.fit, family)[joint]:
         return "not observable"
     half = 1.96 * result.fit.std(family)[joint]
     digits = dict(SHOWN)[family]

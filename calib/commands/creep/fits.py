@@ -11,7 +11,7 @@ from armlink.errors import BadInput
 from calib.commands.screen import print_intervals, print_lines
 from calib.creep.choice import is_creep
 from calib.creep.fit import QUANTILE, CreepFit, fit_creep
-from calib.creep.record import calibration_record, gravity_record, missing
+from calib.creep.record import calibration_record, gravity_record, missing, told
 from calib.creep.run import contacts
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
@@ -84,10 +84,7 @@ def _show(fit: CreepFit, data: list[SweepData]) -> None:
     reasons = missing(fit)
     columns = {}
     for family, heading in SHOWN.items():
-        value = fit.value(family).copy()
-        if family == "gain":
-            value[[(name, "gain") in reasons for name in fit.names]] = np.nan
-        columns[heading] = (value, QUANTILE * fit.std(family))
+        columns[heading] = (np.where(told(fit, family), fit.value(family), np.nan), QUANTILE * fit.std(family))
     print_intervals("Drives, ± half of the 95 % interval", fit.names, columns)
     print_lines([f"{joint} {parameter}: {reason}" for (joint, parameter), reason in reasons.items()])
     print_lines([*(each.reason for one in data for each in contacts(one)), *fit.findings], "yellow")
@@ -95,8 +92,11 @@ def _show(fit: CreepFit, data: list[SweepData]) -> None:
 
 def _answer(fit: CreepFit, data: list[SweepData]) -> dict[str, Any]:
     values = {
-        family: {"estimated": fit.value(family).tolist(), "ci95": fit.ci95(family).tolist()}
-        for family in (*SHOWN, "asymmetry", "warming")
+        family: {
+            "estimated": np.where(known, fit.value(family), np.nan).tolist(),
+            "ci95": [each if kept else None for each, kept in zip(fit.ci95(family).tolist(), known, strict=True)],
+        }
+        for family, known in ((each, told(fit, each)) for each in (*SHOWN, "asymmetry", "warming"))
     }
     return {
         "joints": list(fit.names),
