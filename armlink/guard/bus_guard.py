@@ -60,10 +60,12 @@ class Source:
 class Field:
     """One number of a frame and its bounds.
 
-    `values`: the only ones allowed. `least`, `most`: its range, widened to where the joint stands (`near`). `rate`,
-    `slack`: it changes by at most `rate` a second, after a pause by `slack`; a change to within `within` of a reading
-    that is no older than `age` seconds is free, since it commands what is. Without power it is not followed: then its
-    range alone counts, and the first number with power must be near a reading or one of `first`.
+    `values`: the only ones allowed. `least`, `most`: its range. `rate`, `slack`: it changes by at most `rate` a second,
+    after a pause by `slack`; but a number within `within` of one of the two newest readings (`near`), no older than
+    `age` seconds, commands what is, and may come at once. Without power it is not followed: then its range alone
+    counts, and the first number with power must be near a reading or one of `first`.
+
+    `leads_back`: a joint may stand outside the range. It may be told to stay there, and then only to go inwards.
     """
 
     def __init__(self, found: dict[str, Any]) -> None:
@@ -74,33 +76,38 @@ class Field:
         self.rate, self.slack = _bound(found, "rate", math.inf), _bound(found, "slack", 0.0)
         self.near, self.within = [Source(each) for each in found.get("near", ())], _bound(found, "within", 0.0)
         self.age, self.first = _bound(found, "age", 0.0), frozenset(found.get("first", ()))
+        self.leads_back = bool(found.get("leads_back", False))
         if self.values is None and not (math.isfinite(self.least) and math.isfinite(self.most)):
             raise PolicyError(f"{self.name}: needs values, or least and most")
         self._last: float | None = None
-        self._reading: float | None = None
-        self._room, self._at, self._read_at = self.slack, -math.inf, -math.inf
+        self._readings: list[tuple[float, float]] = []
+        self._room, self._at = self.slack, -math.inf
 
     def see(self, value: float, now: float) -> None:
         """A reading came from the wire."""
-        self._reading, self._read_at = value, now
+        self._readings = [*self._readings[-1:], (value, now)]
 
     def refusal(self, data: bytes, now: float, power: bool = True) -> str:
         """Why this frame's number is not allowed, or an empty text. Keeps nothing: see `keep`."""
         value = self.number.unpack_from(data, self.at)[0]
         if self.values is not None:
             return "" if value in self.values else f"{self.name} {value}, not among the {len(self.values)} allowed"
-        reading = self._reading if now - self._read_at <= self.age else None
-        least = self.least if reading is None else min(self.least, reading - self.within)
-        most = self.most if reading is None else max(self.most, reading + self.within)
-        if not least <= value <= most:  # NaN too
+        known = [reading for reading, at in self._readings if now - at <= self.age]
+        near = any(abs(value - reading) <= self.within for reading in known)
+        began = [self._last] if power and self._last is not None else known
+        if not (self.least <= value <= self.most or (self.leads_back and self._inwards(value, began))):
             return f"{self.name} {value}, allowed {self.least:g} to {self.most:g}"
-        if not power or self.rate == math.inf or (reading is not None and abs(value - reading) <= self.within):
+        if not power or self.rate == math.inf or near:
             return ""
         if self._last is None:
             return "" if value in self.first else f"{self.name} {value} with power, where no reading shows the joint"
         if abs(value - self._last) <= self._room_at(now):
             return ""
         return f"{self.name} from {self._last} to {value} at once, allowed {self._room_at(now):g}"
+
+    def _inwards(self, value: float, began: list[float]) -> bool:
+        """Whether a number outside the range is no further out than one of these, where the joint stands or was led."""
+        return any(self.most < value <= each or self.least > value >= each for each in began)
 
     def keep(self, data: bytes, now: float, power: bool = True) -> None:
         """The frame passes: later ones start from its number."""

@@ -25,8 +25,11 @@ _ACKNOWLEDGED = 0x60
 _UPLOADED = {1: 0x4F, 2: 0x4B, 4: 0x43}
 """First byte of the answer to an SDO read, by the size of the value (CiA 301, 7.2.4.3.6)."""
 _WRITE_2_BYTES = 0x2B
-QUICK_STOP, ENABLE_OPERATION, POWER_BITS = 0x02, 0x0F, 0x8F
-"""Control words, and the bits that make one a command (CiA 402-2)."""
+QUICK_STOP, ENABLE_OPERATION, POWER_BITS = 0x02, 0x0F, 0x0F
+"""Control words, and the bits by which one gives power: an enabled drive stays so whatever bit 7 says, which resets
+faults alone (CiA 402-2)."""
+ROUNDING = 1
+"""A target that follows a reading is this far from it at most [counts]."""
 
 
 def shared_rules(nodes: tuple[int, ...], host: int) -> dict[str, Any]:
@@ -108,11 +111,11 @@ class NodeRules:
         if entry == objects.TARGET_TORQUE:
             step, reading = limits.torque_rate / self.unit.torque, objects.MOTOR_TORQUE
             most = math.floor(limits.max_torque / self.unit.torque + 1e-9)
-            bounds, within, what = (-most, most), 2.0, "torque"
+            bounds, what = (-most, most), "torque"
         elif entry == objects.TARGET_POSITION:
             step, reading = limits.max_velocity / self.unit.position, objects.POSITION
             bounds = math.ceil(limits.lower / self.unit.position), math.floor(limits.upper / self.unit.position)
-            within, what = 2 + 2 * step * period + self.unit.encoder_step / self.unit.position, "position"
+            what = "position"
         else:
             return None
         return {
@@ -123,9 +126,10 @@ class NodeRules:
             "rate": step,
             "slack": BURST * step * period + 2,
             "near": self._readings(reading),
-            "within": within,
+            "within": ROUNDING,
             "age": READING_AGE,
             "first": [0] if entry == objects.TARGET_TORQUE else [],
+            "leads_back": entry == objects.TARGET_POSITION,
         }
 
     def _readings(self, entry: Entry) -> list[dict[str, Any]]:
