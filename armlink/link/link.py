@@ -98,9 +98,13 @@ class Link(Calibrations):
         try:
             if not isinstance(error, BusFault):
                 leave(self, lambda text: None)
-            self.stop()
         except (BusFault, Refused) as failed:
             log.warning("%s: not parked: %s", self.arm.name, failed)
+        finally:
+            self._let_go()
+
+    def _let_go(self) -> None:
+        try:
             self.stop()
         finally:
             self.bus.shutdown()

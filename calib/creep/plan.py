@@ -127,7 +127,7 @@ def creep_seconds(plan: SweepPlan) -> float:
     """Rough duration of a pass [s]."""
     total = 0.0
     for sweep in plan.sweeps:
-        speed = sweep.speed or 0.1
+        speed = creep_speed(sweep)
         way = (sweep.steps[-1] - sweep.steps[0]) * (1 + 1 / (len(sweep.steps) - 1)) + 2 * lead_way(speed)
         total += 2 * way / speed + TRAVEL_SECONDS
     return total
@@ -137,6 +137,13 @@ RAMP = 0.4
 """Time over which a creep reaches its speed, and comes to rest [s]."""
 SETTLE = 0.4
 """Time after that in which friction has turned round and the position loop has settled [s]."""
+
+
+def creep_speed(sweep: Sweep) -> float:
+    """Of a planned creep [rad/s]; raises BadInput for a sweep that has none."""
+    if sweep.speed is None:
+        raise BadInput(f"sweep {sweep.name}: no speed: a plan of steps at rest is no plan of creep sweeps")
+    return sweep.speed
 
 
 def lead_way(speed: float) -> float:

@@ -20,6 +20,15 @@ from gcomp.arrays import Mask
 
 FAMILY: dict[Parameter, str] = {"gain": "gain", "offset": "offset", "position_offset": "zero"}
 """Parameter of a record → family of the fit."""
+HEADINGS = {
+    "gain": "reading per N·m (1/k)",
+    "offset": "offset [N·m]",
+    "zero": "zero [rad]",
+    "coulomb": "Coulomb friction [N·m]",
+    "load": "friction per load",
+    "viscous": "viscous [N·m·s/rad]",
+}
+"""Families of the fit, as people read them."""
 ZERO_SEEN = 0.9
 """A zero counts as found if the data leave at most so much of its doubt."""
 

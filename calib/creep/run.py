@@ -13,7 +13,7 @@ from armlink.loop.driver import ArmDriver
 from calib.arm.drive_limits import Limits
 from calib.arm.sweep_section import sweep_section
 from calib.creep.bins import bin_readings
-from calib.creep.plan import RAMP, CreepGround, lead_way, plan_creep
+from calib.creep.plan import RAMP, CreepGround, creep_speed, lead_way, plan_creep
 from calib.motion.mover import Mover, Stalled
 from calib.motion.static_reading import StaticReading
 from calib.plan.types import Sweep, SweepPlan
@@ -28,8 +28,6 @@ MOST_CONTACTS = 0.3
 """Share of the sweeps that may end in a contact before the pass is given up."""
 CONTACT_TORQUE = 1.5
 """Pull of a soft position loop that friction and gravity alone may ask for [N·m]."""
-CONTACT = "contact"
-"""Begins the reason of a sweep that ended in one."""
 
 
 def run_creep(
@@ -70,11 +68,11 @@ def run_creep(
 
 def contacts(data: SweepData) -> list[StallLine]:
     """Sweeps of a pass that ended in a contact."""
-    return [stall for stall in data.stalls if stall.reason.startswith(CONTACT)]
+    return [stall for stall in data.stalls if stall.contact]
 
 
 def _names(stall: StallLine, sweep: Sweep) -> bool:
-    return stall.reason.startswith(CONTACT) and stall.reading == sweep.name
+    return stall.contact and stall.reading == sweep.name
 
 
 class _Pass:
@@ -115,7 +113,7 @@ class _Pass:
     def _both_ways(self, sweep: Sweep) -> list[StaticReading]:
         mover, joint = self._mover, sweep.joint
         middles = np.array(sweep.steps)
-        speed = sweep.speed or 0.1
+        speed = creep_speed(sweep)
         half = (middles[1] - middles[0]) / 2 + lead_way(speed)
         low, high = middles[0] - half, middles[-1] + half
         goal = np.array(sweep.rest)
@@ -172,10 +170,10 @@ class _Pass:
         self._contacts += 1
         mover.come_to_rest()
         text = (
-            f"{CONTACT}: {stalled.name}: met something at {stalled.position:.2f} rad: the surroundings, the arm"
+            f"contact: {stalled.name}: met something at {stalled.position:.2f} rad: the surroundings, the arm"
             " itself or a cable"
         )
-        line = StallLine(t=mover.seen_at, late_ms=None, reading=sweep.name, reason=text)
+        line = StallLine(t=mover.seen_at, late_ms=None, reading=sweep.name, reason=text, contact=True)
         self._writer.append(line)
         self._progress(len(self.made), len(self._plan.sweeps), 0.0, text)
         if self._contacts > MOST_CONTACTS * len(self._plan.sweeps):

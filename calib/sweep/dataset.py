@@ -98,6 +98,8 @@ class StallLine(_Model):
     reading: str
     """Sweep and number of the reading that was interrupted."""
     reason: str
+    contact: Annotated[bool, Field(exclude_if=lambda value: not value)] = False
+    """A creeping joint met something: its sweep was not repeated."""
 
 
 Line = StaticReading | PlanLine | StallLine

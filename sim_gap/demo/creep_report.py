@@ -5,29 +5,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from plotly.subplots import make_subplots
 from rich.table import Table
 
-from calib.creep.record import missing, told
+from calib.creep.record import HEADINGS, missing, told
 from calib.report.figures import COLOURS, GREY, PANEL, verify_figure
 from calib.report.page import ReportTable, Section, paragraph, render
 from gcomp.arrays import Array
 from sim_gap.demo.creep_run import CreepDemo, worst_gain_error
 from sim_gap.demo.show import gap_line
-from sim_gap.demo.summary import SCHEMA
+from sim_gap.demo.summary import SCHEMA, measured, numbers
 from sim_gap.report.page import sections as gap_sections
 
 SHOWN = (("gain", 4), ("offset", 3), ("zero", 4), ("coulomb", 3), ("load", 3), ("viscous", 3))
 """Families of the fit to show, with digits."""
-HEADINGS = {
-    "gain": "reading per N·m (1/k)",
-    "offset": "offset [N·m]",
-    "zero": "zero [rad]",
-    "coulomb": "Coulomb friction [N·m]",
-    "load": "friction per load",
-    "viscous": "viscous [N·m·s/rad]",
-}
 
 
 def summary(result: CreepDemo) -> dict[str, Any]:
@@ -42,49 +33,34 @@ def summary(result: CreepDemo) -> dict[str, Any]:
         "joints": list(result.names),
         "sensors": {
             name: {
-                "true": _numbers(true[name]),
-                "estimated": _numbers(_seen(result, family)),
+                "true": numbers(true[name]),
+                "estimated": numbers(_seen(result, family)),
                 "ci95": _intervals(result, family),
             }
             for name, family in found.items()
         },
         "friction": {
             "coulomb": {
-                "true": _numbers(result.coulomb),
-                "estimated": _numbers(fit.value("coulomb")),
+                "true": numbers(result.coulomb),
+                "estimated": numbers(fit.value("coulomb")),
                 "ci95": _intervals(result, "coulomb"),
             },
             **{
-                family: {"estimated": _numbers(fit.value(family)), "ci95": _intervals(result, family)}
+                family: {"estimated": numbers(fit.value(family)), "ci95": _intervals(result, family)}
                 for family in ("load", "viscous", "asymmetry")
             },
         },
         "not_identifiable": {f"{joint}.{parameter}": reason for (joint, parameter), reason in missing(fit).items()},
         "disturbed": list(fit.findings),
-        "gravity": {
-            "poses": check.poses,
-            "max_torque": _numbers(check.max_torque),
-            "rms_error": _numbers(check.rms_error),
-            "max_abs_error": _numbers(check.max_abs_error),
-        },
-        "verify": {"poses": len(result.verify.position), "rms": _numbers(result.verify.rms)},
         "sag": None
         if result.sag is None
         else {
             "poses": result.sag.poses,
-            "nominal": _numbers(result.sag.nominal),
-            "calibrated": _numbers(result.sag.calibrated),
+            "nominal": numbers(result.sag.nominal),
+            "calibrated": numbers(result.sag.calibrated),
         },
         "drift": None,
-        "gap": result.gap.to_json(),
-        "bus": {
-            "frames": result.bus.frames,
-            "rate_hz": _number(result.bus.rate_hz),
-            "load": _number(result.bus.load),
-            "missed": result.bus.missed,
-        },
-        "wall_s": _number(result.wall_s),
-        "sim_s": _number(result.sim_s),
+        **measured(check, result.verify, result.gap, result.bus, result.wall_s, result.sim_s),
     }
 
 
@@ -198,7 +174,7 @@ def _seen(result: CreepDemo, family: str) -> Array:
 
 def _intervals(result: CreepDemo, family: str) -> list[list[float | None] | None]:
     seen = np.isfinite(_seen(result, family))
-    return [_numbers(row) if kept else None for row, kept in zip(result.fit.ci95(family), seen, strict=True)]
+    return [numbers(row) if kept else None for row, kept in zip(result.fit.ci95(family), seen, strict=True)]
 
 
 def _cell(result: CreepDemo, family: str, joint: int) -> str:
@@ -207,11 +183,3 @@ def _cell(result: CreepDemo, family: str, joint: int) -> str:
     half = 1.96 * result.fit.std(family)[joint]
     digits = dict(SHOWN)[family]
     return f"{result.fit.value(family)[joint]:.{digits}f} ± {half:.{digits}f}"
-
-
-def _numbers(values: npt.ArrayLike) -> list[float | None]:
-    return [_number(value) for value in np.asarray(values, dtype=float).tolist()]
-
-
-def _number(value: float) -> float | None:
-    return float(f"{value:.7g}") if np.isfinite(value) else None

@@ -1,15 +1,13 @@
 """The demo of an arm without torque sensors: creep sweeps, fit, records in the host, verification, float, gap."""
 
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.link.types import Stats
-from armlink.recording.files import save_recording
-from armlink.recording.recording import Recording
 from calib.arm.kinematics import model_arm
 from calib.arm.sweep_section import CreepSection, sweep_section
 from calib.creep.fit import CreepFit, fit_creep
@@ -29,13 +27,13 @@ from sim_bus.truth import Truth
 from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.demo.bench import Bench, GravityCheck, check_gravity
 from sim_gap.demo.gap import diagnose_recordings
-from sim_gap.demo.motion import multisine, record_motion, travel
-from sim_gap.demo.narrator import Narrator, Report
+from sim_gap.demo.motion import record_pair
+from sim_gap.demo.narrator import Narrator
 from sim_gap.demo.sag import Sag, mean_sag, sag_poses
 
 QUICK = CreepSection(span=1.1, speeds=(0.2, 0.14))
 """Shorter and faster creeps than on a real arm, for two minutes: they cost a factor of two in precision."""
-TRAIN_SECONDS, HELDOUT_SECONDS = 30.0, 20.0
+RECORDED_S = (30.0, 20.0)
 """Length of the gap's recordings [s]."""
 BY = "armlink demo"
 
@@ -104,13 +102,13 @@ def run_creep_demo(
     install(admit(record, arm, store), store, link, by=BY, reason="creep sweeps", check=None)
     teller.say(f"record {record.id} kept by the host and in force: it corrects readings and commands")
     with teller.stage("recording motion for the gap diagnosis") as report:
-        recordings = _record(bench, record, folder, seed, report)
+        recordings = record_pair(bench, record, folder, seed, RECORDED_S, report, motor_only=True)
     diagnosis = other_core.submit(diagnose_recordings, arm.path, recordings)
     with teller.stage("verifying at poses that the fit has not seen, creeping both ways") as report:
         check = verify_creeping(
             link, arm, gravity, record, poses=8, seed=seed, progress=lambda k, n: report(k, n, None, f"pose {k}")
         )
-    gravity_check = check_gravity(_with_truth(bench, truth), fit.beta, record, seed)
+    gravity_check = check_gravity(replace(bench, truth=truth), fit.beta, record, seed)
     sag = None
     if nominal is not None:
         with teller.stage("holding the same poses by a tenth of the gains and the records"):
@@ -162,24 +160,6 @@ def _first_of_each(plan: SweepPlan) -> tuple[Sweep, ...]:
     for sweep in plan.sweeps:
         first.setdefault(sweep.joint, sweep)
     return tuple(first.values())
-
-
-def _with_truth(bench: Bench, truth: Truth) -> Bench:
-    return Bench(bench.arm, bench.described, truth, bench.simulated, bench.link)
-
-
-def _record(
-    bench: Bench, calibration: CalibrationRecord, folder: Path, seed: int, report: Report
-) -> tuple[Recording, Recording]:
-    """Two different motions with motor torque alone, kept as MCAP too."""
-    found = []
-    for number, (name, seconds) in enumerate((("train", TRAIN_SECONDS), ("heldout", HELDOUT_SECONDS))):
-        targets = multisine(bench, seconds, seed=1000 * (seed + 1) + number)
-        travel(bench, bench.link.position_sent, targets[0])
-        made = record_motion(bench, targets, calibration, report, name)
-        found.append(Recording(**{**vars(made), "torque": None}).check("recording of the simulated arm"))
-        save_recording(found[-1], folder / f"{name}.mcap")
-    return found[0], found[1]
 
 
 def worst_gain_error(result: CreepDemo) -> float:

@@ -1,8 +1,12 @@
 """Motion for the gap's recordings: sums of sines within the joints' ranges and speeds, recorded through the link."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 
 from armlink.link.types import Command
+from armlink.recording.files import save_recording
 from armlink.recording.recording import Recording
 from calib.motion.trajectory import trajectory
 from calib.records.records import CalibrationRecord
@@ -52,7 +56,29 @@ def travel(bench: Bench, start: Array, goal: Array) -> None:
         bench.link.cycle(Command.hold(target))
 
 
-def record_motion(bench: Bench, targets: Array, calibration: CalibrationRecord, report: Report, text: str) -> Recording:
+def record_pair(
+    bench: Bench,
+    calibration: CalibrationRecord,
+    folder: Path,
+    seed: int,
+    seconds: tuple[float, float],
+    report: Report,
+    motor_only: bool = False,
+) -> tuple[Recording, Recording]:
+    """Two different motions to learn and to judge from, kept as MCAP too; `motor_only`: without joint torque."""
+    found = []
+    for number, (name, length) in enumerate(zip(("train", "heldout"), seconds, strict=True)):
+        targets = multisine(bench, length, seed=1000 * (seed + 1) + number)
+        travel(bench, bench.link.position_sent, targets[0])
+        made = _record_motion(bench, targets, calibration, report, name)
+        found.append(replace(made, torque=None) if motor_only else made)
+        save_recording(found[-1], folder / f"{name}.mcap")
+    return found[0], found[1]
+
+
+def _record_motion(
+    bench: Bench, targets: Array, calibration: CalibrationRecord, report: Report, text: str
+) -> Recording:
     """Follow the targets and record every cycle, positions as the calibration corrects them; raises BusFault."""
     link = bench.link
     rows = []

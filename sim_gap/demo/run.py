@@ -14,8 +14,6 @@ from rich.console import Console
 
 from armlink.arm_file import MODEL_SUFFIXES, ArmFile, load_arm
 from armlink.errors import BadInput
-from armlink.recording.files import save_recording
-from armlink.recording.recording import Recording
 from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.new_arm import new_arm
 from calib.creep.choice import sweep_motion
@@ -23,7 +21,6 @@ from calib.fit.gravity_fit import identify_gravity
 from calib.fit.sensor_fit import fit_sensors
 from calib.install.apply import Apply, admit_sweeps
 from calib.install.journaled_write import install
-from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
 from calib.sweep.dataset import SweepData
 from calib.sweep.run import run_sweep
@@ -35,13 +32,13 @@ from sim_gap.demo.creep_report import summary as creep_summary
 from sim_gap.demo.creep_run import CreepDemo, quick, run_creep_demo
 from sim_gap.demo.drift import run_drift
 from sim_gap.demo.gap import diagnose_recordings
-from sim_gap.demo.motion import multisine, record_motion, travel
-from sim_gap.demo.narrator import Narrator, Report
+from sim_gap.demo.motion import record_pair
+from sim_gap.demo.narrator import Narrator
 from sim_gap.demo.report import write_report
 from sim_gap.demo.show import calibration_table, drift_line, gap_line, verify_table
 from sim_gap.demo.summary import DemoResult, summary
 
-TRAIN_SECONDS, HELDOUT_SECONDS = 40.0, 25.0
+RECORDED_S = (40.0, 25.0)
 """Length of the gap's recordings [s]."""
 BY = "armlink demo"
 
@@ -122,7 +119,7 @@ def _work(
     gravity_check = check_gravity(bench, gravity.beta, record, seed)
     teller.show(verify_table(link.names, check, gravity_check))
     with teller.stage("recording motion for the gap diagnosis") as report:
-        recordings = _record(bench, record, folder, seed, report)
+        recordings = record_pair(bench, record, folder, seed, RECORDED_S, report)
     diagnosis = other_core.submit(diagnose_recordings, arm.path, recordings)
     with teller.stage("ordinary work: a torque sensor will drift") as report:
         drift = run_drift(bench, store, gravity_record, check, seed, report)
@@ -166,19 +163,6 @@ def _sweeps(bench: Bench, folder: Path, seed: int, teller: Narrator) -> tuple[Sw
         loaded = run_sweep(bench.link, bench.arm, folder / "loaded", reference_mass=mass, progress=report, seed=seed)
     bench.simulated.detach_mass()
     return bare, loaded
-
-
-def _record(
-    bench: Bench, calibration: CalibrationRecord, folder: Path, seed: int, report: Report
-) -> tuple[Recording, Recording]:
-    """Two different motions, kept as MCAP too."""
-    found = []
-    for number, (name, seconds) in enumerate((("train", TRAIN_SECONDS), ("heldout", HELDOUT_SECONDS))):
-        targets = multisine(bench, seconds, seed=1000 * (seed + 1) + number)
-        travel(bench, bench.link.position_sent, targets[0])
-        found.append(record_motion(bench, targets, calibration, report, name))
-        save_recording(found[-1], folder / f"{name}.mcap")
-    return found[0], found[1]
 
 
 def _from_model(model: Path, out: Path, teller: Narrator) -> Path:

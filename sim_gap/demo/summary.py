@@ -46,7 +46,7 @@ class DemoResult:
 
 def summary(result: DemoResult) -> dict[str, Any]:
     """The contract's dictionary; null where a value cannot be determined."""
-    drift, check = result.drift, result.gravity_check
+    drift = result.drift
     return {
         "schema": SCHEMA,
         "arm": result.arm,
@@ -54,47 +54,58 @@ def summary(result: DemoResult) -> dict[str, Any]:
         "joints": list(result.names),
         "sensors": {
             name: {
-                "true": _numbers(getattr(result.truth, name)),
-                "estimated": _numbers(result.sensors.value(name)),
-                "ci95": [None if row[0] is None else row for row in map(_numbers, result.sensors.ci95(name))],
+                "true": numbers(getattr(result.truth, name)),
+                "estimated": numbers(result.sensors.value(name)),
+                "ci95": [None if row[0] is None else row for row in map(numbers, result.sensors.ci95(name))],
             }
             for name, _ in SHOWN
         },
         "not_identifiable": {
             f"{joint}.{parameter}": reason for (joint, parameter), reason in result.sensors.reasons.items()
         },
-        "gravity": {
-            "poses": check.poses,
-            "max_torque": _numbers(check.max_torque),
-            "rms_error": _numbers(check.rms_error),
-            "max_abs_error": _numbers(check.max_abs_error),
-        },
-        "verify": {"poses": len(result.verify.position), "rms": _numbers(result.verify.rms)},
         "drift": {
             "joint": result.names[drift.joint],
             "gain": drift.gain,
             "offset": drift.offset,
-            "detected_after_s": None if drift.detected is None else _number(drift.detected - drift.began),
+            "detected_after_s": None if drift.detected is None else number(drift.detected - drift.began),
             "recalibrated": drift.recalibrated is not None,
-            "recalibrated_after_s": None if drift.recalibrated is None else _number(drift.recalibrated - drift.began),
-            "gain_error_after": _number(abs(drift.error_after[0])),
-            "offset_error_after": _number(abs(drift.error_after[1])),
+            "recalibrated_after_s": None if drift.recalibrated is None else number(drift.recalibrated - drift.began),
+            "gain_error_after": number(abs(drift.error_after[0])),
+            "offset_error_after": number(abs(drift.error_after[1])),
         },
-        "gap": result.gap.to_json(),
-        "bus": {
-            "frames": result.bus.frames,
-            "rate_hz": _number(result.bus.rate_hz),
-            "load": _number(result.bus.load),
-            "missed": result.bus.missed,
-        },
-        "wall_s": _number(result.wall_s),
-        "sim_s": _number(result.sim_s),
+        **measured(result.gravity_check, result.verify, result.gap, result.bus, result.wall_s, result.sim_s),
     }
 
 
-def _numbers(values: npt.ArrayLike) -> list[float | None]:
-    return [_number(value) for value in np.asarray(values, dtype=float).tolist()]
+def measured(
+    check: GravityCheck, verify: Verification, gap: Diagnosis, bus: Stats, wall_s: float, sim_s: float
+) -> dict[str, Any]:
+    """What every demo measures, whatever its drives."""
+    return {
+        "gravity": {
+            "poses": check.poses,
+            "max_torque": numbers(check.max_torque),
+            "rms_error": numbers(check.rms_error),
+            "max_abs_error": numbers(check.max_abs_error),
+        },
+        "verify": {"poses": len(verify.position), "rms": numbers(verify.rms)},
+        "gap": gap.to_json(),
+        "bus": {
+            "frames": bus.frames,
+            "rate_hz": number(bus.rate_hz),
+            "load": number(bus.load),
+            "missed": bus.missed,
+        },
+        "wall_s": number(wall_s),
+        "sim_s": number(sim_s),
+    }
 
 
-def _number(value: float) -> float | None:
+def numbers(values: npt.ArrayLike) -> list[float | None]:
+    """For JSON; null where a value is not finite."""
+    return [number(value) for value in np.asarray(values, dtype=float).tolist()]
+
+
+def number(value: float) -> float | None:
+    """For JSON, with seven digits; null where it is not finite."""
     return float(f"{value:.7g}") if np.isfinite(value) else None

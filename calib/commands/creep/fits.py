@@ -11,20 +11,11 @@ from armlink.errors import BadInput
 from calib.commands.screen import print_intervals, print_lines
 from calib.creep.choice import is_creep
 from calib.creep.fit import QUANTILE, CreepFit, fit_creep
-from calib.creep.record import calibration_record, gravity_record, missing, told
+from calib.creep.record import HEADINGS, calibration_record, gravity_record, missing, told
 from calib.creep.run import contacts
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
 from calib.sweep.dataset import SweepData
-
-SHOWN = {
-    "gain": "reading per N·m (1/k)",
-    "offset": "offset [N·m]",
-    "zero": "zero [rad]",
-    "coulomb": "Coulomb friction [N·m]",
-    "load": "friction per load",
-    "viscous": "viscous [N·m·s/rad]",
-}
 
 
 def all_creep(data: list[SweepData]) -> bool:
@@ -83,7 +74,7 @@ def _fit(data: list[SweepData], arm_file: ArmFile) -> CreepFit:
 def _show(fit: CreepFit, data: list[SweepData]) -> None:
     reasons = missing(fit)
     columns = {}
-    for family, heading in SHOWN.items():
+    for family, heading in HEADINGS.items():
         columns[heading] = (np.where(told(fit, family), fit.value(family), np.nan), QUANTILE * fit.std(family))
     print_intervals("Drives, ± half of the 95 % interval", fit.names, columns)
     print_lines([f"{joint} {parameter}: {reason}" for (joint, parameter), reason in reasons.items()])
@@ -96,7 +87,7 @@ def _answer(fit: CreepFit, data: list[SweepData]) -> dict[str, Any]:
             "estimated": np.where(known, fit.value(family), np.nan).tolist(),
             "ci95": [each if kept else None for each, kept in zip(fit.ci95(family).tolist(), known, strict=True)],
         }
-        for family, known in ((each, told(fit, each)) for each in (*SHOWN, "asymmetry", "warming"))
+        for family, known in ((each, told(fit, each)) for each in (*HEADINGS, "asymmetry", "warming"))
     }
     return {
         "joints": list(fit.names),

@@ -208,6 +208,21 @@ def test_leaving_normally_or_by_an_exception_is_a_quick_stop(arm_of, bus):
         assert bus.closed
 
 
+def test_an_interruption_while_leaving_is_a_quick_stop_too(arm_of, bus, monkeypatch):
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("armlink.link.link.leave", interrupted)
+    link = Link(arm_of(), bus)
+    link.start()
+    link.enable()
+    link.cycle(command(TORQUE, torque=5.0))
+    with pytest.raises(KeyboardInterrupt):
+        link.__exit__(None, None, None)
+    assert [node.status for node in bus.nodes.values()] == [QUICK_STOP] * 3
+    assert bus.closed
+
+
 def test_a_joint_in_quick_stop_is_enabled_without_losing_power(arm_of, bus):
     with Link(arm_of(), bus) as link:
         link.start()
