@@ -31,5 +31,7 @@ def test_its_command_is_one_that_armlink_takes(capsys: pytest.CaptureFixture[str
     shown = capsys.readouterr().out
     options = [word for word in command if word.startswith("--")]
     assert [word for word in options if not re.search(rf"{word}\b(?!-)", shown)] == []
-    assert command[command.index("--tcp") + 1].startswith("127.0.0.1:")  # not on the network, where TCP is not encrypted
+    assert command[command.index("--tcp") + 1].startswith(
+        "127.0.0.1:"
+    )  # not on the network, where TCP is not encrypted
     assert "USER armlink" in LINES
