@@ -8,7 +8,7 @@ import asyncio
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable
+import threading
 from pathlib import Path
 
 from playwright.sync_api import Page, sync_playwright
@@ -36,6 +36,7 @@ def main() -> int:
     options.to.mkdir(parents=True, exist_ok=True)
     chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     found: list[DaemonBench] = []
+    still = threading.Event()
     with tempfile.TemporaryDirectory() as folder:
 
         def begin() -> DaemonView:  # on the server's thread, as the journal wants it
@@ -44,7 +45,8 @@ def main() -> int:
 
         async def go_on() -> None:
             while True:
-                found[0].run(0.1)
+                if not still.is_set():
+                    found[0].run(0.1)
                 await asyncio.sleep(0.1)
 
         with served(begin, Path(folder) / "api.sock", go_on) as server, sync_playwright() as playwright:
@@ -52,11 +54,11 @@ def main() -> int:
                 print("no proposal: the drift was not found", file=sys.stderr)
                 return 1
             browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
-            take(open_page(browser, server, 1280), options.to / "daemon.png", lambda _: None)
+            take(open_page(browser, server, 1280), options.to / "daemon.png", still)
             phone = {"is_mobile": True, "has_touch": True, "device_scale_factor": 2}
-            take(open_page(browser, server, 390, **phone), options.to / "daemon-phone.png", lambda _: None, PHONE)
+            take(open_page(browser, server, 390, **phone), options.to / "daemon-phone.png", still, viewport=PHONE)
             decide = open_page(browser, server, 390, **phone)
-            take(decide, options.to / "daemon-decision.png", lambda page: page.click(".proposal button.main"), PHONE)
+            take(decide, options.to / "daemon-decision.png", still, ".proposal button.main", PHONE)
             browser.close()
     return 0
 
@@ -74,19 +76,26 @@ def drifted(folder: Path, arm: str) -> DaemonBench:
     return bench
 
 
-def take(page: Page, path: Path, act: Callable[[Page], None], viewport: dict[str, int] | None = None) -> None:
-    """A picture of what is seen first, or of the whole page, after `act`."""
+def take(
+    page: Page, path: Path, still: threading.Event, click: str = "", viewport: dict[str, int] | None = None
+) -> None:
+    """A picture of what is seen first, or of the whole page, while the arm rests and stays `still`."""
     page.wait_for_selector("body[data-shown]")
     if viewport:
         page.set_viewport_size(viewport)  # type: ignore[arg-type]
     page.wait_for_selector("#live svg")
     page.wait_for_timeout(3000)
     page.wait_for_selector("#joints.moving")
-    page.wait_for_selector("#joints:not(.moving)")  # now it rests for a while, and residuals mean something
-    page.wait_for_timeout(300)
-    act(page)
-    page.wait_for_timeout(300)
+    while not page.locator("#joints:not(.moving)").count():  # not even after the last step before it stopped
+        still.clear()
+        page.wait_for_selector("#joints.moving")
+        page.wait_for_selector("#joints:not(.moving)")
+        still.set()
+        page.wait_for_timeout(300)
+    if click:
+        page.click(click)
     page.screenshot(path=path, full_page=viewport is None)
+    still.clear()
     complaints = page.complaints  # type: ignore[attr-defined]
     print(f"{path}: {path.stat().st_size / 1000:.0f} kB{'; ' + str(complaints) if complaints else ''}")
 

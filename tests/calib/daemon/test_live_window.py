@@ -1,4 +1,4 @@
-"""Rows of the last minutes: dropped when old, begun anew when the clock restarts, thinned from the newest."""
+"""Rows of the last minutes: dropped when old, begun again when the clock restarts, thinned from the newest."""
 
 import numpy as np
 

@@ -33,13 +33,13 @@ export async function fetchWindow() {
   drawLive();
 }
 
-// Whether any joint turned faster than MOVING between the newest samples, half a second apart.
+// Whether any joint turned faster than MOVING in the last half second, or begins to.
 export function moves() {
   const last = samples.at(-1);
-  const before = last && samples.findLast((one) => last.at - one.at >= 500);
-  if (!before) return false;
-  const seconds = (last.at - before.at) / 1000;
-  return last.position.some((position, k) => Math.abs((position ?? 0) - (before.position[k] ?? 0)) / seconds > MOVING);
+  const first = samples.findLastIndex((one) => last.at - one.at >= 500);
+  if (first < 0) return false;
+  const turned = (one) => last.position.some((position, k) => Math.abs((position ?? 0) - (one.position[k] ?? 0)) > MOVING * (last.at - one.at) / 1000);
+  return samples.slice(first, -1).some(turned);
 }
 
 // A channel as polylines: the smallest and the largest value of every pixel, so that no peak is lost.
