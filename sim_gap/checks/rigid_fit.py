@@ -57,7 +57,7 @@ class RigidFit:
     own_share: Array
     """Standard deviation of the model's own part, over that of the reading, at scale 1."""
     friction: Array
-    """Direction-dependent torque [N·m], of either sign."""
+    """Direction-dependent torque [N·m], of either sign; NaN for a joint that hardly moves."""
     spread: Array
     """Standard deviation of the reading [N·m]."""
 
@@ -121,19 +121,21 @@ def _joint(model: Array, motion: Motion, j: int, spring: bool) -> tuple[float, .
     columns -= columns.mean(0)
     size = columns.std(0)
     if spread < 1e-9 or size[1] < 1e-6:  # nothing read, or a joint that rests
-        return 1.0, 1.0, 0.0, 0.0, 0.0, spread
+        return 1.0, 1.0, 0.0, 0.0, np.nan, spread
     units = np.where(size > 1e-9, size, 1.0)
     scaled = columns / units
     correlation, own = _partial(scaled, y)
     free = _solved(scaled.T @ scaled, scaled.T @ y) / units
-    unsigned = motion.channel == "tau" or np.mean(np.abs(motion.v[:, j]) > TURNING) < MOVING_SHARE
+    moves = np.mean(np.abs(motion.v[:, j]) > TURNING) >= MOVING_SHARE
+    unsigned = motion.channel == "tau" or not moves
     signs = [(1.0,), *[(1.0, -1.0) if unsigned else (1.0,)] * 3]
     if spring and motion.q[:, j].std() > 1e-6:
         turned = (motion.q[:, j] - motion.q[:, j].mean()) / motion.q[:, j].std()
         scaled, signs = np.column_stack([scaled, turned]), [*signs, (1.0, -1.0)]
     coefficients, explained = _positive_fit(scaled, y, signs)
     own_share = own * float(units[0]) / spread
-    return explained, float(coefficients[0] / units[0]), correlation, own_share, float(free[1]), spread
+    friction = float(free[1]) if moves else np.nan
+    return explained, float(coefficients[0] / units[0]), correlation, own_share, friction, spread
 
 
 def _partial(columns: Array, y: Array) -> tuple[float, float]:
