@@ -17,7 +17,7 @@ from sim_gap.better_model import forward_effects
 from sim_gap.better_model.effects_module import joint_effects
 from sim_gap.better_model.export import Written, written
 from sim_gap.better_model.forward_effects import JointEffect
-from sim_gap.better_model.with_effects import with_effects
+from sim_gap.better_model.with_effects import spec_of, with_effects
 from sim_gap.model.load import SimModel
 from sim_gap.residuals.preprocess import CHANNELS
 from sim_gap.residuals.residual_set import ResidualSet
@@ -44,6 +44,7 @@ class RollOuts:
     ) -> None:
         """`laws` go with every simulation of effects, none with that of the nominal model."""
         self.sim, self.recordings, self.estimate, self.laws = sim, recordings, estimate, tuple(laws)
+        self.spec = spec_of(sim) if sim.path is not None else None
         self.numbers = [s.number for s in heldout.signals]
         self.channel = CHANNELS[heldout.layout.motor_side]
         self.source = {"tau_motor": "motor", "tau_cmd": "command", "tau": "sensor"}[heldout.layout.motor_side]
@@ -69,7 +70,7 @@ class RollOuts:
             entries = [*joint_effects(self.sim, self.estimate, corrected.not_held), *(self.laws if terms else ())]
             own = forward_effects.Effects(corrected.model, entries, self.sim.arm.names)
             return corrected.model, forward_effects, own
-        files = written(self.sim, self.estimate, NAME, terms, number, self.laws if terms else ())
+        files = written(self.sim, self.estimate, NAME, terms, number, self.laws if terms else (), self.spec)
         model, module = _compiled(files), _loaded(files)
         return model, module, module.Effects(model, module.EFFECTS, module.JOINTS or self.sim.arm.names)
 

@@ -185,6 +185,13 @@ def spec_of(sim: SimModel) -> Any:
     return spec
 
 
+def compiled_copy(spec: Any) -> Any:
+    """A copy of a `mujoco.MjSpec`, its elements numbered."""
+    own = spec.copy()
+    own.compile()
+    return own
+
+
 def _joint(model: Any, joint: int, effect: str, c: Array) -> None:
     dof, adr = model.jnt_dofadr[joint], model.jnt_qposadr[joint]
     if effect == "friction.coulomb":

@@ -164,17 +164,21 @@ def _link_columns(axis: Array, lever: Array, omega: Array, alpha: Array, push: A
 
 def _cross(x: Array, y: Array) -> Array:
     """Cross product of vectors (3, K) with vectors (3, K) or one vector (3,)."""
-    return np.stack([x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]])
+    out = np.empty_like(x)
+    for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
+        np.multiply(x[i], y[j], out=out[k])
+        out[k] -= x[j] * y[i]
+    return out
 
 
 def _in(turn: Array, vector: Array) -> Array:
     """Into the rotated frame: Rᵀ x for rotations (3, 3, K) and vectors (3, K)."""
-    return np.stack([turn[0, i] * vector[0] + turn[1, i] * vector[1] + turn[2, i] * vector[2] for i in range(3)])
+    return np.asarray(np.einsum("jik,jk->ik", turn, vector))
 
 
 def _out(turn: Array, vector: Array) -> Array:
     """Out of the rotated frame: R x."""
-    return np.stack([turn[i, 0] * vector[0] + turn[i, 1] * vector[1] + turn[i, 2] * vector[2] for i in range(3)])
+    return np.asarray(np.einsum("ijk,jk->ik", turn, vector))
 
 
 def _turned(start: Array, axis: Array, angle: Array) -> Array:
