@@ -139,7 +139,14 @@ def _joint(gram: Array, unsigned: bool) -> tuple[float, ...]:
     both = (1.0, -1.0)
     signs = [(1.0,), *[both if unsigned else (1.0,)] * 3, *([both] if np.isfinite(units[4]) else [])]
     coefficient, explained = _positive_fit(scaled, signs)
-    return explained, coefficient * spread / float(units[0]), correlation, own * float(units[0]) / spread, free[1], spread
+    return (
+        explained,
+        coefficient * spread / float(units[0]),
+        correlation,
+        own * float(units[0]) / spread,
+        free[1],
+        spread,
+    )
 
 
 def _partial(gram: Array) -> tuple[float, float]:

@@ -85,7 +85,7 @@ def _links(parts: _Parts, layout: Layout, values: Values) -> Array:
         if change is not None:
             link = arm.n - 1 if term.effect == "link.payload" else term.place
             inertial[link] += change
-            share = read.regressor[:, :, link] @ change
+            share = read.link_regressor(link) @ change
             torque = torque + share
             parts.add(term, {(channel, int(j)): share[:, j] for j in np.flatnonzero(arm.carries[:, link])})
     arm = arm.with_inertial(inertial)
