@@ -40,15 +40,17 @@ def written(
     number: int = 0,
     laws: Sequence[JointEffect] = (),
     spec: Any = None,
+    mount: float = 0.0,
 ) -> Written:
     """The files of the model with the effects of an estimate, or with some of its terms; `name` is the MJCF's.
 
-    A body that only some recordings have is left out, except for the one with this `number`. `laws` are torques
-    without a known cause. `spec` is the nominal model's if it has been read before; it is copied.
+    A body that only some recordings have is left out, except for the one with this `number`, in which it is turned by
+    `mount` [rad]. `laws` are torques without a known cause. `spec` is the nominal model's if it has been read before;
+    it is copied.
     """
     chosen = () if estimate is None else estimate.terms if terms is None else tuple(terms)
     spec = spec_of(sim) if spec is None else compiled_copy(spec)
-    corrected = with_effects(sim, estimate, chosen, number)
+    corrected = with_effects(sim, estimate, chosen, number, mount)
     for body in list(spec.bodies)[1:]:
         _set_inertial(body, corrected.model)
     for joint in spec.joints:

@@ -62,7 +62,7 @@ def play(x: Array, half: float, rate: float) -> Array:
         at = min(max(at, value - half), value + half)
     start = np.concatenate([coarse[:1], np.repeat(before, np.diff(turns))])
     out = np.clip(start, coarse - half, coarse + half)
-    return np.interp(np.arange(len(x)), np.arange(len(coarse)) * step, out)
+    return np.asarray(np.interp(np.arange(len(x)), np.arange(len(coarse)) * step, out))
 
 
 EFFECTS = (

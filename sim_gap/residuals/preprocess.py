@@ -69,6 +69,8 @@ class Signals:
     it is known to lack the body that others have."""
     groups: tuple[str, ...] = ()
     """Names of the groups of recordings with a common body that it belongs to."""
+    mount: float = 0.0
+    """Angle by which that body is turned about the last joint's axis, against the other recordings [rad]."""
     stuck: tuple[Stuck, ...] = ()
     """Channels that are stuck for some time, in which they are not `known`."""
     found: "Found | None" = None
