@@ -48,6 +48,7 @@ def _run(data: Windows, values: Values, count: int) -> Array:
 
     kp, kd, ki = (of(name) * data.scale if np.any(data.scale != 1.0) else of(name) for name in ("kp", "kd", "ki"))
     armature, viscous, gain = of("armature"), of("viscous"), of("gain", 1.0)
+    back_emf = of("back_emf")
     coulomb, asymmetry = of("coulomb"), of("asymmetry")
     limit, slew = of("limit", np.inf), of("slew", np.inf)
     clipped, slewed = bool(np.isfinite(limit).any()), bool(np.isfinite(slew).any())
@@ -114,7 +115,7 @@ def _run(data: Windows, values: Values, count: int) -> Array:
             torque -= of("offset")
         for name in linear:
             torque -= of(name) * data.columns[name][k]
-        effective = mass + dt * viscous + free * (damped + stiff)
+        effective = mass + dt * (viscous + back_emf * on) + free * (damped + stiff)
         v = (mass * v + dt * torque) / effective
         hold = coulomb
         if "load" in active:

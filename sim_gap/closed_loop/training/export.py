@@ -20,6 +20,7 @@ NATIVE = {
     "controller.slew": "actuator slewmax",
     "controller.integral": "actuator ki",
     "actuator.saturation": "actuator forcerange",
+    "actuator.back_emf": "actuator kv",
     "actuator.rotor_inertia": "joint armature",
     "friction.coulomb": "joint frictionloss",
     "friction.viscous": "joint damping",
@@ -123,17 +124,17 @@ def _set_actuator(spec: Any, joint: str, fit: Fit, j: int, search: Search, compi
         spec.delete(actuator)
     made = spec.add_actuator(name=name, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     kp, ki = (float(fit.point[name][j] * fit.point["gain"][j]) for name in ("kp", "ki"))
-    slew = float(fit.point["slew"][j])
+    slew, back_emf = float(fit.point["slew"][j]), float(fit.point["back_emf"][j])
     if ki > 0.0 or np.isfinite(slew):
         made.set_to_pid(
             kp=kp,
-            kv=0.0,
+            kv=back_emf,
             ctrlspec=POSITION_INPUT,
             **({"ki": ki} if ki > 0.0 else {}),
             **({"slewmax": slew} if np.isfinite(slew) else {}),
         )
     else:
-        made.set_to_position(kp=kp, kv=0.0)
+        made.set_to_position(kp=kp, kv=back_emf)
     limit = float(fit.point["limit"][j])
     if np.isfinite(limit):
         made.forcelimited, made.forcerange = 1, [-limit, limit]
