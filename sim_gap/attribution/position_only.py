@@ -212,6 +212,7 @@ def _notes(found: Identified) -> list[str]:
     if any("viscous" in own and "back_emf" not in own for own in found.fit.active):
         out.append(
             "viscous friction, back-EMF and damping of the measured velocity act alike on a position: the sum is given"
+            + (", as part of the controller" if found.search.open_controller else "")
         )
     if found.export is not None and found.export.lines:
         out.append(f"the corrected model leaves out: {', '.join(found.export.lines)}")

@@ -128,7 +128,9 @@ class ResidualSet:
     def relevance_floor(self) -> dict[Row, float]:
         """Residual of each row below which no effect is searched for [N·m]: noise and a small share of the torque."""
         small = {row: FLOOR if row[0] == self.layout.against_model else FLOOR_INNER for row in self.rows}
-        parts = {row: (self.floor[row], small[row] * self.usual_torque[row[1]], self.least(FLOOR_NM)) for row in self.rows}
+        parts = {
+            row: (self.floor[row], small[row] * self.usual_torque[row[1]], self.least(FLOOR_NM)) for row in self.rows
+        }
         return {row: float(np.linalg.norm(part)) for row, part in parts.items()}
 
     @cached_property

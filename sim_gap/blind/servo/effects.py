@@ -27,7 +27,6 @@ OF_THE_ARM = (
     "base.tilt",
 )
 """Effects of the torque bench that a position shows."""
-GAIN = "a gain too low and a rotor inertia too small differ only where motion is fast"
 
 
 @dataclass(frozen=True)
@@ -113,8 +112,13 @@ OF_THE_SERVO: dict[str, Draw] = {
     "controller.dead_zone": dead_zone,
     "controller.integral": integral,
 }
-UNKNOWN = ("controller.slew", "controller.dead_zone", *OF_THE_ARM)
-"""Effects that count where the model has no controller: the rest belongs to the controller that has to be found."""
+UNKNOWN = (
+    "controller.slew",
+    "controller.dead_zone",
+    *(effect for effect in OF_THE_ARM if effect != "friction.viscous"),
+)
+"""Effects that count where the model has no controller: the rest belongs to the controller that has to be found, and so
+does damping, which a servo makes as well as friction does."""
 
 
 def drawn(effect: str, scene: Scene, law: ServoLaw, random: np.random.Generator) -> Change | None:

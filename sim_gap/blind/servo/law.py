@@ -12,7 +12,7 @@ from sim_gap.blind.plant.runs import Run
 
 VELOCITY_HZ = 60.0
 """Low pass of the servo's velocity [Hz]."""
-FINE = 1e-5
+FINE = 1e-6
 """Resolution of the servo's own position [rad]."""
 
 

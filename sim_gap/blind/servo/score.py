@@ -11,7 +11,9 @@ NAMED, FALSE = 0.85, 0.03
 """Required share of first causes that are right or named as confounded, and of answers with a false cause above 0.8."""
 
 
-def score_positions(answers: Mapping[str, Mapping[str, Any]], labels: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def score_positions(
+    answers: Mapping[str, Mapping[str, Any]], labels: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Any]:
     """Score all answers (by name) against the labels (by case); shares over no case are None."""
     judged: list[Judgement] = []
     for name, answer in answers.items():
