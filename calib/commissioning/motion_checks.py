@@ -42,10 +42,16 @@ def motion_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
         model = model_arm(arm_file)
         guess = guess_of_model(model.arm, model.beta)
         yield from _strength(arm_file, guess)
-        if not creeping and sweep_section(arm_file).hold == "stops" and np.isfinite([model.arm.lower, model.arm.upper]).all():
+        if (
+            not creeping
+            and sweep_section(arm_file).hold == "stops"
+            and np.isfinite([model.arm.lower, model.arm.upper]).all()
+        ):
             yield from _stops(arm_file, guess)
     if creeping:
-        plan_creep(arm_file)  # raises where it cannot be made; joints that gravity does not load are findings of the model
+        plan_creep(
+            arm_file
+        )  # raises where it cannot be made; joints that gravity does not load are findings of the model
         return
     plan = plan_sweep(arm_file, guess)
     checked = check_plan(arm_file, plan)
