@@ -1,5 +1,6 @@
 """Terminal output of the sweep commands: progress with time left, plans and results as tables on standard error."""
 
+import os
 import sys
 from collections.abc import Callable
 from types import TracebackType
@@ -90,7 +91,7 @@ def confirm(question: str) -> None:
 def print_preflight(found: "Preflight") -> None:
     """Print the findings of the pre-flight, one row per joint."""
     headings = (
-        Column("joint", overflow="fold"),
+        "joint",
         "torque noise [N·m]",
         "torque at rest [N·m]",
         "drive [°C]",
@@ -98,7 +99,7 @@ def print_preflight(found: "Preflight") -> None:
         "upper stop [rad]",
     )
     table = Table(*headings, title="Pre-flight")
-    for joint, name in enumerate(found.names):
+    for joint, name in enumerate(_without_common(found.names)):
         stops = [
             "not pushed" if np.isnan(at) else f"{at:.3f} (arm file {wanted:.3f})"
             for at, wanted in zip(found.stops[joint], found.expected[joint], strict=True)
@@ -165,6 +166,14 @@ def warn_late(arm: ArmFile, lateness: Lateness) -> None:
     print_lines([warning] if warning else [], "yellow")
 
 
+def _without_common(names: tuple[str, ...]) -> list[str]:
+    """Names without the words that all begin with: `joint1` of openarm_right_joint1, openarm_right_joint2."""
+    begin = os.path.commonprefix(names)
+    words = begin[: begin.rfind("_") + 1] if len(names) > 1 else ""
+    short = [name.removeprefix(words) for name in names]
+    return list(names) if any(name.isdigit() for name in short) else short
+
+
 def _short(names: tuple[str, ...]) -> list[str]:
     """The numbers of names such as joint_1, joint_2; other names as they are."""
     begin = names[0].rstrip("0123456789")
@@ -174,8 +183,8 @@ def _short(names: tuple[str, ...]) -> list[str]:
 
 def print_intervals(title: str, names: tuple[str, ...], columns: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:
     """Values with the half width of their 95 % interval, a row a joint; `columns` maps heading to (value, half)."""
-    table = Table(Column("joint", overflow="fold"), *columns, title=title)
-    for joint, name in enumerate(names):
+    table = Table("joint", *columns, title=title)
+    for joint, name in enumerate(_without_common(names)):
         table.add_row(name, *(_interval(value[joint], half[joint]) for value, half in columns.values()))
     _CONSOLE.print(table)
 
