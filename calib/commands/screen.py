@@ -1,6 +1,5 @@
 """Terminal output of the sweep commands: progress with time left, plans and results as tables on standard error."""
 
-import os
 import sys
 from collections.abc import Callable
 from types import TracebackType
@@ -168,8 +167,9 @@ def warn_late(arm: ArmFile, lateness: Lateness) -> None:
 
 def _without_common(names: tuple[str, ...]) -> list[str]:
     """Names without the words that all begin with: `joint1` of openarm_right_joint1, openarm_right_joint2."""
-    begin = os.path.commonprefix(names)
-    words = begin[: begin.rfind("_") + 1] if len(names) > 1 else ""
+    words = names[0].rpartition("_")[0] + "_"
+    if len(names) < 2 or not all(name.startswith(words) for name in names):
+        return list(names)
     short = [name.removeprefix(words) for name in names]
     return list(names) if any(name.isdigit() for name in short) else short
 
