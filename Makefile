@@ -5,7 +5,7 @@ export PYTHON
 CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host daemon_days daemon_kills fuzz_frames fuzz_drives fuzz_guard kill_drives two_hosts scales web
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep bodies pictures
+.PHONY: help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies pictures
 
 help: ## Say what can be done
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
@@ -55,6 +55,9 @@ stalls: .venv/.dev ## Long campaign outside make test: sweeps while job, loop an
 creep: .venv/.dev ## Long campaign outside make test: drawn arms without torque sensors (ARGS="--seeds 1 5 --no-steps")
 	$(BIN)/python tests/campaigns/creep_contacts.py
 	$(BIN)/python tests/campaigns/creep_arms.py $(ARGS)
+
+creepwalk: .venv/.dev ## Long campaign outside make test: docs/no-torque-sensors.md typed in order, in real time, on the simulated OpenArm
+	$(BIN)/python tests/campaigns/creep_walk.py $(ARGS)
 
 realism: .venv/.dev ## Long campaign outside make test: sensor fits of realistic arms, good and bad (ARGS="--seeds 1 5 --full")
 	$(BIN)/python tests/campaigns/realism.py $(ARGS)

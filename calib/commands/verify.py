@@ -34,6 +34,7 @@ def verify(
     """
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
+    from armlink.errors import Refused
     from armlink.loop.open import open_arm
     from calib.commands.screen import SweepScreen
     from calib.creep.choice import sweep_motion
@@ -44,11 +45,14 @@ def verify(
     arm_file = load_arm(arm)
     with open_arm(arm_file, bus) as link:
         gravity, calibration = _records(RecordStore(store), arm_file, record or [])
+        creeping = sweep_motion(arm_file) == "creep"
+        if creeping and calibration is None:
+            raise Refused(f"{arm_file.name} {arm_file.serial}: no calibration record yet: armlink calibrate makes one")
         link.start()
         with SweepScreen(f"{arm_file.name}: verify") as screen:
             link.enable()
             watch, bridge = screen.count, screen.on_stall(keep_going)
-            if sweep_motion(arm_file) == "creep" and calibration is not None:
+            if creeping and calibration is not None:
                 result = verify_creeping(
                     link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=watch, on_stall=bridge
                 )
