@@ -15,7 +15,7 @@ from sim_gap.attribution.rivals import Rivals
 from sim_gap.attribution.steadiness import STEADY, steadiness
 from sim_gap.effects.registry import effects
 from sim_gap.residuals.layout import Layout, Row
-from sim_gap.residuals.residual_set import RELEVANT_NM, ResidualSet
+from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.estimate import Estimate, Value
 from sim_gap.search.normal_equations import NormalEquations
 from sim_gap.search.term import Term
@@ -140,7 +140,7 @@ def relevant_terms(
     ):
         return step.terms
     shows = {row for term in step.terms for row in estimate.store.columns(term)}
-    least = np.maximum(_minor(shows, heldout.layout) * heldout.usual_torque, QUIET_NM if quiet else RELEVANT_NM)
+    least = np.maximum(_minor(shows, heldout.layout) * heldout.usual_torque, QUIET_NM if quiet else heldout.relevant_nm)
     if np.all(scorer.falls(step.below, step.terms, quiet) < least):
         return ()
     places = {term.place for term in step.terms}

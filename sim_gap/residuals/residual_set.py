@@ -18,8 +18,9 @@ MODEL_FLOOR = 1e-3
 FLOOR, FLOOR_INNER, FLOOR_NM = 0.01, 0.003, 0.01
 """Residual that is not worth a parameter: share of a joint's torque (RMS) against the model, and of motor against
 sensor or command; and in any case [N·m]."""
-RELEVANT_NM = 0.05
-"""Smallest gap that is relevant to a user [N·m]: every arm has a few hundredths of friction and offset."""
+RELEVANT_NM, RELEVANT_SMALL = 0.05, 0.05
+"""Smallest gap that is relevant to a user [N·m]: every arm has a few hundredths of friction and offset. Of a small arm,
+this share of the largest joint torque (RMS)."""
 RELEVANT, RELEVANT_INNER, RELEVANT_COMMAND = 0.016, 0.007, 0.001
 """Smallest relevant gap as a share of the joint's torque (RMS): against the model, motor against sensor, command
 against motor."""
@@ -133,6 +134,11 @@ class ResidualSet:
         """RMS model torque of each joint in the recording with the largest [N·m], (n,)."""
         return np.asarray(np.max([np.sqrt(np.mean(s.model**2, axis=0)) for s in self.signals], axis=0))
 
+    @cached_property
+    def relevant_nm(self) -> float:
+        """Smallest gap of this arm that is relevant [N·m]."""
+        return min(RELEVANT_NM, RELEVANT_SMALL * float(np.max(self.usual_torque)))
+
     def _floor(self, s: Signals, row: Row, rest: Array) -> float:
         channel, joint = row
         reference = self.layout.reference(row)
@@ -169,7 +175,8 @@ class ResidualSet:
         """
         torque = self.usual_torque
         return {
-            row: 2.0 * self.floor[row] + max(self._relevant(row) * torque[row[1]], RELEVANT_NM) for row in self.rows
+            row: 2.0 * self.floor[row] + max(self._relevant(row) * torque[row[1]], self.relevant_nm)
+            for row in self.rows
         }
 
     def _relevant(self, row: Row) -> float:
@@ -184,7 +191,7 @@ class ResidualSet:
     def quiet_threshold(self) -> dict[Row, float]:
         """RMS of each row below which it may be noise alone: an effect must then show steadily [N·m]."""
         noise = {row: 2.0 * floor for row, floor in self.floor.items()}
-        return {row: noise[row] + max(QUIET * (self.margin[row] - noise[row]), RELEVANT_NM) for row in self.rows}
+        return {row: noise[row] + max(QUIET * (self.margin[row] - noise[row]), self.relevant_nm) for row in self.rows}
 
 
 def residual_sets(train: Sequence[Signals], heldout: Sequence[Signals]) -> tuple[ResidualSet, ResidualSet]:
