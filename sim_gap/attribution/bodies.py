@@ -167,8 +167,8 @@ def _own(estimate: Estimate, store: ColumnStore, body: Term, recording: int) -> 
     squares = [(np.mean(y**2), np.mean((y - x @ change) ** 2), floor, margin) for x, y, floor, margin in rows]
     fall = sum(0.5 * np.log((before + floor) / (after + floor)) for before, after, floor, _ in squares)
     gaps = [after / before for before, after, _, margin in squares if before > NEAR**2 * margin]
-    start = estimate.of(body) if body in estimate.terms else np.zeros(4)
-    return _Own(start + change, float(fall), float(np.mean(gaps)) if gaps else 1.0)
+    found = estimate.of(body) if body in estimate.terms else np.zeros(4)
+    return _Own(found + change, float(fall), float(np.mean(gaps)) if gaps else 1.0)
 
 
 def _across(s: Signals, body: Array) -> Array:
