@@ -7,10 +7,12 @@ import numpy as np
 
 from armlink.errors import BadInput
 from gcomp.arrays import Array
+from sim_gap.residuals.layout import Layout
 from sim_gap.residuals.preprocess import ABSENT, Signals
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import Estimate
+from sim_gap.search.model_selection import golden
 from sim_gap.search.term import Term
 
 
@@ -66,24 +68,47 @@ def placed(estimate: Estimate, heldout: ResidualSet) -> ResidualSet:
         tried = [replace(s, number=with_it.number), replace(s, number=ABSENT)]
         if any(others) and body.bound:
             tried = tried[:1] if any({*s.groups} & {*names} for names in others) else tried[1:]
-        if tried[0].number != ABSENT:
-            own = _own(estimate, estimate.on(ResidualSet((tried[0],), heldout.layout)), body, 0)
-            angle = _turn(s, estimate.of(body), own.values)
-            tried += [replace(tried[0], mount=angle)] if abs(angle) > TURNED else []
         left = [_left(estimate, ResidualSet((each,), heldout.layout)) for each in tried]
-        plain = min(range(min(2, len(tried))), key=left.__getitem__)
-        out.append(tried[-1] if left[-1] < left[plain] - CLEARLY else tried[plain])
+        best = tried[int(np.argmin(left))]
+        if tried[0].number != ABSENT and _has_alike(estimate, ResidualSet((tried[0],), heldout.layout), body):
+            turned = _mounted(estimate, tried[0], heldout.layout)
+            best = turned[1] if turned[0] < min(left) - CLEARLY else best
+        out.append(best)
     return ResidualSet(tuple(out), heldout.layout)
 
 
 TURNED = 0.25
 """Least angle by which a body counts as mounted in another way [rad]."""
+ANGLES = 12
+"""Number of angles that are tried first."""
 CLEARLY = 0.5
 """Fall of Σ ½ log(R² + floor²) over the rows from which it does."""
 ALIKE = 0.5
 """Largest difference of two bodies' mass and moment, as a share of the larger, for one to be the other, turned."""
+OF_A_BODY, NEAR = 0.1, 2.0
+"""Largest share of the squares that a body leaves of a gap that is one; multiple of its margin from which a row has a
+gap."""
 OPPOSITE = 0.9
 """Cosine from which two moments are opposite."""
+
+
+def _has_alike(estimate: Estimate, data: ResidualSet, body: Term) -> bool:
+    """Whether a body of about the same mass, elsewhere, would explain a recording far better than the one found."""
+    own, mass = _own(estimate, estimate.on(data), body, 0), float(estimate.of(body)[0])
+    return own.fall > CLEARLY and abs(own.values[0] - mass) < ALIKE * abs(mass)
+
+
+def _mounted(estimate: Estimate, s: Signals, layout: Layout) -> tuple[float, Signals]:
+    """The recording with the body turned by the angle that leaves least, and what is left then."""
+
+    def left(angle: float) -> float:
+        return _left(estimate, ResidualSet((replace(s, mount=angle),), layout))
+
+    step = 2.0 * np.pi / ANGLES
+    start = min((step * k for k in range(ANGLES)), key=left)
+    angle = golden(left, start - step, start + step)
+    angle = float((angle + np.pi) % (2.0 * np.pi) - np.pi)
+    return left(angle), replace(s, mount=angle)
 
 
 def mounts(estimate: Estimate) -> tuple[float, ...]:
@@ -113,10 +138,13 @@ def mounts(estimate: Estimate) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class _Own:
-    """Mass and first moment of the body from one recording alone, (4,), and the fall of Σ ½ log(R² + floor²) by it."""
+    """Mass and first moment of the body from one recording alone, (4,)."""
 
     values: Array
     fall: float
+    """Fall of Σ ½ log(R² + floor²) over the rows by it."""
+    left: float
+    """Share of the squares of the rows with a gap that it leaves; one without a gap."""
 
 
 def _own(estimate: Estimate, store: ColumnStore, body: Term, recording: int) -> _Own:
@@ -131,14 +159,16 @@ def _own(estimate: Estimate, store: ColumnStore, body: Term, recording: int) -> 
         x, y = columns[part][valid], (data.values[row] - explained[row])[part][valid]
         if len(y):
             floor = data.relevance_floor[row] ** 2
-            rows.append((x, y, floor))
+            rows.append((x, y, floor, data.margin[row] ** 2))
             gram += x.T @ x / (np.mean(y**2) + floor)
             side += x.T @ y / (np.mean(y**2) + floor)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(gram), 1e-12))
     change = scale * np.linalg.lstsq(gram * scale * scale[:, None], scale * side, 1e-8)[0]
-    falls = [0.5 * np.log((np.mean(y**2) + f) / (np.mean((y - x @ change) ** 2) + f)) for x, y, f in rows]
-    before = estimate.of(body) if body in estimate.terms else np.zeros(4)
-    return _Own(before + change, float(sum(falls)))
+    squares = [(np.mean(y**2), np.mean((y - x @ change) ** 2), floor, margin) for x, y, floor, margin in rows]
+    fall = sum(0.5 * np.log((before + floor) / (after + floor)) for before, after, floor, _ in squares)
+    gaps = [after / before for before, after, _, margin in squares if before > NEAR**2 * margin]
+    found = estimate.of(body) if body in estimate.terms else np.zeros(4)
+    return _Own(found + change, float(fall), float(np.mean(gaps)) if gaps else 1.0)
 
 
 def _across(s: Signals, body: Array) -> Array:
@@ -168,12 +198,18 @@ def _turn(s: Signals, one: Array, other: Array) -> float:
 
 
 def lacking(estimate: Estimate, heldout: ResidualSet) -> list[int]:
-    """Indices of held-out recordings without a body that every training recording has.
+    """Indices of held-out recordings that differ from all training recordings by a body.
 
-    Nothing in the training data then separates the body from errors of the arm's own masses.
+    Nothing in the training data then separates the body from errors of the arm's own masses: all of them have one that
+    a held-out recording lacks, or a gap of a held-out recording is nearly all that of a body.
     """
     body, known = body_of(estimate), {s.number for s in estimate.store.data.signals}
-    if body is None or not all(body.form.signature.present(body.shape, number) for number in known):
+    if body is None:
+        trial = Term("link.payload", 0)
+        others = [(k, s) for k, s in enumerate(heldout.signals) if s.number not in known]
+        owns = {k: _own(estimate, estimate.on(ResidualSet((s,), heldout.layout)), trial, 0) for k, s in others}
+        return [k for k, own in owns.items() if own.left < OF_A_BODY]
+    if not all(body.form.signature.present(body.shape, number) for number in known):
         return []
     return [k for k, s in enumerate(heldout.signals) if s.number == ABSENT]
 

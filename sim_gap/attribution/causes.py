@@ -15,7 +15,7 @@ from sim_gap.attribution.rivals import Rivals
 from sim_gap.attribution.steadiness import STEADY, steadiness
 from sim_gap.effects.registry import effects
 from sim_gap.residuals.layout import Layout, Row
-from sim_gap.residuals.residual_set import RELEVANT_NM, ResidualSet
+from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.estimate import Estimate, Value
 from sim_gap.search.normal_equations import NormalEquations
 from sim_gap.search.term import Term
@@ -77,10 +77,10 @@ class _Scorer:
         """Held-out RMS per joint after fitting these terms to the training set, (n,)."""
         return self._by_joint(self.squares(terms))
 
-    def falls(self, terms: Sequence[Term], more: Sequence[Term], quiet: bool) -> Array:
+    def falls(self, terms: Sequence[Term], more: Sequence[Term], by_row: bool) -> Array:
         """Decrease of each joint's RMS by `more` in addition to `terms`, (n,).
 
-        If all is quiet, and at a joint whose command passes over noisy channels: the largest decrease of one row, noise
+        `by_row`, and at a joint whose command passes over noisy channels: the largest decrease of one row, noise
         subtracted.
         """
         layout = self.heldout.layout
@@ -89,7 +89,7 @@ class _Scorer:
         before, after = (np.sqrt(np.maximum(squares - self.noise, 0.0)) for squares in (before, after))
         out = np.zeros(layout.n)
         np.maximum.at(out, self.joint[self.counts], (before - after)[self.counts])
-        noisy = np.array([quiet or layout.beyond(joint) > 0 for joint in range(layout.n)])
+        noisy = np.array([by_row or layout.beyond(joint) > 0 for joint in range(layout.n)])
         return np.where(noisy, out, whole)
 
     def _by_joint(self, squares: Array) -> Array:
@@ -144,10 +144,11 @@ def relevant_terms(
     ):
         return step.terms
     shows = {row for term in step.terms for row in estimate.store.columns(term)}
-    absolute = heldout.least(QUIET_NM if quiet else RELEVANT_NM)
+    absolute = heldout.least(QUIET_NM) if quiet else heldout.relevant_nm
     least = np.maximum(_minor(shows, heldout.layout) * heldout.usual_torque, absolute)
     others = [term for term in estimate.terms if term not in step.terms]
-    falls = scorer.falls(step.below, step.terms, quiet), scorer.falls(others, step.terms, quiet)
+    by_row = quiet or {channel for channel, _ in shows} == {heldout.layout.command}
+    falls = scorer.falls(step.below, step.terms, by_row), scorer.falls(others, step.terms, by_row)
     if np.all(np.maximum(*falls) < least):
         return ()
     places = {term.place for term in step.terms}
@@ -157,7 +158,7 @@ def relevant_terms(
 
     def rise(gone: set[int]) -> Array:
         lost = [term for term in step.terms if term.place in gone]
-        return scorer.falls([term for term in estimate.terms if term not in lost], lost, quiet)
+        return scorer.falls([term for term in estimate.terms if term not in lost], lost, by_row)
 
     for place in sorted(places, key=lambda place: float(np.max(rise({place}) / least))):
         if np.all(rise({*small, place}) < least):

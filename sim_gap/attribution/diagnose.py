@@ -15,7 +15,7 @@ from armlink.errors import BadInput
 from armlink.recording.corrections import AS_IT_IS, Corrections
 from armlink.recording.recording import Recording, default_names, slice_rows
 from sim_gap.attribution.answer import Internals, answer
-from sim_gap.attribution.bodies import CLEARLY, groups_of, lacking, mounts, placed
+from sim_gap.attribution.bodies import CLEARLY, body_of, groups_of, lacking, mounts, placed
 from sim_gap.attribution.causes import causes
 from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.attribution.position_only import diagnose_positions
@@ -39,7 +39,7 @@ OWN_HELDOUT = 0.3
 """Share at the end of each training recording that is held out if no held-out recording is given."""
 OWN_HELDOUT_S = 3.0
 """Least length of it [s], up to half of a short recording."""
-LENT = "the first is fitted: no training recording lacks the body"
+LENT = "the first is fitted: by a body it differs from all training recordings"
 """Why half of a held-out recording is fitted."""
 MOUNTED = 2
 """How often the ways in which a body is mounted are looked at."""
@@ -108,11 +108,12 @@ def diagnose(
     library = library_without(withhold)
     search, estimate = _fitted(fit, library)
     judge = placed(estimate, judge)
-    if lent := lacking(estimate, judge):
-        fit, judge, heldout = _lent(fit, judge, heldout, lent)
-        heldout_is += f"; of {', '.join(judge.signals[k].label for k in lent)} the second half, for {LENT}"
-        search, estimate = _fitted(fit, library)
-        judge = placed(estimate, judge)
+    if "link.payload" in library and (lent := lacking(estimate, judge)):
+        more, rest, recordings = _lent(fit, judge, heldout, lent)
+        other, again = _fitted(more, library)
+        if body_of(again) is not None:
+            search, estimate, judge, heldout = other, again, placed(again, rest), recordings
+            heldout_is += f"; of {', '.join(judge.signals[k].label for k in lent)} the second half, for {LENT}"
     fit = estimate.store.data
     quiet = not fit.impacts and is_quiet(judge) and is_quiet(fit)
     found, minor = causes(estimate, judge, Rivals(search), sim.arm.names, quiet=quiet)

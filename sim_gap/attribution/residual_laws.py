@@ -16,7 +16,7 @@ from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.residuals.besides import regimes, slides
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.preprocess import Signals
-from sim_gap.residuals.residual_set import RELEVANT_NM, ResidualSet, root_mean_square
+from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
 
 KNOTS = 8
 """Number of points between which a law is linear."""
@@ -145,7 +145,7 @@ def _best(
     y = np.concatenate([law.columns(s, joint) for s in judge.signals]) @ c
     before, after = (root_mean_square(rest[judged]) for rest in (left[1], left[1] - y))
     above = before**2 - judge.floor[row] ** 2
-    if before**2 - after**2 < LEAST * above or before - after < judge.least(RELEVANT_NM):
+    if before**2 - after**2 < LEAST * above or before - after < judge.relevant_nm:
         return None
     at = law.basis(law.at)
     band = DEVIATIONS * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", at, covariance, at), 0.0))

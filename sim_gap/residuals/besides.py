@@ -10,7 +10,7 @@ from gcomp.arrays import Array
 from sim_gap.residuals.channel_noise import spectrum
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.preprocess import BAND_HZ, CHANNELS, Signals
-from sim_gap.residuals.residual_set import RELEVANT_NM, ResidualSet, root_mean_square
+from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
 from sim_gap.residuals.where import Location
 
 AT_REST = 0.05
@@ -82,7 +82,7 @@ def fast(data: ResidualSet, recordings: Sequence[Recording]) -> list[Location]:
                 if found and (row not in best or found[1] > best[row].rms):
                     hz, rms, share = found
                     noise = data.floor.get(row, 0.0)
-                    clear = rms > max(data.least(RELEVANT_NM), 2.0 * noise)
+                    clear = rms > max(data.relevant_nm, 2.0 * noise)
                     best[row] = Location(names[joint], channel, "band", rms, noise, share, hz, clear)
     return [each for each in best.values() if each.clear]
 

@@ -138,6 +138,11 @@ class ResidualSet:
         """RMS model torque of each joint in the recording with the largest [N·m], (n,)."""
         return np.asarray(np.max([np.sqrt(np.mean(s.model**2, axis=0)) for s in self.signals], axis=0))
 
+    @property
+    def relevant_nm(self) -> float:
+        """Smallest gap of this arm that is relevant [N·m]."""
+        return self.least(RELEVANT_NM)
+
     def least(self, torque: float) -> float:
         """A bound in N·m as it applies to an arm of this strength."""
         return torque * min(1.0, float(self.usual_torque.max()) / SMALL_ARM_NM)
@@ -176,7 +181,7 @@ class ResidualSet:
 
         That is smaller for the motor against the sensor, in which errors of the links do not show.
         """
-        torque, least = self.usual_torque, self.least(RELEVANT_NM)
+        torque, least = self.usual_torque, self.relevant_nm
         return {row: 2.0 * self.floor[row] + max(self._relevant(row) * torque[row[1]], least) for row in self.rows}
 
     def _relevant(self, row: Row) -> float:
@@ -191,7 +196,7 @@ class ResidualSet:
     def quiet_threshold(self) -> dict[Row, float]:
         """RMS of each row below which it may be noise alone: an effect must then show steadily [N·m]."""
         noise = {row: 2.0 * floor for row, floor in self.floor.items()}
-        least = self.least(RELEVANT_NM)
+        least = self.relevant_nm
         return {row: noise[row] + max(QUIET * (self.margin[row] - noise[row]), least) for row in self.rows}
 
 

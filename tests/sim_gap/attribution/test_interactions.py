@@ -118,3 +118,40 @@ def test_a_hum_above_the_band_is_no_true_model():
     assert (band["joint"], band["channel"]) == ("joint_2", "tau_motor")
     assert band["hz"] == pytest.approx(50.0, abs=0.5)
     assert band["rms"] == pytest.approx(0.5 / np.sqrt(2), rel=0.1)
+
+
+PLACE = np.array([0.10, 0.03, 0.12])
+"""A body aside of the last joint's axis, which is y."""
+
+
+def _turned(angle: float) -> tuple[float, float, float]:
+    c, s = np.cos(angle), np.sin(angle)
+    return float(c * PLACE[0] + s * PLACE[2]), float(PLACE[1]), float(c * PLACE[2] - s * PLACE[0])
+
+
+def _with_body(angle: float | None, seed: int):
+    """An arm with and without a body that is turned about the last joint's axis."""
+    wrong = Wrong(coulomb=np.full(3, 0.3))
+    wrong = wrong if angle is None else replace(wrong, payload=0.6, payload_at=_turned(angle))
+    return record(model(), wrong, seed=seed, seconds=30, rate=50.0)
+
+
+def test_a_body_that_is_mounted_in_another_way_on_the_held_out_recording():
+    made = [_with_body(angle, seed) for seed, angle in enumerate((None, 0.0, 2.0))]
+    answer = diagnose(model(), made[:2], made[2:], labels=["a", "b", "c"])
+    assert answer.verdict == "explained"
+    assert value(answer, "link.payload", "arm", "mass").value == pytest.approx(0.6, rel=0.03)
+    (note,) = (note for note in answer.notes if "turned by" in note)
+    degrees = float(note.partition("turned by ")[2].partition("°")[0])
+    assert note.startswith("link.payload: in c ")
+    assert degrees == pytest.approx(np.degrees(2.0), abs=2.0)
+    assert answer.heldout_after.max() < 0.05
+
+
+def test_loaded_recordings_judged_on_one_without_the_body():
+    made = [_with_body(angle, seed) for seed, angle in enumerate((0.0, 0.0, None))]
+    answer = diagnose(model(), made[:2], made[2:], labels=["a", "b", "c"])
+    assert answer.verdict == "explained"
+    assert value(answer, "link.payload", "arm", "mass").value == pytest.approx(0.6, rel=0.03)
+    assert "link.payload is present in a and b alone" in answer.notes
+    assert "second half" in answer.heldout_is
