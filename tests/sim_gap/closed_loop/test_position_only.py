@@ -1,4 +1,6 @@
 import json
+import sys
+import types
 from pathlib import Path
 
 import mujoco
@@ -9,6 +11,7 @@ from servo_arm import model_text, record, written
 from armlink.errors import BadInput
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.closed_loop.identify import gain_scales
+from sim_gap.closed_loop.training.actuators import write_actuators
 from sim_gap.closed_loop.training.posterior import write_exported, write_samples
 from sim_gap.closed_loop.training.replay import replay_rms
 from sim_gap.report.page import write_report
@@ -56,6 +59,34 @@ def test_samples_scatter_about_the_fit(answer, tmp_path: Path) -> None:
     assert len((tmp_path / "draws.csv").read_text().splitlines()) == 4
     with pytest.raises(BadInput, match=r"\.csv, \.json, \.parquet"):
         write_samples(answer.internals, 3, tmp_path / "draws.txt")
+
+
+def test_actuator_entries_hold_the_fit(answer, tmp_path: Path, monkeypatch) -> None:
+    for name, entry in (
+        ("isaaclab.actuators", "DelayedPDActuatorCfg"),
+        ("mjlab.actuator", "BuiltinPositionActuatorCfg"),
+    ):
+        module = types.ModuleType(name)
+        setattr(module, entry, dict)
+        monkeypatch.setitem(sys.modules, name.partition(".")[0], types.ModuleType(name.partition(".")[0]))
+        monkeypatch.setitem(sys.modules, name, module)
+    write_actuators(answer.internals, tmp_path / "servos.py", 0.002)
+    made: dict = {}
+    exec((tmp_path / "servos.py").read_text(), made)
+    isaac, mjlab = made["isaac_lab"](), made["mjlab"]()
+    native = answer.internals.native.point
+    for j, joint in enumerate(("shoulder", "elbow")):
+        (other,) = [entry for entry in mjlab if entry["target_names_expr"] == (joint,)]
+        entry = isaac[joint]
+        assert entry["stiffness"] == other["stiffness"] == pytest.approx(native["kp"][j], rel=1e-5)
+        assert entry["friction"] == other["frictionloss"] == pytest.approx(native["coulomb"][j], rel=1e-5)
+        assert entry["viscous_friction"] == other["viscous_damping"] == pytest.approx(native["viscous"][j], rel=1e-5)
+        assert entry["armature"] == other["armature"] == pytest.approx(0.02, rel=0.3)
+        assert 0 <= entry["min_delay"] <= entry["max_delay"] < 5
+    with pytest.raises(BadInput, match=r"ends in \.py"):
+        write_actuators(answer.internals, tmp_path / "servos.yaml")
+    with pytest.raises(BadInput, match="--physics-step 0"):
+        write_actuators(answer.internals, tmp_path / "servos.py", 0.0)
 
 
 def test_report_shows_every_joint(answer, tmp_path: Path) -> None:
