@@ -165,11 +165,13 @@ def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: 
 
 def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
     if answer.unit == "rad":
-        from sim_gap.closed_loop.training.posterior import write_exported
+        from sim_gap.closed_loop.training.posterior import batch_path, write_exported
 
         for line in write_exported(answer.internals, path):
             console.print(f"not in MJCF: {line}", style="yellow", markup=False)
         console.print(f"corrected model with its position actuators: {path}")
+        if batch_path(path).is_file():
+            console.print(f"the same without PID actuators, for MuJoCo Warp: {batch_path(path)}")
         return
     from sim_gap.attribution.residual_laws import as_effects
     from sim_gap.better_model.effects_module import module_path

@@ -76,10 +76,11 @@ def _entry(found: Identified, j: int, step: float) -> dict[str, float | None]:
 
 
 def _delays(found: Identified, j: int) -> Array:
-    """Ends of the range of a joint's delay [s], (2,): of 90 % of its draws, or the fixed value."""
+    """Ends of the range of a joint's delay [s], (2,): that of 90 % of its draws, about the exported model's."""
     name = f"{found.sim.arm.names[j]}.delay"
     drawn = [row[name] for row in draw(found.search, found.fit, found.spread, DRAWS) if name in row]
-    return np.asarray(np.quantile(drawn, RANGE) if drawn else np.full(2, float(found.fit.point["delay"][j])))
+    about = np.quantile(drawn, RANGE) - found.fit.point["delay"][j] if drawn else np.zeros(2)
+    return np.asarray(found.native.point["delay"][j] + about)
 
 
 def _isaac(name: str, row: dict[str, float | None]) -> str:

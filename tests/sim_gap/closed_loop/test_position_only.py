@@ -1,6 +1,7 @@
 import json
 import sys
 import types
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -12,7 +13,7 @@ from armlink.errors import BadInput
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.closed_loop.identify import gain_scales
 from sim_gap.closed_loop.training.actuators import write_actuators
-from sim_gap.closed_loop.training.posterior import write_exported, write_samples
+from sim_gap.closed_loop.training.posterior import batch_path, batched, write_exported, write_samples
 from sim_gap.closed_loop.training.replay import replay_rms
 from sim_gap.report.page import write_report
 
@@ -46,6 +47,20 @@ def test_the_written_model_moves_like_the_arm(answer, tmp_path: Path) -> None:
     before = replay_rms(mujoco.MjModel.from_xml_string(model_text(kp=120.0, friction=0.0)), (0, 1), other)
     assert (replay_rms(closed, (0, 1), other) < 0.3 * before).all()
     assert answer.to_json()["rollout"]["closed_loop"] is True
+    assert batched(answer.internals) is None
+    assert not batch_path(tmp_path / "closed.xml").exists()
+
+
+def test_a_model_with_a_slew_limit_is_written_without_pid_too(answer, tmp_path: Path) -> None:
+    """MuJoCo Warp runs no PID actuator."""
+    found = answer.internals
+    limited = found.native.with_values(slew=np.array([1.5, np.inf]))
+    limited = replace(limited, active=(("kp", "slew", "coulomb", "viscous"), limited.active[1]))
+    other = batched(replace(found, native=limited))
+    assert other is not None
+    model = mujoco.MjModel.from_xml_string(other.xml)
+    assert not (model.actuator_dyntype == mujoco.mjtDyn.mjDYN_PID).any()
+    assert abs(model.actuator_gainprm[0, 0] - found.native.point["kp"][0]) < 0.1 * found.native.point["kp"][0]
 
 
 def test_samples_scatter_about_the_fit(answer, tmp_path: Path) -> None:
