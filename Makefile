@@ -5,7 +5,7 @@ export PYTHON
 CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host daemon_days daemon_kills fuzz_frames fuzz_drives fuzz_guard kill_drives two_hosts scales web
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies pictures
+.PHONY: batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies pictures
 
 help: ## Say what can be done
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
@@ -67,6 +67,9 @@ walk: .venv/.dev ## Long campaign outside make test: every command of first-run,
 
 blind: .venv/.dev ## Long campaign outside make test: the diagnosis against sealed cases (ARGS="--cases 20")
 	$(BIN)/armlink gap bench $(ARGS)
+
+batched: .venv/.dev ## Long campaign outside make test: the exported model in MuJoCo and MuJoCo Warp (ARGS="--sim M --train R --heldout R")
+	$(BIN)/python tests/campaigns/batched_replay.py $(ARGS)
 
 corruptions: .venv/.dev ## Long campaign outside make test: wrong columns, units and clocks in real recordings (ARGS="--draws 200")
 	$(BIN)/python tests/campaigns/corrupted_recordings.py $(ARGS)

@@ -39,8 +39,9 @@ def run_bench(
     """Make `cases` sealed cases under `out`, have them diagnosed, seal the answers, open the labels and score.
 
     `lengths` are the seconds of training and held-out recordings, by default 120 and 40; `effects` is the number of
-    effects in every case such as `5-8`, empty for none, one or two. `progress` gets stage, done, total. `diagnose` must
-    be a module-level function if `workers` exceeds 1. Raises BadInput if `out` holds an earlier check.
+    effects in every case such as `5-8`, empty for none, one or two. With `positions`, arms with servos of which `q` and
+    `q_cmd` alone are seen, none or one effect each, by default 36 s and 18 s. `progress` gets stage, done, total.
+    `diagnose` must be a module-level function if `workers` exceeds 1. Raises BadInput if `out` holds an earlier check.
     """
     _require_range(effects)
     if positions and effects:

@@ -10,7 +10,7 @@ from sim_gap.blind.cases.motion import RATE
 from sim_gap.blind.plant.friction import padded
 from sim_gap.blind.plant.runs import Run
 
-VELOCITY_HZ = 60.0
+VELOCITY_HZ = 200.0
 """Low pass of the servo's velocity [Hz]."""
 FINE = 1e-6
 """Resolution of the servo's own position [rad]."""

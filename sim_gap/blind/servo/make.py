@@ -171,7 +171,7 @@ def recorded(run: ServoRun, log: Log, hz: float, random: np.random.Generator) ->
 
 
 def judged(drawing: Drawing, logs: Sequence[Log]) -> tuple[dict[str, Any], bool]:
-    """Gap of the true arm, and without the effect, against the nominal model [rad]; whether it is a good case."""
+    """Gap against the nominal model with and without the effect [rad], and whether the case is good."""
     rows = slice(round(SETTLE_S * RATE), None)
     real, without, ideal = (log.position[rows] for log in logs)
     gaps = [{"q": np.sqrt(np.mean((each - ideal) ** 2, axis=0)).tolist()} for each in (real, without)]

@@ -1,5 +1,6 @@
 """The corrected model as MJCF with native position actuators: gains, delay, limits, friction, inertials, gravity."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -30,6 +31,8 @@ NATIVE = {
     "base.tilt": "option gravity",
 }
 """Effects that a field of MJCF holds."""
+BATCHED = frozenset(NATIVE) - {"controller.slew", "controller.integral"}
+"""Effects that MuJoCo Warp can run too: it has no PID actuator, which slew limit and integral part need."""
 STICKS = {"solref_friction": [0.01, 1.0], "solimp_friction": [0.999, 0.9999, 0.001, 0.5, 2.0]}
 """Solver parameters with which a joint under friction rests; with MuJoCo's usual ones it creeps to where no friction is
 needed, within a tenth of a second on a small arm."""
@@ -47,11 +50,11 @@ class Exported:
     lines: tuple[str, ...]
 
 
-def native_fit(search: Search, fit: Fit) -> Fit:
-    """The fit with what MJCF holds alone, the rest fitted anew around it."""
+def native_fit(search: Search, fit: Fit, held: Collection[str] = NATIVE) -> Fit:
+    """The fit with what a simulator holds alone, the rest fitted around it again."""
     bare = fit
     for effect in EFFECTS:
-        if effect in NATIVE:
+        if effect in held:
             continue
         for j in range(search.data.joints):
             if effect_there(fit, effect, j):
@@ -66,15 +69,15 @@ def native_fit(search: Search, fit: Fit) -> Fit:
     return improve(search.data, replace(bare, active=tuple(wanted), rms=None), search.scales, 6)
 
 
-def exported(sim: SimModel, search: Search, fit: Fit, native: Fit) -> Exported:
-    """MJCF of the native fit, and the effects of the whole fit that it leaves out."""
+def exported(sim: SimModel, search: Search, fit: Fit, native: Fit, held: Collection[str] = NATIVE) -> Exported:
+    """MJCF of the native fit, which has the effects `held`, and the effects of the whole fit that it leaves out."""
     spec = spec_of(sim)
     left = sorted(
         {
             f"{effect} {sim.arm.names[j]}"
             for effect in EFFECTS
             for j in range(sim.n)
-            if effect not in NATIVE and effect_there(fit, effect, j)
+            if effect not in held and effect_there(fit, effect, j)
         }
     )
     compiled = spec.compile()
