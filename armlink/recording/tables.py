@@ -62,6 +62,8 @@ def load_csv(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> R
     except (pa.ArrowInvalid, OSError, EOFError) as error:
         raise BadInput(f"{path}: {_first_line(error)}") from None
     loaded = _recording(table, header, str(path), ())
+    del table, content
+    pa.default_memory_pool().release_unused()
     if cut:
         cut = f"cut recording, {cut}: loaded {loaded.t.size} rows"
         loaded = replace(loaded, warning="; ".join(filter(None, (cut, loaded.warning))))

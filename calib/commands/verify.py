@@ -19,6 +19,10 @@ def verify(
     store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
     poses: Annotated[int, typer.Option(min=1, help="Poses to drive to.")] = 24,
     seed: Annotated[int, typer.Option(min=0, help="Draws other poses.")] = 0,
+    keep_going: Annotated[
+        int,
+        typer.Option(min=0, help="Enable the joints again by itself up to N times after a stall of the cycle."),
+    ] = 0,
     report: Annotated[Path | None, typer.Option(help="Also write a page to file: one self-contained HTML.")] = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")
@@ -47,12 +51,15 @@ def verify(
         link.start()
         with SweepScreen(f"{arm_file.name}: verify") as screen:
             link.enable()
+            watch, bridge = screen.count, screen.on_stall(keep_going)
             if creeping and calibration is not None:
                 result = verify_creeping(
-                    link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=screen.count
+                    link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=watch, on_stall=bridge
                 )
             else:
-                result = run_verify(link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=screen.count)
+                result = run_verify(
+                    link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=watch, on_stall=bridge
+                )
     _show(result)
     if report is not None:
         from calib.report.verification import write_report

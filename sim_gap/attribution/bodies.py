@@ -1,13 +1,15 @@
-"""Bodies that only some recordings have: which of the held-out recordings were made with them."""
+"""Bodies that only some recordings have: which of them were made with one, and how it was mounted."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from armlink.errors import BadInput
-from sim_gap.residuals.preprocess import ABSENT
+from gcomp.arrays import Array
+from sim_gap.residuals.preprocess import ABSENT, Signals
 from sim_gap.residuals.residual_set import ResidualSet
+from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import Estimate
 from sim_gap.search.term import Term
 
@@ -37,31 +39,143 @@ def _names(label: str) -> tuple[str, ...]:
     return label, file, file.split(".", 1)[0]
 
 
+def body_of(estimate: Estimate) -> Term | None:
+    """The body that recordings differ in, if one was found."""
+    return next((term for term in estimate.terms if term.effect == "link.payload"), None)
+
+
 def placed(estimate: Estimate, heldout: ResidualSet) -> ResidualSet:
     """The held-out recordings, each numbered by whether it was made with the body that training recordings have.
 
-    By its groups if there are any; else by the sum of squares that remains with and without the body. A recording that
-    is a part of a training recording stays as it is.
+    By its groups if there are any; else by the sum of squares that remains with and without the body. If it is mounted
+    in another way, turned about the last joint's axis, by which angle. A recording that is a part of a training
+    recording stays as it is.
     """
-    bodies = [term for term in estimate.terms if term.effect == "link.payload"]
-    known = {s.number for s in estimate.store.data.signals}
-    if not bodies or all(s.number in known for s in heldout.signals):
+    body = body_of(estimate)
+    train = estimate.store.data.signals
+    known = {s.number: s for s in train}
+    if body is None or all(s.number in known for s in heldout.signals):
         return heldout
-    (body,) = bodies
-    with_it = next(s for s in estimate.store.data.signals if body.form.signature.present(body.shape, s.number))
-    others = [s.groups for s in estimate.store.data.signals if body.form.signature.present(body.shape, s.number)]
+    with_it = next(s for s in train if body.form.signature.present(body.shape, s.number))
+    others = [s.groups for s in train if body.form.signature.present(body.shape, s.number)]
     out = []
     for s in heldout.signals:
         if s.number in known:
-            out.append(s)
+            out.append(replace(s, mount=known[s.number].mount))
             continue
-        present, absent = replace(s, number=with_it.number), replace(s, number=ABSENT)
+        tried = [replace(s, number=with_it.number), replace(s, number=ABSENT)]
         if any(others) and body.bound:
-            out.append(present if any({*s.groups} & {*names} for names in others) else absent)
-        else:
-            left = [_left(estimate, ResidualSet((each,), heldout.layout)) for each in (present, absent)]
-            out.append(absent if left[1] < left[0] else present)
+            tried = tried[:1] if any({*s.groups} & {*names} for names in others) else tried[1:]
+        if tried[0].number != ABSENT:
+            own = _own(estimate, estimate.on(ResidualSet((tried[0],), heldout.layout)), body, 0)
+            angle = _turn(s, estimate.of(body), own.values)
+            tried += [replace(tried[0], mount=angle)] if abs(angle) > TURNED else []
+        left = [_left(estimate, ResidualSet((each,), heldout.layout)) for each in tried]
+        plain = min(range(min(2, len(tried))), key=left.__getitem__)
+        out.append(tried[-1] if left[-1] < left[plain] - CLEARLY else tried[plain])
     return ResidualSet(tuple(out), heldout.layout)
+
+
+TURNED = 0.25
+"""Least angle by which a body counts as mounted in another way [rad]."""
+CLEARLY = 0.5
+"""Fall of Σ ½ log(R² + floor²) over the rows from which it does."""
+ALIKE = 0.5
+"""Largest difference of two bodies' mass and moment, as a share of the larger, for one to be the other, turned."""
+OPPOSITE = 0.9
+"""Cosine from which two moments are opposite."""
+
+
+def mounts(estimate: Estimate) -> tuple[float, ...]:
+    """Angle by which the body is turned in each training recording against the first that has it [rad].
+
+    Without a body found, one that is turned by half a turn between recordings may have been missed, as its moment
+    cancels: then of what is left, the recordings want opposite moments.
+    """
+    body, data = body_of(estimate), estimate.store.data
+    term = body or Term("link.payload", 0)
+    have = [k for k, s in enumerate(data.signals) if term.form.signature.present(term.shape, s.number)]
+    angles = [s.mount for s in data.signals]
+    if len(have) < 2:
+        return tuple(angles)
+    owns = {k: _own(estimate, estimate.store, term, k) for k in have}
+    one = owns[have[0]]
+    for k in have[1:]:
+        if body is not None:
+            angle = _turn(data.signals[k], one.values, owns[k].values)
+        else:
+            clear = min(one.fall, owns[k].fall) > CLEARLY
+            angle = np.pi if clear and _opposite(data.signals[k], one.values, owns[k].values) else 0.0
+        if abs(angle) > TURNED:
+            angles[k] += angle
+    return tuple(angles)
+
+
+@dataclass(frozen=True)
+class _Own:
+    """Mass and first moment of the body from one recording alone, (4,), and the fall of Σ ½ log(R² + floor²) by it."""
+
+    values: Array
+    fall: float
+
+
+def _own(estimate: Estimate, store: ColumnStore, body: Term, recording: int) -> _Own:
+    """The body in one recording of a set, all else as in the estimate."""
+    data = store.data
+    explained = estimate.predict(data, store)
+    start = sum(data.lengths[:recording])
+    part = slice(start, start + data.lengths[recording])
+    gram, side, rows = np.zeros((4, 4)), np.zeros(4), []
+    for row, columns in store.columns(body).items():
+        valid = data.valid[row][part]
+        x, y = columns[part][valid], (data.values[row] - explained[row])[part][valid]
+        if len(y):
+            floor = data.relevance_floor[row] ** 2
+            rows.append((x, y, floor))
+            gram += x.T @ x / (np.mean(y**2) + floor)
+            side += x.T @ y / (np.mean(y**2) + floor)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(gram), 1e-12))
+    change = scale * np.linalg.lstsq(gram * scale * scale[:, None], scale * side, 1e-8)[0]
+    falls = [0.5 * np.log((np.mean(y**2) + f) / (np.mean((y - x @ change) ** 2) + f)) for x, y, f in rows]
+    before = estimate.of(body) if body in estimate.terms else np.zeros(4)
+    return _Own(before + change, float(sum(falls)))
+
+
+def _across(s: Signals, body: Array) -> Array:
+    """Moment of a body across the last joint's axis, (3,)."""
+    axis = s.arm.axis[-1]
+    return np.asarray(body[1:] - (body[1:] @ axis) * axis)
+
+
+def _opposite(s: Signals, one: Array, other: Array) -> bool:
+    """Whether two moments across the last joint's axis are opposite."""
+    first, second = _across(s, one), _across(s, other)
+    sizes = sorted((float(np.linalg.norm(first)), float(np.linalg.norm(second))))
+    return sizes[0] > ALIKE * sizes[1] and float(first @ second) < -OPPOSITE * sizes[0] * sizes[1]
+
+
+def _turn(s: Signals, one: Array, other: Array) -> float:
+    """Angle about the last joint's axis from a body (mass, moment) to another one; zero if they are different bodies.
+
+    They are alike if their masses are, and the sizes of their moments across the axis.
+    """
+    across = [_across(s, body) for body in (one, other)]
+    sizes = [np.array([abs(b[0]), np.linalg.norm(r)]) for b, r in zip((one, other), across, strict=True)]
+    most = np.maximum(*sizes)
+    if one[0] * other[0] <= 0.0 or np.any(np.abs(sizes[0] - sizes[1]) > ALIKE * most):
+        return 0.0
+    return float(np.arctan2(np.cross(across[0], across[1]) @ s.arm.axis[-1], across[0] @ across[1]))
+
+
+def lacking(estimate: Estimate, heldout: ResidualSet) -> list[int]:
+    """Indices of held-out recordings without a body that every training recording has.
+
+    Nothing in the training data then separates the body from errors of the arm's own masses.
+    """
+    body, known = body_of(estimate), {s.number for s in estimate.store.data.signals}
+    if body is None or not all(body.form.signature.present(body.shape, number) for number in known):
+        return []
+    return [k for k, s in enumerate(heldout.signals) if s.number == ABSENT]
 
 
 def _left(estimate: Estimate, data: ResidualSet) -> float:

@@ -15,7 +15,7 @@ from armlink.errors import BadInput
 from armlink.recording.corrections import AS_IT_IS, Corrections
 from armlink.recording.recording import Recording, default_names, slice_rows
 from sim_gap.attribution.answer import Internals, answer
-from sim_gap.attribution.bodies import groups_of, placed
+from sim_gap.attribution.bodies import CLEARLY, groups_of, lacking, mounts, placed
 from sim_gap.attribution.causes import causes
 from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.attribution.position_only import diagnose_positions
@@ -33,11 +33,16 @@ from sim_gap.residuals.residual_set import ResidualSet, residual_sets
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import Estimate
 from sim_gap.search.model_selection import select_model
+from sim_gap.search.stepwise import Search
 
 OWN_HELDOUT = 0.3
 """Share at the end of each training recording that is held out if no held-out recording is given."""
 OWN_HELDOUT_S = 3.0
 """Least length of it [s], up to half of a short recording."""
+LENT = "the first is fitted: no training recording lacks the body"
+"""Why half of a held-out recording is fitted."""
+MOUNTED = 2
+"""How often the ways in which a body is mounted are looked at."""
 
 
 def diagnose(
@@ -100,10 +105,15 @@ def diagnose(
     ]
     fit, judge = residual_sets(ready[: len(train)], ready[len(train) :])
     _require_motion(fit)
-    store = ColumnStore(fit)
-    search = select_model(store, library_without(withhold))
-    estimate = Estimate(search.normal.store, search.active)
+    library = library_without(withhold)
+    search, estimate = _fitted(fit, library)
     judge = placed(estimate, judge)
+    if lent := lacking(estimate, judge):
+        fit, judge, heldout = _lent(fit, judge, heldout, lent)
+        heldout_is += f"; of {', '.join(judge.signals[k].label for k in lent)} the second half, for {LENT}"
+        search, estimate = _fitted(fit, library)
+        judge = placed(estimate, judge)
+    fit = estimate.store.data
     quiet = not fit.impacts and is_quiet(judge) and is_quiet(fit)
     found, minor = causes(estimate, judge, Rivals(search), sim.arm.names, quiet=quiet)
     if quiet and not found:
@@ -111,6 +121,40 @@ def diagnose(
     else:
         made = answer(Internals(sim, fit, judge, estimate, tuple(heldout), estimate), found, minor, heldout_is)
     return replace(made, checks=findings)
+
+
+def _fitted(fit: ResidualSet, library: Sequence[str]) -> tuple[Search, Estimate]:
+    """The search of the library and the fit; again if a body is mounted in different ways, kept if that is better."""
+    search = select_model(ColumnStore(fit), library)
+    estimate = Estimate(search.normal.store, search.active)
+    for _ in range(MOUNTED):
+        signals = estimate.store.data.signals
+        angles = mounts(estimate)
+        if angles == tuple(s.mount for s in signals):
+            break
+        turned = tuple(replace(s, mount=angle) for s, angle in zip(signals, angles, strict=True))
+        again = select_model(ColumnStore(ResidualSet(turned, fit.layout)), library)
+        if again.score > search.score - CLEARLY:
+            break
+        search, estimate = again, Estimate(again.normal.store, again.active)
+    return search, estimate
+
+
+def _lent(
+    fit: ResidualSet, judge: ResidualSet, heldout: Sequence[Recording], lent: Sequence[int]
+) -> tuple[ResidualSet, ResidualSet, list[Recording]]:
+    """Training and held-out sets with the first half of some held-out recordings in the training set, and what remains
+    of the held-out recordings."""
+    train, rest, recordings = list(fit.signals), list(judge.signals), list(heldout)
+    for number, k in enumerate(lent, start=max(s.number for s in train) + 1):
+        s, whole = judge.signals[k], heldout[k]
+        middle = 0.5 * float(whole.t[0] + whole.t[-1])
+        start = float(whole.t[0]) - float(s.t[0])
+        parts = [slice_rows(whole, whole.t < middle), slice_rows(whole, whole.t >= middle)]
+        first, second = (prepare(part, s.arm, s.label, number, s.groups, start) for part in parts)
+        train.append(first)
+        rest[k], recordings[k] = second, parts[1]
+    return *residual_sets(train, rest), recordings
 
 
 def _checked(

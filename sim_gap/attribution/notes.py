@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from gcomp.arrays import Array
 from sim_gap.attribution.bodies import recordings_with
 from sim_gap.attribution.diagnosis import Cause
@@ -9,6 +11,7 @@ from sim_gap.attribution.residual_laws import ResidualLaw
 from sim_gap.attribution.verdict import row_rms
 from sim_gap.effects.laws import LAWS
 from sim_gap.residuals.layout import Row
+from sim_gap.residuals.preprocess import ABSENT
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.residuals.stuck_channels import Stuck
 from sim_gap.residuals.where import Location, locate
@@ -73,9 +76,21 @@ def _bound(estimate: Estimate | None, fit: ResidualSet, judge: ResidualSet) -> t
                 "link.payload: includes mass errors of the links themselves; to separate them, add recordings of the "
                 "arm without the payload (--train)"
             )
+        if term.effect == "link.payload":
+            lines += _turned((fit, judge))
         if term.effect == "link.payload" and estimate is not None and estimate.of(term)[0] < 0.0:
             lines.append("link.payload: its mass is negative: the model has a body at its tip that the arm lacks")
     return tuple(lines)
+
+
+def _turned(sets: Sequence[ResidualSet]) -> list[str]:
+    """A note for each recording in which a body is mounted in another way."""
+    return [
+        f"link.payload: in {s.label} it is turned by {np.degrees(s.mount):.0f}° about the axis of {s.arm.names[-1]} "
+        "against the other recordings; that angle was found from this recording"
+        for s in dict.fromkeys(s for data in sets for s in data.signals)
+        if s.mount and s.number != ABSENT
+    ]
 
 
 def _alike(found: Sequence[Cause]) -> tuple[str, ...]:

@@ -145,7 +145,7 @@ def _best(
     y = np.concatenate([law.columns(s, joint) for s in judge.signals]) @ c
     before, after = (root_mean_square(rest[judged]) for rest in (left[1], left[1] - y))
     above = before**2 - judge.floor[row] ** 2
-    if before**2 - after**2 < LEAST * above or before - after < RELEVANT_NM:
+    if before**2 - after**2 < LEAST * above or before - after < judge.least(RELEVANT_NM):
         return None
     at = law.basis(law.at)
     band = DEVIATIONS * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", at, covariance, at), 0.0))

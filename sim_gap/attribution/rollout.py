@@ -17,7 +17,7 @@ from sim_gap.better_model import forward_effects
 from sim_gap.better_model.effects_module import joint_effects
 from sim_gap.better_model.export import Written, written
 from sim_gap.better_model.forward_effects import JointEffect
-from sim_gap.better_model.with_effects import with_effects
+from sim_gap.better_model.with_effects import spec_of, with_effects
 from sim_gap.model.load import SimModel
 from sim_gap.residuals.preprocess import CHANNELS
 from sim_gap.residuals.residual_set import ResidualSet
@@ -44,7 +44,8 @@ class RollOuts:
     ) -> None:
         """`laws` go with every simulation of effects, none with that of the nominal model."""
         self.sim, self.recordings, self.estimate, self.laws = sim, recordings, estimate, tuple(laws)
-        self.numbers = [s.number for s in heldout.signals]
+        self.spec = spec_of(sim) if sim.path is not None else None
+        self.bodies = [(s.number, s.mount) for s in heldout.signals]
         self.channel = CHANNELS[heldout.layout.motor_side]
         self.source = {"tau_motor": "motor", "tau_cmd": "command", "tau": "sensor"}[heldout.layout.motor_side]
 
@@ -52,24 +53,24 @@ class RollOuts:
         """Deviation per joint with these terms [rad], RMS over the windows of all recordings, (n,)."""
         share, squares = max(1, windows // len(self.recordings)), []
         bodies = any(term.effect == "link.payload" for term in terms)
-        made: dict[int, tuple[Any, ModuleType, Any]] = {}
-        for r, number in zip(self.recordings, self.numbers, strict=True):
-            number = number if bodies else 0
-            if number not in made:
-                made[number] = self._files(terms, number)
-            model, module, effects = made[number]
+        made: dict[tuple[int, float], tuple[Any, ModuleType, Any]] = {}
+        for r, body in zip(self.recordings, self.bodies, strict=True):
+            body = body if bodies else (0, 0.0)
+            if body not in made:
+                made[body] = self._files(terms, *body)
+            model, module, effects = made[body]
             torque = getattr(r, self.channel)
             squares.append(module.roll_out(model, effects, r.t, r.position, torque, self.source, windows=share) ** 2)
         return np.asarray(np.sqrt(np.nanmean(squares, axis=0)))
 
-    def _files(self, terms: Sequence[Term], number: int) -> tuple[Any, ModuleType, Any]:
+    def _files(self, terms: Sequence[Term], number: int, mount: float) -> tuple[Any, ModuleType, Any]:
         """Model, module and effects with these terms as they are written for one recording."""
         if self.sim.path is None:  # a compiled model has no file to write
-            corrected = with_effects(self.sim, self.estimate, terms, number)
+            corrected = with_effects(self.sim, self.estimate, terms, number, mount)
             entries = [*joint_effects(self.sim, self.estimate, corrected.not_held), *(self.laws if terms else ())]
             own = forward_effects.Effects(corrected.model, entries, self.sim.arm.names)
             return corrected.model, forward_effects, own
-        files = written(self.sim, self.estimate, NAME, terms, number, self.laws if terms else ())
+        files = written(self.sim, self.estimate, NAME, terms, number, self.laws if terms else (), self.spec, mount)
         model, module = _compiled(files), _loaded(files)
         return model, module, module.Effects(model, module.EFFECTS, module.JOINTS or self.sim.arm.names)
 

@@ -11,7 +11,7 @@ from armlink.errors import BadInput
 from sim_gap.better_model.coupled_motors import add_to, coupled_motors
 from sim_gap.better_model.effects_module import joint_effects, module_path, module_text
 from sim_gap.better_model.forward_effects import GEARED, JointEffect
-from sim_gap.better_model.with_effects import spec_of, with_effects
+from sim_gap.better_model.with_effects import compiled_copy, spec_of, with_effects
 from sim_gap.model.load import SimModel
 from sim_gap.search.estimate import Estimate
 from sim_gap.search.term import Term
@@ -39,14 +39,18 @@ def written(
     terms: Sequence[Term] | None = None,
     number: int = 0,
     laws: Sequence[JointEffect] = (),
+    spec: Any = None,
+    mount: float = 0.0,
 ) -> Written:
     """The files of the model with the effects of an estimate, or with some of its terms; `name` is the MJCF's.
 
-    A body that only some recordings have is left out, except for the one with this `number`. `laws` are torques
-    without a known cause.
+    A body that only some recordings have is left out, except for the one with this `number`, in which it is turned by
+    `mount` [rad]. `laws` are torques without a known cause. `spec` is the nominal model's if it has been read before;
+    it is copied.
     """
     chosen = () if estimate is None else estimate.terms if terms is None else tuple(terms)
-    spec, corrected = spec_of(sim), with_effects(sim, estimate, chosen, number)
+    spec = spec_of(sim) if spec is None else compiled_copy(spec)
+    corrected = with_effects(sim, estimate, chosen, number, mount)
     for body in list(spec.bodies)[1:]:
         _set_inertial(body, corrected.model)
     for joint in spec.joints:

@@ -11,7 +11,7 @@ from armlink.errors import BadInput
 from gcomp.arrays import Array
 from sim_gap.better_model.coupled_motors import CoupledMotor, add_to, coupled_motors
 from sim_gap.effects.base import tilted
-from sim_gap.effects.inertials import pseudo_inertia
+from sim_gap.effects.inertials import mounted, pseudo_inertia
 from sim_gap.model.load import SimModel, read_spec
 from sim_gap.model.rigid_body import inertial_of
 from sim_gap.residuals.preprocess import ABSENT
@@ -50,11 +50,16 @@ class CorrectedModel:
 
 
 def with_effects(
-    sim: SimModel, estimate: Estimate | None, terms: Sequence[Term] | None = None, number: int = 0
+    sim: SimModel,
+    estimate: Estimate | None,
+    terms: Sequence[Term] | None = None,
+    number: int = 0,
+    mount: float = 0.0,
 ) -> CorrectedModel:
     """A copy of the compiled model with the estimate's effects in it, or with some of its terms.
 
-    A body that only some recordings have is left out, except for the one with this `number`.
+    A body that only some recordings have is left out, except for the one with this `number`, in which it is turned by
+    `mount` about the last joint's axis [rad].
     """
     if estimate is None:
         return CorrectedModel(copy.copy(sim.mujoco_model), (), ())
@@ -65,7 +70,9 @@ def with_effects(
         for term in chosen
         if term.effect in HELD and in_model(term, number) and (coupled or term.effect != "transmission.coupling")
     )
-    changed = _set_links(model, sim, [(term, estimate.of(term)) for term in held], number)
+    turn = mounted(sim.arm.axis[-1], mount)
+    links = [(term, turn @ estimate.of(term) if term.effect == "link.payload" else estimate.of(term)) for term in held]
+    changed = _set_links(model, sim, links, number)
     for term in held:
         c, joint = estimate.of(term), sim.joints[term.place]
         if term.effect == "base.tilt":
@@ -183,6 +190,13 @@ def spec_of(sim: SimModel) -> Any:
     for name, joint in zip(sim.arm.names, sim.joints, strict=True):
         spec.joints[joint].name = spec.joints[joint].name or name
     return spec
+
+
+def compiled_copy(spec: Any) -> Any:
+    """A copy of a `mujoco.MjSpec`, its elements numbered."""
+    own = spec.copy()
+    own.compile()
+    return own
 
 
 def _joint(model: Any, joint: int, effect: str, c: Array) -> None:

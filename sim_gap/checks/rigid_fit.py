@@ -57,7 +57,7 @@ class RigidFit:
     own_share: Array
     """Standard deviation of the model's own part, over that of the reading, at scale 1."""
     friction: Array
-    """Direction-dependent torque [N·m], of either sign."""
+    """Direction-dependent torque [N·m], of either sign; NaN for a joint that hardly moves."""
     spread: Array
     """Standard deviation of the reading [N·m]."""
 
@@ -87,8 +87,16 @@ def fit_rigid(arm: RigidArm, motion: Motion, springs: bool = False) -> RigidFit:
 
 def fit_model(model: Array, motion: Motion, springs: bool = False) -> RigidFit:
     """Fit the reading of every joint by a model torque (K, n); with `springs`, of either sign, too."""
-    fits = [_joint(model[:, j], motion, j, springs) for j in range(model.shape[1])]
-    return RigidFit(*(np.array(values) for values in zip(*fits, strict=True)))
+    turned = motion.q if springs else 0.0 * motion.q
+    direction = np.clip(motion.v / TURNING, -1.0, 1.0)
+    columns = np.stack([model, direction, motion.v, motion.a, turned, motion.reading]).transpose(2, 0, 1)
+    columns = columns - columns.mean(-1, keepdims=True)
+    grams = columns @ columns.transpose(0, 2, 1) / len(model)
+    moving = np.mean(np.abs(motion.v) > TURNING, axis=0)
+    unsigned = (motion.channel == "tau") | (moving < MOVING_SHARE)
+    fits = [_joint(gram, both) for gram, both in zip(grams, unsigned.tolist(), strict=True)]
+    found = RigidFit(*(np.array(values) for values in zip(*fits, strict=True)))
+    return replace(found, friction=np.where(moving < MOVING_SHARE, np.nan, found.friction))
 
 
 def as_mounted(arm: RigidArm, motion: Motion) -> RigidArm:
@@ -114,51 +122,58 @@ def as_mounted(arm: RigidArm, motion: Motion) -> RigidArm:
     return arm if upside_down and opposite.sum() < found.sum() + 0.3 else turned
 
 
-def _joint(model: Array, motion: Motion, j: int, spring: bool) -> tuple[float, ...]:
-    y = motion.reading[:, j] - motion.reading[:, j].mean()
-    spread = float(y.std())
-    columns = np.column_stack([model, np.clip(motion.v[:, j] / TURNING, -1.0, 1.0), motion.v[:, j], motion.a[:, j]])
-    columns -= columns.mean(0)
-    size = columns.std(0)
+def _joint(gram: Array, unsigned: bool) -> tuple[float, ...]:
+    """One joint from the covariance of model torque, direction, velocity, acceleration, position and reading, (6, 6).
+
+    A sensor on the link feels no gear, and a joint at rest no friction (`unsigned`): then the sign of those columns
+    says nothing, and they have both.
+    """
+    size = np.sqrt(np.diag(gram))
+    spread = float(size[-1])
     if spread < 1e-9 or size[1] < 1e-6:  # nothing read, or a joint that rests
-        return 1.0, 1.0, 0.0, 0.0, 0.0, spread
+        return 1.0, 1.0, 0.0, 0.0, np.nan, spread
     units = np.where(size > 1e-9, size, 1.0)
-    scaled = columns / units
-    correlation, own = _partial(scaled, y)
-    free = _solved(scaled.T @ scaled, scaled.T @ y) / units
-    unsigned = motion.channel == "tau" or np.mean(np.abs(motion.v[:, j]) > TURNING) < MOVING_SHARE
-    signs = [(1.0,), *[(1.0, -1.0) if unsigned else (1.0,)] * 3]
-    if spring and motion.q[:, j].std() > 1e-6:
-        turned = (motion.q[:, j] - motion.q[:, j].mean()) / motion.q[:, j].std()
-        scaled, signs = np.column_stack([scaled, turned]), [*signs, (1.0, -1.0)]
-    coefficients, explained = _positive_fit(scaled, y, signs)
-    own_share = own * float(units[0]) / spread
-    return explained, float(coefficients[0] / units[0]), correlation, own_share, float(free[1]), spread
+    units[4] = size[4] if size[4] > 1e-6 else np.inf
+    scaled = gram / units / units[:, None]
+    correlation, own = _partial(scaled)
+    free = _solved(scaled[:4, :4], scaled[:4, -1]) * spread / units[:4]
+    both = (1.0, -1.0)
+    signs = [(1.0,), *[both if unsigned else (1.0,)] * 3, *([both] if np.isfinite(units[4]) else [])]
+    coefficient, explained = _positive_fit(scaled, signs)
+    return (
+        explained,
+        coefficient * spread / float(units[0]),
+        correlation,
+        own * float(units[0]) / spread,
+        free[1],
+        spread,
+    )
 
 
-def _partial(columns: Array, y: Array) -> tuple[float, float]:
-    """Correlation of y with the first column given the others, and the standard deviation of that column's own part."""
-    gram = np.column_stack([columns, y]).T @ np.column_stack([columns, y])
-    through = _solved(gram[1:-1, 1:-1], gram[1:-1, [0, -1]])
-    left = gram[np.ix_([0, -1], [0, -1])] - gram[[0, -1], 1:-1] @ through
+def _partial(gram: Array) -> tuple[float, float]:
+    """Correlation of the reading with the model given friction and rotor, and the standard deviation of the model's own
+    part."""
+    through = _solved(gram[1:4, 1:4], gram[1:4][:, [0, -1]])
+    left = gram[np.ix_([0, -1], [0, -1])] - gram[[0, -1], 1:4] @ through
     own, rest = np.sqrt(np.maximum(np.diag(left), 0.0))
-    return float(left[0, 1] / (own * rest + 1e-12)), float(own / np.sqrt(len(y)))
+    return float(left[0, 1] / (own * rest + 1e-12)), float(own)
 
 
 def _solved(gram: Array, side: Array) -> Array:
     return np.asarray(np.linalg.lstsq(gram, side, rcond=1e-12)[0])
 
 
-def _positive_fit(columns: Array, y: Array, signs: Sequence[tuple[float, ...]]) -> tuple[Array, float]:
-    """Coefficients, not negative, of the columns with each of their signs, and the share of y's variance explained.
+def _positive_fit(gram: Array, signs: Sequence[tuple[float, ...]]) -> tuple[float, float]:
+    """First coefficient of a fit with none negative, of the columns with each of their signs, and the share of the
+    reading's variance explained.
 
-    By the triangular factor of columns and y, which has the same least squares as they have. A sensor on the link feels
-    no gear, and a joint at rest no friction: then the sign of those columns says nothing, and they have both.
+    By a root of the covariance, which has the same least squares as the columns have.
     """
-    small: Array = np.asarray(np.linalg.qr(np.column_stack([columns, y]), mode="r"))
-    chosen = np.column_stack([sign * small[:, k] for k, both in enumerate(signs) for sign in both])
-    coefficients, rest = nnls(chosen, small[:, -1])
-    return coefficients, 1.0 - rest**2 / float(y @ y)
+    values, vectors = np.linalg.eigh(gram)
+    root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+    chosen = np.stack([sign * root[:, k] for k, both in enumerate(signs) for sign in both], axis=1)
+    coefficients, rest = nnls(chosen, root[:, -1])
+    return float(coefficients[0]), float(1.0 - rest**2)
 
 
 def few_rows(motion: Motion) -> Motion:

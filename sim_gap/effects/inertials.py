@@ -30,6 +30,15 @@ def point_slopes(mass: float, moment: Array) -> Array:
     return out
 
 
+def mounted(axis: Array, angle: float) -> Array:
+    """Mass and first moment of a body that is turned about an axis (3,) by an angle, from those before, (4, 4)."""
+    x, y, z = axis
+    hat = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    out = np.eye(4)
+    out[1:, 1:] += np.sin(angle) * hat + (1.0 - np.cos(angle)) * hat @ hat
+    return out
+
+
 def moment_to_inertia(centre: Array) -> Array:
     """Change of the inertia about the joint with the first moment of a body with its centre of mass there, (6, 3).
 

@@ -53,7 +53,8 @@ def _smooth_in_velocity(s: Signals, joint: int, _shape: Shape) -> Array:
 def _body(signals: Signals, layout: Layout, place: int, _shape: Shape) -> Columns:
     """The ten inertial parameters of a body fixed to a link."""
     carrying = np.flatnonzero(signals.arm.carries[:, place])
-    return {(layout.against_model, int(j)): signals.regressor[:, j, place] for j in carrying}
+    columns = signals.link_regressor(place)
+    return {(layout.against_model, int(j)): columns[:, j] for j in carrying}
 
 
 def _gravity(signals: Signals, layout: Layout, _place: int, _shape: Shape) -> Columns:

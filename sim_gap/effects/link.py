@@ -7,7 +7,7 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.effects.effect import Beneath, Effect, Key, Plausibility, SearchHints, Shape, Signature
-from sim_gap.effects.inertials import moment_to_inertia, point_slopes
+from sim_gap.effects.inertials import moment_to_inertia, mounted, point_slopes
 from sim_gap.residuals.layout import Columns, Layout
 from sim_gap.residuals.preprocess import ABSENT, Signals
 
@@ -38,7 +38,7 @@ def _mass_moment(signals: Signals, layout: Layout, place: int, _shape: Shape) ->
 
     If only the inertia that comes with it would show, it is an error of the inertia and not of the moment.
     """
-    own, inertial = signals.regressor[:, :, place], signals.arm.inertial[place]
+    own, inertial = signals.link_regressor(place), signals.arm.inertial[place]
     centre = inertial[1:4] / max(float(inertial[0]), 1e-9)
     moved, along = own[..., 1:4], own[..., 4:] @ moment_to_inertia(centre)
     shows = np.mean(moved**2, axis=(0, 1)) > SHOWS**2 * np.mean(along**2, axis=(0, 1))
@@ -47,7 +47,7 @@ def _mass_moment(signals: Signals, layout: Layout, place: int, _shape: Shape) ->
 
 def _inertia(signals: Signals, layout: Layout, place: int, _shape: Shape) -> Columns:
     """An error of a link's inertia about its joint."""
-    return _rows(signals, layout, place, signals.regressor[:, :, place, 4:])
+    return _rows(signals, layout, place, signals.link_regressor(place)[..., 4:])
 
 
 def _payload(signals: Signals, layout: Layout, _place: int, shape: Shape) -> Columns:
@@ -56,14 +56,20 @@ def _payload(signals: Signals, layout: Layout, _place: int, shape: Shape) -> Col
     If only some of the recordings were made with it, the shape holds their numbers as bits, the first as 1.
     """
     tip = signals.n - 1
-    return _rows(signals, layout, tip, signals.regressor[:, :, tip, :4] * _has(signals, shape))
+    return _rows(signals, layout, tip, signals.link_regressor(tip)[..., :4] @ _mount(signals) * _has(signals, shape))
 
 
 def _payload_slopes(signals: Signals, layout: Layout, shape: Shape, c: Array) -> Columns:
     """The same about a fitted payload: a point mass, whose inertia changes with it."""
-    tip = signals.n - 1
-    slopes = signals.regressor[:, :, tip] @ point_slopes(float(c[0]), c[1:])
+    tip, mount = signals.n - 1, _mount(signals)
+    here = mount @ c
+    slopes = signals.link_regressor(tip) @ (point_slopes(float(here[0]), here[1:]) @ mount)
     return _rows(signals, layout, tip, slopes * _has(signals, shape))
+
+
+def _mount(signals: Signals) -> Array:
+    """Mass and first moment of the body in a recording, from those that it has in the others, (4, 4)."""
+    return mounted(signals.arm.axis[-1], signals.mount)
 
 
 def _has(signals: Signals, shape: Shape) -> bool:

@@ -54,11 +54,15 @@ def play(x: Array, half: float, rate: float) -> Array:
     """Output of a play (backlash operator) of half width `half` that starts in its middle, (K,)."""
     step = max(1, int(rate / PLAY_HZ))
     coarse = x[::step]
-    out, at = np.empty_like(coarse), float(coarse[0])
-    for k, value in enumerate(coarse.tolist()):
+    steps = np.diff(coarse)
+    turns = np.concatenate([[0], 1 + np.flatnonzero(steps[1:] * steps[:-1] <= 0.0), [len(coarse) - 1]])
+    at, before = float(coarse[0]), []
+    for value in coarse[turns[1:]].tolist():  # within a run in one direction the output follows from its start
+        before.append(at)
         at = min(max(at, value - half), value + half)
-        out[k] = at
-    return np.interp(np.arange(len(x)), np.arange(len(coarse)) * step, out)
+    start = np.concatenate([coarse[:1], np.repeat(before, np.diff(turns))])
+    out = np.clip(start, coarse - half, coarse + half)
+    return np.asarray(np.interp(np.arange(len(x)), np.arange(len(coarse)) * step, out))
 
 
 EFFECTS = (

@@ -17,6 +17,11 @@ CREEP = 0.01
 INERTIAL = ("mass", "mx", "my", "mz", "ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
+Motion = tuple[list[Array], list[tuple[Array, Array, Array]]]
+"""Rotation of each link to its parent (3, 3, K); angular velocity, angular acceleration and acceleration of its origin
+less gravity, in its own frame, (3, K) each."""
+
+
 @dataclass(frozen=True)
 class Tendons:
     """The m fixed tendons of a model, restricted to the n joints of an arm."""
@@ -86,7 +91,7 @@ class RigidArm:
 
         q, v, a (K, n) in rad, rad/s, rad/s²; gravity (3,) in the base frame, by default the model's.
         """
-        turns, moves = self._forward(q, v, a, gravity)
+        turns, moves = self.motion(q, v, a, gravity)
         forces, couples = [], []
         for j, (omega, alpha, push) in enumerate(moves):
             mass, moment, inertia = self.inertial[j, 0], self.inertial[j, 1:4], _symmetric(self.inertial[j, 4:])
@@ -104,24 +109,31 @@ class RigidArm:
 
     def regressor(self, q: Array, v: Array, a: Array, gravity: Array | None = None) -> Array:
         """Columns of `torque` in the inertial parameters: τ = Σ_j Y[:, i, j] · inertial[j]; (K, n, n, 10)."""
-        turns, moves = self._forward(q, v, a, gravity)
-        out = np.zeros((self.n, self.n, 10, len(q)))
-        for i in range(self.n):
-            axes = {i: np.repeat(self.axis[i][:, None], len(q), axis=1)}
-            arms = {i: np.zeros((3, len(q)))}
-            for j in range(i, self.n):
-                if j > i and self.parent[j] in axes:
-                    axes[j] = _in(turns[j], axes[self.parent[j]])
-                    arms[j] = _in(turns[j], arms[self.parent[j]] + self.offset[j][:, None])
-                if j in axes:
-                    out[i, j] = _link_columns(axes[j], _cross(axes[j], arms[j]), *moves[j])
-        return np.moveaxis(out, -1, 0)
+        motion = self.motion(q, v, a, gravity)
+        return np.moveaxis(np.stack([self._of_link(motion, j) for j in range(self.n)], axis=1), -1, 0)
 
-    def _forward(
-        self, q: Array, v: Array, a: Array, gravity: Array | None
-    ) -> tuple[list[Array], list[tuple[Array, Array, Array]]]:
-        """Each link's rotation to its parent (3, 3, K); its angular velocity, angular acceleration and the acceleration
-        of its origin less gravity, in its own frame, (3, K) each."""
+    def link_regressor(self, motion: Motion, link: int) -> Array:
+        """Columns of `torque` in the ten inertial parameters of one link, (K, n, 10); zero where it is not carried."""
+        return np.moveaxis(self._of_link(motion, link), -1, 0)
+
+    def _of_link(self, motion: Motion, link: int) -> Array:
+        """The same, (n, 10, K)."""
+        turns, moves = motion
+        rows = moves[link][0].shape[1]
+        out = np.zeros((self.n, 10, rows))
+        down = np.eye(3)[:, :, None]  # from the frame of a joint to the link's
+        lever: Array = np.zeros((3, 1))
+        i = link
+        while i >= 0:
+            axis = np.broadcast_to(np.einsum("ijk,j->ik", down, self.axis[i]), (3, rows))
+            out[i] = _link_columns(axis, _cross(axis, np.broadcast_to(lever, (3, rows))), *moves[link])
+            down = np.einsum("ijk,ljk->ilk", down, turns[i])
+            lever = lever + np.einsum("ijk,j->ik", down, self.offset[i])
+            i = self.parent[i]
+        return out
+
+    def motion(self, q: Array, v: Array, a: Array, gravity: Array | None = None) -> Motion:
+        """How the links move, from base to tip."""
         field = self.gravity if gravity is None else gravity
         still = np.zeros((3, len(q)))
         base = still, still, still - np.asarray(field, float)[:, None]
@@ -164,17 +176,21 @@ def _link_columns(axis: Array, lever: Array, omega: Array, alpha: Array, push: A
 
 def _cross(x: Array, y: Array) -> Array:
     """Cross product of vectors (3, K) with vectors (3, K) or one vector (3,)."""
-    return np.stack([x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]])
+    out = np.empty_like(x)
+    for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
+        np.multiply(x[i], y[j], out=out[k])
+        out[k] -= x[j] * y[i]
+    return out
 
 
 def _in(turn: Array, vector: Array) -> Array:
     """Into the rotated frame: Rᵀ x for rotations (3, 3, K) and vectors (3, K)."""
-    return np.stack([turn[0, i] * vector[0] + turn[1, i] * vector[1] + turn[2, i] * vector[2] for i in range(3)])
+    return np.asarray(np.einsum("jik,jk->ik", turn, vector))
 
 
 def _out(turn: Array, vector: Array) -> Array:
     """Out of the rotated frame: R x."""
-    return np.stack([turn[i, 0] * vector[0] + turn[i, 1] * vector[1] + turn[i, 2] * vector[2] for i in range(3)])
+    return np.asarray(np.einsum("ijk,jk->ik", turn, vector))
 
 
 def _turned(start: Array, axis: Array, angle: Array) -> Array:

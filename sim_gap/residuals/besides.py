@@ -82,7 +82,7 @@ def fast(data: ResidualSet, recordings: Sequence[Recording]) -> list[Location]:
                 if found and (row not in best or found[1] > best[row].rms):
                     hz, rms, share = found
                     noise = data.floor.get(row, 0.0)
-                    clear = rms > max(RELEVANT_NM, 2.0 * noise)
+                    clear = rms > max(data.least(RELEVANT_NM), 2.0 * noise)
                     best[row] = Location(names[joint], channel, "band", rms, noise, share, hz, clear)
     return [each for each in best.values() if each.clear]
 

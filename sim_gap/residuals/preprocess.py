@@ -16,7 +16,7 @@ from scipy.signal import butter, sosfiltfilt, sosfreqz
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
-from sim_gap.model.rigid_body import CREEP, RigidArm
+from sim_gap.model.rigid_body import CREEP, Motion, RigidArm
 from sim_gap.residuals.channel_noise import band_noise
 from sim_gap.residuals.resampling import SLOW_HZ, bridged, coverage, low_pass, thinner
 from sim_gap.residuals.stuck_channels import Stuck, stuck_intervals
@@ -33,6 +33,8 @@ PAD_S = 1.0
 """Length of the reflection at either end of a signal that is filtered [s]."""
 TRIM_S = 0.3
 """Length cut off at both ends after filtering [s]."""
+COLUMNS = 8
+"""Number of columns that are filtered at a time."""
 SHORTEST_S = 3.0
 ABSENT = -1
 """Number of a recording without the body that training recordings have."""
@@ -67,6 +69,8 @@ class Signals:
     it is known to lack the body that others have."""
     groups: tuple[str, ...] = ()
     """Names of the groups of recordings with a common body that it belongs to."""
+    mount: float = 0.0
+    """Angle by which that body is turned about the last joint's axis, against the other recordings [rad]."""
     stuck: tuple[Stuck, ...] = ()
     """Channels that are stuck for some time, in which they are not `known`."""
     found: "Found | None" = None
@@ -114,13 +118,16 @@ class Signals:
         still = np.zeros_like(self.q)
         return np.stack([self.arm.torque(self.q, still, still, axis) for axis in np.eye(3)], axis=-1)
 
-    @cached_property
-    def regressor(self) -> Array:
-        """Columns of the model torque in the links' inertial parameters, (K, n, n, 10)."""
+    def link_regressor(self, link: int) -> Array:
+        """Columns of the model torque in a link's inertial parameters, (K, n, 10)."""
         read = self.read
         if read is not self and read.q is self.q and np.array_equal(read.arm.gravity, self.arm.gravity):
-            return read.regressor
-        return self.arm.regressor(self.q, self.v, self.a)
+            return read.link_regressor(link)
+        return self.arm.link_regressor(self._motion, link)
+
+    @cached_property
+    def _motion(self) -> Motion:
+        return self.arm.motion(self.q, self.v, self.a)
 
     def sensitivity(self, joint: int) -> tuple[Array, Array, Array]:
         """Derivatives of the model torque with respect to one joint's position, velocity, acceleration, (K, n) each."""
@@ -155,7 +162,7 @@ class Signals:
 
     def release(self) -> None:
         """Free what is large and can be computed again."""
-        for name in ("regressor", "gravity_columns", "_sensitivities"):
+        for name in ("_motion", "gravity_columns", "_sensitivities"):
             self.__dict__.pop(name, None)
 
     @property
@@ -169,13 +176,17 @@ class Signals:
         As a product of spectra, of the signal extended by its reflection in its ends.
         """
         trim, pad = max(1, round(TRIM_S * self.rate)), min(round(PAD_S * self.rate), len(x) - 1)
-        columns = np.ascontiguousarray(np.reshape(x, (len(x), -1)).T)
-        first, last = columns[:, :1], columns[:, -1:]
-        before, after = 2.0 * first - columns[:, pad:0:-1], 2.0 * last - columns[:, -2 : -2 - pad : -1]
         size = next_fast_len(len(x) + 2 * pad, real=True)
-        spectrum = rfft(np.hstack([before, columns, after]), size, axis=1)
-        spectrum *= self._passed(size)
-        out = irfft(spectrum, size, axis=1)[:, pad + trim : pad + len(x) - trim : self.step]
+        columns = np.reshape(x, (len(x), -1)).T
+        out = np.empty((len(columns), len(range(trim, len(x) - trim, self.step))))
+        for start in range(0, len(columns), COLUMNS):
+            part = np.ascontiguousarray(columns[start : start + COLUMNS])
+            first, last = part[:, :1], part[:, -1:]
+            before, after = 2.0 * first - part[:, pad:0:-1], 2.0 * last - part[:, -2 : -2 - pad : -1]
+            spectrum = rfft(np.hstack([before, part, after]), size, axis=1)
+            spectrum *= self._passed(size)
+            whole = irfft(spectrum, size, axis=1)
+            out[start : start + COLUMNS] = whole[:, pad + trim : pad + len(x) - trim : self.step]
         return np.ascontiguousarray(out.T).reshape(-1, *np.shape(x)[1:])
 
     def _passed(self, size: int) -> Array:

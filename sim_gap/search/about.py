@@ -11,7 +11,7 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.effects.base import tilted
-from sim_gap.effects.inertials import moved, point
+from sim_gap.effects.inertials import mounted, moved, point
 from sim_gap.residuals.layout import Columns, Layout
 from sim_gap.residuals.preprocess import Found, Signals
 from sim_gap.search.term import Term
@@ -81,11 +81,12 @@ def _links(parts: _Parts, layout: Layout, values: Values) -> Array:
     ours = {term: c for term, c in values.items() if term.form.signature.side == "link"}
     inertial = arm.inertial.copy()
     for term, c in ours.items():
-        change = inertial_change(term, c, inertial, read.number)
+        body = mounted(arm.axis[-1], read.mount) @ c if term.effect == "link.payload" else c
+        change = inertial_change(term, body, inertial, read.number)
         if change is not None:
             link = arm.n - 1 if term.effect == "link.payload" else term.place
             inertial[link] += change
-            share = read.regressor[:, :, link] @ change
+            share = read.link_regressor(link) @ change
             torque = torque + share
             parts.add(term, {(channel, int(j)): share[:, j] for j in np.flatnonzero(arm.carries[:, link])})
     arm = arm.with_inertial(inertial)

@@ -40,7 +40,8 @@ def select_model(store: ColumnStore, library: Sequence[str]) -> Search:
         near = search.normal.store
         values = near.values
         chosen = one_each([canonical(term) for term in search.active])
-    search.normal.store.beside(None)  # frees the columns of the estimate before
+    for held in (store, search.normal.store.beside(None)):  # frees the columns of rivals and of the estimate before
+        held.keep(search.active)
     return search
 
 

@@ -20,6 +20,7 @@ NATIVE = {
     "controller.slew": "actuator slewmax",
     "controller.integral": "actuator ki",
     "actuator.saturation": "actuator forcerange",
+    "actuator.back_emf": "actuator kv",
     "actuator.rotor_inertia": "joint armature",
     "friction.coulomb": "joint frictionloss",
     "friction.viscous": "joint damping",
@@ -105,11 +106,16 @@ def _implicit() -> Any:
 def _set_joint(joint: Any, fit: Fit, j: int) -> None:
     joint.frictionloss, joint.armature = float(fit.point["coulomb"][j]), float(fit.point["armature"][j])
     joint.solref_friction, joint.solimp_friction = STICKS["solref_friction"], STICKS["solimp_friction"]
-    joint.damping[0] = float(fit.point["viscous"][j])
+    joint.damping[0] = float(fit.point["viscous"][j] - _of_servo(fit, j))
     stiffness = float(fit.point["spring"][j])
     if stiffness > 1e-9:
         joint.stiffness[0] = stiffness
         joint.springref = -float(fit.point["offset"][j]) / stiffness
+
+
+def _of_servo(fit: Fit, j: int) -> float:
+    """Part of the damping that the model's own actuator makes."""
+    return float(min(fit.point["kv"][j], fit.point["viscous"][j]))
 
 
 def _set_actuator(spec: Any, joint: str, fit: Fit, j: int, search: Search, compiled: Any) -> None:
@@ -123,17 +129,17 @@ def _set_actuator(spec: Any, joint: str, fit: Fit, j: int, search: Search, compi
         spec.delete(actuator)
     made = spec.add_actuator(name=name, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     kp, ki = (float(fit.point[name][j] * fit.point["gain"][j]) for name in ("kp", "ki"))
-    slew = float(fit.point["slew"][j])
+    slew, kv = float(fit.point["slew"][j]), float(fit.point["back_emf"][j]) + _of_servo(fit, j)
     if ki > 0.0 or np.isfinite(slew):
         made.set_to_pid(
             kp=kp,
-            kv=0.0,
+            kv=kv,
             ctrlspec=POSITION_INPUT,
             **({"ki": ki} if ki > 0.0 else {}),
             **({"slewmax": slew} if np.isfinite(slew) else {}),
         )
     else:
-        made.set_to_position(kp=kp, kv=0.0)
+        made.set_to_position(kp=kp, kv=kv)
     limit = float(fit.point["limit"][j])
     if np.isfinite(limit):
         made.forcelimited, made.forcerange = 1, [-limit, limit]
