@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TypeVar
 
@@ -22,6 +23,9 @@ from armlink.monitor.rerun_stream import RerunStream
 NAMES = ("shoulder", "elbow")
 T = TypeVar("T")
 RERUN = [sys.executable, "-m", "rerun"]
+installed = pytest.mark.skipif(
+    find_spec("rerun") is None, reason="rerun-sdk is not installed: pip install 'armlink[rerun]'"
+)
 
 
 def sample() -> Sample:
@@ -63,6 +67,7 @@ def connected(port: int) -> RerunStream | None:
         return None
 
 
+@installed
 def test_a_viewer_gets_what_is_there_as_a_time_series_a_joint(tmp_path: Path) -> None:
     port, file = free_port(), tmp_path / "got.rrd"
     expected = {"position/rad/shoulder": 1.25, "torque/newton_metres/shoulder": 0.5, "torque/newton_metres/elbow": 2.75}
@@ -83,6 +88,7 @@ def values_in(file: Path) -> dict[str, float]:
     return found
 
 
+@installed
 def test_no_viewer_is_one_line() -> None:
     port = free_port()
     with pytest.raises(BadInput, match=f"--rerun {port}: no viewer there .*: start it with rerun --port {port}"):
