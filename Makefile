@@ -5,7 +5,7 @@ export PYTHON
 CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host daemon_days daemon_kills fuzz_frames fuzz_drives fuzz_guard kill_drives two_hosts scales web
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep bodies
+.PHONY: batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies pictures
 
 help: ## Say what can be done
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
@@ -56,6 +56,9 @@ creep: .venv/.dev ## Long campaign outside make test: drawn arms without torque 
 	$(BIN)/python tests/campaigns/creep_contacts.py
 	$(BIN)/python tests/campaigns/creep_arms.py $(ARGS)
 
+creepwalk: .venv/.dev ## Long campaign outside make test: docs/no-torque-sensors.md typed in order, in real time, on the simulated OpenArm
+	$(BIN)/python tests/campaigns/creep_walk.py $(ARGS)
+
 realism: .venv/.dev ## Long campaign outside make test: sensor fits of realistic arms, good and bad (ARGS="--seeds 1 5 --full")
 	$(BIN)/python tests/campaigns/realism.py $(ARGS)
 
@@ -64,6 +67,9 @@ walk: .venv/.dev ## Long campaign outside make test: every command of first-run,
 
 blind: .venv/.dev ## Long campaign outside make test: the diagnosis against sealed cases (ARGS="--cases 20")
 	$(BIN)/armlink gap bench $(ARGS)
+
+batched: .venv/.dev ## Long campaign outside make test: the exported model in MuJoCo and MuJoCo Warp (ARGS="--sim M --train R --heldout R")
+	$(BIN)/python tests/campaigns/batched_replay.py $(ARGS)
 
 corruptions: .venv/.dev ## Long campaign outside make test: wrong columns, units and clocks in real recordings (ARGS="--draws 200")
 	$(BIN)/python tests/campaigns/corrupted_recordings.py $(ARGS)
@@ -79,6 +85,9 @@ wheel: .venv/.dev ## Build the wheel into dist/ and run the demo from it in an e
 
 firsthour: .venv/.dev ## Long campaign outside make test: docs/first-hour.md typed for five models, each to a finished demo report
 	$(BIN)/python tests/campaigns/first_hour.py $(ARGS)
+
+pictures: .venv/.dev ## Take the pictures of the daemon's page for the documentation, in Chromium, into docs/images
+	$(BIN)/python tests/campaigns/pictures.py $(ARGS)
 
 docs: .venv/.dev ## Build the documentation site into site/ and check it: warnings are errors, links hold, commands run
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict

@@ -15,8 +15,11 @@ from armlink.loop.open import open_arm
 from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording
 from calib.arm.kinematics import gcomp_arm
-from calib.creep.choice import sweep_motion
+from calib.creep.choice import all_creep, sweep_motion
+from calib.creep.fit import fit_creep
+from calib.creep.record import CreepCalibration, gravity_fit
 from calib.creep.run import run_creep
+from calib.creep.verify import verify_creeping
 from calib.fit.gravity_fit import GravityFit, identify_gravity
 from calib.fit.sensor_fit import SensorFit, fit_sensors
 from calib.observer.config import ObserverConfig
@@ -32,6 +35,8 @@ ArmLike: TypeAlias = ArmFile | str | Path
 """An arm file: loaded, its path, or the name of a bundled arm."""
 SweepLike: TypeAlias = SweepData | str | Path
 """The data set of a pass of sweeps: loaded, or its folder."""
+Calibrated: TypeAlias = SensorFit | CreepCalibration
+"""What `calibrate` finds: in steps at rest, or in creep sweeps of drives whose torque is a motor current."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,21 +117,24 @@ def sweep(
         )
 
 
-def calibrate(*sweeps: SweepLike, arm: ArmLike | None = None) -> SensorFit:
+def calibrate(*sweeps: SweepLike, arm: ArmLike | None = None) -> Calibrated:
     """Gains and offsets of all torque and position sensors, with intervals, from passes of sweeps.
 
     Args:
-        sweeps: data sets of `sweep`, or their folders; one pass without and one with a reference mass.
+        sweeps: data sets of `sweep`, or their folders; one pass without and one with a reference mass. Of an arm
+            without torque sensors one more pass without, after it.
         arm: the arm file, if it is no longer where the sweeps found it.
+
+    From creep sweeps the result has friction too: `value("coulomb")`, `value("load")`, `value("viscous")`.
 
     Nothing is stored or written to controllers: `record(arm)` of the result makes a record, `armlink calibrate --apply`
     writes one. Raises BadInput, Refused.
     """
     data = _sweeps("calibrate", sweeps)
-    return fit_sensors(_arm_of(data, arm), data)
+    return _calibrated(_arm_of(data, arm), data)
 
 
-def identify(*sweeps: SweepLike, arm: ArmLike | None = None, sensors: SensorFit | None = None) -> GravityFit:
+def identify(*sweeps: SweepLike, arm: ArmLike | None = None, sensors: Calibrated | None = None) -> GravityFit:
     """The mass moments of the arm's gravity model, with intervals, from the same sweeps.
 
     Args:
@@ -138,13 +146,16 @@ def identify(*sweeps: SweepLike, arm: ArmLike | None = None, sensors: SensorFit 
     """
     data = _sweeps("identify", sweeps)
     arm_file = _arm_of(data, arm)
-    return identify_gravity(arm_file, data, sensors or fit_sensors(arm_file, data))
+    found = sensors or _calibrated(arm_file, data)
+    if isinstance(found, CreepCalibration) != all_creep(data):
+        raise BadInput("identify: sensors: found in sweeps of the other kind (creep, steps at rest): leave them out")
+    return gravity_fit(found.fit) if isinstance(found, CreepCalibration) else identify_gravity(arm_file, data, found)
 
 
 def verify(
     arm: ArmLike,
     gravity: GravityFit | GravityRecord,
-    sensors: SensorFit | CalibrationRecord | None = None,
+    sensors: Calibrated | CalibrationRecord | None = None,
     *,
     bus: str | None = None,
     simulated: bool = False,
@@ -156,7 +167,8 @@ def verify(
     Args:
         arm: arm file, its path, or a bundled arm's name.
         gravity: what `identify` found, or a gravity record.
-        sensors: what `calibrate` found, or a calibration record; by default what the controllers hold.
+        sensors: what `calibrate` found, or a calibration record; by default what the controllers hold. Arms without
+            torque sensors need it.
         bus: INTERFACE:CHANNEL[@BITRATE] instead of the arm file's.
         simulated: the simulated arm of the arm file's `sim` section.
         poses: how many.
@@ -165,11 +177,16 @@ def verify(
     Raises BadInput, Refused, BusFault.
     """
     arm_file = _arm(arm)
-    calibration = sensors.record(arm_file) if isinstance(sensors, SensorFit) else sensors
+    calibration = sensors.record(arm_file) if isinstance(sensors, SensorFit | CreepCalibration) else sensors
     model = gravity.record(arm_file, calibration) if isinstance(gravity, GravityFit) else gravity
+    creeping = sweep_motion(arm_file) == "creep"
+    if creeping and calibration is None:
+        raise BadInput("verify: sensors: the drives of this arm keep no calibration: give what calibrate found")
     with open_link(arm_file, bus, simulated=simulated) as link:
         link.start()
         link.enable()
+        if creeping and calibration is not None:
+            return verify_creeping(link, arm_file, model, calibration, poses=poses, seed=seed)
         return run_verify(link, arm_file, model, calibration, poses=poses, seed=seed)
 
 
@@ -177,7 +194,7 @@ def observe(
     arm: ArmLike,
     recording: Recording | str | Path,
     gravity: GravityFit | GravityRecord,
-    sensors: SensorFit | CalibrationRecord,
+    sensors: Calibrated | CalibrationRecord,
     *,
     config: ObserverConfig | None = None,
 ) -> Observation:
@@ -198,7 +215,9 @@ def observe(
     names = arm_file.joint_names or gcomp_arm(arm_file).names
     if run.n != len(names):
         raise BadInput(f"observe: the recording has {run.n} joints, but {arm_file.name} has {len(names)}")
-    calibration = sensors.record(arm_file) if isinstance(sensors, SensorFit) else sensors.require(arm_file)
+    calibration = (
+        sensors.record(arm_file) if isinstance(sensors, SensorFit | CreepCalibration) else sensors.require(arm_file)
+    )
     model = gravity.record(arm_file, calibration) if isinstance(gravity, GravityFit) else gravity.require(arm_file)
     rated = arm_file.require_link().rated_torques
     observer = Observer.of_records(gcomp_arm(arm_file), calibration, model, rated, config)
@@ -230,6 +249,12 @@ def _sweeps(function: str, sweeps: tuple[object, ...]) -> list[SweepData]:
             kind = type(each).__name__
             raise BadInput(f"{function}: expected data sets of sweep or their folders, one argument each, not {kind}")
     return found
+
+
+def _calibrated(arm_file: ArmFile, data: list[SweepData]) -> Calibrated:
+    if all_creep(data):
+        return CreepCalibration(fit_creep(arm_file, [each.require(arm_file) for each in data]))
+    return fit_sensors(arm_file, data)
 
 
 def _arm_of(data: list[SweepData], arm: ArmLike | None) -> ArmFile:

@@ -2,7 +2,7 @@
 
 import struct
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
@@ -37,6 +37,15 @@ DRIVE_ERROR = 0x21
 WARMING_STEP = 1.0
 """Torque constants of drives that warm up are brought up to date so often [s]."""
 TARGETS = {(0x6071, 0), (0x607A, 0), (0x60FF, 0)}
+
+MARK_SHIFT = 40
+LARGEST_ID = (1 << MARK_SHIFT) - 1
+"""Identifiers with all flags of a port are below."""
+
+
+def bus_mark(place: int) -> int:
+    """What identifiers of the drives on one of several buses have in addition, by its place among them."""
+    return (place + 1) << MARK_SHIFT
 
 
 class SimulatedArm:
@@ -86,6 +95,8 @@ class SimulatedArm:
         self.drives.sample(0.0, 0.0)
         self._readings = readings = Readings(self.plant, self.sensors)
         motors = [Motor(j, joint, self.drives.loops, self.sensors, readings) for j, joint in enumerate(link.joints)]
+        self._marks: dict[str, int] = {}
+        """Of an arm on several buses: name of each → mark in the identifiers of its frames."""
         self.fronts = build_fronts(arm, motors, self._sender)
         """Bus and drives of every family but CANopen."""
         self.drive_at = {drive.joint: drive for _, front in self.fronts for drive in front.drives}
@@ -95,8 +106,18 @@ class SimulatedArm:
 
     # ---- bus
 
+    def stand_on(self, buses: Sequence[str]) -> None:
+        """Stand on several buses, by name in the arm file's order, on which ids may repeat.
+
+        Frames from and to drives that are no CANopen nodes then carry their bus, `bus_mark(place)`.
+        """
+        self._marks = {name: bus_mark(place) for place, name in enumerate(buses)}
+
     def on_frame(self, can_id: int, data: bytes) -> None:
         """Process a frame: SYNC samples and applies targets; PDO, SDO, NMT and heartbeat by CiA 301."""
+        mark = 0
+        if self._marks:
+            can_id, mark = can_id & LARGEST_ID, can_id & ~LARGEST_ID
         slot = self._pdos.receive.get(can_id)
         if slot is not None:
             self._receive_pdo(slot, data)
@@ -113,8 +134,9 @@ class SimulatedArm:
             self._pdos.send_events()
         elif 0x700 < can_id < 0x780 and data:
             self.supervision.heartbeat(can_id - 0x700, self.time)
-        for _, front in self.fronts:
-            front.on_frame(can_id, data)
+        for bus, front in self.fronts:
+            if not self._marks or self._marks[bus] == mark:
+                front.on_frame(can_id, data)
 
     def waits_for_sync(self, can_id: int) -> bool:
         """Whether a frame takes effect at the next SYNC only: a synchronous RPDO."""
@@ -173,9 +195,11 @@ class SimulatedArm:
 
     def joint_of(self, can_id: int) -> int | None:
         """Joint whose device sends frames of this identifier, or None."""
+        can_id, mark = can_id & LARGEST_ID, can_id & ~LARGEST_ID
         if can_id < 0x800 and (place := self.place_of.get(can_id & 0x7F)) is not None and can_id >= 0x80:
             return place
-        return next((joint for _, front in self.fronts if (joint := front.joint_of(can_id)) is not None), None)
+        fronts = [front for bus, front in self.fronts if not self._marks or self._marks[bus] == mark]
+        return next((joint for front in fronts if (joint := front.joint_of(can_id)) is not None), None)
 
     @property
     def due(self) -> float:
@@ -271,7 +295,7 @@ class SimulatedArm:
 
     def _sender(self, bus: str) -> Callable[[int, bytes], None]:
         """Puts frames of the drives on one bus."""
-        return lambda can_id, data: self.outbox.append((can_id, data))
+        return lambda can_id, data: self.outbox.append((can_id | self._marks.get(bus, 0), data))
 
     def _send(self, frame: Frame) -> None:
         self.outbox.append(frame)

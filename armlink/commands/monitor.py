@@ -33,6 +33,10 @@ def monitor(
         int | None,
         typer.Option(min=0, max=65535, metavar="PORT", help="Serve readings to Foxglove; 0: a free port."),
     ] = None,
+    rerun: Annotated[
+        int | None,
+        typer.Option(min=1, max=65535, metavar="PORT", help="Send readings to a Rerun viewer on this machine."),
+    ] = None,
     json: Annotated[Path | None, typer.Option(help="Write the last state here; - is standard output.")] = None,
 ) -> int:
     """Show what an arm's joints send; exit status 3 where no joint is heard.
@@ -40,7 +44,8 @@ def monitor(
     It listens beside the host that runs the arm. Scales are the arm file's rated torques and 2^20 units a turn. With
     --stats every frame's time stamp counts (the interface's own; the monitor's clock with --sync): latency is from SYNC
     to the last joint's reading, and the load has its stuff bits. With --foxglove 8765 open ws://localhost:8765 in
-    Foxglove: /joint_states and /motor_states as in a recording, 50 times a second.
+    Foxglove: /joint_states and /motor_states as in a recording, 50 times a second. With --rerun 9876 the same readings
+    go to the viewer that the command rerun starts.
 
     Example: armlink monitor sarcos --bus socketcan:vcan0 --stats
     """
@@ -64,7 +69,7 @@ def monitor(
         shown = 0
         with (
             Live(console=console, auto_refresh=False, transient=True) as live,
-            _stream(arm_file, foxglove, console) as send,
+            _stream(arm_file, foxglove, rerun, console) as send,
         ):
             while not refreshes or shown < refreshes:
                 answer = watcher.describe(_watch(watcher, ONCE_SECONDS if once else REFRESH_SECONDS, send))
@@ -82,17 +87,29 @@ def monitor(
 
 
 @contextlib.contextmanager
-def _stream(arm: "ArmFile", port: int | None, console: "Console") -> "Iterator[Callable[[Sample], None] | None]":
+def _stream(
+    arm: "ArmFile", foxglove: int | None, rerun: int | None, console: "Console"
+) -> "Iterator[Callable[[Sample], None] | None]":
     """Where samples go besides the table; None: nowhere."""
-    if port is None:
-        yield None
-        return
-    from armlink.monitor.foxglove_stream import FoxgloveStream
-
     names = tuple(joint.name for joint in arm.require_link().joints)
-    with FoxgloveStream(arm.name, names, port) as stream:
-        console.print(f"Foxglove: open ws://localhost:{stream.port}", markup=False, highlight=False)
-        yield stream.send
+    with contextlib.ExitStack() as open_streams:
+        sends: list[Callable[[Sample], None]] = []
+        if foxglove is not None:
+            from armlink.monitor.foxglove_stream import FoxgloveStream
+
+            served = open_streams.enter_context(FoxgloveStream(arm.name, names, foxglove))
+            console.print(f"Foxglove: open ws://localhost:{served.port}", markup=False, highlight=False)
+            sends.append(served.send)
+        if rerun is not None:
+            from armlink.monitor.rerun_stream import RerunStream
+
+            sends.append(open_streams.enter_context(RerunStream(arm.name, names, rerun)).send)
+
+        def send_all(sample: "Sample") -> None:
+            for send in sends:
+                send(sample)
+
+        yield send_all if sends else None
 
 
 def _watch(watcher: "Monitor", seconds: float, send: "Callable[[Sample], None] | None") -> "View":

@@ -43,7 +43,7 @@ def _ask_all(arm: "ArmFile", bus: str | None, json: Path | None) -> int:
     """The drives of an arm, each asked for its identity."""
     from rich.box import SIMPLE
     from rich.console import Console
-    from rich.table import Table
+    from rich.table import Column, Table
 
     from armlink.commands.output import write_json
     from armlink.errors import BusFault, Refused
@@ -53,7 +53,17 @@ def _ask_all(arm: "ArmFile", bus: str | None, json: Path | None) -> int:
     with Link.open(arm, bus) as link:
         found, channel = link.scan(), str(link.bus.channel_info)
         traits = traits_of(link.groups, link.n)
-    table = Table("joint", "family", "id", "state", "device", "serial", "firmware", box=SIMPLE, title=channel)
+    table = Table(
+        Column("joint", overflow="fold"),
+        "family",
+        "id",
+        "state",
+        "device",
+        "serial",
+        "firmware",
+        box=SIMPLE,
+        title=channel,
+    )
     nodes = []
     for each in found:
         name, kind = link.names[each.joint], link.section.joints[each.joint].settings.family

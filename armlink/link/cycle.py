@@ -250,7 +250,7 @@ class Commander:
         if self._gap_at + MEMORY >= now and self._gap > BLAME_SHARE * self.max_age:
             stopped = self._own_stop()
             if stopped or isinstance(fault, Silence):
-                return HostLate(self._gap, self.max_age, stopped)
+                return HostLate(self._gap, self.max_age, stopped or str(fault))
         return fault
 
     def _drive_fault(self, now: float, modes: Sequence[int]) -> BusFault | None:

@@ -29,13 +29,14 @@ from armlink.recording.joint_messages import left_out, main_joints, nearest_rows
 from armlink.recording.recording import MOST_BYTES, MOST_JOINTS, Recording, require_size
 from armlink.recording.ros_joint_state import SCHEMA, SCHEMA_NAME, JointState, JointStateDecoder, joint_state_encoder
 
-TOPICS: dict[str, tuple[str | None, str | None, str | None]] = {
+Lists = tuple[str | None, str | None, str | None]
+"""Channels carried as position, velocity and effort."""
+TOPICS: dict[str, Lists] = {
     "/joint_states": ("position", "velocity", "torque"),
     "/motor_states": (None, None, "motor_torque"),
     "/joint_commands": ("position_command", None, "torque_command"),
     "/joint_temperatures": (None, None, "temperature"),
 }
-"""Topic → channels carried as position, velocity and effort."""
 FLUSH_SECONDS = 0.5
 """Interval of flushes: a killed recorder loses at most this and what the operating system had not written."""
 MOST_CHUNK = 1 << 28
@@ -46,11 +47,13 @@ _NANO = 1_000_000_000
 class RecordingWriter:
     """Writes rows one by one; a context manager that completes the file."""
 
-    def __init__(self, path: str | Path, names: tuple[str, ...]) -> None:
-        """Create the file for joints with these names."""
-        path = Path(path)
-        self._stream = path.open("wb")
-        self._names, self._n = names, len(names)
+    def __init__(
+        self, to: str | Path | IO[bytes], names: tuple[str, ...], topics: Mapping[str, Lists] = TOPICS
+    ) -> None:
+        """Create the file for joints with these names; a stream is written to, and left open."""
+        self._own = isinstance(to, str | Path)
+        self._stream = to if not isinstance(to, str | Path) else Path(to).open("wb")  # noqa: SIM115
+        self._names, self._topics = names, topics
         self._writer = Writer(self._stream)
         self._writer.start(profile=Profile.ROS2, library="armlink")
         self._schema = self._writer.register_schema(SCHEMA_NAME, SchemaEncoding.ROS2, SCHEMA.encode())
@@ -65,12 +68,13 @@ class RecordingWriter:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         """Complete the file with index and footer."""
         self._writer.finish()
-        self._stream.close()
+        if self._own:
+            self._stream.close()
 
     def append(self, t: float, channels: Mapping[str, Array]) -> None:
         """Add one row at time `t` [s]: channel names of Recording → (n,) values; absent channels are not written."""
         stamp = round(t * _NANO)
-        for topic, of_topic in TOPICS.items():
+        for topic, of_topic in self._topics.items():
             lists = tuple(name is not None and name in channels for name in of_topic)
             if not any(lists):
                 continue

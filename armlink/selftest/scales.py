@@ -26,6 +26,8 @@ OFF = math.log(1.06)
 """Scales closer than this to 1 are sound: with what ratios scatter, ten per cent are found and sound ones are not."""
 FLOOR = 0.012
 """Least standard deviation of the logarithm of a ratio: delays, rounding, friction."""
+DAMPING_FLOOR = 0.05
+"""The same of the damping that torque follows: it is found 10 % off where the position of its joint is; a choice."""
 PRICE = 16.0
 """A further scale must explain this much of the sum of squares."""
 RIVAL = 4.0
@@ -207,15 +209,16 @@ def law(track: Track) -> list[Evidence]:
     stiffness, damping = _coefficients(design, torque[rows], rounding)
     if not damping.known:  # what the damping really is would change the stiffness that is found
         fixed = _coefficients(design[:, [0, 2, 3, 4]], torque[rows] - design[:, 1], rounding[:1])[0]
-        stiffness = replace(stiffness, sigma=math.hypot(stiffness.sigma, stiffness.value - fixed.value))
+        share = min(1.0, 2 * damping.sigma / max(abs(damping.value - 1), 1e-9))
+        stiffness = replace(stiffness, sigma=math.hypot(stiffness.sigma, share * (stiffness.value - fixed.value)))
     found = []
-    for name, each, exponents in (
-        ("stiffness", stiffness, {"position": 1, "torque": -1}),
-        ("damping", damping, {"velocity": 1, "torque": -1}),
+    for name, each, exponents, floor in (
+        ("stiffness", stiffness, {"position": 1, "torque": -1}, FLOOR),
+        ("damping", damping, {"velocity": 1, "torque": -1}, DAMPING_FLOOR),
     ):
         if each.known:
             text = f"torque follows {each.value:.3g} of the commanded {name}"
-            found.append(Evidence(text, each.value, max(FLOOR, 2 * each.sigma / each.value), exponents))
+            found.append(Evidence(text, each.value, max(floor, 2 * each.sigma / each.value), exponents))
     return found
 
 

@@ -36,9 +36,10 @@ def calibrate(
     from armlink.commands.output import write_json
     from armlink.errors import BadInput, Refused
     from calib.arm.kinematics import gcomp_arm
-    from calib.commands.creep.fits import all_creep, calibrate_creep
+    from calib.commands.creep.fits import calibrate_creep
     from calib.commands.screen import print_lines
     from calib.commands.sweep_data import load_sweeps
+    from calib.creep.choice import all_creep
     from calib.fit.felt_mass import felt_mass
     from calib.fit.sensor_fit import fit_sensors
     from calib.install.apply import Apply, apply_calibration

@@ -37,7 +37,7 @@ def hold_afloat(
     from armlink.commands.output import write_json
     from armlink.errors import ArmlinkError
     from armlink.loop.open import open_arm
-    from calib.commands.screen import say_uncalibrated, warn_late
+    from calib.commands.screen import warn_late
     from calib.floating.run import run_float
 
     arm_file = load_arm(arm)
@@ -45,7 +45,6 @@ def hold_afloat(
     screen = Console(stderr=True)
     with open_arm(arm_file, bus) as link:
         link.start()
-        say_uncalibrated(link)
         link.enable()
         screen.print(f"{arm_file.name}: floating by {source}; Ctrl-C ends it, the joints hold then")
         try:

@@ -10,7 +10,7 @@ import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
-from rich.table import Table
+from rich.table import Column, Table
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Stall
@@ -18,7 +18,6 @@ from armlink.link.lateness import Lateness
 from calib.plan.types import SweepPlan
 
 if TYPE_CHECKING:
-    from armlink.loop.driver import ArmDriver
     from calib.sweep.dataset import SweepData
     from calib.sweep.preflight import Preflight
 
@@ -90,9 +89,16 @@ def confirm(question: str) -> None:
 
 def print_preflight(found: "Preflight") -> None:
     """Print the findings of the pre-flight, one row per joint."""
-    headings = ("joint", "torque noise [N·m]", "torque at rest [N·m]", "drive [°C]", "lower stop", "upper stop [rad]")
+    headings = (
+        "joint",
+        "torque noise [N·m]",
+        "torque at rest [N·m]",
+        "drive [°C]",
+        "lower stop",
+        "upper stop [rad]",
+    )
     table = Table(*headings, title="Pre-flight")
-    for joint, name in enumerate(found.names):
+    for joint, name in enumerate(_without_common(found.names)):
         stops = [
             "not pushed" if np.isnan(at) else f"{at:.3f} (arm file {wanted:.3f})"
             for at, wanted in zip(found.stops[joint], found.expected[joint], strict=True)
@@ -106,7 +112,13 @@ def print_plan(arm: ArmFile, plan: SweepPlan) -> None:
     """The sweeps of a plan as a table: where each joint rests, what presses it, range and lever of gravity."""
     title = f"{arm.name}: {len(plan.sweeps)} sweeps"
     table = Table(
-        "sweep", "from … to", "Γ/g", *_short(arm.joint_names), title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0)
+        Column("sweep", overflow="fold"),
+        "from … to",
+        "Γ/g",
+        *_short(arm.joint_names),
+        title=title,
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
     )
     for sweep in plan.sweeps:
         cells = []
@@ -153,12 +165,13 @@ def warn_late(arm: ArmFile, lateness: Lateness) -> None:
     print_lines([warning] if warning else [], "yellow")
 
 
-def say_uncalibrated(link: "ArmDriver") -> None:
-    """Name the joints whose calibration the host keeps and that have no record in force."""
-    names = link.uncalibrated
-    if names:
-        text = f"{link.arm.name}: no calibration record is in force for {', '.join(names)}: torque is the drives' own"
-        print_lines([text], "yellow")
+def _without_common(names: tuple[str, ...]) -> list[str]:
+    """Names without the words that all begin with: `joint1` of openarm_right_joint1, openarm_right_joint2."""
+    words = names[0].rpartition("_")[0] + "_"
+    if len(names) < 2 or not all(name.startswith(words) for name in names):
+        return list(names)
+    short = [name.removeprefix(words) for name in names]
+    return list(names) if any(name.isdigit() for name in short) else short
 
 
 def _short(names: tuple[str, ...]) -> list[str]:
@@ -171,7 +184,7 @@ def _short(names: tuple[str, ...]) -> list[str]:
 def print_intervals(title: str, names: tuple[str, ...], columns: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:
     """Values with the half width of their 95 % interval, a row a joint; `columns` maps heading to (value, half)."""
     table = Table("joint", *columns, title=title)
-    for joint, name in enumerate(names):
+    for joint, name in enumerate(_without_common(names)):
         table.add_row(name, *(_interval(value[joint], half[joint]) for value, half in columns.values()))
     _CONSOLE.print(table)
 

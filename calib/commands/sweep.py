@@ -53,7 +53,7 @@ def sweep(
     from armlink.errors import BadInput
     from calib.api import open_link
     from calib.arm.sweep_section import with_hold
-    from calib.commands.screen import SweepScreen, confirm, say_uncalibrated, warn_late
+    from calib.commands.screen import SweepScreen, confirm, warn_late
     from calib.sweep.dataset import require_vacant
 
     arm_file = with_hold(load_arm(arm), hold)
@@ -68,7 +68,6 @@ def sweep(
     load = reference_mass if dry_run else 0.0
     with open_link(arm_file, None if dry_run else bus, simulated=dry_run, load=load) as link:
         link.start()
-        say_uncalibrated(link)
         with SweepScreen(f"{arm_file.name}, {reference_mass:g} kg attached") as screen:
             found, data = _run(
                 link,

@@ -19,6 +19,10 @@ def verify(
     store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
     poses: Annotated[int, typer.Option(min=1, help="Poses to drive to.")] = 24,
     seed: Annotated[int, typer.Option(min=0, help="Draws other poses.")] = 0,
+    keep_going: Annotated[
+        int,
+        typer.Option(min=0, help="Enable the joints again by itself up to N times after a stall of the cycle."),
+    ] = 0,
     report: Annotated[Path | None, typer.Option(help="Also write a page to file: one self-contained HTML.")] = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")
@@ -30,6 +34,7 @@ def verify(
     """
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
+    from armlink.errors import Refused
     from armlink.loop.open import open_arm
     from calib.commands.screen import SweepScreen
     from calib.creep.choice import sweep_motion
@@ -40,15 +45,21 @@ def verify(
     arm_file = load_arm(arm)
     with open_arm(arm_file, bus) as link:
         gravity, calibration = _records(RecordStore(store), arm_file, record or [])
+        creeping = sweep_motion(arm_file) == "creep"
+        if creeping and calibration is None:
+            raise Refused(f"{arm_file.name} {arm_file.serial}: no calibration record yet: armlink calibrate makes one")
         link.start()
         with SweepScreen(f"{arm_file.name}: verify") as screen:
             link.enable()
-            if sweep_motion(arm_file) == "creep" and calibration is not None:
+            watch, bridge = screen.count, screen.on_stall(keep_going)
+            if creeping and calibration is not None:
                 result = verify_creeping(
-                    link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=screen.count
+                    link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=watch, on_stall=bridge
                 )
             else:
-                result = run_verify(link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=screen.count)
+                result = run_verify(
+                    link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=watch, on_stall=bridge
+                )
     _show(result)
     if report is not None:
         from calib.report.verification import write_report

@@ -9,6 +9,8 @@ from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm, model_arm
 from calib.arm.sweep_section import sweep_section
 from calib.commissioning.finding import SetupFinding
+from calib.creep.choice import sweep_motion
+from calib.creep.plan import plan_creep
 from calib.plan.bias_torque import pressable
 from calib.plan.collisions import check_plan
 from calib.plan.poses import sweep_range
@@ -35,13 +37,22 @@ def motion_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
         if joint.max_torque_rate > FASTEST_RATE * joint.max_torque:
             what = f"max_torque_rate {joint.max_torque_rate:g} N·m/s: full torque within {1e3 / FASTEST_RATE:.0f} ms"
             yield SetupFinding("hint", what, joint.name, f"about {2.5 * joint.max_torque:.3g} N·m/s is usual")
-    guess = None
+    guess, creeping = None, sweep_motion(arm_file) == "creep"
     if arm_file.model_path is not None:
         model = model_arm(arm_file)
         guess = guess_of_model(model.arm, model.beta)
         yield from _strength(arm_file, guess)
-        if sweep_section(arm_file).hold == "stops" and np.isfinite([model.arm.lower, model.arm.upper]).all():
+        if (
+            not creeping
+            and sweep_section(arm_file).hold == "stops"
+            and np.isfinite([model.arm.lower, model.arm.upper]).all()
+        ):
             yield from _stops(arm_file, guess)
+    if creeping:
+        plan_creep(
+            arm_file
+        )  # raises where it cannot be made; joints that gravity does not load are findings of the model
+        return
     plan = plan_sweep(arm_file, guess)
     checked = check_plan(arm_file, plan)
     for note in plan.notes:

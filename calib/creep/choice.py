@@ -1,9 +1,11 @@
 """Whether an arm is swept by creeping or by steps at rest."""
 
+from collections.abc import Sequence
 from typing import Literal
 
 from armlink.arm_file import ArmFile
 from armlink.drives.registry import family
+from armlink.errors import BadInput
 from calib.arm.sweep_section import sweep_section
 from calib.sweep.dataset import SweepData
 
@@ -26,3 +28,12 @@ def sweep_motion(arm_file: ArmFile) -> Motion:
 def is_creep(data: SweepData) -> bool:
     """Whether a data set was swept by creeping."""
     return data.plan is not None and any(sweep.speed is not None for sweep in data.plan.sweeps)
+
+
+def all_creep(data: Sequence[SweepData]) -> bool:
+    """Whether the data sets are creep sweeps; raises BadInput where some are and some are not."""
+    kinds = {is_creep(each) for each in data}
+    if len(kinds) > 1:
+        other = next(each for each in data if not is_creep(each))
+        raise BadInput(f"{other.path}: steps at rest, but the other directories are creep sweeps: give one kind")
+    return kinds == {True}

@@ -1,12 +1,16 @@
 """Records of a creep fit: a calibration with friction, kept by the host, and gravity."""
 
-from typing import Literal
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, TypeAlias
 
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from calib.creep.fit import CreepFit
+from armlink.errors import BadInput
+from calib.creep.fit import QUANTILE, CreepFit
 from calib.creep.plan import VERTICAL, vertical
+from calib.fit.gravity_fit import GravityFit
 from calib.records.records import (
     CalibrationRecord,
     GravityRecord,
@@ -16,10 +20,20 @@ from calib.records.records import (
     matrix,
     provenance,
 )
-from gcomp.arrays import Mask
+from gcomp.arrays import Array, Mask
 
+Value: TypeAlias = Literal["gain", "offset", "position_offset", "coulomb", "load", "viscous"]
 FAMILY: dict[Parameter, str] = {"gain": "gain", "offset": "offset", "position_offset": "zero"}
 """Parameter of a record → family of the fit."""
+VALUES: dict[Value, str] = {
+    "gain": "gain",
+    "offset": "offset",
+    "position_offset": "zero",
+    "coulomb": "coulomb",
+    "load": "load",
+    "viscous": "viscous",
+}
+"""What a program asks for → family of the fit."""
 HEADINGS = {
     "gain": "reading per N·m (1/k)",
     "offset": "offset [N·m]",
@@ -116,16 +130,71 @@ def _motor(fit: CreepFit, joint: int) -> MotorTorque:
     )
 
 
-def gravity_record(fit: CreepFit, arm_file: ArmFile, calibration: CalibrationRecord | None) -> GravityRecord:
+def gravity_fit(fit: CreepFit) -> GravityFit:
     """Mass moments of the arm without the reference mass, in true kg·m, and their covariance."""
     found, place = fit.found("beta"), fit.slices["beta"]
-    covariance = fit.covariance[place, place] * np.outer(found, found)
-    return GravityRecord(
-        **provenance(arm_file, fit.sources),
+    return GravityFit(
         names=fit.names,
-        beta=tuple(fit.beta.tolist()),
-        covariance=matrix(covariance),
-        identifiable=tuple(bool(each) for each in found),
-        gravity=tuple(fit.arm.gravity.tolist()),
-        calibration=None if calibration is None else calibration.id,
+        beta=fit.beta,
+        covariance=fit.covariance[place, place] * np.outer(found, found),
+        identifiable=found,
+        recursive=None,
+        residual_rms=fit.residual_rms,
+        sources=fit.sources,
     )
+
+
+def gravity_record(fit: CreepFit, arm_file: ArmFile, calibration: CalibrationRecord | None) -> GravityRecord:
+    """The same as a record."""
+    return gravity_fit(fit).record(arm_file, calibration)
+
+
+@dataclass(frozen=True, eq=False)
+class CreepCalibration:
+    """What creep sweeps tell of the drives, as programs ask for it: NaN where they do not tell a value."""
+
+    fit: CreepFit
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Joint names."""
+        return self.fit.names
+
+    @cached_property
+    def reasons(self) -> dict[tuple[str, Parameter], str]:
+        """(Joint, parameter) → why it has no value."""
+        return missing(self.fit)
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """What disturbed the sweeps, one sentence each."""
+        return self.fit.findings
+
+    @property
+    def residual_rms(self) -> Array:
+        """RMS of each joint's residual (n,) [N·m]."""
+        return self.fit.residual_rms
+
+    def value(self, parameter: Value) -> Array:
+        """Estimates (n,); the gain is what a drive reads for 1 N·m, 1/k."""
+        family = self._family(parameter)
+        return np.where(told(self.fit, family), self.fit.value(family), np.nan)
+
+    def std(self, parameter: Value) -> Array:
+        """Standard deviations (n,)."""
+        return np.where(np.isnan(self.value(parameter)), np.nan, self.fit.std(self._family(parameter)))
+
+    def ci95(self, parameter: Value) -> Array:
+        """95 % intervals (n, 2)."""
+        half = QUANTILE * self.std(parameter)
+        return np.stack([self.value(parameter) - half, self.value(parameter) + half], axis=1)
+
+    def record(self, arm_file: ArmFile) -> CalibrationRecord:
+        """The calibration record, with friction."""
+        return calibration_record(self.fit, arm_file)
+
+    @staticmethod
+    def _family(parameter: Value) -> str:
+        if parameter not in VALUES:
+            raise BadInput(f"no value {parameter!r} of creep sweeps; there are {', '.join(VALUES)}")
+        return VALUES[parameter]

@@ -1,6 +1,7 @@
 """Verification of an arm whose torque is a motor current: model against half sums of short creeps at held-out poses."""
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from calib.motion.mover import STALL, Mover, Stalled
 from calib.motion.static_reading import stack
 from calib.plan.poses import nearest_first
 from calib.records.records import CalibrationRecord, GravityRecord
+from calib.sweep.stalls import OnStall, give_up, repeated
 from calib.sweep.verify import Verification
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque, torque_covariance
@@ -40,10 +42,12 @@ def verify_creeping(
     poses: int = 12,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
+    on_stall: OnStall = give_up,
 ) -> Verification:
     """Creep all joints together, both ways, about random poses; the half sum of the readings is without friction.
 
-    The link must have been enabled. Raises Refused on records of another arm or where no pose can be reached, BusFault.
+    The link must have been enabled. A pose that a Stall interrupts is repeated where `on_stall` accepts it. Raises
+    Refused on records of another arm or where no pose can be reached, BusFault.
     """
     ground, limits = CreepGround.of(arm_file), Limits.of(arm_file)
     calibration.require(arm_file)
@@ -55,17 +59,11 @@ def verify_creeping(
     angles, torques, skipped = list[Array](), list[Array](), 0
     held_out = _poses(ground, poses, seed, mover.position)
     for number, pose in enumerate(held_out, start=1):
-        begin = mover.position.copy()
-        try:
-            mover.travel(pose - WAY / 2, 1.5)
-            up = _creep(mover, WAY)
-            down = _creep(mover, -WAY)
-        except Stalled:
+        ways = repeated(mover, on_stall, partial(_both_ways, mover, pose))
+        if ways is None:
             skipped += 1
-            mover.hold_all()
-            mover.travel(begin, 1.0)
             continue
-        angle, torque = _half_sum(up, down, pose)
+        angle, torque = _half_sum(*ways, pose)
         raw = np.array([each.apply(float(value)) for each, value in zip(installed, torque, strict=True)])
         angles.append(calibration.angle(angle))
         torques.append(np.where(np.isnan(wanted.gain), torque, wanted.invert(raw)))
@@ -95,6 +93,18 @@ def _poses(ground: CreepGround, count: int, seed: int, begin: Array) -> Array:
     if ground.geometry is None and found:
         return nearest_first(np.array(found), begin)
     return np.array(found)
+
+
+def _both_ways(mover: Mover, pose: Array) -> tuple[list[Sample], list[Sample]] | None:
+    """Creep up and down about a pose (n,) [rad]; back where it came from, and None, where a joint meets something."""
+    begin = mover.position.copy()
+    try:
+        mover.travel(pose - WAY / 2, 1.5)
+        return _creep(mover, WAY), _creep(mover, -WAY)
+    except Stalled:
+        mover.hold_all()
+        mover.travel(begin, 1.0)
+        return None
 
 
 def _creep(mover: Mover, way: float) -> list[Sample]:

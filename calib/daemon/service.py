@@ -5,7 +5,7 @@ Each part holds its own state and calls only parts further down:
     ActiveRecords          records in force, and whether the controllers hold them
     Observation            one observer against one pair of records: ObserverFeed
     RecalibrationWorkflow  proposals, decisions, writes, the check after a write
-    PoseTours, ObserverStorage, ArmState, Recordings
+    PoseTours, ObserverStorage, ArmState, LiveWindow, Recordings
     BusJobs                work that waits for the bus, one job at a time
     EventLog               events to the journal, the stream's Hub and the process's log
     Journal                the file; Configuration and Environment are given
@@ -29,6 +29,7 @@ from calib.daemon.state.arm_state import ArmState
 from calib.daemon.state.bus_jobs import BusJobs
 from calib.daemon.state.event_log import EventLog
 from calib.daemon.state.journal import Journal
+from calib.daemon.state.live_window import LiveWindow
 from calib.daemon.state.recordings import Recordings
 from calib.daemon.view.api_models import State
 from calib.daemon.view.fan_out import Hub
@@ -60,6 +61,7 @@ class Service:
         self.events = EventLog(self.journal, self.hub, monotonic, wall)
         self.jobs = BusJobs(environment.run, self.journal)
         self.arm_state = ArmState(arm, self.events, monotonic)
+        self.window = LiveWindow(len(arm.joint_names))
         self.recordings = Recordings(directory / "recordings", self.configuration)
         self.storage = ObserverStorage(self.journal, environment)
         self.recalibrations = RecalibrationWorkflow(
@@ -136,6 +138,7 @@ class Service:
     def _take(self, message: Message) -> None:
         if isinstance(message, Batch):
             self.arm_state.heard(message)
+            self.window.append(message)
             self.recordings.append(message)
             if self.records.observation is not None:
                 self.records.observation.handle(message)

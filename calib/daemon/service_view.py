@@ -2,19 +2,21 @@
 
 import math
 from collections.abc import Iterator
-from datetime import datetime
+from datetime import datetime, timedelta
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from armlink.errors import BadInput
 from armlink.link.joints.groups import state_name
 from calib.daemon.observing.observation import Observation
 from calib.daemon.service import Service
 from calib.daemon.state.history_reader import HistoryReader
 from calib.daemon.view.api_models import (
     BusHealth,
+    DrawnArm,
     EventRecord,
     HistoryPoint,
     JointEstimate,
@@ -24,8 +26,11 @@ from calib.daemon.view.api_models import (
     RecordsInForce,
     Status,
 )
+from calib.daemon.view.drawn_arm import drawn_arm
 from calib.daemon.view.fan_out import Client
 from calib.daemon.view.view import Decisions, NoSuch
+from calib.daemon.view.window import Window
+from gcomp.arrays import Array
 
 
 class ServiceView:
@@ -34,6 +39,7 @@ class ServiceView:
     def __init__(self, service: Service) -> None:
         self._service, self._version = service, version("armlink")
         self._history = HistoryReader(service.journal.path)
+        self._arm: DrawnArm | None = None
         self.decisions: Decisions = service.recalibrations
 
     @property
@@ -75,17 +81,49 @@ class ServiceView:
         names, arm_state = self._service.configuration.names, self._service.arm_state
         batch = arm_state.batch
         if batch is None:
-            return tuple(_joint(name, math.nan, math.nan, math.nan, "unknown", math.inf) for name in names)
+            missing = np.full(len(names), math.nan)
+            columns = (names, missing, missing, missing, missing, ["unknown"] * len(names), missing)
+            return tuple(_joint(*column) for column in zip(*columns, strict=True))
         position, torque = batch.channels["position"][-1], batch.channels["torque"][-1]
-        model = np.full(len(names), math.nan)
-        if self._observation is not None:
-            torque = self._observation.feed.reading(torque)
-            if np.isfinite(position).all():
-                model = self._observation.feed.observer.model_torque(position)
+        torque, model = self._torques(position[None], torque[None])
+        temperature = np.full(len(names), math.nan) if batch.temperature is None else batch.temperature
         arm = self._service.configuration.arm
         states = [state_name(arm, joint, code) for joint, code in enumerate(batch.status.tolist())]
-        columns = zip(names, position, torque, model, states, batch.age + arm_state.late, strict=True)
-        return tuple(_joint(*column) for column in columns)
+        ages = batch.age + arm_state.late
+        columns = (names, position, torque[0], model[0], temperature, states, ages)
+        return tuple(_joint(*column) for column in zip(*columns, strict=True))
+
+    def window(self, seconds: float, most: int) -> Window:
+        """Readings of the last `seconds`, thinned evenly to at most `most` rows; the model's torque is today's."""
+        environment = self._service.environment
+        t, channels = self._service.window.rows(seconds, most)
+        torque, model = self._torques(channels["position"], channels["torque"])
+        late = timedelta(seconds=environment.monotonic() - float(t[-1])) if len(t) else timedelta()
+        return Window(
+            names=self._service.configuration.names,
+            time=environment.wall() - late,
+            t=t - t[:1],
+            channels=channels | {"torque": torque, "model_torque": model},
+        )
+
+    def arm(self) -> DrawnArm:
+        """The arm's shape; read from its model on the first call. Raises NoSuch."""
+        if self._arm is None:
+            try:
+                self._arm = drawn_arm(self._service.configuration.arm)
+            except (BadInput, OSError) as error:
+                raise NoSuch(f"the arm cannot be drawn: {error}") from None
+        return self._arm
+
+    def _torques(self, position: Array, torque: Array) -> tuple[Array, Array]:
+        """Torques (K, n) as sent, converted to the record in force, and the model's at these positions; NaN without."""
+        model = np.full(position.shape, math.nan)
+        if self._observation is not None:
+            torque = self._observation.feed.reading(torque)
+            known = np.isfinite(position).all(axis=1)
+            if known.any():
+                model[known] = self._observation.feed.observer.model_torque(position[known])
+        return torque, model
 
     def estimates(self) -> tuple[JointEstimate, ...]:
         """Every joint's gain and offset, base to tip; empty while there is no gravity record."""
@@ -185,13 +223,16 @@ def _number(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _joint(name: str, position: float, torque: float, model: float, state: str, age: float) -> JointNow:
+def _joint(
+    name: str, position: float, torque: float, model: float, temperature: float, state: str, age: float
+) -> JointNow:
     return JointNow(
         joint=name,
         position=_number(position),
         torque=_number(torque),
         model_torque=_number(model),
         residual=_number(torque - model),
+        temperature=_number(temperature),
         state=state,
         sample_age_s=_number(age),
     )

@@ -136,9 +136,9 @@ class Observer:
         return self._limits[1]
 
     def model_torque(self, position: Array) -> Array:
-        """Gravity torque (n,) [N·m] that the observer believes at position readings (n,) [rad]."""
-        torque: Array = self._tracking.belief.torque(self._angle(position)[None])[0]
-        return torque
+        """Gravity torque [N·m] that the observer believes at position readings [rad]; (n,), or (K, n) of K poses."""
+        torque: Array = self._tracking.belief.torque(np.atleast_2d(self._angle(position)))
+        return torque.reshape(position.shape)
 
     def install(self, finding: Finding) -> None:
         """The finding was written to the controller: readings are correct again within the finding's uncertainty."""

@@ -5,6 +5,7 @@ from typing import TypeVar
 
 from armlink.errors import HostLate, Stall
 from armlink.loop.driver import ArmDriver
+from calib.motion.mover import Mover
 from calib.sweep.dataset import StallLine
 
 OnStall = Callable[[Stall], bool]
@@ -40,6 +41,16 @@ def bridged(link: ArmDriver, on_stall: OnStall, work: Callable[[], T]) -> T:
             return work()
         except Stall as stall:
             restart(link, on_stall, stall)
+
+
+def repeated(mover: Mover, on_stall: OnStall, work: Callable[[], T]) -> T:
+    """As `bridged`, for work that moves the arm: after a Stall it holds where it stands before the work is repeated."""
+    while True:
+        try:
+            return work()
+        except Stall as stall:
+            restart(mover.link, on_stall, stall)
+            bridged(mover.link, on_stall, mover.resume)
 
 
 def stall_line(stall: Stall, t: float, reading: str) -> StallLine:

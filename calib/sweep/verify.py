@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -13,9 +14,11 @@ from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import SweepSection, sweep_section
 from calib.motion.mover import Mover, Stalled
+from calib.motion.static_reading import StaticReading
 from calib.plan.poses import nearest_first, sweep_range
 from calib.records.records import CalibrationRecord, GravityRecord
-from gcomp.arrays import Array
+from calib.sweep.stalls import OnStall, give_up, repeated
+from gcomp.arrays import Array, Mask
 from gcomp.gravity.torque import gravity_torque, torque_covariance
 
 ACCELERATION = 2.0
@@ -75,11 +78,13 @@ def run_verify(
     poses: int = 24,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
+    on_stall: OnStall = give_up,
 ) -> Verification:
     """Drive, servo-held, to random poses within the joint range and read every torque sensor there.
 
-    The link must have been enabled. Without a calibration record the controllers' own calibration is used. Raises
-    Refused on records of another arm, or if no pose can be reached; BusFault.
+    The link must have been enabled. Without a calibration record the controllers' own calibration is used. A pose whose
+    reading a Stall interrupts is repeated where `on_stall` accepts it. Raises Refused on records of another arm, or if
+    no pose can be reached; BusFault.
     """
     n, section, limits = link.n, sweep_section(arm_file), Limits.of(arm_file)
     kinematics = gcomp_arm(arm_file)
@@ -89,15 +94,10 @@ def run_verify(
     mover.hold_all()
     everything, angles, torques, skipped = np.ones(n, dtype=bool), [], [], 0
     for number, pose in enumerate(verify_poses(limits, section, poses, seed, mover.position), start=1):
-        begin = mover.position.copy()
-        try:
-            mover.travel(pose, ACCELERATION)
-        except Stalled:
+        rest = repeated(mover, on_stall, partial(_rest_at, mover, pose, everything))
+        if rest is None:
             skipped += 1
-            mover.hold_all()
-            mover.travel(begin, ACCELERATION)
             continue
-        rest = mover.rest(everything)
         angles.append(sensors.angle(rest.position))
         torques.append(sensors.torque(rest.torque))
         if progress is not None:
@@ -109,6 +109,18 @@ def run_verify(
     variance = np.diagonal(torque_covariance(kinematics, np.array(gravity.covariance), q), axis1=-2, axis2=-1)
     tolerance = _tolerance(calibration, model, variance, limits.rated)
     return Verification(link.names, q, np.array(torques), model, np.sqrt(np.maximum(variance, 0.0)), skipped, tolerance)
+
+
+def _rest_at(mover: Mover, pose: Array, everything: Mask) -> StaticReading | None:
+    """Travel to a pose (n,) [rad] and rest there; back again, and None, where the drives do not reach it."""
+    begin = mover.position.copy()
+    try:
+        mover.travel(pose, ACCELERATION)
+    except Stalled:
+        mover.hold_all()
+        mover.travel(begin, ACCELERATION)
+        return None
+    return mover.rest(everything)
 
 
 def _tolerance(calibration: CalibrationRecord | None, model: Array, variance: Array, rated: Array) -> Array:

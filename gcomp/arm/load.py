@@ -56,6 +56,8 @@ class PlacedChain:
     geometry: ArmGeometry
     anchors: Array
     """A point on each joint's axis (n, 3), world frame [m]."""
+    reference: Array
+    """Joint positions (n,) of this configuration [rad]."""
     bodies: tuple[tuple[int, ...], ...]
     """Ids of the bodies that each link consists of."""
 
@@ -176,7 +178,7 @@ def _place(model: "mujoco.MjModel", chain: list[int], gravity: ArrayLike | None)
     moments = np.einsum("ndk,nd->nk", geometry.bar, first_moment)
     names = tuple(tuple(model.body(body).name for body in of_link) for of_link in bodies)
     arm = ModelArm(geometry.arm, geometry.base_parameters(mass, moments), mass, moments, names)
-    return PlacedChain(model, data, arm, geometry, data.xanchor[chain], tuple(map(tuple, bodies)))
+    return PlacedChain(model, data, arm, geometry, data.xanchor[chain], reference, tuple(map(tuple, bodies)))
 
 
 def _links(model: "mujoco.MjModel", chain: list[int]) -> dict[int, int]:

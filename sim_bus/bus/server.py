@@ -15,7 +15,7 @@ from sim_bus.bus.effect_options import Drift
 from sim_bus.bus.fault_injector import Injector
 from sim_bus.bus.fault_kinds import Fault
 from sim_bus.bus.wire_timing import Line
-from sim_bus.simulated_arm import SimulatedArm
+from sim_bus.simulated_arm import LARGEST_ID, MARK_SHIFT, SimulatedArm, bus_mark
 
 LARGEST_LAG = 0.25
 """Maximum lag of the physics behind the clock; the rest is dropped, as after a stopped process [s]."""
@@ -51,13 +51,21 @@ class Server:
         """The last of several buses provides SYNC: a host sends to them in order."""
         self._of_port: dict[Port, set[int]] = {port: set() for port in ports}
         """Nodes on each of several buses."""
+        self._marks: dict[Port, int] = {}
+        """Of each of several buses that has other drives: the mark of its frames."""
+        self._several = isinstance(bus, BusGroup)
         self._tags: dict[int, int] = {}
         """Node → what the identifiers of its bus have in addition."""
         if isinstance(bus, BusGroup):
+            arm.stand_on(list(bus.tags))
             for joint in arm.arm.require_link().joints:
-                node, tag = joint.settings.node, bus.tags[joint.bus]
-                self._tags[node] = tag
-                self._of_port[ports[tag >> BUS_SHIFT]].add(node)
+                place = bus.tags[joint.bus] >> BUS_SHIFT
+                if joint.settings.family != "canopen":
+                    self._marks[ports[place]] = bus_mark(place)
+                    continue
+                node = joint.settings.node
+                self._tags[node] = bus.tags[joint.bus]
+                self._of_port[ports[place]].add(node)
         self._line: Line = arm
         self._control, self._injector = control, None if control is None and not faults else Injector(arm)
         if self._injector is not None:
@@ -123,7 +131,7 @@ class Server:
             for node in self._of_port[port] if addressed == 0 else self._of_port[port] & {addressed}:
                 self._line.on_frame(NMT_ID, bytes([command, node]))
         elif port is self._leading or can_id != SYNC_ID:
-            self._frame(can_id, data)
+            self._frame(can_id | self._marks.get(port, 0), data)
 
     def _frame(self, can_id: int, data: bytes) -> None:
         if not (self._lockstep or self._arm.waits_for_sync(can_id)):
@@ -153,14 +161,18 @@ class Server:
     def _flush(self) -> None:
         outbox = self._line.outbox
         if outbox:
-            frames = (
-                [(can_id | self._tags[can_id & 0x7F], data) for can_id, data in outbox] if self._tags else list(outbox)
-            )
+            frames = [(self._on_its_bus(can_id), data) for can_id, data in outbox] if self._several else list(outbox)
             outbox.clear()
             try:
                 self._port.send_all(frames)
             except BusFault:  # lost, as on a dead bus
                 self.lost += len(frames)
+
+    def _on_its_bus(self, can_id: int) -> int:
+        """Identifier of a frame of the arm for the port of several buses."""
+        if can_id > LARGEST_ID:
+            return can_id & LARGEST_ID | ((can_id >> MARK_SHIFT) - 1) << BUS_SHIFT
+        return can_id | self._tags[can_id & 0x7F]
 
     def _end(self, number: int, _frame: FrameType | None) -> None:
         self._ended = INTERRUPTED if number == signal.SIGINT else TERMINATED

@@ -35,9 +35,14 @@ def power_on_values(arm: ArmFile, joint: LinkJoint, increments: int, device: Dev
         (0x608F, 1): increments,
         (0x6092, 1): FEED,
         (0x60C2, 1): min(max(round(1000 / link.rate), 1), 255),
-        (0x6502, 0): SUPPORTED_MODES & ~device.hidden_modes,
+        (0x6502, 0): _modes_shown(device),
         **device.values,
     }
+
+
+def _modes_shown(device: Device) -> int:
+    has = SUPPORTED_MODES if device.modes is None else sum(1 << (mode - 1) for mode in device.modes)
+    return has & ~device.hidden_modes
 
 
 def bring_into_force(node: Node, drives: Drives) -> None:

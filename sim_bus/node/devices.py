@@ -30,6 +30,8 @@ class Device:
     """Whether 60C2h:02 takes −3 only."""
     rpm: bool = False
     """Whether 606Ch is in revolutions a minute of the motor instead of user units a second."""
+    modes: frozenset[int] | None = None
+    """Modes that it has; None: all of ours."""
     hidden_modes: int = 0
     """Bits that 6502h does not show although the device has the modes."""
 
@@ -46,12 +48,17 @@ DEVICES: dict[str, Device] = {
     ),
     "nanotec": Device(absent=frozenset({0x2100, (0x1010, 4), 0x6076, 0x60B2, (0x1400, 5)}), fixed_exponent=True),
     "copley": Device(absent=frozenset({0x2100, (0x1010, 4), (0x1400, 5), 0x60B2}), values={(0x6076, 0): 0}),
+    "velocity": Device(
+        absent=frozenset({0x2100, (0x1010, 4), 0x60B2, (0x1400, 5), 0x6071, 0x607A, 0x607D, 0x6081, 0x6087}),
+        modes=frozenset({9}),
+    ),
     "sample": Device(
         absent=frozenset({0x2100, (0x1010, 4), 0x1016, 0x60B2, (0x1400, 5)}),
         unmappable=frozenset({(0x6060, 0), (0x6061, 0)}),
     ),
 }
-"""`ours` has our torque sensor record, `cia402` all of the profile; the others are as their makers' data sheets."""
+"""`ours` has our torque sensor record, `cia402` all of the profile; `velocity` has cyclic velocity alone, as drives of
+axes whose controller closes the position loop; the others are as their makers' data sheets."""
 
 
 def device_of(joint: LinkJoint, named: str | None) -> Device:

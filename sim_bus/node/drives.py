@@ -77,6 +77,8 @@ class Drives:
     def set_devices(self, devices: Sequence[Device], places: Sequence[int]) -> None:
         """What stock devices show differently."""
         for place, device in zip(places, devices, strict=True):
+            if device.modes is not None:
+                self.refused_modes[place] = set(KINDS) - device.modes
             if device.rpm:
                 self._velocity_per_count[place] = 60.0 / self._sensors.increments[place]
 

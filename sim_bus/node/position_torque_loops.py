@@ -29,8 +29,9 @@ INTEGRAL_SHARE = 0.3
 """Integral gain = this · stiffness · bandwidth."""
 TUNING_POSES = 50
 """Number of poses; the loops are tuned for the largest inertia among them."""
-UNFINISHED = 0.05
-"""Interpolation of a position target continues between SYNCs if more than this share of its time is left."""
+EXTRAPOLATED = 1.0
+"""A cyclic position target that is late is extrapolated for this many interpolation times, then held, as drives do (one
+cycle is usual), so that jitter of SYNC is no jerk."""
 SPARE_ACCELERATION = 100.0
 """The loops are tuned for the bare arm's inertia plus rated torque divided by this acceleration [rad/s²]."""
 
@@ -72,8 +73,7 @@ class Loops:
         self.interpolation = np.zeros(self.n)
         """Interpolation time of cyclic position targets (60C2h) [s]."""
         self._left = np.zeros(self.n)
-        """Interpolation time left after the first step behind SYNC [s]."""
-        self._approaching = False
+        """Time for which position targets go on at their rates without another SYNC [s]."""
         self.lowest, self.highest = np.full(self.n, -np.inf), np.full(self.n, np.inf)
         """Software position limits (607Dh) in user units."""
         self.reconfigure()
@@ -219,15 +219,11 @@ class Loops:
                 time = np.maximum(self.interpolation, duration)
                 rate = (self._sensors.angle_of(wanted * UNIT) - self._target) / time
                 np.copyto(self._rate, rate, where=self._cyclic_position)
-                np.subtract(time, duration, out=self._left)
-                self._approaching = bool((self._left > UNFINISHED * time).any())
-            elif self._approaching:
+                np.subtract(time + EXTRAPOLATED * self.interpolation, duration, out=self._left)
+            else:
                 share = np.minimum(np.maximum(self._left, 0.0) / duration, 1.0)
                 np.copyto(self._rate, self._rate * share, where=self._cyclic_position)
                 self._left -= duration
-                self._approaching = bool((self._left > 0.0).any())
-            else:
-                self._rate[self._cyclic_position] = 0.0
         if self._any_stopping:
             slower = np.maximum(np.abs(self._rate) - self.deceleration * duration, 0.0) * np.sign(self._rate)
             np.copyto(self._rate, slower, where=self.stopping)

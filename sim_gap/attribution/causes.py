@@ -132,7 +132,11 @@ could explain them."""
 def relevant_terms(
     step: Step, estimate: Estimate, heldout: ResidualSet, scorer: _Scorer, quiet: bool
 ) -> tuple[Term, ...]:
-    """Those of a step's terms that matter: without the others together, no joint's RMS rises by a relevant amount."""
+    """Those of a step's terms that matter: without the others together, no joint's RMS rises by a relevant amount.
+
+    A step as a whole matters if it lowers some RMS so far, in its place or as the last of all: an effect whose part
+    others take as well as they can, such as load-dependent friction, shows in what they leave.
+    """
     hit = heldout.impacts | estimate.store.data.impacts
     if any(
         not _is_held_out(term, heldout) or (term.effect == "transmission.backlash" and term.place in hit)
@@ -140,9 +144,12 @@ def relevant_terms(
     ):
         return step.terms
     shows = {row for term in step.terms for row in estimate.store.columns(term)}
-    least = np.maximum(_minor(shows, heldout.layout) * heldout.usual_torque, QUIET_NM if quiet else heldout.relevant_nm)
+    absolute = heldout.least(QUIET_NM) if quiet else heldout.relevant_nm
+    least = np.maximum(_minor(shows, heldout.layout) * heldout.usual_torque, absolute)
+    others = [term for term in estimate.terms if term not in step.terms]
     by_row = quiet or {channel for channel, _ in shows} == {heldout.layout.command}
-    if np.all(scorer.falls(step.below, step.terms, by_row) < least):
+    falls = scorer.falls(step.below, step.terms, by_row), scorer.falls(others, step.terms, by_row)
+    if np.all(np.maximum(*falls) < least):
         return ()
     places = {term.place for term in step.terms}
     if len(places) == 1:

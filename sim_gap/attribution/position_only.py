@@ -84,9 +84,7 @@ def _left(found: Identified) -> float:
 
 
 def _matters(found: Identified, stage: Stage) -> bool:
-    fall = stage.before - stage.after
-    falls = np.any((fall > LEAST_SHRINK * stage.before) & (fall > found.search.floor))
-    return bool(falls) and _differs(found, stage)
+    return bool((stage.share > LEAST_SHRINK).any()) and _differs(found, stage)
 
 
 def _differs(found: Identified, stage: Stage) -> bool:
@@ -211,9 +209,10 @@ def _notes(found: Identified) -> list[str]:
             f"{listed}: position alone shows ratios of gain, friction and inertia here, their common scale rests on "
             "the model's inertia: hold a known load or record the current"
         )
-    if any("viscous" in own for own in found.fit.active):
+    if any("viscous" in own and "back_emf" not in own for own in found.fit.active):
         out.append(
             "viscous friction, back-EMF and damping of the measured velocity act alike on a position: the sum is given"
+            + (", as part of the controller" if found.search.open_controller else "")
         )
     if found.export is not None and found.export.lines:
         out.append(f"the corrected model leaves out: {', '.join(found.export.lines)}")

@@ -13,7 +13,12 @@ from armlink.errors import ArmlinkError, BadInput, Refused
 from sim_gap.blind.cases.make import HELDOUT_S, TRAIN_S
 from sim_gap.blind.cases.seal import open_labels, seal, write_answer
 from sim_gap.blind.judging.score import answer_name, score
+from sim_gap.blind.servo.score import score_positions
 
+MAKER, SERVO_MAKER = "sim_gap.blind.cases.make", "sim_gap.blind.servo.make"
+"""Modules that make the cases, of arms with torque channels and of arms with servos."""
+SERVO_LENGTHS = 36.0, 18.0
+"""Training and held-out recordings of arms with servos [s]."""
 MOST_EFFECTS = 10
 """Largest number of effects in one case."""
 Diagnose = Callable[[Path, Sequence[Path], Sequence[Path], Sequence[str]], dict[str, Any]]
@@ -26,24 +31,30 @@ def run_bench(
     seed: int = 1,
     cases: int = 150,
     workers: int = 2,
-    lengths: tuple[float, float] = (TRAIN_S, HELDOUT_S),
+    lengths: tuple[float, float] | None = None,
     progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
     effects: str = "",
+    positions: bool = False,
 ) -> dict[str, Any]:
     """Make `cases` sealed cases under `out`, have them diagnosed, seal the answers, open the labels and score.
 
-    `lengths` are the seconds of training and held-out recordings; `effects` is the number of effects in every case such
-    as `5-8`, empty for none, one or two. `progress` gets stage, done, total. `diagnose` must
-    be a module-level function if `workers` exceeds 1. Raises BadInput if `out` holds an earlier check.
+    `lengths` are the seconds of training and held-out recordings, by default 120 and 40; `effects` is the number of
+    effects in every case such as `5-8`, empty for none, one or two. With `positions`, arms with servos of which `q` and
+    `q_cmd` alone are seen, none or one effect each, by default 36 s and 18 s. `progress` gets stage, done, total.
+    `diagnose` must be a module-level function if `workers` exceeds 1. Raises BadInput if `out` holds an earlier check.
     """
     _require_range(effects)
+    if positions and effects:
+        raise BadInput(f"--effects {effects}: cases of --positions have one effect at most: leave it out")
     if cases < 1:
         raise BadInput(f"--cases {cases}: expected at least 1")
     if any((out / name).exists() for name in ("answers", "cases", "labels")):
         raise BadInput(f"{out}: holds an earlier check: give another --out, or remove it")
+    lengths = lengths or (SERVO_LENGTHS if positions else (TRAIN_S, HELDOUT_S))
     started = time.monotonic()
     progress("making cases", 0, cases)
-    for done in make_apart(out, seed, cases, workers, lengths, effects):
+    maker = SERVO_MAKER if positions else MAKER
+    for done in make_apart(out, seed, cases, workers, lengths, effects, maker):
         progress("making cases", done, cases)
     made = time.monotonic()
     todo = tasks(out)
@@ -53,7 +64,7 @@ def run_bench(
     digest = seal(out / "answers")
     answered = time.monotonic()
     answers, labels = open_labels(out / "answers", out / "labels", digest)
-    result = score(answers, labels)
+    result = score_positions(answers, labels) if positions else score(answers, labels)
     seconds = {"making": made - started, "diagnosing": answered - made}
     return {**result, "seed": seed, "sealed": digest, "seconds": seconds}
 
@@ -68,23 +79,29 @@ def _require_range(effects: str) -> None:
 
 
 def make_apart(
-    out: Path, seed: int, cases: int, workers: int, lengths: tuple[float, float], effects: str = ""
+    out: Path,
+    seed: int,
+    cases: int,
+    workers: int,
+    lengths: tuple[float, float],
+    effects: str = "",
+    maker: str = MAKER,
 ) -> Iterator[int]:
     """Make the cases in a separate process and yield their number from time to time. Raises Refused if it fails."""
-    command = [sys.executable, "-m", "sim_gap.blind.cases.make", "--seed", str(seed), "--cases", str(cases)]
+    command = [sys.executable, "-m", maker, "--seed", str(seed), "--cases", str(cases)]
     command += ["--out", str(out / "cases"), "--labels", str(out / "labels"), "--workers", str(workers)]
     command += ["--train-s", str(lengths[0]), "--heldout-s", str(lengths[1]), "--effects", effects]
     (out / "cases").mkdir(parents=True)
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as maker:
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         while True:
             try:
-                _, complaint = maker.communicate(timeout=2.0)
+                _, complaint = process.communicate(timeout=2.0)
                 break
             except subprocess.TimeoutExpired:
                 yield len(list((out / "cases").glob("*/heldout.csv")))
-    if maker.returncode:
+    if process.returncode:
         raise Refused(
-            f"the cases could not be made: {complaint.strip().splitlines()[-1] if complaint else maker.returncode}"
+            f"the cases could not be made: {complaint.strip().splitlines()[-1] if complaint else process.returncode}"
         )
 
 

@@ -57,7 +57,7 @@ class RigidFit:
     own_share: Array
     """Standard deviation of the model's own part, over that of the reading, at scale 1."""
     friction: Array
-    """Direction-dependent torque [N·m], of either sign."""
+    """Direction-dependent torque [N·m], of either sign; NaN for a joint that hardly moves."""
     spread: Array
     """Standard deviation of the reading [N·m]."""
 
@@ -95,7 +95,8 @@ def fit_model(model: Array, motion: Motion, springs: bool = False) -> RigidFit:
     moving = np.mean(np.abs(motion.v) > TURNING, axis=0)
     unsigned = (motion.channel == "tau") | (moving < MOVING_SHARE)
     fits = [_joint(gram, both) for gram, both in zip(grams, unsigned.tolist(), strict=True)]
-    return RigidFit(*(np.array(values) for values in zip(*fits, strict=True)))
+    found = RigidFit(*(np.array(values) for values in zip(*fits, strict=True)))
+    return replace(found, friction=np.where(moving < MOVING_SHARE, np.nan, found.friction))
 
 
 def as_mounted(arm: RigidArm, motion: Motion) -> RigidArm:
@@ -130,7 +131,7 @@ def _joint(gram: Array, unsigned: bool) -> tuple[float, ...]:
     size = np.sqrt(np.diag(gram))
     spread = float(size[-1])
     if spread < 1e-9 or size[1] < 1e-6:  # nothing read, or a joint that rests
-        return 1.0, 1.0, 0.0, 0.0, 0.0, spread
+        return 1.0, 1.0, 0.0, 0.0, np.nan, spread
     units = np.where(size > 1e-9, size, 1.0)
     units[4] = size[4] if size[4] > 1e-6 else np.inf
     scaled = gram / units / units[:, None]

@@ -16,8 +16,8 @@ SCALE = 0.42, 2.4
 """Median coefficient of the model's torque, weighted by that torque, outside which a channel is in another unit; with
 loads and wrong torque constants it stays between 0.65 and 1.9 on real arms."""
 GEAR_FRICTION = 0.13
-"""Friction over torque (root sum of squares over the joints) from which a channel is a motor's: link sensors of two
-real arms show 0.04 to 0.07, motors of four others 0.26 to 0.6."""
+"""Friction over torque (root sum of squares over the joints that move) from which a channel is a motor's: link sensors
+of two real arms show 0.04 to 0.07, motors of four others 0.26 to 0.6."""
 LAG, LAG_STEP = 1.5, 0.02
 """Longest delay that is looked for, and its step [s]."""
 OWN_LAG = 0.12
@@ -74,7 +74,8 @@ def find_source(fit: RigidFit, s: Signals, motion: Motion, stated: Corrections) 
     """A channel taken for a link sensor's that holds the friction of gears: a motor's."""
     if motion.channel != "tau" or stated.effort:
         return []
-    share = float(np.linalg.norm(np.maximum(fit.friction, 0.0)) / (np.linalg.norm(fit.spread) + 1e-12))
+    moving = np.isfinite(fit.friction)
+    share = np.linalg.norm(np.maximum(fit.friction[moving], 0.0)) / (np.linalg.norm(fit.spread[moving]) + 1e-12)
     if share < GEAR_FRICTION:
         return []
     evidence = (

@@ -74,7 +74,7 @@ def nominal_point(data: Windows, own: Nominal) -> dict[str, Array]:
     point |= {"coulomb": arm.frictionloss.copy(), "armature": arm.armature.copy()}
     point["viscous"] = arm.damping + np.where(np.isfinite(own.kp), own.kv, 0.0)
     point["kp"] = np.where(np.isfinite(own.kp), own.kp, 1.0)
-    point["limit"] = own.limit.copy()
+    point["limit"], point["kv"] = own.limit.copy(), np.where(np.isfinite(own.kp), own.kv, 0.0)
     point["spring"], point["offset"] = arm.stiffness.copy(), -arm.stiffness * arm.rest
     return point | {name: np.zeros(data.joints) for name in data.columns}
 
@@ -95,7 +95,8 @@ def starting_fit(search: Search, own: Nominal, progress: Progress) -> tuple[Sear
     """A fit of controller, Coulomb and viscous friction; the search that keeps that controller; the controller's name.
 
     With position actuators in the model the controller is of their kind; without, the simplest of `KINDS` that does not
-    score clearly worse than the best.
+    score clearly worse than the best. Damping is part of a controller that has to be found: of all damping, or, where
+    the servo is off at times, of that while it is on.
     """
     kinds = {"P": ()} if own.complete else KINDS
     few = replace(search, data=thinned(search.data, FEW))
@@ -109,6 +110,9 @@ def starting_fit(search: Search, own: Nominal, progress: Progress) -> tuple[Sear
     kept = {"controller.stiffness"} | {
         e.id for e in EFFECTS.values() if e.controller and e.parameters[0] in kinds[kind]
     }
+    if not own.complete:
+        switched = "actuator.back_emf" not in search.excluded
+        kept.add("actuator.back_emf" if switched else "friction.viscous")  # damping that the servo may make
     left_out = {"controller.feed_forward"} if not own.complete else set()
     if "feed" not in kinds[kind]:
         left_out.add("actuator.gain")

@@ -79,7 +79,7 @@ def identify(
     nominal = nominal_point(fitted, own)
     data = thinned(fitted, SEARCHED)
     scales, floor = scales_of(fitted), noise_floor(fitted)
-    never = frozenset(withhold) | _frozen(sim)
+    never = frozenset(withhold) | _frozen(sim, fitted)
     search = Search(data, scales, nominal, floor, never)
     search, fit, kind = starting_fit(search, own, progress)
     fit = select(search, fit, progress)
@@ -146,9 +146,12 @@ def _bare(search: Search, complete: bool) -> Fit:
     return improve(search.data, Fit(point, (names,) * search.data.joints), search.scales, 6)
 
 
-def _frozen(sim: SimModel) -> frozenset[str]:
-    """Effects that this model cannot show: those that need gravity, or several links."""
-    return frozenset() if np.linalg.norm(sim.arm.gravity) > 1e-6 else frozenset({"base.tilt", "position.offset"})
+def _frozen(sim: SimModel, data: Windows) -> frozenset[str]:
+    """Effects that nothing can show here: those that need gravity, and damping by a motor that is never switched off,
+    which acts as viscous friction does."""
+    weightless = np.linalg.norm(sim.arm.gravity) < 1e-6
+    never = {"base.tilt", "position.offset"} if weightless else set[str]()
+    return frozenset(never if bool((data.served < 0.5).any()) else never | {"actuator.back_emf"})
 
 
 def noise_floor(data: Windows) -> Array:

@@ -1,6 +1,6 @@
 """What each effect is worth: its interval, what it lowers on held-out data, and which other effect would do as well."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -52,9 +52,7 @@ def taken_out(search: Search, fit: Fit, group: Group) -> Fit:
 
 def rms_on(data: Windows, fit: Fit) -> Array:
     """RMS of the position gap of each joint [rad], (J,)."""
-    found = evaluate(data, fit).rms
-    assert found is not None
-    return joint_rms(data, found)
+    return joint_rms(data, _rms(data, fit))
 
 
 def joint_rms(data: Windows, rms: Array) -> Array:
@@ -71,6 +69,8 @@ class Stage:
     before: Array
     after: Array
     """(J,) [rad]."""
+    share: Array
+    """What it lowers in its place or as the last of all, whichever is more, as a share of the RMS, (J,)."""
     evidence: float
     """Fall of the training score that nothing else would have brought."""
     rivals: tuple[str, ...]
@@ -90,20 +90,61 @@ def stages(search: Search, fit: Fit, heldout: Windows) -> list[Stage]:
         return improve(search.data, left, search.scales, 4)
 
     current = with_only(())
-    worth = [_worth(search, current, with_only((group,))) for group in groups]
-    ordered = [groups[i] for i in np.argsort(worth)[::-1]]
-    before, out = rms_on(heldout, current), []
-    for number, group in enumerate(ordered, start=1):
-        after = rms_on(heldout, fit if number == len(ordered) else with_only(ordered[:number]))
-        evidence, rivals = rivals_of(search, fit, group) if matters(before, after) else (0.0, ())
-        out.append(Stage(group, before, after, evidence, rivals))
+    before, final, out = _rms(heldout, current), _rms(heldout, fit), []
+    for number, (group, trial) in enumerate(_ordered(search, groups, with_only, current), start=1):
+        after = final if number == len(groups) else _rms(heldout, trial)
+        bare = improve(search.data, taken_out(search, fit, group), search.scales, 4)
+        falls = [_shrink(search, heldout, *pair) for pair in ((before, after), (_rms(heldout, bare), final))]
+        share = np.maximum(*falls)
+        matters = bool((share > LEAST_SHRINK).any())
+        evidence, rivals = rivals_of(search, fit, group, bare) if matters else (0.0, ())
+        out.append(Stage(group, joint_rms(heldout, before), joint_rms(heldout, after), share, evidence, rivals))
         before = after
     return out
 
 
-def matters(before: Array, after: Array) -> bool:
-    """Whether some joint's gap falls by a share that is worth naming."""
-    return bool(np.any(before - after > LEAST_SHRINK * before))
+def _rms(data: Windows, fit: Fit) -> Array:
+    """RMS of every joint and window, (J, W) [rad]."""
+    found = evaluate(data, fit).rms
+    assert found is not None
+    return found
+
+
+def _shrink(search: Search, data: Windows, before: Array, after: Array) -> Array:
+    """Relative fall of each joint's RMS, over all windows or in the typical one, whichever is larger, (J,).
+
+    Where held-out motion shows what no training motion did, such as a motor at its limit, a few windows make up the RMS
+    over all.
+    """
+    floor = search.floor[:, None]
+    counts = (data.weight.sum(0) > 0).astype(float)
+    ratio = np.log(np.hypot(after, floor) / np.hypot(before, floor))
+    typical = 1.0 - np.exp((ratio * counts).sum(1) / np.maximum(counts.sum(1), 1.0))
+    whole = 1.0 - joint_rms(data, np.hypot(after, floor)) / joint_rms(data, np.hypot(before, floor))
+    return np.asarray(np.maximum(typical, whole))
+
+
+def _ordered(
+    search: Search, groups: Sequence[Group], with_only: Callable[[Sequence[Group]], Fit], current: Fit
+) -> Iterator[tuple[Group, Fit]]:
+    """The groups, each the one that lowers the training gap most beside those before it, with the fit up to there.
+
+    A group that was worth less than another beside fewer groups is not tried again until that one is worth less too.
+    """
+    worth = {group: float("inf") for group in groups}
+    fresh: dict[Group, Fit] = {}
+    chosen: list[Group] = []
+    while worth:
+        group = max(worth, key=lambda each: worth[each])
+        if group in fresh:
+            current = fresh[group]
+            chosen.append(group)
+            del worth[group]
+            fresh = {}
+            yield group, current
+        else:
+            fresh[group] = with_only([*chosen, group])
+            worth[group] = _worth(search, current, fresh[group])
 
 
 def _worth(search: Search, current: Fit, trial: Fit) -> float:
@@ -114,12 +155,14 @@ def _worth(search: Search, current: Fit, trial: Fit) -> float:
     return float((fall / np.maximum(search.floor, 0.1 * search.scales.angle)).max())
 
 
-def rivals_of(search: Search, fit: Fit, group: Group) -> tuple[float, tuple[str, ...]]:
-    """Loss of the score with the best other effect in a group's place, and those effects that lose next to nothing."""
+def rivals_of(search: Search, fit: Fit, group: Group, bare: Fit) -> tuple[float, tuple[str, ...]]:
+    """Loss of the score with the best other effect in a group's place, and those effects that lose next to nothing.
+
+    `bare` is the fit without the group.
+    """
     effect, joints = group
     assert fit.rms is not None
     base = search.score(fit)
-    bare = improve(search.data, taken_out(search, fit, group), search.scales, 4)
     loss = float((search.score(bare) - base).sum())
     if effect == "controller.stiffness":
         return loss, _scale_rivals(search, fit)

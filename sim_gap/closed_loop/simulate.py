@@ -17,7 +17,8 @@ an implicit step adds."""
 CELLS = 6_000
 """Most joints times windows times hypotheses that are simulated together, for the cache's sake."""
 Values = Mapping[str, Array]
-"""Parameter → (P, J); the names are those of `parameters`, of `Windows.columns`, and `gain_of` (P, 1, W)."""
+"""Parameter → (P, J); the names are those of `parameters` and of `Windows.columns`, and `kv`: as much of `viscous` as
+the servo makes within its limit while it is on."""
 
 
 def simulate(data: Windows, values: Values) -> Array:
@@ -48,9 +49,11 @@ def _run(data: Windows, values: Values, count: int) -> Array:
 
     kp, kd, ki = (of(name) * data.scale if np.any(data.scale != 1.0) else of(name) for name in ("kp", "kd", "ki"))
     armature, viscous, gain = of("armature"), of("viscous"), of("gain", 1.0)
+    back_emf, brake = of("back_emf"), np.minimum(of("kv"), of("viscous"))
     coulomb, asymmetry = of("coulomb"), of("asymmetry")
     limit, slew = of("limit", np.inf), of("slew", np.inf)
     clipped, slewed = bool(np.isfinite(limit).any()), bool(np.isfinite(slew).any())
+    braked = "kv" in active
     linear = [name for name in data.columns if name in active]
     late = of("delay") / dt
     whole = np.floor(late).astype(int)
@@ -96,7 +99,7 @@ def _run(data: Windows, values: Values, count: int) -> Array:
             torque = torque + of("feed") * feed
         free = on
         if clipped:
-            wish = torque - kd * v
+            wish = torque - (kd + brake) * v
             over = np.abs(wish) > limit
             torque = np.where(over, np.clip(wish, -limit, limit), torque)
             free = on * ~over
@@ -114,7 +117,8 @@ def _run(data: Windows, values: Values, count: int) -> Array:
             torque -= of("offset")
         for name in linear:
             torque -= of(name) * data.columns[name][k]
-        effective = mass + dt * viscous + free * (damped + stiff)
+        outside = viscous - brake * (1.0 - free) if braked else viscous
+        effective = mass + dt * (outside + back_emf * on) + free * (damped + stiff)
         v = (mass * v + dt * torque) / effective
         hold = coulomb
         if "load" in active:

@@ -12,6 +12,9 @@ def bench(
     effects: Annotated[
         str, typer.Option(metavar="LOW-HIGH", help="Number of effects in every case; default: none, one or two.")
     ] = "",
+    positions: Annotated[
+        bool, typer.Option("--positions", help="Arms with position servos, seen as q and q_cmd alone.")
+    ] = False,
     real: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Diagnose the recordings of real arms in DIR instead; see --known."),
@@ -29,6 +32,8 @@ def bench(
 
     Many effects at once: armlink gap bench --effects 5-8 --cases 30 --seed 3
 
+    Positions alone: armlink gap bench --positions --cases 60 --seed 3
+
     Real arms: armlink gap bench --real recordings/
     """
     from tempfile import TemporaryDirectory
@@ -39,7 +44,7 @@ def bench(
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
     from sim_gap.blind.bench import diagnose_files, run_bench
-    from sim_gap.blind.judging.tables import show, show_real
+    from sim_gap.blind.judging.tables import show, show_positions, show_real
     from sim_gap.blind.real import KNOWN, run_real
 
     if json is not None and str(json) != "-" and not json.resolve().parent.is_dir():
@@ -57,7 +62,15 @@ def bench(
             result = run_real(real, out or Path(scratch), known or KNOWN, progress)
         else:
             result = run_bench(
-                diagnose_files, out or Path(scratch), seed, cases, workers, progress=progress, effects=effects
+                diagnose_files,
+                out or Path(scratch),
+                seed,
+                cases,
+                workers,
+                progress=progress,
+                effects=effects,
+                positions=positions,
             )
-    (show if real is None else show_real)(result, console)
+    shown = show_real if real is not None else show_positions if positions else show
+    shown(result, console)
     write_json(json, result)

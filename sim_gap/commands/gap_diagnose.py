@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from rich.status import Status
 
     from sim_gap.attribution.diagnosis import Diagnosis
+    from sim_gap.closed_loop.identify import Identified
 
 
 def diagnose(
@@ -57,6 +58,15 @@ def diagnose(
     out_samples: Annotated[
         Path | None, typer.Option(help="Where the draws go: .csv, .json or .parquet. Default: samples.csv.")
     ] = None,
+    out_actuators: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write actuator entries for Isaac Lab and mjlab here (.py); only if there is no torque channel."
+        ),
+    ] = None,
+    physics_step: Annotated[
+        float, typer.Option(help="Step of the training simulation in which --out-actuators counts delays [s].")
+    ] = 0.005,
     out_model: Annotated[
         Path | None,
         typer.Option(
@@ -78,7 +88,7 @@ def diagnose(
 
     console = Console(stderr=True)
     paths = [*train, *(heldout or [])]
-    for target in (None if str(json) == "-" else json, report, out_model, out_samples):
+    for target in (None if str(json) == "-" else json, report, out_model, out_samples, out_actuators):
         if target is not None and not target.resolve().parent.is_dir():
             raise BadInput(f"{target}: its folder does not exist: create it first")
     stated = parse_corrections(
@@ -120,6 +130,11 @@ def diagnose(
         _write_model(answer, out_model, console)
     if samples:
         _write_samples(answer, samples, out_samples, console)
+    if out_actuators is not None:
+        from sim_gap.closed_loop.training.actuators import write_actuators
+
+        write_actuators(_positions_of(answer, "--out-actuators"), out_actuators, physics_step)
+        console.print(f"actuator entries for Isaac Lab and mjlab: {out_actuators}")
     write_json(json, answer.to_json())
 
 
@@ -130,25 +145,33 @@ def _progress(console: "Console", status: "Status", stage: str) -> None:
         console.print(stage, markup=False)
 
 
-def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: "Console") -> None:
+def _positions_of(answer: "Diagnosis", option: str) -> "Identified":
+    """The fit of positions; raises BadInput if the diagnosis is of torques."""
     from armlink.errors import BadInput
     from sim_gap.closed_loop.identify import Identified
-    from sim_gap.closed_loop.training.posterior import write_samples
 
     if not isinstance(answer.internals, Identified):
-        raise BadInput("--samples: draws are made where no recording has a torque channel (q_cmd and q): leave it out")
+        raise BadInput(f"{option}: written where no recording has a torque channel (q_cmd and q): leave it out")
+    return answer.internals
+
+
+def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: "Console") -> None:
+    from sim_gap.closed_loop.training.posterior import write_samples
+
     target = path or Path("samples.csv")
-    write_samples(answer.internals, count, target)
+    write_samples(_positions_of(answer, "--samples"), count, target)
     console.print(f"{count} draws of all parameters: {target}")
 
 
 def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
     if answer.unit == "rad":
-        from sim_gap.closed_loop.training.posterior import write_exported
+        from sim_gap.closed_loop.training.posterior import batch_path, write_exported
 
         for line in write_exported(answer.internals, path):
             console.print(f"not in MJCF: {line}", style="yellow", markup=False)
         console.print(f"corrected model with its position actuators: {path}")
+        if batch_path(path).is_file():
+            console.print(f"the same without PID actuators, for MuJoCo Warp: {batch_path(path)}")
         return
     from sim_gap.attribution.residual_laws import as_effects
     from sim_gap.better_model.effects_module import module_path

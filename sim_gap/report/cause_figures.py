@@ -7,6 +7,7 @@ import plotly.graph_objects as go
 
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
+from sim_gap.report.effect_text import CHANNEL_WORDS
 from sim_gap.report.figures import BELOW_TITLE, GREY, ORANGE, stacked, thinned
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
@@ -62,7 +63,7 @@ def cause_figure(answer: Diagnosis, cause: Cause) -> Any:
         figure.add_scatter(x=x.round(4), y=values.round(4), mode="markers", marker=marker, name=name)
     joint, channel = answer.names[row[1]], row[0]
     figure.update_xaxes(title=f"{LABELS[quantity]}" + ("" if quantity == "time" else f" of {joint}"))
-    figure.update_yaxes(title=f"{channel} of {joint} [N·m]")
+    figure.update_yaxes(title=f"{CHANNEL_WORDS[channel]} of {joint} [N·m]")
     figure.update_layout(
         title=f"{cause.effect} at {joint}" + (" (example)" if len(cause.joints) > 1 else ""),
         height=340,

@@ -9,6 +9,7 @@ from sim_gap.attribution.causes import left_over
 from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.attribution.residual_laws import ResidualLaw
 from sim_gap.report.cause_figures import LABELS, abscissa
+from sim_gap.report.effect_text import CHANNEL_WORDS
 from sim_gap.report.figures import BELOW_TITLE, GREY, ORANGE, stacked, thinned
 
 
@@ -31,6 +32,8 @@ def law_figure(answer: Diagnosis, law: ResidualLaw) -> Any:
     figure.add_scatter(x=ends, y=band, fill="toself", line={"width": 0}, opacity=0.3, fillcolor=ORANGE, name="band")
     figure.add_scatter(x=law.at, y=law.torque, mode="lines", line={"color": ORANGE}, name=f"law of {law.quantity}")
     figure.update_xaxes(title=f"{LABELS.get(law.quantity, 'temperature [°C]')} of {joint}")
-    figure.update_yaxes(title=f"{law.channel} of {joint} [N·m]" + (", against the motion" if law.directed else ""))
+    figure.update_yaxes(
+        title=f"{CHANNEL_WORDS[law.channel]} of {joint} [N·m]" + (", against the motion" if law.directed else "")
+    )
     figure.update_layout(title=f"Law of {law.quantity} of {joint}", height=340, legend=BELOW_TITLE)
     return figure

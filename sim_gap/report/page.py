@@ -8,18 +8,10 @@ from armlink.effect_catalogue import CATALOGUE
 from calib.report.page import ReportTable, Section, paragraph, render
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
 from sim_gap.report.cause_figures import cause_figure
-from sim_gap.report.effect_text import advice, sentence
+from sim_gap.report.effect_text import CHANNEL_WORDS, WORDS, advice, sentence
 from sim_gap.report.figures import gap_bars, residual_panels, rollout_bars
 from sim_gap.report.law_figure import law_figure
 from sim_gap.report.position_page import position_sections
-
-WORDS = {
-    "explained": "explained",
-    "ambiguous": "ambiguous",
-    "unexplained": "not explained",
-    "no_gap": "no gap",
-}
-"""Verdicts as a heading."""
 
 
 def sections(answer: Diagnosis) -> list[Section]:
@@ -143,10 +135,13 @@ def _residuals(answer: Diagnosis) -> list[Section]:
             if (at := locations.get((channel, name))) is not None
         ]
         header = ("joint", "correlates with", "share", "RMS [N·m]", "noise [N·m]")
-        text = f"{channel} minus {against} on held-out data: grey as measured, orange the sum of the causes."
+        words = CHANNEL_WORDS[channel]
+        text = f"The {words} minus {against} on held-out data: grey as measured, orange the sum of the causes."
         table = ReportTable(
             header, rows, "The regime of motion with the largest share of each residual's mean square.", texts=2
         )
         figure = residual_panels(answer, channel)
-        out.append(Section(f"Residuals: {channel}", paragraph(text), [figure] if figure is not None else [], [table]))
+        out.append(
+            Section(f"Residuals of the {words}", paragraph(text), [figure] if figure is not None else [], [table])
+        )
     return out

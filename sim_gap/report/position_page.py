@@ -11,7 +11,7 @@ from calib.report.page import ReportTable, Section, paragraph
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
 from sim_gap.closed_loop.identify import Identified
 from sim_gap.closed_loop.training.replay import replay
-from sim_gap.report.effect_text import sentence
+from sim_gap.report.effect_text import WORDS, advice, sentence
 from sim_gap.report.figures import BELOW_TITLE, BLUE, GREY, ORANGE
 
 SHOWN_S = 15.0
@@ -21,7 +21,8 @@ POINTS = 750
 
 def position_sections(answer: Diagnosis) -> list[Section]:
     """Sections for a separate page or for a part of another report."""
-    html = f'<p><span class="verdict">{escape(answer.verdict)}</span> {escape(sentence(answer))}.</p>'
+    html = f'<p><span class="verdict">{escape(WORDS[answer.verdict])}</span> {escape(sentence(answer))}.</p>'
+    html += "" if answer.verdict == "ambiguous" else paragraph(advice(answer))  # else the sentence has it
     html += "".join(paragraph(note) for note in answer.notes)
     header = ("effect", "joints", "RMS before [rad]", "after [rad]", "confidence", "or")
     causes = ReportTable(header, [_cause_row(cause) for cause in answer.causes], "Causes, on held-out data.", texts=2)

@@ -18,9 +18,11 @@ MODEL_FLOOR = 1e-3
 FLOOR, FLOOR_INNER, FLOOR_NM = 0.01, 0.003, 0.01
 """Residual that is not worth a parameter: share of a joint's torque (RMS) against the model, and of motor against
 sensor or command; and in any case [N·m]."""
-RELEVANT_NM, RELEVANT_SMALL = 0.05, 0.05
-"""Smallest gap that is relevant to a user [N·m]: every arm has a few hundredths of friction and offset. Of a small arm,
-this share of the largest joint torque (RMS)."""
+RELEVANT_NM = 0.05
+"""Smallest gap that is relevant to a user [N·m]: every arm has a few hundredths of friction and offset."""
+SMALL_ARM_NM = 3.0
+"""RMS torque of an arm's strongest joint below which bounds in N·m shrink in proportion: on a hobby servo a few
+hundredths are a tenth of all it does."""
 RELEVANT, RELEVANT_INNER, RELEVANT_COMMAND = 0.016, 0.007, 0.001
 """Smallest relevant gap as a share of the joint's torque (RMS): against the model, motor against sensor, command
 against motor."""
@@ -126,7 +128,9 @@ class ResidualSet:
     def relevance_floor(self) -> dict[Row, float]:
         """Residual of each row below which no effect is searched for [N·m]: noise and a small share of the torque."""
         small = {row: FLOOR if row[0] == self.layout.against_model else FLOOR_INNER for row in self.rows}
-        parts = {row: (self.floor[row], small[row] * self.usual_torque[row[1]], FLOOR_NM) for row in self.rows}
+        parts = {
+            row: (self.floor[row], small[row] * self.usual_torque[row[1]], self.least(FLOOR_NM)) for row in self.rows
+        }
         return {row: float(np.linalg.norm(part)) for row, part in parts.items()}
 
     @cached_property
@@ -134,10 +138,14 @@ class ResidualSet:
         """RMS model torque of each joint in the recording with the largest [N·m], (n,)."""
         return np.asarray(np.max([np.sqrt(np.mean(s.model**2, axis=0)) for s in self.signals], axis=0))
 
-    @cached_property
+    @property
     def relevant_nm(self) -> float:
         """Smallest gap of this arm that is relevant [N·m]."""
-        return min(RELEVANT_NM, RELEVANT_SMALL * float(np.max(self.usual_torque)))
+        return self.least(RELEVANT_NM)
+
+    def least(self, torque: float) -> float:
+        """A bound in N·m as it applies to an arm of this strength."""
+        return torque * min(1.0, float(self.usual_torque.max()) / SMALL_ARM_NM)
 
     def _floor(self, s: Signals, row: Row, rest: Array) -> float:
         channel, joint = row
@@ -173,11 +181,8 @@ class ResidualSet:
 
         That is smaller for the motor against the sensor, in which errors of the links do not show.
         """
-        torque = self.usual_torque
-        return {
-            row: 2.0 * self.floor[row] + max(self._relevant(row) * torque[row[1]], self.relevant_nm)
-            for row in self.rows
-        }
+        torque, least = self.usual_torque, self.relevant_nm
+        return {row: 2.0 * self.floor[row] + max(self._relevant(row) * torque[row[1]], least) for row in self.rows}
 
     def _relevant(self, row: Row) -> float:
         """Smallest relevant gap in this row, as a share of the joint's torque."""
@@ -191,7 +196,8 @@ class ResidualSet:
     def quiet_threshold(self) -> dict[Row, float]:
         """RMS of each row below which it may be noise alone: an effect must then show steadily [N·m]."""
         noise = {row: 2.0 * floor for row, floor in self.floor.items()}
-        return {row: noise[row] + max(QUIET * (self.margin[row] - noise[row]), self.relevant_nm) for row in self.rows}
+        least = self.relevant_nm
+        return {row: noise[row] + max(QUIET * (self.margin[row] - noise[row]), least) for row in self.rows}
 
 
 def residual_sets(train: Sequence[Signals], heldout: Sequence[Signals]) -> tuple[ResidualSet, ResidualSet]:

@@ -68,10 +68,10 @@ def armlink(folder: Path, *words: str, ok: tuple[int, ...] = (0,)) -> dict[str, 
 
 
 @contextlib.contextmanager
-def simulated(folder: Path, bus: str, seed: int = SEED) -> Iterator[tuple[Path, "subprocess.Popen[bytes]"]]:
-    """The arm of `folder` in real time on this bus; its control pipe and its process."""
+def on_bus(folder: Path, arm: str, bus: str, seed: int) -> Iterator[tuple[Path, "subprocess.Popen[bytes]"]]:
+    """A simulated arm in real time on this bus, seen from `folder`; its control pipe and its process."""
     pipe = folder / "arm.pipe"
-    words = ["sim", "pair.yaml", "--bus", bus, "--seed", str(seed), "--control", str(pipe)]
+    words = ["sim", arm, "--bus", bus, "--seed", str(seed), "--control", str(pipe)]
     with subprocess.Popen([ARMLINK, *words], cwd=folder, stderr=subprocess.DEVNULL) as process:
         while not pipe.exists():
             assert process.poll() is None, "the simulated arm has ended"
@@ -81,3 +81,10 @@ def simulated(folder: Path, bus: str, seed: int = SEED) -> Iterator[tuple[Path, 
         finally:
             process.send_signal(signal.SIGCONT)
             process.send_signal(signal.SIGTERM)
+
+
+def simulated(
+    folder: Path, bus: str, seed: int = SEED
+) -> contextlib.AbstractContextManager[tuple[Path, "subprocess.Popen[bytes]"]]:
+    """The arm of `folder` likewise."""
+    return on_bus(folder, "pair.yaml", bus, seed)

@@ -76,8 +76,12 @@ class Walk:
             if why:
                 self.skipped += 1
                 continue
-            self.run += 1
-            self._line(page, self._as_here(line))
+            self.type(page, line)
+
+    def type(self, page: str, line: str) -> None:
+        """One line of a page, with this arm."""
+        self.run += 1
+        self._line(page, self._as_here(line))
 
     def _prepare(self, page: str) -> None:
         """What the reader has before a page that the pages before it do not make."""

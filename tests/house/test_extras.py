@@ -8,7 +8,8 @@ import sys
 from importlib.abc import MetaPathFinder
 from importlib.metadata import entry_points
 
-EXTRAS = {"cryptography", "distributed", "fastapi", "foxglove", "msgpack", "prometheus_client", "psycopg", "uvicorn"}
+EXTRAS = {"cryptography", "distributed", "fastapi", "foxglove", "msgpack", "prometheus_client", "psycopg", "rerun"}
+EXTRAS |= {"uvicorn"}
 
 class Absent(MetaPathFinder):
     def find_spec(self, name, path=None, target=None):

@@ -1,9 +1,10 @@
 """The CiA 402 power state machine as a pure table: status word → state; state and target → next control word."""
 
+import math
 from enum import Enum, IntEnum
 
 from armlink.drives.orders import MODE_NAMES as MODE_NAMES
-from armlink.drives.orders import Mode
+from armlink.drives.orders import Limits, Mode
 
 
 class State(Enum):
@@ -31,12 +32,40 @@ class Control(IntEnum):
     FAULT_RESET = 0x80
 
 
+CYCLIC_VELOCITY = 9
+"""Cyclic synchronous velocity. No mode of an order: where a device has no position mode, the host makes the velocity
+that leads to an ordered position."""
 NEEDED_MODES = (Mode.POSITION, Mode.TORQUE)
 """Modes that every controller must support; the profile modes are optional."""
 NEW_SET_POINT, CHANGE_AT_ONCE = 0x10, 0x20
 """Bits 4 and 5 of the control word in profile position mode."""
 SET_POINT_ACKNOWLEDGED = 0x1000
 """Bit 12 of the status word in profile position mode."""
+
+
+FASTEST_LOOP, LOOP_PERIODS = 20.0, 0.08
+"""Gain of that position loop [1/s]: at most the first, and the second over the period, so that a delay of two or three
+periods leaves it well damped; a choice."""
+
+
+def loop_gain(period: float) -> float:
+    """Velocity for one radian off the target [1/s], by the period of the cycle [s]."""
+    return min(FASTEST_LOOP, LOOP_PERIODS / period)
+
+
+def velocity_towards(target: float, before: float, seen: float, limits: Limits) -> float:
+    """Velocity [rad/s] that leads a joint to its target, `before` having been that of the last cycle [rad].
+
+    At most `limits.max_velocity`, none towards the outside of the window from outside it, and slowing down towards its
+    ends; 0 where nobody knows where the joint is.
+    """
+    if not math.isfinite(seen):
+        return 0.0
+    gain = loop_gain(limits.period)
+    wanted = (target - before) / limits.period + gain * (target - seen)
+    most = min(limits.max_velocity, max(0.0, gain * (limits.upper - seen)))
+    least = max(-limits.max_velocity, min(0.0, gain * (limits.lower - seen)))
+    return max(least, min(most, wanted))
 
 
 def supports(supported: int, mode: int) -> bool:

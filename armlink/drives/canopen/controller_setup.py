@@ -2,17 +2,18 @@
 
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from armlink.arm_file import DeviceIdentity, LinkJoint, LinkSection
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen import pdo
-from armlink.drives.canopen.cia402 import MODE_NAMES, NEEDED_MODES, State, state_of, supports
+from armlink.drives.canopen.cia402 import CYCLIC_VELOCITY, MODE_NAMES, NEEDED_MODES, State, state_of, supports
 from armlink.drives.canopen.eds_file import expected_identity
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import Pdo
-from armlink.drives.canopen.profile import OURS, Profile
+from armlink.drives.canopen.profile import OURS, Profile, examine
 from armlink.drives.canopen.sdo import NodeServices
+from armlink.drives.canopen.settings import CanopenSettings
 from armlink.drives.canopen.units import Units
 from armlink.drives.orders import Limits, Mode
 from armlink.errors import BusFault, Refused
@@ -141,21 +142,33 @@ def check_modes(services: NodeServices) -> int:
 
 def offered_modes(services: NodeServices) -> int:
     """Modes of a stock device as bits of 6502h, each of those that the link uses tried: a mode's own display is
-    believed, 6502h where there is none. The device is left in a position mode. Raises BusFault without one."""
+    believed, 6502h where there is none. The device is left in a position mode, or where it has none in cyclic velocity.
+    Raises BusFault without either."""
     told = int(services.read(objects.SUPPORTED_MODES)) if services.has(objects.SUPPORTED_MODES) else 0
     offered = 0
     for mode in (Mode.PROFILE_TORQUE, Mode.TORQUE, Mode.PROFILE_POSITION, Mode.POSITION):
         needed = objects.TARGET_TORQUE if mode in (Mode.TORQUE, Mode.PROFILE_TORQUE) else objects.TARGET_POSITION
         if services.has(needed) and _enters(services, mode, supports(told, mode)):
             offered |= 1 << (mode - 1)
-    if not (supports(offered, Mode.POSITION) or supports(offered, Mode.PROFILE_POSITION)):
-        raise BusFault(
-            f"{services.joint} (node {services.node}): enters neither mode 8 nor mode 1 (positions): 6502h is {told:#x}"
-        )
-    return offered
+    if supports(offered, Mode.POSITION) or supports(offered, Mode.PROFILE_POSITION):
+        return offered
+    if services.has(objects.TARGET_VELOCITY) and _enters(services, CYCLIC_VELOCITY, supports(told, CYCLIC_VELOCITY)):
+        return offered | 1 << (CYCLIC_VELOCITY - 1)
+    raise BusFault(
+        f"{services.joint} (node {services.node}): enters none of the modes 8 and 1 (positions) and 9 (velocity): "
+        f"6502h is {told:#x}"
+    )
 
 
-def _enters(services: NodeServices, mode: Mode, told: bool) -> bool:
+def examined(services: NodeServices, settings: CanopenSettings) -> Profile:
+    """The profile of a device, by asking for each object and trying the modes; raises BusFault."""
+    profile = examine(services, settings)
+    if profile is OURS:
+        return profile
+    return replace(profile, by_velocity=supports(offered_modes(services), CYCLIC_VELOCITY))
+
+
+def _enters(services: NodeServices, mode: int, told: bool) -> bool:
     try:
         services.write(objects.MODE, int(mode))
     except BusFault:

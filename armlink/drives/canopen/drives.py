@@ -15,12 +15,22 @@ from armlink.drives.canopen import controller_setup as device
 from armlink.drives.canopen import emcy, faults, torque_sensor_record
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen.check.guard_rules import NodeRules, shared_rules
-from armlink.drives.canopen.cia402 import Control, State, next_control, set_point_control, state_of, supports
+from armlink.drives.canopen.cia402 import (
+    CYCLIC_VELOCITY,
+    Control,
+    State,
+    loop_gain,
+    next_control,
+    set_point_control,
+    state_of,
+    supports,
+    velocity_towards,
+)
 from armlink.drives.canopen.eds_file import of_joints
 from armlink.drives.canopen.host_frames import HostFrames
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import RPDO1, RPDO2, STATUS_DECIMATION, TPDO1, TPDO2, TPDO3
-from armlink.drives.canopen.profile import Profile, examine, profile_of
+from armlink.drives.canopen.profile import Profile, profile_of
 from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork, joint_services
 from armlink.drives.canopen.units import Units, assumed_units, read_units
 from armlink.drives.family import Ask
@@ -99,6 +109,8 @@ class CanopenDrives:
             self.node_states,
             self.restarted,
         )
+        self._seen, self._aimed = [math.nan] * m, [math.nan] * m
+        """Newest reading of each joint, and the last target of one that is led by velocity [rad]."""
         self._board: Board | None = None
         self._places: Sequence[int] = range(m)
         self._network: PumpedNetwork | None = None
@@ -113,6 +125,7 @@ class CanopenDrives:
         self._entries: list[dict[str, tuple[Entry, ...]]] = [
             {each.name: each.entries for each in profile.pdos} for profile in self.profiles
         ]
+        self._any_velocity = any(profile.by_velocity for profile in self.profiles)
         self._with_torque = [objects.TARGET_TORQUE in entries[RPDO1.name] for entries in self._entries]
         self._compile()
 
@@ -124,6 +137,7 @@ class CanopenDrives:
             low, high = math.ceil(limits.lower / unit.position), math.floor(limits.upper / unit.position)
             torque = unit.torque if self._with_torque[joint] else 0.0
             window = (limits.lower, limits.upper, low, high)
+            self._aimed[joint] = math.nan
             self._compiled.append((self._command_ids[joint], layouts[RPDO1.name].pack, torque, unit.position, *window))
             profile, layout = self.profiles[joint], layouts[TPDO1.name]
             scale = 0.0 if profile.reading is None else profile.torque_scale
@@ -213,7 +227,7 @@ class CanopenDrives:
         found = []
         self._limits = list(limits)
         for joint, services in enumerate(all_services):
-            self.profiles[joint] = examine(services, self.rows[joint].settings)
+            self.profiles[joint] = device.examined(services, self.rows[joint].settings)
         self._map()
         for joint, services in enumerate(all_services):
             found.append(self._set_up(joint, services, limits[joint]))
@@ -229,7 +243,9 @@ class CanopenDrives:
         rules: dict[str, Any] = {"frames": shared_rules(self.nodes, self.protection.host), "stop": [], "restarts": {}}
         for row, services, limit in zip(self.rows, self.services(ask), limits, strict=True):
             device.check_identity(services, row)
-            unit, profile = read_units(services, row), examine(services, row.settings)
+            unit, profile = read_units(services, row), device.examined(services, row.settings)
+            if profile.by_velocity:
+                raise BadInput(f"{row.name}: led by velocity (mode 9): no frame tells a guard where that ends")
             check_fits(row.name, limit, unit)
             sheet = list(services.remote.object_dictionary)
             node = NodeRules(row.name, row.settings.node, profile, unit, limit, self.protection, sheet)
@@ -256,8 +272,9 @@ class CanopenDrives:
         self.statuses[joint] = services.read(objects.STATUS_WORD)
         if self._board is not None:
             self._board.status[self._places[joint]] = self.statuses[joint]
+        self._seen[joint] = services.read(objects.POSITION) * unit.position
         return Setup(
-            position=services.read(objects.POSITION) * unit.position,
+            position=self._seen[joint],
             torque=torque,
             position_step=max(unit.position, unit.encoder_step),
             modes=usable_modes(supported, profile),
@@ -304,12 +321,17 @@ class CanopenDrives:
                 self._walking[joint] = False
                 if power is Power.ON:
                     word = ENABLE
-                    if mode != self._modes[joint] and mode:
+                    if mode and self._own_mode(joint, mode) != self._modes[joint]:
                         self._select(joint, mode, modes, now)
                     if mode == PROFILE_POSITION:
                         word = set_point_control(self.statuses[joint])
                 else:
                     word = QUICK_STOP if power is Power.STOPPED else DISABLE_VOLTAGE
+            if self.profiles[joint].by_velocity:
+                data = self._velocity_frame(joint, word, order)
+                self._words[joint], self._sent[joint] = word, data
+                commands.append((self._command_ids[joint], data))
+                continue
             can_id, pack, torque_unit, position_unit, lower, upper, low, high = rows[joint]
             if not lower <= position <= upper:
                 low, high = -INT32_MAX - 1, INT32_MAX
@@ -325,7 +347,22 @@ class CanopenDrives:
         commands.append(_SYNC)
         return commands
 
+    def _velocity_frame(self, joint: int, word: int, order: Order) -> bytes:
+        """RPDO1 of a joint that is led by velocity; none where it is not enabled."""
+        velocity, before = 0.0, self._aimed[joint]
+        if word == ENABLE:
+            before = order.position if math.isnan(before) else before
+            velocity = velocity_towards(order.position, before, self._seen[joint], self._limits[joint])
+        self._aimed[joint] = order.position if word == ENABLE else math.nan
+        counts = int(velocity / self.units[joint].velocity)
+        return self._layouts[joint]["RPDO1"].pack(word, max(-INT32_MAX, min(INT32_MAX, counts)))
+
+    def _own_mode(self, joint: int, mode: int) -> int:
+        """The device's mode for one of an order."""
+        return CYCLIC_VELOCITY if self.profiles[joint].by_velocity and mode == Mode.POSITION else mode
+
     def _select(self, joint: int, mode: int, frames: list[Frame], now: float) -> None:
+        mode = self._own_mode(joint, mode)
         self._modes[joint], self._mode_since[joint] = mode, now
         if RPDO2.name in self._layouts[joint]:
             frames.append((RPDO2.cob_base + self.nodes[joint], struct.pack("<b", mode)))
@@ -358,7 +395,21 @@ class CanopenDrives:
         torque = values[1] * unit.torque if self._with_torque[joint] else math.nan
         word = values[0] & 0x8F
         power = Power.ON if word == ENABLE else Power.STOPPED if word & 0x86 == QUICK_STOP else Power.OFF
+        if self.profiles[joint].by_velocity:
+            velocity, gain = values[-1] * unit.velocity, loop_gain(self._period)
+            mode = Mode.POSITION if self._modes[joint] else OFF
+            return Order(power, False, mode, self._aim(joint, velocity / gain), velocity, math.nan, 0.0, 0.0)
         return Order(power, False, self._modes[joint], values[-1] * unit.position, 0.0, torque, 0.0, 0.0)
+
+    def _aim(self, joint: int, way: float) -> float:
+        """Where a velocity leads that would be so much way by the position loop [rad].
+
+        A joint outside its window that is led back, or rests, counts as being at the window's end.
+        """
+        seen, limits = self._seen[joint], self._limits[joint]
+        if (seen < limits.lower and way >= 0) or (seen > limits.upper and way <= 0):
+            return limits.lower if seen < limits.lower else limits.upper
+        return seen + way
 
     def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
         """See Drives."""
@@ -387,8 +438,10 @@ class CanopenDrives:
         elif scale:
             position, torque = unpack(data)
             board.reading(place, position * unit, (torque - zero) * scale)
+            self._seen[joint] = position * unit
         else:
-            board.reading(place, unpack(data)[0] * unit, math.nan)
+            self._seen[joint] = seen = unpack(data)[0] * unit
+            board.reading(place, seen, math.nan)
 
     def _reading(self, joint: int, data: bytes) -> tuple[float, float] | None:
         size, unpack, unit, scale, zero = self._read[joint]
@@ -518,7 +571,8 @@ class CanopenDrives:
 
     def fault(self, modes: Sequence[int], now: float) -> BusFault | None:
         """See Drives."""
-        return faults.state_fault(self._known, now, modes, self._deadline)
+        own = [self._own_mode(joint, mode) for joint, mode in enumerate(modes)] if self._any_velocity else modes
+        return faults.state_fault(self._known, now, own, self._deadline)
 
     def has_restarted(self) -> int | None:
         """See Drives."""
@@ -557,6 +611,8 @@ class CanopenDrives:
 
 def usable_modes(supported: int, profile: Profile) -> frozenset[int]:
     """Modes that a device can be ordered in while it cycles: where its mode cannot be mapped, the one it is left in."""
+    if profile.by_velocity:
+        return frozenset((int(Mode.OFF), int(Mode.POSITION)))
     modes = frozenset(int(mode) for mode in Mode if supports(supported, mode))
     if profile.modes_by_pdo:
         return modes

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from armlink.drives.canopen import emcy
 from armlink.drives.canopen import object_dictionary as objects
-from armlink.drives.canopen.cia402 import MODE_NAMES, State, state_of
+from armlink.drives.canopen.cia402 import CYCLIC_VELOCITY, MODE_NAMES, State, state_of
 from armlink.drives.orders import Mode
 from armlink.errors import BusFault, Stall
 
@@ -96,9 +96,13 @@ def node_fault(known: Known) -> str | None:
 def refused_mode(mode: int, display: int) -> str:
     """That a controller does not enter a mode that it was told to."""
     return (
-        f"refuses mode {mode} ({MODE_NAMES[Mode(mode)]}): its mode display 6061h is {display}; "
+        f"refuses mode {mode} ({_name_of(mode)}): its mode display 6061h is {display}; "
         "look at its error code 603Fh and at what 6502h says it supports"
     )
+
+
+def _name_of(mode: int) -> str:
+    return "cyclic synchronous velocity" if mode == CYCLIC_VELOCITY else MODE_NAMES[Mode(mode)]
 
 
 def stuck(known: Known, joint: int, target: State, mode: int, seconds: float) -> str:

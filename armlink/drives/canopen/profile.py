@@ -36,6 +36,12 @@ LOST: Mapping[Entry, str] = {
 """Objects that a stock device may lack → what is lost by it; empty where another line says it."""
 
 
+_BY_VELOCITY: Mapping[Entry, Entry | None] = {
+    objects.TARGET_POSITION: objects.TARGET_VELOCITY,
+    objects.TARGET_TORQUE: None,
+}
+
+
 @dataclass(frozen=True)
 class Profile:
     """Objects of one device; by default those of one with our torque sensor record, which has all."""
@@ -54,10 +60,18 @@ class Profile:
         """Whether the device has an object."""
         return entry not in self.absent
 
+    by_velocity: bool = False
+    """Whether cyclic velocity is the only mode that serves: target velocities take the place of positions."""
+
     @property
     def lost(self) -> tuple[str, ...]:
         """What is lost by what it lacks."""
         told = tuple(f"{entry}: {LOST[entry]}" for entry in LOST if entry in self.absent and LOST[entry])
+        if self.by_velocity:
+            told = (
+                *told,
+                "mode 9 alone (cyclic velocity): positions are controlled by the host, and there is no torque",
+            )
         return told if self.modes_by_pdo else (*told, "6060h cannot be mapped: one mode for the whole session")
 
     @property
@@ -66,6 +80,8 @@ class Profile:
         found = []
         for each in pdo.LINK_PDOS:
             entries = [self.reading if entry == objects.TORQUE_READING else entry for entry in each.entries]
+            if self.by_velocity:
+                entries = [_BY_VELOCITY.get(entry, entry) if entry is not None else None for entry in entries]
             held = tuple(entry for entry in entries if entry is not None and self.has(entry))
             if not self.modes_by_pdo:
                 held = tuple(entry for entry in held if entry not in (objects.MODE, objects.MODE_DISPLAY))

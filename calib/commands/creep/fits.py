@@ -7,24 +7,13 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.commands.output import write_json
-from armlink.errors import BadInput
 from calib.commands.screen import print_intervals, print_lines
-from calib.creep.choice import is_creep
 from calib.creep.fit import QUANTILE, CreepFit, fit_creep
 from calib.creep.record import HEADINGS, calibration_record, gravity_record, missing, told
 from calib.creep.run import contacts
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
 from calib.sweep.dataset import SweepData
-
-
-def all_creep(data: list[SweepData]) -> bool:
-    """Whether the data sets are creep sweeps; raises BadInput where some are and some are not."""
-    kinds = {is_creep(each) for each in data}
-    if len(kinds) > 1:
-        other = next(each for each in data if not is_creep(each))
-        raise BadInput(f"{other.path}: steps at rest, but the other directories are creep sweeps: give one kind")
-    return kinds == {True}
 
 
 def calibrate_creep(data: list[SweepData], arm_file: ArmFile, store: str | None, json_file: Path | None) -> None:

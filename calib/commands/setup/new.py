@@ -19,7 +19,9 @@ SCHEMA = "armlink.new/1"
 
 
 def new(
-    model: Annotated[Path, typer.Argument(help="URDF or MJCF model; with --bus also an arm file.", metavar="MODEL")],
+    model: Annotated[
+        Path, typer.Argument(help="URDF or MJCF model; with --bus also an arm file.", metavar="MODEL_OR_ARM")
+    ],
     out: Annotated[
         Path | None, typer.Option(help="Arm file to write; default: the model's name with .yaml, here.")
     ] = None,
@@ -55,7 +57,7 @@ def new(
     """
     from rich.console import Console
 
-    from armlink.arm_file import MODEL_SUFFIXES
+    from armlink.arm_file import MODEL_SUFFIXES, bundled_arms
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
     from calib.commands.setup.terminal import Terminal, hand, parse_stops
@@ -63,7 +65,8 @@ def new(
 
     console = Console(stderr=True, markup=False, highlight=False)
     interactive = sys.stdin is not None and sys.stdin.isatty()
-    is_arm_file = model.suffix.lower() in (".yaml", ".yml")
+    bundled = bundled_arms().get(str(model))
+    is_arm_file = bundled is not None or model.suffix.lower() in (".yaml", ".yml")
     if is_arm_file and bus is None:
         raise BadInput(f"{model}: is an arm file already: give --bus to find its drives, or armlink doctor {model}")
     if is_arm_file and (tip or stops or name):
@@ -75,7 +78,12 @@ def new(
     out = out or Path(f"{model.stem}.yaml")
     _require_free(out, force, interactive)
     if is_arm_file:
-        return _rewire(console, model, out, str(bus), hand(by_hand, interactive), json_file)
+        found = bundled or model
+        if _by_ids(found):
+            if by_hand:
+                raise BadInput("--by-hand: these drives are found by the ids in the arm file, and tell no position yet")
+            return _copy(console, found, out, str(bus), bundled is not None, json_file)
+        return _rewire(console, found, out, str(bus), hand(by_hand, interactive), json_file)
     with console.status(f"reading {model} and looking for collisions"):
         asked = Terminal(console) if interactive else None
         made = new_arm(model, out, tip=tip, stops=parse_stops(stops or []), name=name, questions=asked)
@@ -140,6 +148,36 @@ def _rewire(console: Any, model: Path, out: Path, bus: str, ask: "Ask | None", j
     answer = {"out": str(out), "name": arm.name, "joints": joints, "next": step}
     write_json(json_file, {"schema": SCHEMA, **answer, "findings": [found.to_json() for found in findings]})
     return 1 if findings else 0
+
+
+def _by_ids(model: Path) -> bool:
+    from armlink.arm_file import load_arm
+    from calib.commissioning.own_copy import by_ids
+
+    return by_ids(load_arm(model))
+
+
+def _copy(console: Any, model: Path, out: Path, bus: str, new_serial: bool, json_file: Path | None) -> int:
+    """An arm file with drives that are known by their ids, on a bus of one's own."""
+    from armlink.arm_file import load_arm
+    from armlink.commands.output import write_json
+    from calib.commissioning.own_copy import own_copy
+
+    arm, opened = load_arm(model), _open(bus)
+    try:
+        copied = own_copy(arm, out, _bus_keys(bus, out), opened, new_serial=new_serial)
+    finally:
+        opened.shutdown()
+    out.write_text(copied.text, encoding="utf-8")
+    for found in copied.findings:
+        console.print(str(found), style="red")
+    step = shlex.join(["armlink", "doctor", str(out)])
+    console.print(f"{out}: {', '.join(address for _, address, _ in copied.drives)} answer; limits are those of {model}")
+    console.print(f"next: {step}", style="bold")
+    joints = [{"name": name, "address": address, "serial": serial} for name, address, serial in copied.drives]
+    answer = {"out": str(out), "name": arm.name, "joints": joints, "next": step}
+    write_json(json_file, {"schema": SCHEMA, **answer, "findings": [found.to_json() for found in copied.findings]})
+    return 1 if copied.findings else 0
 
 
 def _require_free(out: Path, force: bool, interactive: bool) -> None:

@@ -23,6 +23,9 @@ class State(StrEnum):
 ProposalState = Literal["pending", "approved", "applied", "rejected", "failed", "superseded"]
 
 
+Vector = tuple[float, float, float]
+
+
 class Answer(BaseModel):
     """Base of every answer."""
 
@@ -101,6 +104,8 @@ class JointNow(Answer):
     """Gravity model at this position [N·m]."""
     residual: float | None
     """Torque minus model torque [N·m]; meaningful at rest."""
+    temperature: float | None = None
+    """Of the drive [°C]; None if it does not tell it."""
     state: str
     """State of the drive in words; "unknown" before its first reading."""
     sample_age_s: float | None
@@ -184,6 +189,47 @@ class Proposal(Answer):
     decided_by: str | None = None
     note: str = ""
     """Why it failed or was superseded."""
+
+
+class DrawnJoint(Answer):
+    """One joint of GET /api/arm, in the arm's base frame with every joint at its `reference`."""
+
+    joint: str
+    axis: Vector
+    """Unit vector."""
+    point: Vector
+    """On the axis [m]."""
+    reference: float
+    """Joint position [rad]."""
+    link: tuple[Vector, ...]
+    """Corners of a line from this joint to the next, the last one to the tip [m]."""
+
+
+class DrawnArm(Answer):
+    """GET /api/arm: what is needed to draw the arm at any joint positions."""
+
+    up: Vector
+    """Unit vector against gravity."""
+    joints: tuple[DrawnJoint, ...]
+    """Base to tip. A joint turns all that follows it about its axis by its position less `reference`."""
+
+
+class WindowRows(Answer):
+    """GET /api/window: K readings of every joint, oldest first; a missing number is null."""
+
+    time: AwareDatetime
+    """Of the newest one."""
+    joints: tuple[str, ...]
+    t: tuple[float, ...]
+    """Time since the oldest one (K) [s]."""
+    position: tuple[tuple[float | None, ...], ...]
+    """[rad], K rows with a value per joint, as all that follow."""
+    torque: tuple[tuple[float | None, ...], ...]
+    """Sensor as the controller calibrates it [N·m]."""
+    model_torque: tuple[tuple[float | None, ...], ...]
+    """Gravity model at these positions [N·m]."""
+    temperature: tuple[tuple[float | None, ...], ...]
+    """Of the drives [°C]."""
 
 
 class Overview(Answer):

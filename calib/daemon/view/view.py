@@ -1,7 +1,7 @@
 """The interface of the service to the web layer, and its refusals.
 
-All calls but those for the history are made on the service's event loop (asyncio, the same thread); no answer waits for
-the bus.
+All calls but those for the history and the arm's shape are made on the service's event loop (asyncio, the same thread);
+no answer waits for the bus.
 """
 
 from collections.abc import Iterator
@@ -9,6 +9,7 @@ from datetime import datetime
 from typing import Protocol
 
 from calib.daemon.view.api_models import (
+    DrawnArm,
     EventItem,
     EventRecord,
     HistoryPoint,
@@ -18,6 +19,7 @@ from calib.daemon.view.api_models import (
     Proposal,
     Status,
 )
+from calib.daemon.view.window import Window
 
 
 class NotPossible(Exception):
@@ -69,6 +71,14 @@ class DaemonView(Protocol):
 
     def joints(self) -> tuple[JointNow, ...]:
         """Every joint as of the newest snapshot, base to tip."""
+        ...
+
+    def window(self, seconds: float, most: int) -> Window:
+        """Readings of the last `seconds` (at most 600), thinned evenly to at most `most` rows."""
+        ...
+
+    def arm(self) -> DrawnArm:
+        """The arm's shape, from its model; raises NoSuch if that cannot be read. May be called in any thread."""
         ...
 
     def estimates(self) -> tuple[JointEstimate, ...]:

@@ -40,19 +40,22 @@ class Histories:
     async def answer(self, query: HistoryQuery) -> StreamingResponse:
         """The points that a query asks for; raises NoSuch, TooMany."""
         pages = self._view.history_pages(query.joint or None, query.since, query.until, query.limit)
-        first = await self.aside(lambda: _encoded(pages))
-        return StreamingResponse(self._body(first, pages), media_type="application/json")
+        return await self.send(_as_json(pages), bytes, "application/json")
 
-    async def _body(self, page: bytes | None, pages: Iterator[tuple[HistoryPoint, ...]]) -> AsyncIterator[bytes]:
+    async def send(
+        self, pages: Iterator[T], encode: Callable[[T], bytes], media_type: str, headers: dict[str, str] | None = None
+    ) -> StreamingResponse:
+        """Pages as they are encoded, in the thread, one at a time; raises TooMany and what the first one raises."""
+        pieces = (encode(page) for page in pages)
+        first = await self.aside(lambda: next(pieces, None))
+        return StreamingResponse(self._body(first, pieces), media_type=media_type, headers=headers)
+
+    async def _body(self, piece: bytes | None, pieces: Iterator[bytes]) -> AsyncIterator[bytes]:
         self._under_way += 1
         try:
-            separator = b"["
-            while page is not None:
-                if page:
-                    yield separator + page
-                    separator = b","
-                page = await asyncio.get_running_loop().run_in_executor(self._thread, _encoded, pages)
-            yield b"[]" if separator == b"[" else b"]"
+            while piece is not None:
+                yield piece
+                piece = await asyncio.get_running_loop().run_in_executor(self._thread, next, pieces, None)
         finally:
             self._under_way -= 1
 
@@ -62,7 +65,11 @@ class Histories:
         self._under_way += 1
 
 
-def _encoded(pages: Iterator[tuple[HistoryPoint, ...]]) -> bytes | None:
-    """The next page as JSON without its brackets; None at the end."""
-    page = next(pages, None)
-    return None if page is None else _POINTS.dump_json(page)[1:-1]
+def _as_json(pages: Iterator[tuple[HistoryPoint, ...]]) -> Iterator[bytes]:
+    """All points as one JSON list."""
+    separator = b"["
+    for page in pages:
+        if page:
+            yield separator + _POINTS.dump_json(page)[1:-1]
+            separator = b","
+    yield b"[]" if separator == b"[" else b"]"

@@ -83,6 +83,15 @@ class OverviewQuery(_Query):
     """Largest number of events."""
 
 
+class WindowQuery(_Query):
+    """GET /api/window, as JSON, CSV or MCAP."""
+
+    seconds: Annotated[float, Field(gt=0, le=600)] = 600.0
+    """Time span that ends with the newest reading [s]."""
+    limit: Annotated[int, Field(ge=2, le=6001)] = 6001
+    """Largest number of rows, thinned evenly."""
+
+
 class StreamQuery(_Query):
     """GET /api/stream."""
 

@@ -8,7 +8,16 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Body, Header, Path, Query, Request
 from fastapi.responses import FileResponse, Response
 
-from calib.daemon.view.api_models import EventRecord, HistoryPoint, JointEstimate, JointNow, Overview, Proposal, Status
+from calib.daemon.view.api_models import (
+    DrawnArm,
+    EventRecord,
+    HistoryPoint,
+    JointEstimate,
+    JointNow,
+    Overview,
+    Proposal,
+    Status,
+)
 from calib.daemon.view.view import DaemonView, NoSuch, NotPossible
 from calib.daemon.web.history import Histories, TooMany
 from calib.daemon.web.parameters import (
@@ -23,6 +32,7 @@ from calib.daemon.web.parameters import (
 )
 from calib.daemon.web.peer import Peer, peer_of
 from calib.daemon.web.stream import StreamResponse, Streams
+from calib.daemon.web.window import add_window
 
 REFUSALS: dict[int | str, dict[str, Any]] = {
     400: {"model": ApiError, "description": "Not HTTP, or the Host header is not a name of this daemon"},
@@ -60,6 +70,7 @@ def api_router(view: DaemonView, streams: Streams, metrics: Callable[[], bytes])
     histories = Histories(view)
     _add_now(router, view, histories)
     _add_past(router, view, histories)
+    add_window(router, view, histories)
     _add_proposals(router, view)
 
     @router.get("/api/stream", response_class=Response, responses=STREAM, tags=["now"])
@@ -89,6 +100,11 @@ def _add_now(router: APIRouter, view: DaemonView, histories: Histories) -> None:
     async def joints() -> tuple[JointNow, ...]:
         """Latest readings of every joint, base to tip."""
         return view.joints()
+
+    @router.get("/api/arm", responses=NO_SUCH, tags=["now"])
+    async def arm() -> DrawnArm:
+        """The arm's shape, to draw it at any joint positions."""
+        return await histories.aside(view.arm)
 
     @router.get("/api/estimates", tags=["now"])
     async def estimates() -> tuple[JointEstimate, ...]:

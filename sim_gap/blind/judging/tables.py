@@ -33,6 +33,22 @@ def show(result: Mapping[str, Any], console: Console) -> None:
             value = value[key]
         table.add_row(text, _percent(value))
     console.print(table)
+    _show_effects(result, console)
+
+
+def show_positions(result: Mapping[str, Any], console: Console) -> None:
+    """Print the score of a check on positions alone."""
+    console.print(
+        f"{result['answers']} answers, {result['tellable']} of them on one effect that can be told: right first or "
+        f"confounded {_percent(result['named_where_tellable'])}, a false cause above 0.8 "
+        f"{_percent(result['false_confident'])}, false alarms without an effect "
+        f"{_percent(result['label_withheld']['no_effect']['false_alarms'])}"
+    )
+    _show_effects(result, console)
+
+
+def _show_effects(result: Mapping[str, Any], console: Console) -> None:
+    """Print effects, calibration and bounds of a score."""
     table = Table("effect", "cases", "right first", "named", "median error", "first named instead")
     for effect, line in result["by_effect"].items():
         others = {name: k for name, k in result["confusion"].get(effect, {}).items() if name != effect}

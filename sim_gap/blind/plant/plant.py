@@ -5,9 +5,9 @@ controller (PID with feed-forward of the nominal model, 500 Hz, on a quantised a
 arms. The simulation of an arm does not depend on the others of its batch.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -25,10 +25,21 @@ STEP = 1.0 / (RATE * SUBSTEPS)
 CHANNELS = ("position", "torque", "motor", "command", "angle")
 
 
-def simulate(runs: Sequence[Run]) -> list[Log]:
-    """Simulate all runs together and return their logs in order."""
+class Commands(Protocol):
+    """The controllers of many arms: torques of the first k of them from their exact readings."""
+
+    def command(self, tick: int, reading: Array) -> Array:
+        """Torques [N·m], (k, width)."""
+
+
+Control = Callable[[Sequence[Run], Array, int], Commands]
+"""Makes the controllers from the runs, the initial readings (B, width) [rad], and the width."""
+
+
+def simulate(runs: Sequence[Run], controller: Control = Controller) -> list[Log]:
+    """Simulate all runs together, each with a controller of this kind, and return their logs in order."""
     order = sorted(range(len(runs)), key=lambda i: -len(runs[i].command))
-    logs = _Batch([runs[i] for i in order]).run()
+    logs = _Batch([runs[i] for i in order], controller).run()
     out: list[Log] = [logs[0]] * len(runs)
     for place, i in enumerate(order):
         out[i] = logs[place]
@@ -38,7 +49,7 @@ def simulate(runs: Sequence[Run]) -> list[Log]:
 class _Batch:
     """Arms sorted by the length of their runs, longest first, so that those still moving are always the first k."""
 
-    def __init__(self, runs: list[Run]) -> None:
+    def __init__(self, runs: list[Run], controller: Control) -> None:
         import mujoco
 
         self.forward = mujoco.mj_forward
@@ -55,7 +66,7 @@ class _Batch:
             self.worlds.append((model, data, data.qpos, data.qvel, data.qfrc_applied, data.qacc, *mine))
         truths = [run.truth for run in runs]
         self.drives = Drives(truths, self._least_inertia(), self.angle, [run.feed_forward[0] for run in runs], STEP)
-        self.controller = Controller(runs, self.drives.reading(self.angle), self.width)
+        self.controller = controller(runs, self.drives.reading(self.angle), self.width)
         self.kept = {name: np.zeros((self.lengths[0], *shape)) for name in CHANNELS}
 
     def run(self) -> list[Log]:

@@ -1,5 +1,6 @@
 """The corrected model as MJCF with native position actuators: gains, delay, limits, friction, inertials, gravity."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,6 +21,7 @@ NATIVE = {
     "controller.slew": "actuator slewmax",
     "controller.integral": "actuator ki",
     "actuator.saturation": "actuator forcerange",
+    "actuator.back_emf": "actuator kv",
     "actuator.rotor_inertia": "joint armature",
     "friction.coulomb": "joint frictionloss",
     "friction.viscous": "joint damping",
@@ -29,6 +31,8 @@ NATIVE = {
     "base.tilt": "option gravity",
 }
 """Effects that a field of MJCF holds."""
+BATCHED = frozenset(NATIVE) - {"controller.slew", "controller.integral"}
+"""Effects that MuJoCo Warp can run too: it has no PID actuator, which slew limit and integral part need."""
 STICKS = {"solref_friction": [0.01, 1.0], "solimp_friction": [0.999, 0.9999, 0.001, 0.5, 2.0]}
 """Solver parameters with which a joint under friction rests; with MuJoCo's usual ones it creeps to where no friction is
 needed, within a tenth of a second on a small arm."""
@@ -46,11 +50,11 @@ class Exported:
     lines: tuple[str, ...]
 
 
-def native_fit(search: Search, fit: Fit) -> Fit:
-    """The fit with what MJCF holds alone, the rest fitted anew around it."""
+def native_fit(search: Search, fit: Fit, held: Collection[str] = NATIVE) -> Fit:
+    """The fit with what a simulator holds alone, the rest fitted around it again."""
     bare = fit
     for effect in EFFECTS:
-        if effect in NATIVE:
+        if effect in held:
             continue
         for j in range(search.data.joints):
             if effect_there(fit, effect, j):
@@ -65,15 +69,15 @@ def native_fit(search: Search, fit: Fit) -> Fit:
     return improve(search.data, replace(bare, active=tuple(wanted), rms=None), search.scales, 6)
 
 
-def exported(sim: SimModel, search: Search, fit: Fit, native: Fit) -> Exported:
-    """MJCF of the native fit, and the effects of the whole fit that it leaves out."""
+def exported(sim: SimModel, search: Search, fit: Fit, native: Fit, held: Collection[str] = NATIVE) -> Exported:
+    """MJCF of the native fit, which has the effects `held`, and the effects of the whole fit that it leaves out."""
     spec = spec_of(sim)
     left = sorted(
         {
             f"{effect} {sim.arm.names[j]}"
             for effect in EFFECTS
             for j in range(sim.n)
-            if effect not in NATIVE and effect_there(fit, effect, j)
+            if effect not in held and effect_there(fit, effect, j)
         }
     )
     compiled = spec.compile()
@@ -105,11 +109,16 @@ def _implicit() -> Any:
 def _set_joint(joint: Any, fit: Fit, j: int) -> None:
     joint.frictionloss, joint.armature = float(fit.point["coulomb"][j]), float(fit.point["armature"][j])
     joint.solref_friction, joint.solimp_friction = STICKS["solref_friction"], STICKS["solimp_friction"]
-    joint.damping[0] = float(fit.point["viscous"][j])
+    joint.damping[0] = float(fit.point["viscous"][j] - _of_servo(fit, j))
     stiffness = float(fit.point["spring"][j])
     if stiffness > 1e-9:
         joint.stiffness[0] = stiffness
         joint.springref = -float(fit.point["offset"][j]) / stiffness
+
+
+def _of_servo(fit: Fit, j: int) -> float:
+    """Part of the damping that the model's own actuator makes."""
+    return float(min(fit.point["kv"][j], fit.point["viscous"][j]))
 
 
 def _set_actuator(spec: Any, joint: str, fit: Fit, j: int, search: Search, compiled: Any) -> None:
@@ -123,17 +132,17 @@ def _set_actuator(spec: Any, joint: str, fit: Fit, j: int, search: Search, compi
         spec.delete(actuator)
     made = spec.add_actuator(name=name, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     kp, ki = (float(fit.point[name][j] * fit.point["gain"][j]) for name in ("kp", "ki"))
-    slew = float(fit.point["slew"][j])
+    slew, kv = float(fit.point["slew"][j]), float(fit.point["back_emf"][j]) + _of_servo(fit, j)
     if ki > 0.0 or np.isfinite(slew):
         made.set_to_pid(
             kp=kp,
-            kv=0.0,
+            kv=kv,
             ctrlspec=POSITION_INPUT,
             **({"ki": ki} if ki > 0.0 else {}),
             **({"slewmax": slew} if np.isfinite(slew) else {}),
         )
     else:
-        made.set_to_position(kp=kp, kv=0.0)
+        made.set_to_position(kp=kp, kv=kv)
     limit = float(fit.point["limit"][j])
     if np.isfinite(limit):
         made.forcelimited, made.forcerange = 1, [-limit, limit]

@@ -8,6 +8,8 @@ import numpy as np
 from armlink.errors import BadInput
 from sim_gap.closed_loop.identify import Identified
 from sim_gap.closed_loop.judge import draw
+from sim_gap.closed_loop.search import effect_there
+from sim_gap.closed_loop.training.export import BATCHED, NATIVE, Exported, exported, native_fit
 
 SUFFIXES = (".csv", ".json", ".parquet")
 
@@ -34,11 +36,30 @@ def write_samples(found: Identified, count: int, path: Path, seed: int = 0) -> N
 
 
 def write_exported(found: Identified, path: Path) -> tuple[str, ...]:
-    """Write the corrected model as MJCF; a line per effect that it leaves out. Raises BadInput."""
+    """Write the corrected model as MJCF; a line per effect that it leaves out. Raises BadInput.
+
+    If it needs PID actuators, which MuJoCo Warp does not run, `NAME_batch.xml` beside it does without.
+    """
     if found.export is None:
         raise BadInput("--out-model: the model did not come from a file: give MJCF, URDF or an arm file with --sim")
     try:
         path.write_text(found.export.xml, encoding="utf-8")
+        if (other := batched(found)) is not None:
+            batch_path(path).write_text(other.xml, encoding="utf-8")
     except OSError as error:
         raise BadInput(f"{path}: cannot be written: {error.strerror}") from None
     return found.export.lines
+
+
+def batched(found: Identified) -> Exported | None:
+    """The corrected model without PID actuators, fitted again without them; None if it has none."""
+    native = found.native
+    if not any(effect_there(native, effect, j) for effect in set(NATIVE) - BATCHED for j in range(found.sim.n)):
+        return None
+    bare = native_fit(found.search, native, BATCHED)
+    return exported(found.sim, found.search, found.fit, bare, BATCHED)
+
+
+def batch_path(path: Path) -> Path:
+    """File of the model without PID actuators beside that of the corrected model."""
+    return path.with_name(f"{path.stem}_batch{path.suffix}")

@@ -63,7 +63,8 @@ def judged(name: str, off: dict[int, tuple[str, float]], seed: int = 0) -> list[
         if name != "six-cia402":
             for joint, (quantity, factor) in off.items():
                 sim.device(joint).inject(f"scale.{quantity}", factor)
-        link = Link(arm, LockStepBus(arm=sim))
+        bus = LockStepBus(arm=sim)
+        link = Link(arm, bus)
         if by_whom == "hand":
             hand = Hand(sim, seed)
             results = by_hand(link, lambda text: None, SECONDS)
@@ -73,6 +74,7 @@ def judged(name: str, off: dict[int, tuple[str, float]], seed: int = 0) -> list[
             link.stop()
         for names, each in zip(found, results, strict=True):
             names |= named(each)
+        bus.shutdown()
     return [sorted(names) for names in found]
 
 

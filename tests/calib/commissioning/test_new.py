@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from armlink import cli
-from armlink.arm_file import load_arm, parse_arm
+from armlink.arm_file import bundled_arms, load_arm, parse_arm
 from armlink.drives.canopen.check.found_drives import Drives
 from armlink.errors import BadInput, BusFault
 from calib.arm.kinematics import gcomp_arm
@@ -220,6 +220,24 @@ def test_with_a_bus_the_file_passes_the_check_on_that_bus(made, tmp_path, capsys
     assert [joint.node for joint in load_arm("rewired.yaml").require_link().joints] == [7, 8, 9, 10]
     assert cli.run(["new", "arm4.urdf", "--out", "x.yaml", "--bus", "armlink_sim:real.yaml", "--by-hand"]) == 2
     assert "nobody to ask" in capsys.readouterr().err
+
+
+def test_drives_that_are_known_by_ids_must_all_answer_and_are_not_found_by_hand(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    content = yaml.safe_load(bundled_arms()["six-damiao"].read_text())
+    (tmp_path / "there.yaml").write_text(yaml.safe_dump(content))
+    content["link"]["joints"][2]["drive"]["id"] = 0x2A
+    (tmp_path / "other.yaml").write_text(yaml.safe_dump(content))
+    line = ["new", "other.yaml", "--out", "mine.yaml", "--bus", "armlink_sim:there.yaml"]
+    assert cli.run(line) == 3
+    assert "id 2Ah" in capsys.readouterr().err
+    assert cli.run([*line, "--by-hand"]) == 2
+    assert "--by-hand" in capsys.readouterr().err
+    assert not (tmp_path / "mine.yaml").exists()
+    assert cli.run(["new", "six-damiao", "--out", "mine.yaml", "--bus", "armlink_sim:there.yaml"]) == 0
+    own = load_arm(tmp_path / "mine.yaml")
+    assert "sim" not in yaml.safe_load(own.path.read_text())
+    assert own.serial != content["serial"]
 
 
 def test_an_arm_file_without_a_bus_has_nothing_to_find(tmp_path):

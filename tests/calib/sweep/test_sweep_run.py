@@ -9,7 +9,7 @@ import pytest
 from sweep_arms import random_arm, with_section
 
 from armlink.arm_file import ArmFile
-from armlink.errors import Refused
+from armlink.errors import HostLate, Refused, Stall
 from armlink.link.link import Link
 from calib.arm.drive_limits import Limits
 from calib.arm.sweep_section import sweep_section
@@ -122,6 +122,35 @@ def test_the_model_holds_at_poses_that_no_fit_has_seen(chain: Chain) -> None:
     assert check.passed
     assert check.sensor.shape == (6, 3)
     assert np.all(check.rms < 0.003 * Limits.of(chain.arm).rated)
+
+
+def test_a_pose_that_a_stall_interrupts_is_repeated(chain: Chain, monkeypatch: pytest.MonkeyPatch) -> None:
+    record = chain.fit.record(chain.arm)
+    gravity = identify_gravity(chain.arm, chain.data, chain.fit).record(chain.arm, record)
+    rest, rests, asked = Mover.rest, [], []
+
+    def late_once(mover: Mover, *args: object) -> object:
+        rests.append(mover.position.copy())
+        if len(rests) == 2:
+            mover.link.stop()
+            raise HostLate(0.18, 0.1)
+        return rest(mover, *args)  # type: ignore[arg-type]
+
+    def go_on(stall: Stall) -> bool:
+        asked.append(str(stall))
+        return True
+
+    monkeypatch.setattr(Mover, "rest", late_once)
+    check = run_verify(chain.link, chain.arm, gravity, record, poses=3, seed=1, on_stall=go_on)
+    assert len(asked) == 1
+    assert len(rests) == 4
+    np.testing.assert_allclose(rests[1], rests[2], atol=2e-3)
+    assert check.sensor.shape == (3, 3)
+    assert check.passed
+    rests.clear()
+    with pytest.raises(HostLate, match="180 ms late"):
+        run_verify(chain.link, chain.arm, gravity, record, poses=3, seed=1)
+    chain.link.recover()
 
 
 def test_a_joint_that_cannot_be_held_on_its_stop_is_noticed(chain: Chain) -> None:

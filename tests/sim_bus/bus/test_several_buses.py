@@ -125,6 +125,45 @@ def test_the_joints_of_both_buses_move_as_one_arm(path):
     nodes.shutdown()
 
 
+class HandTime:
+    """A clock that the test moves on."""
+
+    def __init__(self):
+        self.time = 0.0
+
+    def now(self):
+        return self.time
+
+    def sleep_until(self, instant):
+        self.time = max(self.time, instant)
+
+
+def test_drives_with_the_same_ids_on_two_buses_move_as_one_arm(path):
+    content = yaml.safe_load(path.read_text())
+    for row in content["link"]["joints"]:
+        del row["node"]
+        row["drive"] = {"family": "damiao", "id": 1, "reply": 17, "model": "DM4340", "kp": 40, "kd": 2}
+    path.write_text(yaml.safe_dump(content))
+    described, clock = load_arm(path), HandTime()
+    arm = SimulatedArm(described, Truth.of(described))
+    nodes, host = (open_link_bus(None, described.require_link()) for _ in range(2))
+    server = Server(arm, nodes, now=clock.now)
+    pumped = BusGroup([Pumped(bus, server.turn) for bus in host.members], list(host.tags))
+    pumped.clock = clock
+    with Link(described, pumped) as link:
+        assert len({each.serial for each in link.scan()}) == 2
+        link.start()
+        start = link.enable().position
+        command = Command.hold(start)
+        for _ in range(100):
+            command.position += [0.002, -0.001]
+            clock.time += link.period
+            sample = link.cycle(command)
+        assert sample.position - start == pytest.approx([0.2, -0.1], abs=0.05)
+        assert link.stats.missed == 0
+    nodes.shutdown()
+
+
 def test_each_node_answers_on_its_own_bus_alone(served, path):
     heard = {}
     for name in "ab":

@@ -143,6 +143,23 @@ def test_cyclic_position_follows_within_a_milliradian_at_rest() -> None:
     np.testing.assert_allclose(rig.reading_position * UNIT, goal * UNIT, atol=1e-3)
 
 
+def torque_on_a_way(jitter: float) -> np.ndarray:
+    """Torque readings [N·m] of a joint at constant speed while SYNC comes up to `jitter` [s] early or late."""
+    rig, random, readings = Rig(one_joint()), np.random.default_rng(2), []
+    rig.start(CSP)
+    for _ in range(250):
+        rig.position += round(0.4 * 0.004 / UNIT)
+        rig.arm.on_frame(0x205, struct.pack("<Hhi", rig.word, 0, int(rig.position[0])))
+        rig.arm.on_frame(0x80, b"")
+        rig.arm.advance(0.004 + random.uniform(-jitter, jitter))
+        readings += [struct.unpack("<ii", data)[1] * 1e-6 for can_id, data in rig.drain() if can_id == 0x185]
+    return np.array(readings[50:])
+
+
+def test_jitter_of_sync_is_no_jerk() -> None:
+    assert np.abs(torque_on_a_way(1e-4) - torque_on_a_way(0.0)).max() < 0.2
+
+
 def test_targets_and_readings_of_position_share_the_sensors_gain() -> None:
     arm = one_joint()
     truth = Truth(gain=[1.0], offset=[0.0], position_gain=[1.01], position_offset=[0.1], attachment=[0, 0, 0])

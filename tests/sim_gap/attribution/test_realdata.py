@@ -94,3 +94,17 @@ def test_lwr4_is_not_made_worse_on_another_trajectory(realdata):
     train, other = (load_recording(folder / f"{name}.csv.gz") for name in ("train", "other"))
     answer = diagnose(folder / "sim.xml", [train], [other])
     assert np.all(answer.heldout_after <= answer.heldout_before)
+
+
+def test_load_dependent_friction_of_a_hobby_servo_is_named(realdata):
+    """Gaps of some hundredths of N·m are large in an arm that makes a third of one."""
+    folder = realdata / "bam_servo"
+    motions = ("sin_sin", "lift_and_drop", "up_and_down", "sin_time_square")
+    train, heldout = (
+        [load_recording(folder / f"xl330_kp{gain}_{motion}.csv.gz") for gain in gains for motion in motions]
+        for gains in ((100, 200, 400), (800,))
+    )
+    answer = diagnose(folder / "sim.xml", train, heldout)
+    assert {"friction.load", "actuator.rotor_inertia"} <= {cause.effect for cause in answer.causes}
+    assert answer.heldout_after[0] <= 1.1 * 0.073
+    assert answer.heldout_after[0] < 0.5 * answer.heldout_before[0]

@@ -1,13 +1,15 @@
 """A torque channel's clock against the positions': found if it is one delay, not if several would do."""
 
+from types import SimpleNamespace
+
 import mujoco
 import numpy as np
 import pytest
 from wrong_arms import THREE, motion
 
 from armlink.recording.corrections import AS_IT_IS
-from sim_gap.checks.rigid_fit import Motion
-from sim_gap.checks.torque_source import find_delay
+from sim_gap.checks.rigid_fit import Motion, fit_rigid
+from sim_gap.checks.torque_source import find_delay, find_source
 from sim_gap.model.load import load_model
 
 RATE, LATE = 25.0, 0.4
@@ -36,3 +38,18 @@ def test_a_motion_that_repeats_does_not_tell_by_how_many_periods():
     v, a = 0.5 * w * np.cos(w * t[:, None] + phase), -w * w * q
     findings, _ = find_delay(*late(t, q, v, a), RATE, AS_IT_IS)
     assert not findings
+
+
+@pytest.mark.parametrize(("friction", "found"), [(0.0, 0), (3.0, 1)])
+def test_friction_is_looked_for_in_joints_that_move(friction: float, found: int):
+    """Two joints are held and tremble with a torque that another motion makes: no friction of theirs."""
+    arm = load_model(mujoco.MjModel.from_xml_string(THREE)).arm
+    _, q, v, a = motion(3, 60.0, RATE, seed=3)
+    tremble = np.sin(7.0 * np.arange(len(q)) / RATE)
+    for still in (1, 2):
+        q[:, still], v[:, still], a[:, still] = 0.3 + 1e-4 * tremble, 7e-4 * tremble, 0.0
+    read = arm.torque(q, v, a) + friction * np.sign(v) * [1.0, 0.0, 0.0]
+    read[:, 1:] += 0.5 * tremble[:, None]
+    moved = Motion(q, v, a, read, "tau")
+    findings = find_source(fit_rigid(arm, moved), SimpleNamespace(reading={"tau"}), moved, AS_IT_IS)
+    assert len(findings) == found

@@ -1,4 +1,7 @@
 import json
+import sys
+import types
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -9,7 +12,8 @@ from servo_arm import model_text, record, written
 from armlink.errors import BadInput
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.closed_loop.identify import gain_scales
-from sim_gap.closed_loop.training.posterior import write_exported, write_samples
+from sim_gap.closed_loop.training.actuators import write_actuators
+from sim_gap.closed_loop.training.posterior import batch_path, batched, write_exported, write_samples
 from sim_gap.closed_loop.training.replay import replay_rms
 from sim_gap.report.page import write_report
 
@@ -43,6 +47,20 @@ def test_the_written_model_moves_like_the_arm(answer, tmp_path: Path) -> None:
     before = replay_rms(mujoco.MjModel.from_xml_string(model_text(kp=120.0, friction=0.0)), (0, 1), other)
     assert (replay_rms(closed, (0, 1), other) < 0.3 * before).all()
     assert answer.to_json()["rollout"]["closed_loop"] is True
+    assert batched(answer.internals) is None
+    assert not batch_path(tmp_path / "closed.xml").exists()
+
+
+def test_a_model_with_a_slew_limit_is_written_without_pid_too(answer, tmp_path: Path) -> None:
+    """MuJoCo Warp runs no PID actuator."""
+    found = answer.internals
+    limited = found.native.with_values(slew=np.array([1.5, np.inf]))
+    limited = replace(limited, active=(("kp", "slew", "coulomb", "viscous"), limited.active[1]))
+    other = batched(replace(found, native=limited))
+    assert other is not None
+    model = mujoco.MjModel.from_xml_string(other.xml)
+    assert not (model.actuator_dyntype == mujoco.mjtDyn.mjDYN_PID).any()
+    assert abs(model.actuator_gainprm[0, 0] - found.native.point["kp"][0]) < 0.1 * found.native.point["kp"][0]
 
 
 def test_samples_scatter_about_the_fit(answer, tmp_path: Path) -> None:
@@ -56,6 +74,34 @@ def test_samples_scatter_about_the_fit(answer, tmp_path: Path) -> None:
     assert len((tmp_path / "draws.csv").read_text().splitlines()) == 4
     with pytest.raises(BadInput, match=r"\.csv, \.json, \.parquet"):
         write_samples(answer.internals, 3, tmp_path / "draws.txt")
+
+
+def test_actuator_entries_hold_the_fit(answer, tmp_path: Path, monkeypatch) -> None:
+    for name, entry in (
+        ("isaaclab.actuators", "DelayedPDActuatorCfg"),
+        ("mjlab.actuator", "BuiltinPositionActuatorCfg"),
+    ):
+        module = types.ModuleType(name)
+        setattr(module, entry, dict)
+        monkeypatch.setitem(sys.modules, name.partition(".")[0], types.ModuleType(name.partition(".")[0]))
+        monkeypatch.setitem(sys.modules, name, module)
+    write_actuators(answer.internals, tmp_path / "servos.py", 0.002)
+    made: dict = {}
+    exec((tmp_path / "servos.py").read_text(), made)
+    isaac, mjlab = made["isaac_lab"](), made["mjlab"]()
+    native = answer.internals.native.point
+    for j, joint in enumerate(("shoulder", "elbow")):
+        (other,) = [entry for entry in mjlab if entry["target_names_expr"] == (joint,)]
+        entry = isaac[joint]
+        assert entry["stiffness"] == other["stiffness"] == pytest.approx(native["kp"][j], rel=1e-5)
+        assert entry["friction"] == other["frictionloss"] == pytest.approx(native["coulomb"][j], rel=1e-5)
+        assert entry["viscous_friction"] == other["viscous_damping"] == pytest.approx(native["viscous"][j], rel=1e-5)
+        assert entry["armature"] == other["armature"] == pytest.approx(0.02, rel=0.3)
+        assert 0 <= entry["min_delay"] <= entry["max_delay"] < 5
+    with pytest.raises(BadInput, match=r"ends in \.py"):
+        write_actuators(answer.internals, tmp_path / "servos.yaml")
+    with pytest.raises(BadInput, match="--physics-step 0"):
+        write_actuators(answer.internals, tmp_path / "servos.py", 0.0)
 
 
 def test_report_shows_every_joint(answer, tmp_path: Path) -> None:

@@ -3,9 +3,10 @@ import numpy as np
 from servo_arm import model_text, record
 
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point
-from sim_gap.closed_loop.fit import Fit, evaluate, jacobian
+from sim_gap.closed_loop.fit import Fit, batch, evaluate, jacobian
 from sim_gap.closed_loop.judge import joint_rms
 from sim_gap.closed_loop.parameters import Scales
+from sim_gap.closed_loop.simulate import simulate
 from sim_gap.closed_loop.windows import windows_of
 from sim_gap.model.load import load_model
 
@@ -51,3 +52,30 @@ def test_a_missing_command_switches_the_servo_off() -> None:
     data = windows_of(sim.arm, [recording], ["run"])
     assert data.served[:200, :, 0].all()
     assert not data.served[-1, :, -1].any()
+
+
+def test_damping_of_an_actuator_acts_within_its_limit() -> None:
+    """A strongly damped servo at its limit still moves as MuJoCo's does: the limit clips gain and damping together."""
+    text = model_text(kp=15.0, friction=0.2, damping=0.05)
+    text = text.replace('kp="15.0"', 'kp="15.0" kv="2.0" forcerange="-1.0 1.0"')
+    sim = load_model(mujoco.MjModel.from_xml_string(text))
+    data = windows_of(sim.arm, [record(text, 1, 20.0)], ["run"])
+    point = nominal_point(data, nominal_controller(sim))
+    rms = joint_rms(data, evaluate(data, Fit(point, ((), ()))).rms)
+    moved = np.sqrt(np.mean((data.command - data.recorded) ** 2, axis=(0, 2)))
+    assert (rms < np.maximum(0.05 * moved, 2e-3)).all()
+    outside = joint_rms(data, evaluate(data, Fit({**point, "kv": np.zeros(2)}, ((), ()))).rms)
+    assert (outside > 3.0 * rms).any()
+
+
+def test_back_emf_damps_only_while_the_servo_is_on() -> None:
+    sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
+    recording = record(TEXT, 2, 12.0)
+    on = windows_of(sim.arm, [recording], ["run"])
+    recording.position_command[300:] = np.nan
+    off = windows_of(sim.arm, [recording], ["run"])
+    point = nominal_point(on, nominal_controller(sim))
+    braked = {**point, "viscous": point["viscous"] - 0.3, "back_emf": np.full(2, 0.3)}
+    same, free = (np.abs(simulate(each, batch([point])) - simulate(each, batch([braked]))).max() for each in (on, off))
+    assert same < 1e-12
+    assert free > 1e-3

@@ -37,3 +37,17 @@ def test_every_cause_has_its_figure_and_lies_in_the_middle_of_what_it_explains(a
         assert np.std(left.y - explained.y) < 0.1 * np.std(left.y)
     (section,) = [s for s in sections(answer) if s.title == "The causes one by one"]
     assert len(section.figures) == 2
+
+
+def test_it_begins_with_what_to_do_and_its_headings_are_words(answer):
+    shown = sections(answer)
+    assert "armlink gap diagnose --out-model writes the corrected model" in shown[0].html
+    assert "Residuals of the torque sensor" in [section.title for section in shown]
+    titles = [section.title for section in shown]
+    for figure in (figure for section in shown for figure in section.figures):
+        layout = figure.to_dict()["layout"]
+        titles += [
+            layout[axis].get("title", {}).get("text", "") for axis in layout if axis.startswith(("xaxis", "yaxis"))
+        ]
+    titles = [title.replace("joint_", "") for title in titles]
+    assert [title for title in titles if "tau" in title or "_" in title] == []

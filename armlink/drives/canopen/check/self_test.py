@@ -18,7 +18,7 @@ from armlink.drives.canopen.cia402 import MODE_NAMES, supports
 from armlink.drives.canopen.drives import CanopenDrives, check_fits
 from armlink.drives.canopen.eds_file import OPTIONAL, expected_identity, used_objects
 from armlink.drives.canopen.object_dictionary import Entry
-from armlink.drives.canopen.profile import OURS, Profile, examine
+from armlink.drives.canopen.profile import OURS, Profile
 from armlink.drives.canopen.sdo import NodeServices
 from armlink.drives.canopen.units import read_units
 from armlink.drives.findings import Outcome, Result
@@ -71,7 +71,7 @@ class SelfTest:
             self._calibration(services)
             return
         self.drives.send_nmt(self.link.ask, objects.NMT_PRE_OPERATIONAL, services.node)
-        profile = examine(services, row.settings)
+        profile = device.examined(services, row.settings)
         self.profiles[self.drives.rows.index(row)] = profile
         for lost in profile.lost:
             self._add(services.joint, f"objects: {lost.partition(' ')[0]}", "absent", lost)

@@ -11,12 +11,14 @@ const events = [];
 const live = new Map(); // the present estimate: the last point of each line
 let seconds = 600;
 let now = Date.now();
+let begun = Infinity; // when the daemon started
 let drawn = false;
 
 export const setNow = (time) => { now = Date.parse(time); };
 
 export function setLive(estimates, status) {
   for (const one of estimates) live.set(one.joint, { ...one, at: Date.parse(status.time), record: status.records.calibration });
+  begun = Date.parse(status.time) - 1000 * status.uptime_s;
   drawn = false;
 }
 
@@ -59,9 +61,10 @@ function take(points) {
   }
 }
 
+// The chosen time, or less: from the start of the daemon, or of what is known from before it.
 function range() {
-  const first = Math.min(now - 60000, ...[...history.values()].map((points) => points[0].at), ...events.map((event) => event.at));
-  return [seconds ? now - 1000 * seconds : first, now];
+  const first = Math.min(now - 60000, begun, ...[...history.values()].map((points) => points[0].at), ...events.map((event) => event.at));
+  return [seconds ? Math.max(first, now - 1000 * seconds) : first, now];
 }
 
 function niceHalf(values, least) {
@@ -101,10 +104,11 @@ export function draw() {
     const card = figure(name), last = points.at(-1);
     if (!last) continue;
     card.classList.toggle("drifting", gainIsOff(last) || offsetIsOff(last));
-    card.querySelector("h3 span").textContent = `${signed(100 * (last.gain - 1), 2)} ± ${number(196 * last.gain_std, 2)} %, `
+    const change = `${signed(100 * (last.gain - 1), 2)} ± ${number(196 * last.gain_std, 2)} %, `
       + `${signed(last.offset, 3)} ± ${number(1.96 * last.offset_std, 3)} N·m`;
+    card.querySelector("h3 span").textContent = change;
     const own = near.filter((event) => event.category && (event.joint === null || event.joint === name));
-    drawJoint(card.querySelector("figure"), card.clientWidth || 340, span, points, own, scale);
+    drawJoint(card.querySelector("figure"), `${name}, gain and offset over time: now ${change}`, card.clientWidth || 340, span, points, own, scale);
   }
   drawn = true;
 }

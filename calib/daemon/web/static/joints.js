@@ -5,6 +5,7 @@ import { by, gainIsOff, make, MISSING, number, offsetIsOff, put, signed } from "
 const OLD = 0.5; // s: readings older than this are not live
 const rows = new Map();
 let scale = 0.1;
+export const shownScale = () => scale;
 
 function row(name) {
   if (rows.has(name)) return rows.get(name);
@@ -25,8 +26,10 @@ function row(name) {
     cells[kind].dataset.label = label;
     line.append(cells[kind]);
   }
+  cells.temperature = cell("temperature");
+  cells.temperature.dataset.label = "Temperature [°C]";
   cells.drive = make("td", { className: "drive" });
-  line.append(cells.drive);
+  line.append(cells.temperature, cells.drive);
   by("joints").tBodies[0].append(line);
   rows.set(name, { line, cells });
   return rows.get(name);
@@ -43,8 +46,10 @@ export function showJoints(joints, moving = false) {
   const largest = Math.max(...joints.map((joint) => Math.abs(joint.residual ?? 0)), 0.1);
   scale = largest > scale || largest < scale / 4 ? nice(largest) : scale;
   put(by("bar-scale"), `±${scale} N·m`);
+  by("joints").classList.toggle("cold", joints.every((joint) => joint.temperature === null));
   for (const joint of joints) {
     const { cells } = row(joint.joint);
+    put(cells.temperature, number(joint.temperature, 0));
     put(cells.position, number(joint.position, 3));
     put(cells.torque, number(joint.torque, 2));
     put(cells.model, number(joint.model_torque, 2));

@@ -4,21 +4,15 @@ import { blob, forgetToken, get, stream, token } from "./api.js";
 import { addEvent, draw, drawIfChanged, fetchNew, initRanges, overviewQuery, setHistory, setLive, setNow } from "./drift.js";
 import { showEvent } from "./events.js";
 import { by, clock, duration, put, whole } from "./format.js";
-import { addSample, drawLive, initLive, moves } from "./live.js";
-import { showEstimates, showJoints, verdict } from "./joints.js";
+import { initArm, showArm } from "./arm.js";
+import { showEstimates, showJoints, shownScale, verdict } from "./joints.js";
+import { addSample, drawLive, fetchWindow, initLive, moves } from "./live.js";
 import { fetchProposals, showProposals } from "./proposals.js";
 
 const SLOW = 2000; // ms between updates of what changes slowly
 let status = null;
 let connected = false;
 let summary = "";
-
-let liveDrawn = 0;
-function drawSometimes() { // the stream is faster than eyes
-  if (document.hidden || performance.now() - liveDrawn < 500) return;
-  liveDrawn = performance.now();
-  drawLive();
-}
 
 const WORDS = { lost: "NO CONNECTION", fault: "FAULT", alarm: "ALARM", decide: "DECISION NEEDED" };
 
@@ -108,7 +102,8 @@ const on = {
     status = { ...status, state: item.state, bus: item.bus, time: item.time };
     addSample(item);
     showJoints(item.joints, moves());
-    drawSometimes();
+    showArm(item.joints, shownScale(), moves());
+    if (!document.hidden) drawLive();
     showBus(item.bus);
     showState(item.state, item.bus.fault || status.detail || "");
   },
@@ -156,6 +151,7 @@ async function start() {
   initLive();
   document.body.dataset.shown = Math.round(performance.now()); // ms until everything was shown
   stream(on, status.last_event);
+  for (const more of [fetchWindow, initArm]) more().catch((error) => console.warn(error.message)); // the rest is there without
   forEver();
 }
 

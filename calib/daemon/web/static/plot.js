@@ -72,9 +72,9 @@ function marks(events, range, width, top, bottom) {
     svg("title", {}, event.title)));
 }
 
-export function drawJoint(figure, width, range, points, events, halves) {
+export function drawJoint(figure, name, width, range, points, events, halves) {
   const height = 2 * PANEL + GAP + AXIS + 6, bottom = height - AXIS;
-  const drawing = svg("svg", { viewBox: `0 0 ${width} ${height}`, height, role: "img" });
+  const drawing = svg("svg", { viewBox: `0 0 ${width} ${height}`, height, role: "img", "aria-label": name });
   const of = (key, shift, factor) => points.map((p) => ({ time: p.at, value: factor * (p[key] - shift), std: factor * p[`${key}_std`], record: p.record }));
   drawing.append(
     ...axis(range, width, 6, bottom),
@@ -90,7 +90,7 @@ const LANES = ["fault", "drift", "load", "change"];
 // All events of the arm, one lane per colour.
 export function drawTimeline(figure, width, range, events) {
   const lane = 15, height = LANES.length * lane + AXIS + 4, bottom = height - AXIS, x = across(range, width);
-  const drawing = svg("svg", { viewBox: `0 0 ${width} ${height}`, height, role: "img" });
+  const drawing = svg("svg", { viewBox: `0 0 ${width} ${height}`, height, role: "img", "aria-label": `Events over time: ${events.length || "none"}` });
   drawing.append(...axis(range, width, 0, bottom));
   LANES.forEach((name, index) => {
     const y = lane * (index + 0.5) + 2;

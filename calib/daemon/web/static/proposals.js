@@ -16,7 +16,7 @@ const percent = (share) => (share > 0.999 ? "above 99.9 %" : `${(100 * share).to
 
 function pending(one) {
   const button = (verb, title, className) => {
-    const made = make("button", { className, textContent: title });
+    const made = make("button", { className, textContent: title, ariaLabel: `${title} ${one.joint}` });
     made.addEventListener("click", () => decide(one, verb));
     return made;
   };

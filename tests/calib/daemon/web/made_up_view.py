@@ -5,8 +5,12 @@ import math
 from collections import deque
 from datetime import UTC, datetime, timedelta
 
+import numpy as np
+
+from armlink.arm_file import load_arm
 from calib.daemon.view.api_models import (
     BusHealth,
+    DrawnArm,
     EventItem,
     EventRecord,
     HistoryPoint,
@@ -18,7 +22,9 @@ from calib.daemon.view.api_models import (
     State,
     Status,
 )
+from calib.daemon.view.drawn_arm import drawn_arm
 from calib.daemon.view.view import NoSuch, NotPossible
+from calib.daemon.view.window import Window
 
 NOW = datetime(2026, 5, 1, 8, 0, tzinfo=UTC)
 NAMES = tuple(f"joint_{i}" for i in range(1, 8))
@@ -58,6 +64,7 @@ class MadeUpView:
         self.points: list[HistoryPoint] = []
         self.offered: list[Proposal] = []
         self.shift = 0.0
+        self.moves = True
 
     def tick(self, seconds: float = 0.1) -> None:
         self.t += seconds
@@ -130,15 +137,34 @@ class MadeUpView:
         return tuple(
             JointNow(
                 joint=name,
-                position=0.3 * math.sin(self.t + k),
+                position=0.3 * math.sin(self.t * self.moves + k),
                 torque=5.0 * math.cos(self.t + k) + 0.02 + self.shift * (k == 1),
                 model_torque=5.0 * math.cos(self.t + k),
                 residual=0.02 + self.shift * (k == 1),
+                temperature=31.0 + k,
                 state="operation enabled",
                 sample_age_s=None if self.fault else 0.004,
             )
             for k, name in enumerate(NAMES)
         )
+
+    def window(self, seconds: float, most: int) -> Window:
+        """A swing since the start, of the torques alone if nothing `moves`."""
+        first = max(0.0, self.t - seconds)
+        t = np.linspace(first, self.t, min(most, 1 + round(10 * (self.t - first))))
+        phase = t[:, None] + np.arange(len(NAMES))
+        model = 5.0 * np.cos(phase)
+        channels = {
+            "position": 0.3 * np.sin(phase if self.moves else phase - t[:, None]),
+            "torque": model + 0.02,
+            "model_torque": model,
+            "temperature": np.full(phase.shape, 31.0) + np.arange(len(NAMES)),
+        }
+        channels["temperature"][:, 0] = np.nan
+        return Window(NAMES, self.time(), t - t[0], channels)
+
+    def arm(self) -> DrawnArm:
+        return drawn_arm(load_arm("sarcos"))
 
     def estimates(self) -> tuple[JointEstimate, ...]:
         return tuple(

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from daemon_bench import DaemonBench
 from made_up_view import NAMES, NOW, MadeUpView
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Locator, Page, expect
 from served_page import TOKEN, Served, open_page, served
 from small_arm import small_arm
 
@@ -197,6 +197,8 @@ def test_history_has_intervals_and_events_on_one_time_axis(browser: Browser, ser
     same = [card.get_attribute("x1") for card in page.locator("#charts line.event.load").all()]
     assert len(set(same)) == 1
     expect(page.locator("#ranges [data-seconds='600']")).to_have_attribute("aria-pressed", "true")
+    earlier = [point.model_copy(update={"time": NOW - timedelta(seconds=1800)}) for point in view.points[: len(NAMES)]]
+    server.do(lambda: view.points.__setitem__(slice(0, 0), earlier))
     page.click("#ranges [data-seconds='3600']")
     expect(page.locator("#ranges [data-seconds='3600']")).to_have_attribute("aria-pressed", "true")
     expect(chart.locator("polyline.gain").first).not_to_have_attribute("points", first_line)
@@ -259,13 +261,36 @@ def test_live_torque_beside_the_model_and_its_window_as_a_recording(
     expect(page.locator("#live-joint_1 svg")).to_have_attribute(
         "aria-label", re.compile(r"joint_1: sensor .* model .* N·m")
     )
-    with page.expect_download() as got:
-        page.click("#download")
-    got.value.save_as(tmp_path / "window.csv")
-    run = load_recording(tmp_path / "window.csv")
-    assert (run.n, run.torque is not None) == (len(NAMES), True)
-    assert len(run.t) > 5
+    for suffix, seconds in (("csv", 60), ("mcap", 600)):
+        page.click(f"#live-ranges [data-seconds='{seconds}']")
+        with page.expect_download() as got:
+            page.click(f"#download-{suffix}")
+        assert got.value.suggested_filename.endswith(f".{suffix}")
+        got.value.save_as(tmp_path / f"window.{suffix}")
+        run = load_recording(tmp_path / f"window.{suffix}")
+        assert run.torque is not None
+        assert run.torque.shape[1] == len(NAMES)
+        assert run.t[-1] == pytest.approx(min(seconds, server.do(lambda: view.t)), abs=1.0)
     assert page.complaints == []
+
+
+def test_it_opens_on_what_was_before_it(browser: Browser, server: Served, view: MadeUpView) -> None:
+    server.do(lambda: setattr(view, "t", 250.0))
+    page = open_page(browser, server)
+    chart = page.locator("#live-joint_1 svg")
+    expect(chart.locator("text", has_text="−4.2 min")).to_have_count(1)
+    times = [float(point.split(",")[0]) for point in points_of(chart)]
+    assert times[0] < 60
+    assert times[-1] > chart.bounding_box()["width"] - 20  # type: ignore[index]
+    tops = [float(point.split(",")[1]) for point in points_of(chart)]
+    assert max(tops) - min(tops) > 40  # no peak is lost in drawing few points
+    axis = page.locator("#chart-joint_1 svg text").all_text_contents()
+    assert "08:00" in axis  # since the start, four minutes ago, and not the ten that were asked for
+    assert "07:56" not in axis
+
+
+def points_of(chart: Locator) -> list[str]:
+    return (chart.locator("polyline.torque").first.get_attribute("points") or "").split()
 
 
 def test_a_decision_shows_its_evidence(browser: Browser, server: Served, view: MadeUpView) -> None:

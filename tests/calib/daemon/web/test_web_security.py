@@ -82,7 +82,8 @@ def test_tcp_without_a_proper_token_is_refused_at_the_start(token: str | None) -
 def test_over_tcp_everything_but_the_page_needs_the_token(server: Served, header: str | None) -> None:
     client = server.tcp(token=None)
     headers = {} if header is None else {"Authorization": header.encode("latin-1")}
-    paths = ["status", "overview", "joints", "estimates", "events", "history", "proposals", "stream", "report"]
+    paths = ["status", "overview", "joints", "estimates", "events", "history", "proposals", "stream", "report", "arm"]
+    paths += ["window", "window.csv", "window.mcap"]
     for path in [*(f"/api/{path}" for path in paths), "/metrics", "/openapi.json", "/nothing"]:
         answer = client.get(path, headers=headers)
         assert (path, answer.status_code) == (path, 401)

@@ -1,0 +1,66 @@
+"""One's own copy of an arm file whose drives are known by their ids: on a bus, without a simulated arm."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from armlink.arm_file import ArmFile, Bus, parse_arm
+from armlink.bus.can_bus import CanBus
+from armlink.drives.registry import family
+from armlink.errors import BusFault
+from armlink.link.link import Link
+from calib.commissioning.finding import SetupFinding
+
+
+@dataclass(frozen=True)
+class OwnCopy:
+    """An arm file about to be written."""
+
+    text: str
+    drives: list[tuple[str, str, str]]
+    """Name, address and serial number of each joint's drive."""
+    findings: list[SetupFinding]
+
+
+def by_ids(arm: ArmFile) -> bool:
+    """Whether the drives of an arm are found by the ids of its arm file alone."""
+    joints = arm.require_link().joints
+    return all(family(joint.settings.family).find is None for joint in joints)
+
+
+def own_copy(arm: ArmFile, out: Path, bus: dict[str, str | int], opened: CanBus, *, new_serial: bool) -> OwnCopy:
+    """The copy, to stand at `out`; each drive is asked who it is. Nothing is written.
+
+    `new_serial`: the arm takes its first drive's serial number. Raises BusFault where a drive does not answer.
+    """
+    section = arm.require_link()
+    link = section.model_copy(update={"bus": Bus.model_validate(bus), "buses": {}})
+    there = Link(arm.model_copy(update={"link": link}), opened)
+    found = there.scan()
+    missing = [f"{there.names[each.joint]} ({each.address})" for each in found if not each.present]
+    if missing:
+        raise BusFault(f"no answer from {', '.join(missing)} on {opened.channel_info}: check power, wiring and ids")
+    remedy = "connect the right arm, or correct its drive under link.joints"
+    wrong = [
+        SetupFinding("error", each.mismatch, f"{there.names[each.joint]} ({each.address})", remedy)
+        for each in found
+        if each.mismatch
+    ]
+    content: dict[str, Any] = yaml.safe_load(arm.path.read_text(encoding="utf-8"))
+    content = {key: value for key, value in content.items() if key != "sim"}
+    content["link"] = {**content["link"], "bus": bus}
+    if new_serial:
+        content["serial"] = found[0].serial or "FILL-IN"
+    if arm.model_path is not None:
+        content["kinematics"]["model"] = os.path.relpath(arm.model_path, out.resolve().parent)
+    parse_arm(dict(content), out)
+    text = f"# {arm.name} with the drives on {opened.channel_info}, from {arm.path.name} by armlink new.\n"
+    for key, value in content.items():
+        part = yaml.safe_dump({key: value}, sort_keys=False, allow_unicode=True, width=160)
+        assumed = "  # assumed: that of the first drive" if key == "serial" and new_serial else ""
+        text += part.rstrip("\n") + assumed + "\n"
+    drives = [(there.names[each.joint], each.address, each.serial) for each in found]
+    return OwnCopy(text, drives, wrong)
