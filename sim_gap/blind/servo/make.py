@@ -223,11 +223,12 @@ def _write(drawing: Drawing, train: Log, held: Log, more: dict[str, Any], folder
         "case": recipe.name,
         "kind": "single" if effects else "none",
         "n": drawing.nominal.n,
-        "controller_known": recipe.known,
         "effects": effects,
         "motions": {name: list(kinds) for name, kinds in drawing.motions.items()},
     }
-    (labels / f"{recipe.name}.json").write_text(json.dumps({**truth, **more}, indent=1), encoding="utf-8")
+    (labels / f"{recipe.name}.json").write_text(
+        json.dumps({**truth, "controller_known": recipe.known, **more}, indent=1), encoding="utf-8"
+    )
 
 
 def _truth(change: Change) -> dict[str, Any]:
