@@ -33,6 +33,7 @@ LEFT_OUT = {
     "armlink demo": "the same, for an arm file too",
     "armlink sim": "runs all the while",
     "sudo ": "changes the machine",
+    "podman ": "builds an image; tests/house/test_container.py checks its files and options",
     "armlink gap diagnose-fleet": "needs a dask scheduler; tests/sim_gap runs it on one",
 }
 """Beginning of a line: why it is not run."""

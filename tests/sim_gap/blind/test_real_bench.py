@@ -6,6 +6,7 @@ from wrong_arms import THREE, Wrong, model, record
 
 from armlink.errors import BadInput
 from sim_gap.blind.real import KNOWN, judge_real, read_cases, run_real, score_real
+from sim_gap.closed_loop.parameters import EFFECTS
 from sim_gap.effects.registry import library_without
 
 CASE = {
@@ -62,7 +63,7 @@ def test_shares_over_all_answers():
 
 
 def test_the_arms_that_are_published_name_effects_of_the_library():
-    library = set(library_without(()))
+    library = {*library_without(()), *EFFECTS}
     for case in read_cases(KNOWN):
         named = {*case.get("first", ()), *case.get("has", ()), *case.get("open", ()), *case.get("withhold", ())}
         assert named <= library, case["case"]
