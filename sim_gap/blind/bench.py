@@ -45,7 +45,7 @@ def run_bench(
     """
     _require_range(effects)
     if positions and effects:
-        raise BadInput(f"--effects {effects}: cases of --positions have one effect at most: leave it out")
+        raise BadInput(f"--effects {effects}: cases of positions alone have one effect at most: leave it out")
     if cases < 1:
         raise BadInput(f"--cases {cases}: expected at least 1")
     if any((out / name).exists() for name in ("answers", "cases", "labels")):

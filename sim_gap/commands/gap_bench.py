@@ -12,9 +12,9 @@ def bench(
     effects: Annotated[
         str, typer.Option(metavar="LOW-HIGH", help="Number of effects in every case; default: none, one or two.")
     ] = "",
-    positions: Annotated[
-        bool, typer.Option("--positions", help="Arms with position servos, seen as q and q_cmd alone.")
-    ] = False,
+    channels: Annotated[
+        str, typer.Option(help="q,q_cmd: arms with position servos, seen as these alone; default: with torques.")
+    ] = "",
     real: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Diagnose the recordings of real arms in DIR instead; see --known."),
@@ -32,7 +32,7 @@ def bench(
 
     Many effects at once: armlink gap bench --effects 5-8 --cases 30 --seed 3
 
-    Positions alone: armlink gap bench --positions --cases 60 --seed 3
+    Positions alone: armlink gap bench --channels q,q_cmd --cases 60 --seed 3
 
     Real arms: armlink gap bench --real recordings/
     """
@@ -49,6 +49,9 @@ def bench(
 
     if json is not None and str(json) != "-" and not json.resolve().parent.is_dir():
         raise BadInput(f"--json {json}: its folder does not exist: create it first")
+    if channels and {*channels.split(",")} != {"q", "q_cmd"}:
+        raise BadInput(f"--channels {channels}: expected q,q_cmd; leave it out for arms with torque sensors")
+    positions = bool(channels)
     console = Console(stderr=True)
     with TemporaryDirectory(prefix="armlink-bench-") as scratch, Progress(console=console) as bars:
         stages: dict[str, TaskID] = {}

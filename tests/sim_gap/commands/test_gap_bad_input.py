@@ -108,3 +108,8 @@ def test_json_on_standard_output_is_nothing_but_json(tmp_path, capsys):
     assert "friction.coulomb" in page
     assert 'src="http' not in page
     assert 'frictionloss="0.5' in (tmp_path / "out.xml").read_text()
+
+
+def test_a_bench_on_other_channels_is_one_line(capsys):
+    assert run(["gap", "bench", "--channels", "q,tau", "--cases", "1"]) == 2
+    assert "--channels q,tau: expected q,q_cmd" in capsys.readouterr().err
