@@ -1,5 +1,6 @@
 """Actuator entries for training frameworks: one per joint, as a Python file for Isaac Lab and mjlab."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,24 @@ from gcomp.arrays import Array
 from sim_gap.closed_loop.identify import Identified
 from sim_gap.closed_loop.judge import draw
 
+ISAAC_LAB = {
+    "stiffness": "stiffness",
+    "damping": "damping",
+    "armature": "armature",
+    "friction": "friction",
+    "dynamic_friction": "friction",
+    "viscous_friction": "viscous",
+    "effort_limit": "limit",
+}
+MJLAB = {
+    "stiffness": "stiffness",
+    "damping": "damping",
+    "armature": "armature",
+    "frictionloss": "friction",
+    "viscous_damping": "viscous",
+    "effort_limit": "limit",
+}
+"""Field of an entry → value of the joint that it takes."""
 DRAWS = 400
 """Draws of the parameters from which the range of a delay is taken."""
 RANGE = 0.05, 0.95
@@ -39,7 +58,8 @@ def write_actuators(found: Identified, path: Path, step: float = 0.005) -> None:
 
 def actuators_text(found: Identified, step: float) -> str:
     """The file's text."""
-    rows = [_entry(found, j, step) for j in range(found.sim.n)]
+    drawn = draw(found.search, found.fit, found.spread, DRAWS)
+    rows = [_entry(found, j, step, drawn) for j in range(found.sim.n)]
     left = found.export.lines if found.export is not None else ()
     note = f"Not in these entries: {', '.join(left)}.\n" if left else ""
     isaac = "\n".join(_isaac(name, row) for name, row in zip(found.sim.arm.names, rows, strict=True))
@@ -57,11 +77,11 @@ def actuators_text(found: Identified, step: float) -> str:
     )
 
 
-def _entry(found: Identified, j: int, step: float) -> dict[str, float | None]:
+def _entry(found: Identified, j: int, step: float, drawn: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
     """Values of one joint, as the fit of what a simulator holds has them; None for no limit."""
     point = {name: float(values[j]) for name, values in found.native.point.items() if len(values) == found.sim.n}
     limit = point["limit"] if np.isfinite(point["limit"]) else None
-    late = _delays(found, j) / step
+    late = _delays(found, j, drawn) / step
     inside = min(point["kv"], point["viscous"])
     return {
         "stiffness": point["kp"] * point["gain"],
@@ -75,42 +95,26 @@ def _entry(found: Identified, j: int, step: float) -> dict[str, float | None]:
     }
 
 
-def _delays(found: Identified, j: int) -> Array:
+def _delays(found: Identified, j: int, rows: Sequence[Mapping[str, float]]) -> Array:
     """Ends of the range of a joint's delay [s], (2,): that of 90 % of its draws, about the exported model's."""
     name = f"{found.sim.arm.names[j]}.delay"
-    drawn = [row[name] for row in draw(found.search, found.fit, found.spread, DRAWS) if name in row]
+    drawn = [row[name] for row in rows if name in row]
     about = np.quantile(drawn, RANGE) - found.fit.point["delay"][j] if drawn else np.zeros(2)
     return np.asarray(found.native.point["delay"][j] + about)
 
 
 def _isaac(name: str, row: dict[str, float | None]) -> str:
-    fields = {
-        "stiffness": row["stiffness"],
-        "damping": row["damping"],
-        "armature": row["armature"],
-        "friction": row["friction"],
-        "dynamic_friction": row["friction"],
-        "viscous_friction": row["viscous"],
-        "effort_limit": row["limit"],
-    }
     steps = f"min_delay={row['least']:.0f}, max_delay={row['most']:.0f}"
-    entry = f'joint_names_expr=["{name}"], {_given(fields)}, {steps}'
+    entry = f'joint_names_expr=["{name}"], {_given(ISAAC_LAB, row)}, {steps}'
     return f'        "{name}": DelayedPDActuatorCfg(\n            {entry}\n        ),'
 
 
 def _mjlab(name: str, row: dict[str, float | None]) -> str:
-    fields = {
-        "stiffness": row["stiffness"],
-        "damping": row["damping"],
-        "armature": row["armature"],
-        "frictionloss": row["friction"],
-        "viscous_damping": row["viscous"],
-        "effort_limit": row["limit"],
-    }
     steps = f"delay_min_lag={row['least']:.0f}, delay_max_lag={row['most']:.0f}"
-    entry = f'target_names_expr=("{name}",), {_given(fields)}, {steps}'
+    entry = f'target_names_expr=("{name}",), {_given(MJLAB, row)}, {steps}'
     return f"        BuiltinPositionActuatorCfg(\n            {entry}\n        ),"
 
 
-def _given(fields: dict[str, float | None]) -> str:
-    return ", ".join(f"{name}={value:.6g}" for name, value in fields.items() if value is not None)
+def _given(fields: Mapping[str, str], row: Mapping[str, float | None]) -> str:
+    values = {name: row[key] for name, key in fields.items()}
+    return ", ".join(f"{name}={value:.6g}" for name, value in values.items() if value is not None)
