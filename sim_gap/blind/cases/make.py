@@ -3,7 +3,7 @@
 import argparse
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
@@ -136,15 +136,13 @@ def write_csv(path: Path, columns: dict[str, Array]) -> None:
         write_csv(pa.table(flat), file, WriteOptions(include_header=False))
 
 
-def batches(wanted: Sequence[Recipe], size: int = BATCH) -> Iterator[Sequence[Recipe]]:
-    """Cases in groups of `size`."""
-    for start in range(0, len(wanted), size):
-        yield wanted[start : start + size]
+Make = Callable[[Sequence[Any], Path, Path, float, float], None]
+"""Makes cases: recipes, folder of the cases, folder of the labels, seconds of training and of held-out motion."""
 
 
-def main() -> None:
-    """Make all cases of a check."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def parse_words(description: str) -> argparse.Namespace:
+    """What `gap bench` says to a maker of cases."""
+    parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--cases", type=int, default=150)
     parser.add_argument("--out", type=Path, required=True)
@@ -153,18 +151,27 @@ def main() -> None:
     parser.add_argument("--effects", default="")
     parser.add_argument("--train-s", type=float, default=TRAIN_S)
     parser.add_argument("--heldout-s", type=float, default=HELDOUT_S)
-    given = parser.parse_args()
+    return parser.parse_args()
+
+
+def make_all(make: Make, wanted: Sequence[Any], given: argparse.Namespace) -> None:
+    """All cases of a check, by several processes."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    low, _, high = given.effects.partition("-")
-    wanted = recipes(given.seed, given.cases, (int(low), int(high)) if high else None)
     size = max(1, min(BATCH, -(-len(wanted) // given.workers)))
     with ProcessPoolExecutor(given.workers, mp_context=get_context("spawn")) as pool:
         jobs = [
-            pool.submit(make_cases, batch, given.out, given.labels, given.train_s, given.heldout_s)
-            for batch in batches(wanted, size)
+            pool.submit(make, wanted[first : first + size], given.out, given.labels, given.train_s, given.heldout_s)
+            for first in range(0, len(wanted), size)
         ]
         for job in jobs:
             job.result()
+
+
+def main() -> None:
+    """Make all cases of a check."""
+    given = parse_words(str(__doc__))
+    low, _, high = given.effects.partition("-")
+    make_all(make_cases, recipes(given.seed, given.cases, (int(low), int(high)) if high else None), given)
     (given.labels / "withhold.txt").write_text("\n".join(withheld(given.labels)), encoding="utf-8")
 
 

@@ -54,23 +54,23 @@ def label_withheld(judged: Sequence[Judgement]) -> dict[str, Any]:
     return {
         "cases": len(judged),
         "tellable": sum(j.tellable for j in single),
-        "first_right_where_tellable": _share([j.first_right for j in single if j.tellable]),
-        "first_right": _share([j.first_right for j in single]),
-        "first_or_confounded": _share([j.named for j in single]),
-        "extra_confident": _share([bool(j.blamed) for j in some]),
+        "first_right_where_tellable": share([j.first_right for j in single if j.tellable]),
+        "first_right": share([j.first_right for j in single]),
+        "first_or_confounded": share([j.named for j in single]),
+        "extra_confident": share([bool(j.blamed) for j in some]),
         "joints": {"precision": precision, "recall": recall, "f1": _f1(precision, recall)},
-        "no_effect": {"cases": len(none), "false_alarms": _share([j.verdict != "no_gap" for j in none])},
+        "no_effect": {"cases": len(none), "false_alarms": share([j.verdict != "no_gap" for j in none])},
         "several": several([j for j in judged if j.kind == "several"]),
-        "two": {"cases": len(two), "both_found": _share([set(j.found) == set(j.truth) for j in two])},
+        "two": {"cases": len(two), "both_found": share([set(j.found) == set(j.truth) for j in two])},
         "parameters": {
             "count": len(errors),
             "median_error": float(np.median(errors)) if len(errors) else None,
-            "within_10_percent": _share((errors <= 0.1).tolist()),
-            "inside_ci95": _share([bool(x) for x in inside]),
+            "within_10_percent": share((errors <= 0.1).tolist()),
+            "inside_ci95": share([bool(x) for x in inside]),
         },
         "shrink": {
             "median_ratio": float(np.median(ratios)) if len(ratios) else None,
-            "at_least_0.95": _share((ratios >= 0.95).tolist()),
+            "at_least_0.95": share((ratios >= 0.95).tolist()),
         },
         "verdicts": dict(Counter(j.verdict for j in judged)),
     }
@@ -84,7 +84,7 @@ def several(judged: Sequence[Judgement]) -> dict[str, Any]:
         "effects": shown,
         "named": _ratio(placed, shown),
         "false_confident": _ratio(sum(len(j.blamed) for j in judged), sum(j.confident for j in judged)),
-        "explained": _share([j.verdict == "explained" for j in judged]),
+        "explained": share([j.verdict == "explained" for j in judged]),
     }
 
 
@@ -92,8 +92,8 @@ def effect_withheld(judged: Sequence[Judgement]) -> dict[str, Any]:
     """Shares over the cases whose effect was removed from the library: false blames and verdicts."""
     return {
         "cases": len(judged),
-        "false_blame": _share([bool(j.blamed) for j in judged]),
-        "no_gap": _share([j.verdict == "no_gap" for j in judged]),
+        "false_blame": share([bool(j.blamed) for j in judged]),
+        "no_gap": share([j.verdict == "no_gap" for j in judged]),
         "verdicts": dict(Counter(j.verdict for j in judged)),
         "blamed": [{"case": j.case, "withheld": j.withheld, "blamed": list(j.blamed)} for j in judged if j.blamed],
     }
@@ -139,7 +139,7 @@ def calibration(judged: Sequence[Judgement]) -> list[dict[str, Any]]:
                     "to": high,
                     "count": len(here),
                     "mean_confidence": float(np.mean([j.confidence for j in here])),
-                    "right": _share([j.first_right for j in here]),
+                    "right": share([j.first_right for j in here]),
                 }
             )
     return out
@@ -185,7 +185,8 @@ def meets(result: Mapping[str, Any]) -> dict[str, bool]:
     return met | {name: value is not None and value <= bound for name, (value, bound) in most.items()}
 
 
-def _share(flags: Sequence[bool]) -> float | None:
+def share(flags: Sequence[bool]) -> float | None:
+    """Share of what is true; None of nothing."""
     return sum(flags) / len(flags) if flags else None
 
 

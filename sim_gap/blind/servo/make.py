@@ -1,6 +1,5 @@
 """Makes cases of servo arms in a process of its own: `python -m sim_gap.blind.servo.make --out DIR --labels DIR`."""
 
-import argparse
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.blind.cases.arms import Arm, draw_arm, mjcf
 from sim_gap.blind.cases.gap import largest_fall
-from sim_gap.blind.cases.make import withheld, write_csv
+from sim_gap.blind.cases.make import make_all, parse_words, withheld, write_csv
 from sim_gap.blind.cases.motion import KINDS, RATE, Limits, trajectory
 from sim_gap.blind.cases.scene import Scene
 from sim_gap.blind.cases.true_arm import sound
@@ -21,7 +20,7 @@ from sim_gap.blind.plant.runs import Log
 from sim_gap.blind.servo.effects import OF_THE_ARM, OF_THE_SERVO, UNKNOWN, Change, drawn
 from sim_gap.blind.servo.law import ServoLaw, ServoRun, Servos
 
-BATCH, ROUNDS, ATTEMPTS = 12, 4, 200
+ROUNDS, ATTEMPTS = 4, 200
 NONE_SHARE, UNKNOWN_SHARE = 0.12, 0.3
 """Shares of cases without an effect, and of those whose model has no controller."""
 VISIBLE_RATIO, VISIBLE_COUNTS = 3.0, 2.0
@@ -187,12 +186,14 @@ def _steady(run: ServoRun, log: Log) -> bool:
     return bool(np.abs(log.position - run.command).max() < FOLLOWED)
 
 
-def make_cases(wanted: Sequence[Recipe], out: Path, labels: Path, lengths: tuple[float, float]) -> None:
+def make_cases(wanted: Sequence[Recipe], out: Path, labels: Path, train_s: float, heldout_s: float) -> None:
     """Draw, simulate and write cases; one that does not show its effect is drawn again, and left out in the end."""
     labels.mkdir(parents=True, exist_ok=True)
     todo = dict.fromkeys(wanted, 0)
     for number in range(ROUNDS):
-        drawings = [found for recipe, first in todo.items() if (found := draw(recipe, lengths, first)) is not None]
+        drawings = [
+            found for recipe, first in todo.items() if (found := draw(recipe, (train_s, heldout_s), first)) is not None
+        ]
         if not drawings:
             return
         logs = iter(simulate([run for d in drawings for run in d.runs[1:]], Servos))
@@ -245,20 +246,9 @@ def _truth(change: Change) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Make all cases of a check, one after another."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--cases", type=int, default=60)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--labels", type=Path, required=True)
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--effects", default="")
-    parser.add_argument("--train-s", type=float, required=True)
-    parser.add_argument("--heldout-s", type=float, required=True)
-    given = parser.parse_args()
-    wanted = recipes(given.seed, given.cases)
-    for first in range(0, len(wanted), BATCH):
-        make_cases(wanted[first : first + BATCH], given.out, given.labels, (given.train_s, given.heldout_s))
+    """Make all cases of a check."""
+    given = parse_words(str(__doc__))
+    make_all(make_cases, recipes(given.seed, given.cases), given)
     (given.labels / "withhold.txt").write_text("\n".join(withheld(given.labels, 1)[::3]), encoding="utf-8")
 
 

@@ -1,10 +1,10 @@
 """The score of a check on positions alone: right first or named as confounded, and false causes. Pure functions."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from sim_gap.blind.judging.judge import Judgement, judge
-from sim_gap.blind.judging.score import WITHHELD, by_effect, calibration, confusion, label_withheld, row
+from sim_gap.blind.judging.score import WITHHELD, by_effect, calibration, confusion, label_withheld, row, share
 
 SCHEMA = "armlink.blind-positions/1"
 NAMED, FALSE = 0.85, 0.03
@@ -23,8 +23,8 @@ def score_positions(
     whole = [j for j in judged if not j.withheld]
     told = [j for j in whole if j.tellable and j.kind == "single"]
     shares = {
-        "named_where_tellable": _share([j.named for j in told]),
-        "false_confident": _share([bool(j.blamed) for j in judged]),
+        "named_where_tellable": share([j.named for j in told]),
+        "false_confident": share([bool(j.blamed) for j in judged]),
     }
     met = {
         "named_where_tellable": shares["named_where_tellable"] is not None and shares["named_where_tellable"] >= NAMED,
@@ -42,7 +42,3 @@ def score_positions(
         "calibration": calibration(judged),
         "cases": [row(j) for j in judged],
     }
-
-
-def _share(flags: Sequence[bool]) -> float | None:
-    return sum(flags) / len(flags) if flags else None

@@ -23,7 +23,8 @@ def test_the_arm_without_an_effect_moves_as_its_model_does_in_mujoco(tmp_path) -
         [Recipe("case_0000", "", True, (9, 1)), Recipe("case_0001", "controller.stiffness", True, (9, 2))],
         tmp_path / "cases",
         tmp_path / "labels",
-        (4.0, 4.0),
+        4.0,
+        4.0,
     )
     rms = {}
     for case in ("case_0000", "case_0001"):
