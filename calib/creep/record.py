@@ -26,9 +26,9 @@ Value: TypeAlias = Literal["gain", "offset", "position_offset", "coulomb", "load
 FAMILY: dict[Parameter, str] = {"gain": "gain", "offset": "offset", "position_offset": "zero"}
 """Parameter of a record → family of the fit."""
 VALUES: dict[Value, str] = {
-    "gain": "gain",
-    "offset": "offset",
-    "position_offset": "zero",
+    "gain": FAMILY["gain"],
+    "offset": FAMILY["offset"],
+    "position_offset": FAMILY["position_offset"],
     "coulomb": "coulomb",
     "load": "load",
     "viscous": "viscous",
@@ -74,6 +74,11 @@ def told(fit: CreepFit, family: str) -> Mask:
     reasons = missing(fit)
     parameter = next((each for each, of in FAMILY.items() if of == family), None)
     return np.array([parameter is None or (name, parameter) not in reasons for name in fit.names])
+
+
+def values_told(fit: CreepFit, family: str) -> Array:
+    """A family's estimates (n,), NaN where the data do not determine them."""
+    return np.where(told(fit, family), fit.value(family), np.nan)
 
 
 def _no_gain(fit: CreepFit, joint: int, loaded: bool) -> str:
@@ -177,8 +182,7 @@ class CreepCalibration:
 
     def value(self, parameter: Value) -> Array:
         """Estimates (n,); the gain is what a drive reads for 1 N·m, 1/k."""
-        family = self._family(parameter)
-        return np.where(told(self.fit, family), self.fit.value(family), np.nan)
+        return values_told(self.fit, self._family(parameter))
 
     def std(self, parameter: Value) -> Array:
         """Standard deviations (n,)."""

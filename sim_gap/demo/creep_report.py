@@ -8,10 +8,9 @@ import numpy as np
 from plotly.subplots import make_subplots
 from rich.table import Table
 
-from calib.creep.record import HEADINGS, missing, told
+from calib.creep.record import HEADINGS, missing, told, values_told
 from calib.report.figures import COLOURS, GREY, PANEL, verify_figure
 from calib.report.page import ReportTable, Section, paragraph, render
-from gcomp.arrays import Array
 from sim_gap.demo.creep_run import CreepDemo, worst_gain_error
 from sim_gap.demo.show import gap_line
 from sim_gap.demo.summary import SCHEMA, measured, numbers
@@ -34,7 +33,7 @@ def summary(result: CreepDemo) -> dict[str, Any]:
         "sensors": {
             name: {
                 "true": numbers(true[name]),
-                "estimated": numbers(_seen(result, family)),
+                "estimated": numbers(values_told(result.fit, family)),
                 "ci95": _intervals(result, family),
             }
             for name, family in found.items()
@@ -168,12 +167,8 @@ def _gravity(result: CreepDemo) -> Section:
     return Section("Gravity model", paragraph(text), [verify_figure(verify)], [table])
 
 
-def _seen(result: CreepDemo, family: str) -> Array:
-    return np.where(told(result.fit, family), result.fit.value(family), np.nan)
-
-
 def _intervals(result: CreepDemo, family: str) -> list[list[float | None] | None]:
-    seen = np.isfinite(_seen(result, family))
+    seen = np.isfinite(values_told(result.fit, family))
     return [numbers(row) if kept else None for row, kept in zip(result.fit.ci95(family), seen, strict=True)]
 
 
