@@ -89,14 +89,7 @@ def confirm(question: str) -> None:
 
 def print_preflight(found: "Preflight") -> None:
     """Print the findings of the pre-flight, one row per joint."""
-    headings = (
-        "joint",
-        "torque noise [N·m]",
-        "torque at rest [N·m]",
-        "drive [°C]",
-        "lower stop",
-        "upper stop [rad]",
-    )
+    headings = ("joint", "torque noise [N·m]", "torque at rest [N·m]", "drive [°C]", "lower stop", "upper stop [rad]")
     table = Table(*headings, title="Pre-flight")
     for joint, name in enumerate(_without_common(found.names)):
         stops = [

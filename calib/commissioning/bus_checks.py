@@ -83,6 +83,11 @@ def _absent_interface(bus: Bus) -> SetupFinding | None:
     return SetupFinding("error", "the interface is down", name, f"sudo ip link set {bus.channel} up{set_up}")
 
 
+def another_drive(mismatch: str, where: str) -> SetupFinding:
+    """A drive that is not the one of the arm file."""
+    return SetupFinding("error", mismatch, where, "connect the right arm, or correct its drive under link.joints")
+
+
 def _drives(arm_file: ArmFile, opened: CanBus, bus: str) -> Iterator[SetupFinding]:
     """What the drives on the open bus say against the arm file."""
     groups = make_groups(arm_file, opened)
@@ -97,5 +102,4 @@ def _drives(arm_file: ArmFile, opened: CanBus, bus: str) -> Iterator[SetupFindin
         if not each.present:
             yield SetupFinding("error", f"no answer on {bus}", where, "check its power, wiring and id")
         elif each.mismatch:
-            remedy = "connect the right arm, or correct its drive under link.joints"
-            yield SetupFinding("error", each.mismatch, where, remedy)
+            yield another_drive(each.mismatch, where)

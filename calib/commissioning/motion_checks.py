@@ -49,9 +49,7 @@ def motion_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
         ):
             yield from _stops(arm_file, guess)
     if creeping:
-        plan_creep(
-            arm_file
-        )  # raises where it cannot be made; joints that gravity does not load are findings of the model
+        plan_creep(arm_file)  # raises where it cannot be made; the model's own findings have the joints without load
         return
     plan = plan_sweep(arm_file, guess)
     checked = check_plan(arm_file, plan)

@@ -12,6 +12,7 @@ from armlink.bus.can_bus import CanBus
 from armlink.drives.registry import family
 from armlink.errors import BusFault
 from armlink.link.link import Link
+from calib.commissioning.bus_checks import another_drive
 from calib.commissioning.finding import SetupFinding
 
 
@@ -43,11 +44,8 @@ def own_copy(arm: ArmFile, out: Path, bus: dict[str, str | int], opened: CanBus,
     missing = [f"{there.names[each.joint]} ({each.address})" for each in found if not each.present]
     if missing:
         raise BusFault(f"no answer from {', '.join(missing)} on {opened.channel_info}: check power, wiring and ids")
-    remedy = "connect the right arm, or correct its drive under link.joints"
     wrong = [
-        SetupFinding("error", each.mismatch, f"{there.names[each.joint]} ({each.address})", remedy)
-        for each in found
-        if each.mismatch
+        another_drive(each.mismatch, f"{there.names[each.joint]} ({each.address})") for each in found if each.mismatch
     ]
     content: dict[str, Any] = yaml.safe_load(arm.path.read_text(encoding="utf-8"))
     content = {key: value for key, value in content.items() if key != "sim"}
