@@ -16,8 +16,10 @@ import armlink
 from armlink import cli
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "campaigns"))
+sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
 from creep_walk import PAGE
 from docs_walk import left_out, lines_of
+from soft_links import CREEP, JOINTS, SIM
 
 DRIVE = {"family": "damiao", "model": "DM4340", "kp": 50, "kd": 5}
 LIMITS = {"rated_torque": 9.0, "max_torque": 22.0}
@@ -26,10 +28,7 @@ ARM = {
     "serial": "DOCS",
     "kinematics": {
         "gravity": [9.80665, 0.0, 0.0],
-        "joints": [
-            {"name": "upper", "a": 0.25, "alpha": 0.0, "lower": -1.4, "upper": 1.4},
-            {"name": "fore", "a": 0.2, "alpha": 1.5707963, "lower": -1.6, "upper": 1.6},
-        ],
+        "joints": JOINTS,
     },
     "link": {
         "bus": {"interface": "armlink_sim", "channel": "my-openarm.yaml"},
@@ -40,15 +39,8 @@ ARM = {
         ],
         "park": {"pose": [0.0, 0.0], "speed": 0.4},
     },
-    "sweep": {"creep": {"span": 1.0, "speeds": [0.3, 0.2], "bin": 0.12}},
-    "sim": {
-        "links": [
-            {"mass": 1.0, "com": [0.12, 0.01, 0.0], "inertia": [0.004] * 3},
-            {"mass": 0.6, "com": [0.1, -0.02, 0.0], "inertia": [0.002] * 3},
-        ],
-        "quasi_direct": {},
-        "step": 0.004,
-    },
+    "sweep": {"creep": CREEP},
+    "sim": SIM,
 }
 PASSES = ("unloaded", "loaded", "unloaded-again")
 NOT_HERE = ("armlink float", "armlink drives", "armlink sweep openarm --plan")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from soft_links import CREEP, JOINTS, SIM
 
 from armlink.arm_file import ArmFile, parse_arm
 from armlink.link.link import Link
@@ -24,30 +25,17 @@ from sim_bus.truth import Truth
 @cache
 def arm(motion: str | None = None) -> ArmFile:
     """Two Damiao drives, both axes horizontal."""
-    names, half = ("upper", "fore"), np.pi / 2
-    joints = [
-        {"name": names[0], "a": 0.25, "alpha": 0.0, "lower": -1.4, "upper": 1.4},
-        {"name": names[1], "a": 0.2, "alpha": half, "lower": -1.6, "upper": 1.6},
-    ]
     keys = {"family": "damiao", "model": "DM4340", "kp": 50, "kd": 5}
     drives = [
-        {"name": name, "drive": {**keys, "id": i + 1, "reply": i + 17}, "rated_torque": 9.0, "max_torque": 22.0}
-        for i, name in enumerate(names)
+        {"name": joint["name"], "drive": {**keys, "id": i, "reply": i + 16}, "rated_torque": 9.0, "max_torque": 22.0}
+        for i, joint in enumerate(JOINTS, start=1)
     ]
-    creep = {"span": 1.0, "speeds": [0.3, 0.2], "bin": 0.12}
     content = {
         "name": "two",
-        "kinematics": {"gravity": [9.80665, 0.0, 0.0], "joints": joints},
+        "kinematics": {"gravity": [9.80665, 0.0, 0.0], "joints": JOINTS},
         "link": {"rate": 50, "joints": drives},
-        "sweep": {"creep": creep, **({} if motion is None else {"motion": motion})},
-        "sim": {
-            "links": [
-                {"mass": 1.0, "com": [0.12, 0.01, 0.0], "inertia": [0.004] * 3},
-                {"mass": 0.6, "com": [0.1, -0.02, 0.0], "inertia": [0.002] * 3},
-            ],
-            "quasi_direct": {},
-            "step": 0.004,
-        },
+        "sweep": {"creep": CREEP, **({} if motion is None else {"motion": motion})},
+        "sim": SIM,
     }
     return parse_arm(content, Path("two.yaml"))
 
