@@ -11,7 +11,7 @@ from calib.fit.lags import Lags
 from calib.fit.position_field import PositionField
 from calib.fit.refinement import Extra, Refined, refine
 from calib.fit.remaining_doubt import remaining_doubt
-from calib.fit.small_troubles import Setting
+from calib.fit.small_troubles import FAMILIES, Setting
 from calib.fit.sweep_readings import SweepReadings
 from calib.fit.unmodelled_effects import Effect, size_of, strongest_effect
 from calib.records.records import Discrepancy
@@ -82,6 +82,9 @@ def examine(
         kept = replace(rows.readings, torque=np.where(outliers, np.nan, rows.readings.torque))
         return refine(replace(rows, readings=kept), setting, fit, priors, extras)
 
+    refined = fitted()
+    level = float(refined.levels.level[FAMILIES.index("direction")])
+    setting = replace(setting, lags=Lags.of(kinematics, rows, refined.fit.complete, rated, level))
     refined = fitted()
     for _ in range(MOST_EFFECTS):
         strange = _outliers(kinematics, refined, rows, [extra for effect in effects for extra in effect.extras])
