@@ -37,6 +37,10 @@ these percentiles, so that a knock does not widen it. Chosen on the saturated se
 BLURRED = 3.0
 """Factor to the median standard deviation beyond which a reading, as of a swinging arm, cannot show a limit."""
 
+LAGGING = 1.5
+"""Level of the lags beyond which the sensors' plays are taken as wide as they are, in a second fit; below, readings do
+not show the difference."""
+
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
@@ -84,8 +88,9 @@ def examine(
 
     refined = fitted()
     level = float(refined.levels.level[FAMILIES.index("direction")])
-    setting = replace(setting, lags=Lags.of(kinematics, rows, refined.fit.complete, rated, level))
-    refined = fitted()
+    if level > LAGGING:
+        setting = replace(setting, lags=Lags.of(kinematics, rows, refined.fit.complete, rated, level))
+        refined = fitted()
     for _ in range(MOST_EFFECTS):
         strange = _outliers(kinematics, refined, rows, [extra for effect in effects for extra in effect.extras])
         if (strange != outliers).any():
