@@ -8,7 +8,9 @@ joints; statics by the simulated arm's own physics, models by least squares as a
 import argparse
 import sys
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -45,11 +47,8 @@ class Case:
 
     @classmethod
     def drawn(cls, level: float, seed: int, learning: float = LEARNING) -> "Case":
-        file = "sarcos" if seed % 3 == 0 else drawn_arm(seed)[0]
-        arm = RealArm(file, level, seed)
-        case = cls(arm, arm.observer(), np.random.default_rng([seed, 17]))
-        case.work(learning)
-        return case
+        """A case of its own; the work before the change is done once for all scenarios."""
+        return deepcopy(_worked(level, seed, learning))
 
     def work(self, seconds: float, until: Callable[[list[Event]], bool] = lambda events: False) -> list[Event]:
         """Events of so long, with their times from its beginning."""
@@ -63,6 +62,15 @@ class Case:
         """Gain and offset of a joint's readings as the controller sends them."""
         arm = self.arm
         return arm.gain[joint] / arm.held_gain[joint], (arm.offset - arm.held_offset)[joint] / arm.held_gain[joint]
+
+
+@cache
+def _worked(level: float, seed: int, learning: float) -> Case:
+    file = "sarcos" if seed % 3 == 0 else drawn_arm(seed)[0]
+    arm = RealArm(file, level, seed)
+    case = Case(arm, arm.observer(), np.random.default_rng([seed, 17]))
+    case.work(learning)
+    return case
 
 
 def is_drift_of(event: Event, joint: str) -> bool:
@@ -158,6 +166,8 @@ def contacts(level: int, given: argparse.Namespace) -> list[str]:
             events += case.work(150.0)
         written += sum(event.finding is not None for event in events)
         held += case.observer.held
+        told = [(event.kind, event.joint, event.evidence.get("cause")) for event in events][:6]
+        print(f"contacts: level {level}, draw {seed}: {size:.1%}, held {case.observer.held}, {told}", flush=True)
     print(f"contacts: level {level}: {written} written, {held} of {given.draws} left held")
     return [f"level {level}: a contact was written"] * bool(written) + [f"level {level}: left held"] * bool(held)
 

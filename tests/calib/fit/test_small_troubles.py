@@ -58,10 +58,11 @@ def test_levels_of_drawn_effects_are_found() -> None:
     assert np.mean(found, axis=0) == pytest.approx([2.0, 0.45], rel=0.15)
 
 
-def test_nothing_to_find_leaves_the_least_level_and_a_large_effect_the_largest() -> None:
+def test_nothing_to_find_leaves_what_the_readings_cannot_exclude_and_a_large_effect_the_largest_level() -> None:
+    """A coefficient of 200 readings is known to 1/(3 √200) = 0.024, the level of forty to a fraction of that."""
     random = np.random.default_rng(2)
     effects, family = 3 * random.normal(size=(200, 40)), np.zeros(40, dtype=np.int64)
-    for size, low, high in ((0.0, LEAST, 2 * LEAST), (60.0, LARGEST, LARGEST)):
+    for size, low, high in ((0.0, 1.1 * LEAST, 0.012), (60.0, LARGEST, LARGEST)):
         target = effects @ (size * random.normal(size=40)) + random.normal(size=200)
         level = learn(Effects.of(np.zeros((200, 1)), effects, target, family, 1), np.ones(1)).level[0]
         assert low * (1 - 1e-9) <= level <= high * (1 + 1e-9)
