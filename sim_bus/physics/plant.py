@@ -260,12 +260,13 @@ class Plant:
                 data.qfrc_applied[:] = gears.forces(data, self._lost)
                 data.qfrc_applied[self._dof] += self._pulled
             mujoco.mj_step(model, data)
-            self._made += self._motor_torques * (duration / count)
+            if self.averages:
+                self._made += self._motor_torques * (duration / count)
             level = level + slope
-        # the integrator is implicit: a step's damping acts on the velocity at its end
-        damped = model.actuator_biasprm[:, 2] * (self.motor_velocity - began)
-        self._made += damped * (duration / count)
-        self._made_in += duration
+        if self.averages:  # the integrator is implicit: a step's damping acts on the velocity at its end
+            damped = model.actuator_biasprm[:, 2] * (self.motor_velocity - began)
+            self._made += damped * (duration / count)
+            self._made_in += duration
 
     def take_mean_torque(self) -> Array:
         """Mean of drive_torque (n,) [N·m] over the steps since it was asked last."""
