@@ -5,7 +5,7 @@ export PYTHON
 CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host daemon_days daemon_kills fuzz_frames fuzz_drives fuzz_guard kill_drives two_hosts scales web
 
 .DEFAULT_GOAL := help
-.PHONY: batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies pictures
+.PHONY: moving batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies pictures
 
 help: ## Say what can be done
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
@@ -48,6 +48,9 @@ realtime: .venv/.dev ## Long campaign outside make test: the whole job between p
 
 observer: .venv/.dev ## Long campaign outside make test: the observer on arms that are not perfect (ARGS="--draws 20 --only drifts")
 	$(BIN)/python tests/campaigns/observer_arms.py $(ARGS)
+
+moving: .venv/.dev ## Long campaign outside make test: changes of arms without torque sensors, found in their work (ARGS="--draws 10")
+	$(BIN)/python tests/campaigns/moving_arms.py $(ARGS)
 
 stalls: .venv/.dev ## Long campaign outside make test: sweeps while job, loop and arm are stopped, and on a busy machine
 	$(BIN)/python tests/campaigns/stalls.py $(ARGS)
