@@ -8,7 +8,7 @@ from sim_gap.checks.finding import Finding
 from sim_gap.model.rigid_body import RigidArm
 
 BEYOND = 0.2
-"""Distance beyond the end of its range from which a joint is not there [rad]: more than zeros and soft limits differ."""
+"""Distance beyond the end of its range from which a joint is not there [rad]; zeros and soft limits differ by less."""
 
 
 def find_beyond_range(arm: RigidArm, recording: Recording, stated: Corrections) -> list[Finding]:
@@ -24,6 +24,8 @@ def find_beyond_range(arm: RigidArm, recording: Recording, stated: Corrections) 
             f"runs from {least:.2f} to {most:.2f} rad, the model's joint from {low:.2f} to {high:.2f} rad: another "
             "zero, sign, unit or joint?"
         )
-        option = f"--zero {column}=ANGLE, --sign {column}=-1 or --map, or --zero {column}=0 if the model's range is wrong"
+        option = (
+            f"--zero {column}=ANGLE, --sign {column}=-1 or --map, or --zero {column}=0 if the model's range is wrong"
+        )
         found.append(Finding("zero", "q", arm.names[j], evidence, option, False))
     return found
