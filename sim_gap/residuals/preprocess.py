@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 from scipy.interpolate import make_interp_spline
 from scipy.signal import butter, sosfiltfilt, sosfreqz
@@ -20,7 +19,7 @@ from gcomp.arrays import Array
 from sim_gap.model.rigid_body import CREEP, Motion, RigidArm
 from sim_gap.residuals.channel_noise import band_noise
 from sim_gap.residuals.resampling import SLOW_HZ, bridged, coverage, low_pass, thinner
-from sim_gap.residuals.spikes import Spikes, around, spikes_of
+from sim_gap.residuals.spikes import Spikes, around_spikes, counted, spikes_of
 from sim_gap.residuals.stuck_channels import Stuck, stuck_intervals
 
 BAND_HZ = 6.0
@@ -280,41 +279,23 @@ def prepare(
         v = smooth(thin(bridged(recording.t, recording.velocity, even, label, "dq")))
         a = np.asarray(make_interp_spline(times, v, k=5)(times, 1))
     reading, known, noise = {}, {}, {}
-    channels, spikes = _without_spikes(recording)
-    for channel, values in channels.items():
+    channels = {channel: getattr(recording, name) for channel, name in CHANNELS.items()}
+    spikes = {channel: spikes_of(recording.t, x) for channel, x in channels.items() if x is not None}
+    for channel, spiked in spikes.items():
+        values = np.where(spiked, np.nan, channels[channel])
+        if not np.isfinite(values).any():
+            continue
         reading[channel] = thin(bridged(recording.t, values, even, label, channel))
         known[channel] = coverage(recording.t, values, even)[::stride]
         noise[channel] = np.array([band_noise(recording.t, values[:, j], band) for j in range(arm.n)])
     if not reading:
         raise BadInput(f"{label}: no torque channel holds a number: at least one of tau, tau_motor, tau_cmd is needed")
-    for joint, spiked in spikes.items():
-        near = around(recording.t, spiked, times)
-        for channel in known:
-            known[channel][near, joint] = 0.0
-    counts = tuple(
-        Spikes(channel, joint, int(mask.sum()), int(np.isfinite(getattr(recording, CHANNELS[channel])[:, joint]).sum()))
-        for joint, spiked in spikes.items()
-        for channel, mask in spiked.items()
-    )
+    near = around_spikes(recording.t, list(spikes.values()), times)
+    known = {channel: there * ~near for channel, there in known.items()}
     clock = times - (times[0] if start is None else start)
     temperature = _warmth(recording, times)
     signals = Signals(label, rate, band, clock, q, v, a, reading, known, noise, arm, temperature, number, groups)
-    return _without_stuck(replace(signals, spikes=counts), recording)
-
-
-def _without_spikes(recording: Recording) -> tuple[dict[str, Array], dict[int, dict[str, NDArray[np.bool_]]]]:
-    """The torque channels that hold numbers, without isolated spikes, and by joint and channel where those were."""
-    channels: dict[str, Array] = {}
-    spikes: dict[int, dict[str, NDArray[np.bool_]]] = {}
-    for channel, name in CHANNELS.items():
-        values = getattr(recording, name)
-        if values is None or not np.isfinite(values).any():
-            continue
-        masks = np.stack([spikes_of(recording.t, column) for column in values.T], axis=1)
-        channels[channel] = np.where(masks, np.nan, values)
-        for joint in np.flatnonzero(masks.any(0)).tolist():
-            spikes.setdefault(joint, {})[channel] = masks[:, joint]
-    return channels, spikes
+    return _without_stuck(replace(signals, spikes=counted(spikes, channels)), recording)
 
 
 def _warmth(recording: Recording, times: Array) -> Array | None:

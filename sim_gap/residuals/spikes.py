@@ -4,7 +4,7 @@ A late cycle of the host makes a position controller jump for a cycle or two. Wh
 few samples of it say nothing about its mean, so that neither they nor their surroundings are compared with the model.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,7 @@ from scipy.ndimage import binary_dilation, median_filter
 
 from gcomp.arrays import Array
 
+Mask = NDArray[np.bool_]
 SLOWEST_HZ = 45.0
 """Rate below which a channel's single readings are no spikes: a motion of the arm may be as short."""
 LONGEST_S, LONGEST = 0.015, 3
@@ -42,8 +43,13 @@ class Spikes:
     readings: int
 
 
-def spikes_of(t: Array, values: Array) -> NDArray[np.bool_]:
-    """Readings of a channel, NaN where there is none, that are isolated spikes, (K,) each."""
+def spikes_of(t: Array, values: Array) -> Mask:
+    """Readings of a channel at times `t` (K,), NaN where there is none, that are isolated spikes, (K, n)."""
+    return np.stack([_spikes(t, column) for column in values.T], axis=1)
+
+
+def _spikes(t: Array, values: Array) -> Mask:
+    """Those of one joint, (K,)."""
     out = np.zeros(len(values), bool)
     there = np.flatnonzero(np.isfinite(values))
     if len(there) < 100:
@@ -73,11 +79,26 @@ def spikes_of(t: Array, values: Array) -> NDArray[np.bool_]:
     return out
 
 
-def around(t: Array, spiked: Mapping[str, NDArray[np.bool_]], times: Array) -> NDArray[np.bool_]:
-    """Work times (k,) near a spike of a joint in any of its channels (K,); none where that is too much of the time."""
-    at = t[np.any(list(spiked.values()), axis=0)]
-    near = np.zeros(len(times), bool)
-    near[np.clip(np.searchsorted(times, at), 0, len(times) - 1)] = True
+def around_spikes(t: Array, spikes: Sequence[Mask], times: Array) -> Mask:
+    """Whether work times (k,) are near a spike of a joint in any of its channels, (k, n).
+
+    `spikes` are those of each channel at times `t`, (K, n) each. Joints that would lose too much time lose none.
+    """
+    near = np.zeros((len(times), spikes[0].shape[1]), bool)
     width = round(AROUND_S / float(times[1] - times[0]))
-    near = binary_dilation(near, iterations=width) if width and near.any() else near
-    return near if near.mean() <= MOST else np.zeros(len(times), bool)
+    for joint in range(near.shape[1]):
+        at = t[np.any([mask[:, joint] for mask in spikes], axis=0)]
+        if len(at):
+            near[np.clip(np.searchsorted(times, at), 0, len(times) - 1), joint] = True
+            near[:, joint] = binary_dilation(near[:, joint], iterations=width) if width else near[:, joint]
+    return np.asarray(near & (near.mean(0) <= MOST))
+
+
+def counted(spikes: Mapping[str, Mask], channels: Mapping[str, Array | None]) -> tuple[Spikes, ...]:
+    """Numbers of spikes of each channel and joint that has any."""
+    return tuple(
+        Spikes(channel, int(joint), int(mask[:, joint].sum()), int(np.isfinite(values[:, joint]).sum()))
+        for channel, mask in spikes.items()
+        if (values := channels[channel]) is not None
+        for joint in np.flatnonzero(mask.any(0))
+    )

@@ -19,6 +19,10 @@ def torque(seed: int) -> np.ndarray:
     return 20.0 * np.sin(0.6 * T) + 4.0 * np.sign(np.cos(2.0 * T)) + noise
 
 
+def found(values: np.ndarray, t: np.ndarray = T) -> np.ndarray:
+    return spikes_of(t, values[:, None])[:, 0]
+
+
 @pytest.mark.parametrize("hold", [1, 5])
 def test_spikes_are_found_where_they_are_and_nowhere_else(hold):
     drawn = np.random.default_rng(1).random(T.size // hold) < 0.002
@@ -26,26 +30,26 @@ def test_spikes_are_found_where_they_are_and_nowhere_else(hold):
     there = np.repeat(drawn, hold)
     values = np.repeat(torque(2)[::hold], hold) + 10.0 * there
     assert there.any()
-    np.testing.assert_array_equal(spikes_of(T, values), there)
+    np.testing.assert_array_equal(found(values), there)
 
 
 def test_what_is_not_rare_is_the_channels_noise():
     often = np.random.default_rng(3).random(T.size) < 0.03
-    assert not spikes_of(T, torque(2) + 10.0 * often).any()
+    assert not found(torque(2) + 10.0 * often).any()
     normal = np.random.default_rng(5).normal(0.0, 3.0, T.size)
-    assert not spikes_of(T, torque(2) + normal).any()
+    assert not found(torque(2) + normal).any()
 
 
 def test_what_lasts_is_no_spike():
     knocked = torque(2)
     knocked[3000:3010] += 10.0
-    assert not spikes_of(T, knocked).any()
+    assert not found(knocked).any()
 
 
 def test_a_slow_channel_has_no_spikes():
     slow = torque(2)[::10]
     slow[500] += 10.0
-    assert not spikes_of(T[::10], slow).any()
+    assert not found(slow, T[::10]).any()
 
 
 def test_the_diagnosis_is_the_same_and_says_how_many_samples_it_left_out():
