@@ -5,7 +5,7 @@ export PYTHON
 CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host daemon_days daemon_kills fuzz_frames fuzz_drives fuzz_guard kill_drives two_hosts scales web
 
 .DEFAULT_GOAL := help
-.PHONY: moving batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies pictures
+.PHONY: moving fleetdays batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies pictures
 
 help: ## Say what can be done
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
@@ -79,6 +79,9 @@ corruptions: .venv/.dev ## Long campaign outside make test: wrong columns, units
 
 bodies: .venv/.dev ## Long campaign outside make test: turned bases, bodies added and missing (ARGS="--tilts 40 --bodies 40")
 	$(BIN)/python tests/campaigns/gap_tilts_and_bodies.py $(ARGS)
+
+fleetdays: .venv/.dev ## Long campaign outside make test: a fleet over sixty days, five arms of which wear (ARGS="--arms 8 --days 24")
+	$(BIN)/python tests/campaigns/fleet_days.py $(ARGS)
 
 mutants: .venv/.dev ## Long campaign outside make test: changes of the source must make a test fail (MODULES="sim_gap/*/*.py" ARGS="--draw 50")
 	$(BIN)/python tests/campaigns/mutants.py $(if $(MODULES),--modules $(foreach each,$(MODULES),'$(each)')) $(ARGS)
