@@ -137,7 +137,7 @@ def _rewire(console: Any, model: Path, out: Path, bus: str, ask: "Ask | None", j
 
         content["kinematics"]["model"] = os.path.relpath(arm.model_path, out.resolve().parent)
     parse_arm(dict(content), out)
-    text = f"# {arm.name} with the drives on {channel}, from {model.name} by armlink new.\n"
+    text = f"# {arm.name} with the drives on {channel}, from {model.name}, by the command new.\n"
     out.write_text(text + yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
     for found in findings:
         console.print(str(found), style="red")
