@@ -5,7 +5,7 @@ export PYTHON
 CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host daemon_days daemon_kills fuzz_frames fuzz_drives fuzz_guard kill_drives two_hosts scales web
 
 .DEFAULT_GOAL := help
-.PHONY: moving fleetdays batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies pictures
+.PHONY: moving fleetdays batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies pictures container
 
 help: ## Say what can be done
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
@@ -88,6 +88,9 @@ mutants: .venv/.dev ## Long campaign outside make test: changes of the source mu
 
 wheel: .venv/.dev ## Build the wheel into dist/ and run the demo from it in an empty environment (ARGS="python3.12 python3.13")
 	scripts/test-wheel $(ARGS)
+
+container: ## Build packaging/Containerfile on Debian's packages and run the daemon in it, as root (BASE=docker.io/library/python:3.12-slim)
+	scripts/test-container
 
 firsthour: .venv/.dev ## Long campaign outside make test: docs/first-hour.md typed for five models, each to a finished demo report
 	$(BIN)/python tests/campaigns/first_hour.py $(ARGS)
