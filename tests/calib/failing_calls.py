@@ -293,7 +293,9 @@ class FailingDaemon(FastDaemon):
             self.wrong.append(f"{now:.1f} s: {status.state} {status.detail}, last failure at {self._failed_at:.1f} s")
         kept = self.store.current(type(self.service.records.observation.feed.calibration), self.arm)  # type: ignore[union-attr]
         if kept is None or status.records.calibration != kept.id:
-            self.wrong.append(f"{now:.1f} s: record {status.records.calibration} in force, the store has {kept and kept.id}")
+            self.wrong.append(
+                f"{now:.1f} s: record {status.records.calibration} in force, the store has {kept and kept.id}"
+            )
 
     def lost(self) -> list[Any]:
         """Events that were said and are not in the journal."""

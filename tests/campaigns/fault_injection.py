@@ -46,7 +46,7 @@ def hour(fails: Callable[[str, int], bool], minutes: float) -> tuple[FailingDaem
         daemon.failing.fails = lambda dependency, count: False
         daemon.run(60 * QUIET_MINUTES)
         wrong = daemon.wrong + [f"lost: {each}" for each in daemon.lost()]
-        off = np.abs(daemon.fast.error()[1]).max()
+        off = float(np.abs(daemon.fast.error()[1]).max())
         wrong += [f"a joint is off by {off:.2f} N·m at the end"] * (off > RECALIBRATED)
         wrong += ["a write to a controller is left half done"] * (daemon.store.unfinished_write(daemon.arm) is not None)
         return daemon, wrong
@@ -64,7 +64,10 @@ def main() -> int:
     runs: list[tuple[str, Callable[[str, int], bool]]]
     if given.bursts:
         runs = [
-            (f"{which}, {burst} in a row", lambda name, count, of=which, row=burst: name == of and count % (40 + 2 * row) < row)
+            (
+                f"{which}, {burst} in a row",
+                lambda name, count, of=which, row=burst: name == of and count % (40 + 2 * row) < row,
+            )
             for burst in BURSTS
             for which in DEPENDENCIES
         ]
@@ -79,7 +82,9 @@ def main() -> int:
             calls[name] = max(calls[name], daemon.failing.calls[name])
             failed[name] += daemon.failing.failed[name]
         bad += bool(wrong)
-        print(f"{what}: {sum(daemon.failing.failed.values())} failures, {time.process_time() - began:.0f} s", flush=True)
+        print(
+            f"{what}: {sum(daemon.failing.failed.values())} failures, {time.process_time() - began:.0f} s", flush=True
+        )
         for line in wrong[:10]:
             print(f"FAILED: {what}: {line}", flush=True)
     print(json.dumps({"runs": len(runs), "calls_an_hour": calls, "failed": failed, "runs_wrong": bad}))

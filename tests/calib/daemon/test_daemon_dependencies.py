@@ -39,8 +39,12 @@ def test_no_failing_call_ends_it_or_loses_an_event(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: list[tuple[str, str | None]], failing: str
 ) -> None:
     row, period = BURSTS[failing]
-    daemon = watched_drift(tmp_path, lambda name, count: name == failing and count % period >= period - row, monkeypatch)
-    assert daemon.failing.failed[failing] >= (4 if failing == "disk" else 10)  # recordings pause for a minute after each
+    daemon = watched_drift(
+        tmp_path, lambda name, count: name == failing and count % period >= period - row, monkeypatch
+    )
+    assert daemon.failing.failed[failing] >= (
+        4 if failing == "disk" else 10
+    )  # recordings pause for a minute after each
     assert daemon.lost() == []
     assert daemon.wrong == []
     assert [event for event in undisturbed if event not in events(daemon)] == []

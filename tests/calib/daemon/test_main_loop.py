@@ -180,7 +180,15 @@ def test_systemd_is_told_of_the_end_of_a_reload_whatever_happens(
 def test_what_systemd_s_socket_did_not_take_is_sent_later_and_only_the_newest_of_it(tmp_path: Path) -> None:
     path = tmp_path / "notify"
     notify = Notifier(str(path))
-    for line in ("READY=1", "STATUS=starting", "WATCHDOG=1", "STATUS=observing", "RELOADING=1", "READY=1", "WATCHDOG=1"):
+    for line in (
+        "READY=1",
+        "STATUS=starting",
+        "WATCHDOG=1",
+        "STATUS=observing",
+        "RELOADING=1",
+        "READY=1",
+        "WATCHDOG=1",
+    ):
         notify(line)
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
         receiver.bind(str(path))
