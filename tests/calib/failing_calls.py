@@ -5,12 +5,12 @@ The daemon is the real one, from the event loop's turns down; clock, arm, bus pr
 
 import asyncio
 import errno
+import re
 import socket
 import sqlite3
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
-from datetime import datetime
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -40,6 +40,7 @@ OF_FAULTS = ("fault", "recovered", "started", "refused", "roll-back")
 RIGHT_AGAIN = 5.0
 """State and status are right this long after the last failure [s]."""
 WATCHDOG = 10.0
+RECORD = re.compile(r"record [0-9a-f]{8}")
 STEP = 0.1
 """Between two turns of the event loop [s]."""
 
@@ -298,9 +299,12 @@ class FailingDaemon(FastDaemon):
             )
 
     def lost(self) -> list[Any]:
-        """Events that were said and are not in the journal."""
-        kept = {(event.kind, event.joint, event.text) for event in self.view.events(limit=1_000_000)}
-        return sorted(map(str, self.said - kept))
+        """Events that were said and are not in the journal.
+
+        One that belongs to a proposal which could not be kept is said again with the next one, of another record.
+        """
+        kept = {(event.kind, event.joint, RECORD.sub("", event.text)) for event in self.view.events(limit=1_000_000)}
+        return sorted(map(str, {(kind, joint, RECORD.sub("", text)) for kind, joint, text in self.said} - kept))
 
 
 def watched_drift(folder: Path, fails: Callable[[str, int], bool], patch: Any) -> FailingDaemon:

@@ -2,11 +2,11 @@
 
 python tests/campaigns/fault_injection.py [--stride 40] [--runs 40] [--minutes 60] [--bursts]
 
-Dependencies are record store (statements, commits), journal, disk of the recordings, pipe to the bus process, and systemd's
-socket. In run r the calls fail whose number leaves r when divided by the stride, so that all runs together fail each
-call once; with --bursts the runs fail 1 to 200 calls in a row, of one dependency after the other. In the hour
-ten joints drift and are recalibrated. Exit status 1 if the daemon ends, an event is lost, state or record is wrong later
-than 5 s after a failure, a sign of life is missing, or a joint is not recalibrated at the end.
+Dependencies are record store (statements, commits), journal, disk of the recordings, pipe to the bus process, and the
+socket of systemd. In run r the calls fail whose number leaves r when divided by the stride, so that all runs together
+fail each call once; with --bursts the runs fail 1 to 200 calls in a row, of one dependency after the other. In the hour
+nine joints drift and are recalibrated. Exit status 1 if the daemon ends, an event is lost, state or record is wrong
+later than 5 s after a failure, a sign of life is missing, or a joint is not recalibrated at the end.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Frames that come late, out of order, or beside a bus that is full: no joint does more than it may, and all end safe."""
+"""Frames that come late, out of order, or on a bus that is full: no joint does more than it may, and all end safe."""
 
 import random
 from collections import deque
@@ -6,7 +6,7 @@ from collections import deque
 import numpy as np
 import pytest
 from rows import ARM
-from test_lock_step import Bench, bench  # noqa: F401
+from test_lock_step import Bench
 
 from armlink.drives.canopen.object_dictionary import SYNC_ID
 from armlink.errors import ArmlinkError, BusFault
@@ -53,18 +53,16 @@ def worked(bench: Bench, cycles: int) -> tuple[int, ArmlinkError | None]:
 
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("most", [1, 3])
-def test_frames_a_few_cycles_late_in_any_order_cost_no_joint_its_hold(most: int, seed: int, bench: Bench  # noqa: F811
-) -> None:
+def test_frames_a_few_cycles_late_in_any_order_cost_no_joint_its_hold(most: int, seed: int) -> None:
+    bench = Bench()
     bench.enable()
     Disordered(bench, most, seed)
     cycles, error = worked(bench, 200)
     assert (cycles, error) == (200, None) or isinstance(error, BusFault)
     if error is None:
         assert all(state is State.ENABLED for state in bench.states)
-        with pytest.raises(BusFault):  # a node that is cut off is noticed all the same
-            bench.bus.inject("node.silent:joint_2")
-            for _ in range(60):
-                bench.link.cycle(bench.command)
+        bench.bus.inject("node.silent:joint_2")  # a node that is cut off is noticed all the same
+        assert isinstance(bench.cycles_until_fault()[1], BusFault)
     assert bench.safe()
 
 
