@@ -4,7 +4,7 @@ python tests/campaigns/systemd_units.py
 
 In a user-mode kernel (scripts/with-systemd), some minutes. The guard between arm0 and vcan0 passes a SYNC and nothing
 after a hostile frame, is killed and passes again. The daemon listens to a bus without joints; it is stopped (SIGSTOP)
-and then given too little memory. Exit status 1 if something is not as it should be, 0 with one line where it cannot run.
+and then given too little memory. Exit status 1 if something is wrong, 0 with one line where it cannot run.
 """
 
 import json

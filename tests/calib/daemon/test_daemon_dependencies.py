@@ -9,6 +9,7 @@ from failing_calls import DEPENDENCIES, events, watched_drift
 from fast_daemon import QUIET, FastDaemon
 from postgres import NoServer, stoppable_server
 
+from armlink.errors import BadInput
 from calib.daemon.settings import DaemonSection
 from calib.daemon.state.journal import Journal
 from calib.daemon.view.api_models import State
@@ -148,6 +149,32 @@ def test_a_lock_of_another_program_holds_the_daemon_for_a_moment_only(tmp_path: 
     daemon.run(3)
     assert [event.text for event in daemon.of_kind("clock")] == [f"number {number}" for number in range(100)]
     assert daemon.view.status().journal_fault is None
+
+
+def test_a_state_that_becomes_read_only_is_said_and_loses_no_event(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon.run(5)
+    daemon.service.journal._db.execute("PRAGMA query_only=ON")
+    daemon.service.events.say("clock", None, "while it was read-only", {})
+    daemon.run(5)
+    assert daemon.view.status().detail == "the journal cannot be written: attempt to write a readonly database"
+    assert daemon.view.status().state is State.OBSERVING
+    daemon.service.journal._db.execute("PRAGMA query_only=OFF")
+    daemon.run(3)
+    assert daemon.view.status().detail == ""
+    assert [event.text for event in daemon.of_kind("clock")] == ["while it was read-only"]
+
+
+def test_a_state_that_is_read_only_at_the_start_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, connect = tmp_path / "journal.db", sqlite3.connect
+    sqlite3.connect(path).execute("CREATE TABLE events (id)").connection.close()
+
+    def read_only(given: Path, **options: object) -> sqlite3.Connection:
+        return connect(f"file:{given}?mode=ro", uri=True, **options)  # type: ignore[call-overload,no-any-return]
+
+    monkeypatch.setattr(sqlite3, "connect", read_only)
+    with pytest.raises(BadInput, match=r"journal.db: the journal cannot be opened: attempt to write a readonly database"):
+        Journal(path)
 
 
 def test_what_cannot_be_committed_is_not_half_kept(tmp_path: Path) -> None:
