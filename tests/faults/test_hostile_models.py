@@ -12,9 +12,7 @@ from gcomp.arm.load import compile_model as compile_chain
 from gcomp.errors import BadModel
 
 SECRET = "swordfish"
-BODY = (
-    '<worldbody><body name="a"><joint name="j" type="hinge"/><geom type="sphere" size="0.1" mass="1"/></body></worldbody>'
-)
+BODY = '<worldbody><body name="a"><joint name="j" type="hinge"/><geom type="sphere" size="0.1" mass="1"/></body></worldbody>'
 SHAPE = '<worldbody><body><joint type="hinge"/><geom type="mesh" mesh="m" mass="1"/></body></worldbody>'
 BOMB = "".join(f'<!ENTITY a{i} "' + f"&a{i - 1};" * 10 + '">' for i in range(1, 10))
 MODELS = {

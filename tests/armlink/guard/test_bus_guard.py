@@ -233,6 +233,13 @@ def test_a_joint_outside_its_window_may_be_held_where_it_stands(side):
     assert not joints.send(0x201, COMMAND.pack(0x0F, 0, place + side), PERIOD)[0]
 
 
+@pytest.mark.parametrize("data", [b"\x00", b"\x00\x07"])
+def test_a_restart_is_known_by_its_first_byte(data):
+    joints = Joints()
+    joints.policy.hear(0x701, data, joints.now)
+    assert "acknowledged" in joints.policy.refusal(0x201, COMMAND.pack(0x0F, 0, 0), joints.now)
+
+
 def test_only_the_answer_that_means_it_is_an_acknowledgement():
     joints = Joints()
     joints.policy.hear(0x701, b"\x00", joints.now)
