@@ -2,10 +2,10 @@
 PYTHON ?= python3
 BIN := .venv/bin
 export PYTHON
-CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host daemon_days daemon_kills fuzz_frames fuzz_drives fuzz_guard kill_drives two_hosts scales web
+CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host daemon_days daemon_kills fuzz_frames fuzz_drives fuzz_guard fault_injection systemd_units kill_drives two_hosts scales web
 
 .DEFAULT_GOAL := help
-.PHONY: moving fleetdays batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies pictures container
+.PHONY: moving fleetdays batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies pictures container lock audit sbom
 
 help: ## Say what can be done
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
@@ -106,6 +106,15 @@ constraints: .venv/.dev ## Write constraints.txt anew from what .venv holds
 	@sed -n '/^#/p' constraints.txt > constraints.new
 	@$(BIN)/python -m pip freeze --exclude-editable | grep -E '^[A-Za-z0-9._-]+==' >> constraints.new
 	@mv constraints.new constraints.txt
+
+lock: .venv/.dev ## Write requirements.lock and requirements-dev.lock anew: exact versions with the hashes of their files
+	scripts/lock
+
+audit: .venv/.dev ## Look the locked dependencies up in the database of known vulnerabilities (needs the network)
+	@scripts/audit
+
+sbom: .venv/.dev ## Write armlink.cdx.json: the locked dependencies as a bill of materials (CycloneDX)
+	$(BIN)/python -m cyclonedx_py requirements requirements.lock --pyproject pyproject.toml --output-reproducible -o armlink.cdx.json
 
 clean: ## Remove what was made, .venv included
 	rm -rf .venv .venv.log armlink-demo site .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
