@@ -173,7 +173,9 @@ def test_a_state_that_is_read_only_at_the_start_is_one_line(tmp_path: Path, monk
         return connect(f"file:{given}?mode=ro", uri=True, **options)  # type: ignore[call-overload,no-any-return]
 
     monkeypatch.setattr(sqlite3, "connect", read_only)
-    with pytest.raises(BadInput, match=r"journal.db: the journal cannot be opened: attempt to write a readonly database"):
+    with pytest.raises(
+        BadInput, match=r"journal.db: the journal cannot be opened: attempt to write a readonly database"
+    ):
         Journal(path)
 
 
