@@ -32,7 +32,8 @@ def notes(
     left: dict[Row, Array],
 ) -> tuple[str, ...]:
     """All notes; `fit` is the training set, `judge` the held-out set with the remaining residual `left`."""
-    known = (*_noisy(fit), *_stuck(stuck, fit), *_impacts(fit), *_bound(estimate, fit, judge), *_alike(found))
+    usual = (*_noisy(fit), *_spiked((fit, judge)), *_stuck(stuck, fit), *_impacts(fit))
+    known = (*usual, *_bound(estimate, fit, judge), *_alike(found))
     return (*known, *_remaining(judge, left), *_at_rest(fit))
 
 
@@ -55,6 +56,21 @@ def _stuck(stuck: Sequence[Stuck], data: ResidualSet) -> tuple[str, ...]:
         for one in stuck
     )
     return tuple(dict.fromkeys(lines))
+
+
+def _spiked(sets: Sequence[ResidualSet]) -> tuple[str, ...]:
+    """A note for each channel with isolated spikes: how many samples of which joints are left out."""
+    every = [(s.arm.names[one.joint], one) for data in sets for s in data.signals for one in s.spikes]
+    lines = []
+    for channel in dict.fromkeys(one.channel for _, one in every):
+        ours = [(name, one) for name, one in every if one.channel == channel]
+        count, readings = (sum(getattr(one, part) for _, one in ours) for part in ("count", "readings"))
+        joints = {name: sum(one.count for other, one in ours if other == name) for name, _ in ours}
+        lines.append(
+            f"{channel}: {count} samples of {readings} ({count / readings:.2%}) are left out as spikes, each far from "
+            f"those before and after it ({', '.join(f'{name} {number}' for name, number in joints.items())})"
+        )
+    return tuple(lines)
 
 
 def _impacts(data: ResidualSet) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from armlink.recording.corrections import Corrections, parse_corrections
 from armlink.recording.recording import Recording
 from sim_gap.checks.clock import even_times, without_repeats
 from sim_gap.checks.finding import Finding
+from sim_gap.checks.joint_range import find_beyond_range
 from sim_gap.checks.mapping import SURE, find_mapping
 from sim_gap.checks.rigid_fit import as_mounted, fit_rigid, motion_of
 from sim_gap.checks.torque_source import find_delay, find_scale, find_source, find_unsigned
@@ -61,6 +62,8 @@ def check_recording(
                 s = prepare(recording, arm, label)
             if channel not in s.channels:  # taken for another one
                 break
+    for finding in find_beyond_range(arm, recording, stated):
+        raise BadInput(f"{label}: {finding.sentence()}")
     recording, velocity = sound_velocity(recording, stated)
     return recording, [*found, *velocity]
 

@@ -19,8 +19,11 @@ from sim_gap.checks.finding import Finding, Kind
 from sim_gap.checks.rigid_fit import STRONG_SHARE, Motion, RigidFit, as_mounted, changed, few_rows, fit_rigid
 from sim_gap.model.rigid_body import RigidArm
 
-SURE = 0.7
-"""Fall of the summed cost from which a hypothesis is accepted; a wrong one reaches 0.1 on sound recordings."""
+SURE = 0.3
+"""Fall of the summed cost from which a hypothesis is accepted; a wrong one stays below 0.15 on sound recordings."""
+DOUBTED = 0.4
+"""Fall from which one that makes a joint much worse, or contradicts the model, is asked about; on sound recordings no
+hypothesis at all reaches 0.25."""
 SCREENED = 0.3
 """Share of that fall that a hypothesis must reach on few rows."""
 MOST_WORSE = 0.5
@@ -54,14 +57,15 @@ def find_mapping(arm: RigidArm, motion: Motion, stated: Corrections, follows: Se
     """
     fit = _as_an_arm(arm, motion)
     taken: list[tuple[Hypothesis, float]] = []
-    for _ in range(2 * arm.n):
+    doubted = False
+    while not doubted and len(taken) < 2 * arm.n:
         best = _best(arm, motion, fit, list(hypotheses(arm, motion.channel, stated, follows)))
         if best is None:
             break
-        hypothesis, fit, fall = best
+        hypothesis, fit, fall, doubted = best
         motion = hypothesis.change(motion)
         taken.append((hypothesis, fall))
-    sure = _is_sound(fit, {joint for hypothesis, _ in taken for joint in hypothesis.joints})
+    sure = not doubted and _is_sound(fit, {joint for hypothesis, _ in taken for joint in hypothesis.joints})
     return [_finding(arm, hypothesis, fit, fall, sure) for hypothesis, fall in taken]
 
 
@@ -69,22 +73,26 @@ def _as_an_arm(arm: RigidArm, motion: Motion) -> RigidFit:
     """The fit as it stands, gravity and springs included where they explain a joint: those are effects of the arm."""
     mounted = as_mounted(arm, motion)
     plain, sprung = fit_rigid(mounted, motion), fit_rigid(mounted, motion, springs=True)
-    return replace(plain, explained=np.where(sprung.explained > SPRUNG, sprung.explained, plain.explained))
+    beside = (sprung.scale > PLAUSIBLE[0]) | (sprung.own_share < STRONG_SHARE)  # not in place of gravity
+    return replace(plain, explained=np.where(beside & (sprung.explained > SPRUNG), sprung.explained, plain.explained))
 
 
 def _best(
     arm: RigidArm, motion: Motion, fit: RigidFit, possible: Sequence[Hypothesis]
-) -> tuple[Hypothesis, RigidFit, float] | None:
-    """The hypothesis that lowers the cost most, if by enough."""
-    best, most, few = None, SURE, few_rows(motion)
+) -> tuple[Hypothesis, RigidFit, float, bool] | None:
+    """The hypothesis that lowers the cost most, if by enough, and whether it is doubted; a doubted one comes last."""
+    best, most, few = None, {False: SURE, True: DOUBTED}, few_rows(motion)
     for hypothesis in possible:
         if float((fit.cost - fit_rigid(arm, hypothesis.change(few)).cost).sum()) < SCREENED * SURE:
             continue
         better = fit_rigid(arm, hypothesis.change(motion))
         fall = float((fit.cost - better.cost).sum())
         worse = float(np.max(better.cost - fit.cost))
-        if fall > most and worse < MOST_WORSE * fall and not _contradicts(better, hypothesis.joints):
-            best, most = (hypothesis, better, fall), fall
+        doubted = worse >= MOST_WORSE * fall or _contradicts(better, hypothesis.joints)
+        if fall > most[doubted]:
+            most[doubted] = fall
+            if best is None or best[3] or not doubted:
+                best = (hypothesis, better, fall, doubted)
     return best
 
 

@@ -32,6 +32,8 @@ def diagnose_fleet(
     from sim_gap.fleet.cluster import cluster, open_to_all
     from sim_gap.fleet.fleet import Answers, diagnose_fleet, find_cases
     from sim_gap.fleet.fleet import table as table_of
+    from sim_gap.fleet.trends import fleet_outliers, fleet_trends
+    from sim_gap.fleet.trends import rows as rows_of
 
     cases = find_cases(folder, sim)
     answers = Answers(out or folder / "answers.jsonl")
@@ -51,9 +53,11 @@ def diagnose_fleet(
     found = {case.name: answers.found[case.name] for case in cases}
     rows = table_of(found)
     _show(rows, console)
+    trends, outliers = rows_of(fleet_trends(found)), rows_of(fleet_outliers(found))
+    _show_changes(trends, outliers, console)
     if table is not None:
         _write_table(rows, table)
-    write_json(json_file, {"schema": "armlink.gap-fleet/1", "answers": found})
+    write_json(json_file, {"schema": "armlink.gap-fleet/1", "answers": found, "trends": trends, "outliers": outliers})
     return int(any("error" in answer for answer in found.values()))
 
 
@@ -76,6 +80,25 @@ def _show(rows: list[dict[str, Any]], console: Any) -> None:
     for row in rows:
         if row["error"]:
             console.print(f"{row['case']}: {row['error']}", style="yellow", markup=False)
+
+
+def _show_changes(trends: list[dict[str, Any]], outliers: list[dict[str, Any]], console: Any) -> None:
+    """Print what changes on which arm, and which arm differs from the others."""
+    from rich.table import Table
+
+    if trends:
+        shown = Table("arm", "effect", "joint", "parameter", "before", "now", "since", "noticed", title="what changes")
+        for one in trends:
+            values = (f"{one['before']:.3g}", f"{one['now']:.3g} {one['unit']}")
+            names = (one["arm"], one["effect"], one["joint"], one["parameter"])
+            shown.add_row(*names, *values, one["since"], one["noticed"])
+        console.print(shown)
+    for one in outliers:
+        console.print(
+            f"{one['arm']}: {one['effect']} of {one['joint']}: {one['parameter']} {one['value']:.3g} {one['unit']}, "
+            f"{one['others']:.3g} on the other arms",
+            markup=False,
+        )
 
 
 def _write_table(rows: list[dict[str, Any]], path: Path) -> None:

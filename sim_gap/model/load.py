@@ -129,6 +129,7 @@ def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:
         offset=np.array([up[0].T @ (own[1] - up[1]) for up, own in zip(ups, frames, strict=True)]),
         axis=np.array([model.jnt_axis[j] / np.linalg.norm(model.jnt_axis[j]) for j in joints]),
         zero=model.qpos0[adr].copy(),
+        range=np.where(model.jnt_limited[list(joints)][:, None], model.jnt_range[list(joints)], (-np.inf, np.inf)),
         inertial=inertial,
         gravity=model.opt.gravity.copy(),
         armature=model.dof_armature[dof].copy(),

@@ -55,6 +55,8 @@ class RigidArm:
     """Joint axis in the link frame, (n, 3)."""
     zero: Array
     """Joint position at angle zero (MuJoCo's qpos0) [rad], (n,)."""
+    range: Array
+    """Lowest and highest position of each joint [rad], (n, 2); infinite without limits."""
     inertial: Array
     """Mass [kg], first moment [kg·m], inertia about the origin [kg·m²] in the link frame, (n, 10) as in INERTIAL."""
     gravity: Array

@@ -19,6 +19,7 @@ from gcomp.arrays import Array
 from sim_gap.model.rigid_body import CREEP, Motion, RigidArm
 from sim_gap.residuals.channel_noise import band_noise
 from sim_gap.residuals.resampling import SLOW_HZ, bridged, coverage, low_pass, thinner
+from sim_gap.residuals.spikes import Spikes, around_spikes, counted, spikes_of
 from sim_gap.residuals.stuck_channels import Stuck, stuck_intervals
 
 BAND_HZ = 6.0
@@ -73,6 +74,8 @@ class Signals:
     """Angle by which that body is turned about the last joint's axis, against the other recordings [rad]."""
     stuck: tuple[Stuck, ...] = ()
     """Channels that are stuck for some time, in which they are not `known`."""
+    spikes: tuple[Spikes, ...] = ()
+    """Channels with isolated spikes, which were interpolated; around them they are not `known`."""
     found: "Found | None" = None
     """What an estimate has found, if q, v, a and arm are those of the estimate."""
 
@@ -276,19 +279,23 @@ def prepare(
         v = smooth(thin(bridged(recording.t, recording.velocity, even, label, "dq")))
         a = np.asarray(make_interp_spline(times, v, k=5)(times, 1))
     reading, known, noise = {}, {}, {}
-    for channel, name in CHANNELS.items():
-        values = getattr(recording, name)
-        if values is None or not np.isfinite(values).any():
+    channels = {channel: getattr(recording, name) for channel, name in CHANNELS.items()}
+    spikes = {channel: spikes_of(recording.t, x) for channel, x in channels.items() if x is not None}
+    for channel, spiked in spikes.items():
+        values = np.where(spiked, np.nan, channels[channel])
+        if not np.isfinite(values).any():
             continue
         reading[channel] = thin(bridged(recording.t, values, even, label, channel))
         known[channel] = coverage(recording.t, values, even)[::stride]
         noise[channel] = np.array([band_noise(recording.t, values[:, j], band) for j in range(arm.n)])
     if not reading:
         raise BadInput(f"{label}: no torque channel holds a number: at least one of tau, tau_motor, tau_cmd is needed")
+    near = around_spikes(recording.t, list(spikes.values()), times)
+    known = {channel: there * ~near for channel, there in known.items()}
     clock = times - (times[0] if start is None else start)
     temperature = _warmth(recording, times)
     signals = Signals(label, rate, band, clock, q, v, a, reading, known, noise, arm, temperature, number, groups)
-    return _without_stuck(signals, recording)
+    return _without_stuck(replace(signals, spikes=counted(spikes, channels)), recording)
 
 
 def _warmth(recording: Recording, times: Array) -> Array | None:

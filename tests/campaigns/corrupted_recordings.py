@@ -3,6 +3,8 @@
     python tests/campaigns/corrupted_recordings.py --draws 200 [--realdata DIR]
 
 One line a draw, then what was noticed by kind; the recordings as they are must be no finding. Exit status 1 below 98 %.
+A draw that passed is marked `unseen` if the model explains the spoiled data as well as the sound ones (the zero of a
+last joint on whose axis its mass lies, two wrist joints in which friction is all): no torque can tell it.
 """
 
 import argparse
@@ -19,10 +21,14 @@ from armlink.recording.corrections import AS_IT_IS
 from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording, take_joints
 from sim_gap.checks.check import check_recording
+from sim_gap.checks.rigid_fit import as_mounted, fit_rigid, motion_of
 from sim_gap.model.load import load_model
+from sim_gap.residuals.preprocess import prepare
 
 ARMS = (("ur10e", "train_a"), ("tx40", "recording"), ("ur10", "recording"), ("panda", "recording"), ("lwr4", "train"))
 GOAL = 0.98
+UNSEEN = 0.15
+"""Rise of the logarithm of what the model leaves, over all joints, below which sound recordings differ as much."""
 Corruption = Callable[[Recording, np.random.Generator], Recording | None]
 
 
@@ -144,6 +150,13 @@ def said(arm, recording: Recording) -> str:
         return f"refused: {error}"
 
 
+def left_by_model(arm, recording: Recording) -> float:
+    """Logarithm of what the model leaves of the torques, summed over the joints, gravity along the axis that fits."""
+    s = prepare(recording, arm, "r")
+    motion = motion_of(s, s.channels[0])
+    return float(fit_rigid(as_mounted(arm, motion), motion).cost.sum())
+
+
 def main() -> int:
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("--draws", type=int, default=200)
@@ -156,7 +169,7 @@ def main() -> int:
         arms[folder] = load_model(asked.realdata / folder / "sim.xml", (), recording.n).arm, recording
     alarms = {folder: text for folder, (arm, recording) in arms.items() if (text := said(arm, recording))}
     print("as recorded:", alarms or "no finding", flush=True)
-    random, seen, noticed = np.random.default_rng(asked.seed), Counter(), Counter()
+    random, seen, noticed, unseen = np.random.default_rng(asked.seed), Counter(), Counter(), 0
     while seen.total() < asked.draws:
         kind = list(CORRUPTIONS)[random.integers(len(CORRUPTIONS))]
         folder = list(arms)[random.integers(len(arms))]
@@ -167,11 +180,19 @@ def main() -> int:
         text = said(arm, spoiled)
         seen[kind] += 1
         noticed[kind] += bool(text)
-        print(f"{kind:20s} {folder:6s} {text or 'NOTHING'}"[:200], flush=True)
+        if not text:
+            rise = left_by_model(arm, spoiled) - left_by_model(arm, recording)
+            unseen += rise < UNSEEN
+            text = f"NOTHING, {'unseen' if rise < UNSEEN else 'MISSED'}: the cost rises by {rise:.2f}"
+        print(f"{kind:20s} {folder:6s} {text}"[:200], flush=True)
     for kind in seen:
         print(f"{kind:20s} {noticed[kind]} of {seen[kind]}")
     share = noticed.total() / seen.total()
-    print(f"noticed: {noticed.total()} of {seen.total()}, {share:.1%}")
+    told = seen.total() - unseen
+    print(
+        f"noticed: {noticed.total()} of {seen.total()}, {share:.1%}; of those that the model can see {told}, ", end=""
+    )
+    print(f"{noticed.total() / max(told, 1):.1%}")
     return 0 if share >= GOAL and not alarms else 1
 
 

@@ -217,7 +217,7 @@ def slow(level: int, given: argparse.Namespace) -> list[str]:
 def noticed(level: int, given: argparse.Namespace) -> list[str]:
     """The limit that the observer tells: 1.5 times it is found, half of it is not."""
     wrong = []
-    for factor in (1.5, 0.5):
+    for factor in given.factors:
         count = 0
         for seed in range(given.first, given.first + given.draws):
             case = Case.drawn(level, seed)
@@ -247,7 +247,10 @@ def quiet(level: int, given: argparse.Namespace) -> list[str]:
         case = Case.drawn(level, seed, 0.0)
         size = case.arm.state.warm_up[:, 0].copy()
         case.arm.zero = lambda t, size=size: size * np.sin(2 * np.pi * t / 14400.0) / 2
-        events = case.work(given.hours * 3600)
+        events = list[Event]()
+        for hour in range(given.hours):
+            events += case.work((hour + 1) * 3600 - case.arm.t)
+            print(f"quiet: level {level}, draw {seed}: hour {hour + 1}, {len(events)} events", flush=True)
         written = [event.joint for event in events if event.finding]
         told = [(round(e.t), e.kind, e.joint, e.evidence.get("cause")) for e in events][:20]
         rests = case.observer.rows
@@ -275,7 +278,8 @@ def main() -> int:
     parser.add_argument("--levels", type=int, nargs="*", default=[1, 3], choices=sorted(GAIN))
     parser.add_argument("--draws", type=int, default=20)
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--hours", type=float, default=24.0)
+    parser.add_argument("--hours", type=int, default=24)
+    parser.add_argument("--factors", type=float, nargs="+", default=[1.5, 0.5], help="of the limit, for noticed")
     parser.add_argument("--only", nargs="*", choices=sorted(SCENARIOS), default=list(SCENARIOS))
     given = parser.parse_args()
     wrong = [line for name in given.only for level in given.levels for line in SCENARIOS[name](level, given)]

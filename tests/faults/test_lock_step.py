@@ -34,9 +34,9 @@ def pattern(reads: str) -> str:
 class Bench:
     """The arm, its link and the command: joint 1 under a bias torque, the others in position control."""
 
-    def __init__(self) -> None:
+    def __init__(self, timing: bool = False) -> None:
         arm = parse_arm(ARM, Path("triple.yaml"))
-        self.bus = LockStepBus(arm=SimulatedArm(arm, Truth.of(arm)))
+        self.bus = LockStepBus(arm=SimulatedArm(arm, Truth.of(arm)), timing=timing)
         self.link = Link(arm, self.bus)
 
     def enable(self) -> None:

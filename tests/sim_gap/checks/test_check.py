@@ -2,9 +2,10 @@
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
-from wrong_arms import Wrong, model, record
+from wrong_arms import THREE, Wrong, model, record
 
 from armlink.errors import BadInput
 from armlink.recording.corrections import AS_IT_IS, parse_corrections
@@ -145,3 +146,30 @@ def test_real_arms_as_recorded_are_no_finding(realdata, folder, file):
     recording = load_recording(realdata / folder / f"{file}.csv.gz")
     real = load_model(realdata / folder / "sim.xml", (), recording.n).arm
     assert check(real, recording)[1] == []
+
+
+def with_range(low: float, high: float):
+    """The arm, its second joint with a range [rad]."""
+    limited = THREE.replace('name="joint_2"', f'name="joint_2" range="{low} {high}"')
+    text = limited.replace("<mujoco>", '<mujoco><compiler angle="radian"/>')
+    return load_model(mujoco.MjModel.from_xml_string(text)).arm
+
+
+def test_a_joint_beyond_its_range_is_refused_unless_the_user_says_that_it_is_there(motor):
+    least, most = motor.position[:, 1].min(), motor.position[:, 1].max()
+    assert check(with_range(least - 0.01, most + 0.01), motor)[1] == []
+    assert check(with_range(least - 0.01, most - 0.1), motor)[1] == []
+    narrow = with_range(least - 0.01, most - 0.3)
+    with pytest.raises(BadInput, match=r"q of joint_2: runs from .* the model's joint from .*--zero q_2=0"):
+        check(narrow, motor)
+    assert check(narrow, motor, parse_corrections(zero=["q_2=0"]))[1] == []
+
+
+def test_an_order_that_explains_far_more_but_makes_one_joint_worse_is_asked_about(arm, motor):
+    """With columns 1 and 3 exchanged, and the torque of what is then joint 1 read by a broken sensor."""
+    random = np.random.default_rng(5)
+    torque = motor.motor_torque.copy()
+    torque[:, 2] = 3.0 * np.sin(2.0 * motor.t) * motor.position[:, 2] + random.normal(0.0, 0.1, motor.t.size)
+    mixed = take_joints(replace(motor, motor_torque=torque), [2, 1, 0], motor.names)
+    with pytest.raises(BadInput, match="not corrected: --map"):
+        check(arm, mixed)

@@ -1,0 +1,211 @@
+"""Trends of a fleet: which parameter of which arm changes, since when, and which arm differs from the others.
+
+A series is one parameter (friction of joint 2, say) of one arm over its dated diagnoses. Diagnoses of one arm on one
+motion share their systematic errors, so that a change is judged by the scatter from one diagnosis to the next and not
+by the intervals of each.
+"""
+
+import re
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from gcomp.arrays import Array
+
+FIRST, LAST = 7, 5
+"""Number of diagnoses at the start that are the reference, and at the end that are compared with it."""
+SURE = 5.0
+"""Multiple of the difference's standard deviation from which a parameter has changed, in two diagnoses running."""
+LEAST = 0.01
+"""Least change, as a share of the reference."""
+POOLED = 6
+"""Weight of the fleet's scatter against an arm's own, as a number of diagnoses."""
+ARMS, DIFFERS = 5, 0.25
+"""Least number of arms to compare one with, and its least difference from their median, as a share of it."""
+HIDDEN = 1.3
+"""Multiple of the smallest value reported that a parameter must have had, or have now, to have vanished or appeared:
+below, it may be reported on one day and not on the next."""
+FOUND = 0.6
+"""Share of a window's diagnoses that must have the parameter; it counts as zero if fewer than the rest have it."""
+DATE = re.compile(r"(\d{4})-?(\d\d)-?(\d\d)(?:[T_-]?(\d\d):?(\d\d))?")
+
+Key = tuple[str, str, str, str]
+"""Arm, effect, joint, parameter."""
+
+
+@dataclass(frozen=True)
+class Trend:
+    """One parameter of one arm that changes."""
+
+    arm: str
+    effect: str
+    joint: str
+    parameter: str
+    unit: str
+    before: float
+    now: float
+    since: str
+    """Date at which the change began, by a line that fits from there on."""
+    noticed: str
+    """Date of the diagnosis from which it is certain."""
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """One parameter of one arm that differs from the same of the other arms."""
+
+    arm: str
+    effect: str
+    joint: str
+    parameter: str
+    unit: str
+    value: float
+    others: float
+    """Median of all arms."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Series:
+    unit: str
+    dates: list[datetime]
+    values: Array
+    """NaN where a diagnosis has not found the parameter, (K,)."""
+
+
+def date_of(case: str) -> datetime | None:
+    """Date in a case's name (`arm_3/2026-10-02` or `arm_3/20261002T0830`); None without one."""
+    for found in reversed(list(DATE.finditer(case))):
+        try:
+            year, month, day, hour, minute = (int(part or 0) for part in found.groups())
+            return datetime(year, month, day, hour, minute, tzinfo=UTC)
+        except ValueError:
+            continue
+    return None
+
+
+def fleet_trends(answers: Mapping[str, Mapping[str, Any]]) -> list[Trend]:
+    """Changes of parameters over the dated cases of each arm (the first folder of a case's name), latest first.
+
+    An arm with a case without a date, or with fewer than FIRST + LAST + 1 cases, has none.
+    """
+    series = _series(answers)
+    noise = {key: _scatter(one.values) for key, one in series.items()}
+    pooled: dict[tuple[str, str], list[float]] = defaultdict(list)
+    for (_, effect, _, parameter), (own, count, size) in noise.items():
+        if count >= FIRST and size > 0.0:
+            pooled[effect, parameter].append(own / size)
+    found = []
+    for key, one in series.items():
+        own, count, size = noise[key]
+        usual = float(np.median(pooled[key[1], key[3]] or [0.0])) * size
+        trend = _trend(key, one, float(np.sqrt((count * own**2 + POOLED * usual**2) / (count + POOLED))))
+        if trend is not None:
+            found.append(trend)
+    return sorted(found, key=lambda trend: trend.noticed, reverse=True)
+
+
+def fleet_outliers(answers: Mapping[str, Mapping[str, Any]]) -> list[Outlier]:
+    """Parameters of one arm that differ from those of the other arms, by the median of its last cases."""
+    latest: dict[tuple[str, str, str], dict[str, tuple[float, str]]] = defaultdict(dict)
+    for (arm, *which), one in _series(answers, dated=False).items():
+        last = one.values[-LAST:]
+        if np.isfinite(last).mean() >= FOUND:
+            latest[which[0], which[1], which[2]][arm] = float(np.nanmedian(last)), one.unit
+    out = []
+    for (effect, joint, parameter), arms in latest.items():
+        values = np.array([value for value, _ in arms.values()])
+        middle = float(np.median(values))
+        spread = 1.4826 * float(np.median(np.abs(values - middle)))
+        for arm, (value, unit) in arms.items() if len(arms) >= ARMS else ():
+            if abs(value - middle) > max(SURE * spread, DIFFERS * abs(middle)):
+                out.append(Outlier(arm, effect, joint, parameter, unit, value, middle))
+    return out
+
+
+def rows(found: Sequence[Trend | Outlier]) -> list[dict[str, Any]]:
+    """The JSON form."""
+    return [asdict(one) for one in found]
+
+
+def _series(answers: Mapping[str, Mapping[str, Any]], dated: bool = True) -> dict[Key, _Series]:
+    by_arm: dict[str, list[tuple[datetime, Mapping[str, Any]]]] = defaultdict(list)
+    undated = set()
+    for case, answer in sorted(answers.items()):
+        arm, date = case.split("/")[0], date_of(case)
+        if "error" in answer:
+            continue
+        undated |= {arm} if date is None else set()
+        by_arm[arm].append((date or datetime.min.replace(tzinfo=UTC), answer))
+    out: dict[Key, _Series] = {}
+    for arm, cases in by_arm.items():
+        if dated and (arm in undated or len(cases) < FIRST + LAST + 1):
+            continue
+        cases.sort(key=lambda pair: pair[0])
+        dates = [date for date, _ in cases]
+        for k, (_, answer) in enumerate(cases):
+            for (effect, joint, parameter), (value, unit) in _values(answer).items():
+                key = arm, effect, joint, parameter
+                out.setdefault(key, _Series(unit, dates, np.full(len(cases), np.nan))).values[k] = value
+    return out
+
+
+def _values(answer: Mapping[str, Any]) -> dict[tuple[str, str, str], tuple[float, str]]:
+    return {
+        (cause["effect"], joint, name): (float(one["value"]), one["unit"])
+        for cause in (*answer.get("causes", ()), *answer.get("minor", ()))
+        if not cause["effect"].startswith("law.")
+        for joint, parameters in cause["parameters"].items()
+        for name, one in parameters.items()
+    }
+
+
+def _scatter(values: Array) -> tuple[float, int, float]:
+    """Standard deviation from one diagnosis to the next, the number of differences behind it, and the usual size."""
+    there = values[np.isfinite(values)]
+    steps = np.diff(there)
+    if len(steps) < 2:
+        return 0.0, 0, float(np.median(np.abs(there))) if len(there) else 0.0
+    own = 1.4826 * float(np.median(np.abs(steps - np.median(steps)))) / np.sqrt(2.0)
+    return float(own), len(steps), float(np.median(np.abs(there)))
+
+
+def _window(values: Array) -> float:
+    """Mean of the diagnoses that have the parameter; zero if nearly none has it, NaN if it comes and goes."""
+    share = float(np.isfinite(values).mean())
+    if share >= FOUND:
+        return float(np.nanmean(values))
+    return 0.0 if share <= 1.0 - FOUND else float("nan")
+
+
+def _trend(key: Key, one: _Series, noise: float) -> Trend | None:
+    """The change of one series, if there is one."""
+    start = _window(one.values[:FIRST])
+    least = max(SURE * noise * float(np.sqrt(1.0 / FIRST + 1.0 / LAST)), LEAST * abs(start), 1e-12)
+    hidden = HIDDEN * float(np.nanmin(np.abs(one.values)))
+    running = 0
+    for k in range(FIRST + LAST - 1, len(one.values)):
+        now = _window(one.values[k - LAST + 1 : k + 1])
+        needed = max(least, hidden) if start == 0.0 or now == 0.0 else least
+        running = running + 1 if abs(now - start) > needed else 0
+        if running == 2:
+            since = one.dates[_began(one, start, k)].date().isoformat()
+            now = _window(one.values[-LAST:])
+            return Trend(*key, one.unit, start, now, since, one.dates[k].date().isoformat())
+    return None
+
+
+def _began(one: _Series, start: float, noticed: int) -> int:
+    """Index of the diagnosis from which a line away from a constant fits best, up to the one that notices."""
+    values = np.nan_to_num(one.values) if start == 0.0 else one.values
+    there = np.flatnonzero(np.isfinite(values[: noticed + FIRST + LAST]))
+    days = np.array([(date - one.dates[0]).total_seconds() / 86400.0 for date in one.dates])[there]
+    left = []
+    for k in there[there < noticed]:
+        x = np.column_stack([np.ones_like(days), np.maximum(days - days[there == k], 0.0)])
+        coefficients = np.linalg.lstsq(x, values[there], rcond=None)[0]
+        left.append((float(np.sum((values[there] - x @ coefficients) ** 2)), int(k)))
+    return min(left)[1]

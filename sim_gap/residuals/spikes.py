@@ -1,0 +1,104 @@
+"""Isolated spikes of a torque channel: single readings far from those before and after, as after a late cycle.
+
+A late cycle of the host makes a position controller jump for a cycle or two. Whether that torque was real or misread, a
+few samples of it say nothing about its mean, so that neither they nor their surroundings are compared with the model.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, median_filter
+
+from gcomp.arrays import Array
+
+Mask = NDArray[np.bool_]
+SLOWEST_HZ = 45.0
+"""Rate below which a channel's single readings are no spikes: a motion of the arm may be as short."""
+LONGEST_S, LONGEST = 0.015, 3
+"""Longest spike, in seconds and in readings; one reading in any case."""
+TIMES_USUAL, TIMES_LARGE, LARGE = 8.0, 6.0, 0.95
+"""A spike departs from its surroundings by this many standard deviations of the usual departure (by its median), and by
+this multiple of the departure that is exceeded in one reading of twenty."""
+OF_SPAN = 0.05
+"""A spike departs by this share of the channel's span or more."""
+RARE = 0.01
+"""Largest share of spikes; with more, they are the channel's noise."""
+HELD = 0.6
+"""Share of readings that differ from the one before, below which a channel holds each value for several rows."""
+AROUND_S = 0.03
+"""Time before and after a spike that is not compared either [s]."""
+MOST = 0.2
+"""Largest share of a joint's time that may be left out around spikes; with more, the spikes alone are."""
+
+
+@dataclass(frozen=True)
+class Spikes:
+    """Number of spikes in one joint's channel, of how many readings."""
+
+    channel: str
+    joint: int
+    count: int
+    readings: int
+
+
+def spikes_of(t: Array, values: Array) -> Mask:
+    """Readings of a channel at times `t` (K,), NaN where there is none, that are isolated spikes, (K, n)."""
+    return np.stack([_spikes(t, column) for column in values.T], axis=1)
+
+
+def _spikes(t: Array, values: Array) -> Mask:
+    """Those of one joint, (K,)."""
+    out = np.zeros(len(values), bool)
+    there = np.flatnonzero(np.isfinite(values))
+    if len(there) < 100:
+        return out
+    changes = np.r_[0, np.flatnonzero(np.diff(values[there]) != 0.0) + 1]
+    first = changes if len(changes) < HELD * len(there) else np.arange(len(there))
+    if len(first) < 50:
+        return out
+    x, own = values[there[first]], t[there[first]]
+    period = float(np.median(np.diff(own)))
+    if period > 1.0 / SLOWEST_HZ:
+        return out
+    half = int(np.clip(LONGEST_S / period, 1, LONGEST))
+    departure = np.abs(x - median_filter(x, 2 * half + 1, mode="nearest"))
+    least = max(
+        TIMES_USUAL * 1.4826 * float(np.median(departure)),
+        TIMES_LARGE * float(np.quantile(departure, LARGE)),
+        OF_SPAN * float(np.ptp(np.quantile(x, (0.02, 0.98)))),
+    )
+    lasting = np.diff(np.r_[own, t[there[-1]]])
+    found = (departure > least) & (lasting < max(LONGEST_S, 3.0 * period))
+    if not 0.0 < found.mean() <= RARE:
+        return out
+    last = np.r_[first[1:], len(there)]
+    for k in np.flatnonzero(found).tolist():
+        out[there[first[k] : last[k]]] = True
+    return out
+
+
+def around_spikes(t: Array, spikes: Sequence[Mask], times: Array) -> Mask:
+    """Whether work times (k,) are near a spike of a joint in any of its channels, (k, n).
+
+    `spikes` are those of each channel at times `t`, (K, n) each. Joints that would lose too much time lose none.
+    """
+    near = np.zeros((len(times), spikes[0].shape[1]), bool)
+    width = round(AROUND_S / float(times[1] - times[0]))
+    for joint in range(near.shape[1]):
+        at = t[np.any([mask[:, joint] for mask in spikes], axis=0)]
+        if len(at):
+            near[np.clip(np.searchsorted(times, at), 0, len(times) - 1), joint] = True
+            near[:, joint] = binary_dilation(near[:, joint], iterations=width) if width else near[:, joint]
+    return np.asarray(near & (near.mean(0) <= MOST))
+
+
+def counted(spikes: Mapping[str, Mask], channels: Mapping[str, Array | None]) -> tuple[Spikes, ...]:
+    """Numbers of spikes of each channel and joint that has any."""
+    return tuple(
+        Spikes(channel, int(joint), int(mask[:, joint].sum()), int(np.isfinite(values[:, joint]).sum()))
+        for channel, mask in spikes.items()
+        if (values := channels[channel]) is not None
+        for joint in np.flatnonzero(mask.any(0))
+    )
