@@ -123,9 +123,8 @@ class Mover:
                     yield self._see(sample)
                     row += 1
             finally:
-                if len(setpoints):  # none where it stands there already
-                    now = setpoints.command(min(row, len(setpoints) - 1))
-                    self.command.position, self.command.torque = now.position.copy(), now.torque.copy()
+                now = setpoints.command(min(row, len(setpoints) - 1))
+                self.command.position, self.command.torque = now.position.copy(), now.torque.copy()
 
     def _see(self, sample: Sample) -> Sample:
         self.seen_at = sample.t
@@ -179,6 +178,8 @@ class Mover:
         path = trajectory(
             self.command.position.copy(), goal, self.speed, np.full(len(goal), acceleration), self.link.period
         )
+        if not len(path):  # they stand there
+            return
         held = self.command.guard or Guard.none(self.link.n)
         guard = Guard(held.lower, held.upper, np.where(movable, STALL, np.inf))
         targets = np.where(movable, path, self.command.position)
