@@ -80,7 +80,8 @@ def date_of(case: str) -> datetime | None:
     """Date in a case's name (`arm_3/2026-10-02` or `arm_3/20261002T0830`); None without one."""
     for found in reversed(list(DATE.finditer(case))):
         try:
-            return datetime(*(int(part or 0) for part in found.groups()), tzinfo=UTC)
+            year, month, day, hour, minute = (int(part or 0) for part in found.groups())
+            return datetime(year, month, day, hour, minute, tzinfo=UTC)
         except ValueError:
             continue
     return None
