@@ -2,10 +2,10 @@
 PYTHON ?= python3
 BIN := .venv/bin
 export PYTHON
-CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host daemon_days daemon_kills fuzz_frames fuzz_drives fuzz_guard kill_drives two_hosts scales web
+CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host daemon_days daemon_kills fuzz_frames fuzz_drives fuzz_guard fault_injection systemd_units kill_drives two_hosts scales web
 
 .DEFAULT_GOAL := help
-.PHONY: batched fleetdays help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies pictures
+.PHONY: moving fleetdays batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies pictures container lock audit sbom
 
 help: ## Say what can be done
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
@@ -49,6 +49,9 @@ realtime: .venv/.dev ## Long campaign outside make test: the whole job between p
 observer: .venv/.dev ## Long campaign outside make test: the observer on arms that are not perfect (ARGS="--draws 20 --only drifts")
 	$(BIN)/python tests/campaigns/observer_arms.py $(ARGS)
 
+moving: .venv/.dev ## Long campaign outside make test: changes of arms without torque sensors, found in their work (ARGS="--draws 10")
+	$(BIN)/python tests/campaigns/moving_arms.py $(ARGS)
+
 stalls: .venv/.dev ## Long campaign outside make test: sweeps while job, loop and arm are stopped, and on a busy machine
 	$(BIN)/python tests/campaigns/stalls.py $(ARGS)
 
@@ -86,6 +89,9 @@ mutants: .venv/.dev ## Long campaign outside make test: changes of the source mu
 wheel: .venv/.dev ## Build the wheel into dist/ and run the demo from it in an empty environment (ARGS="python3.12 python3.13")
 	scripts/test-wheel $(ARGS)
 
+container: ## Build packaging/Containerfile on Debian's packages and run the daemon in it, as root (BASE=docker.io/library/python:3.12-slim)
+	scripts/test-container
+
 firsthour: .venv/.dev ## Long campaign outside make test: docs/first-hour.md typed for five models, each to a finished demo report
 	$(BIN)/python tests/campaigns/first_hour.py $(ARGS)
 
@@ -100,6 +106,15 @@ constraints: .venv/.dev ## Write constraints.txt anew from what .venv holds
 	@sed -n '/^#/p' constraints.txt > constraints.new
 	@$(BIN)/python -m pip freeze --exclude-editable | grep -E '^[A-Za-z0-9._-]+==' >> constraints.new
 	@mv constraints.new constraints.txt
+
+lock: .venv/.dev ## Write requirements.lock and requirements-dev.lock anew: exact versions with the hashes of their files
+	scripts/lock
+
+audit: .venv/.dev ## Look the locked dependencies up in the database of known vulnerabilities (needs the network)
+	@scripts/audit
+
+sbom: .venv/.dev ## Write armlink.cdx.json: the locked dependencies as a bill of materials (CycloneDX)
+	$(BIN)/python -m cyclonedx_py requirements requirements.lock --pyproject pyproject.toml --output-reproducible -o armlink.cdx.json
 
 clean: ## Remove what was made, .venv included
 	rm -rf .venv .venv.log armlink-demo site .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shlex
 from functools import cache, cached_property
 from importlib.metadata import entry_points
 from importlib.resources import files
@@ -262,6 +263,15 @@ class ArmFile(Section):
     def joint_names(self) -> tuple[str, ...]:
         """Joint names from base to tip; empty where only a model file would tell."""
         return tuple(joint.name for joint in self.kinematics.joints or (self.link.joints if self.link else ()))
+
+    @property
+    def argument(self) -> str:
+        """The arm as one types it in a command here: a bundled arm's name, else its path, quoted for a shell."""
+        for name, path in bundled_arms().items():
+            if path.resolve() == self.path:
+                return name
+        here = Path.cwd()
+        return shlex.quote(str(self.path.relative_to(here) if self.path.is_relative_to(here) else self.path))
 
     @property
     def model_path(self) -> Path | None:

@@ -22,9 +22,9 @@ from calib.creep.run import run_creep
 from calib.creep.verify import verify_creeping
 from calib.fit.gravity_fit import GravityFit, identify_gravity
 from calib.fit.sensor_fit import SensorFit, fit_sensors
+from calib.observer.choice import observer_of
 from calib.observer.config import ObserverConfig
 from calib.observer.events import Event
-from calib.observer.observer import Observer
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.sweep.dataset import SweepData, load_data
 from calib.sweep.run import Progress, run_sweep
@@ -220,7 +220,7 @@ def observe(
     )
     model = gravity.record(arm_file, calibration) if isinstance(gravity, GravityFit) else gravity.require(arm_file)
     rated = arm_file.require_link().rated_torques
-    observer = Observer.of_records(gcomp_arm(arm_file), calibration, model, rated, config)
+    observer = observer_of(gcomp_arm(arm_file), calibration, model, rated, config)
     events: list[Event] = []
     for t, position, torque in zip(run.t, run.position, run.torque, strict=True):
         events += observer.handle(float(t), position, torque)

@@ -9,6 +9,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
+from armlink.bus.port import BUS_SHIFT
 from armlink.drives.canopen.object_dictionary import SYNC_ID
 from armlink.errors import BadInput
 from sim_bus.drives.fronts import build_fronts
@@ -38,18 +39,16 @@ WARMING_STEP = 1.0
 """Torque constants of drives that warm up are brought up to date so often [s]."""
 TARGETS = {(0x6071, 0), (0x607A, 0), (0x60FF, 0)}
 
-MARK_SHIFT = 40
-LARGEST_ID = (1 << MARK_SHIFT) - 1
-"""Identifiers with all flags of a port are below."""
-
-
-def bus_mark(place: int) -> int:
-    """What identifiers of the drives on one of several buses have in addition, by its place among them."""
-    return (place + 1) << MARK_SHIFT
+UNTAGGED = (1 << BUS_SHIFT) - 1
+SERVICE = 0x780
+"""Bits of an identifier that are CANopen's function code; the others are bus and node."""
 
 
 class SimulatedArm:
-    """Takes frames by on_frame(), sends to `outbox`, advances by advance(). Deterministic for truth and seed."""
+    """Takes frames by on_frame(), sends to `outbox`, advances by advance(). Deterministic for truth and seed.
+
+    Where it stands on several buses, identifiers carry the number of theirs, as those of a host's port do.
+    """
 
     def __init__(self, arm: ArmFile, truth: Truth, seed: int = 0) -> None:
         """Power on: every node boots. Raises BadInput if the arm file is insufficient for simulation."""
@@ -74,9 +73,10 @@ class SimulatedArm:
             if joint.settings.family == "canopen"
         ]
         self._node_at = {node.place: node for node in self.nodes}
-        self.place_of = {node.node_id: node.place for node in self.nodes}
-        self._sdo = {0x600 + node.node_id: node for node in self.nodes}
-        self.supervision = Supervision(self.nodes, self.drives, self._send)
+        self._tags: dict[str, int] = {}
+        """Name of each bus → what identifiers on it have in addition; empty: all joints are on one bus."""
+        self._address()
+        self.supervision = Supervision(self.nodes, self.drives)
         self._nmt = NetworkManagement(self.nodes, self.drives, self.supervision, self._apply)
         self._operational = self._nmt.operational
         self._pdos = PdoTable(self._signals, self._operational, self._send)
@@ -95,11 +95,10 @@ class SimulatedArm:
         self.drives.sample(0.0, 0.0)
         self._readings = readings = Readings(self.plant, self.sensors)
         motors = [Motor(j, joint, self.drives.loops, self.sensors, readings) for j, joint in enumerate(link.joints)]
-        self._marks: dict[str, int] = {}
-        """Of an arm on several buses: name of each → mark in the identifiers of its frames."""
         self.fronts = build_fronts(arm, motors, self._sender)
         """Bus and drives of every family but CANopen."""
         self.drive_at = {drive.joint: drive for _, front in self.fronts for drive in front.drives}
+        self.plant.averages = bool(self.drive_at)
         self._set_torque_constants()
         for drive in self.drive_at.values():
             drive.pass_time(0.0)
@@ -107,36 +106,41 @@ class SimulatedArm:
     # ---- bus
 
     def stand_on(self, buses: Sequence[str]) -> None:
-        """Stand on several buses, by name in the arm file's order, on which ids may repeat.
-
-        Frames from and to drives that are no CANopen nodes then carry their bus, `bus_mark(place)`.
-        """
-        self._marks = {name: bus_mark(place) for place, name in enumerate(buses)}
+        """Stand on several buses, by name in the arm file's order, on which ids may repeat; nodes boot there."""
+        self._tags = {name: place << BUS_SHIFT for place, name in enumerate(buses)}
+        self.outbox.clear()
+        for node in self.nodes:
+            node.tag = self._tags[self.arm.require_link().joints[node.place].bus]
+            node.boot_up()
+        self._address()
+        self._compile()
 
     def on_frame(self, can_id: int, data: bytes) -> None:
         """Process a frame: SYNC samples and applies targets; PDO, SDO, NMT and heartbeat by CiA 301."""
-        mark = 0
-        if self._marks:
-            can_id, mark = can_id & LARGEST_ID, can_id & ~LARGEST_ID
         slot = self._pdos.receive.get(can_id)
         if slot is not None:
             self._receive_pdo(slot, data)
-        elif can_id == SYNC_ID:
-            self._sync()
         elif can_id in self._sdo:
             if self.time > self._sampled:
                 self._sample()
             self._sdo[can_id].on_sdo(data)
             self.drives.take_commands()
             self._pdos.send_events()
+        else:
+            self._to_all(can_id & UNTAGGED, can_id & ~UNTAGGED, data)
+        for bus, front in self.fronts:
+            if self._tags.get(bus, 0) == can_id & ~UNTAGGED:
+                front.on_frame(can_id & UNTAGGED, data)
+
+    def _to_all(self, can_id: int, tag: int, data: bytes) -> None:
+        """Process a frame that may be to all CANopen nodes on the bus of that tag."""
+        if can_id == SYNC_ID:
+            self._sync()
         elif can_id == 0:
-            self._nmt.frame(data, self.time)
+            self._nmt.frame(data, self.time, tag)
             self._pdos.send_events()
         elif 0x700 < can_id < 0x780 and data:
-            self.supervision.heartbeat(can_id - 0x700, self.time)
-        for bus, front in self.fronts:
-            if not self._marks or self._marks[bus] == mark:
-                front.on_frame(can_id, data)
+            self.supervision.heartbeat(can_id - 0x700, self.time, tag)
 
     def waits_for_sync(self, can_id: int) -> bool:
         """Whether a frame takes effect at the next SYNC only: a synchronous RPDO."""
@@ -150,10 +154,9 @@ class SimulatedArm:
             piece = min(remaining, self.period)
             for drive in self.drive_at.values():
                 drive.control(piece)
+            self.drives.loops.advance(piece, self._synchronous)
             if self.drive_at:
-                self._advance_drives(piece)
-            else:
-                self.drives.loops.advance(piece, self._synchronous)
+                self._readings.step_ends()
             self._synchronous = False
             self.time += piece
             remaining -= piece
@@ -170,18 +173,6 @@ class SimulatedArm:
                 self._sample()
             self._pdos.send_events()
 
-    def _advance_drives(self, piece: float) -> None:
-        """Physics of an arm with drives that are no CANopen nodes; their mean torque over the time is kept."""
-        loops, readings = self.drives.loops, self._readings
-        if self.nodes:
-            loops.advance(piece, self._synchronous)
-            readings.step_ends(0.5 * (readings.started + self.plant.drive_torque))
-            return
-        loops.advance(piece / 2, False)
-        middle = self.plant.drive_torque
-        loops.advance(piece / 2, False)
-        readings.step_ends(middle)
-
     def reboot(self, joint: int) -> None:
         """Power-cycle one joint's controller: volatile settings are lost."""
         if joint in self._node_at:
@@ -195,11 +186,15 @@ class SimulatedArm:
 
     def joint_of(self, can_id: int) -> int | None:
         """Joint whose device sends frames of this identifier, or None."""
-        can_id, mark = can_id & LARGEST_ID, can_id & ~LARGEST_ID
-        if can_id < 0x800 and (place := self.place_of.get(can_id & 0x7F)) is not None and can_id >= 0x80:
+        untagged, tag = can_id & UNTAGGED, can_id & ~UNTAGGED
+        if untagged >= 0x80 and (place := self.node_place(can_id)) is not None:
             return place
-        fronts = [front for bus, front in self.fronts if not self._marks or self._marks[bus] == mark]
-        return next((joint for front in fronts if (joint := front.joint_of(can_id)) is not None), None)
+        fronts = [front for bus, front in self.fronts if self._tags.get(bus, 0) == tag]
+        return next((joint for front in fronts if (joint := front.joint_of(untagged)) is not None), None)
+
+    def node_place(self, can_id: int) -> int | None:
+        """Joint whose CANopen node an identifier of its bus names by its last seven bits, or None."""
+        return self._place_of.get(can_id & ~SERVICE) if can_id & UNTAGGED < 0x800 else None
 
     @property
     def due(self) -> float:
@@ -295,10 +290,15 @@ class SimulatedArm:
 
     def _sender(self, bus: str) -> Callable[[int, bytes], None]:
         """Puts frames of the drives on one bus."""
-        return lambda can_id, data: self.outbox.append((can_id | self._marks.get(bus, 0), data))
+        return lambda can_id, data: self.outbox.append((can_id | self._tags.get(bus, 0), data))
 
     def _send(self, frame: Frame) -> None:
         self.outbox.append(frame)
+
+    def _address(self) -> None:
+        """Take the nodes' buses."""
+        self._place_of = {node.tag | node.node_id: node.place for node in self.nodes}
+        self._sdo = {node.tag | 0x600 + node.node_id: node for node in self.nodes}
 
     def _imperfections(self) -> Imperfections:
         """Current effects and the arm file's realism as one state."""

@@ -12,7 +12,7 @@ def record(
     arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
     out: Annotated[
         Path | None,
-        typer.Argument(help="File to write, .mcap; armlink convert makes others of it.", show_default=False),
+        typer.Argument(help="File to write, .mcap; convert makes others of it.", show_default=False),
     ] = None,
     frames: Annotated[
         Path | None, typer.Option(help="Write every frame here as it is: .asc, .blf or .log, by suffix.")
@@ -46,7 +46,8 @@ def record(
     if out is None and frames is None:
         raise BadInput("record: nothing to write: give a file to write (.mcap), or --frames with a .asc, .blf or .log")
     if out is not None and out.suffix != SUFFIX:
-        raise BadInput(f"{out}: recordings are written as {SUFFIX}; armlink convert makes other formats of it")
+        first = out.with_suffix(SUFFIX)
+        raise BadInput(f"{out}: recordings are written as {SUFFIX}: record {first}, then armlink convert {first} {out}")
     rows, last = 0, 0.0
     with contextlib.ExitStack() as stack:
         log = stack.enter_context(FrameLog(frames)) if frames else None

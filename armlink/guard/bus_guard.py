@@ -367,7 +367,7 @@ def main(words: list[str]) -> int:
         with open(path, encoding="utf-8") as file:
             policy = Policy(json.load(file))
     except (OSError, ValueError, RecursionError, PolicyError) as error:
-        _say(f"guard: {path}: {error}: write it with armlink guard")
+        _say(f"guard: {path}: {error}; how it is written: armlink guard --help")
         return 2
     ports = []
     for name in (program, wire):

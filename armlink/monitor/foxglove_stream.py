@@ -11,7 +11,7 @@ from armlink.errors import BadInput
 from armlink.link.types import Sample
 from armlink.recording.ros_joint_state import SCHEMA, SCHEMA_NAME, joint_state_encoder
 
-MISSING = "armlink monitor --foxglove needs the package foxglove-sdk: pip install 'armlink[foxglove]'"
+MISSING = "--foxglove: foxglove-sdk is not installed: pip install 'armlink[foxglove]'"
 
 
 class FoxgloveStream:

@@ -11,7 +11,7 @@ import numpy as np
 from armlink.errors import BadInput
 from armlink.link.types import Sample
 
-MISSING = "armlink monitor --rerun needs the package rerun-sdk: pip install 'armlink[rerun]'"
+MISSING = "--rerun: rerun-sdk is not installed: pip install 'armlink[rerun]'"
 QUANTITIES = {"position": "rad", "velocity": "rad_per_s", "torque": "newton_metres", "motor_torque": "newton_metres"}
 """Reading → its unit, as a folder in the viewer."""
 PATIENCE = 2.0

@@ -73,8 +73,9 @@ def _model(arm_file: "ArmFile", record: str | None, store: str | None) -> "tuple
     """Mass moments (2n,) [kg·m], the calibration record if any, and where the moments come from; raises Refused."""
     import numpy as np
 
-    from armlink.errors import BadInput, Refused
+    from armlink.errors import BadInput
     from calib.arm.kinematics import model_arm
+    from calib.records.missing import no_record
     from calib.records.records import CalibrationRecord, GravityRecord
     from calib.records.store import RecordStore
 
@@ -84,7 +85,7 @@ def _model(arm_file: "ArmFile", record: str | None, store: str | None) -> "tuple
     if kept is None and arm_file.model_path is not None:
         return model_arm(arm_file).beta, calibration, f"the inertials of {arm_file.model_path.name}"
     if kept is None:
-        raise Refused(f"{arm_file.name} {arm_file.serial}: no gravity record yet: armlink identify makes one")
+        raise no_record(arm_file, "gravity")
     if not isinstance(kept, GravityRecord):
         raise BadInput(f"--record {record}: that is a {kept.kind} record, expected a gravity record")
     return np.array(kept.beta), calibration, f"gravity record {kept.id}"

@@ -33,7 +33,7 @@ def history(
 
     arm_file, records = load_arm(arm), RecordStore(store)
     if activate and import_file is None:
-        raise BadInput("--activate: only with --import FILE; armlink rollback makes a kept record current again")
+        raise BadInput(f"--activate: only with --import FILE; kept records are listed by armlink history {arm}")
     if import_file is not None:
         imported = records.import_yaml(import_file, arm_file)
         if activate:

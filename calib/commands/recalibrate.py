@@ -40,16 +40,16 @@ def recalibrate(
     """
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
-    from armlink.errors import Refused
     from calib.field.field_fit import fit_field
     from calib.field.field_record import field_record
+    from calib.records.missing import no_record
     from calib.records.records import CalibrationRecord, GravityRecord
     from calib.records.store import RecordStore
 
     arm_file, records = load_arm(arm), RecordStore(store)
     gravity, before = records.current(GravityRecord, arm_file), records.current(CalibrationRecord, arm_file)
     if gravity is None:
-        raise Refused(f"{arm_file.name} {arm_file.serial}: no gravity record yet: armlink identify makes one")
+        raise no_record(arm_file, "gravity")
     rows, sources = _rows(arm_file, data, before if held == "record" else None)
     fit = fit_field(arm_file, rows, gravity, before)
     record = field_record(arm_file, fit, before, {**sources, f"gravity record {gravity.id}": gravity.id})

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 def rollback(
     arm: Arm,
-    to: Annotated[str, typer.Option(help="Id of a record that was current before (armlink history ARM).")],
+    to: Annotated[str, typer.Option(help="Id of a record that was current before; history lists them.")],
     reason: Annotated[str, typer.Option(help="Why; kept in the log.")] = "rollback",
     apply: Annotated[
         bool, typer.Option("--apply", help="Also write its gains and offsets to the controllers.")

@@ -154,7 +154,7 @@ def stalls_said(data: "SweepData") -> list[str]:
 
 def warn_late(arm: ArmFile, lateness: Lateness) -> None:
     """A line if this machine was late enough to come near the arm's deadline."""
-    warning = lateness.near(arm.require_link().deadline, arm.name)
+    warning = lateness.near(arm.require_link().deadline, arm.argument)
     print_lines([warning] if warning else [], "yellow")
 
 

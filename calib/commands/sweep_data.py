@@ -14,6 +14,6 @@ def load_sweeps(command: str, directories: list[Path], arm: str | None) -> "tupl
     from calib.sweep.dataset import load_data
 
     if not directories:
-        raise BadInput(f"{command}: give the directories that armlink sweep wrote")
+        raise BadInput(f"{command}: give the directories that sweep wrote")
     data = [load_data(path) for path in directories]
     return data, data[0].load_arm(arm)

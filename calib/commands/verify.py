@@ -34,11 +34,11 @@ def verify(
     """
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
-    from armlink.errors import Refused
     from armlink.loop.open import open_arm
     from calib.commands.screen import SweepScreen
     from calib.creep.choice import sweep_motion
     from calib.creep.verify import verify_creeping
+    from calib.records.missing import no_record
     from calib.records.store import RecordStore
     from calib.sweep.verify import run_verify
 
@@ -47,7 +47,7 @@ def verify(
         gravity, calibration = _records(RecordStore(store), arm_file, record or [])
         creeping = sweep_motion(arm_file) == "creep"
         if creeping and calibration is None:
-            raise Refused(f"{arm_file.name} {arm_file.serial}: no calibration record yet: armlink calibrate makes one")
+            raise no_record(arm_file, "calibration")
         link.start()
         with SweepScreen(f"{arm_file.name}: verify") as screen:
             link.enable()
@@ -71,7 +71,7 @@ def verify(
 
 def _records(store: Any, arm_file: Any, ids: list[str]) -> "tuple[GravityRecord, CalibrationRecord | None]":
     """The records named, else the current ones; raises Refused where there is no gravity record."""
-    from armlink.errors import Refused
+    from calib.records.missing import no_record
     from calib.records.records import CalibrationRecord, GravityRecord
 
     named = [store.get(record).require(arm_file) for record in ids]
@@ -79,7 +79,7 @@ def _records(store: Any, arm_file: Any, ids: list[str]) -> "tuple[GravityRecord,
     calibration = next((each for each in named if isinstance(each, CalibrationRecord)), None)
     gravity = gravity or store.current(GravityRecord, arm_file)
     if gravity is None:
-        raise Refused(f"{arm_file.name} {arm_file.serial}: no gravity record yet: armlink identify makes one")
+        raise no_record(arm_file, "gravity")
     return gravity, calibration or store.current(CalibrationRecord, arm_file)
 
 

@@ -10,7 +10,7 @@ from calib.commissioning.draft import FRICTION, Draft, JointDraft
 def arm_text(draft: Draft, out: Path) -> str:
     """The YAML text of the draft, to stand at `out`: the model's path is relative to it."""
     lines = [
-        f"# {draft.name}, from {draft.model.name} by armlink new.",
+        f"# {draft.name}, from {draft.model.name}, by the command new.",
         "# Comments mark what was guessed: check it before a real arm moves, then remove the comment.",
         f"name: {_scalar(draft.name)}",
         f"serial: {_scalar(draft.serial)}",
@@ -32,7 +32,7 @@ def arm_text(draft: Draft, out: Path) -> str:
     if draft.servo is not None:
         lines += ["sweep:", "  hold: servo", f"  # assumed: {draft.servo}"]
     lines += [
-        "sim:  # the simulated arm for armlink demo: masses are the model's",
+        "sim:  # the simulated arm, for the command demo: masses are the model's",
         f"  effects:  # assumed: friction of {FRICTION:.0%} of rated torque",
     ]
     lines += [

@@ -32,13 +32,20 @@ def bus_findings(arm_file: ArmFile, spec: str | None = None) -> Iterator[SetupFi
         opened = open_link_bus(spec, link)
     except ArmlinkError as error:
         what, _, reason = str(error).partition(": ")
-        remedy = "check its name, its driver and that it is up; armlink doctor --offline leaves it out"
+        remedy = (
+            f"check its name, its driver and that it is up; without it: armlink doctor {arm_file.argument} --offline"
+        )
         yield SetupFinding("error", reason or what, name, remedy)
         return
     try:
         yield from _drives(arm_file, opened, name)
     except ArmlinkError as error:
-        yield SetupFinding("error", str(error), name, "check power, wiring and bit rate; armlink scan shows more")
+        yield SetupFinding(
+            "error",
+            str(error),
+            name,
+            f"check power, wiring and bit rate; more is shown by armlink scan {arm_file.argument}",
+        )
     finally:
         opened.shutdown()
     if bus.interface == SIMULATED:

@@ -32,7 +32,7 @@ def _all(arm: str, bus: str | None, offline: bool) -> Iterator[SetupFinding]:
             yield SetupFinding("error", what, f"{arm}: {key}", remedy)
         return
     except ArmlinkError as error:
-        yield SetupFinding("error", str(error), arm, "correct the arm file, or make one of a model with armlink new")
+        yield SetupFinding("error", str(error), arm, "correct the arm file, or make one of a model: armlink new --help")
         return
     try:
         yield from model_findings(arm_file)

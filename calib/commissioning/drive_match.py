@@ -69,7 +69,7 @@ def match_by_hand(
         ask(f"{joint.name}: now to its upper stop ({joint.upper:+.2f} rad)")
         after = drives.positions()
         turned = {node: after[node] - before[node] for node in free}
-        node = _moved(joint.name, turned, bus)
+        node = moved_node(joint.name, turned, bus)
         matches.append(Match(joint.name, free.pop(node), by_hand=True))
         findings += _judge(joint, node, turned[node])
     return matches, findings
@@ -84,7 +84,7 @@ def _require(names: Sequence[str], found: Sequence[FoundDrive], bus: str) -> Non
         )
 
 
-def _moved(joint: str, turned: dict[int, float], bus: str) -> int:
+def moved_node(joint: str, turned: dict[int, float], bus: str) -> int:
     """The node that moved; raises BusFault where that is not clear."""
     order = sorted(turned, key=lambda node: -abs(turned[node]))
     if abs(turned[order[0]]) < LEAST_TURN:

@@ -21,6 +21,10 @@ USUAL_GRAVITY = (9.7, 9.9)
 def model_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
     """Findings about kinematics and model; raises BadInput where the model cannot be used at all."""
     where = str(arm_file.path)
+    if arm_file.model_path is None and not any(row.a or row.alpha or row.d for row in arm_file.kinematics.joints):
+        remedy = "give a, alpha and d of every joint, or make the arm file of its URDF or MJCF: armlink new --help"
+        yield SetupFinding("error", "its geometry is not known: nothing can be swept or identified", where, remedy)
+        return
     if arm_file.model_path is None:
         yield SetupFinding(
             "hint",

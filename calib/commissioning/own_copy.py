@@ -55,7 +55,7 @@ def own_copy(arm: ArmFile, out: Path, bus: dict[str, str | int], opened: CanBus,
     if arm.model_path is not None:
         content["kinematics"]["model"] = os.path.relpath(arm.model_path, out.resolve().parent)
     parse_arm(dict(content), out)
-    text = f"# {arm.name} with the drives on {opened.channel_info}, from {arm.path.name} by armlink new.\n"
+    text = f"# {arm.name} with the drives on {opened.channel_info}, from {arm.path.name}, by the command new.\n"
     for key, value in content.items():
         part = yaml.safe_dump({key: value}, sort_keys=False, allow_unicode=True, width=160)
         assumed = "  # assumed: that of the first drive" if key == "serial" and new_serial else ""

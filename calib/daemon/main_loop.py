@@ -3,6 +3,7 @@
 import asyncio
 import importlib
 import logging
+import math
 import signal
 import time
 from collections.abc import Callable
@@ -49,6 +50,8 @@ class Daemon:
         self.service = Service(arm, settings, options.listen_only, state, RecordStore(options.store), environment)
         self.view = ServiceView(self.service)
         self._why = "stopped"
+        self._ticked = self._kept_alive = -math.inf
+        self._notified = ""
 
     async def run(self) -> None:
         """Run until SIGTERM or SIGINT; leaves the joints safe."""
@@ -89,26 +92,29 @@ class Daemon:
         self._ended.set()
 
     async def _timer(self) -> None:
-        """Snapshots, the service's tick, the watchdog, and supervision of the bus process."""
-        ticked, kept_alive, notified = 0.0, 0.0, ""
         due = time.monotonic()
         while True:
             now = time.monotonic()
-            self.view.publish()
-            why = self.service.trouble or self.service.arm_state.fault or self.service.records.detail
-            status = f"STATUS={self.service.state} {why}".strip()
-            if status != notified:
-                notified = status
-                self._notify(status)
-            if now - ticked >= 1.0:
-                ticked = now
-                self.service.tick()
-                self._judge(now, stood_still=now - due)
-            if self._watchdog is not None and now - kept_alive >= self._watchdog / 3:
-                kept_alive = now
-                self._notify("WATCHDOG=1")
+            self._turn(now, stood_still=now - due)
             due = max(due + SNAPSHOT_SECONDS, now)
             await asyncio.sleep(due - now)
+
+    def _turn(self, now: float, stood_still: float) -> None:
+        """Snapshots, the service's tick, the watchdog, and supervision of the bus process."""
+        self._notify.flush()
+        self.view.publish()
+        why = self.service.trouble or self.service.arm_state.fault or self.service.records.detail
+        status = f"STATUS={self.service.state} {why}".strip()
+        if status != self._notified:
+            self._notified = status
+            self._notify(status)
+        if now - self._ticked >= 1.0:
+            self._ticked = now
+            self.service.tick()
+            self._judge(now, stood_still)
+        if self._watchdog is not None and now - self._kept_alive >= self._watchdog / 3:
+            self._kept_alive = now
+            self._notify("WATCHDOG=1")
 
     def _judge(self, now: float, stood_still: float) -> None:
         """Replace a bus process that hangs; not because this process itself stood still (stopped, say) [s]."""

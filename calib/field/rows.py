@@ -69,7 +69,7 @@ def rows_of_sweeps(data: SweepData, number: int) -> StaticReadings:
     if data.manifest.reference_mass > 0:
         raise BadInput(
             f"{data.path}: swept with a reference mass of {data.manifest.reference_mass:g} kg: the field"
-            " calibration needs the arm without a mass (armlink calibrate takes both)"
+            f" calibration needs the arm without a mass; sweeps with one belong to armlink calibrate {data.path}"
         )
     readings = sweep_readings([data]).readings
     return replace(readings, series=np.full(len(readings), number))

@@ -11,7 +11,7 @@ from calib.fit.lags import Lags
 from calib.fit.position_field import PositionField
 from calib.fit.refinement import Extra, Refined, refine
 from calib.fit.remaining_doubt import remaining_doubt
-from calib.fit.small_troubles import Setting
+from calib.fit.small_troubles import FAMILIES, Setting
 from calib.fit.sweep_readings import SweepReadings
 from calib.fit.unmodelled_effects import Effect, size_of, strongest_effect
 from calib.records.records import Discrepancy
@@ -36,6 +36,10 @@ SWING, BULK = 800.0, (10.0, 90.0)
 these percentiles, so that a knock does not widen it. Chosen on the saturated sensors of test_examination.py."""
 BLURRED = 3.0
 """Factor to the median standard deviation beyond which a reading, as of a swinging arm, cannot show a limit."""
+
+LAGGING = 1.5
+"""Level of the lags beyond which the sensors' plays are taken as wide as they are, in a second fit; below, readings do
+not show the difference."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +87,10 @@ def examine(
         return refine(replace(rows, readings=kept), setting, fit, priors, extras)
 
     refined = fitted()
+    level = float(refined.levels.level[FAMILIES.index("direction")])
+    if level > LAGGING:
+        setting = replace(setting, lags=Lags.of(kinematics, rows, refined.fit.complete, rated, level))
+        refined = fitted()
     for _ in range(MOST_EFFECTS):
         strange = _outliers(kinematics, refined, rows, [extra for effect in effects for extra in effect.extras])
         if (strange != outliers).any():

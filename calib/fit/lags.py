@@ -20,7 +20,8 @@ TURNS = (0.1, 0.3, 0.8)
 """Half widths of a cable's play in a joint's turn [rad]: short and long ones, between which real ones lie; the longest
 for a cable that this joint bends less than another."""
 TORQUE = 5e-4
-"""Half width of a sensor's play, as a share of rated torque: accuracy class 0.05."""
+"""Half width of a good sensor's play, as a share of rated torque: accuracy class 0.05. It is the lag itself, so that a
+worse sensor has a wider one."""
 STEPS = 4
 """Points on a straight way at which the torque is computed."""
 
@@ -40,8 +41,11 @@ class Lags:
         return cls(np.zeros((len(TURNS), count, n)), np.zeros((count, n)))
 
     @classmethod
-    def of(cls, arm: Arm, rows: SweepReadings, parameters: Parameters, rated: Array) -> "Lags":
-        """On straight ways between the readings, each approached from the side that it tells; rated (n,) [N·m]."""
+    def of(cls, arm: Arm, rows: SweepReadings, parameters: Parameters, rated: Array, level: float = 1.0) -> "Lags":
+        """On straight ways between the readings, each approached from the side that it tells; rated (n,) [N·m].
+
+        `level` is that of the sensors' lags, 1 for good ones.
+        """
         position, load = rows.readings.position, rows.readings.load
         approach = position - APPROACH * rows.readings.direction * rows.own
         way = np.stack([approach, position], axis=1).reshape(-1, arm.n)
@@ -52,7 +56,7 @@ class Lags:
         nothing = np.zeros((len(finer), arm.n))
         loads = np.repeat(load, 2 * STEPS)
         torque = predict(arm, parameters, StaticReadings.of(finer, nothing, 1.0, loads)) - parameters.offset
-        sensor = _play(torque / np.where(parameters.gain == 0, 1.0, parameters.gain), TORQUE * rated)
+        sensor = _play(torque / np.where(parameters.gain == 0, 1.0, parameters.gain), level * TORQUE * rated)
         return cls(cable, -sensor[2 * STEPS - 1 :: 2 * STEPS])
 
 

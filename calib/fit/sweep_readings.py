@@ -92,7 +92,7 @@ def sweep_readings(data: Sequence[SweepData]) -> SweepReadings:
 
 def _require_one_arm(data: Sequence[SweepData]) -> None:
     if not any(each.readings for each in data):
-        raise BadInput("no sweep readings: give the directories that armlink sweep wrote")
+        raise BadInput("no sweep readings: give the directories that sweep wrote")
     first = data[0].manifest
     for each in data[1:]:
         if (each.manifest.names, each.manifest.description_hash) != (first.names, first.description_hash):

@@ -127,7 +127,7 @@ class _Run:
             raise Refused(
                 f"{self._link.names[worst]}: its sensor reads {sensor[worst]:.2f} N·m, the gravity model says"
                 f" {model[worst]:.2f}; at most {AGREEMENT * rated[worst]:.2f} apart is safe to float with: is a load"
-                " on the arm, a joint on its stop, or the calibration not written (armlink calibrate --apply)?"
+                " on the arm, a joint on its stop, or the calibration not written to the controllers?"
             )
 
     def follow(self, floating: Floating, seconds: float) -> None:

@@ -1,6 +1,6 @@
 """`--apply`: gates, check motion, write, check motion; for records from sweeps, from slow motion and from earlier."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,8 +74,9 @@ def apply_field(
     """The same for a record of `armlink recalibrate`, from slow rows."""
     _keep(record, arm, store, how)
     admitted = admit(record, arm, store, how.replaced)
-    if admitted.before is not None:
-        _refuse_worse(arm, admitted.before, *heldout_errors(rows, fit, admitted.before))
+    before = admitted.before
+    if before is not None and not fitted_to(before, data_of(record)):
+        _refuse_worse(arm, before, *heldout_errors(rows, fit, before))
     return _write(lambda link: admitted, record, arm, store, beta, how, "slow motion")
 
 
@@ -134,18 +135,24 @@ def check_heldout(
     fixed, and so are the mass moments of `gravity`; without it those are estimated too. A record that was fitted to
     some of these readings is not judged by them: for it they are not held out.
     """
-    if fitted_to(old, data):
+    digests = {each.digest for each in data}
+    if fitted_to(old, digests):
         return
     rows = sweep_readings([each.require(arm) for each in data])
-    independent = gravity is not None and not fitted_to(gravity, data)
+    independent = gravity is not None and not fitted_to(gravity, digests)
     beta = np.array(gravity.require(arm).beta) if gravity is not None and independent else None
     fresh = heldout_scores(new, arm, rows, refit=True)
     _refuse_worse(arm, old, fresh, heldout_scores(old, arm, rows, refit=False, beta=beta))
 
 
-def fitted_to(record: Record, data: Sequence[SweepData]) -> bool:
-    """Whether a record comes from some of these data sets."""
-    return not {each.digest for each in data}.isdisjoint(record.sources.values())
+def fitted_to(record: Record, digests: Set[str]) -> bool:
+    """Whether a record comes from some of these data sets: for it they are not held out."""
+    return not digests.isdisjoint(record.sources.values())
+
+
+def data_of(record: Record) -> set[str]:
+    """Digests of the data that a record comes from; other records, such as gravity's, are named by their ids."""
+    return {digest for name, digest in record.sources.items() if not name.endswith(digest)}
 
 
 def _refuse_worse(arm: ArmFile, old: CalibrationRecord, new_errors: Array, old_errors: Array) -> None:

@@ -123,8 +123,9 @@ class Mover:
                     yield self._see(sample)
                     row += 1
             finally:
-                now = setpoints.command(min(row, len(setpoints) - 1))
-                self.command.position, self.command.torque = now.position.copy(), now.torque.copy()
+                if len(setpoints):  # none where it stands there already
+                    now = setpoints.command(min(row, len(setpoints) - 1))
+                    self.command.position, self.command.torque = now.position.copy(), now.torque.copy()
 
     def _see(self, sample: Sample) -> Sample:
         self.seen_at = sample.t

@@ -77,7 +77,7 @@ class CauseTest:
         """Of K rows with true angles, torques as installed, their standard deviations, temperatures (K, n) if told."""
         self.belief, self.window, self._config = belief, window, config
         expected = belief.expected(window.position, window.direction, temperature)
-        residual = window.torque - belief.torque(window.position) - expected.mean
+        residual = window.torque - expected.torque - expected.mean
         covariance = expected.covariance.copy()
         covariance[np.diag_indices_from(covariance)] += window.sigma.ravel() ** 2
         noise = (window.sigma**2).mean(axis=0)

@@ -34,6 +34,8 @@ FIRST_ROWS = 120
 class Expected:
     """Residuals that the belief expects at K poses while no sensor has drifted."""
 
+    torque: Array
+    """Gravity torque of the model, against which residuals are (K, n) [N·m]."""
     mean: Array
     """(K, n) [N·m]."""
     blocks: Array
@@ -129,13 +131,15 @@ class GravityBelief:
         if self._posterior is None:
             self._posterior = self._learn(self._reference.rows)
         warmer = np.full(q.shape, np.nan) if temperature is None else temperature - self._reference.temperature
-        points = self.kernel.points(q, side, np.nan_to_num(warmer))
-        mean, blocks, columns = self._posterior.predict(points, self._columns(q))
+        regressor = gravity_regressor(self.arm, q)
+        torque: Array = regressor @ self.beta
+        points = self.kernel.points(q, side, np.nan_to_num(warmer), torque)
+        mean, blocks, columns = self._posterior.predict(points, self._columns(q, regressor))
         untold = np.where(np.isfinite(warmer).all(axis=0), TOLD, 1.0)
         blocks += (untold * np.minimum(WANDER * self.level.total, self._wander))[:, None, None] ** 2
         flat = columns.swapaxes(0, 1).reshape(q.size, -1)
-        tool = (gravity_regressor(self.arm, q) @ self._tool).reshape(q.size, -1)
-        return Expected(mean, blocks, np.hstack([flat, tool]))
+        tool = (regressor @ self._tool).reshape(q.size, -1)
+        return Expected(torque, mean, blocks, np.hstack([flat, tool]))
 
     def before(self, position: Array) -> "GravityBelief":
         """The belief from the reference rows before the one of this pose (n,): what a window is tested against."""
@@ -187,7 +191,8 @@ class GravityBelief:
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(LEVEL_ROWS, len(rows))).astype(int))]
         points, n = self.kernel.points(rows.position, rows.side), self.arm.n
         at_origin, by_point = payload_columns(self.arm)
-        payload = gravity_regressor(self.arm, rows.position) @ np.column_stack([at_origin, by_point])
+        regressor = gravity_regressor(self.arm, rows.position)
+        payload = regressor @ np.column_stack([at_origin, by_point])
         free = [payload.swapaxes(0, 1)]
         for epoch in np.unique(rows.epoch):
             within = (rows.epoch == epoch).astype(float)
@@ -196,22 +201,23 @@ class GravityBelief:
         columns = np.concatenate(free, axis=2)
         if len(rows) < columns.shape[2] + 5:
             return
-        known = self._columns(rows.position).swapaxes(0, 1)
+        known = self._columns(rows.position, regressor).swapaxes(0, 1)
         unit = self.kernel.between(points, points)
         self.level = self.level.fitted(unit, rows.residual.T, self._noise, known, columns)
 
     def _learn(self, rows: Rows) -> Posterior:
         warmer = np.nan_to_num(rows.temperature - self._reference.temperature)
         points = self.kernel.points(rows.position, rows.side, warmer)
-        data = Data(points, rows.residual, self._columns(rows.position), rows.epoch)
+        columns = self._columns(rows.position, gravity_regressor(self.arm, rows.position))
+        data = Data(points, rows.residual, columns, rows.epoch)
         free = 0.1 * self.kernel.typical + 20 * self._noise
         thermal, shared = np.minimum(THERMAL * self.level.total, self._wander), self._factor.shape[1] + self.arm.n
         return Posterior(self.kernel, self.level, self._noise, free, thermal, data, shared)
 
-    def _columns(self, q: Array) -> Array:
+    def _columns(self, q: Array, regressor: Array) -> Array:
         """Columns (K, n, P) of the model's stated uncertainty: of β and of the position sensors' zeros."""
         of_position = gravity_stiffness(self.arm, self.beta, q) * self._position_std
-        return np.concatenate([gravity_regressor(self.arm, q) @ self._factor, of_position], axis=2)
+        return np.concatenate([regressor @ self._factor, of_position], axis=2)
 
     def save(self) -> dict[str, Any]:
         """Parameters, factor of their covariance, tool, level and reference rows, as JSON values."""

@@ -54,9 +54,10 @@ class Investigation:
 
     def add(self, row: StaticReading) -> bool:
         """Take a row; False if the window has enough rows of this pose already."""
-        away = [np.abs(kept.position - row.position).max() for kept in self.window]
-        if sum(bool(far < self._config.place_size) for far in away) >= self._config.place_rows:
-            return False
+        if self.window:
+            away = np.abs(np.array([kept.position for kept in self.window]) - row.position).max(axis=1)
+            if (away < self._config.place_size).sum() >= self._config.place_rows:
+                return False
         self.window.append(row)
         self.fresh += 1
         return True

@@ -14,6 +14,7 @@ from calib.install.journaled_write import Controllers, install, recover
 from calib.install.plausibility import Admitted, admit, admit_drift, admit_rollback
 from calib.observer.check_at_rests import AfterWrite, Checked
 from calib.observer.decision import Finding
+from calib.records.missing import no_record
 from calib.records.records import CalibrationRecord, GravityRecord, matrix, provenance
 from calib.records.store import RecordStore
 from gcomp.arrays import Array
@@ -80,7 +81,7 @@ class Recalibrator:
         """Start from the arm's current calibration record (default: as the store has it); raises Refused if none is."""
         current = current or store.current(CalibrationRecord, arm)
         if current is None:
-            raise Refused(f"{arm.name} {arm.serial} has no calibration record yet: run armlink sweep and calibrate")
+            raise no_record(arm, "calibration")
         self.record = current
         self._arm, self._controllers, self._store, self._policy = arm, controllers, store, policy
         self._reference = self._swept(current)
@@ -205,7 +206,7 @@ def require_installed(record: CalibrationRecord, controllers: Controllers, j: in
         if not same_real32(value, found):
             raise Refused(
                 f"{joint.name}: the controller holds {what} {found:.6g}, record {record.id} has {value:.6g}:"
-                " write the record first (armlink calibrate --apply)"
+                " write the record to the controllers first"
             )
     return held
 

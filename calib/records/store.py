@@ -74,7 +74,7 @@ class RecordStore:
         with reading(self._engine) as connection:
             body = connection.execute(sa.select(RECORDS.c.body).where(RECORDS.c.id == record_id)).scalar()
         if body is None:
-            raise Refused(f"no record {record_id} in {self.url}; armlink history ARM lists the records")
+            raise Refused(f"no record {record_id} in {self.url}; the history of an arm lists its records")
         return parse_record(self._parsed(body), f"record {record_id}")
 
     def activate(self, record_id: str, arm: ArmFile, by: str, reason: str) -> Activation:

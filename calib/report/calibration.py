@@ -1,5 +1,6 @@
 """Report of a calibration as one HTML page: sources, results per joint and sweep, comparison with the last record."""
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -51,7 +52,7 @@ def _identity(done: Calibrated) -> Section:
     record, findings = done.record, done.fit.goodness.findings
     broken = sorted({each.joint for each in findings if each.breaks_model})
     verdict = f"the model does not hold: {', '.join(broken)}" if broken else "the model holds"
-    html = f'<p><span class="verdict">{escape(verdict)}</span></p>' + paragraph(_advice(done, broken))
+    html = f'<p><span class="verdict">{escape(verdict)}</span></p>' + _advice(done, broken)
     html += "".join(paragraph(each.text) for each in findings)
     rows = [
         ["arm", escape(f"{record.arm}, serial {record.serial}")],
@@ -67,11 +68,11 @@ def _identity(done: Calibrated) -> Section:
         load = f"{data.manifest.reference_mass:g} kg attached" if data.manifest.reference_mass else "no mass"
         when = f"{data.manifest.created:%Y-%m-%d %H:%M} UTC"
         rows.append([f"sweeps {escape(data.path.name)}", f"{load}, {when}<br><small>SHA-256 {data.digest}</small>"])
-    return Section("Calibration", html, (), [ReportTable(("", ""), rows, texts=2)])
+    return Section("Calibration", html, (), [ReportTable((), rows, texts=2)])
 
 
 def _advice(done: Calibrated, broken: list[str]) -> str:
-    """What a person does with this calibration, in a few sentences."""
+    """What a person does with this calibration, in a few sentences and a command, as HTML."""
     fit = done.fit
     half = fit.half95("gain")
     known, unknown = (
@@ -83,10 +84,15 @@ def _advice(done: Calibrated, broken: list[str]) -> str:
     )
     without = f"; not of {', '.join(unknown)}, see below" if unknown else ""
     if broken:
-        return f"Do not write it yet: look at {', '.join(broken)} first, then sweep again. {exactly}{without}."
+        return paragraph(
+            f"Do not write it yet: look at {', '.join(broken)} first, then sweep again. {exactly}{without}."
+        )
     if done.record.confirmed_by:
-        return f"It is confirmed for the controllers; verify it with armlink verify. {exactly}{without}."
-    return f"It can be written to the controllers: armlink calibrate --apply. {exactly}{without}."
+        next_step, command = "It is confirmed for the controllers; verify it:", f"armlink verify {done.arm.argument}"
+    else:
+        sweeps = shlex.join(str(data.path) for data in done.data)
+        next_step, command = "It can be written to the controllers:", f"armlink calibrate {sweeps} --apply"
+    return paragraph(f"{exactly}{without}. {next_step}") + f"<p><code>{escape(command)}</code></p>"
 
 
 def _sensors(done: Calibrated) -> Section:
@@ -222,7 +228,8 @@ def _left_out(done: Calibrated) -> Section:
     model = sensor - np.where(own, score * rows.readings.sigma, np.nan) / complete.gain
     text = (
         "Torque at held-out steps (every second step of each sweep, then the others): the model fitted without them,"
-        " solid, and the sensor, dashed. For poses that are in no sweep: armlink verify --report."
+        " solid, and the sensor, dashed. For poses that are in no sweep: "
+        f"armlink verify {done.arm.argument} --report verify.html"
     )
     return Section(
         "Model against sensor (the paper's Figure 6)", paragraph(text), [left_out_figure(fit.names, sensor, model)]

@@ -57,11 +57,15 @@ def _figure(figure: Any) -> str:
 
 def style(figure: Any) -> None:
     """Set a plotly figure's grid, typeface and margins to those of the page."""
+    top = figure.layout.margin.t or 48
+    if figure.layout.title.text:  # above a legend that takes two lines on a phone
+        top = max(top, 92)
+        figure.update_layout(title={"y": 0.98, "yanchor": "top"})
     figure.update_layout(
         template="plotly_white",
         font={"family": "system-ui, sans-serif", "size": 13, "color": "#1c2733"},
         colorway=["#1f5fa8", "#d9622b", "#3c8d5a", "#8a4fa3", "#b8912b", "#4f7f95", "#a83248"],
-        margin={"l": 60, "r": 20, "t": figure.layout.margin.t or 48, "b": 48},
+        margin={"l": 60, "r": 20, "t": top, "b": 48},
         paper_bgcolor="white",
         hoverlabel={"font_size": 12},
     )

@@ -86,7 +86,7 @@ def compile_model(path: Path) -> "mujoco.MjModel":
         _drop_absent_meshes(spec, path.parent / spec.compiler.meshdir)
         return spec.compile()
     except ValueError as error:
-        raise BadModel(f"{path}: MuJoCo refuses it: {error}") from None
+        raise BadModel(f"{path}: MuJoCo refuses it: {' '.join(str(error).split())}") from None
 
 
 def _drop_absent_meshes(spec: "mujoco.MjSpec", folder: Path) -> None:

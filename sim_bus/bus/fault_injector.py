@@ -13,14 +13,13 @@ from sim_bus.drives.fault_kinds import DRIVE_KINDS
 from sim_bus.drives.simulated_drive import SimulatedDrive
 from sim_bus.node.node import Node
 from sim_bus.node.pdo import Frame
-from sim_bus.simulated_arm import SimulatedArm
+from sim_bus.simulated_arm import SERVICE, SimulatedArm
 
 ERROR_FLAG = 0x20000000
 """Flag of an error frame, as in SocketCAN; the lower bits are the error class."""
 PROTOCOL_ERROR, BUS_OFF, RESTARTED = 0x08, 0x40, 0x100
 ABORT_CODE, STORM_CODE = 0x08000022, 0x7305
 BABBLE = (0x001, bytes(8))
-SERVICE, NODE, LARGEST_STANDARD = 0x780, 0x7F, 0x7FF
 TPDO1, SDO_ANSWER, SDO_REQUEST = 0x180, 0x580, 0x600
 TO_NODES = (0x200, 0x300, 0x400, 0x500, SDO_REQUEST)
 """Function codes of frames to one node: RPDO1 to 4 and SDO."""
@@ -85,7 +84,7 @@ class Injector:
         self._begin()
         if self.refusal:
             return
-        place = self.arm.place_of.get(can_id & NODE) if can_id <= LARGEST_STANDARD else None
+        place = self.arm.node_place(can_id)
         service = can_id & SERVICE
         if place is not None and service in TO_NODES and self.arm.device(place).unplugged:
             return
@@ -112,7 +111,7 @@ class Injector:
     def _storm(self, place: int) -> Frame:
         device = self.arm.device(place)
         assert isinstance(device, Node)
-        return 0x80 + device.node_id, struct.pack("<HB5x", STORM_CODE, 0x21)
+        return device.tag | 0x80 + device.node_id, struct.pack("<HB5x", STORM_CODE, 0x21)
 
     def _begin(self) -> None:
         while self._planned and self._planned[0].time <= self.arm.time:
@@ -159,7 +158,7 @@ class Injector:
             answer = struct.pack("<B3sI", 0x80, request[1:4].ljust(3, b"\0"), ABORT_CODE)
             device = self.arm.device(place)
             assert isinstance(device, Node)
-            self._sent.append((SDO_ANSWER + device.node_id, answer))
+            self._sent.append((device.tag | SDO_ANSWER + device.node_id, answer))
             self._carry()
             return True
         return ("sdo.timeout", place) in self._on

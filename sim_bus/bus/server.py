@@ -7,15 +7,15 @@ from types import FrameType
 
 from armlink.bus.bus_group import BusGroup, GroupPort
 from armlink.bus.can_bus import CanBus
-from armlink.bus.port import BUS_SHIFT, Frame, InterfaceDown, Port
-from armlink.drives.canopen.object_dictionary import NMT_ID, SYNC_ID
+from armlink.bus.port import BUS_SHIFT, InterfaceDown
+from armlink.drives.canopen.object_dictionary import SYNC_ID
 from armlink.errors import BusFault
 from sim_bus.bus.control_pipe import ControlPipe
 from sim_bus.bus.effect_options import Drift
 from sim_bus.bus.fault_injector import Injector
 from sim_bus.bus.fault_kinds import Fault
 from sim_bus.bus.wire_timing import Line
-from sim_bus.simulated_arm import LARGEST_ID, MARK_SHIFT, SimulatedArm, bus_mark
+from sim_bus.simulated_arm import SimulatedArm
 
 LARGEST_LAG = 0.25
 """Maximum lag of the physics behind the clock; the rest is dropped, as after a stopped process [s]."""
@@ -47,25 +47,15 @@ class Server:
         self._arm, self._lockstep, self._now = arm, lockstep, now
         self._port = bus.open_port(as_node=True)
         ports = self._port.members if isinstance(self._port, GroupPort) else (self._port,)
-        *self._others, self._leading = ports
-        """The last of several buses provides SYNC: a host sends to them in order."""
-        self._of_port: dict[Port, set[int]] = {port: set() for port in ports}
-        """Nodes on each of several buses."""
-        self._marks: dict[Port, int] = {}
-        """Of each of several buses that has other drives: the mark of its frames."""
-        self._several = isinstance(bus, BusGroup)
-        self._tags: dict[int, int] = {}
-        """Node → what the identifiers of its bus have in addition."""
+        self._numbered = [(place << BUS_SHIFT, port) for place, port in enumerate(ports)]
+        """Ports of the buses with the tags of their frames; the leading one last."""
         if isinstance(bus, BusGroup):
             arm.stand_on(list(bus.tags))
-            for joint in arm.arm.require_link().joints:
-                place = bus.tags[joint.bus] >> BUS_SHIFT
-                if joint.settings.family != "canopen":
-                    self._marks[ports[place]] = bus_mark(place)
-                    continue
-                node = joint.settings.node
-                self._tags[node] = bus.tags[joint.bus]
-                self._of_port[ports[place]].add(node)
+            joints = arm.arm.require_link().joints
+            synced = [bus.tags[joint.bus] for joint in joints if joint.settings.family == "canopen"]
+            self._numbered.sort(key=lambda each: each[0] == max(synced, default=bus.tags[joints[-1].bus]))
+        *self._others, (self._leading_tag, self._leading) = self._numbered
+        """The last of several buses with CANopen nodes provides SYNC: a host sends to them in order."""
         self._line: Line = arm
         self._control, self._injector = control, None if control is None and not faults else Injector(arm)
         if self._injector is not None:
@@ -101,7 +91,7 @@ class Server:
                 if frame is None:
                     break
                 self._take_from_others()
-                self._heard(frame, self._leading)
+                self._frame(frame[0] | self._leading_tag, frame[1])
                 frame = receive(0.0)
             self._take_from_others()
         except InterfaceDown:  # may come up again; until then nodes receive nothing
@@ -119,25 +109,17 @@ class Server:
         return due + self._offset - self._now()
 
     def _take_from_others(self) -> None:
-        for port in self._others:
+        """Frames of the other buses; SYNC, which comes on all of them, counts on the leading one alone."""
+        for tag, port in self._others:
             while (frame := port.receive(0.0)) is not None:
-                self._heard(frame, port)
-
-    def _heard(self, frame: Frame, port: Port) -> None:
-        """Count frames sent to every bus once: SYNC on the leading bus, NMT commands on each node's own."""
-        can_id, data = frame
-        if self._others and can_id == NMT_ID and len(data) == 2:
-            command, addressed = data
-            for node in self._of_port[port] if addressed == 0 else self._of_port[port] & {addressed}:
-                self._line.on_frame(NMT_ID, bytes([command, node]))
-        elif port is self._leading or can_id != SYNC_ID:
-            self._frame(can_id | self._marks.get(port, 0), data)
+                if frame[0] != SYNC_ID:
+                    self._frame(frame[0] | tag, frame[1])
 
     def _frame(self, can_id: int, data: bytes) -> None:
         if not (self._lockstep or self._arm.waits_for_sync(can_id)):
             self._let_time_pass()
         self._line.on_frame(can_id, data)
-        if self._lockstep and can_id == SYNC_ID:
+        if self._lockstep and can_id == SYNC_ID | self._leading_tag:
             self._synced = self._now()
             self._line.advance(self._arm.period)
         self._flush()
@@ -161,18 +143,12 @@ class Server:
     def _flush(self) -> None:
         outbox = self._line.outbox
         if outbox:
-            frames = [(self._on_its_bus(can_id), data) for can_id, data in outbox] if self._several else list(outbox)
+            frames = list(outbox)
             outbox.clear()
             try:
                 self._port.send_all(frames)
             except BusFault:  # lost, as on a dead bus
                 self.lost += len(frames)
-
-    def _on_its_bus(self, can_id: int) -> int:
-        """Identifier of a frame of the arm for the port of several buses."""
-        if can_id > LARGEST_ID:
-            return can_id & LARGEST_ID | ((can_id >> MARK_SHIFT) - 1) << BUS_SHIFT
-        return can_id | self._tags[can_id & 0x7F]
 
     def _end(self, number: int, _frame: FrameType | None) -> None:
         self._ended = INTERRUPTED if number == signal.SIGINT else TERMINATED

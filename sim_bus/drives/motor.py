@@ -23,19 +23,14 @@ class Readings:
         self._time = -1.0
         self.position, self.velocity, self.torque, self.heating = (np.zeros(plant.n) for _ in range(4))
         """By the drive's encoder [rad] and [rad/s]; current times torque constant [N·m]; temperature rise [K]."""
-        self.started = np.zeros(plant.n)
-        """Torque at the start of the present step (n,) [N·m]."""
         self._mean = np.zeros(plant.n)
 
-    def step_ends(self, middle: Array) -> None:
-        """A step of the arm has ended, in whose middle the torques were `middle` (n,) [N·m]: a drive tells the mean of
-        its many cycles within it (Simpson's rule), not the last one.
+    def step_ends(self) -> None:
+        """A step of the arm has ended: a drive tells the mean of its many cycles within it, not the last one.
 
         A stiff drive whose target stands still for a step while the joint moves on makes less and less torque in it.
         """
-        ended = self._plant.drive_torque
-        self._mean = (self.started + 4.0 * middle + ended) / 6.0
-        self.started = ended.copy()
+        self._mean = self._plant.take_mean_torque()
 
     def at(self, time: float) -> "Readings":
         """The readings at `time` [s]."""
@@ -99,9 +94,7 @@ class Motor:
         at_zero = self._zero - turn * offset
         level = kp * (position - at_zero) + kd * velocity + torque
         self.powered = True
-        law = kp * turn * ratio, kd * turn * ratio, level * ratio, limit * abs(ratio)
-        self._loops.impede(joint, *law)
-        self._readings.started[joint] = self._loops.torque_by(joint, *law)
+        self._loops.impede(joint, kp * turn * ratio, kd * turn * ratio, level * ratio, limit * abs(ratio))
 
     @property
     def tuned(self) -> tuple[float, float, float]:
@@ -115,7 +108,6 @@ class Motor:
         if self.powered:
             self.powered = False
             self._loops.release(self.joint)
-            self._readings.started[self.joint] = 0.0
 
     def _value(self, values: Array) -> float:
         return float(values[self.joint])

@@ -21,12 +21,12 @@ class NetworkManagement:
         self._nodes, self._drives, self._supervision, self._apply = nodes, drives, supervision, apply
         self.operational = bytearray(drives.n)
 
-    def frame(self, data: bytes, time: float) -> None:
-        """Process an NMT command."""
+    def frame(self, data: bytes, time: float, tag: int) -> None:
+        """Process an NMT command on the bus of that tag."""
         if len(data) < 2:
             return
         for node in self._nodes:
-            if data[1] in (0, node.node_id) and not node.unplugged:
+            if data[1] in (0, node.node_id) and node.tag == tag and not node.unplugged:
                 self.command(node, data[0], time)
 
     def command(self, node: Node, asked: int, time: float) -> None:

@@ -26,6 +26,8 @@ class Node:
     def __init__(self, place: int, node_id: int, signals: Signals, outbox: Callable[[Frame], None]) -> None:
         """A node that has not booted yet: call reset()."""
         self.place, self.node_id = place, node_id
+        self.tag = 0
+        """Number of its bus, as identifiers carry it (`armlink.bus.port.BUS_SHIFT`)."""
         self.object_dictionary = data_sheet()
         self.device = Device()
         """What it lacks, and has differently."""
@@ -38,7 +40,7 @@ class Node:
         self.errors: list[int] = []
         self.on_write: Callable[[Key], None] = lambda key: None
         self.on_pdo_change: Callable[[], None] = lambda: None
-        self._signals, self._outbox = signals, outbox
+        self._signals, self._put = signals, outbox
         self._values: dict[Key, bytes] = {}
         self._stored: dict[Key, bytes] = {}
         self._server = SdoServer(0x600 + node_id, 0x580 + node_id, self)
@@ -62,7 +64,7 @@ class Node:
         self._values[0x1010, 0] = b"\4"
         self.on_pdo_change()
         self.nmt = PRE_OPERATIONAL
-        self._outbox((0x700 + self.node_id, b"\0"))
+        self.boot_up()
 
     def _default(self, entry: ODVariable) -> bytes:
         value: Any = self.identity.get((entry.index, entry.subindex), entry.default)
@@ -164,7 +166,7 @@ class Node:
             count = self.value(mapping + number)
             entries = tuple(self.value(mapping + number, sub) for sub in range(1, count + 1))
             cob_id, kind = self.value(communication + number, 1), self.value(communication + number, 2)
-            parameters.append(PdoParameters(self.place, number, cob_id & ~0x40000000, kind, entries))
+            parameters.append(PdoParameters(self.place, number, self.tag | cob_id & ~0x40000000, kind, entries))
         return parameters
 
     def _check_pdo(self, key: Key, data: bytes) -> None:
@@ -198,6 +200,14 @@ class Node:
 
     # ---- services
 
+    def boot_up(self) -> None:
+        """Say that it has booted."""
+        self.send(0x700 + self.node_id, b"\0")
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Send a frame on its bus."""
+        self._put((self.tag | can_id, data))
+
     def on_sdo(self, data: bytes) -> None:
         """Pass a frame to the SDO server."""
         if len(data) == 8 and self.nmt in (PRE_OPERATIONAL, OPERATIONAL):
@@ -205,7 +215,7 @@ class Node:
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
         """Send a response of the SDO server."""
-        self._outbox((can_id, bytes(data)))
+        self.send(can_id, bytes(data))
 
     def emergency(self, code: int, register: int, manufacturer: bytes = b"") -> None:
         """Send an EMCY frame: error code, error register, five manufacturer-specific bytes."""
@@ -214,7 +224,7 @@ class Node:
         else:
             self.errors.clear()
         self._signals[0x1001, 0][self.place] = register
-        self._outbox((0x80 + self.node_id, struct.pack("<HB5s", code, register, manufacturer)))
+        self.send(0x80 + self.node_id, struct.pack("<HB5s", code, register, manufacturer))
 
 
 def _stored_by(sub: int, index: int) -> bool:

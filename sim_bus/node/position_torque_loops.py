@@ -107,13 +107,6 @@ class Loops:
         self._given[:, joint] = stiffness, damping, limit
         self._given_anew = True
 
-    def torque_by(self, joint: int, stiffness: float, damping: float, drive: float, limit: float) -> float:
-        """Torque that a law given by impede() makes where the motor stands now, as its drive takes it [N·m]."""
-        plant = self._plant
-        position, velocity = float(plant.motor_position[joint]), float(plant.motor_velocity[joint])
-        asked = drive - float(self.imagined[joint]) - stiffness * position - damping * velocity
-        return max(-limit, min(limit, asked)) / float(plant.torque_constant[joint])
-
     def tuned(self, joint: int) -> tuple[float, float, float]:
         """Stiffness, damping and integral gain of the position loop that suits a joint, in SI units."""
         bandwidth, inertia = float(self._stable_bandwidth()[joint]), float(self._inertia[joint])

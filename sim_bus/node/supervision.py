@@ -2,12 +2,10 @@
 
 import math
 import struct
-from collections.abc import Callable
 
 from sim_bus.node.cia402 import State
 from sim_bus.node.drives import Drives
 from sim_bus.node.node import OPERATIONAL, PRE_OPERATIONAL, STOPPED, Node
-from sim_bus.node.pdo import Frame
 
 HEARTBEAT_LOST, RPDO_TIMEOUT, SYNC_LOST = 0x8130, 0x8250, 0x8700
 COMMUNICATION_ERROR = 0x11
@@ -20,9 +18,9 @@ ABORT_NOTHING, ABORT_FAULT, ABORT_DISABLE, ABORT_QUICK_STOP = 0, 1, 2, 3
 class Supervision:
     """Timers of all nodes. `due` is the time of the next one [s]."""
 
-    def __init__(self, nodes: list[Node], drives: Drives, outbox: Callable[[Frame], None]) -> None:
+    def __init__(self, nodes: list[Node], drives: Drives) -> None:
         """Nothing is monitored before configure()."""
-        self._nodes, self._drives, self._outbox = nodes, drives, outbox
+        self._nodes, self._drives = nodes, drives
         n = drives.n
         self.due = math.inf
         self.watches_rpdos = False
@@ -54,11 +52,11 @@ class Supervision:
             self._sync[j], self._sync_due[j] = sync, math.inf
         self._schedule()
 
-    def heartbeat(self, master: int, time: float) -> None:
-        """A heartbeat of node id `master` arrived: start or restart its consumers' timers."""
+    def heartbeat(self, master: int, time: float, tag: int) -> None:
+        """A heartbeat of node id `master` arrived on the bus of that tag: its consumers' timers start."""
         for node in self._nodes:
             consumed = self._consume[node.place]
-            if master in consumed and not node.unplugged:
+            if master in consumed and node.tag == tag and not node.unplugged:
                 self._consume_due[node.place][master] = time + consumed[master]
         self._schedule()
 
@@ -97,7 +95,7 @@ class Supervision:
             j = node.place
             period, due = self._produce[j]
             if due <= time:
-                self._outbox((0x700 + node.node_id, bytes([node.nmt])))
+                node.send(0x700 + node.node_id, bytes([node.nmt]))
                 self._produce[j] = (period, max(due + period, time))
             for master, limit in list(self._consume_due[j].items()):
                 if limit <= time:

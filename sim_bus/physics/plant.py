@@ -43,6 +43,10 @@ class Plant:
         self._servo = (np.zeros(n), np.zeros(n), np.zeros(n))
         self.torque_constant = np.ones(n)
         """Torque that each drive believes to make for one that it makes: its nominal by its true torque constant."""
+        self.averages = False
+        """Whether take_mean_torque() is asked after steps."""
+        self._made, self._made_in = np.zeros(n), 0.0
+        """Torque times time of the drives since it was asked last [N·m·s], and that time [s]."""
         self._lost, self._sag = np.zeros(n), np.zeros(n)
         self._cables: Cables | None = None
         self._build(Imperfections(arm.joint_names))
@@ -242,12 +246,12 @@ class Plant:
         model.opt.timestep = duration / count
         if self._changing:
             self._change()
-        if start is end and self._plain:
+        if start is end and self._plain and not self.averages:
             data.ctrl[:] = end
             mujoco.mj_step(model, data, count)
             return
         slope, gears = (end - start) / count, self._gears
-        level = start + 0.5 * slope
+        level, began = start + 0.5 * slope, self.motor_velocity
         for _ in range(count):
             data.ctrl[:] = level if self._motors is None else self._asked(level, duration / count)
             if not self._steady_friction:
@@ -256,7 +260,19 @@ class Plant:
                 data.qfrc_applied[:] = gears.forces(data, self._lost)
                 data.qfrc_applied[self._dof] += self._pulled
             mujoco.mj_step(model, data)
+            if self.averages:
+                self._made += self._motor_torques * (duration / count)
             level = level + slope
+        if self.averages:  # the integrator is implicit: a step's damping acts on the velocity at its end
+            damped = model.actuator_biasprm[:, 2] * (self.motor_velocity - began)
+            self._made += damped * (duration / count)
+            self._made_in += duration
+
+    def take_mean_torque(self) -> Array:
+        """Mean of drive_torque (n,) [N·m] over the steps since it was asked last."""
+        mean: Array = self._made / (max(self._made_in, 1e-12) * self._imperfections.actuator_gain)
+        self._made[:], self._made_in = 0.0, 0.0
+        return mean
 
     def _asked(self, level: Array, duration: float) -> Array:
         """Torque of delayed motors for the drive's demand; ripple is subtracted on the way to the link."""

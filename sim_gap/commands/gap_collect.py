@@ -8,7 +8,7 @@ import typer
 
 def collect(
     arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
-    motion: Annotated[Path, typer.Option(help="Motion with columns t and q_cmd_i, as armlink gap plan writes it.")],
+    motion: Annotated[Path, typer.Option(help="Motion with columns t and q_cmd_i, as gap plan writes it.")],
     out: Annotated[Path, typer.Option(help="Recording to write (.mcap).")],
     bus: Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")] = None,
     json_file: Annotated[

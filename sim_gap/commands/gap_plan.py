@@ -1,5 +1,6 @@
 """Plans the motion that would separate the candidate causes of a diagnosis."""
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -10,7 +11,7 @@ def plan(
     arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
     out: Annotated[Path, typer.Option(help="Write the motion here (.csv with t and q_cmd_i).")],
     answer: Annotated[
-        Path | None, typer.Option(help="Result of armlink gap diagnose --json: its undecided joints are moved.")
+        Path | None, typer.Option(help="Result of gap diagnose --json: its undecided joints are moved.")
     ] = None,
     joint: Annotated[list[str] | None, typer.Option(help="Joint to move alone; may be repeated. Default: all.")] = None,
     poses: Annotated[int, typer.Option(min=1, help="Number of poses of the other joints, for different loads.")] = 2,
@@ -38,7 +39,8 @@ def plan(
         console.print(f"requested by the diagnosis: {sentence}", markup=False)
     for piece in motion.pieces:
         console.print(piece, markup=False)
-    console.print(f"{out}: {motion.seconds:.0f} s; run it with armlink gap collect {arm} --motion {out}", markup=False)
+    run = shlex.join(["armlink", "gap", "collect", arm, "--motion", str(out), "--out", str(out.with_suffix(".mcap"))])
+    console.print(f"{out}: {motion.seconds:.0f} s; next: {run}", markup=False)
     write_json(
         json_file,
         {"file": str(out), "seconds": motion.seconds, "pieces": list(motion.pieces), "asked_for": sentences},

@@ -136,4 +136,4 @@ def joints_in_doubt(answer: Path) -> tuple[list[str], list[str]]:
     except OSError as error:
         raise BadInput(f"{answer}: cannot be read: {error.strerror}") from None
     except (ValueError, KeyError, TypeError):
-        raise BadInput(f"{answer}: not a result of armlink gap diagnose --json") from None
+        raise BadInput(f"{answer}: not a result that gap diagnose wrote with --json") from None

@@ -43,13 +43,13 @@ def load_motion(path: Path, arm: ArmFile) -> Array:
         if column.min() < low or column.max() > high:
             raise BadInput(
                 f"{path}: {name} goes from {column.min():.3f} to {column.max():.3f} rad, beyond its range {low:.3f} to "
-                f"{high:.3f}: plan the motion for this arm (armlink gap plan)"
+                f"{high:.3f}: plan the motion for this arm: armlink gap plan {arm.argument} --out {path}"
             )
         fastest = float(np.abs(np.diff(column)).max()) * section.rate
         if fastest > ROUNDING * limits.max_velocity:
             raise BadInput(
                 f"{path}: {name} turns at {fastest:.3f} rad/s, beyond its max_velocity {limits.max_velocity:.3f}: "
-                "plan the motion for this arm (armlink gap plan)"
+                f"plan the motion for this arm: armlink gap plan {arm.argument} --out {path}"
             )
     return rows
 

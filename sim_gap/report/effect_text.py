@@ -20,8 +20,8 @@ def advice(answer: Diagnosis) -> str:
     if answer.verdict == "unexplained":
         return "Change nothing yet: look at where the gap is, check cabling, payload and model there, and record again."
     if answer.verdict == "ambiguous":
-        return "Record one more motion, which tells the candidates apart: armlink gap plan makes it of this answer."
-    return "Add these effects to the simulator: armlink gap diagnose --out-model writes the corrected model."
+        return "Record one more motion, which tells the candidates apart; gap plan makes it of the answer in JSON."
+    return "Add these effects to the simulator; the diagnosis writes the corrected model if it is given --out-model."
 
 
 def sentence(answer: Diagnosis) -> str:

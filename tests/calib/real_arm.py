@@ -1,5 +1,6 @@
 """An arm with all small troubles of a real one (`sim.realism`), at rest, with the model that a calibration left."""
 
+import mujoco
 import numpy as np
 from rest_arm import RestArm
 
@@ -12,7 +13,6 @@ from sim_bus.effects.realism import add_realism
 from sim_bus.effects.state import Imperfections
 from sim_bus.physics.cables import Cables
 from sim_bus.physics.friction import coldness
-from sim_bus.physics.gravity import gravity_torque
 from sim_bus.physics.plant import Plant
 from sim_bus.physics.sensors import TORQUE_RANGE
 
@@ -29,6 +29,7 @@ class RealArm(RestArm):
         self.state = Imperfections(self.file.joint_names)
         add_realism(self.state, self.rated, level, seed)
         self.plant = Plant(self.file, self.state)
+        self._scratch = mujoco.MjData(self.plant.model)  # to make one takes as long as all else at a rest
         self.scale, self.cold_at = 1.0, -WARM
         middle = (self.arm.lower + self.arm.upper) / 2
         self._cables = Cables(self.state, middle, middle)
@@ -47,9 +48,8 @@ class RealArm(RestArm):
         """Reading (n,) [N·m] of ideal gain and offset at position readings (n,) [rad], without noise."""
         amplitude, phase = self.state.eccentricity.T
         angle = q + amplitude * np.sin(q + phase)
-        torque = gravity_torque(self.plant.model, slice(0, self.n), angle[None])[0]
-        angle = angle - self.state.compliance * torque
-        torque = gravity_torque(self.plant.model, slice(0, self.n), angle[None])[0] - self._cables.torque(angle)
+        angle = angle - self.state.compliance * self._gravity_torque(angle)
+        torque = self._gravity_torque(angle) - self._cables.torque(angle)
         torque = torque + self.state.crosstalk @ torque
         torque = torque * (1 + self.state.cubic * (torque / (TORQUE_RANGE * self.rated)) ** 2)
         self._play = np.clip(self._play, torque - self.state.hysteresis, torque + self.state.hysteresis)
@@ -60,6 +60,15 @@ class RealArm(RestArm):
     def reading(self, q: np.ndarray, side: np.ndarray) -> np.ndarray:
         torque = self.sensed(q, self.t)
         return torque if self.push is None else torque + self.push(q[None])[0]
+
+    def _gravity_torque(self, angle: np.ndarray) -> np.ndarray:
+        """As `sim_bus.physics.gravity.gravity_torque`, (n,) [N·m] at link angles (n,) [rad]."""
+        model, data = self.plant.model, self._scratch
+        data.qpos[: self.n] = angle
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_rne(model, data, 0, data.qfrc_bias)
+        return np.array(data.qfrc_bias[: self.n])
 
     def _calibrate(self) -> None:
         """The gravity model and offsets of least squares over poses of the whole range, as a calibration has them."""

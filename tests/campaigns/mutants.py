@@ -53,6 +53,9 @@ EXPLAINED = {
     "0.0 becomes 1.0": "stands for a mode that needs no number; any finite one does",
     "value if lower <= value <= upper else max(lower, min(upper, value))': condition always false": "the quick way out",
     "value if lower <= value <= upper else max(lower, min(upper, value))': LtE becomes Lt": "max and min do the same",
+    "for each in began)': Lt becomes LtE": "a number at the bound itself is within it",
+    "for each in began)': Gt becomes GtE": "a number at the bound itself is within it",
+    "'if self.rate != math.inf:': condition always true": "the room of a rate without bound is not asked for",
     "'return \"\"': returns None": "asked only whether it is true; the field of Passed has its own default",
 }
 """Part of a mutant's description → why no test can tell it from the original."""

@@ -20,13 +20,14 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from armlink.arm_file import load_arm
-from armlink.errors import Stall
+from armlink.errors import BusFault, Refused
 from armlink.link.link import Link
 from armlink.link.park import straight
 from armlink.link.types import Command
@@ -41,25 +42,43 @@ MOST_STARTS = 10
 """A busy machine may take so many times as long to begin."""
 SWAY, SPEED = 0.25, 0.5
 """Of the other host's motion [rad], [rad/s]."""
+PATIENCE, AGAIN = 1.0, 0.5
+"""Deadline of the other host's drives [s], and how long it waits before it tries again [s]."""
 MOVED = 0.2
 """A listener must have seen every joint move so far [rad]."""
 
 
 def host(arm_name: str, bus: str, seconds: float) -> None:
-    """The other host: sways all joints about where they stand."""
+    """The other host: sways all joints about where they stand; on a busy machine it begins again where it stalled."""
     arm = load_arm(arm_name)
+    arm = arm.model_copy(update={"link": arm.require_link().model_copy(update={"deadline": PATIENCE})})
     with Link.open(arm, bus) as link:
-        link.start()
-        start = link.enable().position
-        end, side = time.monotonic() + seconds, 1.0
+        end = time.monotonic() + seconds
+        begun(link.start, end)
+        begun(link.enable, end)
+        start, side = link.position_sent, 1.0
         while time.monotonic() < end:
             goal = start + side * SWAY * np.where(start > 0, -1.0, 1.0)
             try:
                 for target in straight(link.position_sent, goal, np.full(link.n, SPEED), link.period):
                     link.cycle(Command.hold(target))
-            except Stall:  # a busy machine
-                link.recover()
+            except (BusFault, Refused) as fault:
+                print(f"other host: {fault}", flush=True)
+                begun(link.recover, end)
             side = 0.0 if side else 1.0
+
+
+def begun(step: Callable[[], object], end: float) -> None:
+    """Do a step of the other host again until it succeeds; raises its error where it has not until `end` [s]."""
+    while True:
+        try:
+            step()
+            return
+        except (BusFault, Refused) as fault:
+            if time.monotonic() > end:
+                raise
+            print(f"other host: {fault}", flush=True)
+            time.sleep(AGAIN)
 
 
 def witness(group: str) -> socket.socket:

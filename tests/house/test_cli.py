@@ -291,37 +291,6 @@ def test_completion_works_in_bash(capsys):
     assert done.stdout.split() == ["calibrate"]
 
 
-VERBS = {"completion", "knows", "does", "needs"}
-"""Words after `armlink` in sentences of messages, and the command that is none of a package."""
-HINT = re.compile(r"armlink ([a-z][a-z-]*)((?: (?:plan|collect|diagnose-fleet|diagnose|bench))?)((?: --[a-z-]+)*)")
-
-
-def test_hints_in_messages_name_commands_that_exist():
-    """Each `armlink …` in a string of ours is a command, with options that it has."""
-    import ast
-    from pathlib import Path
-
-    root, known = Path(cli.__file__).parents[1], commands()
-    found = 0
-    for package in ("armlink", "calib", "gcomp", "sim_bus", "sim_gap"):
-        for file in (root / package).rglob("*.py"):
-            tree = ast.parse(file.read_text())
-            prose = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}  # docstrings
-            for node in ast.walk(tree):
-                if not (isinstance(node, ast.Constant) and isinstance(node.value, str)) or id(node) in prose:
-                    continue
-                for name, sub, options in HINT.findall(node.value):
-                    if name in VERBS or file.name == "completion.py":
-                        continue
-                    found += 1
-                    assert name in known, f"{file}: armlink {name}"
-                    for option in options.split():
-                        assert option in cli.completion.candidates(known, [name, *sub.split(), option]), (
-                            f"{file}: {name} {option}"
-                        )
-    assert found > 40
-
-
 @pytest.mark.parametrize(
     ("module", "extra"),
     [

@@ -19,7 +19,7 @@ def test_what_it_copies_is_what_the_wheel_is_made_of() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     needed = {*project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"], "pyproject.toml"}
     needed |= {project["project"]["readme"], *project["project"]["license-files"]}
-    assert needed | {"constraints.txt"} == copied
+    assert needed | {"requirements.lock"} == copied
     let_in = (ROOT / ".dockerignore").read_text().split()
     assert {f"!{name}" for name in copied} == {line for line in let_in if line.startswith("!")}
 

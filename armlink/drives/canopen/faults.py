@@ -1,8 +1,10 @@
 """Faults that the frames of CiA 402 drives show, in words: which joint, what, and what to do. Pure."""
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+import math
+from collections import deque
+from collections.abc import Sequence
 
+from armlink.drives.board import NO_STATUS
 from armlink.drives.canopen import emcy
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen.cia402 import CYCLIC_VELOCITY, MODE_NAMES, State, state_of
@@ -16,23 +18,33 @@ WATCHDOGS = frozenset({0x8130, 0x8250, 0x8700})
 _FAULTS = (State.FAULT, State.FAULT_REACTION)
 
 
-@dataclass
-class Known:
-    """What m joints have told: live views of the buffers."""
+EMERGENCIES_KEPT = 64
+"""So many emergencies are kept; a storm of them costs no memory."""
+NO_MODE = 0
+"""Stands for the mode display of a joint that has sent none: no mode is active."""
 
-    names: Sequence[str]
-    statuses: Sequence[int]
-    """Newest status words (6041h)."""
-    displays: Sequence[int]
-    """Newest mode displays (6061h)."""
-    mode_since: Sequence[float]
-    """When each joint's mode was commanded, by the clock [s]."""
-    emergencies: Collection[tuple[int, int, int]]
-    """(joint, code, error register)."""
-    node_states: Mapping[int, int]
-    """NMT states by joint, of the newest heartbeat."""
-    restarted: Collection[int]
-    """Joints whose controller has sent its boot-up message."""
+
+class Known:
+    """What m joints have shown of themselves, the newest of each."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        """Nothing is known yet."""
+        m = len(names)
+        self.names = names
+        self.statuses = [NO_STATUS] * m
+        """Status words (6041h)."""
+        self.displays = [NO_MODE] * m
+        """Mode displays (6061h)."""
+        self.mode_since = [-math.inf] * m
+        """When each joint's mode was commanded, by the clock [s]."""
+        self.positions = [math.nan] * m
+        """Position readings [rad]."""
+        self.emergencies: deque[tuple[int, int, int]] = deque(maxlen=EMERGENCIES_KEPT)
+        """(joint, code, error register) in the order of arrival; ends of errors (code 0) are not kept."""
+        self.node_states: dict[int, int] = {}
+        """NMT states by joint, of the newest heartbeat."""
+        self.restarted: set[int] = set()
+        """Joints whose controller has sent its boot-up message."""
 
 
 def alarm(known: Known) -> BusFault | None:

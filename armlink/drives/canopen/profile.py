@@ -5,11 +5,13 @@ from dataclasses import dataclass, field, replace
 
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen import pdo
+from armlink.drives.canopen.cia402 import supports
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import Pdo
 from armlink.drives.canopen.sdo import NodeServices
 from armlink.drives.canopen.settings import TYPES, CanopenSettings, TorqueObject
 from armlink.drives.canopen.units import TORQUE_PER_MICRO
+from armlink.drives.orders import Mode
 from armlink.errors import BusFault
 
 LOST: Mapping[Entry, str] = {
@@ -62,6 +64,18 @@ class Profile:
 
     by_velocity: bool = False
     """Whether cyclic velocity is the only mode that serves: target velocities take the place of positions."""
+
+    def usable_modes(self, supported: int) -> frozenset[int]:
+        """Modes that the device can be ordered in while it cycles, of `supported` ones (bits of 6502h).
+
+        Where its mode cannot be mapped, that is the one that it is left in.
+        """
+        if self.by_velocity:
+            return frozenset((int(Mode.OFF), int(Mode.POSITION)))
+        modes = frozenset(int(mode) for mode in Mode if supports(supported, mode))
+        if self.modes_by_pdo:
+            return modes
+        return modes & {min((Mode.POSITION, Mode.PROFILE_POSITION), key=lambda mode: mode not in modes)}
 
     @property
     def lost(self) -> tuple[str, ...]:

@@ -10,20 +10,20 @@ import typer
 from calib.commands.options import JsonFile
 
 if TYPE_CHECKING:
-    from armlink.bus.can_bus import CanBus
-    from calib.commissioning.drive_match import Ask
-    from calib.commissioning.finding import SetupFinding
     from calib.commissioning.new_arm import NewArm
-
-SCHEMA = "armlink.new/1"
 
 
 def new(
     model: Annotated[
-        Path, typer.Argument(help="URDF or MJCF model; with --bus also an arm file.", metavar="MODEL_OR_ARM")
-    ],
+        Path | None,
+        typer.Argument(
+            help="URDF or MJCF model; with --bus also an arm file, or nothing: the drives alone.",
+            metavar="MODEL_OR_ARM",
+        ),
+    ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Arm file to write; default: the model's name with .yaml, here.")
+        Path | None,
+        typer.Option(help="Arm file to write; default: the model's name with .yaml, here; arm.yaml without one."),
     ] = None,
     tip: Annotated[
         str | None, typer.Option(help="Body that the arm ends in; default: the end of the longest chain.")
@@ -51,7 +51,8 @@ def new(
     The arm is the longest chain of revolute joints; gripper, mimic and prismatic joints at its end are set aside.
     Limits and torques are the model's. What the model does not state is asked on a terminal, else assumed; every
     assumed value says so in a comment. Drives on the bus are only read. Exit status 1 where a joint turns the other
-    way or has another gear than the model.
+    way or has another gear than the model. Without a model, the drives on --bus make an arm file of which only the
+    geometry is missing: enough to check, monitor and record.
 
     Example: armlink new arm.urdf --out arm.yaml
     """
@@ -60,11 +61,24 @@ def new(
     from armlink.arm_file import MODEL_SUFFIXES, bundled_arms
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
+    from calib.commands.setup.on_bus import begin_with_drives, bus_keys, copy, drives_by_ids, open_named, rewire
     from calib.commands.setup.terminal import Terminal, hand, parse_stops
     from calib.commissioning.new_arm import new_arm
 
     console = Console(stderr=True, markup=False, highlight=False)
     interactive = sys.stdin is not None and sys.stdin.isatty()
+    if bus is None and by_hand:
+        raise BadInput("--by-hand: needs --bus, on which the drives are")
+    if model is None:
+        if bus is None:
+            raise BadInput(
+                "new: give a URDF or MJCF model of the arm, or --bus INTERFACE:CHANNEL to begin with its drives"
+            )
+        if tip or stops:
+            raise BadInput("--tip and --stops are for a model: give one, or change the arm file itself")
+        out = out or Path("arm.yaml")
+        _require_free(out, force, interactive)
+        return begin_with_drives(console, out, bus, name, hand(by_hand, interactive), json_file)
     bundled = bundled_arms().get(str(model))
     is_arm_file = bundled is not None or model.suffix.lower() in (".yaml", ".yml")
     if is_arm_file and bus is None:
@@ -73,17 +87,15 @@ def new(
         raise BadInput(f"{model}: --tip, --stops and --name are for a model: change the arm file itself")
     if not is_arm_file and model.suffix.lower() not in MODEL_SUFFIXES:
         raise BadInput(f"{model}: expected a URDF or MJCF model ({', '.join(MODEL_SUFFIXES)}), or an arm file (.yaml)")
-    if bus is None and by_hand:
-        raise BadInput("--by-hand: needs --bus, on which the drives are")
     out = out or Path(f"{model.stem}.yaml")
     _require_free(out, force, interactive)
     if is_arm_file:
         found = bundled or model
-        if _by_ids(found):
+        if drives_by_ids(found):
             if by_hand:
                 raise BadInput("--by-hand: these drives are found by the ids in the arm file, and tell no position yet")
-            return _copy(console, found, out, str(bus), bundled is not None, json_file)
-        return _rewire(console, found, out, str(bus), hand(by_hand, interactive), json_file)
+            return copy(console, found, out, str(bus), bundled is not None, json_file)
+        return rewire(console, found, out, str(bus), hand(by_hand, interactive), json_file)
     with console.status(f"reading {model} and looking for collisions"):
         asked = Terminal(console) if interactive else None
         made = new_arm(model, out, tip=tip, stops=parse_stops(stops or []), name=name, questions=asked)
@@ -91,12 +103,12 @@ def new(
         from armlink.drives.registry import found_drives
         from calib.commissioning.new_arm import match_drives
 
-        opened = _open(bus)
+        opened = open_named(bus)
         try:
             match_drives(made, found_drives(opened), str(opened.channel_info), hand(by_hand, interactive))
         finally:
             opened.shutdown()
-        made.draft.bus = _bus_keys(bus, out)
+        made.draft.bus = bus_keys(bus, out)
     made.parsed()
     made.write()
     _show(console, made)
@@ -104,80 +116,6 @@ def new(
     console.print(f"next: {step}", style="bold")
     write_json(json_file, _answer(made, step))
     return 1 if any(found.level == "error" for found in made.findings) else 0
-
-
-def _rewire(console: Any, model: Path, out: Path, bus: str, ask: "Ask | None", json_file: Path | None) -> int:
-    """An arm file with the drives of a bus."""
-    import yaml
-
-    from armlink.arm_file import load_arm, parse_arm
-    from armlink.commands.output import write_json
-    from armlink.drives.registry import found_drives
-    from calib.arm.kinematics import gcomp_arm
-    from calib.commissioning.drive_match import TurnedJoint, match_by_hand, match_in_order
-    from calib.commissioning.new_arm import rewired
-
-    arm = load_arm(model)
-    arm.require_link()
-    findings: list[SetupFinding] = []
-    opened = _open(bus)
-    try:
-        drives, channel = found_drives(opened), str(opened.channel_info)
-        if ask is None:
-            matches = match_in_order(arm.joint_names, drives, channel)
-        else:
-            known = gcomp_arm(arm)
-            turned = [TurnedJoint(*each) for each in zip(known.names, known.lower, known.upper, strict=True)]
-            matches, findings = match_by_hand(turned, drives, channel, ask)
-    finally:
-        opened.shutdown()
-    content = rewired(yaml.safe_load(arm.path.read_text(encoding="utf-8")), matches, _bus_keys(bus, out))
-    if arm.model_path is not None:
-        import os
-
-        content["kinematics"]["model"] = os.path.relpath(arm.model_path, out.resolve().parent)
-    parse_arm(dict(content), out)
-    text = f"# {arm.name} with the drives on {channel}, from {model.name} by armlink new.\n"
-    out.write_text(text + yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
-    for found in findings:
-        console.print(str(found), style="red")
-    step = shlex.join(["armlink", "check", str(out)])
-    console.print(f"{out}: nodes {', '.join(str(match.drive.node) for match in matches)}")
-    console.print(f"next: {step}", style="bold")
-    joints = [{"name": match.joint, "node": match.drive.node, "by_hand": match.by_hand} for match in matches]
-    answer = {"out": str(out), "name": arm.name, "joints": joints, "next": step}
-    write_json(json_file, {"schema": SCHEMA, **answer, "findings": [found.to_json() for found in findings]})
-    return 1 if findings else 0
-
-
-def _by_ids(model: Path) -> bool:
-    from armlink.arm_file import load_arm
-    from calib.commissioning.own_copy import by_ids
-
-    return by_ids(load_arm(model))
-
-
-def _copy(console: Any, model: Path, out: Path, bus: str, new_serial: bool, json_file: Path | None) -> int:
-    """An arm file with drives that are known by their ids, on a bus of one's own."""
-    from armlink.arm_file import load_arm
-    from armlink.commands.output import write_json
-    from calib.commissioning.own_copy import own_copy
-
-    arm, opened = load_arm(model), _open(bus)
-    try:
-        copied = own_copy(arm, out, _bus_keys(bus, out), opened, new_serial=new_serial)
-    finally:
-        opened.shutdown()
-    out.write_text(copied.text, encoding="utf-8")
-    for found in copied.findings:
-        console.print(str(found), style="red")
-    step = shlex.join(["armlink", "doctor", str(out)])
-    console.print(f"{out}: {', '.join(address for _, address, _ in copied.drives)} answer; limits are those of {model}")
-    console.print(f"next: {step}", style="bold")
-    joints = [{"name": name, "address": address, "serial": serial} for name, address, serial in copied.drives]
-    answer = {"out": str(out), "name": arm.name, "joints": joints, "next": step}
-    write_json(json_file, {"schema": SCHEMA, **answer, "findings": [found.to_json() for found in copied.findings]})
-    return 1 if copied.findings else 0
 
 
 def _require_free(out: Path, force: bool, interactive: bool) -> None:
@@ -190,26 +128,6 @@ def _require_free(out: Path, force: bool, interactive: bool) -> None:
     if not interactive:
         raise BadInput(f"{out}: exists already: choose another --out, or --force to replace it")
     typer.confirm(f"{out} exists. Replace it?", abort=True, err=True)
-
-
-def _open(bus: str) -> "CanBus":
-    from armlink.arm_file import Bus
-    from armlink.bus.open import open_bus
-
-    return open_bus(bus, Bus())
-
-
-def _bus_keys(bus: str, out: Path) -> dict[str, str | int]:
-    """Keys of link.bus for a bus given on the command line; the arm file of a simulated one relative to `out`."""
-    import os
-
-    from armlink.bus.open import parse_bus
-
-    parsed = parse_bus(bus)
-    channel = parsed.channel
-    if Path(channel).is_file():
-        channel = os.path.relpath(Path(channel).resolve(), out.resolve().parent)
-    return {"interface": parsed.interface, "channel": channel, "bitrate": parsed.bitrate}
 
 
 def _show(console: Any, made: "NewArm") -> None:
@@ -233,6 +151,8 @@ def _show(console: Any, made: "NewArm") -> None:
 
 
 def _answer(made: "NewArm", step: str) -> dict[str, Any]:
+    from calib.commands.setup.on_bus import SCHEMA
+
     draft = made.draft
     return {
         "schema": SCHEMA,

@@ -13,6 +13,7 @@ from calib.daemon.state.event_log import EventLog
 from calib.install.journaled_write import recover
 from calib.install.plausibility import GateRefused
 from calib.records.database import StoreFault, first_line
+from calib.records.missing import first_sweep
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.records.store import ControllerWrite, RecordStore
 
@@ -116,7 +117,7 @@ class ActiveRecords:
             found = {"calibration": calibration, "gravity": gravity}
             missing = " and ".join(name for name, record in found.items() if record is None)
             of_arm = f"of {arm.name} {arm.serial}"
-            waits = f"waits for a {missing} record {of_arm}: armlink sweep, calibrate, identify"
+            waits = f"waits for a {missing} record {of_arm}: {first_sweep(arm)}"
             if waits != self.detail:
                 _LOG.warning(waits)
             self.detail = waits
@@ -200,7 +201,8 @@ class ActiveRecords:
             return
         if self._configuration.settings.policy != "apply" or self._configuration.listen_only:
             text = f"{', '.join(differ)}: the controllers hold another calibration than record {record.id}"
-            text += "; readings are converted; armlink calibrate --apply writes it"
+            write = f"armlink rollback {self._configuration.arm.argument} --to {record.id} --apply"
+            text += f"; readings are converted; it is written by {write}"
             self._events.say("configuration", None, text, {"record": record.id, "joints": differ})
             return
 

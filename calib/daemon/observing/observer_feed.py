@@ -6,10 +6,10 @@ from armlink.arm_file import ArmFile
 from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, per_joint
 from calib.arm.kinematics import gcomp_arm
 from calib.daemon.loop.loop_messages import Batch
+from calib.observer.choice import observer_of
 from calib.observer.config import ObserverConfig
 from calib.observer.decision import Finding
 from calib.observer.events import Event
-from calib.observer.observer import Observer
 from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arrays import Array
 
@@ -32,7 +32,7 @@ class ObserverFeed:
         described, self.gravity, self.calibration = gcomp_arm(arm), gravity.require(arm), calibration.require(arm)
         self.names = described.names
         rated = section.rated_torques
-        self.observer = Observer.of_records(described, self.calibration, self.gravity, rated, config)
+        self.observer = observer_of(described, self.calibration, self.gravity, rated, config)
         self._group = max(1, round(section.rate / OBSERVED_RATE))
         self._change = per_joint([UNCALIBRATED] * described.n)
         self._left: Samples | None = None

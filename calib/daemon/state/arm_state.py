@@ -63,7 +63,7 @@ class ArmState:
         stats = None if self.batch is None else self.batch.stats
         if stats is None or self._told_late or stats.cycles < JUDGED_CYCLES:
             return
-        warning = stats.lateness.near(self._arm.require_link().deadline, self._arm.name)
+        warning = stats.lateness.near(self._arm.require_link().deadline, self._arm.argument)
         if warning:
             self._told_late = True
             self._report("late", None, warning, {"late_ms": stats.lateness.in_ms()})

@@ -17,6 +17,12 @@ _EFFECTS = {
     "scale": "all torques changed by one factor: gravity, supply voltage, or a common scale",
     "temperature": "several sensors' zeros moved together: temperature or supply voltage",
 }
+_OF_MOTORS = {
+    "gain": ("drift", "its drive reads {change:+.1%} ± {std:.1%} torque: measure its torque constant by creep sweeps"),
+    "offset": ("drift", "its drive reads {change:+.3f} ± {std:.3f} N·m at no torque: measure it by creep sweeps"),
+    "friction": ("effect", "its friction has changed by {change:+.0%} ± {std:.0%}"),
+}
+"""Cause → kind and text, where torque is a motor current."""
 
 
 def describe(event: Event) -> Description:
@@ -50,6 +56,10 @@ def one_alarm_a_joint(events: list[Event]) -> list[Event]:
 
 def _verdict(joint: str, evidence: dict[str, Any]) -> Description:
     cause, sure = evidence["cause"], f"confidence {evidence['confidence']:.1%}"
+    if evidence.get("motor") and cause in _OF_MOTORS:
+        kind, text = _OF_MOTORS[cause]
+        change, std = evidence["values"][0], evidence["std"][0]
+        return kind, f"{joint}: {text.format(change=change, std=2 * std)}; {sure}", evidence
     if cause in DRIFT:
         beside = f", and {evidence['beside']}" if "beside" in evidence else ""
         return "drift", f"{joint}{beside}: the torque sensor drifts ({cause}); {sure}; not written yet", evidence

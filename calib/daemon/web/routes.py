@@ -147,7 +147,7 @@ def _add_past(router: APIRouter, view: DaemonView, histories: Histories) -> None
         """The newest report in the state directory, one HTML file."""
         path = view.status().report
         if path is None or not path.is_file():
-            raise NoSuch("no report yet: the newest HTML file in the state directory (armlink calibrate --report)")
+            raise NoSuch("no report yet: the newest HTML file in the state directory (calibrate --report writes one)")
         return FileResponse(path, media_type="text/html", headers={"content-security-policy": REPORT_CSP})
 
 

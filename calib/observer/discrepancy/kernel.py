@@ -40,6 +40,11 @@ class Points:
     warmth: Array
     """Temperature above that of the reference (K, n), in units of WARM; 0 if it is not known."""
 
+    @cached_property
+    def turned(self) -> Array:
+        """Cosine and sine of each joint's angle (n, K, 2)."""
+        return np.stack([np.cos(self.position.T), np.sin(self.position.T)], axis=2)
+
 
 class Kernel:
     """Unit covariance of each joint's discrepancy; its variance is about 1 at a typical pose."""
@@ -63,16 +68,32 @@ class Kernel:
         size = np.linalg.norm(flat, axis=0)
         return int(np.linalg.matrix_rank(flat / np.where(size > 1e-9, size, 1.0), tol=1e-6))
 
-    def points(self, position: Array, side: Array, warmer: Array | None = None) -> Points:
-        """Poses (K, n) [rad], sides of approach and temperatures above the reference's (K, n) [K]."""
+    def points(self, position: Array, side: Array, warmer: Array | None = None, torque: Array | None = None) -> Points:
+        """Poses (K, n) [rad], sides of approach, temperatures above the reference's (K, n) [K] and gravity torques
+        (K, n) [N·m], computed if not given."""
         warmth = np.zeros_like(position) if warmer is None else warmer / WARM
-        return Points(position, gravity_torque(self._arm, self._beta, position) / self.typical, side, warmth)
+        torque = gravity_torque(self._arm, self._beta, position) if torque is None else torque
+        return Points(position, torque / self.typical, side, warmth)
 
     def between(self, a: Points, b: Points) -> Array:
-        """Covariance (parts, n, A, B) between two sets of poses, joint by joint."""
+        """Covariance (parts, n, A, B) between two sets of poses, joint by joint, of each part at size 1."""
+        parts, common = self._shapes(a, b)
+        covariance: Array = (1.0 - CONSTANT - SLOPE - SIDE) * np.stack(parts) + common
+        return covariance
+
+    def weighted(self, smooth: Array, a: Points, b: Points) -> Array:
+        """Covariance (n, A, B) between two sets of poses from the sizes of the parts (parts, n) [N·m]."""
+        parts, common = self._shapes(a, b)
+        square = (smooth**2)[:, :, None, None]
+        covariance: Array = square.sum(axis=0) * common
+        for size, part in zip((1.0 - CONSTANT - SLOPE - SIDE) * square, parts, strict=True):
+            covariance += size * part
+        return covariance
+
+    def _shapes(self, a: Points, b: Points) -> tuple[tuple[Array, ...], Array]:
+        """(The shape of each part, (n, A, B) each; what all parts have in common, (n, A, B))."""
         n = a.position.shape[1]
-        turned = [np.stack([np.cos(points.position.T), np.sin(points.position.T)], axis=2) for points in (a, b)]
-        away = 1.0 - turned[0] @ turned[1].swapaxes(1, 2)
+        away = 1.0 - a.turned @ b.turned.swapaxes(1, 2)
         near = np.exp(away * (-1 / LOCAL_ANGLE**2))
         beside = np.zeros_like(near)
         beside[:-1] += near[1:]
@@ -84,13 +105,5 @@ class Kernel:
         crosstalk = (slope.sum(axis=0) - slope) / max(n - 1, 1)
         curve = slope * slope * (1 / 6.0 + slope / 30.0)  # E t⁴ = 3, E t⁶ = 15 of a normal t: each half of the part
         side = a.side.T[:, :, None] * b.side.T[:, None, :]
-        parts = np.stack([local, np.broadcast_to(wide, local.shape), (crosstalk + curve) / 2])
         common = CONSTANT + SLOPE * slope + SIDE * side
-        covariance: Array = (1.0 - CONSTANT - SLOPE - SIDE) * parts + common
-        return covariance
-
-
-def weighted(smooth: Array, unit: Array) -> Array:
-    """Covariance (n, A, B) from the sizes of the parts (parts, n) [N·m] and `Kernel.between` (parts, n, A, B)."""
-    covariance: Array = np.einsum("mj,mjab->jab", smooth**2, unit)
-    return covariance
+        return (local, np.broadcast_to(wide, local.shape), (crosstalk + curve) / 2), common

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.observer.discrepancy.kernel import Kernel, Points, weighted
+from calib.observer.discrepancy.kernel import Kernel, Points
 from calib.observer.discrepancy.level import Level
 from gcomp.arrays import Array
 
@@ -76,7 +76,7 @@ class Posterior:
 
     def _between(self, a: Points, b: Points) -> Array:
         """Covariance (n, A, B) of the discrepancy and of zeros that follow temperature [N²·m²]."""
-        smooth = weighted(self._level.smooth, self._kernel.between(a, b))
+        smooth = self._kernel.weighted(self._level.smooth, a, b)
         if a.warmth.any() and b.warmth.any():
             smooth += self._thermal[:, None, None] ** 2 * a.warmth.T[:, :, None] * b.warmth.T[:, None, :]
         return smooth

@@ -54,9 +54,9 @@ class Tracking:
     def watch(self, row: StaticReading) -> list[Alarm]:
         """Take a row while no alarm is open: update the filter unless the row raises an alarm."""
         q, noise = row.position, self.sigma**2
-        torque = self.belief.torque(q[None])[0]
         expected = self.belief.expected(q[None], row.direction[None], row.temperature[None])
-        residual, of_model = row.torque - torque - expected.mean[0], expected.variance[0]
+        torque, of_model = expected.torque[0], expected.variance[0]
+        residual = row.torque - torque - expected.mean[0]
         here, left = self._poses.expected(q, of_model, noise)
         self._since.append((row, self._poses.seen(q) >= self._config.place_rows))
         if not self.belief.level.is_known:
@@ -88,9 +88,13 @@ class Tracking:
         """Of the last rows (K,): one joint's residual, its model torque, and the covariance (K, K) of the residual."""
         rows = [row for row, _ in self._since][-count:]
         position, torques, side, temperature = _arrays(rows)
-        torque, expected = self.belief.torque(position), self.belief.expected(position, side, temperature)
-        residual = (torques - torque - expected.mean)[:, joint]
-        return residual, torque[:, joint], expected.of_joint(joint) + self.sigma[joint] ** 2 * np.eye(len(rows))
+        expected = self.belief.expected(position, side, temperature)
+        residual = (torques - expected.torque - expected.mean)[:, joint]
+        return (
+            residual,
+            expected.torque[:, joint],
+            expected.of_joint(joint) + self.sigma[joint] ** 2 * np.eye(len(rows)),
+        )
 
     def _are_outliers(self, joint: int) -> bool:
         """Whether the rejected rows stand out together; the model's own error is alike at poses close to each other."""

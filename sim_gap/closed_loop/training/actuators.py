@@ -31,7 +31,7 @@ MJLAB = {
 DRAWS = 400
 """Draws of the parameters from which the range of a delay is taken."""
 RANGE = 0.05, 0.95
-HEAD = '''"""Actuators of the corrected model, written by `armlink gap diagnose --out-actuators`.
+HEAD = '''"""Actuators of the corrected model, written by gap diagnose --out-actuators.
 
 Gains in N·m/rad and N·m·s/rad, friction and limits in N·m, rotor inertia in kg·m²; delays in physics steps of
 {step:g} s. Friction of other kinds is taken into Coulomb and viscous friction; the links of the model are not changed

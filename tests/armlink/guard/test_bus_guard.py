@@ -4,8 +4,10 @@ import ast
 import copy
 import json
 import math
+import signal
 import socket
 import struct
+import subprocess
 import sys
 from pathlib import Path
 
@@ -152,7 +154,8 @@ def test_segmented_and_block_writes_are_refused():
     policy = Policy(CONTENT)
     for data in ("2172600000000000", "0172600000000000", "c672600002000000", "2272600000000000", "2372"):
         assert policy.refusal(0x601, bytes.fromhex(data), 10.0)
-    assert policy.refusal(0x601, bytes.fromhex("4064600000000000"), 10.0) == ""
+    for data in ("4064600000000000", "8064600000000405", "6000000000000000", "7000000000000000"):  # reads, and an abort
+        assert policy.refusal(0x601, bytes.fromhex(data), 10.0) == ""
 
 
 hostile = st.one_of(
@@ -222,6 +225,59 @@ def test_a_torque_that_the_drive_exceeds_by_itself_is_no_leave_to_ask_for_it():
     assert not passed
 
 
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_joint_outside_its_window_may_be_held_where_it_stands(side):
+    joints, place = Joints(), side * (int(WINDOW) + 5000)
+    joints.stand(1, place)
+    assert joints.send(0x201, COMMAND.pack(0x0F, 0, place))[0]
+    assert not joints.send(0x201, COMMAND.pack(0x0F, 0, place + side), PERIOD)[0]
+
+
+@pytest.mark.parametrize("data", [b"\x00", b"\x00\x07"])
+def test_a_restart_is_known_by_its_first_byte(data):
+    joints = Joints()
+    joints.policy.hear(0x701, data, joints.now)
+    assert "acknowledged" in joints.policy.refusal(0x201, COMMAND.pack(0x0F, 0, 0), joints.now)
+
+
+def test_only_the_answer_that_means_it_is_an_acknowledgement():
+    joints = Joints()
+    joints.policy.hear(0x701, b"\x00", joints.now)
+    for can_id, prefix in joints.policy.frames[0x201].after:
+        joints.policy.hear(can_id, b"\x80" + prefix[1:] + bytes(4), joints.now)  # the node has aborted it
+    assert "acknowledged" in joints.policy.refusal(0x201, COMMAND.pack(0x0F, 0, 0), joints.now)
+
+
+POSITION_FIELD = {"name": "x", "at": 0, "code": "h", "least": -100, "most": 100, "rate": 8, "slack": 4, "first": [0]}
+POSITION_FIELD |= {"near": [{"frame": 1, "at": 0, "code": "h"}], "within": 2, "age": 10}
+
+
+def refusal(field, value, now):
+    return field.refusal(struct.pack("<h", value), now)
+
+
+def test_exactly_what_the_rate_has_room_for_may_come():
+    field = Field(POSITION_FIELD)
+    assert refusal(field, 0, 0.0) == ""
+    field.keep(struct.pack("<h", 0), 0.0)
+    assert refusal(field, 4, 0.0) == ""
+    assert refusal(field, 5, 0.0)
+    field.keep(struct.pack("<h", 4), 0.0)
+    assert refusal(field, 6, 0.25) == ""
+    assert refusal(field, 7, 0.25)
+
+
+def test_only_the_two_newest_readings_are_where_the_joint_is():
+    field = Field(POSITION_FIELD)
+    field.keep(struct.pack("<h", 0), 0.0)
+    for reading in (50, 60, 70):
+        field.see(reading, 0.0)
+    assert refusal(field, 60, 0.0) == ""
+    assert refusal(field, 72, 0.0) == ""
+    assert refusal(field, 50, 0.0)
+    assert refusal(field, 70, 11.0)
+
+
 def test_bit_7_of_the_control_word_is_no_way_around_the_rate():
     joints = Joints()
     assert not joints.send(0x201, COMMAND.pack(0x8F, 0, 300_000))[0]
@@ -253,12 +309,19 @@ def test_the_first_frame_that_is_not_allowed_closes_it_and_stops_the_joints():
     assert program.sent == [(0x181, bytes(8))]
 
 
-@pytest.mark.parametrize("flag", [bus_guard.REMOTE, bus_guard.ERROR, bus_guard.EXTENDED])
-def test_remote_error_and_extended_frames_do_not_pass(flag):
+@pytest.mark.parametrize(
+    ("flag", "said"),
+    [
+        (bus_guard.REMOTE, "a remote or error frame"),
+        (bus_guard.ERROR, "a remote or error frame"),
+        (bus_guard.EXTENDED, "identifier 80000080h, which the policy does not name"),
+    ],
+)
+def test_remote_error_and_extended_frames_do_not_pass(flag, said):
     wire = Side()
     guard = Guard(Policy(CONTENT), Side(), wire, lambda text: None)
     guard._to_wire(0x80 | flag, b"", False)
-    assert guard.closed
+    assert guard.closed == said
     assert (0x80 | flag, b"") not in wire.sent
 
 
@@ -418,3 +481,79 @@ def test_wrong_arguments_get_one_line(words, said, capfd, tmp_path, monkeypatch)
     error = capfd.readouterr().err
     assert said in error
     assert error.count("\n") == 1
+
+
+def test_the_file_alone_is_a_program():
+    command = [sys.executable, "-I", bus_guard.__file__]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr.strip()) == (
+        2,
+        "python3 -I bus_guard.py POLICY PROGRAM_INTERFACE WIRE_INTERFACE",
+    )
+
+
+STOP = [(0x600 + node, bytes.fromhex("2b40600002000000"), 0, 16) for node in (1, 2)]
+
+
+def run_main(wires, monkeypatch, folder, steps):
+    """`main` with these ports; its steps fail with these errors (None: do not), then it is told to end."""
+    by_name = {"arm0": wires[0].port, "can0": wires[1].port}
+    monkeypatch.setattr(bus_guard, "Port", by_name.__getitem__)
+    monkeypatch.setattr(bus_guard.time, "sleep", lambda seconds: None)
+    step, waiting = Guard.step, list(steps)
+
+    def next_step(guard, seconds):
+        if not waiting:
+            signal.raise_signal(signal.SIGTERM)
+            return
+        failure = waiting.pop(0)
+        if failure is not None:
+            raise failure
+        step(guard, 0.0)
+
+    monkeypatch.setattr(Guard, "step", next_step)
+    (folder / "policy.json").write_text(json.dumps(CONTENT))
+    before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
+    try:
+        return bus_guard.main([str(folder / "policy.json"), "arm0", "can0"])
+    finally:
+        signal.signal(signal.SIGTERM, before[0])
+        signal.signal(signal.SIGINT, before[1])
+
+
+def all_heard(wire):
+    wire.other.setblocking(False)
+    found = []
+    while True:
+        try:
+            found.append(wire.hear())
+        except BlockingIOError:
+            return found
+
+
+def test_main_passes_frames_until_it_is_told_to_end_and_stops_the_joints(wires, monkeypatch, tmp_path, capfd):
+    program, wire = wires
+    program.say(0x80, b"")
+    wire.say(0x181, b"12345678")
+    assert run_main(wires, monkeypatch, tmp_path, [None, InterruptedError(), None]) == 0
+    assert all_heard(wire) == [(0x80, b"", 0, 16), *STOP]
+    assert all_heard(program) == [(0x181, b"12345678", 0, 16)]
+    first, second = capfd.readouterr().err.splitlines()
+    assert first == f"guard: arm0 may command can0 by {tmp_path / 'policy.json'}"
+    assert second.startswith("guard: closed: it was told to end; ")
+
+
+def test_main_closes_once(wires, monkeypatch, tmp_path, capfd):
+    wires[0].say(0x123, b"")
+    assert run_main(wires, monkeypatch, tmp_path, [None, OSError(100, "Network is down")]) == 0
+    assert all_heard(wires[1]) == STOP
+    assert capfd.readouterr().err.count("closed") == 1
+
+
+def test_main_closes_when_an_interface_fails_and_stays(wires, monkeypatch, tmp_path, capfd):
+    failures = [OSError(100, "Network is down"), OSError(100, "Network is down")]
+    wires[0].say(0x80, b"")
+    assert run_main(wires, monkeypatch, tmp_path, [*failures, None]) == 0
+    assert all_heard(wires[1]) == STOP
+    _, line = capfd.readouterr().err.splitlines()
+    assert line.startswith("guard: closed: an interface failed: Network is down; ")

@@ -73,7 +73,7 @@ def test_it_follows_a_ramp_holds_and_obeys_no_torque(sim: SimulatedArm) -> None:
     assert late < 0.02
     np.testing.assert_allclose(sample.position, goal, atol=2e-3)
     assert 0.4 < fastest <= 1.0
-    assert all(display == CYCLIC_VELOCITY for display in link.groups[0].drives.displays)  # type: ignore[attr-defined]
+    assert all(display == CYCLIC_VELOCITY for display in link.groups[0].drives.known.displays)  # type: ignore[attr-defined]
 
 
 def test_a_guard_of_the_bus_refuses_it(sim: SimulatedArm) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from armlink.arm_file import LinkJoint, load_arm, parse_arm
 from armlink.drives.canopen.controller_setup import milliseconds
-from armlink.drives.canopen.drives import check_fits
+from armlink.drives.canopen.cyclic.wire import check_fits
 from armlink.drives.canopen.units import Units
 from armlink.errors import BadInput
 from armlink.link.gate_limits import drive_limits, gate_limits, joint_ranges, target_window

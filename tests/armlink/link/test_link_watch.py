@@ -145,7 +145,7 @@ def run_simulated(mode, torque=None, position=None, seconds=1.0):
             sample = link.cycle(given)
             if np.isfinite(sample.velocity[6]):
                 largest = max(largest, abs(sample.velocity[6]))
-        displays = link.groups[0].drives.displays[6]
+        displays = link.groups[0].drives.known.displays[6]
         return sample.position[6] - start, largest, displays, arm.require_link().joints[6]
 
 
@@ -358,7 +358,7 @@ def test_a_storm_of_emergencies_is_one_fault_and_costs_no_memory(enabled, bus):
     cycle, says = cycles_until_fault(enabled, command(POSITION))
     assert cycle == 0
     assert says.startswith("joint_2: emergency 73")
-    assert len(enabled.groups[0].drives.emergencies) <= 64
+    assert len(enabled.groups[0].drives.known.emergencies) <= 64
     assert all_stopped(bus)
 
 

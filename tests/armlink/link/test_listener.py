@@ -58,4 +58,4 @@ def test_emergencies_and_restarts_are_kept(arm_of):
     listener = Listener(arm_of(2), Tap(frames))
     listener.next(0.1)
     assert [(each.joint, each.code) for each in listener.emergencies] == [(0, "4310h")]
-    assert listener.groups[0].drives.node_states == {1: 0}
+    assert listener.groups[0].drives.known.node_states == {1: 0}

@@ -198,7 +198,7 @@ def test_verify_without_a_gravity_record_is_refused(
 ) -> None:
     command = ["verify", str(arm_path), "--bus", f"armlink_sim:{arm_path}", "--store", str(tmp_path / "records.db")]
     assert run(command) == 1
-    assert "armlink identify makes one" in capsys.readouterr().err
+    assert ": armlink sweep " in capsys.readouterr().err
 
 
 def test_a_directory_that_is_no_data_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,6 +15,7 @@ from armlink.arm_file import bundled_arms, load_arm, parse_arm
 from armlink.drives.canopen.check.found_drives import Drives
 from armlink.errors import BadInput, BusFault
 from calib.arm.kinematics import gcomp_arm
+from calib.commissioning.bus_arm import arm_of_bus
 from calib.commissioning.new_arm import NewArm, match_drives, new_arm
 from calib.plan.collisions import Geometry
 from gcomp.errors import BadModel
@@ -177,6 +178,43 @@ def test_permuted_ids_a_turned_sign_and_another_gear_are_found_by_hand(made, tmp
     link = made.parsed().require_link()
     assert [joint.node for joint in link.joints] == [12, 10, 11, 13]
     assert [joint.rated_torque for joint in link.joints] == pytest.approx([44, 44, 22, 8.8])
+
+
+def test_the_command_finds_other_ids_by_hand_and_its_file_passes_the_check(made, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    arm = real_arm(made, tmp_path, nodes=[12, 10, 11, 13], position_gain=[1.0] * 4)
+    monkeypatch.setattr("calib.commands.setup.on_bus.open_named", lambda bus: LockStepBus(arm=arm))
+    monkeypatch.setattr("calib.commands.setup.terminal.hand", lambda by_hand, interactive: hands(arm, made))
+    line = ["new", "arm4.urdf", "--out", "found.yaml", "--bus", "armlink_sim:real.yaml", "--by-hand"]
+    assert cli.run(line) == 0
+    assert "next: armlink check found.yaml" in capsys.readouterr().err
+    assert cli.run(["check", "found.yaml"]) == 0
+    assert [joint.node for joint in load_arm("found.yaml").require_link().joints] == [12, 10, 11, 13]
+
+
+def test_of_a_bus_alone_drives_and_stops_are_known_and_the_geometry_is_said_to_be_missing(
+    made, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    arm = real_arm(made, tmp_path, nodes=[12, 10, 11, 13], position_gain=[1.0, -1.0, 1.0, 1.0])
+    known, names = gcomp_arm(made.parsed()), [joint.name for joint in made.draft.joints]
+
+    def ask(text: str) -> None:
+        joint = int(text[len("joint_")]) - 1
+        arm.turn_by_hand(names[joint], (known.upper if "other" in text else known.lower)[joint])
+
+    found = arm_of_bus(Drives(LockStepBus(arm=arm)), "the bus", {"interface": "x", "channel": "y"}, "mine", ask)
+    rows = yaml.safe_load(found.text)["kinematics"]["joints"]
+    assert [match.drive.node for match in found.matches] == [12, 10, 11, 13]
+    lower = [row["lower"] for row in rows]
+    np.testing.assert_allclose(lower, [-2.5, -1.0, -2.2, -2.9], atol=2e-3)  # the second counts the other way
+    assert cli.run(["new", "--bus", "armlink_sim:real.yaml", "--json", "-"]) == 0
+    assert json.loads(capsys.readouterr().out)["next"] == "armlink check arm.yaml"
+    assert cli.run(["check", "arm.yaml", "--passive"]) == 0
+    assert cli.run(["doctor", "arm.yaml"]) == 1
+    assert "geometry is not known" in capsys.readouterr().err
+    assert cli.run(["new"]) == 2
+    assert "--bus" in capsys.readouterr().err
 
 
 def test_in_order_of_ids_a_doubtful_rating_is_named(made, tmp_path):

@@ -9,6 +9,7 @@ from failing_calls import DEPENDENCIES, events, watched_drift
 from fast_daemon import QUIET, FastDaemon
 from postgres import NoServer, stoppable_server
 
+from armlink.errors import BadInput
 from calib.daemon.settings import DaemonSection
 from calib.daemon.state.journal import Journal
 from calib.daemon.view.api_models import State
@@ -23,27 +24,41 @@ def settings(policy: str = "propose") -> DaemonSection:
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[str, str | None]]:
     with pytest.MonkeyPatch.context() as patch:
-        daemon, _ = watched_drift(tmp_path_factory.mktemp("undisturbed"), lambda dependency, count: False, patch)
+        daemon = watched_drift(tmp_path_factory.mktemp("undisturbed"), lambda dependency, count: False, patch)
         found = events(daemon)
     assert {kind for kind, _ in found} >= {"alarm", "drift", "proposal", "approved", "recalibration"}
+    assert daemon.wrong == []
     return found
+
+
+BURSTS = {"store": (14, 28), "journal": (11, 22), "disk": (2, 4), "pipe": (5, 200), "notify": (5, 10)}
+"""How many calls in a row fail, of how many; each failure of the pipe is a new bus process."""
 
 
 @pytest.mark.parametrize("failing", DEPENDENCIES)
 def test_no_failing_call_ends_it_or_loses_an_event(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: list[tuple[str, str | None]], failing: str
 ) -> None:
-    """The calls of one dependency fail, ten and more in a row, with as many between that succeed."""
-    burst = {"store": 14, "journal": 11, "disk": 10}[failing]
-    daemon, counted = watched_drift(
-        tmp_path, lambda name, count: name == failing and count // burst % 2 == 1, monkeypatch
+    row, period = BURSTS[failing]
+    daemon = watched_drift(
+        tmp_path, lambda name, count: name == failing and count % period >= period - row, monkeypatch
     )
-    assert counted.failed >= (2 if failing == "disk" else 10)  # recordings pause for a minute after each
-    found = events(daemon)
-    assert [event for event in undisturbed if event not in found] == []
-    status = daemon.view.status()
-    assert (status.detail, status.state) == ("", State.OBSERVING)
+    assert daemon.failing.failed[failing] >= (
+        4 if failing == "disk" else 10
+    )  # recordings pause for a minute after each
+    assert daemon.lost() == []
+    assert daemon.wrong == []
+    assert [event for event in undisturbed if event not in events(daemon)] == []
     assert daemon.store.unfinished_write(daemon.arm) is None
+
+
+def test_single_failures_of_all_at_once_are_right_again_within_seconds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: list[tuple[str, str | None]]
+) -> None:
+    daemon = watched_drift(tmp_path, lambda name, count: count % 97 == 13, monkeypatch)
+    assert min(daemon.failing.failed.values()) >= 1
+    assert (daemon.lost(), daemon.wrong) == ([], [])
+    assert [event for event in undisturbed if event not in events(daemon)] == []
 
 
 def metric(daemon: FastDaemon, name: str) -> str:
@@ -134,6 +149,34 @@ def test_a_lock_of_another_program_holds_the_daemon_for_a_moment_only(tmp_path: 
     daemon.run(3)
     assert [event.text for event in daemon.of_kind("clock")] == [f"number {number}" for number in range(100)]
     assert daemon.view.status().journal_fault is None
+
+
+def test_a_state_that_becomes_read_only_is_said_and_loses_no_event(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon.run(5)
+    daemon.service.journal._db.execute("PRAGMA query_only=ON")
+    daemon.service.events.say("clock", None, "while it was read-only", {})
+    daemon.run(5)
+    assert daemon.view.status().detail == "the journal cannot be written: attempt to write a readonly database"
+    assert daemon.view.status().state is State.OBSERVING
+    daemon.service.journal._db.execute("PRAGMA query_only=OFF")
+    daemon.run(3)
+    assert daemon.view.status().detail == ""
+    assert [event.text for event in daemon.of_kind("clock")] == ["while it was read-only"]
+
+
+def test_a_state_that_is_read_only_at_the_start_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, connect = tmp_path / "journal.db", sqlite3.connect
+    sqlite3.connect(path).execute("CREATE TABLE events (id)").connection.close()
+
+    def read_only(given: Path, **options: object) -> sqlite3.Connection:
+        return connect(f"file:{given}?mode=ro", uri=True, **options)  # type: ignore[call-overload,no-any-return]
+
+    monkeypatch.setattr(sqlite3, "connect", read_only)
+    with pytest.raises(
+        BadInput, match=r"journal.db: the journal cannot be opened: attempt to write a readonly database"
+    ):
+        Journal(path)
 
 
 def test_what_cannot_be_committed_is_not_half_kept(tmp_path: Path) -> None:

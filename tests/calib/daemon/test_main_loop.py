@@ -16,6 +16,7 @@ from armlink.loop.messages import Alive
 from calib.daemon import main_loop
 from calib.daemon.loop.loop_messages import Message
 from calib.daemon.main_loop import BEGIN_SECONDS, SILENT_SECONDS, Daemon
+from calib.daemon.notify import Notifier
 from calib.daemon.options import Options
 
 
@@ -174,6 +175,31 @@ def test_systemd_is_told_of_the_end_of_a_reload_whatever_happens(
         with_daemon(tmp_path, monkeypatch, act)
         assert receiver.recv(200).startswith(b"RELOADING=1\n")
         assert receiver.recv(200) == b"READY=1"
+
+
+def test_what_systemd_s_socket_did_not_take_is_sent_later_and_only_the_newest_of_it(tmp_path: Path) -> None:
+    path = tmp_path / "notify"
+    notify = Notifier(str(path))
+    for line in (
+        "READY=1",
+        "STATUS=starting",
+        "WATCHDOG=1",
+        "STATUS=observing",
+        "RELOADING=1",
+        "READY=1",
+        "WATCHDOG=1",
+    ):
+        notify(line)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(str(path))
+        receiver.settimeout(1.0)
+        for _ in range(2):
+            notify.flush()
+        heard = [receiver.recv(200) for _ in range(4)]
+        assert heard == [b"STATUS=observing", b"RELOADING=1", b"READY=1", b"WATCHDOG=1"]
+        receiver.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            receiver.recv(200)
 
 
 @pytest.mark.parametrize(("waiting", "stood_still"), [([Alive()], 0.0), ([], 20.0)])

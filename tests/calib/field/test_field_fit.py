@@ -269,4 +269,4 @@ def test_what_cannot_be_used_is_one_line(kept, capsys, arguments, status, said) 
 
 def test_without_a_gravity_record_it_says_how_to_make_one(tmp_path, capsys) -> None:
     assert run(["recalibrate", "sarcos", "x.csv", "--store", str(tmp_path / "empty.db")]) == 1
-    assert "armlink identify makes one" in capsys.readouterr().err
+    assert ": armlink sweep " in capsys.readouterr().err

@@ -9,7 +9,7 @@ from drawn_arms import drawn_arm
 from realistic_sweeps import RestingArm, both_passes, plans
 
 from calib.arm.kinematics import gcomp_arm
-from calib.fit.lags import Lags
+from calib.fit.lags import TORQUE, Lags
 from calib.fit.levels import LARGEST, LEAST, Effects, learn
 from calib.fit.position_field import PositionField, kernel
 from calib.fit.sensor_fit import SensorFit, fit_sensors
@@ -58,10 +58,11 @@ def test_levels_of_drawn_effects_are_found() -> None:
     assert np.mean(found, axis=0) == pytest.approx([2.0, 0.45], rel=0.15)
 
 
-def test_nothing_to_find_leaves_the_least_level_and_a_large_effect_the_largest() -> None:
+def test_nothing_to_find_leaves_what_the_readings_cannot_exclude_and_a_large_effect_the_largest_level() -> None:
+    """A coefficient of 200 readings is known to 1/(3 √200) = 0.024, the level of forty to a fraction of that."""
     random = np.random.default_rng(2)
     effects, family = 3 * random.normal(size=(200, 40)), np.zeros(40, dtype=np.int64)
-    for size, low, high in ((0.0, LEAST, 2 * LEAST), (60.0, LARGEST, LARGEST)):
+    for size, low, high in ((0.0, 1.1 * LEAST, 0.012), (60.0, LARGEST, LARGEST)):
         target = effects @ (size * random.normal(size=40)) + random.normal(size=200)
         level = learn(Effects.of(np.zeros((200, 1)), effects, target, family, 1), np.ones(1)).level[0]
         assert low * (1 - 1e-9) <= level <= high * (1 + 1e-9)
@@ -110,6 +111,29 @@ def _unloaded(q: np.ndarray) -> SweepReadings:
         position_sigma=np.zeros(q.shape[1]),
         resolution=np.zeros(q.shape[1]),
     )
+
+
+@pytest.mark.parametrize("level", [1.0, 30.0])
+def test_a_sensor_that_lags_by_more_has_a_wider_play(level: float) -> None:
+    """Against a play taken along MuJoCo's torque in small steps: of 0.05 % of rated torque, and of 1.5 %."""
+    arm, truth = drawn_arm(SEED)
+    described, n = gcomp_arm(arm), 3
+    rated = arm.require_link().rated_torques
+    q = np.cumsum(np.random.default_rng(4).normal(size=(60, n)) * [0.01, 0.1, 0.02], axis=0)
+    regressor = gravity_regressor(described, q).reshape(-1, 2 * n)
+    simulated, half = SimulatedArm(arm, truth), level * TORQUE * rated
+    beta = np.linalg.lstsq(regressor, simulated.gravity_torque(q).ravel(), rcond=None)[0]
+    parameters = replace(
+        Parameters.from_vector(np.zeros(6 * n + 3), n), gain=np.ones(n), position_gain=np.ones(n), beta=beta
+    )
+    found = Lags.of(described, _unloaded(q), parameters, rated, level).sensor
+    play, lag = simulated.gravity_torque(q[:1])[0], np.zeros((len(q), n))
+    for row in range(1, len(q)):
+        for torque in simulated.gravity_torque(np.linspace(q[row - 1], q[row], 21)[1:]):
+            play = np.clip(play, torque - half, torque + half)
+        lag[row] = (play - torque) / half
+    assert np.abs(lag).max() > 0.9
+    assert found == pytest.approx(lag, abs=0.05)
 
 
 @pytest.mark.parametrize("level", [0.0, 1.0, 3.0])

@@ -8,7 +8,7 @@ from rest_arm import RestArm, harmonics
 
 from calib.observer.cause_test import CauseTest
 from calib.observer.config import ObserverConfig
-from calib.observer.discrepancy.kernel import Kernel, weighted
+from calib.observer.discrepancy.kernel import Kernel
 from calib.observer.discrepancy.level import Level
 from calib.observer.effect_dictionary import DRIFT
 from calib.observer.gravity_belief import GravityBelief
@@ -20,7 +20,7 @@ NOISE = 0.02
 def field(kernel: Kernel, level: Level, q: np.ndarray, side: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """A draw of the field (K, n) at poses, by the prior itself."""
     points = kernel.points(q, side)
-    covariance = weighted(level.smooth, kernel.between(points, points))
+    covariance = kernel.weighted(level.smooth, points, points)
     roots = np.linalg.cholesky(covariance + 1e-10 * np.eye(len(q)))
     smooth = np.einsum("jab,bj->aj", roots, random.normal(size=q.shape))
     return np.asarray(smooth + level.rough * random.normal(size=q.shape))

@@ -64,6 +64,7 @@ def test_the_report_says_what_from_what_and_per_joint_and_opens_without_complain
         "Before and after",
         "Figure 6",
         "cross-validation RMS",
+        f"<code>armlink calibrate {DATA[0].path} {DATA[1].path} --apply</code>",
     ):
         assert said in document, said
     for name in ARM.joint_names:

@@ -153,6 +153,14 @@ def test_a_pose_that_a_stall_interrupts_is_repeated(chain: Chain, monkeypatch: p
     chain.link.recover()
 
 
+def test_a_travel_to_where_the_arm_stands_moves_nothing(chain: Chain) -> None:
+    mover = Mover(chain.link, sweep_section(chain.arm), Limits.of(chain.arm))
+    mover.hold_all()
+    before = mover.command.position.copy()
+    mover.travel(before.copy(), 1.0)
+    assert mover.command.position.tolist() == before.tolist()
+
+
 def test_a_joint_that_cannot_be_held_on_its_stop_is_noticed(chain: Chain) -> None:
     """Pressed with too little torque it slips within the press, and is caught."""
     mover = Mover(chain.link, sweep_section(chain.arm), Limits.of(chain.arm))

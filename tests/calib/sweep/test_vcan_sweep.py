@@ -9,7 +9,7 @@ from small_pair import MASS, SEED, armlink, describe, simulated
 from armlink.arm_file import load_arm
 from sim_bus.truth import Truth
 
-pytestmark = pytest.mark.vcan
+pytestmark = [pytest.mark.vcan, pytest.mark.sweep]
 
 BUS = "socketcan:vcan0"
 LOWEST, HIGHEST = 25.0, 100.0

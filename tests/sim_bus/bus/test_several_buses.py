@@ -3,7 +3,6 @@
 import threading
 
 import can
-import numpy as np
 import pytest
 import yaml
 
@@ -102,8 +101,22 @@ class ArmTime:
         pass
 
 
-def test_the_joints_of_both_buses_move_as_one_arm(path):
-    described = load_arm(path)
+def with_drives(path, *drives):
+    """The arm with other drives: keys of both joints' drives, or None for a CANopen node of id 11."""
+    content = yaml.safe_load(path.read_text())
+    for row, drive in zip(content["link"]["joints"], drives, strict=True):
+        del row["node"]
+        row |= {"node": 11} if drive is None else {"drive": drive}
+    path.write_text(yaml.safe_dump(content))
+    return load_arm(path)
+
+
+DAMIAO = {"family": "damiao", "id": 1, "reply": 17, "model": "DM4340", "kp": 40, "kd": 2}
+
+
+@pytest.mark.parametrize("repeated", [False, True])
+def test_the_joints_of_both_buses_move_as_one_arm(path, repeated):
+    described = with_drives(path, None, None) if repeated else load_arm(path)
     arm = SimulatedArm(described, Truth.of(described))
     nodes, host = (open_link_bus(None, described.require_link()) for _ in range(2))
     server = Server(arm, nodes, lockstep=True, now=lambda: 0.0)
@@ -113,15 +126,59 @@ def test_the_joints_of_both_buses_move_as_one_arm(path):
         link.start()
         link.enable()
         command = Command.hold(link.position_sent)
-        began = arm.time
+        began, start = arm.time, link.position_sent
         for _ in range(100):
-            command.position += 0.002
+            command.position += [0.002, -0.001]
             sample = link.cycle(command)
-        assert np.isfinite(sample.position).all()
-        assert sample.position == pytest.approx(command.position, abs=0.03)
+        assert sample.position - start == pytest.approx([0.2, -0.1], abs=0.03)
         # SYNC comes on both buses, and is one period all the same
         assert arm.time - began == pytest.approx(100 * link.period, abs=3 * link.period)
         assert link.stats.missed == 0
+    nodes.shutdown()
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_node_and_another_drive_on_two_buses_move_as_one_arm(path, turned):
+    described, clock = with_drives(path, *((DAMIAO, None) if turned else (None, DAMIAO))), HandTime()
+    arm = SimulatedArm(described, Truth.of(described))
+    nodes, host = (open_link_bus(None, described.require_link()) for _ in range(2))
+    server = Server(arm, nodes, now=clock.now)
+    pumped = BusGroup([Pumped(bus, server.turn) for bus in host.members], list(host.tags))
+    pumped.clock = clock
+    with Link(described, pumped) as link:
+        link.start()
+        start = link.enable().position
+        command = Command.hold(start)
+        for _ in range(100):
+            command.position += [0.002, -0.001]
+            clock.time += link.period
+            sample = link.cycle(command)
+        assert sample.position - start == pytest.approx([0.2, -0.1], abs=0.05)
+        assert link.stats.missed == 0
+    nodes.shutdown()
+
+
+def test_frames_on_a_bus_without_nodes_reach_no_node_of_another(path):
+    described, clock = with_drives(path, None, DAMIAO), HandTime()
+    arm = SimulatedArm(described, Truth.of(described))
+    nodes, host = (open_link_bus(None, described.require_link()) for _ in range(2))
+    server = Server(arm, nodes, now=clock.now)
+    server.turn()
+    [node], port = arm.nodes, host.open_port()
+    before = node.nmt, node.value(0x60FF)
+    write = bytes.fromhex("23ff600001000000")
+    for tag in host.tags.values():
+        while port.receive(0.0) is not None:
+            pass
+        port.send(tag | 0x60B, write)  # to node 11, were it there
+        port.send(tag, bytes([1, 0]))
+        server.turn()
+        found = list(iter(lambda: (port.receive(0.0) or (None,))[0], None))
+        assert ((node.nmt, node.value(0x60FF)) == before) == (tag > 0)
+        assert (0x58B in found) == (tag == 0)
+        node.nmt = before[0]
+        node._set((0x60FF, 0), bytes(4))
+    host.shutdown()
     nodes.shutdown()
 
 
@@ -139,12 +196,7 @@ class HandTime:
 
 
 def test_drives_with_the_same_ids_on_two_buses_move_as_one_arm(path):
-    content = yaml.safe_load(path.read_text())
-    for row in content["link"]["joints"]:
-        del row["node"]
-        row["drive"] = {"family": "damiao", "id": 1, "reply": 17, "model": "DM4340", "kp": 40, "kd": 2}
-    path.write_text(yaml.safe_dump(content))
-    described, clock = load_arm(path), HandTime()
+    described, clock = with_drives(path, DAMIAO, DAMIAO), HandTime()
     arm = SimulatedArm(described, Truth.of(described))
     nodes, host = (open_link_bus(None, described.require_link()) for _ in range(2))
     server = Server(arm, nodes, now=clock.now)

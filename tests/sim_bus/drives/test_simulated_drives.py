@@ -268,3 +268,22 @@ def test_armlink_sim_serves_drives_of_a_family_on_a_bus():
         finally:
             process.terminate()
             process.communicate(timeout=30)
+
+
+# ---- the torque that a drive tells
+
+
+def test_a_stiff_drive_tells_the_mean_torque_of_a_step():
+    """Its target stands still for each step while the joint moves on: momentum changes by what it told, less gravity's
+    part."""
+    arm = simulated(DAMIAO)
+    motor, plant, step = arm.device(0).motor, arm.plant, 0.004
+    inertia, told, fallen, speed = 0.01 + 0.2**2, 0.0, 0.0, 0.8
+    for k in range(100):
+        before = plant.position[0]
+        motor.impede(300.0, 30.0, speed * step * (k + 1), speed, 0.0)
+        arm.advance(step)
+        told += step * motor.torque
+        fallen += step * 9.81 * 0.2 * np.sin((before + plant.position[0]) / 2)
+    assert plant.position[0] == pytest.approx(speed * step * 100, abs=0.02)
+    assert told - fallen == pytest.approx(inertia * plant.velocity[0], abs=2e-3)

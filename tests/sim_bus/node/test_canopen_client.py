@@ -6,9 +6,13 @@ import can
 import canopen
 import numpy as np
 import pytest
+import yaml
 
+from armlink.arm_file import bundled_arms, parse_arm
 from armlink.drives.canopen.eds_file import bundled_path
 from sim_bus.bus.lock_step import LockStepBus
+from sim_bus.simulated_arm import SimulatedArm
+from sim_bus.truth import Truth
 
 
 @pytest.fixture
@@ -65,3 +69,41 @@ def test_a_bus_of_a_bundled_arm_opens_by_name_and_its_clock_is_simulated() -> No
         bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
         assert bus.clock.now() == pytest.approx(2.004)
         np.testing.assert_allclose(bus.arm.plant.velocity, 0.0, atol=1e-3)
+
+
+def test_the_stock_client_drives_cyclic_velocity_where_nothing_else_is_offered() -> None:
+    path = bundled_arms()["six-cia402"]
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    content["sim"]["device"] = "velocity"
+    arm = parse_arm(content, path)
+    simulated = SimulatedArm(arm, Truth.of(arm))
+    network = canopen.Network(bus=LockStepBus(arm=simulated))
+    network.connect()
+    try:
+        node = network.add_node(simulated.nodes[5].node_id, bundled_path())
+        node.sdo.RESPONSE_TIMEOUT = 10.0
+        assert node.sdo[0x6502].raw == 1 << 8
+        node.sdo[0x6060].raw = 9
+        for control in (0x06, 0x07, 0x0F):
+            node.sdo[0x6040].raw = control
+        assert (node.sdo[0x6041].raw & 0x6F, node.sdo[0x6061].raw) == (0x27, 9)
+        node.nmt.state = "OPERATIONAL"
+
+        def moved_in(cycles: int) -> tuple[float, float]:
+            before = node.sdo[0x6064].raw, simulated.time
+            for _ in range(cycles):
+                network.sync.transmit()
+            return node.sdo[0x6064].raw - before[0], simulated.time - before[1]
+
+        velocity = 40_000
+        node.sdo[0x60FF].raw = velocity
+        moved_in(50)
+        way, seconds = moved_in(50)
+        assert way / seconds == pytest.approx(velocity, rel=0.05)
+        node.sdo[0x60FF].raw = 0
+        moved_in(50)
+        assert abs(moved_in(25)[0]) < 200
+        node.sdo[0x6040].raw = 0
+        assert node.sdo[0x6041].raw & 0x6F != 0x27
+    finally:
+        network.disconnect()

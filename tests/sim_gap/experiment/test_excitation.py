@@ -50,7 +50,7 @@ def test_what_a_diagnosis_leaves_open_is_moved(tmp_path: Path) -> None:
     answer.write_text(json.dumps({"causes": [clear], "where": []}), encoding="utf-8")
     assert joints_in_doubt(answer) == (["joint_1"], [])
     answer.write_text("[]", encoding="utf-8")
-    with pytest.raises(BadInput, match="not a result of armlink gap diagnose"):
+    with pytest.raises(BadInput, match="not a result that gap diagnose wrote"):
         joints_in_doubt(answer)
     with pytest.raises(BadInput, match="no joint elbow in arm sarcos"):
         plan_motion(load_arm("sarcos"), ["elbow"])

@@ -41,7 +41,7 @@ def test_every_cause_has_its_figure_and_lies_in_the_middle_of_what_it_explains(a
 
 def test_it_begins_with_what_to_do_and_its_headings_are_words(answer):
     shown = sections(answer)
-    assert "armlink gap diagnose --out-model writes the corrected model" in shown[0].html
+    assert "writes the corrected model if it is given --out-model" in shown[0].html
     assert "Residuals of the torque sensor" in [section.title for section in shown]
     titles = [section.title for section in shown]
     for figure in (figure for section in shown for figure in section.figures):

@@ -21,7 +21,8 @@ def arm_findings(arm_file: ArmFile, opened: CanBus, bus: str) -> Iterator[DriveF
         node = joint.settings.node
         where, drive = f"{joint.name} (node {node})", by_node.get(node)
         if drive is None:
-            remedy = f"check its power, wiring and node id{unknown}; armlink new with --bus finds the drives"
+            find = f"armlink new {arm_file.argument} --bus {bus} --out found.yaml"
+            remedy = f"check its power, wiring and node id{unknown}; the drives are found by {find}"
             yield DriveFinding("error", f"no answer on {bus}", where, remedy)
             continue
         for differs in identity_mismatches(expected_identity(joint, sheet), vars(drives.identities[node])):

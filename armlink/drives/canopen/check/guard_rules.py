@@ -1,16 +1,21 @@
 """Rules of a bus guard for CiA 402 drives: frames of the cycle within limits, and the writes of the set-up."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
+from armlink.arm_file import LinkJoint
 from armlink.drives.canopen import controller_setup as device
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen import pdo
+from armlink.drives.canopen.cyclic.wire import check_fits
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import Pdo
 from armlink.drives.canopen.profile import Profile
-from armlink.drives.canopen.units import Units
+from armlink.drives.canopen.sdo import NodeServices
+from armlink.drives.canopen.units import Units, read_units
 from armlink.drives.orders import Limits, Mode
+from armlink.errors import BadInput
 from armlink.torque_calibration import GAIN_RANGE
 
 BURST = 5
@@ -30,6 +35,27 @@ QUICK_STOP, ENABLE_OPERATION, POWER_BITS = 0x02, 0x0F, 0x0F
 faults alone (CiA 402-2)."""
 ROUNDING = 1
 """A target that follows a reading is this far from it at most [counts]."""
+
+
+def guard_rules(
+    rows: Sequence[LinkJoint], services: Sequence[NodeServices], limits: Sequence[Limits], protection: device.Protection
+) -> dict[str, Any]:
+    """Rules of the joints with scales and objects as their devices tell them; raises BadInput, BusFault."""
+    nodes = tuple(row.settings.node for row in rows)
+    rules: dict[str, Any] = {"frames": shared_rules(nodes, protection.host), "stop": [], "restarts": {}}
+    for row, each, limit in zip(rows, services, limits, strict=True):
+        device.check_identity(each, row)
+        unit, profile = read_units(each, row), device.examined(each, row.settings)
+        if profile.by_velocity:
+            raise BadInput(f"{row.name}: led by velocity (mode 9): no frame tells a guard where that ends")
+        check_fits(row.name, limit, unit)
+        sheet = list(each.remote.object_dictionary)
+        node = NodeRules(row.name, row.settings.node, profile, unit, limit, protection, sheet)
+        rules["frames"] |= node.frames()
+        rules["stop"].append(node.stop)
+        boot_up, answers = node.restart
+        rules["restarts"][f"{boot_up}"] = answers
+    return rules
 
 
 def shared_rules(nodes: tuple[int, ...], host: int) -> dict[str, Any]:

@@ -73,7 +73,7 @@ class PowerTest:
         except ArmlinkError as error:
             reason = str(error)
         finally:
-            self.loop.withheld, self.drives.beating = frozenset(), True
+            self.loop.withheld, self.drives.cycle.beating = frozenset(), True
             if self.commander.passed:
                 self.commander.stop()
         told = self._refused
@@ -96,7 +96,7 @@ class PowerTest:
 
     def _has(self, joint: int, entry: Entry, check: str) -> bool:
         """Whether a device has the object that a check is about; if not, the check is told to be absent."""
-        profile = self.drives.profiles[joint]
+        profile = self.drives.wires[joint].profile
         if profile.has(entry):
             return True
         name = self.link.names[joint]
@@ -114,8 +114,8 @@ class PowerTest:
         sample = self.commander.stand(power)
         self._last = sample.t
         names, watch = self.link.names, self.loop.watch
-        if watch.intruder or self.drives.restarted:
-            where = self.drives.restarted and names[min(self.drives.restarted)]
+        if watch.intruder or self.drives.known.restarted:
+            where = self.drives.known.restarted and names[min(self.drives.known.restarted)]
             raise BusFault(
                 f"another host is on this bus: it sends {watch.intruder}: stop it, only one program may command an arm"
                 if watch.intruder
@@ -126,7 +126,7 @@ class PowerTest:
             joint = int(np.nanargmax(moved))
             raise BusFault(f"{names[joint]}: moved by {moved[joint]:.3f} rad while it should hold: test ended")
         if tested is not None:
-            for joint, code, _ in self.drives.emergencies:
+            for joint, code, _ in self.drives.known.emergencies:
                 if joint != tested:
                     raise BusFault(f"{names[joint]}: emergency {code:04X}h, {emcy.name_of(code)}, while it only held")
         return sample
@@ -136,7 +136,7 @@ class PowerTest:
         link = self.link
         self._progress("readings, heartbeats and modes, without power")
         off, came = [Power.OFF] * link.n, np.zeros(link.n, int)
-        self.drives.node_states.clear()
+        self.drives.known.node_states.clear()
         beat = 2 * self.drives.protection.producer_ms * 1e-3
         cycles = max(CYCLES, int(np.ceil(beat / link.period)) + 1)
         for _ in range(cycles):
@@ -148,7 +148,7 @@ class PowerTest:
                 bool(came[joint] >= ANSWERED * cycles),
                 f"{came[joint]} of {cycles} SYNCs answered",
             )
-            heard = joint in self.drives.node_states
+            heard = joint in self.drives.known.node_states
             found = (
                 f"heard, period {self.drives.protection.producer_ms} ms"
                 if heard
@@ -158,7 +158,9 @@ class PowerTest:
         since = {mode: self._time_modes(mode, off) for mode in (Mode.TORQUE, Mode.POSITION)}
         for joint in range(link.n):
             slow = [
-                f"{int(mode)} (displays {self.drives.displays[joint]})" for mode in since if since[mode][joint] is None
+                f"{int(mode)} (displays {self.drives.known.displays[joint]})"
+                for mode in since
+                if since[mode][joint] is None
             ]
             times = [seconds for mode in since if (seconds := since[mode][joint]) is not None]
             found = f"does not enter mode {', '.join(slow)}" if slow else "follows 6060h"
@@ -175,7 +177,7 @@ class PowerTest:
             now = link.clock.now() - start
             times = [
                 now if time is None and shown == mode else time
-                for time, shown in zip(times, self.drives.displays, strict=True)
+                for time, shown in zip(times, self.drives.known.displays, strict=True)
             ]
         return times
 
@@ -185,7 +187,7 @@ class PowerTest:
         start = link.clock.now()
         sample = self.commander.walk(Power.ON)
         self._standing, self._last = sample.position.copy(), sample.t
-        self.drives.emergencies.clear()
+        self.drives.known.emergencies.clear()
         seconds = link.clock.now() - start
         for _ in range(self._cycles(HOLD_SECONDS)):
             sample = self._cycle([Power.ON] * link.n, tested=-1)
@@ -198,13 +200,13 @@ class PowerTest:
     def _again(self) -> None:
         """Everything back to enabled."""
         drives = self.drives
-        self.loop.withheld, drives.beating = frozenset(), True
-        for joint, state in drives.node_states.items():
+        self.loop.withheld, drives.cycle.beating = frozenset(), True
+        for joint, state in drives.known.node_states.items():
             if state != objects.OPERATIONAL:
                 drives.send_nmt(self.link.ask, objects.NMT_START, drives.nodes[joint])
-        drives.node_states.clear()
+        drives.known.node_states.clear()
         self._last = self.commander.walk(Power.ON).t
-        drives.emergencies.clear()
+        drives.known.emergencies.clear()
 
     def _quick_stop(self, joint: int) -> None:
         """The command quick stop: reached, kept, and the joint holds."""
@@ -236,14 +238,14 @@ class PowerTest:
             return
         self._progress(f"all joints: no heartbeat of the host for {limit * 1e3:.0f} ms")
         self.drives.beat(self.link.ask)
-        self.drives.beating = False
+        self.drives.cycle.beating = False
         start, seconds = self._last, 0.0
         after: list[tuple[State, float] | None] = [None] * link.n
         pairs = list(enumerate(watching))
         while any(watches and after[joint] is None for joint, watches in pairs) and seconds < PATIENCE * limit:
             seconds = self._cycle([Power.ON] * link.n).t - start + link.period
             for joint, each in enumerate(after):
-                left = self.drives.node_states.get(joint, objects.OPERATIONAL) != objects.OPERATIONAL
+                left = self.drives.known.node_states.get(joint, objects.OPERATIONAL) != objects.OPERATIONAL
                 state = self._read(joint) if left and each is None else self._state(joint)  # it sends no status then
                 if each is None and state is not State.ENABLED:
                     after[joint] = (state, seconds)
@@ -270,9 +272,9 @@ class PowerTest:
     def _judge(self, joint: int, check: str, state: State, seconds: float, limit: float) -> None:
         """Quick stop in time passes; anything else is told as what the device does."""
         allowed = limit * (1 + LATE_SHARE) + LATE_SECONDS + 2 * self.link.period
-        codes = [code for place, code, _ in self.drives.emergencies if place == joint]
+        codes = [code for place, code, _ in self.drives.known.emergencies if place == joint]
         why = f", emergency {codes[0]:04X}h" if codes else ", no emergency"
-        nmt = self.drives.node_states.get(joint, objects.OPERATIONAL)
+        nmt = self.drives.known.node_states.get(joint, objects.OPERATIONAL)
         left = "" if nmt == objects.OPERATIONAL else f", NMT {objects.NMT_STATES.get(nmt, nmt)} (1029h:01)"
         timing = f"after {seconds * 1e3:.0f} ms (told {limit * 1e3:.0f} ms){why}{left}"
         if state is State.ENABLED:
@@ -286,7 +288,7 @@ class PowerTest:
             self._harmed = f"not run: {self.link.names[joint]} lost its power in the check of its {check}"
 
     def _state(self, joint: int) -> State:
-        return state_of(self.drives.statuses[joint])
+        return state_of(self.drives.known.statuses[joint])
 
     def _read(self, joint: int) -> State:
         status: Any = self.drives.services(self.link.ask)[joint].read(objects.STATUS_WORD)

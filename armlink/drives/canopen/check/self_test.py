@@ -15,7 +15,8 @@ from armlink.drives.canopen import pdo
 from armlink.drives.canopen import torque_sensor_record as calibration
 from armlink.drives.canopen.check.power_test import PowerTest
 from armlink.drives.canopen.cia402 import MODE_NAMES, supports
-from armlink.drives.canopen.drives import CanopenDrives, check_fits
+from armlink.drives.canopen.cyclic.wire import check_fits
+from armlink.drives.canopen.drives import CanopenDrives
 from armlink.drives.canopen.eds_file import OPTIONAL, expected_identity, used_objects
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.profile import OURS, Profile

@@ -97,7 +97,7 @@ function drawOne(card, shown, k) {
   const degrees = Number.isFinite(now.temperature[k]) ? `, ${number(now.temperature[k], 0)} °C` : "";
   const label = `${name}: sensor ${number(now.torque[k], 2)}, model ${number(now.model_torque[k], 2)} N·m${degrees}`;
   const drawing = svg("svg", { viewBox: `0 0 ${width} ${bottom + FOOT}`, height: bottom + FOOT, role: "img", "aria-label": label });
-  graph(drawing, ["model_torque", "torque"], shown, k, box, 0.5, 1);
+  graph(drawing, ["torque", "model_torque"], shown, k, box, 0.5, 1);
   if (warm) graph(drawing, ["temperature"], shown, k, { ...box, top: TORQUE + 6, bottom: bottom - 4 }, 2, 0);
   for (const [at, anchor] of [[from, "start"], [(from + to) / 2, "middle"], [to, "end"]]) {
     drawing.append(svg("text", { x: x(at), y: bottom + 12, "text-anchor": anchor }, ago(to - at)));

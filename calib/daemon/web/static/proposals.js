@@ -45,7 +45,7 @@ function decide(one, verb) {
   const dialog = by("ask-decision");
   by("decision-title").textContent = verb === "approve" ? `Write the new calibration to ${one.joint}?` : `Drop the proposal for ${one.joint}?`;
   by("decision-text").textContent = verb === "approve"
-    ? `Record ${one.record} goes to the controller and is read back: ${change(one)}. The arm does not move. armlink rollback undoes it.`
+    ? `Record ${one.record} goes to the controller and is read back: ${change(one)}. The arm does not move. A roll-back undoes it.`
     : `${change(one)} stays uncorrected; nothing is written.`;
   by("decision-evidence").replaceChildren(...evidence(one));
   by("decision-yes").textContent = verb === "approve" ? "Approve" : "Reject";

@@ -4,12 +4,13 @@ import math
 import struct
 
 import pytest
-from fake_joints import make_arm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from armlink.drives.canopen.drives import CanopenDrives
-from armlink.drives.canopen.family import TRAITS
+from armlink.drives.canopen.cyclic.commands import CommandFrames
+from armlink.drives.canopen.cyclic.wire import Wire
+from armlink.drives.canopen.faults import Known
+from armlink.drives.canopen.profile import OURS
 from armlink.drives.canopen.units import Units
 from armlink.drives.orders import Limits, Mode, Order, Power
 
@@ -17,11 +18,8 @@ UNIT = Units(0.04, 2 * math.pi / 2**20, 2 * math.pi / 2**20, 1e-6)
 
 
 def drives(lower=-2.0, upper=2.0, unit=UNIT):
-    arm = make_arm(1)
-    found = CanopenDrives(arm, arm.link.joints, TRAITS)
-    found.units[0] = unit
-    found._limits = [Limits(30.0, 200.0, 1.0, lower, upper, 0.1, 0.004)]
-    found._compile()
+    found = CommandFrames(Known(("joint_1",)), host=127, beat_every=0.05, period=0.004)
+    found.use([Wire(1, OURS, unit, Limits(30.0, 200.0, 1.0, lower, upper, 0.1, 0.004))])
     return found
 
 

@@ -261,6 +261,12 @@ def test_live_torque_beside_the_model_and_its_window_as_a_recording(
     expect(page.locator("#live-joint_1 svg")).to_have_attribute(
         "aria-label", re.compile(r"joint_1: sensor .* model .* N·m")
     )
+    drawn = page.locator("#live-joint_1 svg polyline").evaluate_all(
+        "all => all.map(e => [e.classList.value.split(' ')[1], parseFloat(getComputedStyle(e).strokeWidth)])"
+    )
+    (below, wide), (above, thin) = drawn[0], next(each for each in reversed(drawn) if "torque" in each[0])
+    assert (below, above) == ("torque", "model_torque")  # the model is seen where it agrees with the sensor
+    assert wide > 2 * thin
     for suffix, seconds in (("csv", 60), ("mcap", 600)):
         page.click(f"#live-ranges [data-seconds='{seconds}']")
         with page.expect_download() as got:

@@ -1,0 +1,181 @@
+"""Orders become frames: RPDO1 of every joint, RPDO2 where a mode changes, heartbeat and SYNC; and back, for a check."""
+
+import math
+import struct
+from collections.abc import Callable, Sequence
+
+from armlink.bus.port import Frame
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen.cia402 import (
+    CYCLIC_VELOCITY,
+    Control,
+    State,
+    loop_gain,
+    next_control,
+    set_point_control,
+    state_of,
+    velocity_towards,
+)
+from armlink.drives.canopen.cyclic.wire import INT32_MAX, Wire
+from armlink.drives.canopen.faults import Known
+from armlink.drives.canopen.pdo import RPDO1, RPDO2
+from armlink.drives.orders import Mode, Order, Power
+
+OFF, PROFILE_POSITION = int(Mode.OFF), int(Mode.PROFILE_POSITION)
+ENABLE, DISABLE_VOLTAGE = int(Control.ENABLE), int(Control.DISABLE_VOLTAGE)
+FAULT_RESET, QUICK_STOP = int(Control.FAULT_RESET), int(Control.QUICK_STOP)
+TARGETS = {Power.ON: State.ENABLED, Power.OFF: State.SWITCH_ON_DISABLED, Power.STOPPED: State.QUICK_STOP}
+SYNC: Frame = (objects.SYNC_ID, b"")
+_OPERATIONAL = bytes([objects.OPERATIONAL])
+
+
+class CommandFrames:
+    """Frames of each cycle for m joints; what each joint was sent last can be decoded again."""
+
+    def __init__(self, known: Known, host: int, beat_every: float, period: float) -> None:
+        """`known` is what the joints show; `host` is our own node id, whose heartbeat is due every `beat_every` [s]."""
+        self._known, self._period, self._beat_every = known, period, beat_every
+        self.beating = True
+        """Whether the host's heartbeat is sent; not, so that the joints' watching it is put to the test."""
+        self.heartbeat: Frame = (objects.HEARTBEAT_ID + host, _OPERATIONAL)
+        self._wires: Sequence[Wire] = ()
+        self._rows: list[tuple[int, Callable[..., bytes], float, float, float, float, int, int]] = []
+        m = len(known.names)
+        self._sent: list[bytes | None] = [None] * m
+        self._aimed = [math.nan] * m
+        """Last target of a joint that is led by velocity [rad]."""
+        self.restart()
+
+    def restart(self) -> None:
+        """Drives that were set up anew: in no mode, nothing sent yet."""
+        m = len(self._known.names)
+        self._beat = -math.inf
+        self.modes, self._words, self._walking = [OFF] * m, [FAULT_RESET] * m, [False] * m
+
+    def forget_walk(self) -> None:
+        """The next step towards a power state is a first one."""
+        self._walking = [False] * len(self._walking)
+
+    def use(self, wires: Sequence[Wire]) -> None:
+        """From now on these layouts, scales and windows."""
+        self._wires, self._rows = wires, []
+        self._any_velocity = any(wire.by_velocity for wire in wires)
+        for joint, wire in enumerate(wires):
+            limits, unit = wire.limits, wire.unit
+            low, high = math.ceil(limits.lower / unit.position), math.floor(limits.upper / unit.position)
+            self._aimed[joint] = math.nan
+            pack, torque = wire.layouts[RPDO1.name].pack, unit.torque if wire.with_torque else 0.0
+            window = (limits.lower, limits.upper, low, high)
+            self._rows.append((RPDO1.cob_base + wire.node, pack, torque, unit.position, *window))
+
+    def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
+        """RPDO2 where a mode changes, RPDO1 of every joint with an order, heartbeat when due, SYNC."""
+        modes: list[Frame] = []
+        commands: list[Frame] = []
+        rows = self._rows
+        for joint, order in enumerate(orders):
+            if order is None:
+                self._sent[joint], self._walking[joint] = None, False
+                continue
+            power, walk, mode, position, _, torque, _, _, _ = order
+            if walk:
+                word = self._step(joint, order, modes, now)
+            else:
+                self._walking[joint] = False
+                if power is Power.ON:
+                    word = ENABLE
+                    if mode and self.own_mode(joint, mode) != self.modes[joint]:
+                        self._select(joint, mode, modes, now)
+                    if mode == PROFILE_POSITION:
+                        word = set_point_control(self._known.statuses[joint])
+                else:
+                    word = QUICK_STOP if power is Power.STOPPED else DISABLE_VOLTAGE
+            can_id, pack, torque_unit, position_unit, lower, upper, low, high = rows[joint]
+            if self._wires[joint].by_velocity:
+                data = self._velocity_frame(joint, word, order)
+            else:
+                if not lower <= position <= upper:
+                    low, high = -INT32_MAX - 1, INT32_MAX
+                target = max(low, min(high, round(position / position_unit)))
+                data = pack(word, int(torque / torque_unit), target) if torque_unit else pack(word, target)
+            self._words[joint], self._sent[joint] = word, data
+            commands.append((can_id, data))
+        if modes:
+            commands = modes + commands
+        if self.beating and now - self._beat > self._beat_every - 0.5 * self._period:
+            commands.append(self.heartbeat)
+            self._beat = now
+        commands.append(SYNC)
+        return commands
+
+    def beaten(self, now: float) -> None:
+        """The host's heartbeat was sent apart from a cycle."""
+        self._beat = now
+
+    def _velocity_frame(self, joint: int, word: int, order: Order) -> bytes:
+        """RPDO1 of a joint that is led by velocity; none where it is not enabled."""
+        wire, velocity, before = self._wires[joint], 0.0, self._aimed[joint]
+        if word == ENABLE:
+            before = order.position if math.isnan(before) else before
+            velocity = velocity_towards(order.position, before, self._known.positions[joint], wire.limits)
+        self._aimed[joint] = order.position if word == ENABLE else math.nan
+        counts = int(velocity / wire.unit.velocity)
+        return wire.layouts[RPDO1.name].pack(word, max(-INT32_MAX, min(INT32_MAX, counts)))
+
+    def own_modes(self, modes: Sequence[int]) -> Sequence[int]:
+        """The devices' modes for those of orders."""
+        return [self.own_mode(joint, mode) for joint, mode in enumerate(modes)] if self._any_velocity else modes
+
+    def own_mode(self, joint: int, mode: int) -> int:
+        """The device's mode for one of an order."""
+        return CYCLIC_VELOCITY if self._wires[joint].by_velocity and mode == Mode.POSITION else mode
+
+    def _select(self, joint: int, mode: int, frames: list[Frame], now: float) -> None:
+        mode, wire = self.own_mode(joint, mode), self._wires[joint]
+        self.modes[joint], self._known.mode_since[joint] = mode, now
+        if RPDO2.name in wire.layouts:
+            frames.append((RPDO2.cob_base + wire.node, struct.pack("<b", mode)))
+
+    def _step(self, joint: int, order: Order, frames: list[Frame], now: float) -> int:
+        """Control word of the next step towards the power of an order; the first of a walk changes nothing yet, so that
+        the next one is an edge; a joint with power keeps it."""
+        target, state = TARGETS[order.power], state_of(self._known.statuses[joint])
+        if not self._walking[joint]:
+            self._walking[joint] = True
+            self._select(joint, order.mode, frames, now)
+            if state is State.QUICK_STOP:
+                return QUICK_STOP
+            return next_control(state, target) if state is State.ENABLED else DISABLE_VOLTAGE
+        reset_again = state is State.FAULT and self._words[joint] == FAULT_RESET
+        return DISABLE_VOLTAGE if reset_again else next_control(state, target)
+
+    def sent(self, joint: int) -> Order | None:
+        """What the last frame orders a joint, decoded from its bytes; None where none was sent."""
+        data = self._sent[joint]
+        return None if data is None else self.decoded(joint, data)
+
+    def decoded(self, joint: int, data: bytes) -> Order | None:
+        """What RPDO1 with these bytes orders a joint; None where they are too few or too many."""
+        wire = self._wires[joint]
+        layout, unit = wire.layouts[RPDO1.name], wire.unit
+        if len(data) != layout.size:
+            return None
+        values = layout.unpack(data)
+        torque = values[1] * unit.torque if wire.with_torque else math.nan
+        word = values[0] & 0x8F
+        power = Power.ON if word == ENABLE else Power.STOPPED if word & 0x86 == QUICK_STOP else Power.OFF
+        if wire.by_velocity:
+            velocity, gain = values[-1] * unit.velocity, loop_gain(self._period)
+            mode = Mode.POSITION if self.modes[joint] else OFF
+            return Order(power, False, mode, self._aim(joint, velocity / gain), velocity, math.nan, 0.0, 0.0)
+        return Order(power, False, self.modes[joint], values[-1] * unit.position, 0.0, torque, 0.0, 0.0)
+
+    def _aim(self, joint: int, way: float) -> float:
+        """Where a velocity leads that would be so much way by the position loop [rad].
+
+        A joint outside its window that is led back, or rests, counts as being at the window's end.
+        """
+        seen, limits = self._known.positions[joint], self._wires[joint].limits
+        if (seen < limits.lower and way >= 0) or (seen > limits.upper and way <= 0):
+            return limits.lower if seen < limits.lower else limits.upper
+        return seen + way

@@ -1,0 +1,62 @@
+"""One CiA 402 joint on the wire: the objects that its PDOs carry, their scales, and its limits."""
+
+import struct
+from dataclasses import dataclass
+from functools import cached_property
+
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen.object_dictionary import Entry
+from armlink.drives.canopen.pdo import RPDO1
+from armlink.drives.canopen.profile import Profile
+from armlink.drives.canopen.units import Units
+from armlink.drives.orders import Limits
+from armlink.errors import BadInput
+
+INT16_MAX, INT32_MAX, UINT32_MAX = 2**15 - 1, 2**31 - 1, 2**32 - 1
+NO_LIMITS = Limits(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+"""Of a joint that is only listened to."""
+
+
+@dataclass(frozen=True)
+class Wire:
+    """A joint's part of the bus."""
+
+    node: int
+    profile: Profile
+    unit: Units
+    limits: Limits = NO_LIMITS
+
+    @cached_property
+    def entries(self) -> dict[str, tuple[Entry, ...]]:
+        """Objects of each PDO, by its name; a PDO that is not used is absent."""
+        return {each.name: each.entries for each in self.profile.pdos}
+
+    @cached_property
+    def layouts(self) -> dict[str, struct.Struct]:
+        """Payload of each PDO, by its name."""
+        return {each.name: each.layout for each in self.profile.pdos}
+
+    @cached_property
+    def with_torque(self) -> bool:
+        """Whether RPDO1 carries a target torque."""
+        return objects.TARGET_TORQUE in self.entries[RPDO1.name]
+
+    @cached_property
+    def by_velocity(self) -> bool:
+        """Whether target velocities take the place of target positions (mode 9)."""
+        return self.profile.by_velocity
+
+
+def check_fits(name: str, limits: Limits, unit: Units) -> None:
+    """Raise BadInput where limits fit no frame and no object."""
+    if limits.max_torque / unit.torque > INT16_MAX:
+        most = INT16_MAX * unit.torque
+        raise BadInput(f"{name}: max_torque {limits.max_torque} N·m: 6071h carries at most {most:.6g} N·m")
+    if limits.max_velocity / unit.velocity > UINT32_MAX:
+        fastest = UINT32_MAX * unit.velocity
+        raise BadInput(f"{name}: max_velocity {limits.max_velocity} rad/s: 6081h carries at most {fastest:.6g} rad/s")
+    if limits.torque_rate / unit.torque > UINT32_MAX:
+        most = UINT32_MAX * unit.torque
+        raise BadInput(f"{name}: max_torque_rate {limits.torque_rate} N·m/s: 6087h carries at most {most:.6g} N·m/s")
+    if max(abs(limits.lower), abs(limits.upper)) / unit.position > INT32_MAX:
+        raise BadInput(f"{name}: its range is more than 607Ah carries at {unit.position:.3g} rad a user unit")

@@ -1,0 +1,138 @@
+"""The parts of `armlink new` that begin with the drives on a bus: of an arm file, and of nothing else."""
+
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from armlink.bus.can_bus import CanBus
+    from calib.commissioning.drive_match import Ask
+    from calib.commissioning.finding import SetupFinding
+
+SCHEMA = "armlink.new/1"
+
+
+def begin_with_drives(
+    console: Any, out: Path, bus: str, name: str | None, ask: "Ask | None", json_file: Path | None
+) -> int:
+    """An arm file of nothing but a bus: its drives, and no geometry."""
+    import yaml
+
+    from armlink.arm_file import parse_arm
+    from armlink.commands.output import write_json
+    from armlink.drives.registry import found_drives
+    from calib.commissioning.bus_arm import arm_of_bus
+
+    opened = open_named(bus)
+    try:
+        made = arm_of_bus(found_drives(opened), str(opened.channel_info), bus_keys(bus, out), name or out.stem, ask)
+    finally:
+        opened.shutdown()
+    parse_arm(yaml.safe_load(made.text), out)
+    out.write_text(made.text, encoding="utf-8")
+    nodes = ", ".join(str(match.drive.node) for match in made.matches)
+    console.print(
+        f"{out}: {len(made.matches)} joints, nodes {nodes}; the geometry is not known, and says so in the file"
+    )
+    step = shlex.join(["armlink", "check", str(out)])
+    console.print(f"next: {step}", style="bold")
+    joints = [{"name": match.joint, "node": match.drive.node, "by_hand": match.by_hand} for match in made.matches]
+    answer = {"schema": SCHEMA, "out": str(out), "name": name or out.stem, "joints": joints, "next": step}
+    write_json(json_file, {**answer, "findings": []})
+    return 0
+
+
+def rewire(console: Any, model: Path, out: Path, bus: str, ask: "Ask | None", json_file: Path | None) -> int:
+    """An arm file with the drives of a bus."""
+    import yaml
+
+    from armlink.arm_file import load_arm, parse_arm
+    from armlink.commands.output import write_json
+    from armlink.drives.registry import found_drives
+    from calib.arm.kinematics import gcomp_arm
+    from calib.commissioning.drive_match import TurnedJoint, match_by_hand, match_in_order
+    from calib.commissioning.new_arm import rewired
+
+    arm = load_arm(model)
+    arm.require_link()
+    findings: list[SetupFinding] = []
+    opened = open_named(bus)
+    try:
+        drives, channel = found_drives(opened), str(opened.channel_info)
+        if ask is None:
+            matches = match_in_order(arm.joint_names, drives, channel)
+        else:
+            known = gcomp_arm(arm)
+            turned = [TurnedJoint(*each) for each in zip(known.names, known.lower, known.upper, strict=True)]
+            matches, findings = match_by_hand(turned, drives, channel, ask)
+    finally:
+        opened.shutdown()
+    content = rewired(yaml.safe_load(arm.path.read_text(encoding="utf-8")), matches, bus_keys(bus, out))
+    if arm.model_path is not None:
+        import os
+
+        content["kinematics"]["model"] = os.path.relpath(arm.model_path, out.resolve().parent)
+    parse_arm(dict(content), out)
+    text = f"# {arm.name} with the drives on {channel}, from {model.name}, by the command new.\n"
+    out.write_text(text + yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
+    for found in findings:
+        console.print(str(found), style="red")
+    step = shlex.join(["armlink", "check", str(out)])
+    console.print(f"{out}: nodes {', '.join(str(match.drive.node) for match in matches)}")
+    console.print(f"next: {step}", style="bold")
+    joints = [{"name": match.joint, "node": match.drive.node, "by_hand": match.by_hand} for match in matches]
+    answer = {"out": str(out), "name": arm.name, "joints": joints, "next": step}
+    write_json(json_file, {"schema": SCHEMA, **answer, "findings": [found.to_json() for found in findings]})
+    return 1 if findings else 0
+
+
+def drives_by_ids(model: Path) -> bool:
+    """Whether the drives of an arm file are found by the ids that stand in it."""
+    from armlink.arm_file import load_arm
+    from calib.commissioning.own_copy import by_ids
+
+    return by_ids(load_arm(model))
+
+
+def copy(console: Any, model: Path, out: Path, bus: str, new_serial: bool, json_file: Path | None) -> int:
+    """An arm file with drives that are known by their ids, on a bus of one's own."""
+    from armlink.arm_file import load_arm
+    from armlink.commands.output import write_json
+    from calib.commissioning.own_copy import own_copy
+
+    arm, opened = load_arm(model), open_named(bus)
+    try:
+        copied = own_copy(arm, out, bus_keys(bus, out), opened, new_serial=new_serial)
+    finally:
+        opened.shutdown()
+    out.write_text(copied.text, encoding="utf-8")
+    for found in copied.findings:
+        console.print(str(found), style="red")
+    step = shlex.join(["armlink", "doctor", str(out)])
+    console.print(f"{out}: {', '.join(address for _, address, _ in copied.drives)} answer; limits are those of {model}")
+    console.print(f"next: {step}", style="bold")
+    joints = [{"name": name, "address": address, "serial": serial} for name, address, serial in copied.drives]
+    answer = {"out": str(out), "name": arm.name, "joints": joints, "next": step}
+    write_json(json_file, {"schema": SCHEMA, **answer, "findings": [found.to_json() for found in copied.findings]})
+    return 1 if copied.findings else 0
+
+
+def open_named(bus: str) -> "CanBus":
+    """The bus of the option --bus; raises BadInput, BusFault."""
+    from armlink.arm_file import Bus
+    from armlink.bus.open import open_bus
+
+    return open_bus(bus, Bus())
+
+
+def bus_keys(bus: str, out: Path) -> dict[str, str | int]:
+    """Keys of link.bus for a bus given on the command line; the arm file of a simulated one relative to `out`."""
+    import os
+
+    from armlink.bus.open import parse_bus
+
+    parsed = parse_bus(bus)
+    channel = parsed.channel
+    if Path(channel).is_file():
+        channel = os.path.relpath(Path(channel).resolve(), out.resolve().parent)
+    return {"interface": parsed.interface, "channel": channel, "bitrate": parsed.bitrate}

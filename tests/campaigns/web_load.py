@@ -1,0 +1,195 @@
+"""Campaign: the real daemon under every kind of client at once, beside the same time without any.
+
+python tests/campaigns/web_load.py [--arm sarcos] [--bus armlink_sim:sarcos] [--seconds 600] [--alone 120]
+
+50 clients on the stream, 100 requests a second on the Unix socket, 10 readers that ask for the whole history and never
+read (a new one for each that is cut), and 500 idle strangers on TCP (likewise). Exit status 1 if cycles are late or
+lost beyond the rate without clients, if one local answer in a hundred takes longer than 100 ms, or if the daemon's
+processes grow by more than 50 MB.
+"""
+
+import argparse
+import asyncio
+import contextlib
+import json
+import resource
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from web import counters, cpu_seconds, free_port, listen, start
+
+STREAMS, READERS, STRANGERS = 50, 10, 500
+REQUESTS, WORKERS = 100.0, 20
+"""Requests a second, on this many connections."""
+P99, GROWTH = 0.1, 50e6
+"""Bounds: of a local answer [s], of the memory [bytes]."""
+AGAIN = 10.0
+"""After this a stranger that was cut comes back [s]."""
+SPREAD = 3.0
+"""Standard deviations by which a count of late cycles may exceed what it was without clients."""
+PATHS = ("/api/status", "/api/joints", "/api/estimates", "/api/events?limit=20", "/api/proposals", "/metrics")
+"""Answers with history in them are long: of those 16 are under way at once, and the next client gets 429."""
+LONG = "/api/history?limit=20000"
+
+
+def request(path: str) -> bytes:
+    """As a client on the Unix socket sends it."""
+    return f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode()
+
+
+def memory(process: int) -> float:
+    """Resident bytes of a process and its children."""
+    children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
+    total = 0.0
+    for each in (str(process), *children):
+        with contextlib.suppress(OSError):
+            total += int(Path(f"/proc/{each}/statm").read_text().split()[1]) * resource.getpagesize()
+    return total
+
+
+async def ask(socket: Path, end: float, took: list[float], answers: Counter[object]) -> None:
+    """Requests in their turn until the end, each at its time; how long each answer took since it was due [s]."""
+    every, number = WORKERS / REQUESTS, 0
+    due, reader, writer = time.monotonic(), None, None
+    while (due := due + every) < end:
+        await asyncio.sleep(max(0.0, due - time.monotonic()))
+        number += 1
+        path = PATHS[number % len(PATHS)]
+        while True:
+            if reader is None or writer is None:
+                reader, writer = await asyncio.open_unix_connection(str(socket))
+            try:
+                writer.write(request(path))
+                status = await answered(reader)
+                break
+            except (asyncio.IncompleteReadError, ConnectionError):  # it was idle for too long: this client is late
+                writer.transport.abort()
+                reader, writer = None, None
+                answers["again"] += 1
+        answers[status if status == 200 else f"{status} {path}"] += 1
+        took.append(time.monotonic() - due)
+    if writer is not None:
+        writer.close()
+
+
+async def answered(reader: asyncio.StreamReader) -> int:
+    """The status of the next answer, whose body is read."""
+    head = (await reader.readuntil(b"\r\n\r\n")).decode().lower()
+    if "transfer-encoding: chunked" in head:
+        while size := int(await reader.readline(), 16):
+            await reader.readexactly(size + 2)
+        await reader.readline()
+    else:
+        await reader.readexactly(int(head.partition("content-length:")[2].split()[0]))
+    return int(head.split()[1])
+
+
+async def never_read(socket: Path, end: float, cut: Counter[str]) -> None:
+    """Ask for much, read nothing, until the server closes; then again."""
+    while time.monotonic() < end:
+        _, writer = await asyncio.open_unix_connection(str(socket), limit=1)
+        writer.transport.pause_reading()  # type: ignore[attr-defined]
+        writer.write(request(LONG) * 20)
+        for _ in range(int(max(1.0, min(30.0, end - time.monotonic())))):
+            await asyncio.sleep(1.0)
+            with contextlib.suppress(ConnectionError):
+                writer.write(request("/api/status"))
+                await asyncio.wait_for(writer.drain(), 0.01)
+                continue
+            cut["readers"] += 1
+            break
+        writer.transport.abort()
+
+
+async def idle(port: int, end: float, cut: Counter[str]) -> None:
+    """Say nothing on TCP; another one some seconds after the server has cut it."""
+    while (left := end - time.monotonic()) > 0:
+        try:
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            with contextlib.suppress(TimeoutError, ConnectionError):
+                await asyncio.wait_for(reader.read(1), left)
+            writer.transport.abort()
+        except OSError:
+            pass
+        cut["strangers"] += 1
+        await asyncio.sleep(min(AGAIN, max(0.0, end - time.monotonic())))
+
+
+async def crowd(folder: Path, port: int, seconds: float, process: int) -> dict[str, Any]:
+    """Everybody at once for so long."""
+    socket, end = folder / "api.sock", time.monotonic() + seconds
+    took, answers, cut, grown = list[float](), Counter[object](), Counter[str](), [memory(process)]
+
+    async def weigh() -> None:
+        while time.monotonic() < end:
+            grown.append(memory(process))
+            await asyncio.sleep(1.0)
+
+    streams = listen(folder, STREAMS, seconds)
+    others = [ask(socket, end, took, answers) for _ in range(WORKERS)]
+    others += [never_read(socket, end, cut) for _ in range(READERS)]
+    others += [idle(port, end, cut) for _ in range(STRANGERS)]
+    items, *_ = await asyncio.gather(streams, weigh(), *others)
+    took.sort()
+    return {
+        "requests": len(took),
+        "answers": dict(answers),
+        "median_ms": 1e3 * took[len(took) // 2],
+        "p99_ms": 1e3 * took[int(0.99 * len(took))],
+        "worst_ms": 1e3 * took[-1],
+        "stream_items_least": min(items),
+        "cut": dict(cut),
+        "memory_mb": [round(each / 1e6, 1) for each in (grown[0], max(grown), grown[-1])],
+    }
+
+
+def counted(folder: Path, process: int, work: Any) -> dict[str, Any]:
+    """What `work` returns, with the bus's counters over its time."""
+    before, spent, began = counters(folder), cpu_seconds(process), time.monotonic()
+    found = dict(work() or {})
+    seconds = time.monotonic() - began
+    after = counters(folder)
+    rise = {key: after[key] - before[key] for key in ("frames", "missed", "late", "errors")}
+    return {"seconds": seconds, **rise, "cpu_share": (cpu_seconds(process) - spent) / seconds, **found}
+
+
+def beyond(alone: dict[str, Any], busy: dict[str, Any], key: str) -> bool:
+    """Whether a count is higher than its rate without clients explains."""
+    expected = alone[key] / alone["seconds"] * busy["seconds"]
+    return bool(busy[key] > expected + SPREAD * (expected + alone[key] + 1.0) ** 0.5)
+
+
+def main() -> int:
+    """Run it all and print one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--arm", default="sarcos")
+    parser.add_argument("--bus", default="armlink_sim:sarcos")
+    parser.add_argument("--seconds", type=float, default=600.0)
+    parser.add_argument("--alone", type=float, default=120.0)
+    given = parser.parse_args()
+    resource.setrlimit(resource.RLIMIT_NOFILE, (4096, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
+    with tempfile.TemporaryDirectory() as name:
+        folder, port = Path(name), free_port()
+        daemon = start(given.arm, given.bus, folder, port)
+        try:
+            time.sleep(10.0)
+            alone = counted(folder, daemon.pid, lambda: time.sleep(given.alone))
+            busy = counted(folder, daemon.pid, lambda: asyncio.run(crowd(folder, port, given.seconds, daemon.pid)))
+        finally:
+            daemon.terminate()
+            daemon.wait(30)
+    print(json.dumps({"alone": alone, "busy": busy}, indent=1))
+    first, most, _ = busy["memory_mb"]
+    wrong = [key for key in ("missed", "late", "errors") if beyond(alone, busy, key)]
+    wrong += ["p99"] * (busy["p99_ms"] > 1e3 * P99) + ["memory"] * ((most - first) * 1e6 > GROWTH)
+    wrong += ["answers"] * (not set(busy["answers"]) <= {200, "again"})
+    print("out of bounds:", ", ".join(wrong) or "nothing", file=sys.stderr)
+    return int(bool(wrong))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
