@@ -22,6 +22,7 @@ from gcomp.gravity.torque import gravity_regressor
 
 ZERO_STD = 2e-3
 """Least standard deviation of a position zero [rad]: links give way."""
+USUAL = Doubt()
 SIGMA_SHARE = 2e-3
 """Standard deviation of a row about the model where the record has none, as a share of rated torque."""
 USUAL_ROWS = 5
@@ -45,7 +46,7 @@ class MotorBelief:
     """Parameters and covariance of an arm's drives, and the standard deviation of a row."""
 
     def __init__(
-        self, arm: Arm, calibration: CalibrationRecord, gravity: GravityRecord, rated: Array, doubt: Doubt | None = None
+        self, arm: Arm, calibration: CalibrationRecord, gravity: GravityRecord, rated: Array, doubt: Doubt = USUAL
     ) -> None:
         """Of records of creep sweeps; rated torques (n,) [N·m]. `doubt` is of what the records do not hold."""
         self.arm, self.rated, n = arm, rated, arm.n
@@ -54,7 +55,7 @@ class MotorBelief:
         self.mean = np.zeros(self._at["rho"].stop)
         std = np.zeros_like(self.mean)
         self.mean[self._at["gain"]] = 1.0
-        std[self._at["gain"]], std[self._at["offset"]], zero = _sensors(calibration, rated)
+        std[self._at["gain"]], std[self._at["offset"]], zero = _sensors(calibration, rated, doubt)
         for family in ("coulomb", "load", "viscous", "asymmetry"):
             self.mean[self._at[family]], std[self._at[family]] = np.array([getattr(each, family) for each in motors]).T
         warming = np.array([each.gain_per_kelvin or (0.0, 0.0) for each in motors])
@@ -64,7 +65,7 @@ class MotorBelief:
         )
         std[self._at["zero"]] = np.append(np.hypot(zero[:-1], ZERO_STD), LAST_ZERO)
         coulomb = np.maximum(self.mean[self._at["coulomb"]], 1e-3 * rated)
-        std[self._at["uneven"]] = np.repeat((doubt or Doubt()).uneven * coulomb, (len(std[self._at["uneven"]])) // n)
+        std[self._at["uneven"]] = np.repeat(doubt.uneven * coulomb, (len(std[self._at["uneven"]])) // n)
         self.mean[self._at["beta"]] = gravity.beta
         self.covariance = np.diag(std**2)
         self.covariance[self._at["beta"], self._at["beta"]] = np.array(gravity.covariance)
@@ -154,13 +155,14 @@ def _motor(motor: MotorTorque | None) -> MotorTorque:
     return motor or MotorTorque(coulomb=nothing, load=nothing, viscous=nothing, asymmetry=nothing)
 
 
-def _sensors(calibration: CalibrationRecord, rated: Array) -> tuple[Array, Array, Array]:
-    """Standard deviations (n,) of relative gains, of offsets [N·m] and of zeros [rad]; a tenth where none is known."""
+def _sensors(calibration: CalibrationRecord, rated: Array, doubt: Doubt) -> tuple[Array, Array, Array]:
+    """Standard deviations (n,) of relative gains, of offsets [N·m] and of zeros [rad]; where one is not known, what is
+    assumed before any sweep."""
     known = {name: float(row[at]) ** 0.5 for at, (name, row) in enumerate(
         zip(calibration.covariance_of, calibration.covariance, strict=True))}  # fmt: skip
     gain, offset, zero = (np.empty(len(rated)) for _ in range(3))
     for j, joint in enumerate(calibration.joints):
-        gain[j] = known.get(f"{joint.name}.gain", 0.1) / abs(joint.gain or 1.0)
-        offset[j] = known.get(f"{joint.name}.offset", 0.1 * rated[j]) / abs(joint.gain or 1.0)
+        gain[j] = known.get(f"{joint.name}.gain", doubt.gain) / abs(joint.gain or 1.0)
+        offset[j] = known.get(f"{joint.name}.offset", doubt.offset_share * rated[j]) / abs(joint.gain or 1.0)
         zero[j] = known.get(f"{joint.name}.position_offset", 0.0)
     return gain, offset, zero

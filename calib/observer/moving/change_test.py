@@ -20,6 +20,9 @@ from gcomp.arrays import Array
 
 FEWEST = 6
 """Rows of a joint from which a change of its drive can be told."""
+MISFIT = 8.0
+"""χ² above its degrees of freedom, in standard deviations, from which nothing explains the rows: 120 rows then scatter
+by 1.4 times what was learned. Friction of a joint is never quite what it was; a contact is far beyond."""
 INEXACT = 0.03
 """Most that a change's own shape may be off, as a share."""
 ROUNDS = 2
@@ -76,7 +79,7 @@ class ChangeTest:
         nothing, config = np.empty(0), self._config
         none = Verdict("none", None, 1.0, nothing, np.empty((0, 0)), {"misfit": self._misfit(self.chi2, 0)})
         if not fits or self.chi2 - fits[0].bic < config.evidence:
-            return none if self._misfit(self.chi2, 0) <= config.misfit else _named(none, "unknown")
+            return none if self._misfit(self.chi2, 0) <= MISFIT else _named(none, "unknown")
         best, others = fits[0], fits[1:]
         scores = np.array([fit.bic for fit in fits] + [self.chi2])
         weight = np.exp(-(scores - best.bic) / 2)
@@ -87,7 +90,7 @@ class ChangeTest:
         values, covariance = best.values, best.covariance
         cause, joint = best.candidate.name
         found = Verdict(cause, joint, float(1 / weight.sum()), values, covariance, evidence)
-        if evidence["misfit"] > config.misfit or (cause == "payload" and values[0] < 0):
+        if evidence["misfit"] > MISFIT or (cause == "payload" and values[0] < 0):
             return _named(found, "unknown")
         rivals = [fit.candidate for fit in others if fit.bic - best.bic < config.evidence]
         if rivals:
