@@ -1,4 +1,4 @@
-"""Model files as an attacker would write them: entities, includes, files out of the folder; one line each, and no secret."""
+"""Model files of an attacker: entities, includes, files out of the folder; one line each, and no secret."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,11 +12,15 @@ from gcomp.arm.load import compile_model as compile_chain
 from gcomp.errors import BadModel
 
 SECRET = "swordfish"
-BODY = '<worldbody><body name="a"><joint name="j" type="hinge"/><geom type="sphere" size="0.1" mass="1"/></body></worldbody>'
+BODY = (
+    '<worldbody><body name="a"><joint name="j" type="hinge"/>'
+    '<geom type="sphere" size="0.1" mass="1"/></body></worldbody>'
+)
 SHAPE = '<worldbody><body><joint type="hinge"/><geom type="mesh" mesh="m" mass="1"/></body></worldbody>'
 BOMB = "".join(f'<!ENTITY a{i} "' + f"&a{i - 1};" * 10 + '">' for i in range(1, 10))
 MODELS = {
-    "an entity of another file": f'<!DOCTYPE m [<!ENTITY x SYSTEM "file://SECRET">]><mujoco model="&x;">{BODY}</mujoco>',
+    "an entity of another file": f'<!DOCTYPE m [<!ENTITY x SYSTEM "file://SECRET">]><mujoco model="&x;">'
+    f"{BODY}</mujoco>",
     "a bomb of entities": f'<!DOCTYPE m [<!ENTITY a0 "bomb">{BOMB}]><mujoco model="&a9;">{BODY}</mujoco>',
     "an include of no model": f'<mujoco><include file="SECRET"/>{BODY}</mujoco>',
     "an include without an end": f'<mujoco><include file="/dev/zero"/>{BODY}</mujoco>',
@@ -45,10 +49,12 @@ def test_a_hostile_model_is_one_line_and_tells_no_secret(
     try:
         model = compiled(path)
     except (BadInput, BadModel) as error:
-        assert SECRET not in str(error)
-        assert str(path) in str(error)
-        assert "\n" not in str(error)
+        said = str(error)
     else:
         assert what in HARMLESS
         assert SECRET.encode() not in bytes(model.names)
         assert len(model.names) < 10_000
+        return
+    assert SECRET not in said
+    assert str(path) in said
+    assert "\n" not in said
