@@ -168,8 +168,12 @@ class ArmLoop:
     def _listen(self, listener: Listener) -> list[tuple[float, Sample, Array, Array]]:
         rows = []
         end = listener.clock.now() + BATCH_SECONDS
-        while (remaining := end - listener.clock.now()) > 0:
+        while (remaining := end - (begin := listener.clock.now())) > 0:
             sample = listener.next(remaining)
+            if sample is None and listener.clock.now() == begin:  # in lock-step, where only a host's SYNC moves time
+                time.sleep(BATCH_SECONDS)
+                self._heard = -math.inf
+                break
             while sample is not None:
                 rows.append((sample.t, sample, listener.torque_sent, listener.position_sent))
                 sample = listener.next(0.0)

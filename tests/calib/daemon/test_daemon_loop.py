@@ -140,6 +140,20 @@ class Tap(InProcessBus):
         pass
 
 
+def test_listening_where_nobody_makes_time_pass_ends_and_says_so(tmp_path: Path) -> None:
+    bench = DaemonBench(tmp_path, settings=settings("observe"), work=False)
+    bench.host.close()
+    bus = LockStepBus(arm=bench.simulated)
+    loop = ArmLoop(LoopOptions(bench.arm, listen_only=True, open_bus=lambda: bus))
+    messages = [message for _ in range(3) for message in loop.run()]
+    loop.close()
+    assert isinstance(messages[0], Up)
+    (silent,) = (message for message in messages if isinstance(message, Down))
+    assert silent.reason == f"no SYNC on {bus.channel_info}: is the arm's controller running?"
+        f"no SYNC on {bus.channel_info}: is the arm's controller running?"
+    ]
+
+
 def test_beside_another_controller_it_hears_all_and_sends_nothing(tmp_path: Path) -> None:
     bench = DaemonBench(tmp_path, settings=settings("observe"), work=False)
     bench.host.close()
