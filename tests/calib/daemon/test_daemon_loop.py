@@ -150,8 +150,6 @@ def test_listening_where_nobody_makes_time_pass_ends_and_says_so(tmp_path: Path)
     assert isinstance(messages[0], Up)
     (silent,) = (message for message in messages if isinstance(message, Down))
     assert silent.reason == f"no SYNC on {bus.channel_info}: is the arm's controller running?"
-        f"no SYNC on {bus.channel_info}: is the arm's controller running?"
-    ]
 
 
 def test_beside_another_controller_it_hears_all_and_sends_nothing(tmp_path: Path) -> None:
