@@ -35,6 +35,9 @@ SLEEP = 0.04
 """Frames with a time stamp may wait for this long [s]: ten cycles at 250 Hz, half of what a small receive queue holds
 of a full bus."""
 
+RESOLUTION = 1e-9
+"""Times closer than this are the same [s]: a simulated clock may not move by less."""
+
 
 class Listener(Calibrations):
     """Context manager: `with Listener(arm, bus) as listener: sample = listener.next(0.1)`."""
@@ -114,7 +117,7 @@ class Listener(Calibrations):
             end = self.clock.now() + timeout
             while not self._ready:
                 remaining = end - self.clock.now()
-                if remaining <= 0:
+                if remaining <= RESOLUTION:
                     return None
                 self._hear(remaining)
         sample, self._sent = self._ready.popleft()

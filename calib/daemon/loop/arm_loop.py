@@ -10,7 +10,7 @@ import numpy as np
 from armlink.bus.arm_hold import ArmHold
 from armlink.errors import ArmlinkError, BusFault, Refused
 from armlink.link.link import Link
-from armlink.link.listener import Listener
+from armlink.link.listener import RESOLUTION, Listener
 from armlink.link.types import Calibration, Command, Sample
 from armlink.loop.messages import Answer, Call
 from calib.arm.kinematics import gcomp_arm
@@ -168,15 +168,12 @@ class ArmLoop:
     def _listen(self, listener: Listener) -> list[tuple[float, Sample, Array, Array]]:
         rows = []
         end = listener.clock.now() + BATCH_SECONDS
-        while (remaining := end - (begin := listener.clock.now())) > 0:
+        while (remaining := end - listener.clock.now()) > RESOLUTION:
             sample = listener.next(remaining)
-            if sample is None and listener.clock.now() == begin:  # in lock-step, where only a host's SYNC moves time
-                time.sleep(BATCH_SECONDS)
-                self._heard = -math.inf
-                break
             while sample is not None:
                 rows.append((sample.t, sample, listener.torque_sent, listener.position_sent))
                 sample = listener.next(0.0)
+            self._keep_pace(listener)
         return rows
 
     def _silence(self, listener: Listener, heard: bool) -> list[Message]:
@@ -217,7 +214,7 @@ class ArmLoop:
         random = np.random.default_rng([seed, 8])
         return work_pieces(link.position_sent, arm.lower, arm.upper, speed, link.period, random, motion)
 
-    def _keep_pace(self, link: Link) -> None:
+    def _keep_pace(self, link: Link | Listener) -> None:
         """Run an in-process simulated arm in real time: wait for the machine's clock."""
         if not self.options.pace or link.bus.clock is None:
             return
