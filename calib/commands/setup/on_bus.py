@@ -37,8 +37,8 @@ def begin_with_drives(
     step = shlex.join(["armlink", "check", str(out)])
     console.print(f"next: {step}", style="bold")
     joints = [{"name": match.joint, "node": match.drive.node, "by_hand": match.by_hand} for match in made.matches]
-    answer = {"schema": SCHEMA, "out": str(out), "name": name or out.stem, "joints": joints, "next": step}
-    write_json(json_file, {**answer, "findings": []})
+    answer = {"out": str(out), "name": name or out.stem, "joints": joints, "next": step}
+    write_json(json_file, {"schema": SCHEMA, **answer, "findings": []})
     return 0
 
 
