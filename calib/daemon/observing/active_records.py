@@ -213,6 +213,7 @@ class ActiveRecords:
                 self._events.say("refused", None, text, {"record": record.id, "joints": differ, **gate})
                 return
             feed.controllers_hold(None)
+            self._arm_state.calibrated(outcome)
             recalibrations.restored(outcome)
             evidence = {"record": record.id, "joints": differ, "applied": True, "restored": True}
             text = f"record {record.id} written again to {', '.join(outcome)}"

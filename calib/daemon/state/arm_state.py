@@ -1,7 +1,7 @@
 """The arm as last heard: bus connection, newest batch, faults."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 from armlink.arm_file import ArmFile
@@ -57,6 +57,10 @@ class ArmState:
         for event in batch.emergencies:
             name = self._names[event.joint]
             self._report("fault", name, f"{name}: {event.text}", dict(event.evidence))
+
+    def calibrated(self, joints: Collection[str]) -> None:
+        """A calibration was written for these joints."""
+        self.uncalibrated = tuple(name for name in self.uncalibrated if name not in joints)
 
     def tick(self) -> None:
         """Report once per connection that the host is nearly too late for the arm."""

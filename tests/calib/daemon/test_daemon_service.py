@@ -210,8 +210,9 @@ def test_controllers_that_lost_power_get_the_record_again(tmp_path: Path) -> Non
     daemon.service.take(Down("no power"))
     assert daemon.view.status().state is State.FAULT
     daemon.fast.held_gain[:], daemon.fast.held_offset[:] = 1.0, 0.0
-    daemon.service.take(Up(daemon.held()))
+    daemon.service.take(Up(daemon.held(), uncalibrated=tuple(daemon.arm.joint_names)))
     assert daemon.of_kind("recalibration")[-1].evidence["restored"]
+    assert daemon.view.status().uncalibrated == ()
     assert abs(daemon.fast.error()[0][2]) < 0.003
 
 
