@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
-from creep_arms import CreepVerdict, creep_arm, creep_passes, judge_creep, steps_error
+from judged_creeps import CreepVerdict, creep_arm, creep_passes, judge_creep, steps_error
 
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
-from creep_arms import creep_arm
 from drawn_creeps import draw_creep
 from drawn_work import NOTHING, Change, work
+from judged_creeps import creep_arm
 
 from calib.arm.kinematics import gcomp_arm
 from calib.creep.fit import fit_rows

@@ -15,7 +15,7 @@ import yaml
 import armlink
 from armlink import cli
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "campaigns"))
+sys.path.append(str(Path(__file__).parent.parent / "campaigns"))
 sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
 from creep_walk import PAGE
 from docs_walk import left_out, lines_of

@@ -14,7 +14,7 @@ import pytest
 
 from armlink import cli
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "campaigns"))
+sys.path.append(str(Path(__file__).parent.parent / "campaigns"))
 from docs_walk import LEFT_OUT, NEW, OLD, PAGES, left_out, lines_of
 from small_pair import describe
 

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from creep_arms import creep_arm
 from drawn_creeps import DrawnCreep, draw_creep
 from drawn_work import NOTHING, Change, work
+from judged_creeps import creep_arm
 
 from calib.arm.kinematics import gcomp_arm
 from calib.creep.fit import fit_rows
