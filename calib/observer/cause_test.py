@@ -1,5 +1,6 @@
 """The cause test: which single effect explains a window's torque residual, if any (docs/theory.md, section 6)."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations, pairwise, product
@@ -62,6 +63,48 @@ class _Fit:
     chi2: float
     values: Array
     covariance: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """A least-squares fit of whitened columns."""
+
+    values: Array
+    """Parameters (p,)."""
+    covariance: Array
+    """(p, p); 0 for parameters that the rows do not show."""
+    chi2: float
+    """Of what the columns leave."""
+    shown: int
+    """Number of independent parameters that the rows show."""
+
+
+def solved(columns: Array, target: Array) -> Solved:
+    """The fit of whitened columns (K, p) to a whitened target (K,)."""
+    size = np.linalg.norm(columns, axis=0)
+    size[size <= 1e-9] = 1.0
+    u, s, vt = np.linalg.svd(columns / size, full_matrices=False)
+    kept = s > max(1e-6 * s[0], 1e-12)
+    back = (vt[kept].T / s[kept]) / size[:, None]
+    explained = u[:, kept].T @ target
+    covariance = back @ back.T
+    hidden = (np.abs(vt[~kept]) > 1e-3).any(axis=0)
+    covariance[hidden] = covariance[:, hidden] = 0.0
+    chi2 = float(target @ target) - float(explained @ explained)
+    return Solved(back @ explained, covariance, chi2, int(kept.sum()))
+
+
+def smallest_noticed(own: Array, rivals: Iterable[tuple[Array, int]], evidence: float) -> float:
+    """Size of a change with whitened column (K,) that wins in one case of two: over "none", and over every rival.
+
+    Of each rival an orthonormal basis (K, p) and the parameters charged in its BIC.
+    """
+    size, once = float(own @ own), float(np.log(len(own)))
+    needed = evidence + once
+    for basis, price in rivals if size > 0 else ():
+        alike = float(((basis.T @ own) ** 2).sum()) / size
+        needed = max(needed, (evidence - (price - 1) * once) / max(1 - alike, 1e-9))
+    return float(np.sqrt(needed / max(size, 1e-30)))
 
 
 class CauseTest:
@@ -144,25 +187,16 @@ class CauseTest:
         entries = [self.entries[index] for index in indices]
         count = columns.shape[1]
         nothing = _Fit(entries[0], np.inf, np.inf, np.full(count, np.nan), np.full((count, count), np.nan))
-        size = np.linalg.norm(columns, axis=0)
-        shown = size > 1e-9
-        size[~shown] = 1.0
-        u, s, vt = np.linalg.svd(columns / size, full_matrices=False)
-        kept = s > max(1e-6 * s[0], 1e-12)
+        found = solved(columns, self._white)
         hidden_by_arm = [entry.cause for entry in entries] == [
             "payload"
-        ] and kept.sum() == self.belief.kernel.payload_rank
-        if not kept.any() or not (kept.all() or hidden_by_arm):
+        ] and found.shown == self.belief.kernel.payload_rank
+        if not found.shown or not (found.shown == count or hidden_by_arm):
             return nothing
-        back = (vt[kept].T / s[kept]) / size[:, None]
-        explained = u[:, kept].T @ self._white
-        chi2 = self.chi2_none - float(explained @ explained)
         price = sum(entry.columns.shape[1] if entry.price is None else entry.price for entry in entries)
-        price -= int((~kept).sum())
-        covariance = back @ back.T
-        hidden = (np.abs(vt[~kept]) > 1e-3).any(axis=0)
-        covariance[hidden] = covariance[:, hidden] = 0.0
-        return _Fit(entries[0], chi2 + price * np.log(len(self._white)), chi2, back @ explained, covariance)
+        price -= count - found.shown
+        bic = found.chi2 + price * np.log(len(self._white))
+        return _Fit(entries[0], bic, found.chi2, found.values, found.covariance)
 
     def _two_drifts(self) -> Verdict | None:
         """Two joints that drift at once, if that alone explains the window; else None.
@@ -217,14 +251,12 @@ class CauseTest:
         """Size of a gain's or offset's change that wins in one case of two: over "none", and over every rival."""
         index = self._index(cause, joint)
         winner, own = self.entries[index], self._columns[index][:, 0]
-        size, once = float(own @ own), float(np.log(len(self._white)))
-        needed = self._config.evidence + once
-        for entry, basis in zip(self.entries, self._bases, strict=True):
-            if size > 0 and basis.size and not kin(entry, winner):
-                alike = float(((basis.T @ own) ** 2).sum()) / size
-                ahead = (entry.columns.shape[1] if entry.price is None else entry.price) - 1
-                needed = max(needed, (self._config.evidence - ahead * once) / max(1 - alike, 1e-9))
-        return float(np.sqrt(needed / max(size, 1e-30)))
+        rivals = (
+            (basis, entry.columns.shape[1] if entry.price is None else entry.price)
+            for entry, basis in zip(self.entries, self._bases, strict=True)
+            if basis.size and not kin(entry, winner)
+        )
+        return smallest_noticed(own, rivals, self._config.evidence)
 
     @cached_property
     def _bases(self) -> list[Array]:

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from calib.creep.parameters import family_slices
-from calib.observer.cause_test import Verdict
+from calib.observer.cause_test import Verdict, smallest_noticed, solved
 from calib.observer.config import ObserverConfig
 from calib.observer.moving.belief import USUAL_ROWS, MotorBelief
 from calib.observer.moving.passages import Passage
@@ -94,8 +94,7 @@ class ChangeTest:
             return _named(found, "unknown")
         rivals = [fit.candidate for fit in others if fit.bic - best.bic < config.evidence]
         if rivals:
-            said = tuple(f"{each.cause}" if each.joint is None else f"{each.cause} of {each.joint}" for each in rivals)
-            return _named(found, "ambiguous", said)
+            return _named(found, "ambiguous", tuple(each.cause for each in rivals))
         return found
 
     def denies(self, cause: str, joint: int | None, values: Array) -> bool:
@@ -129,16 +128,9 @@ class ChangeTest:
         own = next((each for each in self._candidates if each.name == (cause, joint)), None)
         if own is None:
             return float("nan")
-        once = float(np.log(len(self._white)))
-        white = own.columns[:, 0]
-        size, needed = float(white @ white), self._config.evidence + once
-        for each in self._candidates:
-            basis = np.linalg.qr(each.columns)[0]
-            if each is not own:
-                alike = float(((basis.T @ white) ** 2).sum()) / max(size, 1e-30)
-                ahead = (each.columns.shape[1] - 1) * once
-                needed = max(needed, (self._config.evidence - ahead) / max(1 - alike, 1e-9))
-        return float(np.sqrt(needed / max(size, 1e-30)))
+        others = (each.columns for each in self._candidates if each is not own)
+        rivals = ((np.linalg.qr(columns)[0], columns.shape[1]) for columns in others)
+        return smallest_noticed(own.columns[:, 0], rivals, self._config.evidence)
 
     def _whitened(self, columns: Array) -> Array:
         white: Array = np.linalg.solve(self._root, columns)
@@ -164,18 +156,9 @@ class ChangeTest:
 
     def _least_squares(self, candidate: Candidate, target: Array, around: Array | float) -> _Fit:
         """The candidate's parameters from whitened residuals that it has at values `around`."""
-        columns = candidate.columns
-        size = np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
-        u, s, vt = np.linalg.svd(columns / size, full_matrices=False)
-        kept = s > 1e-6 * s[0]
-        back = (vt[kept].T / s[kept]) / size[:, None]
-        explained = u[:, kept].T @ target
-        chi2 = float(target @ target) - float(explained @ explained)
-        covariance = back @ back.T
-        hidden = (np.abs(vt[~kept]) > 1e-3).any(axis=0)
-        covariance[hidden] = covariance[:, hidden] = 0.0
-        bic = chi2 + int(kept.sum()) * float(np.log(len(self._white)))
-        return _Fit(candidate, bic, chi2, around + back @ explained, covariance)
+        found = solved(candidate.columns, target)
+        bic = found.chi2 + found.shown * float(np.log(len(target)))
+        return _Fit(candidate, bic, found.chi2, around + found.values, found.covariance)
 
     def _misfit(self, chi2: float, parameters: int) -> float:
         """χ² above its degrees of freedom, in standard deviations, those of the rows' own scatter included."""
