@@ -5,8 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from armlink.bus.can_bus import CanBus
-    from calib.commissioning.drive_match import Ask
+    from calib.commissioning.drive_match import Ask, Match
     from calib.commissioning.finding import SetupFinding
 
 SCHEMA = "armlink.new/1"
@@ -19,7 +21,6 @@ def begin_with_drives(
     import yaml
 
     from armlink.arm_file import parse_arm
-    from armlink.commands.output import write_json
     from armlink.drives.registry import found_drives
     from calib.commissioning.bus_arm import arm_of_bus
 
@@ -31,15 +32,8 @@ def begin_with_drives(
     parse_arm(yaml.safe_load(made.text), out)
     out.write_text(made.text, encoding="utf-8")
     nodes = ", ".join(str(match.drive.node) for match in made.matches)
-    console.print(
-        f"{out}: {len(made.matches)} joints, nodes {nodes}; the geometry is not known, and says so in the file"
-    )
-    step = shlex.join(["armlink", "check", str(out)])
-    console.print(f"next: {step}", style="bold")
-    joints = [{"name": match.joint, "node": match.drive.node, "by_hand": match.by_hand} for match in made.matches]
-    answer = {"out": str(out), "name": name or out.stem, "joints": joints, "next": step}
-    write_json(json_file, {"schema": SCHEMA, **answer, "findings": []})
-    return 0
+    told = f"{len(made.matches)} joints, nodes {nodes}; the geometry is not known, and says so in the file"
+    return _tell(console, out, told, "check", name or out.stem, _matched(made.matches), [], json_file)
 
 
 def rewire(console: Any, model: Path, out: Path, bus: str, ask: "Ask | None", json_file: Path | None) -> int:
@@ -47,7 +41,6 @@ def rewire(console: Any, model: Path, out: Path, bus: str, ask: "Ask | None", js
     import yaml
 
     from armlink.arm_file import load_arm, parse_arm
-    from armlink.commands.output import write_json
     from armlink.drives.registry import found_drives
     from calib.arm.kinematics import gcomp_arm
     from calib.commissioning.drive_match import TurnedJoint, match_by_hand, match_in_order
@@ -75,15 +68,8 @@ def rewire(console: Any, model: Path, out: Path, bus: str, ask: "Ask | None", js
     parse_arm(dict(content), out)
     text = f"# {arm.name} with the drives on {channel}, from {model.name}, by the command new.\n"
     out.write_text(text + yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
-    for found in findings:
-        console.print(str(found), style="red")
-    step = shlex.join(["armlink", "check", str(out)])
-    console.print(f"{out}: nodes {', '.join(str(match.drive.node) for match in matches)}")
-    console.print(f"next: {step}", style="bold")
-    joints = [{"name": match.joint, "node": match.drive.node, "by_hand": match.by_hand} for match in matches]
-    answer = {"out": str(out), "name": arm.name, "joints": joints, "next": step}
-    write_json(json_file, {"schema": SCHEMA, **answer, "findings": [found.to_json() for found in findings]})
-    return 1 if findings else 0
+    told = f"nodes {', '.join(str(match.drive.node) for match in matches)}"
+    return _tell(console, out, told, "check", arm.name, _matched(matches), findings, json_file)
 
 
 def drives_by_ids(model: Path) -> bool:
@@ -97,7 +83,6 @@ def drives_by_ids(model: Path) -> bool:
 def copy(console: Any, model: Path, out: Path, bus: str, new_serial: bool, json_file: Path | None) -> int:
     """An arm file with drives that are known by their ids, on a bus of one's own."""
     from armlink.arm_file import load_arm
-    from armlink.commands.output import write_json
     from calib.commissioning.own_copy import own_copy
 
     arm, opened = load_arm(model), open_named(bus)
@@ -106,15 +91,36 @@ def copy(console: Any, model: Path, out: Path, bus: str, new_serial: bool, json_
     finally:
         opened.shutdown()
     out.write_text(copied.text, encoding="utf-8")
-    for found in copied.findings:
-        console.print(str(found), style="red")
-    step = shlex.join(["armlink", "doctor", str(out)])
-    console.print(f"{out}: {', '.join(address for _, address, _ in copied.drives)} answer; limits are those of {model}")
-    console.print(f"next: {step}", style="bold")
+    told = f"{', '.join(address for _, address, _ in copied.drives)} answer; limits are those of {model}"
     joints = [{"name": name, "address": address, "serial": serial} for name, address, serial in copied.drives]
-    answer = {"out": str(out), "name": arm.name, "joints": joints, "next": step}
-    write_json(json_file, {"schema": SCHEMA, **answer, "findings": [found.to_json() for found in copied.findings]})
-    return 1 if copied.findings else 0
+    return _tell(console, out, told, "doctor", arm.name, joints, copied.findings, json_file)
+
+
+def _matched(matches: "Sequence[Match]") -> list[dict[str, Any]]:
+    return [{"name": match.joint, "node": match.drive.node, "by_hand": match.by_hand} for match in matches]
+
+
+def _tell(
+    console: Any,
+    out: Path,
+    told: str,
+    command: str,
+    name: str,
+    joints: list[dict[str, Any]],
+    findings: "Sequence[SetupFinding]",
+    json_file: Path | None,
+) -> int:
+    """Findings, what was written and the next command, to the screen and as JSON; the exit status."""
+    from armlink.commands.output import write_json
+
+    for found in findings:
+        console.print(str(found), style="red")
+    step = shlex.join(["armlink", command, str(out)])
+    console.print(f"{out}: {told}")
+    console.print(f"next: {step}", style="bold")
+    answer = {"out": str(out), "name": name, "joints": joints, "next": step}
+    write_json(json_file, {"schema": SCHEMA, **answer, "findings": [found.to_json() for found in findings]})
+    return 1 if findings else 0
 
 
 def open_named(bus: str) -> "CanBus":
