@@ -23,6 +23,11 @@ class Observes(Protocol):
         ...
 
     @property
+    def accepted(self) -> Array:
+        """Rows that went into each joint's estimate (n,)."""
+        ...
+
+    @property
     def held(self) -> bool:
         """Whether estimates are held until a verdict."""
         ...

@@ -72,6 +72,11 @@ class Observer:
         return self._tracking.rows
 
     @property
+    def accepted(self) -> Array:
+        """Rows that went into each joint's estimate (n,)."""
+        return self._tracking.filter.accepted.copy()
+
+    @property
     def held(self) -> bool:
         """Whether an alarm is open: estimates are held until a verdict."""
         return self._investigation.held and not self._investigation.silent

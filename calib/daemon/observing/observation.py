@@ -30,7 +30,7 @@ class Observation:
         self._storage, self._events, self._jobs, self._more_poses = storage, events, jobs, more_poses
         self.last_accepted: dict[str, datetime] = {}
         """Time of the newest row that went into each joint's estimate."""
-        self._accepted = feed.observer.estimate().accepted
+        self._accepted = feed.observer.accepted
 
     def handle(self, batch: Batch) -> None:
         """Observe the samples of a batch."""
@@ -44,7 +44,7 @@ class Observation:
         self.recalibrations.watch(samples, self.feed.observer.held)
 
     def _note_accepted(self) -> None:
-        accepted = self.feed.observer.estimate().accepted
+        accepted = self.feed.observer.accepted
         for name, more in zip(self.feed.names, accepted > self._accepted, strict=True):
             if more:
                 self.last_accepted[name] = self._events.now()

@@ -81,6 +81,11 @@ class MovingObserver:
         return int(self._count.sum())
 
     @property
+    def accepted(self) -> Array:
+        """Rows of each joint (n,)."""
+        return self._count.copy()
+
+    @property
     def held(self) -> bool:
         """Estimates are never held: nothing is written by this observer."""
         return False
@@ -142,15 +147,6 @@ class MovingObserver:
             return Limits(np.full(n, np.nan), np.full(n, np.nan), LONGEST + BLOCK)
         gain, offset = (np.array([test.noticed(cause, j) for j in range(n)]) for cause in ("gain", "offset"))
         return Limits(gain, offset, LONGEST + BLOCK)
-
-    def smallest(self, cause: str, joint: int) -> float:
-        """Smallest change of a joint's gain, offset [N·m] or friction (shares but for the offset) that the latest rows
-        would show in one case of two; 0 for other causes, infinite where they tell nothing."""
-        if cause not in ("gain", "offset", "friction"):
-            return 0.0
-        test = self._test()
-        found = float("nan") if test is None else test.noticed(cause, joint)
-        return found if np.isfinite(found) else float("inf")
 
     def model_torque(self, position: Array) -> Array:
         """Gravity torque [N·m] that the observer believes at position readings [rad]; (n,), or (K, n) of K poses."""
