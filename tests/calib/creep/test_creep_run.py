@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from soft_links import CREEP, JOINTS, SIM
+from soft_links import soft_arm
 
-from armlink.arm_file import ArmFile, parse_arm
 from armlink.link.link import Link
 from calib.creep.choice import is_creep, sweep_motion
 from calib.creep.fit import fit_creep
@@ -21,23 +20,7 @@ from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
-
-@cache
-def arm(motion: str | None = None) -> ArmFile:
-    """Two Damiao drives, both axes horizontal."""
-    keys = {"family": "damiao", "model": "DM4340", "kp": 50, "kd": 5}
-    drives = [
-        {"name": joint["name"], "drive": {**keys, "id": i, "reply": i + 16}, "rated_torque": 9.0, "max_torque": 22.0}
-        for i, joint in enumerate(JOINTS, start=1)
-    ]
-    content = {
-        "name": "two",
-        "kinematics": {"gravity": [9.80665, 0.0, 0.0], "joints": JOINTS},
-        "link": {"rate": 50, "joints": drives},
-        "sweep": {"creep": CREEP, **({} if motion is None else {"motion": motion})},
-        "sim": SIM,
-    }
-    return parse_arm(content, Path("two.yaml"))
+arm = cache(soft_arm)
 
 
 def opened(simulated: SimulatedArm) -> Link:

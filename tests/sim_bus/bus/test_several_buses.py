@@ -139,23 +139,7 @@ def test_the_joints_of_both_buses_move_as_one_arm(path, repeated):
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_node_and_another_drive_on_two_buses_move_as_one_arm(path, turned):
-    described, clock = with_drives(path, *((DAMIAO, None) if turned else (None, DAMIAO))), HandTime()
-    arm = SimulatedArm(described, Truth.of(described))
-    nodes, host = (open_link_bus(None, described.require_link()) for _ in range(2))
-    server = Server(arm, nodes, now=clock.now)
-    pumped = BusGroup([Pumped(bus, server.turn) for bus in host.members], list(host.tags))
-    pumped.clock = clock
-    with Link(described, pumped) as link:
-        link.start()
-        start = link.enable().position
-        command = Command.hold(start)
-        for _ in range(100):
-            command.position += [0.002, -0.001]
-            clock.time += link.period
-            sample = link.cycle(command)
-        assert sample.position - start == pytest.approx([0.2, -0.1], abs=0.05)
-        assert link.stats.missed == 0
-    nodes.shutdown()
+    serials_of_an_arm_that_moves_as_one(path, *((DAMIAO, None) if turned else (None, DAMIAO)))
 
 
 def test_frames_on_a_bus_without_nodes_reach_no_node_of_another(path):
@@ -182,6 +166,29 @@ def test_frames_on_a_bus_without_nodes_reach_no_node_of_another(path):
     nodes.shutdown()
 
 
+def serials_of_an_arm_that_moves_as_one(path, *drives):
+    """Serial numbers on the buses of an arm of two joints, which follows its targets."""
+    described, clock = with_drives(path, *drives), HandTime()
+    arm = SimulatedArm(described, Truth.of(described))
+    nodes, host = (open_link_bus(None, described.require_link()) for _ in range(2))
+    server = Server(arm, nodes, now=clock.now)
+    pumped = BusGroup([Pumped(bus, server.turn) for bus in host.members], list(host.tags))
+    pumped.clock = clock
+    with Link(described, pumped) as link:
+        serials = {each.serial for each in link.scan()}
+        link.start()
+        start = link.enable().position
+        command = Command.hold(start)
+        for _ in range(100):
+            command.position += [0.002, -0.001]
+            clock.time += link.period
+            sample = link.cycle(command)
+        assert sample.position - start == pytest.approx([0.2, -0.1], abs=0.05)
+        assert link.stats.missed == 0
+    nodes.shutdown()
+    return serials
+
+
 class HandTime:
     """A clock that the test moves on."""
 
@@ -196,24 +203,7 @@ class HandTime:
 
 
 def test_drives_with_the_same_ids_on_two_buses_move_as_one_arm(path):
-    described, clock = with_drives(path, DAMIAO, DAMIAO), HandTime()
-    arm = SimulatedArm(described, Truth.of(described))
-    nodes, host = (open_link_bus(None, described.require_link()) for _ in range(2))
-    server = Server(arm, nodes, now=clock.now)
-    pumped = BusGroup([Pumped(bus, server.turn) for bus in host.members], list(host.tags))
-    pumped.clock = clock
-    with Link(described, pumped) as link:
-        assert len({each.serial for each in link.scan()}) == 2
-        link.start()
-        start = link.enable().position
-        command = Command.hold(start)
-        for _ in range(100):
-            command.position += [0.002, -0.001]
-            clock.time += link.period
-            sample = link.cycle(command)
-        assert sample.position - start == pytest.approx([0.2, -0.1], abs=0.05)
-        assert link.stats.missed == 0
-    nodes.shutdown()
+    assert len(serials_of_an_arm_that_moves_as_one(path, DAMIAO, DAMIAO)) == 2
 
 
 def test_each_node_answers_on_its_own_bus_alone(served, path):

@@ -3,9 +3,8 @@
 from pathlib import Path
 
 import numpy as np
-from soft_links import CREEP, JOINTS, SIM
+from soft_links import soft_arm
 
-from armlink.arm_file import parse_arm
 from armlink.link.link import Link
 from armlink.link.types import Command
 from calib.arm.kinematics import gcomp_arm
@@ -25,23 +24,7 @@ LOAD = 0.3
 
 
 def test_a_load_is_told_while_the_arm_carries_it(tmp_path: Path) -> None:
-    drives = [
-        {
-            "name": joint["name"],
-            "drive": {"family": "damiao", "model": "DM4340", "kp": 50, "kd": 5, "id": i, "reply": i + 16},
-            "rated_torque": 9.0,
-            "max_torque": 22.0,
-        }
-        for i, joint in enumerate(JOINTS, start=1)
-    ]
-    content = {
-        "name": "two",
-        "kinematics": {"gravity": [9.80665, 0.0, 0.0], "joints": JOINTS},
-        "link": {"rate": 50, "joints": drives},
-        "sweep": {"creep": CREEP},
-        "sim": SIM,
-    }
-    arm = parse_arm(content, tmp_path / "two.yaml")
+    arm = soft_arm()
     simulated, plan, random = SimulatedArm(arm, Truth.draw(arm, 3), 3), plan_creep(arm), np.random.default_rng(0)
     with Link(arm, LockStepBus(arm=simulated)) as link:
         link.start()
