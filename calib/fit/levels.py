@@ -16,10 +16,9 @@ family that hardly shows keeps a level instead of none, which would make the int
 not tell."""
 UNKNOWN = 2.0
 """Standard deviation beforehand of the common level's logarithm about that of good arms: a factor of seven."""
-LEAST, LARGEST = 2e-3, 5.0
-"""Range of a level. The least one only bounds the search: perfect arms come to 0.005 to 0.02, where the readings end
-it; at a bound of 0.02 their offsets were said to be known up to a third worse than they are. Bad arms have 3: a trouble
-that asks for more than 5 is not small: it stands out, is named and taken out."""
+LEAST = 2e-3
+"""Least level; it only bounds the search. Perfect arms come to 0.005 to 0.02, where the readings end it; at a bound of
+0.02 their offsets were said to be known up to a third worse than they are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,17 +67,18 @@ class Levels:
     """Of the levels' logarithms (F, F)."""
 
 
-def learn(effects: Effects, start: Array) -> Levels:
-    """Levels of all families (F,) by Fisher scoring in their logarithms from `start`, with the arm's common level.
+def learn(effects: Effects, start: Array, largest: Array) -> Levels:
+    """Levels of all families (F,), at most `largest`, by Fisher scoring in their logarithms, with a common level.
 
     A family has the inverse χ² prior of WEIGHT coefficients at the common level, which is unknown within the range.
     """
     count = effects.families
     theta = np.append(np.log(start), np.log(start).mean())
+    most = np.log(np.append(largest, largest.min()))
     for _ in range(ROUNDS):
         score, told, hessian = _scored(effects, theta)
         step = np.clip(-np.linalg.solve(hessian, score), -LONGEST, LONGEST)
-        before, theta = theta, np.clip(theta + step, np.log(LEAST), np.log(LARGEST))
+        before, theta = theta, np.clip(theta + step, np.log(LEAST), most)
         if np.abs(theta - before).max() < SETTLED:
             break
     covariance: Array = np.asarray(2 * np.linalg.inv(hessian), dtype=np.float64)

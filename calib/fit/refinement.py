@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy import linalg
 
 from calib.fit.levels import Effects, Levels, learn
-from calib.fit.small_troubles import FAMILIES, ROUGHLY, UNITS, Setting, Troubles, troubles
+from calib.fit.small_troubles import FAMILIES, LARGEST, UNITS, Setting, Troubles, troubles
 from calib.fit.sweep_readings import SweepReadings
 from gcomp.arrays import Array
 from gcomp.identify.global_fit import GlobalFit
@@ -24,6 +24,12 @@ from gcomp.identify.parameters import Parameters, Prior, parameter_names, prior_
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict_and_jacobian
 
+WITHIN = 0.2
+"""Standard deviation of the part of a held joint's lag that changes during a sweep, in levels of `direction`: half of
+ROUGHLY, a choice."""
+LEAST_FACTOR = 0.5
+"""Least scatter over the samples' noise; it only bounds the search. Less than 1 is by chance, but so is as much more:
+cut off at 1, the intervals of perfect arms were 5 % too wide."""
 ROUNDS = 4
 """Gauss-Newton steps, each followed by an update of the noise; the start is the global fit's minimum; a choice."""
 NEGLIGIBLE = 0.1
@@ -79,7 +85,7 @@ class Refined:
 
     fit: GlobalFit
     factor: Array
-    """Scatter of each joint's readings over their samples' noise (n,); at least 1."""
+    """Scatter of each joint's readings over their samples' noise (n,)."""
     raw_factor: Array
     """The same without the lower bound; NaN for a joint with too few readings."""
     linear: Linear
@@ -112,7 +118,7 @@ def refine(
         level = step.levels.level
         vector[problem.free] += step.solution[: step.parameters]
         raw, freedom = _scatter(step.linear, kinematics.n)
-        used, factor = factor, np.maximum(factor * np.where(np.isnan(raw), 1.0, raw), 1.0)
+        used, factor = factor, np.maximum(factor * np.where(np.isnan(raw), 1.0, raw), LEAST_FACTOR)
     found = analyse(step.triangle, step.scale)
     inner, behind = slice(0, step.parameters), slice(step.parameters, None)
     residual = np.full(readings.torque.shape, np.nan)
@@ -136,7 +142,7 @@ def refine(
     )
     spread = np.sqrt(np.abs(np.diag(found.covariance)[behind]))
     certainty = np.full(len(vector), 1.0)
-    certainty[problem.free] = _certainty(step, np.nan_to_num(covariance), refined.dof)
+    certainty[problem.free] = _certainty(step, np.nan_to_num(covariance), freedom)
     return Refined(
         refined,
         factor,
@@ -151,17 +157,19 @@ def refine(
     )
 
 
-def _certainty(step: "_Step", covariance: Array, free: int) -> Array:
+def _certainty(step: "_Step", covariance: Array, free: Array) -> Array:
     """Degrees of freedom (p,) of the parameters' variances, by Satterthwaite: 2 v² over the variance of v.
 
-    v consists of the noise's part, known from `free` readings, and one part a family, in proportion to its level's
-    square. Extra columns are left out of account.
+    v consists of each joint's noise, known from its `free` (n,) readings, and one part a family, in proportion to its
+    level's square. Extra columns are left out of account.
     """
     linear, families = step.linear, np.arange(len(FAMILIES))
-    across = linear.effects.T @ (linear.precision @ (linear.design @ covariance))
-    parts = (step.troubles.family == families[:, None]).astype(float) @ across**2
+    weight = linear.precision @ (linear.design @ covariance)
+    parts = (step.troubles.family == families[:, None]).astype(float) @ (linear.effects.T @ weight) ** 2
+    noise = (linear.joint == np.arange(len(free))[:, None]).astype(float) @ weight**2
     variance = np.maximum(np.diag(covariance), 1e-300)
-    spread = 4 * np.einsum("fp,fg,gp->p", parts, step.levels.covariance, parts) + 2 * variance**2 / max(free, 1)
+    spread = 4 * np.einsum("fp,fg,gp->p", parts, step.levels.covariance, parts)
+    spread += (2 * noise**2 / np.maximum(free, 1.0)[:, None]).sum(axis=0)
     certainty: Array = 2 * variance**2 / np.maximum(spread, 1e-300)
     return np.maximum(certainty, 1.0)
 
@@ -208,7 +216,7 @@ class _Problem:
         """Solve the problem linearised at a parameter vector (6n + 3,), noise times factor (n,)."""
         readings, free = self.readings, int(self.free.sum())
         modelled, jacobian, slope = predict_and_jacobian(self.arm, Parameters.from_vector(vector, self.arm.n), readings)
-        lag = ROUGHLY * level[FAMILIES.index("direction")] * UNITS["direction"][0] * self.setting.rated[self.joint]
+        lag = WITHIN * level[FAMILIES.index("direction")] * UNITS["direction"][0] * self.setting.rated[self.joint]
         own = self.rows.swept[self.row] == self.joint
         sigma = np.hypot(readings.sigma[readings.counted], np.where(own, 0.0, lag)) * factor[self.joint]
         rounding = _rounding_columns(readings, self.resolution, slope / sigma[:, None])
@@ -225,7 +233,7 @@ class _Problem:
         nuisance = np.vstack([rounding, np.zeros((known, rounding.shape[1]))])
         fixed = np.hstack([design * self.scale, nuisance])
         effects = Effects.of(fixed, weighted, target, found.family, len(FAMILIES))
-        levels = learn(effects, level)
+        levels = learn(effects, level, LARGEST)
         random = np.hstack([rounding, weighted * levels.level[found.family]])
         root = np.linalg.cholesky(np.eye(count) + random @ random.T)
         whitened = linalg.solve_triangular(root, np.column_stack([design[:count], target[:count]]), lower=True)

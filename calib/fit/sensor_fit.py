@@ -40,7 +40,7 @@ class SensorFit:
     fit: GlobalFit
     rows: SweepReadings
     noise_factor: Array
-    """Scatter of the readings over their samples' noise (n,); at least 1."""
+    """Scatter of the readings over their samples' noise (n,)."""
     hysteresis: Array
     """Half the mean difference between readings approached upwards and downwards (n,) [N·m]."""
     friction: Array
