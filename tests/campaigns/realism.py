@@ -136,7 +136,11 @@ def summary(level: float, done: list[Outcome]) -> bool:
         f" RMS {np.sqrt(np.mean(ratio**2)):.2f}, {np.mean(ratio < 1.96):.1%} below 1.96; doubtful arms {doubtful}",
         flush=True,
     )
-    return median <= MEDIAN[level] and COVERAGE[0] - chance <= share and float(np.mean(ratio < 1.96)) >= 0.9
+    return (
+        median <= MEDIAN[level]
+        and COVERAGE[0] - chance <= share <= COVERAGE[1] + chance
+        and float(np.mean(ratio < 1.96)) >= 0.9
+    )
 
 
 def main() -> int:
