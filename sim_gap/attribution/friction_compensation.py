@@ -20,6 +20,8 @@ from sim_gap.residuals.preprocess import Signals
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.estimate import Estimate
 
+MOST = 10_000
+"""Number of samples of a command that are looked at, spread over the recording."""
 LAGS = 3
 """Number of samples by which the command may follow the velocity, from 0."""
 VISCOUS = 3 * LAGS
@@ -95,18 +97,22 @@ def _law(command: Array, velocity: Array, position: Array) -> tuple[float, float
     Second differences leave the noise alone, in which a command that knows only the plan has no part, nor has one that
     the joint's true friction made: that follows the smoothed velocity.
     """
+    if len(command) < FEWEST:
+        return None
     best: tuple[float, float, float] | None = None
-    smooth = np.asarray(savgol_filter(velocity, SMOOTH, 2))
+    smooth = np.asarray(savgol_filter(velocity, SMOOTH, 2, mode="nearest"))
+    bent = _bent(command)[LAGS - 1 :]
+    there = np.flatnonzero(np.isfinite(bent))
+    there = there[:: len(there) // MOST + 1]
     for speed in SPEEDS:
         laws = (*(_dry(v, speed) for v in (velocity, smooth)), np.sign(smooth), velocity, smooth, position)
         bends = [_bent(law) for law in laws]
-        columns = np.stack([bend[LAGS - 1 - lag : len(bend) - lag] for bend in bends for lag in range(LAGS)], axis=1)
-        bent = _bent(command)[LAGS - 1 :]
-        there = np.isfinite(bent) & np.isfinite(columns).all(axis=1)
-        x, y = columns[there], bent[there]
-        scale = x.std(axis=0)
-        if len(y) < FEWEST or not y.std() or not scale.all():
+        x = np.stack([bend[LAGS - 1 - lag : len(bend) - lag][there] for bend in bends for lag in range(LAGS)], axis=1)
+        known = np.isfinite(x).all(axis=1)
+        x, y = x[known], bent[there][known]
+        if len(y) < FEWEST:
             continue
+        scale = np.maximum(x.std(axis=0), 1e-12)
         x = x / scale
         without, whole = (_rest(part, y) for part in (x[:, LAGS:], x))
         share = 1.0 - float(whole @ whole) / max(float(without @ without), 1e-300)

@@ -34,6 +34,8 @@ def test_a_command_that_holds_it():
     made, quiet = arm(1), record(model(), Wrong(), seed=1, seconds=30, noise=1e-3).motor_torque
     late = np.vstack([made.velocity[:1], made.velocity[:-1]])
     holds = replace(made, torque_command=quiet + compensation(late))
+    for channel in (holds.torque_command, holds.velocity):
+        channel[500:520] = np.nan
     found = held_in_commands([made, holds], ["off", "on"])
     assert [(each.recording, each.joint) for each in found] == [("on", name) for name in made.names]
     assert [each.torque for each in found] == pytest.approx(DRY, rel=0.2)
