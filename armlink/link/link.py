@@ -15,7 +15,7 @@ from armlink.bus.arm_hold import ArmHold
 from armlink.bus.can_bus import CanBus
 from armlink.clock import Clock, MonotonicClock
 from armlink.drives.family import Guarded
-from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Setup
+from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Setup, law_torque
 from armlink.errors import BadInput, BusFault, Refused, Silence
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
@@ -140,8 +140,9 @@ class Link(Calibrations):
 
     @property
     def torque_sent(self) -> Array:
-        """Target torque of the last frames [N·m], (n,)."""
-        return np.array([order.torque for order in self.orders_sent])
+        """Torque that the last frames command [N·m], (n,); of a drive with gains by its law, at the newest readings."""
+        readings = zip(self.orders_sent, self._loop.latest_position, self._loop.latest_velocity, strict=False)
+        return np.array([law_torque(*each) for each in readings])
 
     @property
     def position_sent(self) -> Array:

@@ -10,6 +10,7 @@ import pytest
 from bench import Bench
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from wiretap import Tap
 
 from armlink.arm_file import load_arm, parse_arm
 from armlink.bus.port import EXTENDED
@@ -20,6 +21,7 @@ from armlink.drives.orders import Limits, Mode, Order, Power
 from armlink.drives.registry import family
 from armlink.drives.robstride import frames as robstride
 from armlink.errors import BadInput, BusFault, Stall
+from armlink.recording.recorder import Recorder
 
 ARMS = ("six-damiao", "six-robstride", "six-moteus", "six-odrive")
 MIT = ARMS[:2]
@@ -400,6 +402,31 @@ def test_another_hosts_commands_are_known_as_such(bench):
         assert "another host" in str(bench.drives.alarm())
         bench.drives.forget()
         assert bench.drives.alarm() is None
+
+
+@pytest.mark.parametrize("name", MIT)
+def test_a_recording_beside_another_host_has_the_torque_that_its_commands_ask_for(bench):
+    """Rebuilt at the joint from both gains, both targets and the torque of each command, of the cycle that it led."""
+    bench.walk()
+    rows, frames, period = bench.link.joints, [], bench.period
+    start, position, expected = bench.position, [], []
+    for cycle in range(12):
+        t = 100.0 + cycle * period
+        orders = [bench.order(j, position=start[j] + 0.002 * cycle, torque=0.1 * (j + 1)) for j in range(6)]
+        bench.heard.clear()
+        frames += [(t, *frame) for frame in bench.cycle(orders)]
+        frames += [(t + period / 2, *frame) for frame in bench.heard]
+        torques = []
+        for j, (sent, read) in enumerate(zip(map(bench.drives.sent, range(6)), bench.latest, strict=True)):
+            law = sent.kp * (sent.position - read.position) + sent.kd * (sent.velocity - read.velocity) + sent.torque
+            torques.append(rows[j].settings.direction * rows[j].settings.gear * law)
+        expected.append(torques)
+        position.append([bench.at_joint(j, bench.drives.sent(j).position) for j in range(6)])
+    recorded = [row for _, row in Recorder(bench.described, Tap(frames)).rows(1.0)]
+    assert len(recorded) == 11  # the last is not complete before the next command
+    np.testing.assert_allclose([row["position_command"] for row in recorded], position[:-1], atol=1e-9)
+    np.testing.assert_allclose([row["torque_command"] for row in recorded], expected[:-1], atol=1e-9)
+    assert np.ptp(expected, axis=0).min() > 0.01  # both gains are in it: the torques differ from row to row
 
 
 # ---- the load of the bus
