@@ -4,14 +4,17 @@
 
 The loop is that of every job (`armlink.loop.process`), started by a `RemoteLink` that plays a slow motion; the arm is
 simulated in a process of its own. Without `--bus` the two are joined by a pair of Unix sockets that carry the 16 bytes
-of SocketCAN's `can_frame`, read and written by the link's own SocketCAN port, and the arm's end lets every frame take
-the time that it takes at 1 Mbit/s: replies come one by one, as from a real bus. `--bus udp_multicast:239.74.163.57` or
-`socketcan:vcan0` put both on that bus. Prints JSON; processor time is the kernel's count of the loop's threads alone.
+of SocketCAN's `can_frame`, read and written by the link's own SocketCAN port, with a process between them that lets
+every frame take its time at 1 Mbit/s: replies come one by one, as from a real bus. `--bus udp_multicast:239.74.163.57`
+or `socketcan:vcan0` put both on that bus. Prints JSON; processor time is what the kernel counts of the loop's threads.
 """
 
 import argparse
+import heapq
 import json
+import multiprocessing
 import os
+import select
 import socket
 import subprocess
 import sys
@@ -26,11 +29,12 @@ import yaml
 
 from armlink.arm_file import ArmFile, bundled_arms, load_arm
 from armlink.bus.frame_bits import frame_bits
-from armlink.bus.port import Frame, Port
+from armlink.bus.port import Port
 from armlink.bus.sockets.socket_port import SocketPort
 from armlink.link.link import Link
 from armlink.link.types import Setpoints
 from armlink.loop import process, remote_link
+from armlink.loop.realtime import SIMULATED, prepare
 
 BIT = 1e-6
 """Time of a bit at 1 Mbit/s [s]."""
@@ -44,14 +48,16 @@ class PairBus:
     """One end of a pair of sockets as a bus of CAN frames; a CanBus."""
 
     clock = None
-    channel_info = "a pair of sockets"
+    channel_info = "pair of sockets"
+    fd = False
 
     def __init__(self, end: socket.socket) -> None:
-        self.end, self.fd = end, False
+        """Take over the socket."""
+        self.end = end
 
     def open_port(self, as_node: bool = False) -> Port:
-        """The host's is SocketCAN's own; that of the nodes keeps the wire's time."""
-        return WirePort(self.end, self.channel_info, as_node=True) if as_node else SocketPort(self.end, "pair")
+        """SocketCAN's own."""
+        return SocketPort(self.end, self.channel_info, as_node=as_node)
 
     def open_listening_port(self) -> Port:
         """Nobody listens."""
@@ -62,33 +68,30 @@ class PairBus:
         self.end.close()
 
 
-class WirePort(SocketPort):
-    """A frame passes when the wire has carried it, each after the one before."""
-
-    free = 0.0
-    """When the wire is free again, by time.monotonic() [s]."""
-
-    def _pass(self, can_id: int, data: bytes) -> None:
-        self.free = max(self.free, time.monotonic()) + BIT * frame_bits(can_id, data)
-        time.sleep(max(0.0, self.free - time.monotonic()))
-
-    def receive(self, timeout: float) -> Frame | None:
-        """See Port."""
-        frame = super().receive(timeout)
-        if frame is not None:
-            self._pass(*frame)
-        return frame
-
-    def send_all(self, frames: Any) -> None:
-        """See Port."""
-        for frame in frames:
-            self._pass(*frame)
-            super().send_all((frame,))
+def carry(one: socket.socket, other: socket.socket) -> None:
+    """The wire between two sockets: one frame at a time, the lowest identifier first, each for its bits."""
+    prepare(SIMULATED)
+    ends, waiting, free, number = {one: other, other: one}, list[tuple[int, int, bytes, socket.socket]](), 0.0, 0
+    while True:
+        for end in select.select(list(ends), [], [], 0.0 if waiting else None)[0]:
+            frame = end.recv(64)
+            if not frame:
+                return
+            number += 1
+            heapq.heappush(waiting, (int.from_bytes(frame[:4], "little"), number, frame, ends[end]))
+        if waiting:
+            can_id, _, frame, to = heapq.heappop(waiting)
+            now = time.monotonic()
+            free = max(free, now - BIT * 130) + BIT * frame_bits(can_id, frame[8 : 8 + frame[4]])
+            if free > now:
+                time.sleep(free - now)
+            to.send(frame)
 
 
 def seven_joints(name: str, rate: float, folder: Path) -> Path:
     """The bundled arm at this rate."""
     content = yaml.safe_load(bundled_arms()[name].read_text(encoding="utf-8"))
+    content["serial"] = "SIM-BENCH"  # no record of another is for it
     content["link"] |= {"rate": rate, "deadline": DEADLINE}
     model = content["kinematics"].get("model")
     if model:
@@ -106,7 +109,9 @@ def simulate(path: str, number: int) -> None:
     from sim_bus.truth import Truth
 
     arm = load_arm(path)
-    server = Server(SimulatedArm(arm, Truth.of(arm)), PairBus(socket.socket(fileno=number)))
+    bus = PairBus(socket.socket(fileno=number))  # keeps the socket open
+    server = Server(SimulatedArm(arm, Truth.of(arm)), bus)
+    prepare(SIMULATED)
     print("ready", flush=True)
     try:
         server.run()
@@ -199,9 +204,12 @@ def main() -> int:
         keep_cycle(*asked.keep_cycle)
         return 0
     os.environ["CAN_CONFIG"] = json.dumps({"port": 44200 + os.getpid() % 1000})
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours, near = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    far, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    wire = multiprocessing.get_context("fork").Process(target=carry, args=(near, far), daemon=True)
     if not asked.bus:
         on_pair(ours.fileno())
+        wire.start()
     with tempfile.TemporaryDirectory() as folder:
         path = seven_joints(asked.arm, asked.rate, Path(folder))
         arm = start_arm(path, asked.bus, theirs.fileno())
@@ -211,6 +219,8 @@ def main() -> int:
         finally:
             arm.terminate()
             arm.wait()
+            if not asked.bus:
+                wire.terminate()
     return 0
 
 
