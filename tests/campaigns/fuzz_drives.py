@@ -17,7 +17,7 @@ def main() -> int:
     parser.add_argument("--frames", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
-    for arm in ("six-damiao", "six-robstride", "six-moteus", "six-odrive"):
+    for arm in ("six-damiao", "six-robstride", "six-moteus", "six-odrive", "six-cia402"):
         print(f"{arm}: {fuzz(arm, asked.frames, asked.seed)} frames", flush=True)
     return 0
 

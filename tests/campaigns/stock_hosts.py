@@ -104,12 +104,17 @@ def robstride(way: Way, channel: str, seconds: float) -> None:
         return round((value - least) / (most - least) * 65535)
 
     host = 0xAA
-    with can.Bus(interface="udp_multicast", channel=channel) as bus:
+    to_host = [{"can_id": host, "can_mask": 0xFF, "extended": True}]  # udp_multicast gives back what one sends
+    with can.Bus(interface="udp_multicast", channel=channel, can_filters=to_host) as bus:
         client = Client(bus, host_can_id=host)
         for row in way.rows:
             drive = row.settings.id
             bus.send(
-                can.Message(18 << 24 | host << 8 | drive, data=bytes.fromhex("2870000020a10700"), is_extended_id=True)
+                can.Message(
+                    arbitration_id=18 << 24 | host << 8 | drive,
+                    data=bytes.fromhex("2870000020a10700"),
+                    is_extended_id=True,
+                )
             )
             client._recv()  # canTimeout 500000 = 25 s
             client.enable(drive)

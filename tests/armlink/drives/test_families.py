@@ -15,6 +15,7 @@ from wiretap import Tap
 from armlink.arm_file import load_arm, parse_arm
 from armlink.bus.port import EXTENDED
 from armlink.drives.damiao import frames as damiao
+from armlink.drives.mit_packing import MitFeedback
 from armlink.drives.moteus import frames as moteus
 from armlink.drives.odrive import frames as odrive
 from armlink.drives.orders import Limits, Mode, Order, Power
@@ -427,6 +428,17 @@ def test_a_recording_beside_another_host_has_the_torque_that_its_commands_ask_fo
     np.testing.assert_allclose([row["position_command"] for row in recorded], position[:-1], atol=1e-9)
     np.testing.assert_allclose([row["torque_command"] for row in recorded], expected[:-1], atol=1e-9)
     assert np.ptp(expected, axis=0).min() > 0.01  # both gains are in it: the torques differ from row to row
+
+
+def test_a_listener_takes_what_a_robstride_drive_replies_to_a_host_of_any_id():
+    listener, host = Bench("six-robstride"), 0xAA
+    motion = MitFeedback(0.5, -1.0, 2.0)
+    frame = robstride.pack_feedback(robstride.Feedback(2, 0, 2, motion, 30.0), host, listener.drives._known[1].ranges)
+    reading = listener.drives.take(frame[0] | EXTENDED, frame[1], 0.0)
+    assert reading.joint == 1
+    assert tuple(reading[1:4]) == pytest.approx(tuple(motion), abs=1e-2)
+    listener.set_up()
+    assert listener.drives.take(frame[0] | EXTENDED, frame[1], 0.0) is None  # a host takes what is said to it
 
 
 # ---- the load of the bus
