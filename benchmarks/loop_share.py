@@ -159,6 +159,12 @@ def processor_time(pid: int) -> float:
     return sum(runs) * 1e-9
 
 
+def wakes(pid: int) -> int:
+    """How often its main thread has waited."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    return int(status.partition("\nvoluntary_ctxt_switches:")[2].split()[0])
+
+
 def measure(arm: ArmFile, bus: str, seconds: float) -> dict[str, Any]:
     """The figures of one run."""
     with remote_link.RemoteLink(arm, bus or None) as link:
@@ -169,7 +175,8 @@ def measure(arm: ArmFile, bus: str, seconds: float) -> dict[str, Any]:
         samples = link.play(Setpoints.follow(position))
         for _ in range(int(2.0 * link.rate)):
             next(samples)
-        missed, began, used = link.stats.missed, time.monotonic(), processor_time(link.pid)
+        missed, woken = link.stats.missed, wakes(link.pid)
+        began, used = time.monotonic(), processor_time(link.pid)
         ages = np.array([sample.age.max() for sample in samples])
         elapsed, used = time.monotonic() - began, processor_time(link.pid) - used
         answer = {
@@ -178,6 +185,7 @@ def measure(arm: ArmFile, bus: str, seconds: float) -> dict[str, Any]:
             "rate_hz": len(ages) / elapsed,
             "loop_core_share": used / elapsed,
             "loop_us_per_cycle": used / len(ages) * 1e6,
+            "wakes_per_cycle": (wakes(link.pid) - woken) / len(ages),
             "bus_load": link.stats.load,
             "missed": link.stats.missed - missed,
             "oldest_reading_ms": ages.max() * 1e3,
