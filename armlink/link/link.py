@@ -141,13 +141,19 @@ class Link(Calibrations):
     @property
     def torque_sent(self) -> Array:
         """Torque that the last frames command [N·m], (n,); of a drive with gains by its law, at the newest readings."""
-        readings = zip(self.orders_sent, self._loop.latest_position, self._loop.latest_velocity, strict=False)
-        return np.array([law_torque(*each) for each in readings])
+        return self.sent[0]
 
     @property
     def position_sent(self) -> Array:
         """Target position of the last frames [rad], (n,)."""
-        return np.array([order.position for order in self.orders_sent])
+        return self.sent[1]
+
+    @property
+    def sent(self) -> tuple[Array, Array]:
+        """`torque_sent` and `position_sent`, the bytes decoded once."""
+        orders = self.orders_sent
+        readings = zip(orders, self._loop.latest_position, self._loop.latest_velocity, strict=False)
+        return np.array([law_torque(*each) for each in readings]), np.array([order.position for order in orders])
 
     @property
     def orders_sent(self) -> list[Order]:

@@ -79,7 +79,7 @@ def test_a_drifting_torque_has_not_but_one_that_does_not_count_may() -> None:
 
 
 def worst_reading(rule: SettleRule, left: Callable[[Array], Array]) -> float:
-    """Largest error of the first window taken for rest, in standard errors, of 12 draws; `left` is what is yet to come."""
+    """Largest error of the first window taken for rest, in standard errors, of 12 draws; `left` is still to come."""
     t, worst = np.arange(900) * PERIOD, 0.0
     for seed in range(12):
         random = np.random.default_rng(seed)
