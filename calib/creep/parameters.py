@@ -1,17 +1,20 @@
 """Unknowns of the creep fit: their order in one vector, and what is known of them beforehand."""
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
+from calib.arm.sweep_section import SweepSection
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
+from gcomp.identify.parameters import Prior
 
 HARMONICS = 2
 """Friction over position: cosine and sine of so many multiples of the joint angle."""
 LAST_ZERO = 1e-6
 """The last joint's zero is kept at 0 [rad]: turning the last link's frame is the same as turning its mass moment and
-the place of the mass (docs/theory.md, 4.1)."""
+the place of the mass (docs/theory.md, 4.1). A measured place resolves it."""
 FAMILIES = (
     "gain", "offset", "coulomb", "load", "viscous", "asymmetry", "warming", "zero", "spring", "uneven", "beta", "rho",
 )  # fmt: skip
@@ -61,6 +64,13 @@ class Doubt:
     """Place of the mass [m]."""
     spring_share: float = 1e-5
     """Pull that grows with position, of rated torque per rad: none, unless it is looked for."""
+    point: Prior | None = None
+    """Place of the mass, where it was measured [m]; the last joint's zero is then seen by it."""
+
+    @classmethod
+    def of(cls, section: SweepSection) -> Self:
+        """What an arm file states."""
+        return cls(zero=section.creep.zero_std, point=section.known_point)
 
 
 def prior(arm: Arm, rated: Array, doubt: Doubt, by_temperature: bool, coulomb: Array) -> tuple[Array, Array]:
@@ -88,5 +98,8 @@ def prior(arm: Arm, rated: Array, doubt: Doubt, by_temperature: bool, coulomb: A
     }
     for family, value in values.items():
         std[slices[family]] = value
-    std[slices["zero"].stop - 1] = LAST_ZERO
+    if doubt.point is None:
+        std[slices["zero"].stop - 1] = LAST_ZERO
+    else:
+        mean[slices["rho"]], std[slices["rho"]] = doubt.point.mean, doubt.point.std
     return mean, std
