@@ -16,14 +16,14 @@ LAST_ZERO = 1e-6
 """The last joint's zero is kept at 0 [rad]: turning the last link's frame is the same as turning its mass moment and
 the place of the mass (docs/theory.md, 4.1). A measured place resolves it."""
 FAMILIES = (
-    "gain", "offset", "coulomb", "load", "viscous", "asymmetry", "warming", "zero", "spring", "uneven", "beta", "rho",
+    "gain", "offset", "coulomb", "load", "viscous", "asymmetry", "warming", "zero", "lag", "spring", "uneven", "beta", "rho",
 )  # fmt: skip
 """In the order of the vector."""
 
 
 def family_slices(n: int) -> dict[str, slice]:
     """Place of each family in the vector of an arm of n joints."""
-    sizes = {"uneven": 2 * HARMONICS * n, "beta": 2 * n, "rho": 3}
+    sizes = {"lag": 1, "uneven": 2 * HARMONICS * n, "beta": 2 * n, "rho": 3}
     slices, begin = {}, 0
     for family in FAMILIES:
         slices[family] = slice(begin, begin + sizes.get(family, n))
@@ -58,6 +58,8 @@ class Doubt:
     """Over all passes, where no temperature is known."""
     zero: float = 0.03
     """Position zero that was set by hand [rad]."""
+    lag: float = 0.005
+    """How much later than the position the torque is read, one for all joints: drives filter it, or average it [s]."""
     uneven: float = 0.15
     """Friction over position, as a share of the joint's Coulomb friction."""
     rho: float = 0.3
@@ -91,6 +93,7 @@ def prior(arm: Arm, rated: Array, doubt: Doubt, by_temperature: bool, coulomb: A
         "asymmetry": doubt.asymmetry,
         "warming": doubt.warming if by_temperature else doubt.warming_by_time,
         "zero": doubt.zero,
+        "lag": doubt.lag,
         "spring": doubt.spring_share * rated,
         "uneven": np.repeat(doubt.uneven * np.maximum(coulomb, 1e-3 * rated), 2 * HARMONICS),
         "beta": np.repeat(3.0 * float(rated.max()) / gravity, 2 * n),
