@@ -16,7 +16,8 @@ LAST_ZERO = 1e-6
 """The last joint's zero is kept at 0 [rad]: turning the last link's frame is the same as turning its mass moment and
 the place of the mass (docs/theory.md, 4.1). A measured place resolves it."""
 FAMILIES = (
-    "gain", "offset", "coulomb", "load", "viscous", "asymmetry", "warming", "zero", "lag", "spring", "uneven", "beta", "rho",
+    "gain", "offset", "coulomb", "load", "viscous", "asymmetry", "warming", "zero", "lag", "spring", "uneven",
+    "beta", "rho",
 )  # fmt: skip
 """In the order of the vector."""
 
