@@ -47,6 +47,8 @@ class RecalibrationWorkflow:
         self._recalibrator: Recalibrator | None = None
         self._installed: Installed = lambda record, finding: None
         self._waiting: list[Finding] = []
+        self._unkept: deque[Callable[[], None]] = deque()
+        """Outcomes of writes that the journal did not take."""
         self._checking: tuple[str, ...] = ()
         self._unexplained: deque[Samples] = deque(maxlen=WAITING)
 
@@ -54,8 +56,9 @@ class RecalibrationWorkflow:
         """Follow other records from now on; approvals that a kill interrupted are closed.
 
         `installed` is called with each record that becomes current, once its finding is written. Returns the finding
-        that led to the record now in force, if one did.
+        that led to the record now in force, if one did. Raises sqlite3.Error if the disk fails.
         """
+        self._keep_outcomes()
         self._recalibrator, self._installed = recalibrator, installed
         self._waiting, self._checking, self._unexplained = [], (), deque(maxlen=WAITING)
         current, last = recalibrator.record, None
@@ -79,7 +82,7 @@ class RecalibrationWorkflow:
         policy = self._configuration.settings.policy
         if policy == "observe":
             return
-        if self._jobs.busy or self._journal.trouble:
+        if self._jobs.busy or self._journal.trouble or self._unkept:
             self._waiting.append(finding)
             return
         recalibrator, automatic = self._active(), policy == "apply"
@@ -146,6 +149,7 @@ class RecalibrationWorkflow:
 
     def _write(self, row: ProposalRow, by: str) -> None:
         recalibrator, number = self._active(), row.id
+        self._keep_outcomes()
         _require_pending(row)
         if self._jobs.busy:
             raise NotPossible("another recalibration is under way: try again in a moment")
@@ -165,16 +169,15 @@ class RecalibrationWorkflow:
 
         def done(outcome: CalibrationRecord | ArmlinkError) -> None:
             if isinstance(outcome, ArmlinkError):
-                with self._journal.transaction():
-                    self._journal.decide(number, self._events.now(), "failed", "daemon", str(outcome))
-                    self._refused(row.finding, outcome, number)
-                if isinstance(outcome, StoreFault) and by == APPLIED_BY:
-                    self._waiting.append(row.finding)  # to be proposed again once the store answers
+                again = isinstance(outcome, StoreFault) and by == APPLIED_BY
+                if again:
+                    self._waiting.append(row.finding)  # to be proposed once the store answers
+                self._keep(lambda: self._failed(row, outcome))
+                if again:
                     return
             else:
-                with self._journal.transaction():
-                    self._applied(row, by, outcome)
-                    self._installed(outcome, row.finding)
+                self._installed(outcome, row.finding)
+                self._keep(lambda: self._applied(row, by, outcome))
             self._next()
 
         self._jobs.start(work, done)
@@ -191,6 +194,29 @@ class RecalibrationWorkflow:
 
     # ---- after a write
 
+    def _keep(self, outcome: Callable[[], None]) -> None:
+        """Journal what came of a write now, or as soon as the journal can be written: no proposal stays open."""
+        self._unkept.append(outcome)
+        self._keep_outcomes()
+
+    def _keep_outcomes(self) -> None:
+        """Journal the outcomes that wait, in their order; raises sqlite3.Error if the disk still fails."""
+        while self._unkept:
+            with self._journal.transaction():
+                self._unkept[0]()
+            self._unkept.popleft()
+
+    def _failed(self, row: ProposalRow, error: ArmlinkError) -> None:
+        """Keep and report that a proposal's record could not be written."""
+        self._decided(row, "failed", "daemon", str(error))
+        self._refused(row.finding, error, row.id)
+
+    def _decided(self, row: ProposalRow, state: str, by: str, note: str = "") -> None:
+        """Keep a decision, unless the journal was begun anew since and has no such proposal."""
+        kept = self._journal.proposal(row.id)
+        if kept is not None and kept.record == row.record:
+            self._journal.decide(row.id, self._events.now(), state, by, note)
+
     def _applied(self, row: ProposalRow, by: str, record: CalibrationRecord) -> None:
         """Keep and report that a proposal's record is current."""
         self._checking = (row.joint,)
@@ -198,7 +224,7 @@ class RecalibrationWorkflow:
         gain = "as before" if joint.gain is None else f"{joint.gain:.5f}"
         text = f"{row.joint}: record {record.id} in force: gain {gain}, offset {joint.offset or 0.0:.3f} N·m"
         evidence = {"proposal": row.id, "record": record.id, "replaces": row.base, "by": by, "applied": True}
-        self._journal.decide(row.id, self._events.now(), "applied", by)
+        self._decided(row, "applied", by)
         self._events.say("recalibration", row.joint, text, evidence)
 
     def restore(self) -> tuple[str, ...]:
@@ -261,7 +287,8 @@ class RecalibrationWorkflow:
     # ---- inside
 
     def tick(self) -> None:
-        """Go on with findings that waited for the journal or the record store."""
+        """Go on with outcomes and findings that waited for the journal or the record store."""
+        self._keep_outcomes()
         self._next()
 
     def _next(self) -> None:
