@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Callable
 from datetime import datetime
 
-from armlink.errors import ArmlinkError, Refused
+from armlink.errors import ArmlinkError, BusFault, Refused
 from calib.daemon.observing.observer_feed import Samples
 from calib.daemon.settings import Configuration
 from calib.daemon.state.arm_state import ArmState
@@ -50,6 +50,8 @@ class RecalibrationWorkflow:
         self._unkept: deque[Callable[[], None]] = deque()
         """Outcomes of writes that the journal did not take."""
         self._checking: tuple[str, ...] = ()
+        self._worse: Checked | None = None
+        """A write that made the readings worse and could not be taken back yet."""
         self._unexplained: deque[Samples] = deque(maxlen=WAITING)
 
     def begin(self, recalibrator: Recalibrator, installed: Installed) -> Finding | None:
@@ -61,6 +63,7 @@ class RecalibrationWorkflow:
         self._keep_outcomes()
         self._recalibrator, self._installed = recalibrator, installed
         self._waiting, self._checking, self._unexplained = [], (), deque(maxlen=WAITING)
+        self._worse = None
         current, last = recalibrator.record, None
         for row in self._journal.proposals():
             if row.record == current.id and row.state in ("applied", "approved"):
@@ -82,7 +85,7 @@ class RecalibrationWorkflow:
         policy = self._configuration.settings.policy
         if policy == "observe":
             return
-        if self._jobs.busy or self._journal.trouble or self._unkept:
+        if self._jobs.busy or self._journal.trouble or self._unkept or self._worse is not None:
             self._waiting.append(finding)
             return
         recalibrator, automatic = self._active(), policy == "apply"
@@ -177,6 +180,7 @@ class RecalibrationWorkflow:
                     return
             else:
                 self._installed(outcome, row.finding)
+                self._forget(joint)
                 self._keep(lambda: self._applied(row, by, outcome))
             self._next()
 
@@ -265,34 +269,50 @@ class RecalibrationWorkflow:
                 return
 
     def _checked(self, checked: Checked) -> None:
+        if checked.verdict == "worse":
+            self._take_back(checked)
+            return
         joint = self._names[checked.joint]
         why = checked.why.removeprefix(f"{joint}: ")
-        if checked.verdict == "kept":
-            self._events.say("check", joint, f"{joint}: recalibration holds: {why}", {"kept": True})
-            return
+        self._events.say("check", joint, f"{joint}: recalibration holds: {why}", {"kept": True})
+
+    def _take_back(self, checked: Checked) -> None:
+        """Roll the last write back; where store or bus fail, again later."""
+        joint, again, recalibrator = self._names[checked.joint], self._worse is not None, self._active()
+        self._worse = checked
 
         def done(outcome: Recalibration | ArmlinkError) -> None:
             if isinstance(outcome, ArmlinkError):
-                self._events.say("refused", joint, f"{joint}: roll-back failed: {outcome}", {})
+                if not isinstance(outcome, StoreFault | BusFault):
+                    self._worse = None
+                if not again or self._worse is None:
+                    self._events.say("refused", joint, f"{joint}: roll-back failed: {outcome}", {})
             else:
-                text = f"{joint}: rolled back to record {outcome.record.id}: {why}"
+                self._worse = None
+                self._forget(checked.joint)
+                text = f"{joint}: rolled back to record {outcome.record.id}: {checked.why.removeprefix(f'{joint}: ')}"
                 self._events.say("roll-back", joint, text, {"record": outcome.record.id, "why": checked.why})
                 if outcome.undo is not None:  # else a whole record: the service sees that another one is current
                     self._installed(outcome.record, outcome.undo)
             self._next()
 
-        recalibrator = self._active()
         self._jobs.start(lambda: recalibrator.undo(checked), done)
 
     # ---- inside
 
     def tick(self) -> None:
-        """Go on with outcomes and findings that waited for the journal or the record store."""
+        """Go on with outcomes, a roll-back and findings that waited for the journal or the record store."""
         self._keep_outcomes()
+        if self._worse is not None and self._arm_state.connected and not self._jobs.busy:
+            self._take_back(self._worse)
         self._next()
 
+    def _forget(self, joint: int) -> None:
+        """Another pair is in force for a joint: findings about it that wait are of the pair before."""
+        self._waiting = [finding for finding in self._waiting if finding.joint != joint]
+
     def _next(self) -> None:
-        if self._waiting and not self._jobs.busy and not self._journal.trouble:
+        if self._worse is None and self._waiting and not self._jobs.busy and not self._journal.trouble:
             self.found(self._waiting.pop(0))
 
     def _refused(self, finding: Finding, error: ArmlinkError, number: int | None = None) -> None:
