@@ -26,7 +26,8 @@ from collections import Counter
 from pathlib import Path
 
 TESTS = Path(__file__).parents[1]
-sys.path[:0] = [str(TESTS / "faults"), str(TESTS / "calib")]
+sys.path.insert(0, str(TESTS / "faults"))
+sys.path.insert(0, str(TESTS / "calib"))
 
 from daemon_bench import good_records
 from processes import ENABLED, SAFE, Ear, write_arm
