@@ -25,9 +25,8 @@ import time
 from collections import Counter
 from pathlib import Path
 
-TESTS = Path(__file__).parents[1]
-sys.path.insert(0, str(TESTS / "faults"))
-sys.path.insert(0, str(TESTS / "calib"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "faults"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "calib"))
 
 from daemon_bench import good_records
 from processes import ENABLED, SAFE, Ear, write_arm
