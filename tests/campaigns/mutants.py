@@ -65,7 +65,7 @@ EXPLAINED = {
 }
 """Part of a mutant's description → why no test can tell it from the original."""
 OPTIONS = ["-q", "-p", "no:cacheprovider", "-m", "not vcan and not slow"]
-SURVEY_SECONDS = 15.0
+SURVEY_SECONDS = 8.0
 """Processor time of the tests of a module, after which no further one is looked at [s]."""
 SECONDS = 120
 """A mutant that takes more processor time hangs [s], and is noticed by that."""
