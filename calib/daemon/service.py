@@ -181,7 +181,7 @@ class Service:
 
         def installed(record: CalibrationRecord, finding: Finding) -> None:
             feed.install(record, finding)
-            self.storage.save(feed, history=True)
+            self.journal.guard(lambda: self.storage.save(feed, history=True))
 
         self.storage.restore(feed, self.recalibrations.begin(recalibrator, installed))
         observation = Observation(feed, self.recalibrations, self.storage, self.events, self.jobs, self.tours.wish)
