@@ -57,6 +57,7 @@ stalls: .venv/.dev ## Long campaign outside make test: sweeps while job, loop an
 
 creep: .venv/.dev ## Long campaign outside make test: drawn arms without torque sensors (ARGS="--seeds 1 5 --no-steps")
 	$(BIN)/python tests/campaigns/creep_contacts.py
+	$(BIN)/python tests/campaigns/creep_float.py
 	$(BIN)/python tests/campaigns/creep_arms.py $(ARGS)
 
 creepwalk: .venv/.dev ## Long campaign outside make test: docs/no-torque-sensors.md typed in order, in real time, on the simulated OpenArm
