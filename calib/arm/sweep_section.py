@@ -80,7 +80,8 @@ class SweepSection(Section):
     gain_tolerance: Share = 0.15
     """Allowance for the error of the torque scale before calibration."""
     settle_window: Positive = 0.15
-    """Window over which velocity and torque scatter are judged [s]."""
+    """Window over which velocity and torque scatter are judged [s]; where it is not given and drives have kp and kd,
+    three of their slowest time constants."""
     settle_velocity: Positive = 0.001
     """Speed over the window below which a joint is at rest [rad/s]."""
     settle_scatter: Positive = 1.2

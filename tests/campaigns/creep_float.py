@@ -1,4 +1,4 @@
-"""Sag and drift of OpenArm before and after creep sweeps: nominal model against records, with a right and a wrong model.
+"""Sag and drift of OpenArm before and after creep sweeps: nominal model, right or wrong, against records.
 
     .venv/bin/python tests/campaigns/creep_float.py --seeds 0 2
 
@@ -18,7 +18,7 @@ from armlink.arm_file import ArmFile, load_arm
 from armlink.arrays import Array
 from armlink.errors import Refused
 from armlink.link.types import Command
-from calib.arm.kinematics import gcomp_arm
+from calib.arm.kinematics import gcomp_arm, model_arm
 from calib.creep.fit import fit_creep
 from calib.creep.plan import plan_creep
 from calib.creep.record import calibration_record
@@ -101,8 +101,6 @@ def run(seed: int, folder: Path, wrong: bool) -> bool:
         passes.append(run_creep(link, arm, folder / name, reference_mass=mass, plan=plan))
     fit = fit_creep(arm, passes)
     record = calibration_record(fit, arm)
-    from calib.arm.kinematics import model_arm
-
     before = measured(bench, plan, model_arm(believed).beta, np.zeros(link.n))
     install(admit(record, arm, store), store, link, by="campaign", reason="creep sweeps", check=None)
     after = measured(bench, plan, fit.beta, record.values("position_offset", 0.0))
