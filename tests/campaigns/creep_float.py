@@ -37,8 +37,6 @@ LEFT = 0.25
 """Largest share of the nominal model's sag and drift that may be left."""
 SECONDS = 1.0
 """For which a joint is released [s]."""
-LEAST = np.radians(0.05)
-"""Mean movement that counts as none [rad]: the sensors' noise."""
 
 
 def wrong_model(arm: ArmFile, folder: Path, seed: int) -> ArmFile:
