@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 export PYTHON
-CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host daemon_days daemon_kills fuzz_frames fuzz_drives fuzz_guard fault_injection systemd_units kill_drives two_hosts scales web
+CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host random_kills daemon_days daemon_kills fuzz_frames fuzz_drives fuzz_guard fault_injection systemd_units kill_drives two_hosts scales web
 
 .DEFAULT_GOAL := help
 .PHONY: moving fleetdays batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies pictures container lock audit sbom
@@ -57,9 +57,10 @@ stalls: .venv/.dev ## Long campaign outside make test: sweeps while job, loop an
 
 creep: .venv/.dev ## Long campaign outside make test: drawn arms without torque sensors (ARGS="--seeds 1 5 --no-steps")
 	$(BIN)/python tests/campaigns/creep_contacts.py
+	$(BIN)/python tests/campaigns/creep_float.py
 	$(BIN)/python tests/campaigns/creep_arms.py $(ARGS)
 
-creepwalk: .venv/.dev ## Long campaign outside make test: docs/no-torque-sensors.md typed in order, in real time, on the simulated OpenArm
+creepwalk: .venv/.dev ## Long campaign outside make test: the procedure of the demo openarm in real time over udp_multicast: docs/no-torque-sensors.md typed in order (ARGS="--out DIR")
 	$(BIN)/python tests/campaigns/creep_walk.py $(ARGS)
 
 realism: .venv/.dev ## Long campaign outside make test: sensor fits of realistic arms, good and bad (ARGS="--seeds 1 5 --full")
