@@ -248,6 +248,8 @@ class DamiaoDrives(BasicDrives):
 
     def fault(self, modes: Sequence[int], now: float) -> BusFault | None:
         """See Drives."""
+        if self.all_on():
+            return None
         lost = self.own_stop()
         return Stall(lost) if lost else super().fault(modes, now)
 
