@@ -5,6 +5,7 @@ import importlib
 import logging
 import math
 import signal
+import sys
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -32,6 +33,9 @@ AGAIN_SECONDS = 5.0
 """Time to the next attempt where the system gives no process [s]."""
 BEGIN_SECONDS = 30.0
 """Time for a new bus process to send its first message [s]."""
+SWITCH_SECONDS = 0.001
+"""A thread at work (reading history, say) lets the event loop go on after this time; Python's default is five times
+that, and an answer waits for it several times [s]."""
 log = logging.getLogger("armlink.daemon")
 
 
@@ -200,6 +204,8 @@ class _CurrentProcess:
 
 def run_daemon(options: Options, arm: ArmFile, state: Path, process: LoopProcess) -> None:
     """Run until a signal to stop, with a bus process already started; it has ended when this returns."""
+
+    sys.setswitchinterval(SWITCH_SECONDS)
 
     async def main() -> None:
         try:

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from armlink.link.types import Calibration
+from armlink.torque_calibration import TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
 from calib.observer.config import ObserverConfig
 from calib.observer.rest_detector import RestDetector
@@ -43,8 +43,8 @@ class AfterWrite:
         arm: ArmFile,
         gravity: GravityRecord,
         record: CalibrationRecord,
-        old: Mapping[int, Calibration],
-        new: Mapping[int, Calibration],
+        old: Mapping[int, TorqueCalibration[float]],
+        new: Mapping[int, TorqueCalibration[float]],
     ) -> None:
         """`old` and `new`: calibrations of the joints written, before and after. Raises Refused for another arm."""
         self._arm, self._beta = gcomp_arm(arm), np.array(gravity.require(arm).beta)

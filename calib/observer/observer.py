@@ -110,7 +110,8 @@ class Observer:
     def handle_row(self, row: StaticReading) -> list[Event]:
         """Take one row: the average over one stop, as the rest detector makes it."""
         row = replace(row, position=self._angle(row.position))
-        self._tracking.count(row)
+        if not self._tracking.count(row):
+            return []
         alarms = [] if self._investigation.held else self._tracking.watch(row)
         if alarms:
             told = [alarm for alarm in alarms if alarm[0] != "suspicion"]

@@ -127,8 +127,9 @@ class Recalibrator:
         recover(self._arm, self._store, self._controllers)
         old = require_installed(self.record, self._controllers, j)
         admitted = admit_drift(new, self._reference, j, self._arm)
+        check = self._check_of(new, {j: old})
         self._install(admitted, by, new.note, (j,))
-        self._watch(new, {j: old}, before=self.record.id)
+        self._installed(new, self.record.id, (j,), check)
 
     def restore(self) -> tuple[str, ...]:
         """Write the whole current record to controllers that hold something else; returns the joints written.
@@ -139,9 +140,10 @@ class Recalibrator:
         recover(self._arm, self._store, self._controllers)
         held = [self._controllers.read_calibration(j) for j in range(len(self.record.joints))]
         admitted = admit(self.record, self._arm, self._store, held=held)
+        check = self._check_of(self.record, dict(enumerate(held)))
         written = self._install(admitted, RESTORED_BY, "the controllers held another calibration")
         if admitted.before is not None:
-            self._watch(self.record, dict(enumerate(held)), before=admitted.before.id)
+            self._installed(self.record, admitted.before.id, tuple(range(len(held))), check)
         return written
 
     def sample(self, t: float, position: Array, torque: Array) -> Checked | None:
@@ -167,7 +169,7 @@ class Recalibrator:
         held = {joint: require_installed(self.record, self._controllers, joint) for joint in joints}
         admitted = admit_rollback(parent, self._arm, self._store, held)
         self._install(admitted, CHECKED_BY, checked.why, joints)
-        now = self._controllers.read_calibration(j)
+        now = parent.joints[j].torque_calibration(held[j])
         change = now.relative_to(held[j])
         undo = Finding(j, "drift", change.gain, change.offset, np.zeros((2, 2)), 0, 1.0)
         self.record, self._before, self._written, self._check = parent, parent.parent, (), None
@@ -181,13 +183,22 @@ class Recalibrator:
         """Write without a check: it is made at the rests that follow, by `sample`, since nothing here may move."""
         return install(admitted, self._store, self._controllers, by=by, reason=reason, joints=joints, check=None)
 
-    def _watch(self, record: CalibrationRecord, old: Mapping[int, Calibration], before: str) -> None:
-        """A record is installed: from now on check it against `old`, what its controllers held before."""
-        self.record, self._before, self._written = record, before, tuple(old)
+    def _check_of(self, record: CalibrationRecord, old: Mapping[int, Calibration]) -> AfterWrite | None:
+        """The check of a record against `old`, what the controllers hold before; None without a gravity record.
+
+        Made before the write: nothing that could fail comes after it.
+        """
         gravity = self._store.current(GravityRecord, self._arm)
-        if gravity is not None:
-            new = {j: self._controllers.read_calibration(j) for j in old}
-            self._check = AfterWrite(self._arm, gravity, record, old, new)
+        if gravity is None:
+            return None
+        new = {j: record.joints[j].torque_calibration(held) for j, held in old.items()}
+        return AfterWrite(self._arm, gravity, record, old, new)
+
+    def _installed(
+        self, record: CalibrationRecord, before: str, written: tuple[int, ...], check: AfterWrite | None
+    ) -> None:
+        """A record is in force, after the record of id `before`."""
+        self.record, self._before, self._written, self._check = record, before, written, check
 
     def _swept(self, record: CalibrationRecord) -> CalibrationRecord:
         """The last record of this line that the observer did not make: what drift is bounded against."""

@@ -16,17 +16,14 @@ from calib.records.schema import MIGRATIONS
 HEAD = MIGRATIONS[-1]
 BUSY_SECONDS = 10
 """Wait for another writer of an SQLite store [s]."""
-SILENT_SECONDS = 10
-"""A PostgreSQL server that answers nothing for this time has gone [s]."""
 _POSTGRESQL = {
     "connect_timeout": 5,
     "keepalives_idle": 5,
     "keepalives_interval": 2,
     "keepalives_count": 3,
-    "tcp_user_timeout": SILENT_SECONDS * 1000,
-    "options": f"-c statement_timeout={SILENT_SECONDS * 1000}",
+    "options": "-c statement_timeout=10000",
 }
-"""Of libpq: how long it waits before it takes a connection for lost."""
+"""Of libpq: how long it waits for a connection, and how long the server may work [s, s, s, –, ms]."""
 _VERSION = "alembic_version"
 _LOCK = 0x61726D6C
 """Advisory lock on PostgreSQL that serialises writers, as SQLite does by itself."""
@@ -53,6 +50,10 @@ def open_database(url: str) -> sa.Engine:
         engine = sa.create_engine(full, pool_pre_ping=True, connect_args=connect)
         if engine.dialect.name == "sqlite":
             _prepare_sqlite(engine)
+        elif connect:
+            from calib.records.hanging_server import give_up_when_silent  # psycopg is an extra
+
+            give_up_when_silent(engine)
         _migrate(engine)
     except (sa.exc.SQLAlchemyError, ImportError, OSError, ValueError) as error:
         raise BadInput(f"record store {_shown(full)}: cannot be opened: {first_line(error)}") from None

@@ -301,10 +301,15 @@ class FailingDaemon(FastDaemon):
     def lost(self) -> list[Any]:
         """Events that were said and are not in the journal.
 
-        One that belongs to a proposal which could not be kept is said again with the next one, of another record.
+        One that belongs to a proposal which could not be kept is said again with the next one, of another record; a
+        proposal itself may also give way to a newer one of its joint.
         """
-        kept = {(event.kind, event.joint, RECORD.sub("", event.text)) for event in self.view.events(limit=1_000_000)}
-        return sorted(map(str, {(kind, joint, RECORD.sub("", text)) for kind, joint, text in self.said} - kept))
+
+        def known_by(kind: str, joint: str | None, text: str) -> tuple[str, str | None, str]:
+            return kind, joint, "" if kind == "proposal" else RECORD.sub("", text)
+
+        kept = {known_by(event.kind, event.joint, event.text) for event in self.view.events(limit=1_000_000)}
+        return sorted(map(str, {known_by(*said) for said in self.said} - kept))
 
 
 def watched_drift(folder: Path, fails: Callable[[str, int], bool], patch: Any) -> FailingDaemon:

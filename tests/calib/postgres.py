@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import tempfile
@@ -45,11 +46,13 @@ def server() -> Iterator[str]:
 
 
 class Running(NamedTuple):
-    """A server that can be stopped and started under way."""
+    """A server that can be stopped and started under way, and that can hang: all its processes stand still."""
 
     url: str
     start: Callable[[], None]
     stop: Callable[[], None]
+    hang: Callable[[], None]
+    go_on: Callable[[], None]
 
 
 @contextmanager
@@ -71,11 +74,22 @@ def stoppable_server() -> Iterator[Running]:
         def stop() -> None:
             _run([*control, "-m", "immediate", "stop"], folder)
 
+        def signal_all(number: signal.Signals) -> None:
+            first = int((data / "postmaster.pid").read_text().splitlines()[0])
+            children = Path(f"/proc/{first}/task/{first}/children").read_text().split()
+            _run([*become, "kill", f"-{int(number)}", first, *children], folder)
+
+        def go_on() -> None:
+            signal_all(signal.SIGCONT)
+
         start()
         try:
-            yield Running(f"postgresql://armlink@127.0.0.1:{port}", start, stop)
+            yield Running(
+                f"postgresql://armlink@127.0.0.1:{port}", start, stop, lambda: signal_all(signal.SIGSTOP), go_on
+            )
         finally:
             if (data / "postmaster.pid").exists():
+                go_on()
                 stop()
 
 

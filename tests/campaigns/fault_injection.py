@@ -52,6 +52,8 @@ def hour(fails: Callable[[str, int], bool], minutes: float) -> tuple[FailingDaem
         names = daemon.arm.joint_names
         left = [names[j] for j in np.flatnonzero(off > RECALIBRATED) if said.get(names[j]) != "undecided"]
         wrong += [f"{name} is off by {off[names.index(name)]:.2f} N·m at the end" for name in left]
+        open_ones = [each.id for each in daemon.view.proposals() if each.state == "approved"]
+        wrong += [f"proposal {number} is left without an outcome" for number in open_ones]
         wrong += ["a write to a controller is left half done"] * (daemon.store.unfinished_write(daemon.arm) is not None)
         return daemon, wrong
 

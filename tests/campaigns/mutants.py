@@ -3,27 +3,33 @@
 python tests/campaigns/mutants.py [--only gate.py] [--list]
 python tests/campaigns/mutants.py --modules 'sim_gap/attribution/*.py' [--draw 500] [--seed 0]
 
-With --modules those of any modules, by the tests that mirror each: its own file, then the rest of its folder; --draw
-takes so many of them at random. Exit status 1 if a mutant survives that EXPLAINED does not name. A mutant that hangs
-counts as noticed.
+With --modules those of any modules, by the tests that mirror each: its own file, those that import it, else the rest of
+its folder; --draw takes so many of them at random. Of these tests run those that run the mutant's lines. Exit status 1
+if a mutant survives that EXPLAINED does not name. A mutant that hangs counts as noticed.
 
 Operators: comparisons, arithmetic, signs, and/or, not, conditions negated and fixed, numbers, empty texts, min/max,
 ceil/floor, round/int, abs left out, returned and assigned values replaced by None.
 """
 
 import argparse
-import ast
-import copy
+import contextlib
+import functools
+import importlib
 import importlib.abc
 import importlib.util
 import os
+import pickle
 import random
+import re
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from importlib.machinery import ModuleSpec
 from pathlib import Path
+from types import FrameType
+from typing import Any
 
 os.environ.update(PYTEST_DISABLE_PLUGIN_AUTOLOAD="1", OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
 import hypothesis.strategies  # noqa: F401  (here, so that the children need not)
@@ -31,6 +37,7 @@ import numpy  # noqa: F401
 import pydantic  # noqa: F401
 import pytest
 import yaml  # noqa: F401
+from mutations import Mutant, mutants
 
 sys.dont_write_bytecode = True
 
@@ -41,8 +48,6 @@ TARGETS = {
     "armlink/guard/bus_guard.py": ["tests/armlink/guard/test_bus_guard.py"],
     "armlink/drives/canopen/cia402.py": ["tests/armlink/drives/canopen/test_cia402.py"],
 }
-NEED_NO_CONFTEST = ("armlink/link/gate.py", "armlink/link/gate_limits.py", "armlink/drives/canopen/cia402.py")
-"""Targets whose tests start faster without."""
 PACKAGES = ("armlink", "calib", "gcomp", "sim_bus", "sim_gap")
 EXPLAINED = {
     "int becomes round": "a mode is a whole number, and round() of one is that number",
@@ -59,34 +64,11 @@ EXPLAINED = {
     "'return \"\"': returns None": "asked only whether it is true; the field of Passed has its own default",
 }
 """Part of a mutant's description → why no test can tell it from the original."""
-SLOW = "whoever_calls"
-"""Tests by this name run only on mutants that the others did not notice."""
+OPTIONS = ["-q", "-p", "no:cacheprovider", "-m", "not vcan and not slow"]
+SURVEY_SECONDS = 8.0
+"""Processor time of the tests of a module, after which no further one is looked at [s]."""
 SECONDS = 120
 """A mutant that takes more processor time hangs [s], and is noticed by that."""
-SWAPS: dict[type, tuple[type, ...]] = {
-    ast.Lt: (ast.LtE, ast.GtE),
-    ast.LtE: (ast.Lt, ast.Gt),
-    ast.Gt: (ast.GtE, ast.LtE),
-    ast.GtE: (ast.Gt, ast.Lt),
-    ast.Eq: (ast.NotEq,),
-    ast.NotEq: (ast.Eq,),
-    ast.In: (ast.NotIn,),
-    ast.NotIn: (ast.In,),
-    ast.Is: (ast.IsNot,),
-    ast.IsNot: (ast.Is,),
-    ast.Add: (ast.Sub,),
-    ast.Sub: (ast.Add,),
-    ast.Mult: (ast.Div,),
-    ast.Div: (ast.Mult,),
-    ast.Pow: (ast.Mult,),
-    ast.RShift: (ast.LShift,),
-    ast.LShift: (ast.RShift,),
-    ast.BitAnd: (ast.BitOr,),
-    ast.BitOr: (ast.BitAnd,),
-    ast.And: (ast.Or,),
-    ast.Or: (ast.And,),
-}
-CALLS = {"max": "min", "min": "max", "ceil": "floor", "floor": "ceil", "round": "int", "int": "round"}
 
 
 class Broken(Exception):
@@ -112,137 +94,156 @@ class Mutated(importlib.abc.MetaPathFinder, importlib.abc.SourceLoader):
         return self.source.encode()
 
 
-def edits(node: ast.AST) -> Iterator[tuple[str, Callable[[ast.AST], ast.AST]]]:
-    """What can be changed in one node: description and the change, which returns the node or another in its place."""
-
-    def put(field: str, value: object) -> Callable[[ast.AST], ast.AST]:
-        def change(target: ast.AST) -> ast.AST:
-            setattr(target, field, value)
-            return target
-
-        return change
-
-    if isinstance(node, ast.Compare):
-        for place, op in enumerate(node.ops):
-            for other in SWAPS.get(type(op), ()):
-                ops = [*node.ops[:place], other(), *node.ops[place + 1 :]]
-                yield f"{type(op).__name__} becomes {other.__name__}", put("ops", ops)
-    elif isinstance(node, ast.BinOp | ast.BoolOp):
-        for other in SWAPS.get(type(node.op), ()):
-            yield f"{type(node.op).__name__} becomes {other.__name__}", put("op", other())
-    elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.Not):
-        yield f"{type(node.op).__name__} left out", lambda target: target.operand  # type: ignore[attr-defined]
-    elif isinstance(node, ast.Constant) and isinstance(node.value, int | float) and not isinstance(node.value, bool):
-        yield f"{node.value} becomes {node.value + 1}", put("value", node.value + 1)
-    elif isinstance(node, ast.Constant) and node.value == "":
-        yield "empty text becomes another", put("value", "mutant")
-    elif isinstance(node, ast.Call):
-        name = node.func.id if isinstance(node.func, ast.Name) else getattr(node.func, "attr", "")
-        if name in CALLS:
-            field = "id" if isinstance(node.func, ast.Name) else "attr"
-            yield f"{name} becomes {CALLS[name]}", lambda t: setattr(t.func, field, CALLS[name]) or t  # type: ignore[attr-defined,func-returns-value]
-        if name == "abs":
-            yield "abs left out", lambda target: target.args[0]  # type: ignore[attr-defined]
-    elif isinstance(node, ast.If | ast.IfExp):
-        yield "condition negated", put("test", ast.UnaryOp(ast.Not(), node.test))
-        yield "condition always true", put("test", ast.Constant(True))
-        yield "condition always false", put("test", ast.Constant(False))
-    elif isinstance(node, ast.Return) and node.value is not None:
-        yield "returns None", put("value", ast.Constant(None))
-    elif isinstance(node, ast.Assign):
-        yield "assigns None", put("value", ast.Constant(None))
-
-
-class Changed(ast.NodeTransformer):
-    """Puts one change at one place."""
-
-    def __init__(self, place: int, change: Callable[[ast.AST], ast.AST]) -> None:
-        self.place, self.change, self.at = place, change, -1
-
-    def visit(self, node: ast.AST) -> ast.AST:
-        """Count nodes in the order of visit; change the one."""
-        self.at += 1
-        if self.at == self.place:
-            self.at += 10**6
-            return self.change(node)
-        return self.generic_visit(node)
-
-
-def ordered(tree: ast.AST) -> list[ast.AST]:
-    """Nodes in the order in which Changed visits them."""
-    seen: list[ast.AST] = []
-
-    class Seen(ast.NodeTransformer):
-        def visit(self, node: ast.AST) -> ast.AST:
-            seen.append(node)
-            return self.generic_visit(node)
-
-    Seen().visit(copy.deepcopy(tree))
-    return seen
-
-
-def mutants(path: Path) -> Iterator[tuple[str, str]]:
-    """(where and what, source) of every mutant of a module; docstrings and annotations stay."""
-    text = path.read_text(encoding="utf-8")
-    tree, lines = ast.parse(text), text.splitlines()
-    for place, node in enumerate(ordered(tree)):
-        for what, change in edits(node):
-            line = getattr(node, "lineno", 0)
-            mutated = Changed(place, change).visit(copy.deepcopy(tree))
-            source = ast.unparse(ast.fix_missing_locations(mutated))
-            if source != ast.unparse(tree):
-                yield f"{path.name}:{line}: {lines[line - 1].strip()!r}: {what}", source
-
-
 def noticed(target: str, source: str, tests: list[str]) -> bool:
-    """Whether the tests fail, or hang, on a mutant's source; each runs in a child of this process."""
+    """Whether the tests fail, or hang, on a mutant's source; they run in a child of this process."""
     child = os.fork()
     if child == 0:
         signal.setitimer(signal.ITIMER_PROF, SECONDS)
-        silent = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(silent, 1)
-        os.dup2(silent, 2)
+        _silence()
         name = target.removesuffix(".py").replace("/", ".")
         sys.meta_path.insert(0, Mutated(name, ROOT / target, source))
-        options = ["-x", "-q", "-p", "no:cacheprovider", "-m", "not vcan"]
-        options += ["--noconftest"] * (target in NEED_NO_CONFTEST) + tests
-        status = pytest.main([*options, "-k", f"not {SLOW}"]) or pytest.main([*options, "-k", SLOW])
+        status = pytest.main([*OPTIONS, "-x", *tests])
         os._exit(0 if status in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED) else 1)
     return os.waitpid(child, 0)[1] != 0
 
 
+class Survey:
+    """A pytest plugin: which tests run which lines of a module, and how long they take."""
+
+    def __init__(self, target: str) -> None:
+        self.file = str(ROOT / target)
+        self.lines: dict[str, set[int]] = {"": set()}
+        """Test → lines; those of the import by no test's name."""
+        self.seconds: dict[str, float] = {}
+        self._now = self.lines[""]
+
+    def trace(self, frame: FrameType, event: str, value: object) -> Callable[..., object] | None:
+        """For sys.settrace: of frames in the module, every line."""
+        if frame.f_code.co_filename != self.file:
+            return None
+        self._now.add(frame.f_lineno)
+        return self._line
+
+    def _line(self, frame: FrameType, event: str, value: object) -> Callable[..., object]:
+        self._now.add(frame.f_lineno)
+        return self._line
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
+        """Each test's own lines; no further test beyond the time for a survey."""
+        before, self._now = time.process_time(), self.lines.setdefault(item.nodeid, set())
+        sys.settrace(self.trace)
+        try:
+            return (yield)
+        finally:
+            self._now, self.seconds[item.nodeid] = self.lines[""], time.process_time() - before
+            if sum(self.seconds.values()) > SURVEY_SECONDS:
+                item.session.shouldstop = "enough"
+
+    def run(self, tests: list[str]) -> dict[str, Any]:
+        """In a child: what the tests run, and which foreign modules they load; raises Broken if one fails."""
+        ours, theirs = os.pipe()
+        child = os.fork()
+        if child == 0:
+            os.close(ours)
+            _silence()
+            sys.settrace(self.trace)
+            threading.settrace(self.trace)
+            status = pytest.main([*OPTIONS, *tests], plugins=[self])
+            sys.settrace(None)
+            foreign = [name for name in sys.modules if name.split(".")[0] not in (*PACKAGES, "__main__")]
+            ok = status in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED, pytest.ExitCode.INTERRUPTED)
+            with os.fdopen(theirs, "wb") as pipe:
+                pickle.dump({"ok": ok, "lines": self.lines, "seconds": self.seconds, "foreign": foreign}, pipe)
+            os._exit(0)
+        os.close(theirs)
+        with os.fdopen(ours, "rb") as pipe:
+            content = pipe.read()
+        os.waitpid(child, 0)
+        found: dict[str, Any] = pickle.loads(content)
+        if not found["ok"]:
+            raise Broken("its tests fail without a mutant")
+        for name in found["foreign"]:  # so that the children that follow need not
+            module = sys.modules.get(name) or _spec(name)
+            if module is not None and "site-packages" in str(getattr(module, "origin", "")):
+                with contextlib.suppress(Exception):
+                    importlib.import_module(name)
+        return found
+
+
+def _spec(name: str) -> ModuleSpec | None:
+    with contextlib.suppress(Exception):
+        return importlib.util.find_spec(name)
+    return None
+
+
+def _silence() -> None:
+    silent = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(silent, 1)
+    os.dup2(silent, 2)
+
+
+def tests_of(mutant: Mutant, found: dict[str, Any]) -> list[str]:
+    """The tests that run a mutant's lines, the quickest first; of what runs at the import, all that use the module."""
+    lines: dict[str, set[int]] = found["lines"]
+    tests = [test for test, run in lines.items() if test and run.intersection(mutant.lines)]
+    if not tests and lines[""].intersection(mutant.lines):
+        tests = [test for test, run in lines.items() if test and run] or [test for test in lines if test]
+    return sorted(tests, key=lambda test: found["seconds"].get(test, 0.0))
+
+
+def _parts(tests: list[str], files: list[str]) -> list[list[str]]:
+    """The tests of the first file that has any, which mostly notice; then the others."""
+    first = next((file for file in files if any(test.startswith(file + "::") for test in tests)), "")
+    parts = [[test for test in tests if test.startswith(first + "::") is mine] for mine in (True, False)]
+    return [part for part in parts if part]
+
+
 def mirrors(target: str) -> list[str]:
-    """Tests of a module: the file that mirrors it, and its folder's others after it; empty if there are none."""
-    folder = ROOT / "tests" / Path(target).parent
+    """Tests of a module: the file that mirrors it, those that import it, else the others of its folder."""
+    folder, name = ROOT / "tests" / Path(target).parent, target.removesuffix(".py").replace("/", ".")
+    package, _, last = name.rpartition(".")
+    imports = re.compile(rf"(from|import) {re.escape(name)}\b|from {re.escape(package)} import .*\b{last}\b")
     own = folder / f"test_{Path(target).name}"
-    others = sorted(path for path in folder.glob("test_*.py") if path != own)
-    return [str(path.relative_to(ROOT)) for path in ([own] if own.exists() else []) + others]
+    found = [own] if own.exists() else []
+    found += [path for path, text in texts().items() if path != own and imports.search(text)]
+    while not found and folder != ROOT / "tests":
+        found, folder = sorted(folder.glob("test_*.py")), folder.parent
+    return [str(path.relative_to(ROOT)) for path in found]
 
 
-def chosen(patterns: list[str], draw: int, seed: int) -> dict[str, list[tuple[str, str]]]:
-    """Module → its mutants, of the modules that match; `draw` of them all, 0 for every one."""
+@functools.cache
+def texts() -> dict[Path, str]:
+    """Every file of tests, those of the packages first."""
+    return {path: path.read_text(encoding="utf-8") for path in sorted(ROOT.glob("tests/*/**/test_*.py"))}
+
+
+def chosen(patterns: list[str], draw: int, first: int, seed: int) -> dict[str, list[Mutant]]:
+    """Module → its mutants, of the modules that match; `draw` of them all, 0 for every one, the `first` of those."""
     targets = [str(path.relative_to(ROOT)) for pattern in patterns for path in sorted(ROOT.glob(pattern))]
-    targets = [target for target in targets if target.split("/")[0] in PACKAGES and mirrors(target)]
+    targets = [target for target in targets if target.split("/")[0] in PACKAGES]
     pairs = [(target, mutant) for target in targets for mutant in mutants(ROOT / target)]
     if draw and draw < len(pairs):
-        pairs = sorted(random.Random(seed).sample(pairs, draw), key=lambda pair: targets.index(pair[0]))
-    found: dict[str, list[tuple[str, str]]] = {}
+        pairs = random.Random(seed).sample(pairs, draw)
+    pairs = sorted(pairs[: first or None], key=lambda pair: targets.index(pair[0]))
+    found: dict[str, list[Mutant]] = {}
     for target, mutant in pairs:
         found.setdefault(target, []).append(mutant)
     return found
 
 
-def judged(target: str, found: list[tuple[str, str]], tests: list[str]) -> tuple[int, int]:
+def judged(target: str, found: list[Mutant], tests: list[str]) -> tuple[int, int]:
     """How many mutants survive, and how many of them without an explanation; raises Broken."""
-    if noticed(target, (ROOT / target).read_text(encoding="utf-8"), tests):
-        raise Broken(f"{target}: its tests fail without a mutant")
+    seen = Survey(target).run(tests)
     alive = unexplained = 0
-    for what, source in found:
-        if noticed(target, source, tests):
+    for mutant in found:
+        by = tests_of(mutant, seen)
+        if any(noticed(target, mutant.source, part) for part in _parts(by, tests)):
             continue
-        why = next((why for part, why in EXPLAINED.items() if part in what), "")
+        why = next((why for part, why in EXPLAINED.items() if part in mutant.what), "")
         alive, unexplained = alive + 1, unexplained + (not why)
-        print(f"survives: {what}{f' (explained: {why})' if why else ''}", flush=True)
+        said = f" (explained: {why})" if why else "" if by else " (no test runs it)"
+        print(f"survives: {target}: {mutant.what}{said}", flush=True)
     print(f"{target}: {len(found)} mutants, {len(found) - alive} noticed, {alive} survive", flush=True)
     return alive, unexplained
 
@@ -254,31 +255,34 @@ def main() -> int:
     parser.add_argument("--list", action="store_true", help="say what the mutants are, and end")
     parser.add_argument("--modules", nargs="+", default=[], metavar="GLOB", help="modules, instead of the gate's")
     parser.add_argument("--draw", type=int, default=0, help="this many mutants of the modules, at random")
+    parser.add_argument("--first", type=int, default=0, help="the first of those drawn, in the order of the draw")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     os.chdir(ROOT)
     if given.modules:
-        work = [
-            (target, found, mirrors(target)) for target, found in chosen(given.modules, given.draw, given.seed).items()
-        ]
+        drawn = chosen(given.modules, given.draw, given.first, given.seed)
+        work = [(target, found, mirrors(target)) for target, found in drawn.items()]
     else:
         targets = {target: tests for target, tests in TARGETS.items() if given.only in ("", Path(target).name)}
         work = [(target, list(mutants(ROOT / target)), tests) for target, tests in targets.items()]
     if given.list:
-        print("\n".join(what for _, found, _ in work for what, _ in found))
+        print("\n".join(f"{target}: {each.what}" for target, found, _ in work for each in found))
         return 0
-    survivors = unexplained = total = 0
+    survivors = unexplained = total = left_out = 0
     start = time.monotonic()
     for target, found, tests in work:
         try:
             alive, unknown = judged(target, found, tests)
         except Broken as broken:
-            print(broken)
-            return 1
+            print(f"{target}: {broken}", flush=True)
+            left_out += len(found)
+            continue
         survivors, unexplained, total = survivors + alive, unexplained + unknown, total + len(found)
     took = time.monotonic() - start
     print(f"{total} mutants, {survivors} survive, {unexplained} of them unexplained; {took:.0f} s")
-    return int(unexplained > 0)
+    if left_out:
+        print(f"{left_out} more not judged: their tests fail without a mutant")
+    return int(unexplained + left_out > 0)
 
 
 if __name__ == "__main__":

@@ -17,14 +17,19 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from web import counters, cpu_seconds, free_port, listen, start
+from web import counters, cpu_seconds, free_port, start
+
+from armlink.arm_file import load_arm
+from calib.daemon.state.journal import Journal
 
 STREAMS, READERS, STRANGERS = 50, 10, 500
 REQUESTS, WORKERS = 100.0, 20
 """Requests a second, on this many connections."""
+DAYS = 30
 P99, GROWTH = 0.1, 50e6
 """Bounds: of a local answer [s], of the memory [bytes]."""
 AGAIN = 10.0
@@ -33,6 +38,7 @@ SPREAD = 3.0
 """Standard deviations by which a count of late cycles may exceed what it was without clients."""
 PATHS = ("/api/status", "/api/joints", "/api/estimates", "/api/events?limit=20", "/api/proposals", "/metrics")
 """Answers with history in them are long: of those 16 are under way at once, and the next client gets 429."""
+ITEM = b"event: joints"
 LONG = "/api/history?limit=20000"
 
 
@@ -51,8 +57,8 @@ def memory(process: int) -> float:
     return total
 
 
-async def ask(socket: Path, end: float, took: list[float], answers: Counter[object]) -> None:
-    """Requests in their turn until the end, each at its time; how long each answer took since it was due [s]."""
+async def ask(socket: Path, end: float, took: list[tuple[float, float]], answers: Counter[str]) -> None:
+    """Requests in their turn until the end, each at its time; how long each took since it was due, and was sent [s]."""
     every, number = WORKERS / REQUESTS, 0
     due, reader, writer = time.monotonic(), None, None
     while (due := due + every) < end:
@@ -62,6 +68,7 @@ async def ask(socket: Path, end: float, took: list[float], answers: Counter[obje
         while True:
             if reader is None or writer is None:
                 reader, writer = await asyncio.open_unix_connection(str(socket))
+            sent = time.monotonic()
             try:
                 writer.write(request(path))
                 status = await answered(reader)
@@ -70,10 +77,33 @@ async def ask(socket: Path, end: float, took: list[float], answers: Counter[obje
                 writer.transport.abort()
                 reader, writer = None, None
                 answers["again"] += 1
-        answers[status if status == 200 else f"{status} {path}"] += 1
-        took.append(time.monotonic() - due)
+        answers["200" if status == 200 else f"{status} {path}"] += 1
+        took.append((time.monotonic() - due, time.monotonic() - sent))
     if writer is not None:
         writer.close()
+
+
+def ask_all(socket: Path, seconds: float) -> dict[str, Any]:
+    """All requests, in a process that does nothing else; what the answers took."""
+    took, answers = list[tuple[float, float]](), Counter[str]()
+
+    async def run() -> None:
+        end = time.monotonic() + seconds
+        await asyncio.gather(*(ask(socket, end, took, answers) for _ in range(WORKERS)))
+
+    spent = time.process_time()
+    asyncio.run(run())
+    due, sent = sorted(each for each, _ in took), sorted(each for _, each in took)
+    middle, last = len(took) // 2, int(0.99 * len(took))
+    return {
+        "requests": len(took),
+        "answers": dict(answers),
+        "median_ms": 1e3 * due[middle],
+        "p99_ms": 1e3 * due[last],
+        "worst_ms": 1e3 * due[-1],
+        "p99_since_sent_ms": 1e3 * sent[last],
+        "client_cpu_share": (time.process_time() - spent) / seconds,
+    }
 
 
 async def answered(reader: asyncio.StreamReader) -> int:
@@ -119,32 +149,53 @@ async def idle(port: int, end: float, cut: Counter[str]) -> None:
         await asyncio.sleep(min(AGAIN, max(0.0, end - time.monotonic())))
 
 
+async def stream(socket: Path, end: float) -> int:
+    """A client of the stream; how many joints items it got."""
+    reader, writer = await asyncio.open_unix_connection(str(socket), limit=1 << 20)
+    writer.write(request("/api/stream"))
+    count, rest = 0, b""
+    with contextlib.suppress(TimeoutError):
+        while content := await asyncio.wait_for(reader.read(1 << 16), max(0.0, end - time.monotonic())):
+            content = rest + content
+            count += content.count(ITEM)
+            rest = content[-len(ITEM) + 1 :]
+    writer.close()
+    return count
+
+
 async def crowd(folder: Path, port: int, seconds: float, process: int) -> dict[str, Any]:
     """Everybody at once for so long."""
     socket, end = folder / "api.sock", time.monotonic() + seconds
-    took, answers, cut, grown = list[float](), Counter[object](), Counter[str](), [memory(process)]
+    cut, grown = Counter[str](), [memory(process)]
 
     async def weigh() -> None:
         while time.monotonic() < end:
             grown.append(memory(process))
             await asyncio.sleep(1.0)
 
-    streams = listen(folder, STREAMS, seconds)
-    others = [ask(socket, end, took, answers) for _ in range(WORKERS)]
-    others += [never_read(socket, end, cut) for _ in range(READERS)]
+    command = [sys.executable, __file__, "--ask", str(socket), "--seconds", str(seconds)]
+    asking = await asyncio.create_subprocess_exec(*command, stdout=asyncio.subprocess.PIPE)
+    others = [never_read(socket, end, cut) for _ in range(READERS)]
     others += [idle(port, end, cut) for _ in range(STRANGERS)]
-    items, *_ = await asyncio.gather(streams, weigh(), *others)
-    took.sort()
+    streams = asyncio.gather(*(stream(socket, end) for _ in range(STREAMS)))
+    items, (said, _), *_ = await asyncio.gather(streams, asking.communicate(), weigh(), *others)
     return {
-        "requests": len(took),
-        "answers": dict(answers),
-        "median_ms": 1e3 * took[len(took) // 2],
-        "p99_ms": 1e3 * took[int(0.99 * len(took))],
-        "worst_ms": 1e3 * took[-1],
+        **json.loads(said),
         "stream_items_least": min(items),
         "cut": dict(cut),
         "memory_mb": [round(each / 1e6, 1) for each in (grown[0], max(grown), grown[-1])],
     }
+
+
+def month_of_history(folder: Path) -> None:
+    """What a daemon has after 30 days: long answers for those that do not read."""
+    values = [1.0] * len(load_arm("sarcos").joint_names)
+    estimate = dict.fromkeys(("gain", "gain_std", "offset", "offset_std"), values)
+    journal, now = Journal(folder / "journal.db"), datetime.now(UTC)
+    with journal.transaction():
+        for minute in range(DAYS * 1440):
+            journal.add_history(now - timedelta(minutes=DAYS * 1440 - minute), 60.0 * minute, None, estimate)
+    journal.close()
 
 
 def counted(folder: Path, process: int, work: Any) -> dict[str, Any]:
@@ -163,17 +214,36 @@ def beyond(alone: dict[str, Any], busy: dict[str, Any], key: str) -> bool:
     return bool(busy[key] > expected + SPREAD * (expected + alone[key] + 1.0) ** 0.5)
 
 
+def told(alone: dict[str, Any], busy: dict[str, Any]) -> None:
+    """All of it in one paragraph."""
+    first, most, last = busy["memory_mb"]
+    print(
+        f"{STREAMS} streams, {REQUESTS:g} requests/s, {READERS} readers that never read, {STRANGERS} idle strangers, "
+        f"{busy['seconds']:.0f} s: {busy['late']} late and {busy['missed']} lost cycles, {alone['late']} and "
+        f"{alone['missed']} in {alone['seconds']:.0f} s without; {busy['requests']} answers, median "
+        f"{busy['median_ms']:.1f} ms, p99 {busy['p99_ms']:.1f} ms ({busy['p99_since_sent_ms']:.1f} ms since sent), "
+        f"worst {busy['worst_ms']:.0f} ms; memory {first:g} MB, {most:g} at most, {last:g} at the end; the daemon used "
+        f"{busy['cpu_share']:.2f} of a processor, {alone['cpu_share']:.2f} without, the client that asks "
+        f"{busy['client_cpu_share']:.2f}."
+    )
+
+
 def main() -> int:
-    """Run it all and print one JSON object."""
+    """Run it all; print one JSON object and one paragraph."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--arm", default="sarcos")
     parser.add_argument("--bus", default="armlink_sim:sarcos")
     parser.add_argument("--seconds", type=float, default=600.0)
     parser.add_argument("--alone", type=float, default=120.0)
+    parser.add_argument("--ask", type=Path, metavar="SOCKET", help="only the requests; their times as JSON")
     given = parser.parse_args()
+    if given.ask:
+        print(json.dumps(ask_all(given.ask, given.seconds)))
+        return 0
     resource.setrlimit(resource.RLIMIT_NOFILE, (4096, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
     with tempfile.TemporaryDirectory() as name:
         folder, port = Path(name), free_port()
+        month_of_history(folder)
         daemon = start(given.arm, given.bus, folder, port)
         try:
             time.sleep(10.0)
@@ -186,7 +256,8 @@ def main() -> int:
     first, most, _ = busy["memory_mb"]
     wrong = [key for key in ("missed", "late", "errors") if beyond(alone, busy, key)]
     wrong += ["p99"] * (busy["p99_ms"] > 1e3 * P99) + ["memory"] * ((most - first) * 1e6 > GROWTH)
-    wrong += ["answers"] * (not set(busy["answers"]) <= {200, "again"})
+    wrong += ["answers"] * (not set(busy["answers"]) <= {"200", "again"})
+    told(alone, busy)
     print("out of bounds:", ", ".join(wrong) or "nothing", file=sys.stderr)
     return int(bool(wrong))
 

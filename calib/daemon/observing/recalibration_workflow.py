@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Callable
 from datetime import datetime
 
-from armlink.errors import ArmlinkError, Refused
+from armlink.errors import ArmlinkError, BusFault, Refused
 from calib.daemon.observing.observer_feed import Samples
 from calib.daemon.settings import Configuration
 from calib.daemon.state.arm_state import ArmState
@@ -47,17 +47,23 @@ class RecalibrationWorkflow:
         self._recalibrator: Recalibrator | None = None
         self._installed: Installed = lambda record, finding: None
         self._waiting: list[Finding] = []
+        self._unkept: deque[Callable[[], None]] = deque()
+        """Outcomes of writes that the journal did not take."""
         self._checking: tuple[str, ...] = ()
+        self._worse: Checked | None = None
+        """A write that made the readings worse and could not be taken back yet."""
         self._unexplained: deque[Samples] = deque(maxlen=WAITING)
 
     def begin(self, recalibrator: Recalibrator, installed: Installed) -> Finding | None:
         """Follow other records from now on; approvals that a kill interrupted are closed.
 
         `installed` is called with each record that becomes current, once its finding is written. Returns the finding
-        that led to the record now in force, if one did.
+        that led to the record now in force, if one did. Raises sqlite3.Error if the disk fails.
         """
+        self._keep_outcomes()
         self._recalibrator, self._installed = recalibrator, installed
         self._waiting, self._checking, self._unexplained = [], (), deque(maxlen=WAITING)
+        self._worse = None
         current, last = recalibrator.record, None
         for row in self._journal.proposals():
             if row.record == current.id and row.state in ("applied", "approved"):
@@ -79,7 +85,7 @@ class RecalibrationWorkflow:
         policy = self._configuration.settings.policy
         if policy == "observe":
             return
-        if self._jobs.busy or self._journal.trouble:
+        if self._jobs.busy or self._journal.trouble or self._unkept or self._worse is not None:
             self._waiting.append(finding)
             return
         recalibrator, automatic = self._active(), policy == "apply"
@@ -146,6 +152,7 @@ class RecalibrationWorkflow:
 
     def _write(self, row: ProposalRow, by: str) -> None:
         recalibrator, number = self._active(), row.id
+        self._keep_outcomes()
         _require_pending(row)
         if self._jobs.busy:
             raise NotPossible("another recalibration is under way: try again in a moment")
@@ -165,16 +172,16 @@ class RecalibrationWorkflow:
 
         def done(outcome: CalibrationRecord | ArmlinkError) -> None:
             if isinstance(outcome, ArmlinkError):
-                with self._journal.transaction():
-                    self._journal.decide(number, self._events.now(), "failed", "daemon", str(outcome))
-                    self._refused(row.finding, outcome, number)
-                if isinstance(outcome, StoreFault) and by == APPLIED_BY:
-                    self._waiting.append(row.finding)  # to be proposed again once the store answers
+                again = isinstance(outcome, StoreFault) and by == APPLIED_BY
+                if again:
+                    self._waiting.append(row.finding)  # to be proposed once the store answers
+                self._keep(lambda: self._failed(row, outcome))
+                if again:
                     return
             else:
-                with self._journal.transaction():
-                    self._applied(row, by, outcome)
-                    self._installed(outcome, row.finding)
+                self._installed(outcome, row.finding)
+                self._forget(joint)
+                self._keep(lambda: self._applied(row, by, outcome))
             self._next()
 
         self._jobs.start(work, done)
@@ -191,6 +198,29 @@ class RecalibrationWorkflow:
 
     # ---- after a write
 
+    def _keep(self, outcome: Callable[[], None]) -> None:
+        """Journal what came of a write now, or as soon as the journal can be written: no proposal stays open."""
+        self._unkept.append(outcome)
+        self._keep_outcomes()
+
+    def _keep_outcomes(self) -> None:
+        """Journal the outcomes that wait, in their order; raises sqlite3.Error if the disk still fails."""
+        while self._unkept:
+            with self._journal.transaction():
+                self._unkept[0]()
+            self._unkept.popleft()
+
+    def _failed(self, row: ProposalRow, error: ArmlinkError) -> None:
+        """Keep and report that a proposal's record could not be written."""
+        self._decided(row, "failed", "daemon", str(error))
+        self._refused(row.finding, error, row.id)
+
+    def _decided(self, row: ProposalRow, state: str, by: str, note: str = "") -> None:
+        """Keep a decision, unless the journal was begun anew since and has no such proposal."""
+        kept = self._journal.proposal(row.id)
+        if kept is not None and kept.record == row.record:
+            self._journal.decide(row.id, self._events.now(), state, by, note)
+
     def _applied(self, row: ProposalRow, by: str, record: CalibrationRecord) -> None:
         """Keep and report that a proposal's record is current."""
         self._checking = (row.joint,)
@@ -198,7 +228,7 @@ class RecalibrationWorkflow:
         gain = "as before" if joint.gain is None else f"{joint.gain:.5f}"
         text = f"{row.joint}: record {record.id} in force: gain {gain}, offset {joint.offset or 0.0:.3f} N·m"
         evidence = {"proposal": row.id, "record": record.id, "replaces": row.base, "by": by, "applied": True}
-        self._journal.decide(row.id, self._events.now(), "applied", by)
+        self._decided(row, "applied", by)
         self._events.say("recalibration", row.joint, text, evidence)
 
     def restore(self) -> tuple[str, ...]:
@@ -239,33 +269,50 @@ class RecalibrationWorkflow:
                 return
 
     def _checked(self, checked: Checked) -> None:
+        if checked.verdict == "worse":
+            self._take_back(checked)
+            return
         joint = self._names[checked.joint]
         why = checked.why.removeprefix(f"{joint}: ")
-        if checked.verdict == "kept":
-            self._events.say("check", joint, f"{joint}: recalibration holds: {why}", {"kept": True})
-            return
+        self._events.say("check", joint, f"{joint}: recalibration holds: {why}", {"kept": True})
+
+    def _take_back(self, checked: Checked) -> None:
+        """Roll the last write back; where store or bus fail, again later."""
+        joint, again, recalibrator = self._names[checked.joint], self._worse is not None, self._active()
+        self._worse = checked
 
         def done(outcome: Recalibration | ArmlinkError) -> None:
             if isinstance(outcome, ArmlinkError):
-                self._events.say("refused", joint, f"{joint}: roll-back failed: {outcome}", {})
+                if not isinstance(outcome, StoreFault | BusFault):
+                    self._worse = None
+                if not again or self._worse is None:
+                    self._events.say("refused", joint, f"{joint}: roll-back failed: {outcome}", {})
             else:
-                text = f"{joint}: rolled back to record {outcome.record.id}: {why}"
+                self._worse = None
+                self._forget(checked.joint)
+                text = f"{joint}: rolled back to record {outcome.record.id}: {checked.why.removeprefix(f'{joint}: ')}"
                 self._events.say("roll-back", joint, text, {"record": outcome.record.id, "why": checked.why})
                 if outcome.undo is not None:  # else a whole record: the service sees that another one is current
                     self._installed(outcome.record, outcome.undo)
             self._next()
 
-        recalibrator = self._active()
         self._jobs.start(lambda: recalibrator.undo(checked), done)
 
     # ---- inside
 
     def tick(self) -> None:
-        """Go on with findings that waited for the journal or the record store."""
+        """Go on with outcomes, a roll-back and findings that waited for the journal or the record store."""
+        self._keep_outcomes()
+        if self._worse is not None and self._arm_state.connected and not self._jobs.busy:
+            self._take_back(self._worse)
         self._next()
 
+    def _forget(self, joint: int) -> None:
+        """Another pair is in force for a joint: findings about it that wait are of the pair before."""
+        self._waiting = [finding for finding in self._waiting if finding.joint != joint]
+
     def _next(self) -> None:
-        if self._waiting and not self._jobs.busy and not self._journal.trouble:
+        if self._worse is None and self._waiting and not self._jobs.busy and not self._journal.trouble:
             self.found(self._waiting.pop(0))
 
     def _refused(self, finding: Finding, error: ArmlinkError, number: int | None = None) -> None:

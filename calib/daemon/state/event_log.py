@@ -83,7 +83,8 @@ class EventLog:
 
     def _keep(self, said: Said) -> None:
         number = self._journal.add_event(*said)
-        self._hub.publish(EventItem(event=EventRecord(id=number, **said._asdict())))
+        item = EventItem(event=EventRecord(id=number, **said._asdict()))
+        self._journal.once_kept(lambda: self._hub.publish(item))
 
     def tick(self) -> None:
         """Keep what waits, and report that the wall clock, which dates the events, was set."""

@@ -70,6 +70,7 @@ class Journal:
         self.path, self._monotonic = path, monotonic
         self._failed_at = -float("inf")
         self._last_event = self._pending = 0
+        self._after_commit: list[Callable[[], object]] = []
         self.trouble = ""
         """Why nothing can be written, in one line; empty while it can."""
         self.set_aside = ""
@@ -148,12 +149,23 @@ class Journal:
             yield
             self._db.execute("COMMIT")
         except BaseException as error:
+            self._after_commit.clear()
             with suppress(sqlite3.Error):
                 self._db.rollback()
             if isinstance(error, sqlite3.Error):
                 self.failed(error)
             raise
         self.trouble = ""
+        acts, self._after_commit = self._after_commit, []
+        for act in acts:
+            act()
+
+    def once_kept(self, act: Callable[[], object]) -> None:
+        """Call `act` once what is written now is on disk: at once, or at the end of the transaction; else never."""
+        if self.in_transaction:
+            self._after_commit.append(act)
+        else:
+            act()
 
     @property
     def in_transaction(self) -> bool:

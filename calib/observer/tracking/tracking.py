@@ -27,6 +27,9 @@ DOUBT = 4.0
 """An alarm is one at once if its log-likelihood ratio is this many times larger than needed, where the model's error is
 all there is beside it; else it is first confirmed."""
 
+STEADY, CHANCE = 8.0, 3.0
+"""The two halves of a rest's average may differ by this many standard deviations of it, and do by chance at most."""
+
 
 class Tracking:
     """The gravity model as it is believed, and every joint's sensor against it. Rows have true-angle positions."""
@@ -44,12 +47,21 @@ class Tracking:
         """Rows for which there has been a suspicion: it may yet become an alarm."""
         self._since: deque[tuple[StaticReading, bool]] = deque(maxlen=config.window)
 
-    def count(self, row: StaticReading) -> None:
-        """Count a row, and average its measured noise into sigma."""
-        self.rows += 1
-        if np.isfinite(row.torque_error).all():
-            weight = 1 / min(self.rows + self._config.noise_rows, self._config.noise_memory)
-            self.sigma = np.sqrt((1 - weight) * self.sigma**2 + weight * row.torque_error**2)
+    def count(self, row: StaticReading) -> bool:
+        """Count a row, and average its measured noise into sigma; False if its torque was not steady.
+
+        Such a row is not of a rest: a motion begins in it, or a load changes. Sigma grows by what it may at most have
+        been by chance, so that rows of an arm that has become noisier count again after a while.
+        """
+        if not np.isfinite(row.torque_error).all():
+            self.rows += 1
+            return True
+        steady = bool((row.torque_error <= STEADY * self.sigma).all())
+        self.rows += steady
+        error = np.minimum(row.torque_error, CHANCE * self.sigma)
+        weight = 1 / min(self.rows + self._config.noise_rows, self._config.noise_memory)
+        self.sigma = np.sqrt((1 - weight) * self.sigma**2 + weight * error**2)
+        return steady
 
     def watch(self, row: StaticReading) -> list[Alarm]:
         """Take a row while no alarm is open: update the filter unless the row raises an alarm."""

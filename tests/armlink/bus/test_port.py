@@ -1,8 +1,11 @@
 """Ports: CAN FD frames, several buses as one, and what a SocketCAN socket does when its queues are full."""
 
+import contextlib
 import errno
 import socket
 import struct
+import threading
+import time
 
 import can
 import pytest
@@ -47,6 +50,32 @@ def test_frames_go_out_and_in_in_order(pair):
         pair.other.send(raw(0x180 + i, bytes([i] * i)))
     assert [port.receive(0.0) for _ in range(9)] == [(0x180 + i, bytes([i] * i)) for i in range(9)]
     assert port.receive(0.0) is None
+
+
+def test_more_frames_than_a_batch_all_leave_in_order(pair):
+    """As the two frames a cycle of 63 joints do."""
+    frames = [(0x100 + i, bytes([i])) for i in range(2 * BATCH + 5)]
+    pair.other.setblocking(False)
+    sent = []
+
+    def drain():
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                sent.append(pair.other.recv(100))
+
+    pair.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
+    port = SocketPort(pair.socket, "pair")
+
+    def take_all():
+        while len(sent) < len(frames):
+            drain()
+            time.sleep(1e-3)
+
+    reader = threading.Thread(target=take_all, daemon=True)
+    reader.start()
+    port.send_all(frames)
+    reader.join(30)
+    assert sent == [raw(can_id, data) for can_id, data in frames]
 
 
 def test_more_frames_than_a_batch_are_all_taken(pair):

@@ -9,12 +9,13 @@ from failing_calls import DEPENDENCIES, events, watched_drift
 from fast_daemon import QUIET, FastDaemon
 from postgres import NoServer, stoppable_server
 
-from armlink.errors import BadInput
+from armlink.errors import BadInput, BusFault
 from calib.daemon.settings import DaemonSection
 from calib.daemon.state.journal import Journal
-from calib.daemon.view.api_models import State
+from calib.daemon.view.api_models import EventItem, State
 from calib.daemon.web.metrics import metrics_text
 from calib.daemon.web.stream import Streams
+from calib.records.records import CalibrationRecord
 
 
 def settings(policy: str = "propose") -> DaemonSection:
@@ -252,3 +253,73 @@ def test_a_journal_that_is_no_database_is_set_aside(tmp_path: Path) -> None:
     journal = Journal(tmp_path / "journal.db", lambda: 0.0)
     assert journal.set_aside.startswith("journal.db.damaged-")
     assert journal.events() == []
+
+
+# ---- store, bus and journal at once
+
+
+def drifted(folder: Path) -> FastDaemon:
+    """Joint 3 has drifted, and its recalibration waits for an approval."""
+    daemon = FastDaemon(folder, 1, settings())
+    daemon.run(40)
+    daemon.fast.gain[2] *= 1.03
+    daemon.fast.offset[2] += 0.3
+    daemon.run(80)
+    return daemon
+
+
+@pytest.mark.parametrize(("bus", "state"), [("fails too", "failed"), ("works", "applied")])
+def test_a_write_whose_outcome_the_journal_does_not_take_is_kept_later(tmp_path: Path, bus: str, state: str) -> None:
+    daemon = drifted(tmp_path)
+    streamed = daemon.service.hub.subscribe()
+    real = daemon.service.journal._db
+
+    class NoCommit:
+        def execute(self, statement: str, *values: object) -> object:
+            if statement == "COMMIT":
+                raise sqlite3.OperationalError("disk is full")
+            return real.execute(statement, *values)
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(real, name)
+
+    def written(joint: int) -> None:
+        daemon.service.journal._db = NoCommit()  # type: ignore[assignment]
+        if bus == "fails too":
+            raise BusFault("joint gone")
+
+    daemon.on_write = written
+    daemon.view.decisions.approve(1, "ann")
+    daemon.run(7)  # a look at the record store lies within
+    daemon.service.journal._db = real
+    assert daemon.view.proposals()[0].state == "approved"
+    assert "disk is full" in daemon.view.status().detail
+    kind = {"failed": "fault", "applied": "recalibration"}[state]
+    assert kind not in [item.event.kind for item in streamed._items if isinstance(item, EventItem)]
+    daemon.run(3)
+    assert daemon.view.proposals()[0].state == state
+    assert len(daemon.of_kind(kind)) == 1
+    assert [item.event.kind for item in streamed._items if isinstance(item, EventItem)].count(kind) == 1
+    assert daemon.view.status().detail == ""
+    current = daemon.store.current(CalibrationRecord, daemon.arm)
+    assert current is not None
+    assert daemon.view.status().records.calibration == current.id
+    daemon.on_write = lambda joint: None
+    daemon.run(60)
+    found_again = {"failed": 1, "applied": 0}[state]
+    assert len(daemon.view.proposals()) == 1 + found_again
+
+
+def test_an_outcome_that_waited_for_a_journal_that_was_begun_anew_is_said_and_holds_nothing_up(tmp_path: Path) -> None:
+    daemon = drifted(tmp_path)
+
+    def written(joint: int) -> None:
+        daemon.service.journal._db.execute("PRAGMA query_only=ON")
+
+    daemon.on_write = written
+    daemon.view.decisions.approve(1, "ann")
+    daemon.service.journal.failed(sqlite3.DatabaseError("database disk image is malformed"))
+    daemon.run(5)
+    assert daemon.view.status().detail == ""
+    assert daemon.view.proposals() == ()
+    assert [event.joint for event in daemon.of_kind("recalibration")] == ["joint_3"]

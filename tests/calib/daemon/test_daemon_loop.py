@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import threading
 import time
 from collections import deque
@@ -19,12 +20,13 @@ from armlink.bus.open import open_link_bus
 from armlink.errors import BadInput, BusFault
 from armlink.link.link import Link
 from armlink.link.listener import Listener
-from armlink.link.types import Calibration, Command
+from armlink.link.types import Calibration, Command, Stats
+from armlink.loop.channel import Channel
 from armlink.loop.messages import Answer, Call
 from calib.arm.kinematics import gcomp_arm
 from calib.daemon.loop.arm_loop import ArmLoop
-from calib.daemon.loop.loop_messages import Batch, Down, LoopOptions, Up
-from calib.daemon.loop.loop_process import LoopProcess
+from calib.daemon.loop.loop_messages import CHANNELS, Batch, Down, LoopOptions, Message, Up
+from calib.daemon.loop.loop_process import BATCHES, LoopProcess
 from calib.daemon.settings import DaemonSection
 from calib.daemon.view.api_models import State
 from calib.motion.random_work import work_targets
@@ -63,6 +65,27 @@ def test_a_fault_of_a_joint_is_a_message_and_the_bus_is_opened_again(tmp_path: P
     assert isinstance(reply[0], Down)
     bench.run(1)
     assert bench.view.status().state is State.OBSERVING
+
+
+def test_no_state_is_lost_at_20_joints_and_1_khz_whatever_the_service_does(tmp_path: Path) -> None:
+    """A minute of samples that the service does not read, between states: they arrive, and the newest samples do."""
+    ours, theirs = socket.socketpair()
+    loop, service, n = Channel(theirs, BATCHES), Channel(ours), 20
+    channels = {name: np.zeros((100, n)) for name in CHANNELS}
+    for tenth in range(600):
+        batch = Batch(tenth / 10 + np.arange(100) * 1e-3, channels, np.zeros(n, dtype=int), np.zeros(n), Stats())
+        loop.put(batch, sample=True)
+        if tenth in (100, 300):
+            loop.put(Down("gone") if tenth == 100 else Up(None))
+        loop.flush()
+    heard: list[Message] = []
+    while not loop.flush():
+        heard += service.receive()
+    heard += service.receive()
+    assert [type(message) for message in heard if not isinstance(message, Batch)] == [Down, Up]
+    assert isinstance(heard[-1], Batch)
+    assert heard[-1].t[-1] == pytest.approx(60.0, abs=2e-3)
+    assert loop.dropped == 600 - sum(isinstance(message, Batch) for message in heard) > 300
 
 
 def test_through_a_fault_no_other_program_may_take_the_arm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

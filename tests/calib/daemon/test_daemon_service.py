@@ -26,6 +26,7 @@ from calib.daemon.state.journal import Journal
 from calib.daemon.view.api_models import State
 from calib.daemon.view.view import NoSuch, NotPossible
 from calib.observer.recalibrator import Recalibrator
+from calib.records.database import StoreFault
 from calib.records.records import CalibrationRecord
 
 
@@ -133,6 +134,22 @@ def test_a_recalibration_that_makes_it_worse_is_rolled_back(tmp_path: Path) -> N
     assert daemon.of_kind("roll-back")[0].joint == "joint_3"
     assert abs(daemon.fast.error()[1][2]) < 0.01
     assert [line.by for line in daemon.store.activations(daemon.arm)][-1] == "check after recalibration"
+
+
+def test_a_roll_back_that_fails_is_tried_again_and_said_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings("apply"))
+    daemon.run(60)
+    daemon.fast.offset[2] += 0.5
+    daemon.run(200, until=lambda: bool(daemon.of_kind("recalibration")))
+    daemon.fast.offset[2] -= 0.5
+    with monkeypatch.context() as patch:
+        patch.setattr(daemon.store, "get", lambda record: (_ for _ in ()).throw(StoreFault("store failed")))
+        daemon.run(60)
+    (refused,) = daemon.of_kind("refused")
+    assert refused.text == "joint_3: roll-back failed: store failed"
+    daemon.run(3)
+    assert daemon.of_kind("roll-back")[0].joint == "joint_3"
+    assert abs(daemon.fast.error()[1][2]) < 0.01
 
 
 def test_payload_is_an_event_with_mass_and_centre_and_nothing_is_written(tmp_path: Path) -> None:

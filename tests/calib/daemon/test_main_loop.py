@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import yaml
 
+from armlink import cli
 from armlink.arm_file import bundled_arms, load_arm
 from armlink.loop.messages import Alive
 from calib.daemon import main_loop
@@ -18,6 +19,7 @@ from calib.daemon.loop.loop_messages import Message
 from calib.daemon.main_loop import BEGIN_SECONDS, SILENT_SECONDS, Daemon
 from calib.daemon.notify import Notifier
 from calib.daemon.options import Options
+from calib.records.file_lock import locked_directory
 
 
 class NoProcess:
@@ -236,3 +238,21 @@ def test_a_bus_process_that_hangs_is_replaced_and_again_where_there_is_no_proces
         assert len(running.started) == 1
 
     with_daemon(tmp_path, monkeypatch, act)
+
+
+def test_a_second_daemon_on_a_state_directory_does_not_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It neither opens the bus nor touches the first one's journal."""
+    begun: list[object] = []
+    monkeypatch.setattr("calib.commands.daemon.TAKE_OVER_SECONDS", 0.0)
+    monkeypatch.setattr("calib.daemon.logs.log_as_json", lambda: None)
+    monkeypatch.setattr("calib.daemon.loop.loop_process.LoopProcess", lambda *given, **options: begun.append(given))
+    with locked_directory(tmp_path, "--state of the first"):
+        status = cli.run(["daemon", "sarcos", "--bus", "armlink_sim:sarcos", "--state", str(tmp_path)])
+    error = capsys.readouterr().err
+    assert status == 2
+    assert f"--state {tmp_path}: in use by" in error
+    assert f"(process {os.getpid()}): stop that, or choose another" in error.replace("\n", " ")
+    assert begun == []
+    assert not (tmp_path / "journal.db").exists()

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rest_arm import RestArm
 
 from calib.motion.static_reading import StaticReading
 from calib.observer.config import ObserverConfig
@@ -141,3 +142,21 @@ def test_the_halves_of_an_average_tell_its_noise() -> None:
     means = np.array([row.torque[0] for row in rows])
     noise = np.array([row.torque_error[0] for row in rows])
     assert np.sqrt(np.mean(noise**2)) == pytest.approx(np.std(means), rel=0.25)
+
+
+def test_a_row_in_which_a_motion_began_is_none_and_an_arm_that_is_noisier_is_watched_again() -> None:
+    arm = RestArm("sarcos", 3)
+    observer = arm.observer()
+    assert arm.work(observer, 30) == []
+    rows, sigma, rest = observer.rows, observer._tracking.sigma.copy(), arm.row()
+    began = np.where(np.arange(7) == 0, 0.05 * arm.rated, 0.0)
+    for _ in range(3):
+        assert observer.handle_row(replace(rest, torque=rest.torque + began, torque_error=began / 2)) == []
+    assert observer.rows == rows
+    assert (observer._tracking.sigma < 1.5 * sigma).all()
+    noisier = 20 * sigma
+    for _ in range(60):
+        rest = arm.row()
+        observer.handle_row(replace(rest, torque_error=np.abs(noisier * arm.random.normal(size=7))))
+    assert observer.rows > rows + 10
+    np.testing.assert_array_less(5 * sigma, observer._tracking.sigma)

@@ -1,22 +1,40 @@
 """From a finding to a record and to the controller: composed with what is installed, within bounds, never half done."""
 
+import shutil
+import sqlite3
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
+import sqlalchemy as sa
 from fake_controllers import ARM, NAMES, Controllers, joint, record
 
 from armlink.errors import BusFault, Refused
 from armlink.torque_calibration import TorqueCalibration
+from calib.install.journaled_write import recover
 from calib.observer.check_at_rests import Checked
 from calib.observer.decision import Finding
 from calib.observer.recalibrator import Recalibrator, recalibrated
-from calib.records.records import CalibrationRecord
+from calib.records.database import StoreFault
+from calib.records.records import CalibrationRecord, GravityRecord, matrix, provenance
 from calib.records.store import RecordStore
 
 
 def finding(gain: float = 1.03, offset: float = 0.3, at: int = 1, cause: str = "drift") -> Finding:
     return Finding(at, cause, gain, offset, np.array([[4e-8, -1e-8], [-1e-8, 1e-5]]), 40, 0.999)
+
+
+def still_gravity() -> GravityRecord:
+    """A gravity record of an arm without masses."""
+    return GravityRecord(
+        **provenance(ARM, created=datetime(2026, 11, 21, tzinfo=UTC)),
+        names=NAMES,
+        beta=(0.0,) * 4,
+        covariance=matrix(np.zeros((4, 4))),
+        identifiable=(True,) * 4,
+        gravity=(0.0, 0.0, -9.81),
+    )
 
 
 @pytest.fixture
@@ -93,6 +111,67 @@ def test_what_the_check_finds_worse_is_undone(store: RecordStore) -> None:
     np.testing.assert_allclose((old.gain, old.offset), (1.1, -0.4), atol=1e-6)
     with pytest.raises(Refused, match="none before it"):
         recalibrator.undo(Checked("worse", 1, "again"))
+
+
+class Calls:
+    """Fails one call of the record store or of a controller."""
+
+    def __init__(self, store: RecordStore, controllers: Controllers) -> None:
+        self.left, commit, dialect = -1, store._engine.dialect.do_commit, store._engine.dialect
+
+        def do_commit(connection: object) -> None:
+            self.count(sqlite3.OperationalError("store failed"))
+            commit(connection)
+
+        dialect.do_commit = do_commit  # type: ignore[method-assign,assignment]
+        sa.event.listen(store._engine, "do_execute", lambda *_: self.count(sqlite3.OperationalError("store failed")))
+        read, write = controllers.read_calibration, controllers.write_calibration
+        controllers.read_calibration = lambda joint: self.count(BusFault("no answer")) or read(joint)  # type: ignore[method-assign]
+        controllers.write_calibration = lambda *given: self.count(BusFault("no answer")) or write(*given)  # type: ignore[method-assign]
+
+    def count(self, error: Exception) -> None:
+        self.left -= 1
+        if self.left == 0:
+            raise error
+
+
+@pytest.mark.parametrize("step", ["apply", "undo", "restore"])
+def test_whichever_call_fails_it_and_the_store_agree_on_what_is_in_force(tmp_path: Path, step: str) -> None:
+    """Nothing fails after the write that would make a record that is in force look refused, and be written twice."""
+    begun = RecordStore(str(tmp_path / "begun.db"))
+    for kept in (record(), still_gravity()):
+        begun.put(kept, ARM, by="ann", reason="sweep")
+    begun.close()
+    failed, number = 0, 0
+    while number == 0 or failed == number:
+        number += 1
+        shutil.copy(tmp_path / "begun.db", tmp_path / f"{number}.db")
+        store, controllers = RecordStore(str(tmp_path / f"{number}.db")), Controllers()
+        recalibrator = Recalibrator(ARM, controllers, store, "propose")
+        proposed = recalibrator.propose(finding())
+        if step == "undo":
+            recalibrator.apply(proposed.record, 1, "ann")
+        elif step == "restore":
+            controllers.held = Controllers(gain=1.0, offset=0.0).held
+        calls = Calls(store, controllers)
+        calls.left, before = number, recalibrator.record
+        acts = {
+            "apply": lambda: recalibrator.apply(proposed.record, 1, "ann"),  # noqa: B023
+            "undo": lambda: recalibrator.undo(Checked("worse", 1, "worse")),  # noqa: B023
+            "restore": recalibrator.restore,
+        }
+        try:
+            acts[step]()
+        except (StoreFault, BusFault):
+            failed += 1
+            assert recalibrator.record == before
+        calls.left = -1
+        recover(ARM, store, controllers)
+        assert store.current(CalibrationRecord, ARM) == recalibrator.record
+        if step != "restore":
+            assert controllers.held[1].gain == pytest.approx(recalibrator.record.joints[1].gain, rel=1e-6)
+        store.close()
+    assert failed > 10
 
 
 def test_propose_keeps_the_record_and_touches_nothing(store: RecordStore) -> None:

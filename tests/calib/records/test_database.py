@@ -10,10 +10,11 @@ from pathlib import Path
 import pytest
 import sqlalchemy as sa
 from made_records import ARM, arm_file, calibration, gravity
-from postgres import NoServer, server
+from postgres import NoServer, server, stoppable_server
 
 from armlink.errors import BadInput, Refused
-from calib.records.database import open_database
+from calib.records import database
+from calib.records.database import StoreFault, open_database
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.records.schema import TABLES
 from calib.records.store import RecordStore
@@ -154,6 +155,34 @@ def test_a_server_that_is_not_there_is_one_line_without_the_password() -> None:
         RecordStore("postgresql://armlink:secret@127.0.0.1:9/records")
     assert "secret" not in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_a_server_that_hangs_is_a_failure_after_a_while_and_found_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its processes stand still (SIGSTOP); the kernel goes on to acknowledge what is sent, so that TCP sees nothing."""
+    monkeypatch.setattr("calib.records.hanging_server.SILENT_SECONDS", 0.3)
+    monkeypatch.setitem(database._POSTGRESQL, "connect_timeout", 2)
+    try:
+        with stoppable_server() as running:
+            store, arm = RecordStore(f"{running.url}/postgres"), arm_file()
+            store.put(calibration(), arm, by="ann", reason="sweep")
+            record = store.current(CalibrationRecord, arm)
+            silence = r"cannot be read: the server has answered nothing for 0\.3 s"
+
+            def read() -> None:
+                with database.reading(store._engine) as connection:
+                    running.hang()
+                    connection.execute(sa.text("SELECT 1"))
+
+            with pytest.raises(StoreFault, match=silence) as fault:
+                read()
+            assert "\n" not in str(fault.value)
+            with pytest.raises(StoreFault, match="cannot be read: connection timeout expired"):
+                store.current(CalibrationRecord, arm)
+            running.go_on()
+            assert store.current(CalibrationRecord, arm) == record
+            store.close()
+    except NoServer as reason:
+        pytest.skip(str(reason))
 
 
 def test_a_full_disk_is_said_and_nothing_is_lost(tmp_path: Path) -> None:
