@@ -25,7 +25,7 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from armlink.drives.orders import Mode, Order, Power, law_torque
+from armlink.drives.orders import Mode, Order, Power
 
 OFF = int(Mode.OFF)
 POSITION_MODES = (int(Mode.POSITION), int(Mode.PROFILE_POSITION))
@@ -204,7 +204,7 @@ def beyond(limits: JointLimits, passed: Order, sent: Order, seen: Seen) -> str:
 
     `passed` is the order that the bytes stand for: outside the window a target may lie only where the gate led it.
     """
-    power, _, mode, position, _, torque, kp, kd, _ = sent
+    power, _, mode, position, rate, torque, kp, kd, _ = sent
     if power is not ON:
         return ""
     most = limits.most_sent * EXACT
@@ -218,7 +218,8 @@ def beyond(limits: JointLimits, passed: Order, sent: Order, seen: Seen) -> str:
         return f"position {position:.6g} rad"
     if not (kp or kd):
         return "" if not abs(torque) > most else f"torque {torque:.6g} N·m"
-    total = law_torque(sent, seen.position, seen.velocity if math.isfinite(seen.velocity) else 0.0)
+    velocity = seen.velocity if math.isfinite(seen.velocity) else 0.0
+    total = kp * (position - seen.position) + kd * (rate - velocity) + torque  # NaN where any of them is: refused
     return "" if abs(total) <= most else f"gains and targets for {total:.6g} N·m"
 
 
