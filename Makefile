@@ -57,9 +57,10 @@ stalls: .venv/.dev ## Long campaign outside make test: sweeps while job, loop an
 
 creep: .venv/.dev ## Long campaign outside make test: drawn arms without torque sensors (ARGS="--seeds 1 5 --no-steps")
 	$(BIN)/python tests/campaigns/creep_contacts.py
+	$(BIN)/python tests/campaigns/creep_float.py
 	$(BIN)/python tests/campaigns/creep_arms.py $(ARGS)
 
-creepwalk: .venv/.dev ## Long campaign outside make test: docs/no-torque-sensors.md typed in order, in real time, on the simulated OpenArm
+creepwalk: .venv/.dev ## Long campaign outside make test: the procedure of the demo openarm in real time over udp_multicast: docs/no-torque-sensors.md typed in order (ARGS="--out DIR")
 	$(BIN)/python tests/campaigns/creep_walk.py $(ARGS)
 
 realism: .venv/.dev ## Long campaign outside make test: sensor fits of realistic arms, good and bad (ARGS="--seeds 1 5 --full")

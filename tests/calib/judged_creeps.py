@@ -44,7 +44,7 @@ class CreepVerdict:
     gain: Array
     """Relative errors (n,); NaN where no value is given."""
     scores: dict[str, Array]
-    """Errors over standard deviations of each family's values that are given: gain, offset, coulomb, load, zero."""
+    """Errors over standard deviations of each family's values that are given."""
     coulomb: Array
     """Errors (n,) [N·m]."""
     gravity: Array
@@ -151,6 +151,8 @@ def judge_creep(arm: ArmFile, simulated: SimulatedArm, data: list[SweepData], st
         "offset": truth.offset,
         "coulomb": state.coulomb,
         "load": state.uneven[:, 2],
+        "viscous": state.viscous,
+        "asymmetry": state.leaning,
         "zero": truth.position_offset,
     }
     scores = dict[str, Array]()

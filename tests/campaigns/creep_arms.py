@@ -86,7 +86,7 @@ def main() -> int:
 
 def tell(verdicts: list[CreepVerdict], failed: list[int]) -> int:
     """The whole, and the exit status."""
-    for family in ("gain", "offset", "coulomb", "load", "zero"):
+    for family in verdicts[0].scores if verdicts else ():
         score = np.concatenate([each.scores[family] for each in verdicts])
         if not score.size:
             continue

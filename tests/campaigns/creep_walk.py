@@ -2,7 +2,9 @@
 
     python tests/campaigns/creep_walk.py [--out DIR] [--group 7]
 
-About half an hour. Prints a line a command; exit status 1 where one does not end as the page says.
+The procedure of `armlink demo --arm openarm` in real time, command by command, over udp_multicast. About half an hour.
+Prints a line a command, and leaves `summary.json` in DIR beside the data sets; exit status 1 where a command does not
+end as the page says.
 """
 
 import argparse
@@ -43,7 +45,10 @@ def main() -> int:
                 walk.skipped += 1
             else:
                 walk.type(PAGE, line)
-    print(json.dumps({"run": walk.run, "left_out": walk.skipped, "wrong": walk.wrong}, indent=1))
+    summary = json.dumps({"run": walk.run, "left_out": walk.skipped, "wrong": walk.wrong}, indent=1)
+    (folder / "summary.json").write_text(summary, encoding="utf-8")
+    print(summary)
+    print(f"data sets and summary: {folder}")
     return 1 if walk.wrong else 0
 
 
