@@ -1,11 +1,11 @@
 """Share of a core that the process takes which keeps an arm's cycle, on this machine's own kernel.
 
-    .venv/bin/python benchmarks/loop_share.py [--arm openarm] [--rate 250] [--seconds 30] [--bus BUS]
+    .venv/bin/python benchmarks/loop_share.py [--arm openarm] [--rate 250] [--seconds 30] [--bus BUS] [--bitrate 1e6]
 
 The loop is that of every job (`armlink.loop.process`), started by a `RemoteLink` that plays a slow motion; the arm is
 simulated in a process of its own. Without `--bus` the two are joined by a pair of Unix sockets that carry the 16 bytes
 of SocketCAN's `can_frame`, read and written by the link's own SocketCAN port, with a process between them that lets
-every frame take its time at 1 Mbit/s: replies come one by one, as from a real bus. `--bus udp_multicast:239.74.163.57`
+every frame take its time on the wire: replies come one by one, as from a real bus. `--bus udp_multicast:239.74.163.57`
 or `socketcan:vcan0` put both on that bus. Prints JSON; processor time is what the kernel counts of the loop's threads.
 """
 
@@ -36,8 +36,6 @@ from armlink.link.types import Setpoints
 from armlink.loop import process, remote_link
 from armlink.loop.realtime import SIMULATED, prepare
 
-BIT = 1e-6
-"""Time of a bit at 1 Mbit/s [s]."""
 SWAY, TURN = 0.05, 4.0
 """Motion of every joint [rad] and time for it and back [s]."""
 DEADLINE = 1.0
@@ -68,8 +66,8 @@ class PairBus:
         self.end.close()
 
 
-def carry(one: socket.socket, other: socket.socket) -> None:
-    """The wire between two sockets: one frame at a time, the lowest identifier first, each for its bits."""
+def carry(one: socket.socket, other: socket.socket, bit: float) -> None:
+    """The wire between two sockets: one frame at a time, the lowest identifier first; a bit takes `bit` [s]."""
     prepare(SIMULATED)
     ends, waiting, free, number = {one: other, other: one}, list[tuple[int, int, bytes, socket.socket]](), 0.0, 0
     while True:
@@ -82,7 +80,7 @@ def carry(one: socket.socket, other: socket.socket) -> None:
         if waiting:
             can_id, _, frame, to = heapq.heappop(waiting)
             now = time.monotonic()
-            free = max(free, now - BIT * 130) + BIT * frame_bits(can_id, frame[8 : 8 + frame[4]])
+            free = max(free, now - bit * 130) + bit * frame_bits(can_id, frame[8 : 8 + frame[4]])
             if free > now:
                 time.sleep(free - now)
             to.send(frame)
@@ -189,7 +187,7 @@ def measure(arm: ArmFile, bus: str, seconds: float) -> dict[str, Any]:
             "bus_load": link.stats.load,
             "missed": link.stats.missed - missed,
             "oldest_reading_ms": ages.max() * 1e3,
-            "bus": bus or "can_frame over a pair of sockets, 1 Mbit/s",
+            "bus": bus or "can_frame over a pair of sockets",
         }
         link.disable()
     return answer
@@ -202,6 +200,7 @@ def main() -> int:
     parser.add_argument("--rate", type=float, default=250.0)
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--bus", default="")
+    parser.add_argument("--bitrate", type=float, default=1e6, help="of the wire between the pair [bit/s]")
     parser.add_argument("--simulate", nargs=2, help=argparse.SUPPRESS)
     parser.add_argument("--keep-cycle", nargs=2, type=int, help=argparse.SUPPRESS)
     asked = parser.parse_args()
@@ -214,7 +213,7 @@ def main() -> int:
     os.environ["CAN_CONFIG"] = json.dumps({"port": 44200 + os.getpid() % 1000})
     ours, near = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     far, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    wire = multiprocessing.get_context("fork").Process(target=carry, args=(near, far), daemon=True)
+    wire = multiprocessing.get_context("fork").Process(target=carry, args=(near, far, 1 / asked.bitrate), daemon=True)
     if not asked.bus:
         on_pair(ours.fileno())
         wire.start()

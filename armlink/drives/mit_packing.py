@@ -148,8 +148,13 @@ def pack_command(command: MitCommand, ranges: Ranges) -> bytes:
 
 def unpack_command(data: bytes, ranges: Ranges) -> MitCommand:
     """A command as the drive understands it; `data` has eight bytes."""
-    bits = int.from_bytes(data[:8], "big")
-    return grid_of(ranges).command(bits >> 48, bits >> 36 & 0xFFF, bits >> 24 & 0xFFF, bits >> 12 & 0xFFF, bits & 0xFFF)
+    return command_in(data, grid_of(ranges))
+
+
+def command_in(data: bytes, grid: Grid) -> MitCommand:
+    """As `unpack_command`, on a grid that is known."""
+    bits = int.from_bytes(data, "big")
+    return grid.command(bits >> 48, bits >> 36 & 0xFFF, bits >> 24 & 0xFFF, bits >> 12 & 0xFFF, bits & 0xFFF)
 
 
 def pack_feedback(feedback: MitFeedback, ranges: Ranges) -> bytes:
@@ -159,9 +164,14 @@ def pack_feedback(feedback: MitFeedback, ranges: Ranges) -> bytes:
 
 
 def unpack_feedback(data: bytes, ranges: Ranges) -> MitFeedback:
-    """Feedback from bytes 1 to 5 of a reply (`data` has at least five bytes)."""
-    bits = int.from_bytes(data[:5], "big")
-    return grid_of(ranges).feedback(bits >> 24, bits >> 12 & 0xFFF, bits & 0xFFF)
+    """Feedback from bytes 1 to 5 of a reply, which `data` is."""
+    return feedback_in(data, grid_of(ranges))
+
+
+def feedback_in(data: bytes, grid: Grid) -> MitFeedback:
+    """As `unpack_feedback`, on a grid that is known."""
+    bits = int.from_bytes(data, "big")
+    return grid.feedback(bits >> 24, bits >> 12 & 0xFFF, bits & 0xFFF)
 
 
 def unwrap(position: float, near: float, span: float) -> float:

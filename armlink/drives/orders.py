@@ -88,11 +88,11 @@ def law_torque(order: Order, position: float, velocity: float) -> float:
 
     Gains that are 0 or NaN are those of a drive with a controller of its own: τ alone.
     """
-    torque = order.torque
-    if order.kp > 0:
-        torque += order.kp * (order.position - position)
-    if order.kd > 0:
-        torque += order.kd * (order.velocity - velocity)
+    _, _, _, target, rate, torque, kp, kd, _ = order
+    if kp > 0:
+        torque += kp * (target - position)
+    if kd > 0:
+        torque += kd * (rate - velocity)
     return torque
 
 

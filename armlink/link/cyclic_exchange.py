@@ -71,6 +71,8 @@ class Loop:
         self._any: list[Callable[[int, bytes], None]] = []
         for group in self.groups:
             self._route(group)
+        self.told: list[Order | None] = [None] * self.n
+        """What the bytes of the newest frames order each joint, at the joint; None where they carry no target."""
         self._leaving: list[Frame] = []
         """Frames of the newest cycle, which have passed the check."""
         self._counted = self._dropped = 0
@@ -226,10 +228,13 @@ class Loop:
         if frames != self._leaving or any(order.kp for order in orders):  # with gains the joint's place counts too
             self._leaving = []
             for each in self.groups:
+                sent_of = each.drives.sent
                 for joint, place in enumerate(each.places):
-                    sent = each.drives.sent(joint)
+                    sent = sent_of(joint)
                     if sent is not None:
-                        self.verify(place, self.values.ordered(place, sent))
+                        sent = self.values.ordered(place, sent)
+                        self.verify(place, sent)
+                    self.told[place] = sent
             self._leaving = frames
         return frames
 
@@ -302,16 +307,17 @@ class Loop:
 
     def _keep_reading(self, joint: int, reading: Reading) -> None:
         board = self.board
-        if reading.position == reading.position:  # not NaN
-            board.reading(joint, reading.position, reading.sensor_torque)
-        if reading.motor_torque == reading.motor_torque:
-            board.motor[joint], board.slow_came = reading.motor_torque, True
-        if reading.velocity == reading.velocity:
-            board.velocity[joint], board.slow_came = reading.velocity, True
-        if reading.power is not None:
-            board.status[joint] = power_code(reading.power)
-        if reading.fault:
-            event = Event(joint, "", reading.fault)
+        _, position, velocity, motor, sensor, _, power, fault = reading
+        if position == position:  # not NaN
+            board.reading(joint, position, sensor)
+        if motor == motor:
+            board.motor[joint], board.slow_came = motor, True
+        if velocity == velocity:
+            board.velocity[joint], board.slow_came = velocity, True
+        if power is not None:
+            board.status[joint] = power_code(power)
+        if fault:
+            event = Event(joint, "", fault)
             if not board.events or board.events[-1] != event:
                 board.events.append(event)
 

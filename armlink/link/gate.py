@@ -25,7 +25,7 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from armlink.drives.orders import Mode, Order, Power, law_torque
+from armlink.drives.orders import Mode, Order, Power
 
 OFF = int(Mode.OFF)
 POSITION_MODES = (int(Mode.POSITION), int(Mode.PROFILE_POSITION))
@@ -204,22 +204,23 @@ def beyond(limits: JointLimits, passed: Order, sent: Order, seen: Seen) -> str:
 
     `passed` is the order that the bytes stand for: outside the window a target may lie only where the gate led it.
     """
-    if sent.power is not ON:
+    power, _, mode, position, rate, torque, kp, kd, _ = sent
+    if power is not ON:
         return ""
-    if sent.mode in TORQUE_MODES:
-        return "" if abs(sent.torque) <= limits.most_sent * EXACT else f"torque {sent.torque:.6g} N·m"
-    if sent.mode not in POSITION_MODES:
+    most = limits.most_sent * EXACT
+    if mode in TORQUE_MODES:
+        return "" if abs(torque) <= most else f"torque {torque:.6g} N·m"
+    if mode not in POSITION_MODES:
         return ""
-    inside = limits.lower <= passed.position <= limits.upper
-    room = (ROUNDED if inside else LED_BACK) + (EXACT - 1) * abs(sent.position)
-    lower, upper = min(limits.lower, passed.position), max(limits.upper, passed.position)
-    if not lower - room <= sent.position <= upper + room:
-        return f"position {sent.position:.6g} rad"
-    if not (sent.kp or sent.kd):
-        return "" if not abs(sent.torque) > limits.most_sent * EXACT else f"torque {sent.torque:.6g} N·m"
+    goal, lower, upper = passed.position, limits.lower, limits.upper
+    room = (ROUNDED if lower <= goal <= upper else LED_BACK) + (EXACT - 1) * abs(position)
+    if not (goal if goal < lower else lower) - room <= position <= (goal if goal > upper else upper) + room:
+        return f"position {position:.6g} rad"
+    if not (kp or kd):
+        return "" if not abs(torque) > most else f"torque {torque:.6g} N·m"
     velocity = seen.velocity if math.isfinite(seen.velocity) else 0.0
-    total = law_torque(sent, seen.position, velocity)
-    return "" if abs(total) <= limits.most_sent * EXACT else f"gains and targets for {total:.6g} N·m"
+    total = kp * (position - seen.position) + kd * (rate - velocity) + torque  # NaN where any of them is: refused
+    return "" if abs(total) <= most else f"gains and targets for {total:.6g} N·m"
 
 
 def _towards(start: float, goal: float, step: float) -> float:

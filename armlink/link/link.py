@@ -158,13 +158,8 @@ class Link(Calibrations):
     @property
     def orders_sent(self) -> list[Order]:
         """Orders as their bytes tell them; as they passed where the bytes carry no target."""
-        found = list(self.commander.passed)
-        for group in self.groups:
-            for drive, place in enumerate(group.places):
-                sent = group.drives.sent(drive)
-                if sent is not None and found:
-                    found[place] = self.values.ordered(place, sent)
-        return found
+        pairs = zip(self._loop.told, self.commander.passed, strict=False)  # nothing has passed before start()
+        return [passed if told is None else told for told, passed in pairs]
 
     def scan(self) -> list[DriveIdentity]:
         """Identity and state of each joint's drive; one that does not answer is there with `present` false."""

@@ -14,13 +14,15 @@ from armlink.drives.damiao.set_up import LARGEST_RANGE, prepare, read_registers
 from armlink.drives.family import BROADCAST, Ask
 from armlink.drives.mit_leash import damping, round_within
 from armlink.drives.mit_packing import (
+    Grid,
     MitCommand,
     Ranges,
+    command_in,
+    feedback_in,
     grid_of,
     pack_command,
     pack_steps,
     unpack_command,
-    unpack_feedback,
     unwrap,
 )
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
@@ -33,6 +35,7 @@ OTHER_MODES = {0x100: "position", 0x200: "velocity", 0x300: "force"}
 IDENTITY = (Register.HARDWARE_VERSION, Register.SOFTWARE_VERSION, Register.SERIAL_NUMBER, Register.REPLY_ID)
 REGISTER_KINDS = frozenset((READ, WRITE))
 ENABLED = int(State.ENABLED)
+ON, POSITION, TORQUE = Power.ON, int(Mode.POSITION), int(Mode.TORQUE)
 POWERS: dict[int | None, Power] = {State.DISABLED: Power.OFF, State.LOST_COMMUNICATION: Power.STOPPED}
 RANGE_FIELDS: dict[int, str] = {
     Register.POSITION_RANGE: "position",
@@ -57,6 +60,8 @@ class _Known:
 
     ranges: Ranges | None = None
     """By its registers; before they are known those that its model is delivered with, None for an unknown model."""
+    grid: Grid | None = None
+    """Of these ranges."""
     limits: Limits | None = None
     state: int | None = None
     position: float = math.nan
@@ -66,6 +71,10 @@ class _Known:
     """The newest frame damps, whatever was ordered."""
     sent: Order | None = None
 
+    def use(self, ranges: Ranges | None) -> None:
+        """Code and decode by these ranges from now on."""
+        self.ranges, self.grid = ranges, None if ranges is None else grid_of(ranges)
+
 
 class DamiaoDrives(BasicDrives):
     """The drives of one bus; see `Drives`."""
@@ -74,7 +83,9 @@ class DamiaoDrives(BasicDrives):
         """Nothing is sent."""
         super().__init__(joints, TRAITS)
         self._settings = [joint.settings for joint in joints]
-        self._known = [_Known(delivered(settings.model)) for settings in self._settings]
+        self._known = [_Known() for _ in joints]
+        for known, settings in zip(self._known, self._settings, strict=True):
+            known.use(delivered(settings.model))
         self._joint_of = {settings.id: joint for joint, settings in enumerate(self._settings)}
         self._replies = {(each.reply, each.id & 0xF): joint for joint, each in reversed([*enumerate(self._settings)])}
         """Joint by reply id and by the id in a reply."""
@@ -131,7 +142,8 @@ class DamiaoDrives(BasicDrives):
         """See Drives."""
         found = []
         for joint, (known, settings, limit) in enumerate(zip(self._known, self._settings, limits, strict=True)):
-            known.ranges, result = prepare(ask, self.names[joint], settings, limit)
+            ranges, result = prepare(ask, self.names[joint], settings, limit)
+            known.use(ranges)
             known.limits, known.state = limit, None
             found.append(result)
             known.position = result.position
@@ -166,15 +178,15 @@ class DamiaoDrives(BasicDrives):
 
     def _command(self, joint: int, order: Order) -> Frame:
         known = self._known[joint]
-        ranges, limits = known.ranges, known.limits
-        if ranges is None or limits is None:
+        grid, limits = known.grid, known.limits
+        if grid is None or limits is None:
             raise BusFault(f"{self.names[joint]}: a command before the set-up")
-        stiff = order.mode == Mode.POSITION
-        asked = MitCommand(
-            order.position, order.velocity, order.kp if stiff else 0.0, order.kd if stiff else 0.0, order.torque
-        )
-        data = pack_steps(*round_within(asked, grid_of(ranges), limits, known.position, known.velocity))
-        known.sent = _order_of(unpack_command(data, ranges))
+        _, _, mode, position, velocity, torque, kp, kd, _ = order
+        asked = MitCommand(position, velocity, kp, kd, torque)
+        if mode != POSITION:
+            asked = MitCommand(position, velocity, 0.0, 0.0, torque)
+        data = pack_steps(*round_within(asked, grid, limits, known.position, known.velocity))
+        known.sent = _order_of(command_in(data, grid))
         return self._settings[joint].id, data
 
     def _damp(self, joint: int) -> Frame:
@@ -203,13 +215,13 @@ class DamiaoDrives(BasicDrives):
             if told is not None:
                 self._overhear(joint, *told)
                 return None
-        ranges = known.ranges
-        if ranges is None:
+        grid = known.grid
+        if grid is None:
             return None
-        position, velocity, torque = unpack_feedback(data[1:6], ranges)
+        position, velocity, torque = feedback_in(data[1:6], grid)
         known.state = state = data[0] >> 4
-        if abs(known.position - position) > ranges.position:
-            position = unwrap(position, known.position, 2 * ranges.position)
+        if abs(known.position - position) > grid.q:
+            position = unwrap(position, known.position, grid.q_span)
         known.position, known.velocity = position, velocity
         self.powers[joint] = power = self._power(known)
         self.faults[joint] = fault = _fault_text(state)
@@ -226,7 +238,7 @@ class DamiaoDrives(BasicDrives):
         if asked != (joint, kind, register) or field is None or not 0.0 < value < LARGEST_RANGE:
             return
         self._asked = None
-        known.ranges = (known.ranges or UNKNOWN_RANGES)._replace(**{field: value})
+        known.use((known.ranges or UNKNOWN_RANGES)._replace(**{field: value}))
 
     @staticmethod
     def _power(known: _Known) -> Power:
@@ -236,6 +248,8 @@ class DamiaoDrives(BasicDrives):
 
     def fault(self, modes: Sequence[int], now: float) -> BusFault | None:
         """See Drives."""
+        if self.all_on():
+            return None
         lost = self.own_stop()
         return Stall(lost) if lost else super().fault(modes, now)
 
@@ -281,5 +295,5 @@ def _fault_text(state: int) -> str:
 
 
 def _order_of(command: MitCommand) -> Order:
-    mode = Mode.POSITION if command.kp > 0 else Mode.TORQUE
-    return Order(Power.ON, False, mode, command.position, command.velocity, command.torque, command.kp, command.kd)
+    position, velocity, kp, kd, torque = command
+    return Order(ON, False, POSITION if kp > 0 else TORQUE, position, velocity, torque, kp, kd)

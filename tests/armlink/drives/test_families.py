@@ -374,7 +374,7 @@ def test_a_number_that_is_not_finite_never_becomes_a_frame(name, value, place):
         bench.drives.frames([order, *[None] * 5], bench.arm.time)
 
 
-@every_arm
+@pytest.mark.parametrize("name", [*ARMS, "six-cia402"])
 def test_fuzzed_frames_raise_nothing_and_read_nothing_that_is_not_a_number(name):
     """1,500 frames a family here; the campaign tests/campaigns/fuzz_drives.py has 100,000."""
     from fuzzing import fuzz

@@ -2,6 +2,7 @@
 
 import math
 import struct
+from itertools import islice
 
 import can
 import cantools
@@ -207,7 +208,7 @@ def test_any_bytes_are_read_as_mjbots_reads_them(data):
     found = list(moteus.unpack(data))
     theirs = []
     try:
-        for each in multiplex.parse_frame(data):
+        for each in islice(multiplex.parse_frame(data), len(found)):  # a read may name millions
             if not isinstance(each, multiplex.RegisterSubframe):
                 break
             theirs.append(each)
