@@ -5,6 +5,7 @@
 `/joint_temperatures` add their channels as in `armlink.recording.mcap`.
 """
 
+import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,19 +13,35 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rosbags.highlevel import AnyReader, AnyReaderError
-from rosbags.rosbag2 import ReaderError
-from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, TypesysError, get_typestore
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
 
 from armlink.arrays import Array
-from armlink.errors import BadInput
+from armlink.errors import ArmlinkError, BadInput
 from armlink.recording.joint_messages import left_out, main_joints, nearest_rows
 from armlink.recording.recording import MOST_JOINTS, Recording, require_size
 
 TOPICS = {"/motor_states": "motor_torque", "/joint_commands": "torque_command", "/joint_temperatures": "temperature"}
 """Topics beside the states → channel that their efforts hold."""
 _NANO = 1_000_000_000
+
+
+_TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
+_DEFINED = re.compile(r"^\s*MSG\s*:(.*)$", re.MULTILINE)
+
+
+class _Reader(AnyReader):
+    """Refuses names of message types that are none: rosbags makes Python source of them, and runs it."""
+
+    def _open(self) -> None:
+        for reader in self.readers:
+            with reader:
+                for connection in reader.connections:
+                    named = (connection.msgtype, *map(str.strip, _DEFINED.findall(connection.msgdef.data)))
+                    wrong = next((name for name in named if not _TYPE.fullmatch(name)), None)
+                    if wrong is not None:
+                        raise ValueError(f"{wrong[:60]!r} is no name of a message type")
+        super()._open()
 
 
 @dataclass(frozen=True)
@@ -43,7 +60,7 @@ def load_bag(path: Path, topic: str = "") -> Recording:
     where the topic must be named, or nothing can be read.
     """
     try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        with _Reader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             readable = [connection for connection in reader.connections if _short(connection.msgtype) in _READERS]
             states = _state_connections(readable, topic, reader.connections, path)
             samples: dict[str, list[Sample]] = defaultdict(list)
@@ -54,7 +71,9 @@ def load_bag(path: Path, topic: str = "") -> Recording:
                 require_size(size, str(path))
                 message = reader.deserialize(raw, connection.msgtype)
                 samples[connection.topic].append(_READERS[_short(connection.msgtype)](message, receipt))
-    except (AnyReaderError, ReaderError, SerdeError, TypesysError, OSError, KeyError, ValueError) as error:
+    except ArmlinkError:
+        raise
+    except Exception as error:  # damaged files raise many kinds, those of each compression too
         raise BadInput(f"{path}: cannot read the bag: {str(error).partition(chr(10))[0]}") from None
     main = samples.pop(states[0].topic, [])
     if not main:
