@@ -5,7 +5,6 @@
 `/joint_temperatures` add their channels as in `armlink.recording.mcap`.
 """
 
-import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,24 +25,6 @@ TOPICS = {"/motor_states": "motor_torque", "/joint_commands": "torque_command", 
 _NANO = 1_000_000_000
 
 
-_TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
-_DEFINED = re.compile(r"^\s*MSG\s*:(.*)$", re.MULTILINE)
-
-
-class _Reader(AnyReader):
-    """Refuses names of message types that are none: rosbags makes Python source of them, and runs it."""
-
-    def _open(self) -> None:
-        for reader in self.readers:
-            with reader:
-                for connection in reader.connections:
-                    named = (connection.msgtype, *map(str.strip, _DEFINED.findall(connection.msgdef.data)))
-                    wrong = next((name for name in named if not _TYPE.fullmatch(name)), None)
-                    if wrong is not None:
-                        raise ValueError(f"{wrong[:60]!r} is no name of a message type")
-        super()._open()
-
-
 @dataclass(frozen=True)
 class Sample:
     """One message: its stamp [ns], joint names, and the channels that it carries."""
@@ -60,7 +41,7 @@ def load_bag(path: Path, topic: str = "") -> Recording:
     where the topic must be named, or nothing can be read.
     """
     try:
-        with _Reader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             readable = [connection for connection in reader.connections if _short(connection.msgtype) in _READERS]
             states = _state_connections(readable, topic, reader.connections, path)
             samples: dict[str, list[Sample]] = defaultdict(list)

@@ -148,9 +148,9 @@ def test_what_fuzzing_found_loads_or_is_refused_in_one_line(name):
 
 @pytest.mark.parametrize("inside", [False, True])
 def test_a_name_of_a_message_type_is_not_run_as_a_program(tmp_path, monkeypatch, inside):
-    """Readers of bags make Python source of message definitions."""
+    """rosbags makes Python source of message definitions; it takes nothing but names for names."""
     monkeypatch.chdir(tmp_path)
-    hostile = 'A:\n    import pathlib; pathlib.Path("made").touch()\nclass B'
+    hostile = 'A(__import__("pathlib").Path("made").touch() or object)'
     name, text = ("pkg/msg/A", f"pkg/B b\n{'=' * 80}\nMSG: {hostile}\nint8 x") if inside else (hostile, "int8 x")
     with (tmp_path / "r.mcap").open("wb") as stream:
         writer = Writer(stream)
