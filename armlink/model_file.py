@@ -1,5 +1,6 @@
 """URDF and MJCF files as MuJoCo takes them: packages resolved, meshes that are not there left out."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,19 @@ READABLE_MESHES = (".stl", ".obj", ".msh")
 PACKAGE = "package://"
 NEGLIGIBLE = 1e-14
 """Mass [kg] and inertia [kg·m²] of massless moving bodies, which are common in URDF files and MuJoCo refuses."""
+
+
+@dataclass(frozen=True)
+class Beside:
+    """A model that stands beside another one."""
+
+    path: Path
+    at: tuple[float, float, float]
+    """Its origin in the other's world frame [m]."""
+    turned: tuple[float, float, float]
+    """Rotation about that frame's x, then y, then z axis [rad]."""
+    prefix: str
+    """What the names of its bodies and joints begin with."""
 
 
 @dataclass(frozen=True)
@@ -71,14 +85,26 @@ def read_model(path: Path) -> ModelFile:
     return ModelFile(spec, tuple(absent), kind)
 
 
-def compile_model(path: Path) -> Any:
-    """The file as a compiled `mujoco.MjModel`; raises BadInput if it cannot be read or compiled."""
+def compile_model(path: Path, beside: Sequence[Beside] = ()) -> Any:
+    """The file as a compiled `mujoco.MjModel`, with others beside it; raises BadInput if one cannot be used."""
     found = read_model(path)
+    for each in beside:
+        frame = found.spec.worldbody.add_frame(pos=each.at, quat=_quaternion(each.turned))
+        found.spec.attach(read_model(each.path).spec, prefix=each.prefix, frame=frame)
     try:
         return found.spec.compile()
     except ValueError as error:
         hint = f" (without the meshes {', '.join(found.absent)}, which are not there)" if found.absent else ""
         raise BadInput(f"{path}: MuJoCo cannot compile it{hint}: {one_line(error)}") from None
+
+
+def _quaternion(turned: tuple[float, float, float]) -> Any:
+    import mujoco
+    import numpy as np
+
+    found = np.empty(4)
+    mujoco.mju_euler2Quat(found, np.array(turned), "XYZ")
+    return found
 
 
 def one_line(error: ValueError) -> str:

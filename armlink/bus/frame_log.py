@@ -15,7 +15,7 @@ import can
 from can.io.blf import BLFParseError
 
 from armlink.bus.in_process import InProcessBus
-from armlink.bus.message_port import is_data
+from armlink.bus.message_port import as_frame, is_data
 from armlink.bus.port import Frame
 from armlink.errors import BadInput, BusFault
 
@@ -128,14 +128,14 @@ class LogReader:
         """Where the log is truncated or unreadable; empty if it is intact."""
 
     def frames(self) -> Iterator[tuple[int, int, bytes]]:
-        """Time since the first message [µs], identifier and data of each data frame with an 11-bit identifier."""
+        """Time since the first message [µs], identifier with flags and data of each data frame."""
         first = None
         for message in self._messages():
             stamp = round(message.timestamp * 1e6)
             first = stamp if first is None else first
             if is_data(message):
                 self.count += 1
-                yield stamp - first, message.arbitration_id, bytes(message.data)
+                yield stamp - first, *as_frame(message)
 
     def _messages(self) -> Iterator[can.Message]:
         why = ""

@@ -67,8 +67,8 @@ def as_frame(message: can.Message) -> Frame:
 
 
 def is_data(message: can.Message) -> bool:
-    """Whether a message is a data frame with an 11-bit identifier."""
-    return not (message.is_error_frame or message.is_extended_id or message.is_remote_frame)
+    """Whether a message is a data frame."""
+    return not (message.is_error_frame or message.is_remote_frame)
 
 
 def receive_message(bus: can.BusABC, name: str, timeout: float) -> can.Message | None:

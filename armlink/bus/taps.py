@@ -6,7 +6,7 @@ import can
 
 from armlink.bus.can_bus import MessageSource
 from armlink.bus.in_process import InProcessBus
-from armlink.bus.message_port import is_data, receive_message
+from armlink.bus.message_port import as_frame, is_data, receive_message
 from armlink.bus.port import Frame, Port
 from armlink.clock import Clock, MonotonicClock
 from armlink.errors import BusFault
@@ -30,7 +30,7 @@ class TappedBus(InProcessBus):
         return self._newest / 1e6
 
     def take(self, timeout: float = 0.0) -> Frame | None:
-        """The next data frame with an 11-bit identifier, or None after `timeout` seconds; raises BusFault."""
+        """The next data frame, or None after `timeout` seconds; raises BusFault."""
         while True:
             message = receive_message(self._source, self.channel_info, timeout)
             if message is None:
@@ -40,7 +40,7 @@ class TappedBus(InProcessBus):
             self._newest = stamp - self._first
             self._tap(message, stamp)
             if is_data(message):
-                return message.arbitration_id, bytes(message.data)
+                return as_frame(message)
 
     def put(self, can_id: int, data: bytes) -> None:
         """Raise BusFault: the bus is listen-only."""

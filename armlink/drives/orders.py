@@ -83,6 +83,19 @@ class Order(NamedTuple):
     """Why the gate refused the command, so that `power` is STOPPED; for the link alone."""
 
 
+def law_torque(order: Order, position: float, velocity: float) -> float:
+    """Torque that an order stands for where its drive stands and moves [N·m]: kp (q* − q) + kd (v* − v) + τ.
+
+    Gains that are 0 or NaN are those of a drive with a controller of its own: τ alone.
+    """
+    torque = order.torque
+    if order.kp > 0:
+        torque += order.kp * (order.position - position)
+    if order.kd > 0:
+        torque += order.kd * (order.velocity - velocity)
+    return torque
+
+
 class Reading(NamedTuple):
     """What one frame of a drive tells; NaN or None where it says nothing."""
 

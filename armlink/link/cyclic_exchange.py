@@ -22,6 +22,11 @@ from armlink.link.types import Sample, Stats
 
 COLLECT_SHARE = 0.8
 """Share of a period after the commands in which their replies are waited for."""
+REST_SHARE, REST_GROWTH = 0.9, 1.02
+"""The loop sleeps through this share of the time that the replies have taken of late, instead of waking for each; from
+one cycle to the next that time grows by this factor at most, so that the quickest of late counts."""
+LEAST_REST = 1e-4
+"""Shorter rests are not worth their system call [s]."""
 OWED_CYCLES = 25
 """A reply that has been owed for this many cycles is lost."""
 _UNTAGGED = (1 << BUS_SHIFT) - 1
@@ -51,6 +56,8 @@ class Loop:
         """Takes frames that no drive of ours sends, such as those of another host."""
         self._port, self._clock = port, clock
         self._patience = 0.0 if lock_step else COLLECT_SHARE * period
+        self._rest = 0.0 if lock_step else math.inf
+        """Time from the commands until it looks for replies [s]; inf until it is known how long they take."""
         self._alone = self.groups[0] if len(self.groups) == 1 else None
         traits = traits_of(self.groups, self.n)
         cadences = {each.cadence for each in traits}
@@ -180,21 +187,30 @@ class Loop:
         if self._pass_time is not None:
             self._pass_time(self.period)
         self.synced = now
-        end = now + self._patience
-        for _ in range(MOST_FRAMES):
-            if board.awaited <= 0:
-                break
-            if not self.receive(0.0):
-                remaining = end - self._clock.now()
-                if remaining <= 0 or not self.receive(remaining):
-                    break
-        delay = self._clock.now() - now
+        delay = self._collect(now)
         self._take_what_is_there()
         self.stats.missed += board.awaited
         timely = None if board.awaited <= 0 and not self._owed_for else self._timely()
         sample = self.sample(now)
         sample.timely, sample.delay = timely, delay
         return sample
+
+    def _collect(self, now: float) -> float:
+        """Take in the replies to commands that left at `now`; how long they took [s]."""
+        board, clock, end = self.board, self._clock, now + self._patience
+        if board.awaited > 0 and LEAST_REST < self._rest < self._patience:
+            clock.sleep_until(now + self._rest)
+        for _ in range(MOST_FRAMES):
+            if board.awaited <= 0:
+                break
+            if not self.receive(0.0):
+                remaining = end - clock.now()
+                if remaining <= 0 or not self.receive(remaining):
+                    break
+        delay = clock.now() - now
+        if board.awaited <= 0:
+            self._rest = min(REST_SHARE * delay, REST_GROWTH * self._rest)
+        return delay
 
     def _encode(self, orders: Sequence[Order], now: float) -> list[Frame]:
         """Frames of the orders, every group's; what their bytes say is checked before they may leave."""

@@ -25,7 +25,7 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from armlink.drives.orders import Mode, Order, Power
+from armlink.drives.orders import Mode, Order, Power, law_torque
 
 OFF = int(Mode.OFF)
 POSITION_MODES = (int(Mode.POSITION), int(Mode.PROFILE_POSITION))
@@ -218,7 +218,7 @@ def beyond(limits: JointLimits, passed: Order, sent: Order, seen: Seen) -> str:
     if not (sent.kp or sent.kd):
         return "" if not abs(sent.torque) > limits.most_sent * EXACT else f"torque {sent.torque:.6g} N·m"
     velocity = seen.velocity if math.isfinite(seen.velocity) else 0.0
-    total = sent.kp * (sent.position - seen.position) + sent.kd * (sent.velocity - velocity) + sent.torque
+    total = law_torque(sent, seen.position, velocity)
     return "" if abs(total) <= limits.most_sent * EXACT else f"gains and targets for {total:.6g} N·m"
 
 

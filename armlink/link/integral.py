@@ -19,6 +19,14 @@ DEADBAND = 5e-4
 """Errors below this are not integrated, against hunting under stiction [rad]."""
 
 
+def slowest_time(kp: float, kd: float) -> float:
+    """Time constant in which a joint held with these gains and this term comes to rest, at the longest [s]; 0 without.
+
+    What is left of a disturbance fades with kd / kp, and with the term itself.
+    """
+    return max(1.0 / RATE, kd / kp) if kp > 0 else 0.0
+
+
 class Integral:
     """Feed-forward torque of one joint."""
 

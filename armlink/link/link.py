@@ -15,7 +15,7 @@ from armlink.bus.arm_hold import ArmHold
 from armlink.bus.can_bus import CanBus
 from armlink.clock import Clock, MonotonicClock
 from armlink.drives.family import Guarded
-from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Setup
+from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Setup, law_torque
 from armlink.errors import BadInput, BusFault, Refused, Silence
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
@@ -140,13 +140,20 @@ class Link(Calibrations):
 
     @property
     def torque_sent(self) -> Array:
-        """Target torque of the last frames [N·m], (n,)."""
-        return np.array([order.torque for order in self.orders_sent])
+        """Torque that the last frames command [N·m], (n,); of a drive with gains by its law, at the newest readings."""
+        return self.sent[0]
 
     @property
     def position_sent(self) -> Array:
         """Target position of the last frames [rad], (n,)."""
-        return np.array([order.position for order in self.orders_sent])
+        return self.sent[1]
+
+    @property
+    def sent(self) -> tuple[Array, Array]:
+        """`torque_sent` and `position_sent`, the bytes decoded once."""
+        orders = self.orders_sent
+        readings = zip(orders, self._loop.latest_position, self._loop.latest_velocity, strict=False)
+        return np.array([law_torque(*each) for each in readings]), np.array([order.position for order in orders])
 
     @property
     def orders_sent(self) -> list[Order]:

@@ -60,8 +60,8 @@ class Listener(Calibrations):
         self._host = ForeignHost(self.groups, self.values)
         self._ready: deque[tuple[Sample, Commands]] = deque()
         self._sent: Commands = ()
-        self._given: Commands = ()
-        """Commands for the sample that `next` gave last, and for the one that is coming in."""
+        self._sample: Sample | None = None
+        """What `next` gave last, and the commands for it."""
         self._decoded: tuple[Array, Array] | None = None
         self._sync: float | None = None
         self._since: float | None = None
@@ -89,12 +89,14 @@ class Listener(Calibrations):
 
     @property
     def torque_sent(self) -> Array:
-        """Target torque of the other controller for the last sample of `next` [N·m], (n,); NaN before its first."""
+        """Commanded torque of the other controller for the last sample of `next` [N·m], (n,); NaN before its first.
+
+        Of a drive with gains the torque of its law at the readings of that sample."""
         return self._commands[0]
 
     @property
     def position_sent(self) -> Array:
-        """Likewise target position [rad]."""
+        """Its target position [rad], likewise."""
         return self._commands[1]
 
     @property
@@ -105,7 +107,7 @@ class Listener(Calibrations):
     @property
     def _commands(self) -> tuple[Array, Array]:
         if self._decoded is None:
-            self._decoded = self._host.decode(self._sent)
+            self._decoded = self._host.decode(self._sent, self._sample)
         return self._decoded
 
     def next(self, timeout: float) -> Sample | None:
@@ -120,9 +122,9 @@ class Listener(Calibrations):
                 if remaining <= RESOLUTION:
                     return None
                 self._hear(remaining)
-        sample, self._sent = self._ready.popleft()
+        self._sample, self._sent = self._ready.popleft()
         self._decoded = None
-        return sample
+        return self._sample
 
     def _hear(self, seconds: float, at_once: bool = False) -> None:
         """Take in what comes, for at most that long; `at_once`: somebody waits for the very next frame."""
@@ -157,8 +159,8 @@ class Listener(Calibrations):
             sample.t = self._sync
             self._loop.stats.missed += sum([value != value for value in sample.position.tolist()])  # NaN
             self._loop.drop_readings()
-            self._ready.append((sample, self._given))
-        self._sync, self._given = now, self._host.commands()
+            self._ready.append((sample, self._host.ended))
+        self._sync = now
 
     def _pump(self, done: Callable[[], bool], timeout: float) -> bool:
         """Go on listening until `done` or the time is over."""

@@ -124,7 +124,7 @@ class DriveLoop:
             self._begin(self._id)
             self._channel.put(Stopped(error))
         else:
-            self._channel.put((self._id, row, pack(sample, self._link.torque_sent, self._link.position_sent)), True)
+            self._channel.put((self._id, row, pack(sample, *self._link.sent)), True)
             self._mind_silence()
         self._channel.flush()
 

@@ -8,7 +8,7 @@ import can
 
 from armlink.arm_file import ArmFile
 from armlink.bus.can_bus import MessageBus
-from armlink.bus.message_port import is_data
+from armlink.bus.message_port import as_frame, is_data
 from armlink.bus.port import Port
 from armlink.bus.taps import TappedBus, TappedPort
 from armlink.clock import Clock, MonotonicClock
@@ -138,7 +138,7 @@ class Monitor:
 
     def _count_cycle(self, message: can.Message, stamp: int) -> None:
         if self.cycle_stats and is_data(message):
-            self.cycle_stats.take(stamp / 1e6, message.arbitration_id, bytes(message.data))
+            self.cycle_stats.take(stamp / 1e6, *as_frame(message))
 
     def _count(self, can_id: int, data: bytes) -> None:
         self._syncs += self._host.begins(can_id, data)

@@ -29,11 +29,10 @@ class Recorder:
         values, lock_step = values_of(arm, groups), bus.clock is not None
         self._loop = Loop(bus.open_port(), self.clock, groups, values, 1.0 / section.rate, lock_step)
         self._loop.on_unknown = self._take
-        self._host = ForeignHost(groups, values)
+        self._host = ForeignHost(groups, values, forgets=True)
         self._start: float | None = None
         self._sync: float | None = None
         self._rows: list[Row] = []
-        self._torque, self._position = self._host.decode(())
 
     def rows(self, seconds: float) -> Iterator[Row]:
         """Rows completed within `seconds`, or in a whole log (LogBus); raises BusFault if the bus fails."""
@@ -48,21 +47,20 @@ class Recorder:
             self._complete(self._stamp())
 
     def _complete(self, now: float) -> None:
-        """A cycle that begins completes the row of the previous one; commands received before it take effect now."""
+        """A cycle that begins completes the row of the previous one."""
         sample = self._loop.sample(now)
         self._loop.drop_readings()
         if self._sync is not None and self._start is not None:
+            torque, position = self._host.decode(self._host.ended, sample)
             channels = {
                 "position": sample.position,
                 "velocity": sample.velocity,
                 "torque": sample.torque,
                 "motor_torque": sample.motor_torque,
-                "torque_command": self._torque,
-                "position_command": self._position,
+                "torque_command": torque,
+                "position_command": position,
             }
             self._rows.append((self._sync - self._start, channels))
         else:
             self._start = now
         self._sync = now
-        self._torque, self._position = self._host.decode(self._host.commands())
-        self._host.forget()

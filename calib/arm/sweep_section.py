@@ -1,5 +1,6 @@
 """The `sweep` section of the arm file. Every key has a default, so that the section may be left out."""
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
@@ -29,6 +30,22 @@ class CreepSection(Section):
     until they pull by 1.5 N·m."""
     zero_std: Annotated[FiniteFloat, Field(gt=0)] = 0.03
     """Standard deviation of the position zeros beforehand, which such arms get by hand [rad]."""
+
+
+Place = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+
+
+class ParkedArm(Section):
+    """An arm that stands beside this one and keeps still; nothing moves before collisions with it are excluded."""
+
+    model: Path | None = None
+    """Its URDF or MJCF file, a path from the arm file; none where `kinematics.model` has both arms."""
+    at: Place = (0.0, 0.0, 0.0)
+    """Origin of its model in the world frame of `kinematics.model` [m]."""
+    turned: Place = (0.0, 0.0, 0.0)
+    """Rotation of its model about the x, then the y, then the z axis of that frame [rad]."""
+    pose: dict[str, FiniteFloat] = Field(default_factory=dict)
+    """Angles at which its joints are parked, by name; the others are at their model's zero [rad]."""
 
 
 class SweepSection(Section):
@@ -63,7 +80,8 @@ class SweepSection(Section):
     gain_tolerance: Share = 0.15
     """Allowance for the error of the torque scale before calibration."""
     settle_window: Positive = 0.15
-    """Window over which velocity and torque scatter are judged [s]."""
+    """Window over which velocity and torque scatter are judged [s]; where it is not given and drives have kp and kd,
+    three of their slowest time constants."""
     settle_velocity: Positive = 0.001
     """Speed over the window below which a joint is at rest [rad/s]."""
     settle_scatter: Positive = 1.2
@@ -85,6 +103,8 @@ class SweepSection(Section):
     """Standard deviation of `reference_point` [m]."""
     position_offset_std: Annotated[FiniteFloat, Field(ge=0)] = 0.005
     """Standard deviation of the position sensors' zero beforehand [rad]; 0 for exact."""
+    beside: tuple[ParkedArm, ...] = ()
+    """Arms that are parked within reach, such as the other one of a pair."""
 
     @model_validator(mode="after")
     def _one_bias_a_joint(self) -> "SweepSection":
@@ -107,6 +127,10 @@ def sweep_section(arm_file: ArmFile) -> SweepSection:
     if section.bias_torque is not None and len(section.bias_torque) != n:
         raise BadInput(
             f"{arm_file.path}: key sweep.bias_torque: {len(section.bias_torque)} values, expected {n}, one per joint"
+        )
+    if section.beside and arm_file.model_path is None:
+        raise BadInput(
+            f"{arm_file.path}: key sweep.beside: collisions need geometry: give a URDF or MJCF as kinematics.model"
         )
     return section
 

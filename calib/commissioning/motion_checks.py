@@ -1,6 +1,8 @@
 """Findings about what the drives must do: hold the arm, press joints on their stops, sweep without a collision."""
 
+import math
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
@@ -17,11 +19,17 @@ from calib.plan.poses import sweep_range
 from calib.plan.rough_gravity import GravityGuess, guess_of_model
 from calib.plan.stop_selection import stop_combinations
 from calib.plan.sweep_plan import plan_sweep
+from gcomp.arm.inertia import joint_inertias
+from gcomp.arm.load import place_chain
 from gcomp.gravity.torque import gravity_torque
 
 POSES = 500
+DAMPED_POSES = 100
+"""An inertia changes little from pose to pose."""
 RESERVE = 1.2
 """Torque that a drive should have over gravity, as a factor; a choice: friction and acceleration need the rest."""
+LEAST_DAMPING = 0.3
+"""Damping ratio of a joint that its drive holds with stiffness and damping alone; below it swings after each move."""
 FASTEST_RATE = 20.0
 """A torque limit that is reached in less than its inverse [1/s] is a blow; a choice."""
 
@@ -42,6 +50,7 @@ def motion_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
         model = model_arm(arm_file)
         guess = guess_of_model(model.arm, model.beta)
         yield from _strength(arm_file, guess)
+        yield from _damping(arm_file, arm_file.model_path)
         if (
             not creeping
             and sweep_section(arm_file).hold == "stops"
@@ -75,6 +84,32 @@ def _strength(arm_file: ArmFile, guess: GravityGuess) -> Iterator[SetupFinding]:
         elif RESERVE * need[joint] > most:
             what = f"gravity needs up to {need[joint]:.3g} N·m by the model, max_torque is {most:g}: little is left"
             yield SetupFinding("warning", what, name, "narrow the ranges, or allow more torque if the drive has it")
+
+
+def _damping(arm_file: ArmFile, model: Path) -> Iterator[SetupFinding]:
+    """Joints that their drives hold with kp and kd, and whose kd is too low for what they turn."""
+    assert arm_file.link is not None
+    joints = [joint for joint in arm_file.link.joints if getattr(joint.settings, "kp", 0.0) > 0]
+    if not joints:
+        return
+    placed = place_chain(model, tip=arm_file.kinematics.tip)
+    arm = placed.arm.arm
+    low, high = np.nan_to_num([arm.lower, arm.upper], posinf=np.pi, neginf=-np.pi)
+    poses = np.random.default_rng(0).uniform(low, high, (DAMPED_POSES, arm.n))
+    mass = sweep_section(arm_file).reference_mass or 0.0
+    largest = dict(zip(arm.names, joint_inertias(placed, poses, mass).max(axis=0).tolist(), strict=True))
+    for joint in joints:
+        drive, inertia = joint.settings, largest[joint.name]
+        square = drive.gear**2
+        ratio = drive.kd * square / (2 * math.sqrt(drive.kp * square * inertia))
+        if ratio < LEAST_DAMPING:
+            enough = 2 * LEAST_DAMPING * math.sqrt(drive.kp * inertia / square)
+            softer = square * (drive.kd / (2 * LEAST_DAMPING)) ** 2 / inertia
+            what = f"kd {drive.kd:g} damps its swing by a ratio of {ratio:.2f} where it turns {inertia:.2g} kg·m²"
+            remedy = (
+                f"kd {enough:.2g} or more, or kp {softer:.2g} or less, gives {LEAST_DAMPING:g}, at which it settles"
+            )
+            yield SetupFinding("warning", what, joint.name, remedy)
 
 
 def _stops(arm_file: ArmFile, guess: GravityGuess) -> Iterator[SetupFinding]:

@@ -38,14 +38,13 @@ class Candidate:
 
 def choose(
     arm: Arm, beta: Array, rated: Array, candidates: list[list[Candidate]], count: int, speeds: tuple[float, ...],
-    mass: float, zero_std: float,
+    mass: float, doubt: Doubt,
 ) -> tuple[list[list[Candidate]], Array]:  # fmt: skip
     """(`count` candidates of each list, tip to base; standard deviations of the gains that they promise (n,)).
 
     Greedy: each choice makes the sum of the gains' variances least, with one pass without and one with the mass [kg].
     beta (2n,) [kg·m] is a guess of the mass moments.
     """
-    doubt = Doubt(zero=zero_std)
     mean, std = prior(arm, rated, doubt, True, 0.02 * rated)
     x, at = mean.copy(), family_slices(arm.n)
     x[at["beta"]], x[at["coulomb"]], x[at["load"]] = beta, 0.02 * rated, 0.05

@@ -77,8 +77,10 @@ class CreepFit:
         return np.sqrt(variance)
 
     def found(self, family: str) -> Mask:
-        """Parameters of a family that the data determine; without a mass nothing tells the scale."""
-        if family in ("gain", "beta") and not (self.rows.mass > 0).any():
+        """Parameters of a family that the data determine; without a gain nothing tells the scale of mass moments."""
+        if family == "gain" and not (self.rows.mass > 0).any():
+            return np.zeros(len(self.value(family)), dtype=bool)
+        if family == "beta" and not self.found("gain").any():
             return np.zeros(len(self.value(family)), dtype=bool)
         seen = self.std(family) < SEEN * self.prior_std[self.slices[family]]
         if family == "gain":
@@ -118,10 +120,8 @@ def fit_creep(arm_file: ArmFile, passes: Sequence[SweepData]) -> CreepFit:
     rows = CreepRows.of(passes)
     if not len(rows):
         raise BadInput(f"{passes[0].path}: no creep sweeps: sweep with sweep.motion: creep")
-    doubt = Doubt(zero=sweep_section(arm_file).creep.zero_std)
-    return fit_rows(
-        gcomp_arm(arm_file), rows, Limits.of(arm_file).rated, doubt, {data.path.name: data.digest for data in passes}
-    )
+    doubt, sources = Doubt.of(sweep_section(arm_file)), {data.path.name: data.digest for data in passes}
+    return fit_rows(gcomp_arm(arm_file), rows, Limits.of(arm_file).rated, doubt, sources)
 
 
 def fit_rows(

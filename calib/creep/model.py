@@ -2,8 +2,9 @@
 
     v = g (1 + w·warmth) (τ + (s + a)(F_c + μ|τ|) + s·u(q) + F_v q̇ + κ (q − q̄)) + o
 
-κ is a spring's stiffness, which is 0 unless one is looked for; τ the gravity torque of joint i at the angles q + zero,
-with the reference mass where it hangs; s the direction.
+κ is a spring's stiffness, which is 0 unless one is looked for; τ the gravity torque of joint i at the angles
+q + zero − lag·q̇, with the reference mass where it hangs: torque is read a little later than the position; s is the
+direction.
 """
 
 import numpy as np
@@ -49,6 +50,7 @@ class CreepModel:
         """(Torque (R,), regressor rows (R, 2n), angles (R, n), added mass moments per kilogram (2n,))."""
         rows, at = self.rows, self.slices
         angles = rows.position + x[at["zero"]]
+        angles[self._each, rows.joint] -= x[at["lag"]] * rows.velocity
         of_joint = regressor(self.arm, angles)[self._each, rows.joint]
         per_kilogram = self._at_origin + self._by_point @ x[at["rho"]]
         torque = of_joint @ x[at["beta"]] + rows.mass * (of_joint @ per_kilogram)
@@ -88,7 +90,9 @@ class CreepModel:
         by_torque = slope * (1 + both * load * np.sign(torque))
         jacobian[:, at["beta"]] = by_torque[:, None] * of_joint
         jacobian[:, at["rho"]] = (by_torque * rows.mass)[:, None] * (of_joint @ self._by_point)
-        jacobian[:, at["zero"]] = by_torque[:, None] * self._stiffness(x, angles, per_kilogram)
+        stiffness = self._stiffness(x, angles, per_kilogram)
+        jacobian[:, at["zero"]] = by_torque[:, None] * stiffness
+        jacobian[:, at["lag"].start] = -by_torque * stiffness[each, j] * rows.velocity
         return predicted, jacobian
 
     def _stiffness(self, x: Array, angles: Array, per_kilogram: Array) -> Array:

@@ -1,26 +1,30 @@
 """Unknowns of the creep fit: their order in one vector, and what is known of them beforehand."""
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
+from calib.arm.sweep_section import SweepSection
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
+from gcomp.identify.parameters import Prior
 
 HARMONICS = 2
 """Friction over position: cosine and sine of so many multiples of the joint angle."""
 LAST_ZERO = 1e-6
 """The last joint's zero is kept at 0 [rad]: turning the last link's frame is the same as turning its mass moment and
-the place of the mass (docs/theory.md, 4.1)."""
+the place of the mass (docs/theory.md, 4.1). A measured place resolves it."""
 FAMILIES = (
-    "gain", "offset", "coulomb", "load", "viscous", "asymmetry", "warming", "zero", "spring", "uneven", "beta", "rho",
+    "gain", "offset", "coulomb", "load", "viscous", "asymmetry", "warming", "zero", "lag", "spring", "uneven",
+    "beta", "rho",
 )  # fmt: skip
 """In the order of the vector."""
 
 
 def family_slices(n: int) -> dict[str, slice]:
     """Place of each family in the vector of an arm of n joints."""
-    sizes = {"uneven": 2 * HARMONICS * n, "beta": 2 * n, "rho": 3}
+    sizes = {"lag": 1, "uneven": 2 * HARMONICS * n, "beta": 2 * n, "rho": 3}
     slices, begin = {}, 0
     for family in FAMILIES:
         slices[family] = slice(begin, begin + sizes.get(family, n))
@@ -55,12 +59,21 @@ class Doubt:
     """Over all passes, where no temperature is known."""
     zero: float = 0.03
     """Position zero that was set by hand [rad]."""
+    lag: float = 0.005
+    """How much later than the position the torque is read, one for all joints: drives filter it, or average it [s]."""
     uneven: float = 0.15
     """Friction over position, as a share of the joint's Coulomb friction."""
     rho: float = 0.3
     """Place of the mass [m]."""
     spring_share: float = 1e-5
     """Pull that grows with position, of rated torque per rad: none, unless it is looked for."""
+    point: Prior | None = None
+    """Place of the mass, where it was measured [m]; the last joint's zero is then seen by it."""
+
+    @classmethod
+    def of(cls, section: SweepSection) -> Self:
+        """What an arm file states."""
+        return cls(zero=section.creep.zero_std, point=section.known_point)
 
 
 def prior(arm: Arm, rated: Array, doubt: Doubt, by_temperature: bool, coulomb: Array) -> tuple[Array, Array]:
@@ -81,6 +94,7 @@ def prior(arm: Arm, rated: Array, doubt: Doubt, by_temperature: bool, coulomb: A
         "asymmetry": doubt.asymmetry,
         "warming": doubt.warming if by_temperature else doubt.warming_by_time,
         "zero": doubt.zero,
+        "lag": doubt.lag,
         "spring": doubt.spring_share * rated,
         "uneven": np.repeat(doubt.uneven * np.maximum(coulomb, 1e-3 * rated), 2 * HARMONICS),
         "beta": np.repeat(3.0 * float(rated.max()) / gravity, 2 * n),
@@ -88,5 +102,8 @@ def prior(arm: Arm, rated: Array, doubt: Doubt, by_temperature: bool, coulomb: A
     }
     for family, value in values.items():
         std[slices[family]] = value
-    std[slices["zero"].stop - 1] = LAST_ZERO
+    if doubt.point is None:
+        std[slices["zero"].stop - 1] = LAST_ZERO
+    else:
+        mean[slices["rho"]], std[slices["rho"]] = doubt.point.mean, doubt.point.std
     return mean, std

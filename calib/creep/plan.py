@@ -9,7 +9,9 @@ from armlink.errors import BadInput
 from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm, model_arm
 from calib.arm.sweep_section import SweepSection, sweep_section
+from calib.arm.unseen import NO_LEVER, SHORTEST, VERTICAL, known_lever, vertical
 from calib.creep.design import Candidate, choose
+from calib.creep.parameters import Doubt
 from calib.plan.collisions import POINTS, Geometry
 from calib.plan.poses import require_range
 from calib.plan.types import Side, Sweep, SweepPlan
@@ -100,7 +102,7 @@ def plan_creep(arm_file: ArmFile, *, seed: int = 0) -> SweepPlan:
     home = _home(ground, random)
     lists = [_candidates(ground, joint, home, mass, random) for joint in reversed(range(n))]
     chosen, promised = choose(
-        ground.arm, ground.beta, ground.limits.rated, lists, creep.poses, creep.speeds, mass, creep.zero_std
+        ground.arm, ground.beta, ground.limits.rated, lists, creep.poses, creep.speeds, mass, Doubt.of(ground.section)
     )
     sweeps = []
     for each in chosen:
@@ -108,6 +110,8 @@ def plan_creep(arm_file: ArmFile, *, seed: int = 0) -> SweepPlan:
             sweeps.append(_sweep(ground, one, number, creep.speeds[number % len(creep.speeds)]))
     blind = [ground.arm.names[joint] for joint in range(n) if vertical(ground.arm, joint)]
     notes = tuple(f"{name}: {VERTICAL}" for name in blind)
+    if ground.section.known_point is None and known_lever(ground.arm) < SHORTEST:
+        notes = (*notes, f"{arm_file.name}: {NO_LEVER}")
     return SweepPlan(
         sweeps=tuple(sweeps),
         scout=(tuple(home.tolist()),),
@@ -153,16 +157,6 @@ def lead_way(speed: float) -> float:
 
 RESTING: Side = 0
 """No joint rests on a stop."""
-VERTICAL = (
-    "its axis is vertical in every pose, so that gravity does not load it: its torque constant cannot be seen; mount"
-    " the base tilted by 10° or more and state kinematics.gravity accordingly"
-)
-
-
-def vertical(arm: Arm, joint: int) -> bool:
-    """Whether a joint's axis is along gravity in every pose."""
-    poses = np.random.default_rng(1).uniform(-1.5, 1.5, (20, arm.n))
-    return bool(np.all(gravity_levers(arm, poses)[:, joint] < 0.02 * np.linalg.norm(arm.gravity)))
 
 
 def _sweep(ground: CreepGround, one: Candidate, number: int, speed: float) -> Sweep:

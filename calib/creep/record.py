@@ -8,8 +8,9 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
+from calib.arm.unseen import NO_LEVER, SHORTEST, VERTICAL, known_lever, vertical
 from calib.creep.fit import QUANTILE, CreepFit
-from calib.creep.plan import VERTICAL, vertical
+from calib.creep.parameters import LAST_ZERO
 from calib.fit.gravity_fit import GravityFit
 from calib.records.records import (
     CalibrationRecord,
@@ -62,7 +63,7 @@ def missing(fit: CreepFit) -> dict[tuple[str, Parameter], str]:
             reasons[name, "gain"] = VERTICAL if upright else _no_gain(fit, joint, loaded)
         if not found["offset"][joint]:
             reasons[name, "offset"] = "no sweep of this joint tells it"
-        if joint == fit.arm.n - 1:
+        if joint == fit.arm.n - 1 and fit.prior_std[fit.slices["zero"]][joint] <= LAST_ZERO:
             reasons[name, "position_offset"] = "turning the last link's frame is the same as turning its centre of mass"
         elif not zero[joint]:
             reasons[name, "position_offset"] = "the sweeps tell no more than was known before"
@@ -86,6 +87,8 @@ def _no_gain(fit: CreepFit, joint: int, loaded: bool) -> str:
         return "no sweep of this joint was free of disturbance"
     if not loaded:
         return "without a reference mass only products of torque constant and mass are seen: sweep again with one"
+    if not fit.found("gain").any() and known_lever(fit.arm) < SHORTEST:
+        return NO_LEVER
     return "gravity loads this joint too little in these sweeps: attach the mass further out, or add poses"
 
 

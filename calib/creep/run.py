@@ -16,6 +16,7 @@ from calib.creep.bins import bin_readings
 from calib.creep.plan import RAMP, CreepGround, creep_speed, lead_way, plan_creep
 from calib.motion.mover import Mover, Stalled
 from calib.motion.static_reading import StaticReading
+from calib.plan.collisions import check_creeps
 from calib.plan.types import Sweep, SweepPlan
 from calib.sweep.dataset import DataWriter, Manifest, PlanLine, StallLine, SweepData, load_data
 from calib.sweep.run import Progress, sparkline
@@ -46,17 +47,20 @@ def run_creep(
     """One pass over all joints with `reference_mass` [kg] attached (0 for none), into the directory `out`.
 
     The link must have been enabled; the joints hold at the end. A joint that meets something on its way is led back;
-    the sweep is then noted with the reason, and has no readings. Raises BadInput, Refused if too many sweeps do so,
-    BusFault; every reading made is on disk.
+    the sweep is then noted with the reason, and has no readings. Raises BadInput, Refused if too many sweeps do so or
+    the model shows beforehand that one would touch something, BusFault; every reading made is on disk.
     """
     installed = bridged(link, on_stall, lambda: [link.read_calibration(joint) for joint in range(link.n)])
     with DataWriter(out, Manifest.of(arm, reference_mass, installed), resume) as writer:
         data = load_data(out)
         mover = bridged(link, on_stall, lambda: Mover(link, sweep_section(arm), Limits.of(arm)))
         used = data.plan or plan or plan_creep(arm, seed=seed)
+        ground = CreepGround.of(arm)
+        if ground.geometry is not None:
+            check_creeps(arm, ground.geometry, used, mover.command.position)
         if data.plan is None:
             writer.append(PlanLine(plan=used, resolution=tuple(mover.known_resolution.tolist())))
-        run = _Pass(mover, writer, CreepGround.of(arm), used, progress or (lambda *_: None), clock, on_stall)
+        run = _Pass(mover, writer, ground, used, progress or (lambda *_: None), clock, on_stall)
         run.made = {reading.sweep for reading in data.readings}
         for sweep in used.sweeps:
             if sweep.name not in run.made and not any(_names(stall, sweep) for stall in data.stalls):

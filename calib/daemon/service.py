@@ -5,6 +5,7 @@ Each part holds its own state and calls only parts further down:
     ActiveRecords          records in force, and whether the controllers hold them
     Observation            one observer against one pair of records: ObserverFeed
     RecalibrationWorkflow  proposals, decisions, writes, the check after a write
+    DailyDiagnosis         the day's recording, diagnosed by a process of its own; what wears
     PoseTours, ObserverStorage, ArmState, LiveWindow, Recordings
     BusJobs                work that waits for the bus, one job at a time
     EventLog               events to the journal, the stream's Hub and the process's log
@@ -19,6 +20,7 @@ from armlink.loop.messages import Answer
 from calib.daemon.environment import Environment
 from calib.daemon.loop.loop_messages import Batch, Down, Message, Progress, Up
 from calib.daemon.observing.active_records import ActiveRecords
+from calib.daemon.observing.daily_diagnosis import DailyDiagnosis
 from calib.daemon.observing.observation import Observation
 from calib.daemon.observing.observer_feed import ObserverFeed
 from calib.daemon.observing.observer_storage import ObserverStorage
@@ -62,7 +64,8 @@ class Service:
         self.jobs = BusJobs(environment.run, self.journal)
         self.arm_state = ArmState(arm, self.events, monotonic)
         self.window = LiveWindow(len(arm.joint_names))
-        self.recordings = Recordings(directory / "recordings", self.configuration)
+        self.diagnosis = DailyDiagnosis(self.configuration, environment, self.events, directory / "diagnosis")
+        self.recordings = Recordings(directory / "recordings", self.configuration, self.diagnosis.finished)
         self.storage = ObserverStorage(self.journal, environment)
         self.recalibrations = RecalibrationWorkflow(
             self.configuration, store, self.arm_state, self.journal, self.events, self.jobs
@@ -101,7 +104,7 @@ class Service:
         """Do what is due; what fails on its part does not keep the rest from being done."""
         self.journal.probe()
         self._say_set_aside()
-        parts = (self.events, self.arm_state, self.records, self.recalibrations, self.tours)
+        parts = (self.events, self.arm_state, self.records, self.recalibrations, self.tours, self.diagnosis)
         for act in (*(part.tick for part in parts), self._save_due):
             self.journal.guard(act)
 
@@ -133,6 +136,7 @@ class Service:
         self.journal.guard(self.save)
         self.journal.guard(lambda: self.events.say("stopped", None, why, {}))
         self.recordings.close()
+        self.diagnosis.close()
         self.journal.close()
 
     def _take(self, message: Message) -> None:

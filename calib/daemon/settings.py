@@ -24,6 +24,18 @@ class RecordingSettings(Section):
     """All files together [MB]."""
 
 
+class DiagnosisSettings(Section):
+    """The daemon's own diagnosis of the arm's recordings (`armlink gap trend`), by a process of its own."""
+
+    enabled: bool = True
+    hours: Positive = 24.0
+    """Time from one to the next [h]."""
+    travel: Positive = 20.0
+    """Least path of all joints together in a recording that is diagnosed [rad]."""
+    sim: str | None = None
+    """Nominal model: MJCF, URDF or arm file, a path from the arm file; by default the arm file itself."""
+
+
 class DaemonSection(Section):
     """The arm file's section `daemon`; every key has a default."""
 
@@ -40,6 +52,7 @@ class DaemonSection(Section):
     work: bool = False
     """Whether the daemon, if it drives the bus, moves the arm among random poses, in place of ordinary work."""
     recording: RecordingSettings = RecordingSettings()
+    diagnosis: DiagnosisSettings = DiagnosisSettings()
     observer: dict[str, FiniteFloat] = Field(default_factory=dict)
     """Thresholds of the observer (calib/observer/config.py) that differ from their defaults."""
 

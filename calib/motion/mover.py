@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from armlink.errors import Refused
 from armlink.link.guard import Crossed, Guard
+from armlink.link.integral import slowest_time
 from armlink.link.types import Command, Sample, Samples, Setpoints
 from armlink.loop.driver import ArmDriver
 from calib.arm.drive_limits import Limits
@@ -107,7 +108,10 @@ class Mover:
 
     def average_to(self, share: float) -> None:
         """From now on average readings to this standard error, a share of rated torque."""
-        self.rule = SettleRule.of(self.section, share * self.limits.rated, self.link.period)
+        drives = [joint.settings for joint in self.link.arm.require_link().joints]
+        gains = [(getattr(each, "kp", 0.0), getattr(each, "kd", 0.0)) for each in drives]
+        slowest = max(slowest_time(*each) for each in gains)
+        self.rule = SettleRule.of(self.section, share * self.limits.rated, self.link.period, slowest)
 
     def cycle(self) -> Sample:
         """A cycle of the present command; raises Slipped when a pressed joint has left its stop, EncoderFault."""

@@ -9,6 +9,8 @@ from gcomp.arrays import Array, Mask
 
 DRIFT = 2.5
 """Standard errors by which the means of the window's halves may differ."""
+WINDOW_TIMES = 3.0
+"""Time constants of the slowest position loop in a window: what drifts more slowly is what one would call creep."""
 QUIET = 1.0
 """Torque scatter that is this many times the standard error asked for has settled whatever its shape."""
 
@@ -29,9 +31,17 @@ class SettleRule:
     """Asked for [N·m]."""
 
     @classmethod
-    def of(cls, section: SweepSection, standard_error: Array, period: float) -> "SettleRule":
-        """From the sweep section; standard error (n,) [N·m] of each reading, cycle `period` [s]."""
-        window = max(round(section.settle_window / period), 8)
+    def of(cls, section: SweepSection, standard_error: Array, period: float, slowest: float = 0.0) -> "SettleRule":
+        """From the sweep section; standard error (n,) [N·m] of each reading, cycle `period` [s].
+
+        `slowest` is the longest time constant of the position loops [s], 0 where the drives close them: the window
+        covers WINDOW_TIMES of it, unless the arm file names the window. A shorter one takes the slow end of a motion,
+        or the turning point of a slow swing, for rest.
+        """
+        seconds = section.settle_window
+        if "settle_window" not in section.model_fields_set:
+            seconds = max(seconds, WINDOW_TIMES * slowest)
+        window = max(round(seconds / period), 8)
         return cls(
             window=window,
             timeout=round(section.settle_timeout / period),

@@ -7,8 +7,9 @@ import numpy as np
 import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
-from armlink.errors import Refused
-from armlink.model_file import compile_model, read_model
+from armlink.errors import BadInput, Refused
+from armlink.model_file import Beside, compile_model, read_model
+from calib.arm.sweep_section import ParkedArm, sweep_section
 from calib.plan.types import Sweep, SweepPlan
 from gcomp.arrays import Array
 
@@ -16,6 +17,8 @@ POINTS = 15
 """Poses checked between two poses of a plan: 0.1 rad apart if a joint moves 1.5 rad; a choice."""
 DEPTH = 0.0005
 """Overlap from which bodies count as touching [m]; a choice, below the accuracy of collision meshes."""
+PARKED = "parked "
+"""What the names of bodies of an arm that is parked beside this one begin with, where it has a model of its own."""
 Pair = tuple[str, str]
 
 
@@ -33,7 +36,10 @@ class Contact:
 
 
 class Geometry:
-    """The bodies of the arm file's model. Overlaps that the model has at every pose do not count as collisions."""
+    """The bodies of the arm file's model, and of arms parked beside it (`sweep.beside`).
+
+    Overlaps that the model has at every pose do not count as collisions.
+    """
 
     def __init__(self, arm_file: ArmFile) -> None:
         """Compile the model; raises BadInput if it cannot be used."""
@@ -45,13 +51,26 @@ class Geometry:
         self._mujoco = mujoco
         kinematics = gcomp_arm(arm_file)  # checks the chain, with errors in terms of the arm file
         self.absent = read_model(arm_file.model_path).absent
-        self.model = compile_model(arm_file.model_path)
+        parked = sweep_section(arm_file).beside
+        self.model = compile_model(arm_file.model_path, [_attached(arm_file, each) for each in parked if each.model])
         self.data = mujoco.MjData(self.model)
+        for each in parked:
+            self._park(arm_file, each, kinematics.names)
         self._places = [int(self.model.joint(name).qposadr[0]) for name in kinematics.names]
         generator = np.random.default_rng(0)
         poses = generator.uniform(kinematics.lower, kinematics.upper, (12, kinematics.n))
         always = [{contact.bodies for contact in self._contacts(pose)} for pose in poses]
         self._own: set[Pair] = set.intersection(*always)
+
+    def _park(self, arm_file: ArmFile, parked: ParkedArm, moving: tuple[str, ...]) -> None:
+        """Bring the joints of an arm that is parked to their angles; raises BadInput for a joint that it has not."""
+        for name, angle in parked.pose.items():
+            known = f"{PARKED}{name}" if parked.model else name
+            place = self._mujoco.mj_name2id(self.model, self._mujoco.mjtObj.mjOBJ_JOINT, known)
+            if place < 0 or known in moving:
+                what = "moves itself" if known in moving else f"is not in {parked.model or arm_file.kinematics.model}"
+                raise BadInput(f"{arm_file.path}: key sweep.beside: pose: joint {name!r} {what}: give joints at rest")
+            self.data.qpos[self.model.jnt_qposadr[place]] = angle
 
     def contacts(self, pose: Array) -> list[Contact]:
         """Collisions at a pose (n,) [rad], deepest first."""
@@ -91,16 +110,40 @@ def check_plan(arm_file: ArmFile, plan: SweepPlan) -> str:
     count = 0
     for place, pose in poses_along(plan):
         count += 1
-        touching = geometry.contacts(pose)
-        if touching:
-            first, second = touching[0].bodies
-            raise Collided(
-                f"{arm_file.name}: {first} would touch {second} {place}, {touching[0].depth * 1000:.1f} mm deep, at"
-                f" {' '.join(f'{angle:.3f}' for angle in pose)} rad: narrow lower and upper of these joints in the arm"
-                " file, or clear the workspace"
-            )
+        _require_free(arm_file, geometry, place, pose)
     without = f", without {len(geometry.absent)} meshes that were not found" if geometry.absent else ""
     return f"no collision at {count} poses along the way{without}"
+
+
+def check_creeps(arm_file: ArmFile, geometry: Geometry, plan: SweepPlan, here: Array) -> None:
+    """Check every creep of a plan, and the way to it from the home pose, which is reached from `here` (n,) [rad].
+
+    Raises Collided naming bodies, sweep and pose.
+    """
+    home = np.array(plan.scout[0])
+    for where, pose in _between(here, home, "on the way from where it stands to the first pose"):
+        _require_free(arm_file, geometry, where, pose)
+    for sweep in plan.sweeps:
+        begin, end = sweep_ends(sweep)
+        for start, goal, place in ((home, begin, "on the way to sweep"), (begin, end, "in sweep")):
+            for where, pose in _between(start, goal, f"{place} {sweep.name}"):
+                _require_free(arm_file, geometry, where, pose)
+
+
+def _require_free(arm_file: ArmFile, geometry: Geometry, place: str, pose: Array) -> None:
+    touching = geometry.contacts(pose)
+    if touching:
+        first, second = touching[0].bodies
+        raise Collided(
+            f"{arm_file.name}: {first} would touch {second} {place}, {touching[0].depth * 1000:.1f} mm deep, at"
+            f" {' '.join(f'{angle:.3f}' for angle in pose)} rad: narrow lower and upper of these joints in the arm"
+            " file, or clear the workspace"
+        )
+
+
+def _attached(arm_file: ArmFile, parked: ParkedArm) -> Beside:
+    assert parked.model is not None
+    return Beside(arm_file.path.parent / parked.model, parked.at, parked.turned, PARKED)
 
 
 def poses_along(plan: SweepPlan) -> Iterator[tuple[str, Array]]:

@@ -42,7 +42,7 @@ class QuasiDirect(BaseModel):
     cogging: NotNegative = 0.03
     """Amplitude of the ripple as a share of the Coulomb friction."""
     cogging_cycles: Annotated[FiniteFloat, Field(gt=0)] = 20.0
-    """Ripple periods per radian: the motor's poles through the gear."""
+    """Periods of the ripple in a turn of the joint: the gear's teeth."""
     warming: NotNegative = 0.02
     """Loss of the torque constant when warm."""
     heating: NotNegative = 20.0

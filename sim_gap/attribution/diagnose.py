@@ -18,6 +18,7 @@ from sim_gap.attribution.answer import Internals, answer
 from sim_gap.attribution.bodies import CLEARLY, body_of, groups_of, lacking, mounts, placed
 from sim_gap.attribution.causes import causes
 from sim_gap.attribution.diagnosis import Diagnosis
+from sim_gap.attribution.friction_compensation import held_in_commands, missing_in_readings
 from sim_gap.attribution.position_only import diagnose_positions
 from sim_gap.attribution.rivals import Rivals
 from sim_gap.attribution.verdict import is_quiet
@@ -81,7 +82,7 @@ def diagnose(
     train, heldout = recordings[: len(train)], recordings[len(train) :]
     heldout_is = "the recordings given" if heldout else f"the last {OWN_HELDOUT:.0%} of each training recording"
     numbers = list(range(1, len(train) + len(heldout) + 1))
-    named = groups_of(groups, labels)
+    named, compensated = groups_of(groups, labels), held_in_commands(recordings, labels)
     starts = [float(recording.t[0]) for recording in recordings]
     if not heldout:
         train, heldout, labels, numbers, named, starts = *_split(train), labels * 2, numbers * 2, named * 2, starts * 2
@@ -121,7 +122,9 @@ def diagnose(
         made = answer(Internals(sim, fit, judge, None, tuple(heldout), estimate), [], [], heldout_is)
     else:
         made = answer(Internals(sim, fit, judge, estimate, tuple(heldout), estimate), found, minor, heldout_is)
-    return replace(made, checks=findings)
+    compensated += missing_in_readings(estimate, (fit, judge))
+    told = tuple(each.sentence() for each in compensated)
+    return replace(made, checks=findings, notes=(*made.notes, *told), friction_compensation=tuple(compensated))
 
 
 def _fitted(fit: ResidualSet, library: Sequence[str]) -> tuple[Search, Estimate]:

@@ -6,6 +6,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gcomp.arrays import Array
+from sim_gap.attribution.friction_compensation import Compensation
 from sim_gap.attribution.residual_laws import ResidualLaw
 from sim_gap.checks.finding import Finding
 from sim_gap.residuals.where import Location
@@ -109,6 +110,8 @@ class Diagnosis:
     notes: tuple[str, ...] = ()
     unit: str = "N·m"
     """Of the gap: N·m, or rad where no recording has a torque channel."""
+    friction_compensation: tuple[Compensation, ...] = ()
+    """Recordings whose controller compensates friction, by joint."""
     checks: tuple[Finding, ...] = ()
     """Findings on mapping, units and clocks of the recordings."""
     internals: Any = field(default=None, repr=False, compare=False)
@@ -163,6 +166,7 @@ class Diagnosis:
             "unexplained": _round(self.unexplained),
             "left_out": _round(self.left_out),
             "notes": list(self.notes),
+            "friction_compensation": [each.to_json() for each in self.friction_compensation],
             "checks": [finding.to_json() for finding in self.checks],
         }
 

@@ -7,6 +7,7 @@ from sim_gap.commands.gap_collect import collect
 from sim_gap.commands.gap_diagnose import diagnose
 from sim_gap.commands.gap_fleet import diagnose_fleet
 from sim_gap.commands.gap_plan import plan
+from sim_gap.commands.gap_trend import trend
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True)
 
@@ -19,5 +20,5 @@ def gap() -> None:
     """
 
 
-for command in (diagnose, plan, collect, diagnose_fleet, bench):
+for command in (diagnose, plan, collect, diagnose_fleet, trend, bench):
     app.command()(command)

@@ -54,7 +54,7 @@ def diagnose_fleet(
     rows = table_of(found)
     _show(rows, console)
     trends, outliers = rows_of(fleet_trends(found)), rows_of(fleet_outliers(found))
-    _show_changes(trends, outliers, console)
+    show_changes(trends, outliers, console)
     if table is not None:
         _write_table(rows, table)
     write_json(json_file, {"schema": "armlink.gap-fleet/1", "answers": found, "trends": trends, "outliers": outliers})
@@ -82,7 +82,7 @@ def _show(rows: list[dict[str, Any]], console: Any) -> None:
             console.print(f"{row['case']}: {row['error']}", style="yellow", markup=False)
 
 
-def _show_changes(trends: list[dict[str, Any]], outliers: list[dict[str, Any]], console: Any) -> None:
+def show_changes(trends: list[dict[str, Any]], outliers: list[dict[str, Any]], console: Any) -> None:
     """Print what changes on which arm, and which arm differs from the others."""
     from rich.table import Table
 

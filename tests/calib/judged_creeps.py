@@ -11,8 +11,9 @@ from armlink.arm_file import ArmFile, parse_arm
 from armlink.arrays import Array
 from armlink.link.link import Link
 from calib.arm.kinematics import gcomp_arm
-from calib.creep.fit import CreepFit, fit_creep
-from calib.creep.plan import plan_creep, vertical
+from calib.arm.unseen import vertical
+from calib.creep.fit import QUANTILE, CreepFit, fit_creep
+from calib.creep.plan import plan_creep
 from calib.creep.record import missing
 from calib.creep.run import contacts, run_creep
 from calib.fit.gravity_fit import identify_gravity
@@ -42,9 +43,8 @@ class CreepVerdict:
     names: tuple[str, ...]
     gain: Array
     """Relative errors (n,); NaN where no value is given."""
-    gain_inside: list[bool]
-    other_inside: list[bool]
-    """Whether the 95 % intervals of offsets, friction and zeros hold."""
+    scores: dict[str, Array]
+    """Errors over standard deviations of each family's values that are given: gain, offset, coulomb, load, zero."""
     coulomb: Array
     """Errors (n,) [N·m]."""
     gravity: Array
@@ -54,6 +54,19 @@ class CreepVerdict:
     gravity_nominal: Array
     """The same of a feed-forward by the model's masses, with k = 1, at the joint (n,)."""
     wrong: list[str] = field(default_factory=list)
+    unseen: list[str] = field(default_factory=list)
+    """Joints without a gain, and the reason given."""
+
+    @property
+    def gain_inside(self) -> list[bool]:
+        """Whether the 95 % intervals of the gains hold."""
+        return (np.abs(self.scores["gain"]) < QUANTILE).tolist()
+
+    @property
+    def other_inside(self) -> list[bool]:
+        """Whether those of offsets, friction and zeros hold."""
+        others = [each for name, each in self.scores.items() if name != "gain"]
+        return (np.abs(np.concatenate(others)) < QUANTILE).tolist()
 
 
 def creep_arm(seed: int) -> ArmFile:
@@ -133,21 +146,22 @@ def judge_creep(arm: ArmFile, simulated: SimulatedArm, data: list[SweepData], st
     lost = missing(fit)
     seen = np.array([(name, "gain") not in lost for name in fit.names])
     off = np.where(seen, fit.value("gain") / gain - 1, np.nan)
-    inside = (np.abs(fit.value("gain") - gain) < 1.96 * fit.std("gain"))[seen].tolist()
     pairs = {
+        "gain": gain,
         "offset": truth.offset,
         "coulomb": state.coulomb,
         "load": state.uneven[:, 2],
         "zero": truth.position_offset,
     }
-    other: list[bool] = []
+    scores = dict[str, Array]()
     for family, true in pairs.items():
         counted = seen & np.array([(name, "position_offset") not in lost or family != "zero" for name in fit.names])
-        other += (np.abs(fit.value(family) - true) < 1.96 * fit.std(family))[counted].tolist()
+        scores[family] = ((fit.value(family) - true) / fit.std(family))[counted]
     friction = np.where(seen, fit.value("coulomb") - state.coulomb, np.nan)
     error, largest = gravity_error(arm, simulated, fit.beta, fit.value("zero"))
     loaded = largest > 0.02 * largest.max()
-    share = np.where(loaded, error / np.maximum(largest, 1e-9), np.nan)
+    given = loaded & fit.found("beta").any()
+    share = np.where(given, error / np.maximum(largest, 1e-9), np.nan)
     nominal = nominal_error(arm, simulated, gain) / np.maximum(largest, 1e-9)
     upright = [name for joint, name in enumerate(fit.names) if vertical(described, joint)]
     wrong = [f"{name}: gain {each:+.2%}" for name, each in zip(fit.names, off, strict=True) if abs(each) > GAIN]
@@ -157,9 +171,10 @@ def judge_creep(arm: ArmFile, simulated: SimulatedArm, data: list[SweepData], st
     wrong += [f"{name}: vertical, but a gain is given" for name in upright if (name, "gain") not in lost]
     wrong += list(fit.findings) + [each.reason for one in data for each in contacts(one)]
     return CreepVerdict(
-        fit.names, off, inside, other, friction, share,
+        fit.names, off, scores, friction, share,
         np.full(n, np.nan) if steps is None else np.where(loaded, steps / np.maximum(largest, 1e-9), np.nan),
         np.where(loaded, nominal, np.nan), wrong,
+        [f"{joint}: {reason}" for (joint, parameter), reason in lost.items() if parameter == "gain"],
     )  # fmt: skip
 
 

@@ -1,7 +1,8 @@
 """Kill, or stop, the host while a bias torque is on, again and again: is every joint safe within its deadline?
 
-`kill_host.py [--tries 100] [--bus udp_multicast:239.74.163.77] [--stop]`; a try is one host process. Exit status 0
-where every joint was in quick stop or without power within the deadline in every try.
+`kill_host.py [--tries 100] [--bus udp_multicast:239.74.163.77] [--stop] [--device cia402]`; a try is one host process;
+`--device` is a stock one whose torque is a current, by default our own with its torque sensor. Exit status 0 where
+every joint was in quick stop or without power within the deadline in every try.
 """
 
 import argparse
@@ -67,13 +68,14 @@ def main() -> int:
     parser.add_argument("--tries", type=int, default=100)
     parser.add_argument("--bus", default="udp_multicast:239.74.163.77")
     parser.add_argument("--stop", action="store_true", help="SIGSTOP in place of SIGKILL")
+    parser.add_argument("--device", default="", help="as in the key sim.device: cia402, epos4, nanotec, copley, sample")
     text = "what this script and the arm's process, which share the machine, may add to the deadline [s]"
     parser.add_argument("--slack", type=float, default=0.1, help=text)
     chosen = parser.parse_args()
     if chosen.bus.startswith("udp_multicast"):  # a port of one's own: all groups on one port hear each other
         os.environ["CAN_CONFIG"] = json.dumps({"port": 43200 + os.getpid() % 1000})
     with tempfile.TemporaryDirectory() as folder:
-        arm, ear = write_arm(Path(folder), RATE, DEADLINE), Ear(chosen.bus)
+        arm, ear = write_arm(Path(folder), RATE, DEADLINE, chosen.device), Ear(chosen.bus)
         with simulated(arm, chosen.bus):
             numbers = range(-chosen.tries, 0) if chosen.stop else range(chosen.tries)
             times, again = tries(arm, chosen.bus, ear, numbers)

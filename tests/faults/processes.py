@@ -48,9 +48,15 @@ except ArmlinkError as error:
 """
 
 
-def write_arm(folder: Path, rate: float, deadline: float) -> Path:
-    """The fault tests' arm, slow enough for several processes on one core."""
+def write_arm(folder: Path, rate: float, deadline: float, device: str = "") -> Path:
+    """The fault tests' arm, slow enough for several processes on one core; `device` as in the key `sim.device`."""
     content: dict[str, Any] = {**ARM, "link": {**ARM["link"], "rate": rate, "deadline": deadline}}
+    if device:
+        content["sim"] = {**ARM["sim"], "device": device}
+        rows = [dict(row) for row in ARM["link"]["joints"]]
+        content["link"]["joints"] = [
+            row | {"drive": {"family": "canopen", "node": row.pop("node"), "torque": "motor"}} for row in rows
+        ]
     path = folder / "triple.yaml"
     parse_arm(content, path)
     path.write_text(json.dumps(content))

@@ -214,7 +214,7 @@ def commands() -> dict[str, EntryPoint]:
 
 
 SUB_COMMANDS = [(name,) for name in sorted(commands())] + [
-    ("gap", name) for name in ("diagnose", "plan", "collect", "diagnose-fleet", "bench")
+    ("gap", name) for name in ("diagnose", "plan", "collect", "diagnose-fleet", "trend", "bench")
 ]
 
 

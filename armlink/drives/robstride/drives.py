@@ -157,9 +157,11 @@ class RobStrideDrives(BasicDrives):
         if intruder := self.intrusion(can_id, data):
             self._intruder = f"another host sends {intruder} ({can_id & 0x1FFFFFFF:08X}h)"
         joint = self._joint_of.get(frames.data_of(can_id) & 0xFF)
-        if joint is None or can_id & 0xFF != self._settings[joint].host:
+        if joint is None:
             return None
         known = self._known[joint]
+        if known.limits is not None and can_id & 0xFF != self._settings[joint].host:
+            return None  # a listener, who has set nothing up, takes what is said to any host
         feedback = frames.unpack_feedback(can_id, data, known.ranges)
         if feedback is None:
             return None

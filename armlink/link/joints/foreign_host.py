@@ -7,9 +7,10 @@ import numpy as np
 from armlink.arrays import Array
 from armlink.bus.port import BUS_SHIFT, Frame
 from armlink.drives.family import ANY
-from armlink.drives.orders import Order
+from armlink.drives.orders import Order, law_torque
 from armlink.link.joints.groups import Group
 from armlink.link.joints.values import JointValues
+from armlink.link.types import Sample
 
 Commands = tuple[Frame, ...]
 """Newest command frames."""
@@ -18,8 +19,12 @@ Commands = tuple[Frame, ...]
 class ForeignHost:
     """Follows the commands of another host for n joints."""
 
-    def __init__(self, groups: Sequence[Group], values: JointValues) -> None:
-        """The drives of an arm on their buses; `values` turns values of drives into those of joints."""
+    def __init__(self, groups: Sequence[Group], values: JointValues, forgets: bool = False) -> None:
+        """The drives of an arm on their buses; `values` turns values of drives into those of joints.
+
+        `forgets`: a command counts for one cycle; otherwise until the next to its joint.
+        """
+        self._forgets = forgets
         self._groups, self._values = tuple(groups), values
         self._n = sum([len(group.places) for group in groups])
         syncs = [can_id | group.tag for group in groups for can_id in group.drives.cycle_ids()]
@@ -36,10 +41,16 @@ class ForeignHost:
         self._leader: int | None = None
         """Without SYNC, the joint whose command begins a cycle: the first that was heard."""
         self._newest: dict[int, Frame] = {}
+        self._given: Commands = ()
+        """With SYNC: the commands that it put into force."""
+        self.ended: Commands = ()
+        """Commands of the cycle that ended when one last began: with SYNC those before it, else those within it."""
 
     def begins(self, can_id: int, data: bytes) -> bool:
         """Take a frame that no drive sends; whether a cycle begins with it."""
         if can_id in self._ignored:
+            if can_id == self._sync:
+                self._next_cycle()
             return can_id == self._sync
         group = self._group_of.get(can_id)
         groups = self._unnamed if group is None else (group,)
@@ -54,26 +65,29 @@ class ForeignHost:
                 place = each.places[found[0]]
                 begins = self._sync is None and self._leader in (None, place)
                 self._leader = place if self._leader is None else self._leader
+                if begins:
+                    self._next_cycle()
                 self._newest[-1 - place] = can_id, data
                 return begins
         return False
 
-    def commands(self) -> Commands:
-        """The newest command frames."""
-        return tuple(self._newest.values())
+    def _next_cycle(self) -> None:
+        newest = tuple(self._newest.values())
+        self.ended, self._given = (newest, ()) if self._sync is None else (self._given, newest)
+        if self._forgets:
+            self._newest.clear()
 
-    def forget(self) -> None:
-        """Forget them."""
-        self._newest.clear()
+    def decode(self, commands: Commands, sample: Sample | None) -> tuple[Array, Array]:
+        """Commanded torque [N·m] and target position [rad] (n,) of command frames; NaN for a joint without.
 
-    def decode(self, commands: Commands) -> tuple[Array, Array]:
-        """Target torque [N·m] and position [rad] (n,) of command frames; NaN for a joint without.
-
-        Of a drive with gains the torque is feed-forward alone, as its frame has it.
+        Of a drive with gains the torque is that of its law at the readings of `sample`.
         """
-        orders = self.orders(commands)
-        columns = [(np.nan, np.nan) if each is None else (each.torque, each.position) for each in orders]
-        torque, position = np.array(columns, dtype=np.float64).reshape(-1, 2).T.copy()
+        torque, position = np.full((2, self._n), np.nan)
+        for joint, order in enumerate(self.orders(commands)):
+            if order is not None:
+                position[joint] = order.position
+                if sample is not None:
+                    torque[joint] = law_torque(order, float(sample.position[joint]), float(sample.velocity[joint]))
         return torque, position
 
     def orders(self, commands: Commands) -> list[Order | None]:

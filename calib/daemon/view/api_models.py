@@ -143,7 +143,7 @@ class EventRecord(Answer):
     t: float
     kind: str
     """drift, payload, contact, effect, alarm, clear, undecided, proposal, approved, rejected, recalibration, refused,
-    roll-back, sweep, fault, recovered, started, stopped, configuration, clock."""
+    roll-back, sweep, fault, recovered, started, stopped, configuration, clock, diagnosis, wear."""
     joint: str | None
     text: str
     """One line, for people."""

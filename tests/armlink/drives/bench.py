@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from armlink.arm_file import ArmFile, load_arm
+from armlink.drives.board import Board
+from armlink.drives.family import FillsBoard
 from armlink.drives.orders import Limits, Mode, Order, Power, Reading
 from armlink.drives.registry import family
 from sim_bus.simulated_arm import SimulatedArm
@@ -29,6 +31,8 @@ class Bench:
             for row in self.link.joints
         ]
         self.routes, self.latest = self.drives.routes(), [Reading(joint) for joint in range(self.arm.n)]
+        self.board = Board(self.arm.n)
+        self.fast = self.drives.fill(self.board, range(self.arm.n)) if isinstance(self.drives, FillsBoard) else {}
         self.log: list[tuple[int, bytes]] = []
         """Frames that the host sent."""
         self.heard: list[tuple[int, bytes]] = []
@@ -78,7 +82,9 @@ class Bench:
             yield frame
 
     def hear(self, can_id: int, data: bytes) -> None:
-        if can_id in self.routes or -1 in self.routes:
+        if can_id in self.fast:
+            self.fast[can_id](data)
+        elif can_id in self.routes or -1 in self.routes:
             reading = self.drives.take(can_id, data, self.arm.time)
             if reading is not None:
                 old = self.latest[reading.joint]
@@ -90,7 +96,11 @@ class Bench:
             self.hear(*frame)
 
     def set_up(self):
-        return self.drives.set_up(self, self.limits)
+        setups = self.drives.set_up(self, self.limits)
+        if self.fast:  # its frames do not pass `take`: readings as the set-up found them
+            self.latest = [Reading(joint, each.position) for joint, each in enumerate(setups)]
+            self.fast = self.drives.fill(self.board, range(self.arm.n))
+        return setups
 
     def cycle(self, orders: Sequence[Order | None]) -> list:
         sent = self.drives.frames(orders, self.arm.time)

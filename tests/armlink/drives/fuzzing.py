@@ -27,6 +27,8 @@ def fuzz(name: str, count: int, seed: int) -> int:
             reading = bench.drives.take(can_id, data, bench.arm.time)
             order = bench.drives.command_of(can_id, data)
             given += 1
+            if can_id in bench.fast:
+                bench.fast[can_id](data)
             if reading is not None:
                 assert 0 <= reading.joint < 6
                 values = (reading.position, reading.velocity, reading.motor_torque, reading.temperature)

@@ -2,6 +2,7 @@
 
 import copy
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -50,6 +51,27 @@ def written(folder, *changes) -> str:
         place[keys[-1]] = value
     (folder / "arm.yaml").write_text(yaml.safe_dump(content))
     return str(folder / "arm.yaml")
+
+
+def test_a_damping_that_is_too_low_for_what_the_joint_turns_is_named(tmp_path):
+    path = bundled_arms()["openarm"]
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    content["kinematics"]["model"] = str(path.with_name(content["kinematics"]["model"]))
+
+    def found():
+        (tmp_path / "arm.yaml").write_text(yaml.safe_dump(content))
+        return [each for each in examine(str(tmp_path / "arm.yaml"), offline=True) if "damps" in each.what]
+
+    assert found() == []
+    drive = content["link"]["joints"][3]["drive"]
+    drive["kd"] = 1.0
+    (named,) = found()
+    assert (named.level, named.where) == ("warning", "openarm_right_joint4")
+    inertia, kp = 0.26, 50.0
+    assert named.what.startswith(f"kd 1 damps its swing by a ratio of {1 / (2 * math.sqrt(kp * inertia)):.2f} where")
+    assert "kd 2.2 or more, or kp 11 or less" in named.remedy
+    drive["kd"] = 2.25
+    assert found() == []
 
 
 def test_a_sound_arm_has_no_error(tmp_path):

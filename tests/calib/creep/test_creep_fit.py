@@ -6,12 +6,14 @@ from functools import cache
 import numpy as np
 import pytest
 from drawn_creeps import DrawnCreep, draw_creep, without
+from judged_creeps import creep_arm
 
 from armlink.arm_file import ArmFile, Kinematics, load_arm
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import CreepSection, SweepSection
 from calib.creep.fit import CreepFit, fit_rows
 from calib.creep.model import CreepModel
+from calib.creep.parameters import Doubt
 from calib.creep.plan import plan_creep
 from calib.creep.record import calibration_record, gravity_record, missing
 from calib.plan.types import SweepPlan
@@ -112,6 +114,25 @@ def test_a_vertical_axis_is_named_with_its_remedy() -> None:
     record = calibration_record(fit, arm(True))
     assert record.joints[0].gain is None
     assert not any(gravity_record(fit, arm(True), record).identifiable[:2])
+
+
+def test_an_arm_whose_axes_meet_has_no_scale_until_the_place_of_the_mass_is_measured() -> None:
+    wrist = creep_arm(16)
+    planned = plan_creep(wrist)
+    assert any("meet in one point" in note for note in planned.notes)
+    made = draw_creep(wrist, planned, 4, planned.reference_mass)
+    rated = wrist.require_link().rated_torques
+    fit = fit_rows(gcomp_arm(wrist), made.rows, rated)
+    reasons = missing(fit)
+    assert all("meet in one point" in reasons[name, "gain"] for name in ("j2", "j3", "j4"))
+    assert not gravity_record(fit, wrist, None).identifiable.count(True)
+    measured = SweepSection(reference_point=tuple(made.truth.attachment + np.array([3e-4, -4e-4, 4e-4])))
+    cured = fit_rows(gcomp_arm(wrist), made.rows, rated, Doubt.of(measured))
+    assert [joint for joint, parameter in missing(cured) if parameter == "gain"] == ["j1"]
+    off = cured.value("gain") / made.warm_gain - 1
+    assert np.abs(off[1:] / (cured.std("gain") / made.warm_gain)[1:]).max() < 3
+    assert np.abs(off[1:]).max() < 0.015
+    assert len(plan_creep(wrist.model_copy(update={"sweep": measured})).notes) == 1
 
 
 def test_a_push_on_one_sweep_is_named_and_left_out() -> None:

@@ -2,7 +2,7 @@
 
 import json
 import resource
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from sweep_arms import random_arm, synthetic_pass
 
 from armlink.errors import BadInput, Refused
+from armlink.link.integral import slowest_time
 from calib.arm.sweep_section import SweepSection
 from calib.commands.screen import unsettled_said
 from calib.motion.settle_rule import SettleRule
@@ -20,6 +21,7 @@ from calib.motion.static_reading import StaticReading
 from calib.motion.trajectory import trajectory
 from calib.plan.sweep_plan import plan_sweep
 from calib.sweep.dataset import DataWriter, Manifest, PlanLine, encoded, load_data
+from gcomp.arrays import Array
 from sim_bus.truth import Truth
 
 PERIOD = 0.004
@@ -74,6 +76,49 @@ def test_a_drifting_torque_has_not_but_one_that_does_not_count_may() -> None:
     still = np.zeros((RULE.window, 1))
     assert not RULE.settled(still, drifting, COUNTS, STEP)
     assert RULE.settled(still, drifting, ~COUNTS, STEP)
+
+
+def worst_reading(rule: SettleRule, left: Callable[[Array], Array]) -> float:
+    """Largest error of the first window taken for rest, in standard errors, of 12 draws; `left` is still to come."""
+    t, worst = np.arange(900) * PERIOD, 0.0
+    for seed in range(12):
+        random = np.random.default_rng(seed)
+        torque = random.normal(0, 0.05, t.size) + left(t + random.uniform(0.0, 0.5))
+        ends = range(rule.window, t.size, 5)
+        windows = [torque[end - rule.window : end, None] for end in ends]
+        first = next(each for each in windows if rule.settled(np.zeros_like(each), each, COUNTS, STEP))
+        worst = max(worst, abs(float(first.mean())) / (0.05 / np.sqrt(50)))
+    return worst
+
+
+@pytest.mark.parametrize("swing", [0.3, 0.45, 0.6])
+def test_the_turning_point_of_a_slow_swing_is_no_rest(swing: float) -> None:
+    """Damped by 0.1: the joint of a soft drive with a load. The window of a stiff drive takes its turns for rest."""
+    rate = 2 * np.pi / swing
+    soft = SettleRule.of(SweepSection(), np.array([0.05 / np.sqrt(50)]), PERIOD, slowest_time(12.0, 1.2))
+    stiff = SettleRule.of(SweepSection(), np.array([0.05 / np.sqrt(50)]), PERIOD)
+
+    def left(t: Array) -> Array:
+        return np.asarray(0.6 * np.exp(-0.1 * rate * t) * np.cos(rate * t))
+
+    assert worst_reading(soft, left) < 3.0 < 6.0 < worst_reading(stiff, left)
+
+
+def test_the_tail_of_a_slow_loop_is_no_rest() -> None:
+    slowest = slowest_time(100.0, 12.0)
+    soft = SettleRule.of(SweepSection(), np.array([0.05 / np.sqrt(50)]), PERIOD, slowest)
+    stiff = SettleRule.of(SweepSection(), np.array([0.05 / np.sqrt(50)]), PERIOD)
+
+    def left(t: Array) -> Array:
+        return np.asarray(0.6 * np.exp(-t / slowest))
+
+    assert worst_reading(soft, left) < 5.0 < 10.0 < worst_reading(stiff, left)
+
+
+def test_a_window_in_the_arm_file_is_kept() -> None:
+    section = SweepSection(settle_window=0.1)
+    assert SettleRule.of(section, np.array([0.05]), PERIOD, slowest_time(12.0, 1.2)).window == 25
+    assert SettleRule.of(SweepSection(), np.array([0.05]), PERIOD, slowest_time(0.0, 0.0)).window == 38
 
 
 def test_averaging_goes_on_until_the_standard_error_is_reached() -> None:

@@ -61,9 +61,13 @@ class Served:
             self._server.turn()
 
     def inject(self, fault: str, value: float = 0.0) -> None:
-        """A firmware fault, from the thread of the arm."""
+        """A firmware fault."""
+        self.do(lambda: self.drive.inject(fault, value))
+
+    def do(self, action: Callable[[], None]) -> None:
+        """Do something to the arm, in its thread."""
         done = threading.Event()
-        self._jobs.put(lambda: (self.drive.inject(fault, value), done.set()))
+        self._jobs.put(lambda: (action(), done.set()))
         assert done.wait(10.0)
 
     def client(self) -> can.BusABC:

@@ -39,7 +39,7 @@ class CommandFrames:
         """Whether the host's heartbeat is sent; not, so that the joints' watching it is put to the test."""
         self.heartbeat: Frame = (objects.HEARTBEAT_ID + host, _OPERATIONAL)
         self._wires: Sequence[Wire] = ()
-        self._rows: list[tuple[int, Callable[..., bytes], float, float, float, float, int, int]] = []
+        self._rows: list[tuple[int, Callable[..., bytes], float, int, float, float, float, int, int]] = []
         m = len(known.names)
         self._sent: list[bytes | None] = [None] * m
         self._aimed = [math.nan] * m
@@ -65,8 +65,9 @@ class CommandFrames:
             low, high = math.ceil(limits.lower / unit.position), math.floor(limits.upper / unit.position)
             self._aimed[joint] = math.nan
             pack, torque = wire.layouts[RPDO1.name].pack, unit.torque if wire.with_torque else 0.0
+            most = int(limits.max_torque / torque) if torque else 0
             window = (limits.lower, limits.upper, low, high)
-            self._rows.append((RPDO1.cob_base + wire.node, pack, torque, unit.position, *window))
+            self._rows.append((RPDO1.cob_base + wire.node, pack, torque, most, unit.position, *window))
 
     def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
         """RPDO2 where a mode changes, RPDO1 of every joint with an order, heartbeat when due, SYNC."""
@@ -90,14 +91,17 @@ class CommandFrames:
                         word = set_point_control(self._known.statuses[joint])
                 else:
                     word = QUICK_STOP if power is Power.STOPPED else DISABLE_VOLTAGE
-            can_id, pack, torque_unit, position_unit, lower, upper, low, high = rows[joint]
+            can_id, pack, torque_unit, most, position_unit, lower, upper, low, high = rows[joint]
             if self._wires[joint].by_velocity:
                 data = self._velocity_frame(joint, word, order)
             else:
                 if not lower <= position <= upper:
                     low, high = -INT32_MAX - 1, INT32_MAX
                 target = max(low, min(high, round(position / position_unit)))
-                data = pack(word, int(torque / torque_unit), target) if torque_unit else pack(word, target)
+                if torque_unit:
+                    data = pack(word, max(-most, min(most, int(torque / torque_unit))), target)
+                else:
+                    data = pack(word, target)
             self._words[joint], self._sent[joint] = word, data
             commands.append((can_id, data))
         if modes:

@@ -39,12 +39,12 @@ export function put(element, text) {
 
 const CATEGORIES = {
   fault: ["fault", "refused", "failed"],
-  drift: ["drift", "alarm", "outliers", "undecided", "proposal"],
+  drift: ["drift", "alarm", "outliers", "undecided", "proposal", "wear"],
   load: ["payload", "contact", "effect"],
   change: ["recalibration", "approved", "rejected", "roll-back", "check", "sweep", "recovered"],
 };
 
-// The colour of an event; empty for those without one (started, stopped, clear, configuration, clock).
+// The colour of an event; empty for those without one (started, stopped, clear, configuration, clock, diagnosis).
 export const category = (kind) => Object.keys(CATEGORIES).find((name) => CATEGORIES[name].includes(kind)) ?? "";
 
 // The page marks a drift beyond three standard deviations and beyond the required accuracy of a calibration.

@@ -1,0 +1,151 @@
+"""The diagnosis of the arm's own recordings once a day, and the trend of its friction, ripple, play and gains.
+
+`armlink gap trend` does it in a process of its own, at low priority and the first to be killed if memory is short: this
+package knows nothing of simulation models. The recording of the day in which the arm moved most is diagnosed.
+"""
+
+import contextlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+from calib.daemon.environment import Environment
+from calib.daemon.settings import Configuration, DiagnosisSettings
+from calib.daemon.state.event_log import EventLog
+
+KEPT = 7
+"""Number of diagnosed recordings that are kept to look at."""
+LONGEST = timedelta(minutes=30)
+"""A diagnosis that takes longer is ended."""
+TOLD, FOUND = "trend.json", "trend.new.json"
+"""Changes that were told, and those of the diagnosis under way."""
+NICE, FIRST_TO_KILL = 10, "1000"
+"""Niceness and oom_score_adj of the process."""
+
+
+class DailyDiagnosis:
+    """Chooses a recording, starts the process, tells its answer and what changes."""
+
+    def __init__(
+        self, configuration: Configuration, environment: Environment, events: EventLog, directory: Path
+    ) -> None:
+        """Recordings and answers are kept in `directory`, which is made with the first one."""
+        self._configuration, self._environment, self._events = configuration, environment, events
+        self._directory = directory
+        self._best: tuple[float, Path] | None = None
+        self._process: subprocess.Popen[str] | None = None
+        self._begun = self._last = max((_date(path) for path in directory.glob("*.mcap")), default=environment.wall())
+        self._failure = ""
+
+    @property
+    def _settings(self) -> DiagnosisSettings:
+        return self._configuration.settings.diagnosis
+
+    def finished(self, recording: Path, travel: float) -> None:
+        """A recording is whole; `travel` is the path of all joints together in it [rad]."""
+        if self._settings.enabled and travel >= max(self._settings.travel, self._best[0] if self._best else 0.0):
+            self._best = travel, recording
+
+    def tick(self) -> None:
+        """Start the diagnosis if it is due, or tell what came of it."""
+        now = self._environment.wall()
+        if self._process is not None:
+            self._ended(now)
+        elif self._best is not None and now - self._last >= timedelta(hours=self._settings.hours):
+            recording, self._best, self._last = self._best[1], None, now
+            try:
+                self._start(recording, now)
+            except OSError as error:
+                self._failed(f"{recording.name}: {error}")
+
+    def close(self) -> None:
+        """End a diagnosis under way; it is made again with the next recording."""
+        process, self._process = self._process, None
+        if process is not None:
+            process.kill()
+            process.communicate()
+
+    def _start(self, recording: Path, now: datetime) -> None:
+        self._directory.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(recording, self._directory / f"{now:%Y%m%dT%H%M%SZ}.mcap")
+        for old in sorted(self._directory.glob("*.mcap"))[:-KEPT]:
+            old.unlink(missing_ok=True)
+        arm = self._configuration.arm.path
+        model = arm.parent / self._settings.sim if self._settings.sim else arm
+        command = [sys.executable, "-m", "armlink.cli", "gap", "trend", str(self._directory), "--sim", str(model)]
+        threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        self._begun = now
+        self._process = subprocess.Popen(
+            [*command, "--json", str(self._directory / FOUND)],
+            env={**os.environ, **threads},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        with contextlib.suppress(OSError):  # it may have ended, or the system may not permit it
+            os.setpriority(os.PRIO_PROCESS, self._process.pid, NICE)
+            Path(f"/proc/{self._process.pid}/oom_score_adj").write_text(FIRST_TO_KILL)
+
+    def _ended(self, now: datetime) -> None:
+        assert self._process is not None
+        if self._process.poll() is None:
+            if now - self._begun > LONGEST:
+                self.close()
+                self._failed(f"took longer than {LONGEST.total_seconds() / 60:.0f} min")
+            return
+        process, self._process = self._process, None
+        said = process.communicate()[1].strip().splitlines()
+        try:
+            answer = json.loads((self._directory / FOUND).read_text())
+        except (OSError, ValueError):
+            self._failed(said[-1].removeprefix("armlink: ") if said else f"ended with status {process.returncode}")
+            return
+        self._tell(answer)
+        (self._directory / FOUND).replace(self._directory / TOLD)
+
+    def _tell(self, found: dict[str, Any]) -> None:
+        """The answer of the day, and the changes that were not told yet."""
+        answer = found["newest"]["answer"]
+        if "error" in answer:
+            self._failed(answer["error"])
+            return
+        self._failure = ""
+        causes = ", ".join(f"{cause['effect']} of {' and '.join(cause['joints'])}" for cause in answer["causes"])
+        text = f"diagnosis of the day: {answer['verdict'].replace('_', ' ')}" + (f": {causes}" if causes else "")
+        self._events.say("diagnosis", None, text, {"recording": found["newest"]["case"], "causes": answer["causes"]})
+        told = {_key(trend) for trend in _trends(self._directory / TOLD)}
+        for trend in found["trends"]:
+            if _key(trend) not in told:
+                change = f"{trend['before']:.3g} to {trend['now']:.3g} {trend['unit']}"
+                text = f"{trend['joint']}: wear: {trend['parameter']} of {trend['effect']} went from {change}"
+                self._events.say("wear", trend["joint"], f"{text} since {trend['since']}", trend)
+
+    def _failed(self, why: str) -> None:
+        """Say why there is no diagnosis, once for the same reason."""
+        if why != self._failure:
+            self._events.say("diagnosis", None, f"no diagnosis of the day: {why}", {})
+        self._failure = why
+
+
+def _date(recording: Path) -> datetime:
+    try:
+        return datetime.strptime(f"{recording.stem}+0000", "%Y%m%dT%H%M%SZ%z")
+    except ValueError:
+        return datetime.min.replace(tzinfo=UTC)
+
+
+def _trends(path: Path) -> list[dict[str, Any]]:
+    try:
+        return list(json.loads(path.read_text())["trends"])
+    except (OSError, ValueError, KeyError):
+        return []
+
+
+def _key(trend: dict[str, Any]) -> tuple[str, str, str]:
+    return trend["effect"], trend["joint"], trend["parameter"]
