@@ -42,6 +42,8 @@ FLUSH_SECONDS = 0.5
 MOST_CHUNK = 1 << 28
 """A chunk that unpacks to more bytes is refused; rosbag2 writes less than a thousandth of it."""
 _NANO = 1_000_000_000
+_DAMAGED = (McapError, ValueError, OverflowError, MemoryError, OSError, struct.error, ZstdError)
+"""What reading a damaged file raises."""
 
 
 class RecordingWriter:
@@ -135,7 +137,7 @@ def has_our_topics(path: Path) -> bool:
     try:
         with path.open("rb") as stream:
             summary = make_reader(stream).get_summary()
-    except (McapError, ValueError, OSError, struct.error, ZstdError, MemoryError):
+    except _DAMAGED:
         return True
     if summary is None or not summary.channels:
         return True
@@ -171,7 +173,7 @@ def _read(path: Path) -> tuple[dict[str, list[JointState]], str]:
             why = str(error)
         except RuntimeError as error:  # of LZ4
             why = f"a chunk cannot be unpacked ({error})"
-        except (McapError, ValueError, MemoryError, OSError, struct.error, ZstdError):
+        except _DAMAGED:
             pass
         position = stream.tell()
     if complete:

@@ -12,13 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rosbags.highlevel import AnyReader, AnyReaderError
-from rosbags.rosbag2 import ReaderError
-from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, TypesysError, get_typestore
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
 
 from armlink.arrays import Array
-from armlink.errors import BadInput
+from armlink.errors import ArmlinkError, BadInput
 from armlink.recording.joint_messages import left_out, main_joints, nearest_rows
 from armlink.recording.recording import MOST_JOINTS, Recording, require_size
 
@@ -54,7 +52,9 @@ def load_bag(path: Path, topic: str = "") -> Recording:
                 require_size(size, str(path))
                 message = reader.deserialize(raw, connection.msgtype)
                 samples[connection.topic].append(_READERS[_short(connection.msgtype)](message, receipt))
-    except (AnyReaderError, ReaderError, SerdeError, TypesysError, OSError, KeyError, ValueError) as error:
+    except ArmlinkError:
+        raise
+    except Exception as error:  # damaged files raise many kinds, those of each compression too
         raise BadInput(f"{path}: cannot read the bag: {str(error).partition(chr(10))[0]}") from None
     main = samples.pop(states[0].topic, [])
     if not main:

@@ -237,8 +237,8 @@ def judged(target: str, found: list[Mutant], tests: list[str]) -> tuple[int, int
     seen = Survey(target).run(tests)
     alive = unexplained = 0
     for mutant in found:
-        by = tests_of(mutant, seen)
-        if any(noticed(target, mutant.source, part) for part in _parts(by, tests)):
+        by, source = tests_of(mutant, seen), mutant.source()
+        if source is None or any(noticed(target, source, part) for part in _parts(by, tests)):
             continue
         why = next((why for part, why in EXPLAINED.items() if part in mutant.what), "")
         alive, unexplained = alive + 1, unexplained + (not why)

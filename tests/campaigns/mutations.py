@@ -2,6 +2,7 @@
 
 import ast
 import copy
+import functools
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -106,7 +107,8 @@ class Mutant(NamedTuple):
 
     what: str
     """Where, and which."""
-    source: str
+    source: Callable[[], str | None]
+    """Makes the module's source with it; None where nothing but the way of writing would change."""
     lines: range
     """Of the statement that it is in, a compound one's head."""
 
@@ -116,15 +118,18 @@ def mutants(path: Path) -> Iterator[Mutant]:
     text = path.read_text(encoding="utf-8")
     tree, lines = ast.parse(text), text.splitlines()
     statements = [_lines_of(node) for node in ast.walk(tree) if isinstance(node, ast.stmt)]
+    original = ast.unparse(tree)
+
+    def made(place: int, change: Callable[[ast.AST], ast.AST]) -> str | None:
+        source = ast.unparse(ast.fix_missing_locations(Changed(place, change).visit(copy.deepcopy(tree))))
+        return None if source == original else source
+
     for place, node in enumerate(ordered(tree)):
         for what, change in edits(node):
             line = getattr(node, "lineno", 0)
-            mutated = Changed(place, change).visit(copy.deepcopy(tree))
-            source = ast.unparse(ast.fix_missing_locations(mutated))
-            if source != ast.unparse(tree):
-                around = [each for each in statements if line in each] or [range(line, line + 1)]
-                smallest = min(around, key=len)
-                yield Mutant(f"{path.name}:{line}: {lines[line - 1].strip()!r}: {what}", source, smallest)
+            around = [each for each in statements if line in each] or [range(line, line + 1)]
+            said = f"{path.name}:{line}: {lines[line - 1].strip()!r}: {what}"
+            yield Mutant(said, functools.partial(made, place, change), min(around, key=len))
 
 
 def _lines_of(statement: ast.stmt) -> range:

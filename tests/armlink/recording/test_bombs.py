@@ -4,6 +4,7 @@ import gzip
 import json
 import struct
 import zlib
+from pathlib import Path
 
 import lz4.frame
 import numpy as np
@@ -129,3 +130,34 @@ def test_a_chunk_that_says_less_than_it_unpacks_to(tmp_path, pack):
     much = struct.pack("<QQQI", 0, 0, 1 << 40, 0) + packed[28:]
     (tmp_path / "r.mcap").write_bytes(begin + b"\x06" + struct.pack("<Q", len(much)) + much)
     refused(tmp_path / "r.mcap", "a chunk of 1099511627776 bytes, expected at most")
+
+
+CORPUS = Path(__file__).parent / "corpus"
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in CORPUS.iterdir()))
+def test_what_fuzzing_found_loads_or_is_refused_in_one_line(name):
+    """Files of the campaign `fuzz_files` that ended in a traceback once."""
+    said = ""
+    try:
+        loaded = load_recording(CORPUS / name)
+    except BadInput as error:
+        said = str(error)
+    assert len(said.splitlines()) == 1 if said else loaded.t.size > 0
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_a_name_of_a_message_type_is_not_run_as_a_program(tmp_path, monkeypatch, inside):
+    """rosbags makes Python source of message definitions; it takes nothing but names for names."""
+    monkeypatch.chdir(tmp_path)
+    hostile = 'A(__import__("pathlib").Path("made").touch() or object)'
+    name, text = ("pkg/msg/A", f"pkg/B b\n{'=' * 80}\nMSG: {hostile}\nint8 x") if inside else (hostile, "int8 x")
+    with (tmp_path / "r.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2")
+        schema = writer.register_schema(name, "ros2msg", text.encode())
+        channel = writer.register_channel("/anything", "cdr", schema)
+        writer.add_message(channel, 0, b"\x00\x01\x00\x00\x01", 0)
+        writer.finish()
+    refused(tmp_path / "r.mcap", "cannot read the bag")
+    assert not (tmp_path / "made").exists()

@@ -9,6 +9,7 @@ import pytest
 from armlink.arm_file import load_arm
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen.sdo import PumpedNetwork, joint_services
+from armlink.errors import BusFault
 
 
 class SlowNode:
@@ -45,3 +46,15 @@ def test_late_responses_are_not_taken_for_those_of_the_next_request(behind: int)
         services.write_checked(objects.STAGED_GAIN, gain)
         services.write_checked(objects.RECORD_ID, record)
         assert services.read(objects.STAGED_GAIN) == struct.unpack("<f", struct.pack("<f", gain))[0]
+
+
+@pytest.mark.parametrize("held", [0.9000001, 0.0])
+def test_a_value_that_the_device_does_not_hold_bit_for_bit_is_a_fault(held: float) -> None:
+    node = SlowNode(0)
+    arm = load_arm("sarcos")
+    services = joint_services(node.network, arm, arm.require_link().joints, node.pump)[0]
+    services.write_checked(objects.STAGED_GAIN, 0.9)
+    for place in node.values:
+        node.values[place] = struct.pack("<f", held)
+    with pytest.raises(BusFault, match=r"wrote 0\.9, the device holds 0"):
+        services.expect(objects.STAGED_GAIN, 0.9)
