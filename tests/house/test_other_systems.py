@@ -4,7 +4,7 @@ import subprocess
 import sys
 
 ELSEWHERE = """
-import ctypes, os, resource, select, signal, socket, sys
+import ctypes, os, resource, select, selectors, signal, socket, sys
 
 def drop(module, *beginnings):
     for name in [name for name in dir(module) if name.startswith(beginnings)]:
@@ -15,6 +15,7 @@ drop(os, "sched_", "SCHED_", "eventfd", "EFD_", "memfd", "MFD_", "pidfd", "posix
 drop(socket, "AF_CAN", "PF_CAN", "CAN_", "SOL_CAN", "AF_NETLINK", "AF_PACKET", "AF_VSOCK", "AF_ALG", "SO_PEERCRED",
      "SO_MARK", "SO_PRIORITY", "SO_BINDTODEVICE", "SOCK_CLOEXEC", "SOCK_NONBLOCK", "TCP_USER_TIMEOUT", "MSG_NOSIGNAL")
 drop(select, "epoll", "EPOLL")
+drop(selectors, "EpollSelector")
 drop(signal, "sigwaitinfo", "sigtimedwait", "SIGRTM", "SIGPWR", "SIGSTKFLT", "SIGPOLL", "pidfd")
 drop(resource, "prlimit", "RLIMIT_SIGPENDING", "RLIMIT_RTPRIO", "RLIMIT_MSGQUEUE", "RUSAGE_THREAD")
 import time

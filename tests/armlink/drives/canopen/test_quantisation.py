@@ -56,7 +56,8 @@ def test_the_bytes_say_what_was_ordered(torque, position, counts):
     sent = found.sent(0)
     assert word == 0x0F
     assert sent.power is Power.ON
-    assert abs(sent.torque) <= abs(torque) < abs(sent.torque) + 0.04 * (1 + 1e-9)
+    assert abs(sent.torque) <= abs(torque) * (1 + 1e-12)  # 35 steps of 0.04 are 1.4000000000000001
+    assert abs(torque) < abs(sent.torque) + 0.04 * (1 + 1e-9)
     assert abs(sent.position - position) <= unit.position * (1 + 1e-9)
     assert -2.0 <= sent.position <= 2.0
 
