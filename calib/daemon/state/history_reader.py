@@ -11,8 +11,8 @@ from urllib.parse import quote
 
 HistoryRow = tuple[datetime, float, str | None, dict[str, Any]]
 """Time, monotonic time [s], record id, estimates of all joints."""
-PAGE = 500
-"""Rows that are in memory at a time."""
+PAGE = 100
+"""Rows that are in memory at a time, and are made JSON of without letting other threads run."""
 LOCK_SECONDS = 2.0
 
 
