@@ -149,18 +149,26 @@ class _Friction:
 
 
 def missing_in_readings(estimate: Estimate | None, sets: Sequence[ResidualSet]) -> list[Compensation]:
-    """Recordings in which a joint has none of the friction that most others show, or drives itself on."""
+    """Recordings in which joints have none of the friction that most others show, or drive themselves on.
+
+    It must be more than half of the joints that show friction at all: a controller compensates an arm's, and one joint
+    alone may have too little motion, or a load that was taken for it.
+    """
     every = [one for data in sets for one in _frictions(estimate, data)]
-    out = {}
+    out: dict[tuple[str, str], Compensation] = {}
+    shown: dict[str, set[Row]] = {}
     for one in every:
         others = [other.torque for other in every if other.row == one.row and other.recording != one.recording]
         usual = float(np.median(others)) if others else 0.0
         margin = max(data.margin[one.row] for data in sets)
+        if max(usual, abs(one.torque)) > margin:
+            shown.setdefault(one.recording, set()).add(one.row)
         lacks = usual > margin and one.torque < LEAST_SHARE * usual
         if (lacks or one.torque < -margin) and max(usual, 0.0) - one.torque > CLEAR * one.error:
             name, beside = sets[0].signals[0].arm.names[one.row[1]], usual if others else None
             out[one.recording, name] = Compensation(one.recording, name, one.row[0], False, one.torque, usual=beside)
-    return list(out.values())
+    lacking = [recording for recording, _ in out]
+    return [each for each in out.values() if 2 * lacking.count(each.recording) > len(shown[each.recording])]
 
 
 def _frictions(estimate: Estimate | None, data: ResidualSet) -> list[_Friction]:
