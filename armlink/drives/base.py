@@ -81,9 +81,11 @@ class BasicDrives:
         return None
 
     def fault(self, modes: Sequence[int], now: float) -> BusFault | None:
-        """See Drives."""
-        if self.all_on():
+        """See Drives. Most cycles find every drive on and well, and look no further."""
+        if self.powers.count(Power.ON) == self.m and not any(self.faults):
             return None
+        if stalled := self.stalled(modes):
+            return Stall(stalled)
         for joint, mode in enumerate(modes):
             power = self.powers[joint]
             if self.faults[joint]:
@@ -96,9 +98,9 @@ class BasicDrives:
                 return BusFault(f"{self.where(joint)}: power is {power.value}, expected on")
         return None
 
-    def all_on(self) -> bool:
-        """Whether every drive is on and tells no fault: most cycles need not look further."""
-        return self.powers.count(Power.ON) == self.m and not any(self.faults)
+    def stalled(self, modes: Sequence[int]) -> str:
+        """Which drive's watchdog ran out, by signs of the family's own; empty if none did, or none would show it."""
+        return ""
 
     def has_restarted(self) -> int | None:
         """See Drives: no drive tells."""

@@ -91,7 +91,8 @@ class Listener(Calibrations):
     def torque_sent(self) -> Array:
         """Commanded torque of the other controller for the last sample of `next` [N·m], (n,); NaN before its first.
 
-        Of a drive with gains the torque of its law at the readings of that sample."""
+        Of a drive with gains the torque of its law at the readings of that sample.
+        """
         return self._commands[0]
 
     @property

@@ -27,7 +27,7 @@ from armlink.drives.mit_packing import (
 )
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
 from armlink.drives.traits import Traits
-from armlink.errors import BusFault, Stall
+from armlink.errors import BusFault
 
 TRAITS = Traits(torque="current", calibration="host", silence="falls", bounds=(), cadence="reply", frame="11")
 OTHER_MODES = {0x100: "position", 0x200: "velocity", 0x300: "force"}
@@ -246,12 +246,9 @@ class DamiaoDrives(BasicDrives):
             return Power.STOPPED if known.damping else Power.ON
         return POWERS.get(known.state, Power.FAULT)
 
-    def fault(self, modes: Sequence[int], now: float) -> BusFault | None:
-        """See Drives."""
-        if self.all_on():
-            return None
-        lost = self.own_stop()
-        return Stall(lost) if lost else super().fault(modes, now)
+    def stalled(self, modes: Sequence[int]) -> str:
+        """See BasicDrives."""
+        return self.own_stop()
 
     def state_request(self, joint: int) -> list[Frame]:
         """See Drives."""

@@ -22,7 +22,7 @@ from armlink.drives.moteus.frames import (
 from armlink.drives.moteus.settings import MoteusSettings
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
 from armlink.drives.traits import Traits
-from armlink.errors import BadInput, BusFault, Stall
+from armlink.errors import BadInput, BusFault
 
 TURN = 2 * math.pi
 TRAITS = Traits(torque="current", calibration="host", silence="damps", bounds=("torque",), cadence="reply", frame="fd")
@@ -267,10 +267,9 @@ class MoteusDrives(BasicDrives):
             )
         )
 
-    def fault(self, modes: Sequence[int], now: float) -> BusFault | None:
-        """See Drives."""
-        lost = self.own_stop()
-        return Stall(lost) if lost else super().fault(modes, now)
+    def stalled(self, modes: Sequence[int]) -> str:
+        """See BasicDrives."""
+        return self.own_stop()
 
     def state_request(self, joint: int) -> list[Frame]:
         """See Drives: a query."""

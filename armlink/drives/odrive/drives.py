@@ -28,7 +28,7 @@ from armlink.drives.odrive.frames import (
 )
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
 from armlink.drives.traits import Traits
-from armlink.errors import BusFault, Stall
+from armlink.errors import BusFault
 
 TURN = 2 * math.pi
 TRAITS = Traits(torque="current", calibration="host", silence="falls", bounds=(), cadence="cyclic", frame="11")
@@ -271,10 +271,9 @@ class ODriveDrives(BasicDrives):
             return self.note(Reading(joint, temperature=max(values)))
         return None
 
-    def fault(self, modes: Sequence[int], now: float) -> BusFault | None:
-        """See Drives."""
-        lost = self.own_stop()
-        return Stall(lost) if lost else super().fault(modes, now)
+    def stalled(self, modes: Sequence[int]) -> str:
+        """See BasicDrives."""
+        return self.own_stop()
 
     def lets_go(self, joint: int) -> bool:
         """See Drives: in every state but closed loop."""

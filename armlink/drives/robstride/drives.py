@@ -15,7 +15,7 @@ from armlink.drives.robstride import frames
 from armlink.drives.robstride.frames import RANGES, Type, fault_names
 from armlink.drives.robstride.set_up import identify, prepare
 from armlink.drives.traits import Traits
-from armlink.errors import BusFault, Stall
+from armlink.errors import BusFault
 
 TRAITS = Traits(torque="current", calibration="host", silence="falls", bounds=(), cadence="reply", frame="29")
 HOST_TYPES = frozenset((Type.MOTION, Type.ENABLE, Type.STOP, Type.SET_ZERO, Type.SET_ID, Type.WRITE, Type.SAVE))
@@ -183,12 +183,12 @@ class RobStrideDrives(BasicDrives):
         """See Drives: another host."""
         return BusFault(self._intruder) if self._intruder else None
 
-    def fault(self, modes: Sequence[int], now: float) -> BusFault | None:
-        """See Drives. A watchdog that ran out shows as mode reset alone."""
+    def stalled(self, modes: Sequence[int]) -> str:
+        """See BasicDrives: a watchdog that ran out shows as mode reset alone."""
         for joint, mode in enumerate(modes):
             if mode and self._stopped_itself(joint):
-                return Stall(f"{self.where(joint)}: went to mode reset: its canTimeout ran out, the torque is off")
-        return super().fault(modes, now)
+                return f"{self.where(joint)}: went to mode reset: its canTimeout ran out, the torque is off"
+        return ""
 
     def state_request(self, joint: int) -> list[Frame]:
         """See Drives: the torque limit, written as it is, since a reading is answered without the mode."""
