@@ -1,6 +1,7 @@
 """The arm file's section `daemon`, read again at SIGHUP, and the configuration in use."""
 
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, FiniteFloat, field_validator
@@ -32,7 +33,7 @@ class DiagnosisSettings(Section):
     """Time from one to the next [h]."""
     travel: Positive = 20.0
     """Least path of all joints together in a recording that is diagnosed [rad]."""
-    sim: str | None = None
+    sim: Path | None = None
     """Nominal model: MJCF, URDF or arm file, a path from the arm file; by default the arm file itself."""
 
 

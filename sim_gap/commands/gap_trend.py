@@ -1,9 +1,12 @@
 """Diagnoses the recordings of one arm in turn, and tells which parameter changes over them."""
 
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+UNDATED = datetime.min.replace(tzinfo=UTC)
 
 
 def trend(
@@ -27,14 +30,14 @@ def trend(
     from armlink.commands.output import write_json
     from sim_gap.commands.gap_fleet import show_changes
     from sim_gap.fleet.fleet import Answers, diagnose_case, find_cases
-    from sim_gap.fleet.trends import fleet_trends, rows
+    from sim_gap.fleet.trends import date_of, fleet_trends, rows
     from sim_gap.model.load import load_compiled
 
     load_compiled(sim)  # what is wrong with it is no answer of a recording
     console = Console(stderr=True)
     answers = Answers(out or folder / "answers.jsonl")
     newest = ""
-    for case in find_cases(folder, sim):
+    for case in sorted(find_cases(folder, sim), key=lambda case: (date_of(case.name) or UNDATED, case.name)):
         newest = f"{folder.resolve().name}/{case.name}"
         if newest not in answers.found:
             answers.add(newest, diagnose_case(case))

@@ -80,6 +80,7 @@ class DailyDiagnosis:
         command = [sys.executable, "-m", "armlink.cli", "gap", "trend", str(self._directory), "--sim", str(model)]
         threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         self._begun = now
+        (self._directory / FOUND).unlink(missing_ok=True)  # of a diagnosis that was ended: it is no answer of this one
         self._process = subprocess.Popen(
             [*command, "--json", str(self._directory / FOUND)],
             env={**os.environ, **threads},

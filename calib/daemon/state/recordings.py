@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from armlink.arrays import Array
 from armlink.recording.mcap import RecordingWriter
 from calib.daemon.loop.loop_messages import Batch
 from calib.daemon.settings import Configuration, RecordingSettings
@@ -31,7 +32,8 @@ class Recordings:
         """
         self._directory, self._configuration, self._finished = directory, configuration, finished
         self._writer: RecordingWriter | None = None
-        self._path, self._travel, self._at = directory, 0.0, np.zeros(0)
+        self._path, self._travel = directory, 0.0
+        self._at: Array | None = None
         self._begun = self._last = self._due = -float("inf")
         self._failed_at = -float("inf")
 
@@ -74,10 +76,10 @@ class Recordings:
                 continue
             self._due = max(self._due + 1 / self._settings.rate, t + 0.5 / self._settings.rate)
             self._writer.append(t - self._begun, {name: values[k] for name, values in batch.channels.items()})
-            if "position" in batch.channels:
-                q = batch.channels["position"][k]
-                moved = np.abs(q - self._at) if len(self._at) else np.zeros(1)
-                self._travel, self._at = self._travel + float(np.nansum(moved)), q
+            at = batch.channels["position"][k]
+            if self._at is not None:
+                self._travel += float(np.nansum(np.abs(at - self._at)))
+            self._at = at
 
     def _rotate(self, t: float) -> None:
         self.close()
@@ -88,7 +90,7 @@ class Recordings:
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
         self._path = self._directory / f"{number:08d}-{stamp}.mcap"
         self._writer = RecordingWriter(self._path, self._configuration.names)
-        self._travel, self._at = 0.0, np.zeros(0)
+        self._travel, self._at = 0.0, None
         self._begun = self._due = t
 
     def _keep_quota(self) -> None:

@@ -1,5 +1,6 @@
 """The diagnosis of the day: which recording, when, in a process of its own, and what is said."""
 
+import json
 import time
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -78,6 +79,16 @@ def test_why_there_is_none_is_said_once(tmp_path: Path) -> None:
     assert (kind, joint) == ("diagnosis", None)
     assert text.startswith("no diagnosis of the day: no model file ")
     assert "\n" not in text
+
+
+def test_the_answer_of_one_that_was_ended_is_not_that_of_the_next(tmp_path: Path) -> None:
+    bench, folder = Bench(tmp_path / "diagnosis"), tmp_path / "diagnosis"
+    folder.mkdir()
+    left = {"newest": {"case": "old", "answer": {"verdict": "no_gap", "causes": []}}, "trends": []}
+    (folder / "trend.new.json").write_text(json.dumps(left))
+    bench.daily.finished(recording(tmp_path, "any"), 30.0)
+    bench.day()
+    assert "no model file" in bench.said[0][2]
 
 
 def test_a_recording_that_the_quota_took_is_no_end_of_the_daemon(tmp_path: Path) -> None:

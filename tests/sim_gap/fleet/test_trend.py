@@ -69,6 +69,15 @@ def test_by_command(folder: Path) -> None:
     assert (folder / "answers.jsonl").read_text().splitlines() == lines
 
 
+def test_the_newest_is_that_of_the_latest_date(folder: Path) -> None:
+    for name in ("a-2026-11-17.mcap", "b-2026-11-16.mcap"):
+        worn(folder / name)
+    out = folder / "trend.json"
+    arguments = ["trend", str(folder), "--sim", str(folder.parent / "sim.xml"), "--json", str(out)]
+    assert CliRunner().invoke(app, arguments, standalone_mode=False).return_value == 0
+    assert json.loads(out.read_text())["newest"]["case"] == "a-2026-11-17.mcap"
+
+
 def test_by_the_daemon(folder: Path) -> None:
     """What wears is an event, once."""
     said: list[tuple[Any, ...]] = []
