@@ -19,9 +19,12 @@ from armlink.drives.mit_packing import (
     MitCommand,
     MitFeedback,
     Ranges,
+    Special,
     grid_of,
     pack_command,
     pack_feedback,
+    special,
+    special_of,
     unpack_command,
     unpack_feedback,
     unwrap,
@@ -111,9 +114,9 @@ def test_damiao_reply_by_hand_and_by_the_stock_client():
 
 
 def test_damiao_special_commands_and_registers_by_hand():
-    assert damiao.special(damiao.Special.ENABLE).hex() == "fffffffffffffffc"
-    assert damiao.special_of(bytes.fromhex("fffffffffffffffd")) is damiao.Special.DISABLE
-    assert damiao.special_of(bytes.fromhex("ffffffffffffff00")) is None
+    assert special(Special.ENABLE).hex() == "fffffffffffffffc"
+    assert special_of(bytes.fromhex("fffffffffffffffd")) is Special.DISABLE
+    assert special_of(bytes.fromhex("ffffffffffffff00")) is None
     assert damiao.read_request(0x102, 21).hex() == "0201331500000000"
     assert damiao.write_request(2, 10, 1).hex() == "0200550a01000000"  # uint32
     assert damiao.write_request(2, 23, 28.0).hex() == "020055170000e041"  # float
