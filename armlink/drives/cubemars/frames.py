@@ -2,7 +2,8 @@
 
 A reply has the drive's id, position, velocity and torque; from firmware 1.1 on also a temperature and an error. It
 tells neither whether the motor has power nor whether a watchdog ran out. Sources: the maker's driver manual for the AK
-series, section 5.3; neurobionics/TMotorCANControl `mit_can.py`; dfki-ric-underactuated-lab/mini-cheetah-tmotor-python-can.
+series, section 5.3; `mit_can.py` of neurobionics/TMotorCANControl; dfki-ric-underactuated-lab/mini-cheetah-tmotor-
+python-can.
 """
 
 from typing import NamedTuple

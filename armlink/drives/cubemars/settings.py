@@ -38,8 +38,8 @@ class CubeMarsSettings(DriveSettings):
         given = (self.position_range, self.velocity_range, self.torque_range)
         if self.model.upper() not in MODELS and None in given:
             raise ValueError(
-                f"model {self.model!r} is not known: give one of {', '.join(MODELS)}, or position_range, velocity_range "
-                "and torque_range as its manual has them"
+                f"model {self.model!r} is not known: give one of {', '.join(MODELS)}, or position_range, "
+                "velocity_range and torque_range as its manual has them"
             )
         return self
 

@@ -33,8 +33,9 @@ from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
-ARMS = ("six-damiao", "six-robstride", "six-moteus", "six-odrive")
-MIT = ARMS[:2]
+ARMS = ("six-damiao", "six-cubemars", "six-robstride", "six-moteus", "six-odrive")
+MIT = ARMS[:3]
+PACKED_ALIKE = ARMS[:2]
 every_arm = pytest.mark.parametrize("name", ARMS)
 NAN = math.nan
 
@@ -267,8 +268,9 @@ def told(name, bench, joint, frames):
     row = bench.link.joints[joint].settings
     found = []
     for can_id, data in frames:
-        if name == "six-damiao" and can_id == row.id and data[:7] != b"\xff" * 7:
-            p, v, t = (bench.simulated[joint].registers[register] for register in (21, 22, 23))
+        if name in PACKED_ALIKE and can_id == row.id and data[:7] != b"\xff" * 7:
+            device = bench.simulated[joint]
+            p, v, t = device.coding[:3] if name == "six-cubemars" else (device.registers[r] for r in (21, 22, 23))
             bits = int.from_bytes(data, "big")
             q, dq = bits >> 48, bits >> 36 & 0xFFF
             kp, kd, torque = bits >> 24 & 0xFFF, bits >> 12 & 0xFFF, bits & 0xFFF
@@ -333,6 +335,8 @@ def lies(name, draw, bench, joint):
     row = bench.link.joints[joint].settings
     if name == "six-damiao":
         return row.reply, draw.draw(st.binary(max_size=8))
+    if name == "six-cubemars":
+        return row.reply, bytes([row.id]) + draw.draw(st.binary(max_size=7))
     if name == "six-robstride":
         head = draw.draw(st.integers(0, 255))
         return 2 << 24 | head << 16 | row.id << 8 | row.host | EXTENDED, draw.draw(st.binary(max_size=8))

@@ -27,6 +27,7 @@ DAMIAO = {"family": "damiao", "id": 2, "reply": 0x12, "model": "DM4340", "kp": 4
 DM4340 = Ranges(12.5, 10.0, 28.0)
 FAMILIES = [
     DAMIAO,
+    {"family": "cubemars", "id": 6, "model": "AK80-9", "can_timeout": 4000, "kp": 40, "kd": 1.0},
     {"family": "robstride", "id": 3, "model": "RS01", "kp": 40, "kd": 1.0},
     {"family": "moteus", "id": 4},
     {"family": "odrive", "node": 5},
@@ -60,6 +61,7 @@ def mixed():
         {"family": "canopen", "node": 5},
         DAMIAO,
         {"family": "robstride", "id": 3, "model": "RS01", "kp": 40, "kd": 1.0},
+        {"family": "cubemars", "id": 6, "model": "AK80-9", "kp": 40, "kd": 1.0},
         {"family": "moteus", "id": 0x21},
         {"family": "odrive", "node": 20, "gear": 8.0},
     ]
@@ -90,6 +92,7 @@ def test_each_drive_of_a_mixed_arm_answers_its_own_frames():
         (0x605, bytes.fromhex("4000100000000000"), 0x585),
         (0x002, special(Special.CLEAR_ERROR), 0x12),
         (0x8300FD03, bytes(8), 0x828003FD),
+        (0x006, special(Special.DISABLE), 0x000),
         (0x80008021, read_mode, 0x80002100),
         (0x40000280, bytes(8), 0x280),
     ):
