@@ -55,6 +55,7 @@ class CubeMarsDrive(SimulatedDrive):
             self.motor_mode = False
         elif special is Special.SET_ZERO:
             self._zero, self._deaf_until = self.motor.position, self.now + ZEROING
+            return
         elif special is None and self.motor_mode:
             self.command = unpack_command(data, self.coding)
         self._answer()
