@@ -27,12 +27,13 @@ def scan_report(
     Raises BusFault for a joint that does not answer, Refused for another controller than the arm file states.
     """
     if arm is None:
-        joints, stated = {}, {}
+        joints, stated, stock = {}, {}, set[int]()
         opened = open_bus(bus, Bus())
     else:
         link = arm.require_link()
         sheets = of_joints(arm, link.joints)
         joints = {joint.settings.node: joint.name for joint in link.joints}
+        stock = {joint.settings.node for joint in link.joints if joint.settings.torque != "record"}
         stated = {
             each.settings.node: expected_identity(each, sheet) for each, sheet in zip(link.joints, sheets, strict=True)
         }
@@ -46,7 +47,7 @@ def scan_report(
             if arm is not None and isinstance(opened, BusGroup):
                 named = [joint for joint in arm.require_link().joints if opened.tags[joint.bus] >> BUS_SHIFT == place]
                 here = {joint.settings.node: joint.name for joint in named}
-            found += scan_bus(member, clock, here)
+            found += scan_bus(member, clock, here, stock & here.keys())
         channel = str(opened.channel_info)
     finally:
         opened.shutdown()
@@ -64,7 +65,11 @@ def scan_report(
             table.add_row(str(each.node), each.joint, *told, identity, str(each.serial), style=style)
         else:
             table.add_row(str(each.node), each.joint, "[red]no answer[/red]")
-    Console(stderr=True).print(table if found else f"{channel}: no node answers")
+    console = Console(stderr=True)
+    console.print(table if found else f"{channel}: no node answers")
+    for lost in dict.fromkeys(lost for each in found for lost in each.lost):
+        lacking = [each.joint for each in found if lost in each.lost]
+        console.print(f"{', '.join(lacking)} {'lacks' if len(lacking) == 1 else 'lack'} {lost}", soft_wrap=True)
     nodes = [{**vars(each), "state": each.state.value, "mismatches": wrong.get(each.node, [])} for each in found]
     write(json, {"bus": channel, "nodes": nodes})
     missing = [f"{each.joint} (node {each.node})" for each in found if not each.present]
