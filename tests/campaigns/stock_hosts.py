@@ -1,8 +1,8 @@
 """Hosts that are not ours: each family's stock client sways all joints of a bundled arm, on a bus of python-can.
 
-`stock_hosts.py ARM six-damiao 239.74.163.77 --seconds 600`: damiao-motor, moteus, odrive-can, canopen, TMotorCANControl,
-and robstride with the motion commands of the manual, which that package lacks. Of armlink they use the arm file's
-numbers (ids, direction, zero, gear) and nothing else.
+`stock_hosts.py ARM six-damiao 239.74.163.77 --seconds 600`: damiao-motor, moteus, odrive-can, canopen,
+TMotorCANControl, and robstride with the motion commands of the manual, which it lacks. Of armlink they use the arm
+file's numbers (ids, direction, zero, gear) and nothing else.
 """
 
 import argparse
