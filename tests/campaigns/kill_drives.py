@@ -66,7 +66,8 @@ def one_try(name: str, arm: serving.Served, group: str, number: int) -> float:
         time.sleep(0.02 * (number % 10) / 10)
         os.kill(host.pid, signal.SIGKILL)
         struck = time.monotonic()
-        falls = family(name).traits.silence == "falls"
+        described = serving.pendulum(DRIVES[name])
+        falls = family(name).build(described, described.require_link().joints).traits(0).silence == "falls"
         done = serving.wait_for(lambda: not arm.drive.motor.powered if falls else arm.drive.mode == 11, LONGEST)
         return time.monotonic() - struck if done else float("inf")
 
