@@ -90,7 +90,7 @@ def test_the_stock_client_drives_cyclic_velocity_where_nothing_else_is_offered()
         node.nmt.state = "OPERATIONAL"
 
         def moved_in(cycles: int) -> tuple[float, float, float]:
-            """Way, and the shortest and the longest simulated time it can have taken: time passes as the client waits."""
+            """Way, and the shortest and longest simulated time it can have taken: time passes as the client waits."""
             earliest = simulated.time
             before = node.sdo[0x6064].raw
             latest = simulated.time
