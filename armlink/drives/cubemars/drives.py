@@ -22,6 +22,7 @@ from armlink.errors import BadInput, BusFault
 
 TRAITS = Traits(torque="current", calibration="host", silence="keeps on", bounds=(), cadence="reply", frame="11")
 """Of a drive with the default keys; with a CAN timeout it lets go."""
+NMT_ID = 0
 LISTEN = 0.1
 """A drive that answers another host is heard within this time [s]."""
 LOADED = 0.02
@@ -70,6 +71,18 @@ class CubeMarsDrives(MitDrives):
                     f"{self.names[other]}'s commands: replies need an id that is no drive's (master id, usually 0)"
                 )
         self._replies = {(each.reply, each.id): joint for joint, each in enumerate(self._settings)}
+        self._spare_canopen(arm)
+
+    def _spare_canopen(self, arm: ArmFile) -> None:
+        """Raise BadInput where CANopen nodes share the bus and would take replies for NMT commands."""
+        buses = {row.bus for row, each in zip(self.rows, self._settings, strict=True) if each.reply == NMT_ID}
+        others = [each for each in arm.require_link().joints if each.settings.family == "canopen"]
+        for joint in others:
+            if joint.bus in buses:
+                raise BadInput(
+                    f"{arm.path}: {joint.name}: a CANopen node takes CubeMars replies on id 0 for NMT commands: put "
+                    "it on another bus, or set another master id in the drives (drive.reply)"
+                )
 
     # ---- set-up
 
