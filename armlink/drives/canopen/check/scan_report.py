@@ -27,13 +27,12 @@ def scan_report(
     Raises BusFault for a joint that does not answer, Refused for another controller than the arm file states.
     """
     if arm is None:
-        joints, stated, stock = {}, {}, set[int]()
+        joints, stated = {}, {}
         opened = open_bus(bus, Bus())
     else:
         link = arm.require_link()
         sheets = of_joints(arm, link.joints)
         joints = {joint.settings.node: joint.name for joint in link.joints}
-        stock = {joint.settings.node for joint in link.joints if joint.settings.torque != "record"}
         stated = {
             each.settings.node: expected_identity(each, sheet) for each, sheet in zip(link.joints, sheets, strict=True)
         }
@@ -43,11 +42,11 @@ def scan_report(
         port = opened.open_port()
         found = []
         for place, member in enumerate(port.members if isinstance(port, GroupPort) else (port,)):
-            here = joints
-            if arm is not None and isinstance(opened, BusGroup):
-                named = [joint for joint in arm.require_link().joints if opened.tags[joint.bus] >> BUS_SHIFT == place]
-                here = {joint.settings.node: joint.name for joint in named}
-            found += scan_bus(member, clock, here, stock & here.keys())
+            named = [] if arm is None else arm.require_link().joints
+            if isinstance(opened, BusGroup):
+                named = [joint for joint in named if opened.tags[joint.bus] >> BUS_SHIFT == place]
+            stock = {joint.settings.node for joint in named if joint.settings.torque != "record"}
+            found += scan_bus(member, clock, {joint.settings.node: joint.name for joint in named}, stock)
         channel = str(opened.channel_info)
     finally:
         opened.shutdown()
