@@ -2,12 +2,13 @@
 
     python tests/campaigns/fleet_days.py [--arms 20] [--days 60] [--seed 1]
 
-Every arm is recorded once a day on the same motion and diagnosed; friction or the gain of a sensor of the worn arms
-changes from a quarter of the days on, over 60 % of them. Prints the changes found; exit status 1 if one is noticed late
+Every arm is recorded once a day on the same motion and diagnosed; friction, play or the gain of a sensor of the worn
+arms changes from a quarter of the days on, over 60 % of them. Prints the changes found; exit status 1 if one is noticed late
 (after half of it), or another is.
 """
 
 import argparse
+import json
 import sys
 from dataclasses import replace
 from datetime import date, timedelta
@@ -20,18 +21,19 @@ from wrong_arms import Wrong, model, record
 
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.fleet.trends import fleet_trends
+from sim_gap.fleet.watched import watched
 
 START = date(2026, 9, 1)
-FRICTION, GAIN = 0.30, -0.03
-"""Relative change of the friction and of the gain of a joint by wear."""
+FRICTION, GAIN, PLAY = 0.30, -0.03, np.radians(0.2)
+"""Relative change of the friction and of the gain of a joint by wear, and its play by then [rad]."""
 NOISE = 0.02
 """Of both torque channels [N·m]."""
 WORN = (
     ("friction.coulomb", 1),
     ("torque.gain", 1),
-    ("friction.coulomb", 0),
+    ("transmission.backlash", 0),
     ("friction.viscous", 2),
-    ("torque.gain", 0),
+    ("transmission.backlash", 1),
 )
 """Effect and joint of each worn arm."""
 
@@ -39,12 +41,14 @@ WORN = (
 def of_the_day(effect: str, joint: int, worn: float, own: np.ndarray, random: np.random.Generator) -> Wrong:
     """An arm with its own friction and gain, which vary by a per cent from day to day."""
     daily = own * random.normal(1.0, 0.01, own.shape)
-    gain = 1.1 * np.ones(3) * random.normal(1.0, 0.001, 3)
+    gain, play = 1.1 * np.ones(3) * random.normal(1.0, 0.001, 3), np.zeros(3)
     if effect == "torque.gain":
         gain[joint] *= 1.0 + GAIN * worn
+    elif effect == "transmission.backlash":
+        play[joint] = PLAY * worn
     elif effect:
         daily[("friction.coulomb", "friction.viscous").index(effect), joint] *= 1.0 + FRICTION * worn
-    return Wrong(coulomb=daily[0], viscous=daily[1], gain=gain)
+    return Wrong(coulomb=daily[0], viscous=daily[1], gain=gain, play=play)
 
 
 def main() -> int:
@@ -52,6 +56,7 @@ def main() -> int:
     options.add_argument("--arms", type=int, default=20)
     options.add_argument("--days", type=int, default=60)
     options.add_argument("--seed", type=int, default=1)
+    options.add_argument("--answers", type=Path, help="keep the answers in this file, one JSON line each")
     asked = options.parse_args()
     random, answers = np.random.default_rng(asked.seed), {}
     begins, takes = asked.days // 4, int(0.6 * asked.days)
@@ -67,19 +72,23 @@ def main() -> int:
             noise = random.normal(0.0, NOISE, (2, *clean.position.shape))
             channels = {"torque": clean.torque + noise[0], "motor_torque": clean.motor_torque + noise[1]}
             recording = replace(clean, **channels)
-            made = diagnose(model(), [recording]).to_json()
-            answers[f"{arm}/{(START + timedelta(days=day)).isoformat()}"] = made
+            found = diagnose(model(), [recording])
+            made = found.to_json() | {"watched": watched(found)}
+            answers[case := f"{arm}/{(START + timedelta(days=day)).isoformat()}"] = made
+            if asked.answers:
+                with asked.answers.open("a") as file:
+                    file.write(json.dumps({"case": case, "answer": made}) + "\n")
         print(arm, effect or "sound", flush=True)
-    found, right = fleet_trends(answers), set()
-    half = START + timedelta(days=begins + takes // 2)
-    for trend in found:
+    trends, right = fleet_trends(answers), set()
+    half, false = START + timedelta(days=begins + takes // 2), 0
+    for trend in trends:
         meant = wears.get(trend.arm)
         own = meant == (trend.effect, int(trend.joint[-1]) - 1)
+        false += not own
         early = date.fromisoformat(trend.noticed) < half
         right |= {trend.arm} if own and early else set()
         print(trend, "" if own else "FALSE", "" if early else "LATE")
-    false = [trend for trend in found if wears.get(trend.arm, ("", 0))[0] != trend.effect]
-    print(f"{len(right)} of {len(wears)} worn arms seen in time, {len(false)} false alarms")
+    print(f"{len(right)} of {len(wears)} worn arms seen in time, {false} false alarms")
     return 0 if len(right) == len(wears) and not false else 1
 
 
