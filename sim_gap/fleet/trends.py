@@ -1,8 +1,9 @@
 """Trends of a fleet: which parameter of which arm changes, since when, and which arm differs from the others.
 
-A series is one parameter (friction of joint 2, say) of one arm over its dated diagnoses: those that are watched at every
-joint (`sim_gap.fleet.watched`), and those of the causes. Diagnoses of one arm on one motion share their systematic
-errors, so that a change is judged by the scatter from one diagnosis to the next and not by the intervals of each.
+A series is one parameter (friction of joint 2, say) of one arm over its dated diagnoses: those that are watched at
+every joint (`sim_gap.fleet.watched`), and those of the causes. Diagnoses of one arm on one motion share their
+systematic errors, so that a change is judged by the scatter from one diagnosis to the next and not by the intervals of
+each.
 """
 
 import re

@@ -21,7 +21,7 @@ MOVES = 0.05
 
 
 def watched(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Values of the watched parameters at each joint that moves, by effect, joint and parameter; none without torque."""
+    """Watched parameters with 95 % intervals, of each joint that moves; none without a torque channel."""
     made = diagnosis.internals
     if not isinstance(made, Internals) or made.nominal is None:
         return []
