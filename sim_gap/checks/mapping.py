@@ -88,7 +88,7 @@ def _best(
         if float((fit.cost - fit_rigid(arm, hypothesis.change(few)).cost).sum()) < SCREENED * SURE:
             continue
         better = fit_rigid(arm, hypothesis.change(motion))
-        fall = float(_told(better, fit.cost - better.cost).sum())
+        fall = float(_told(hypothesis, motion.channel, better, fit.cost - better.cost).sum())
         worse = float(np.max(better.cost - fit.cost))
         doubted = worse >= MOST_WORSE * fall or _contradicts(better, hypothesis.joints)
         if fall > most[doubted]:
@@ -98,17 +98,18 @@ def _best(
     return best
 
 
-def _told(fit: RigidFit, falls: Array) -> Array:
+def _told(hypothesis: Hypothesis, channel: str, fit: RigidFit, falls: Array) -> Array:
     """Falls of the cost by joint with a hypothesis, without those that the model has no part in, (n,).
 
     At a joint that others drag along, its motor all but idle, the model's torque is carried by friction and rotor: the
-    reading is a small difference of the three, which any change may happen to fit better, with a coefficient of the
-    model that no arm has.
+    motor reads a small difference of the three, which any change may happen to fit better, with a coefficient of the
+    model that no arm has. So it is with an angle unit that makes the model's torque too small by far.
     """
     low, high = PLAUSIBLE
-    unread = (fit.own_share > IDLE) & (fit.scale < 0.5 * low)
-    blown_up = (fit.scale > high) & (fit.own_share * fit.scale > STRONG_SHARE)
-    return np.where(unread | blown_up, np.minimum(falls, 0.0), falls)
+    nothing = (channel != "tau") & (fit.own_share > IDLE) & (fit.scale < 0.5 * low)
+    if hypothesis.kind == "scale":
+        nothing |= (fit.scale > high) & (fit.own_share * fit.scale > STRONG_SHARE)
+    return np.where(nothing, np.minimum(falls, 0.0), falls)
 
 
 def _contradicts(fit: RigidFit, joints: Sequence[int]) -> bool:

@@ -71,7 +71,7 @@ def main() -> int:
     answers = kept_answers(asked.answers)
     begins, takes = asked.days // 4, int(0.6 * asked.days)
     wears = {f"arm_{4 * k % asked.arms:02d}": WORN[k] for k in range(min(5, max(1, asked.arms // 4)))}
-    for number in range(asked.arms):
+    for number in sorted(range(asked.arms), key=lambda number: f"arm_{number:02d}" not in wears):
         arm = f"arm_{number:02d}"
         random = np.random.default_rng((asked.seed, number))
         own = np.array([[1.2], [0.8]]) * random.uniform(0.8, 1.2, (2, 3))
