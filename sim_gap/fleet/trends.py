@@ -108,7 +108,7 @@ def fleet_trends(answers: Mapping[str, Mapping[str, Any]]) -> list[Trend]:
     An arm with a case without a date, or with fewer than FIRST + LAST + 1 cases, has none.
     """
     series = _series(answers)
-    noise = {key: _scatter(one.values) for key, one in series.items()}
+    noise = {key: _scatter(one) for key, one in series.items()}
     pooled: dict[tuple[str, str], list[float]] = defaultdict(list)
     for (_, effect, _, parameter), (own, count, size) in noise.items():
         if count >= FIRST and size > 0.0:
@@ -212,14 +212,16 @@ def _values(
     }
 
 
-def _scatter(values: Array) -> tuple[float, int, float]:
-    """Standard deviation from one diagnosis to the next, the number of differences behind it, and the usual size."""
-    there = values[np.isfinite(values)]
+def _scatter(one: _Series) -> tuple[float, int, float]:
+    """Standard deviation from one diagnosis to the next, the number of differences behind it, and what it is in
+    proportion to over the fleet: the interval of what is watched, which wear does not change; else the usual size."""
+    there = one.values[np.isfinite(one.values)]
+    size = float(np.nanmedian(one.interval if one.watched else np.abs(one.values)))
     steps = np.diff(there)
     if len(steps) < 2:
-        return 0.0, 0, float(np.median(np.abs(there))) if len(there) else 0.0
+        return 0.0, 0, size
     own = 1.4826 * float(np.median(np.abs(steps - np.median(steps)))) / np.sqrt(2.0)
-    return float(own), len(steps), float(np.median(np.abs(there)))
+    return float(own), len(steps), size
 
 
 def _window(one: _Series, part: slice) -> float:

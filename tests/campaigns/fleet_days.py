@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "sim_gap"))
 from wrong_arms import Wrong, model, record
 
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.fleet.trends import fleet_trends
+from sim_gap.fleet.trends import Trend, fleet_trends
 from sim_gap.fleet.watched import watched
 
 START = date(2026, 9, 1)
@@ -59,6 +59,15 @@ def kept_answers(path: Path | None) -> dict[str, dict]:
     return {line["case"]: line["answer"] for line in map(json.loads, path.read_text().splitlines())}
 
 
+def told_day_by_day(answers: dict[str, dict], days: int) -> dict[tuple[str, ...], tuple[date, Trend]]:
+    """The first day on which each change is told, from the answers up to that day, and how it is told then."""
+    found: dict[tuple[str, ...], tuple[date, Trend]] = {}
+    for today in (START + timedelta(days=day) for day in range(days)):
+        for trend in fleet_trends({case: each for case, each in answers.items() if case[-10:] <= today.isoformat()}):
+            found.setdefault((trend.arm, trend.effect, trend.joint, trend.parameter), (today, trend))
+    return found
+
+
 def main() -> int:
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("--arms", type=int, default=20)
@@ -94,15 +103,15 @@ def main() -> int:
                 with asked.answers.open("a") as file:
                     file.write(json.dumps({"case": case, "answer": made}) + "\n")
         print(arm, effect or "sound", flush=True)
-    trends, right = fleet_trends(answers), set()
-    half, false = START + timedelta(days=begins + takes // 2), 0
-    for trend in trends:
-        meant = wears.get(trend.arm)
-        own = meant == (trend.effect, int(trend.joint[-1]) - 1)
+    half, right, false = START + timedelta(days=begins + takes // 2), set(), 0
+    for (arm, effect, joint, parameter), (noticed, trend) in told_day_by_day(answers, asked.days).items():
+        own = wears.get(arm) == (effect, int(joint[-1]) - 1)
         false += not own
-        early = date.fromisoformat(trend.noticed) < half
-        right |= {trend.arm} if own and early else set()
-        print(trend, "" if own else "FALSE", "" if early else "LATE")
+        right |= {arm} if own and noticed < half else set()
+        change = f"{trend.before:.4g} to {trend.now:.4g} {trend.unit} since {trend.since}"
+        late = "" if noticed < half else "LATE"
+        print(f"{noticed} {arm} {effect} {joint} {parameter} {change}", "" if own else "FALSE", late)
+    print(f"half of the wear is on {half}, {len(answers)} diagnoses; ", end="")
     print(f"{len(right)} of {len(wears)} worn arms seen in time, {false} false alarms")
     return 0 if len(right) == len(wears) and not false else 1
 
