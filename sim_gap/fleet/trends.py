@@ -11,6 +11,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -164,7 +165,7 @@ def _series(answers: Mapping[str, Mapping[str, Any]], dated: bool = True) -> dic
         if dated and len(with_watched) >= FIRST + LAST + 1:
             _add(out, arm, with_watched, _watched_values)
         followed = {key[1] for key in out if key[0] == arm}
-        _add(out, arm, cases, lambda answer, leave=followed: _values(answer, leave))
+        _add(out, arm, cases, partial(_values, leave=followed))
     return {key: _without_unclear(one) for key, one in out.items()}
 
 

@@ -8,6 +8,7 @@ that it holds its share of those.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gcomp.arrays import Array
 from sim_gap.closed_loop.fit import Fit, batch, improve, residuals, root_mean_squares
@@ -60,11 +61,13 @@ def _uncertainty(squares: Array) -> Array:
     return np.asarray(np.sqrt(1.0 + error / np.maximum(squares.mean(0), 1e-300)))
 
 
-def left_of_others(search: Search, fit: Fit) -> tuple[Array, Array]:
+def left_of_others(search: Search, fit: Fit) -> tuple[Array, NDArray[np.intp]]:
     """What is left of each training window by a fit to the other recordings, of thirds if there is one, (To, J, W), and
     the number of its recording or third (W,)."""
     data = search.data
-    groups = data.recording if len(np.unique(data.recording)) > 1 else np.arange(data.count) * FOLDS // data.count
+    groups = data.recording
+    if len(np.unique(groups)) == 1:
+        groups = np.arange(data.count) * FOLDS // data.count
     out = np.zeros_like(data.measured)
     for group in np.unique(groups):
         own, others = np.flatnonzero(groups == group), np.flatnonzero(groups != group)
