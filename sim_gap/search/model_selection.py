@@ -14,18 +14,32 @@ from sim_gap.search.gauss_newton import Values, converged
 from sim_gap.search.normal_equations import NormalEquations, Weighted
 from sim_gap.search.stepwise import TRIES, Search, shortlist
 from sim_gap.search.term import Term
+from sim_gap.search.torque_constants import CONSTANTS, drives_are_off, every_constant, price_of_all
 
 
 def select_model(store: ColumnStore, library: Sequence[str]) -> Search:
     """Search the library, refine the shapes of the selected terms, and drop those that no longer earn their place."""
     offered, active = first_search(store, library)
     store.keep(offered)
+    search = searched_again(store, active, offered)
+    if drives_are_off(search):
+        again = searched_again(store, every_constant(search, offered), offered, CONSTANTS)
+        search = again if again.score + price_of_all(again) < search.score else search
+    for held in (store, search.normal.store.beside(None)):  # frees the columns of rivals and of the estimate before
+        held.keep(search.active)
+    return search
+
+
+def searched_again(
+    store: ColumnStore, active: Sequence[Term], offered: Sequence[Term], usual: frozenset[str] = frozenset()
+) -> Search:
+    """The terms offered, searched about the fit of those that are active, until both agree."""
     chosen = refine(store, one_each([canonical(term) for term in active]))
     values: Values = {}
     near: ColumnStore | None = None
     rounds = 0
     for _ in range(MOST_ROUNDS):
-        search = about_itself(store, chosen, offered, values, near)
+        search = about_itself(store, chosen, offered, values, near, usual)
         keys = {term.key for term in search.active}
         gone = {term.key for term in chosen} - keys
         if rounds == ROUNDS and not gone:
@@ -40,8 +54,6 @@ def select_model(store: ColumnStore, library: Sequence[str]) -> Search:
         near = search.normal.store
         values = near.values
         chosen = one_each([canonical(term) for term in search.active])
-    for held in (store, search.normal.store.beside(None)):  # frees the columns of rivals and of the estimate before
-        held.keep(search.active)
     return search
 
 
@@ -55,7 +67,12 @@ def first_search(store: ColumnStore, library: Sequence[str]) -> tuple[list[Term]
 
 
 def about_itself(
-    nominal: ColumnStore, chosen: list[Term], offered: Sequence[Term], start: Values, near: ColumnStore | None = None
+    nominal: ColumnStore,
+    chosen: list[Term],
+    offered: Sequence[Term],
+    start: Values,
+    near: ColumnStore | None = None,
+    usual: frozenset[str] = frozenset(),
 ) -> Search:
     """The chosen terms and their rivals with columns evaluated about the fit of the chosen ones, from coefficients
     `start` on. `near` is the store of an earlier fit, whose columns of rivals serve if it is close."""
@@ -67,7 +84,7 @@ def about_itself(
     keys = {term.key for term in chosen}
     others = [term for term in with_levels(store, offered) if term.key not in keys]
     rivals = relinearised_in_place(store, chosen, others)
-    return Search(NormalEquations(store, [*chosen, *rivals]), chosen)
+    return Search(NormalEquations(store, [*chosen, *rivals]), chosen, usual=usual)
 
 
 def with_levels(store: ColumnStore, offered: Sequence[Term]) -> list[Term]:
