@@ -162,7 +162,7 @@ def without_doubtful(search: Search) -> Search:
 
 
 def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
-    """Move each shape to the best fit between its neighbours on the starting grid (golden section)."""
+    """Move each shape, in its best form, to the best fit between its neighbours on the grid (golden section)."""
     out = list(active)
     for _ in range(3):
         out = relinearised(store, out)
@@ -172,16 +172,18 @@ def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
             continue
         free, low, high = found
 
-        def fit(value: float, term: Term = term, free: int = free) -> float:
-            trial = [term.reshaped(free, value) if other == term else other for other in out]
-            normal = NormalEquations(store, trial)
+        def fit(other: Term, term: Term = term) -> float:
+            normal = NormalEquations(store, [other if each == term else each for each in out])
             start = normal.square.sum(0) / np.maximum(normal.count.sum(0), 1.0)
             squares = normal.mean_square(*Weighted(normal, start).fit(normal.terms))
             return float(0.5 * np.log(squares + normal.floor**2)[normal.seen].sum())
 
-        value = golden(fit, low, high)
-        if fit(value) < fit(term.shape[free]):
-            out[out.index(term)] = term.reshaped(free, value)
+        def best(form: Term, low: float, high: float, free: int = free) -> Term:
+            return form.reshaped(free, golden(lambda value: fit(form.reshaped(free, value)), low, high))
+
+        size = term.shape[free]
+        trials = [term, best(term, low, high), *(best(form, 0.5 * size, 1.5 * size) for form in term.forms)]
+        out[out.index(term)] = min(trials, key=fit)
     return out
 
 
