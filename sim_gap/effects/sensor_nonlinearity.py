@@ -99,12 +99,12 @@ EFFECTS = (
         ),
         parameters_of=as_share_of_shape,
     ),
-    Effect(
+    Effect(  # the width is what is lost beyond the band
         "torque.deadband",
         _distorted(lambda torque, shape, _rate: -np.clip(torque, -shape[0], shape[0])),
         CUT_OFF,
         SearchHints(shapes_for=_shares(0.02, 0.05, 0.1, 0.2, 0.4, 0.8)),
-        parameters_of=as_shape,
+        parameters_of=as_share_of_shape,
     ),
     Effect(
         "torque.saturation",

@@ -188,15 +188,17 @@ def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
 
 
 def _between(data: ResidualSet, term: Term) -> tuple[int, float, float] | None:
-    """The free entry of a term's shape and its neighbours on the starting grid; None if it has none."""
+    """The free entry of a term's shape, and the neighbours on the starting grid of the value there that is closest to
+    its own, which levels about an estimate may miss by a little; None if it has none."""
     free = term.free
     if free is None:
         return None
     grid = sorted({shape[free] for shape in term.form.hints.grid(data.signals, term.place)})
     value = term.shape[free]
-    lower, upper = [x for x in grid if x < value - 1e-9], [x for x in grid if x > value + 1e-9]
+    closest = int(np.argmin(np.abs(np.array(grid) - value)))
+    lower, upper = grid[:closest], grid[closest + 1 :]
     beyond = sorted((0.5 * value, 1.5 * value))
-    return free, (lower[-1] if lower else beyond[0]), (upper[0] if upper else beyond[1])
+    return free, lower[-1] if lower else beyond[0], upper[0] if upper else beyond[1]
 
 
 def relinearised(store: ColumnStore, active: list[Term]) -> list[Term]:
