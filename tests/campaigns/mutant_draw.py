@@ -21,30 +21,35 @@ import functools
 import hashlib
 import importlib
 import json
+import math
 import os
 import signal
 import sys
 import tempfile
 import time
+import traceback
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from live_patch import Live
 from mutants import OPTIONS, PACKAGES, ROOT, mirrors, silence
 from mutated import install, install_in_children
 from mutations import Mutant, mutants
 
 JOURNAL = Path(__file__).parent / "mutant_draw.jsonl"
-LIMITS = (15.0, 15.0, 20.0, 40.0)
+LIMITS = (10.0, 10.0, 15.0, 30.0)
 """Processor time of the tests of the module's own file, that import it, of its sub-package, of its package [s]."""
+NEAR = 2
+"""The tests of later stages have little to do with the module: one that notices must do so twice."""
 HANGS, STILL = 20.0, 240.0
 """A test that takes more processor time, or more time by the clock, hangs [s]."""
 ASKED = 0.9
-FOREIGN = ("scipy.optimize", "scipy.signal", "scipy.linalg", "scipy.sparse", "scipy.interpolate", "scipy.stats")
-FOREIGN += ("sqlalchemy", "pyarrow.parquet", "mujoco", "can", "canopen", "jinja2", "plotly", "aiohttp.web", "starlette")
-FOREIGN += ("uvicorn", "fastapi", "hypothesis.strategies", "pydantic", "yaml", "typer", "rich", "httpx", "msgpack")
+NONE = "no change"
+"""What is said of a mutant that is written another way only."""
+FINE = (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED, pytest.ExitCode.INTERRUPTED)
 
 
 class Drawn(NamedTuple):
@@ -55,11 +60,11 @@ class Drawn(NamedTuple):
     mutant: Mutant
 
 
-def ranking(seed: int) -> list[Drawn]:
-    """Every mutant of the packages, in the order of the draw."""
+def ranking(seed: int, modules: list[str]) -> list[Drawn]:
+    """Every mutant of the modules that match, in the order of the draw."""
     found = []
-    for package in PACKAGES:
-        for path in sorted((ROOT / package).rglob("*.py")):
+    for pattern in modules:
+        for path in sorted(ROOT.glob(pattern)):
             target, seen = str(path.relative_to(ROOT)), Counter[str]()
             for mutant in mutants(path):
                 what = mutant.what.split(": ", 1)[1]
@@ -87,10 +92,13 @@ def importers() -> dict[str, list[str]]:
     found = defaultdict(list)
     for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):
-            name = str(path.relative_to(ROOT)).removesuffix(".py").removesuffix("/__init__").replace("/", ".")
             for each in imports(path):
-                found[each].append(name)
+                found[each].append(_name(path))
     return found
+
+
+def _name(path: Path) -> str:
+    return str(path.relative_to(ROOT)).removesuffix(".py").removesuffix("/__init__").replace("/", ".")
 
 
 def distances(name: str) -> dict[str, int]:
@@ -106,10 +114,10 @@ def distances(name: str) -> dict[str, int]:
 def stages(target: str) -> Iterator[list[str]]:
     """Files of tests that may notice a mutant of a module: its own, its sub-package's, its package's."""
     own = mirrors(target)
-    first = own[:1] if Path(own[0]).name == f"test_{Path(target).name}" else []
+    first = [file for file in own[:1] if Path(file).name == f"test_{Path(target).name}"]
     yield first
     yield [file for file in own if file not in first]
-    far, parts = distances(target.removesuffix(".py").replace("/", ".")), Path(target).parts
+    far, parts = distances(_name(ROOT / target)), Path(target).parts
 
     def nearest(folder: Path) -> list[str]:
         files = {
@@ -129,6 +137,11 @@ class Watch:
     def __init__(self, notes: Path, seconds: float) -> None:
         self._notes, self._end = notes.open("a", buffering=1), time.process_time() + seconds
 
+    @pytest.hookimpl(trylast=True)
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        """Tests of many drawn examples last: the others notice most, and sooner."""
+        items.sort(key=lambda item: hasattr(getattr(item, "function", None), "hypothesis"))
+
     def pytest_runtest_logstart(self, nodeid: str, location: object) -> None:
         self._notes.write(f"> {nodeid}\n")
         signal.setitimer(signal.ITIMER_PROF, HANGS)
@@ -147,55 +160,56 @@ class Watch:
             item.session.shouldstop = "enough"
 
 
-def failing(target: str, source: str | None, tests: list[str], seconds: float, *options: str) -> str:
-    """The first test that fails, or hangs, with this source; an empty text if none does. Runs in a child."""
+def _run(target: str, source: str | None, words: list[str], seconds: float, notes: Path) -> int:
+    """In the child: pytest with this source of the module."""
+    os.setpgid(0, 0)
+    silence()
+    if source is not None:
+        name = _name(ROOT / target)
+        if not load().patch(ROOT / target, source):
+            install(name, ROOT / target, source)
+            for module in [each for each in sys.modules if each.split(".")[0] in PACKAGES]:
+                del sys.modules[module]
+        (site := notes.parent / "site").mkdir()
+        install_in_children(site, name, ROOT / target, source)
+    return int(pytest.main([*OPTIONS, *words], plugins=[Watch(notes, seconds)]))
+
+
+def failing(target: str, source: str | None, tests: list[str], seconds: float, *options: str) -> list[str]:
+    """The tests that fail, or hang, with this source. They run in a child."""
     with tempfile.TemporaryDirectory(prefix="armlink-mutant-") as folder:
         notes = Path(folder) / "notes"
         notes.touch()
         child = os.fork()
         if child == 0:
-            os.setpgid(0, 0)
-            silence()
-            (site := Path(folder) / "site").mkdir()
-            if source is not None:
-                name = target.removesuffix(".py").replace("/", ".").removesuffix(".__init__")
-                install(name, ROOT / target, source)
-                install_in_children(site, name, ROOT / target, source)
-            status = pytest.main([*OPTIONS, "-x", *options, *tests], plugins=[Watch(notes, seconds)])
-            os._exit(int(status))
+            status: int = 70
+            try:
+                status = _run(target, source, [*options, *tests], seconds, notes)
+            except BaseException:
+                notes.write_text(f"E {traceback.format_exc()}")
+            finally:
+                os._exit(status)
         status = os.waitpid(child, 0)[1]
         with contextlib.suppress(ProcessLookupError):
             os.killpg(child, signal.SIGKILL)  # what its tests have left
         lines = notes.read_text(encoding="utf-8").splitlines()
-    failed = [line[2:] for line in lines if line.startswith("!")]
-    if failed:
-        return failed[0]
-    fine = (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED, pytest.ExitCode.INTERRUPTED)
-    if os.WIFEXITED(status) and os.WEXITSTATUS(status) in fine:
-        return ""
+    if lines and lines[0].startswith("E "):
+        raise RuntimeError("\n".join(lines))
+    found = [line[2:] for line in lines if line.startswith("!")]
+    if found or (os.WIFEXITED(status) and os.WEXITSTATUS(status) in FINE):
+        return found
     started = [line[2:] for line in lines if line.startswith(">")]
-    return started[-1] if started else tests[0]
+    return [started[-1] if started else tests[0]]
 
 
-@functools.cache
-def sound(test: str) -> bool:
-    """Whether a test, or the import of its file, passes without a mutant."""
-    return not failing("", None, [test], 2 * HANGS, *(() if "::" in test else ("--collect-only",)))
-
-
-def noticed_by(target: str, source: str, places: range) -> str:
+def noticed_by(target: str, source: str, places: range, unsound: list[str]) -> str:
     """The test of these stages that notices a mutant, an empty text if none does."""
+    options = ["-x", *(word for test in unsound for word in ("--deselect", test))]
     for place, (files, seconds) in enumerate(zip(stages(target), LIMITS, strict=True)):
-        if place not in places:
-            continue
-        left_out: list[str] = []
-        while files:
-            test = failing(target, source, files, seconds, *left_out)
-            if not test or sound(test):
-                break
-            left_out += ["--deselect", test] if "::" in test else ["--ignore", test]
-        if files and test:
-            return test
+        if place in places and files:
+            found = failing(target, source, files, seconds, *options)
+            if found and (place < NEAR or failing(target, source, found[:1], seconds)):
+                return found[0]
     return ""
 
 
@@ -216,31 +230,56 @@ class Journal:
             file.write(json.dumps(line, ensure_ascii=False) + "\n")
         self._take(line)
 
+    def unsound(self) -> list[str]:
+        """Tests that fail without a mutant."""
+        return [key for key, line in self.lines.items() if line.get("sound") is False]
+
+    def confirm(self) -> None:
+        """Run the tests that have noticed a mutant without one; what a test noticed that fails then is open again."""
+        by = {line["by"] for line in self.lines.values() if line.get("by", NONE) not in (NONE, "")} - set(self.lines)
+        tests = sorted(test for test in by if "::" in test)  # else the file could not even be imported
+        bad = failing("", None, tests, math.inf) if tests else []
+        for test in tests:
+            self.append(key=test, sound=test not in bad)
+        for key in [key for key, line in self.lines.items() if line.get("by") in bad]:
+            self.append(key=key, by="", stages=0)
+
+
+@functools.cache
+def load() -> Live:
+    """Load every module of ours, so that the children need not."""
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            if "migrations" not in path.parts and path.name != "__main__.py":  # run, never imported
+                importlib.import_module(_name(path))
+    return Live()
+
 
 def judge(journal: Journal, drawn: list[Drawn], limit: int, until: int, again: bool) -> None:
     """Judge the mutants that have no line, or none of the later stages, or the survivors `again`; at most so many."""
-    for name in FOREIGN:  # so that the children need not
-        with contextlib.suppress(ImportError):
-            importlib.import_module(name)
+    load()
+    sys.dont_write_bytecode = False  # of the tests; a mutant has none
+    journal.confirm()
     for each in drawn:
         known = journal.lines.get(each.key, {"by": "", "stages": 0})
         begin = 0 if again else known["stages"]
         if known["by"] or "why" in known or begin >= until:
             continue
         if limit <= 0:
-            return
+            break
         began, source = time.monotonic(), each.mutant.source()
-        by = noticed_by(each.target, source, range(begin, until)) if source is not None else "no change"
+        by = noticed_by(each.target, source, range(begin, until), journal.unsound()) if source is not None else NONE
         limit -= 1
         journal.append(key=each.key, module=each.target, mutant=each.mutant.what, by=by, stages=until)
         took = f"{time.monotonic() - began:.0f} s"
         print(f"{each.key} {each.target}: {each.mutant.what}: {by or 'survives'} ({took})", flush=True)
+    journal.confirm()
 
 
 def report(journal: Journal, drawn: list[Drawn]) -> int:
     """Say what is known of the draw; the exit status."""
     known = [journal.lines[each.key] for each in drawn if each.key in journal.lines]
-    known = [line for line in known if line["by"] != "no change"]
+    known = [line for line in known if line["by"] != NONE]
     alive = [line for line in known if not line["by"]]
     for line in alive:
         print(f"survives: {line['key']} {line['module']}: {line['mutant']} {line.get('why', 'NOT EXPLAINED')}")
@@ -261,6 +300,7 @@ def main() -> int:
     parser.add_argument("--draw", type=int, default=500)
     parser.add_argument("--seed", type=int, default=23)
     parser.add_argument("--journal", type=Path, default=JOURNAL)
+    parser.add_argument("--modules", nargs="+", default=[f"{name}/**/*.py" for name in PACKAGES], metavar="GLOB")
     parser.add_argument("--limit", type=int, default=10**6, help="judge at most this many now")
     parser.add_argument("--stages", type=int, default=len(LIMITS), help="judge by the first of the stages only")
     parser.add_argument("--again", action="store_true", help="judge the survivors that have no explanation once more")
@@ -273,7 +313,7 @@ def main() -> int:
     if given.explain:
         journal.append(key=given.explain[0], why=given.explain[1])
         return 0
-    drawn = ranking(given.seed)[: given.draw]
+    drawn = ranking(given.seed, given.modules)[: given.draw]
     if not given.report:
         judge(journal, drawn, given.limit, given.stages, given.again)
     return report(journal, drawn)
