@@ -202,15 +202,19 @@ def failing(target: str, source: str | None, tests: list[str], seconds: float, *
     return [started[-1] if started else tests[0]]
 
 
-def noticed_by(target: str, source: str, places: range, unsound: list[str]) -> str:
-    """The test of these stages that notices a mutant, an empty text if none does."""
-    options = ["-x", *(word for test in unsound for word in ("--deselect", test))]
+def noticed_by(target: str, source: str, places: range, unsound: list[str]) -> tuple[str, int]:
+    """The test of these stages that notices a mutant, an empty text if none does; how many stages were gone through.
+
+    Where these stages have no tests, the next one that has any is taken.
+    """
+    options, ran, last = ["-x", *(word for test in unsound for word in ("--deselect", test))], False, places.stop
     for place, (files, seconds) in enumerate(zip(stages(target), LIMITS, strict=True)):
-        if place in places and files:
-            found = failing(target, source, files, seconds, *options)
-            if found and (place < NEAR or failing(target, source, found[:1], seconds)):
-                return found[0]
-    return ""
+        if not files or place < places.start or (ran and place >= places.stop):
+            continue
+        found, ran, last = failing(target, source, files, seconds, *options), True, max(last, place + 1)
+        if found and (place < NEAR or failing(target, source, found[:1], seconds)):
+            return found[0], last
+    return "", last
 
 
 class Journal:
@@ -268,9 +272,11 @@ def judge(journal: Journal, drawn: list[Drawn], limit: int, until: int, again: b
         if limit <= 0:
             break
         began, source = time.monotonic(), each.mutant.source()
-        by = noticed_by(each.target, source, range(begin, until), journal.unsound()) if source is not None else NONE
+        by, gone = NONE, until
+        if source is not None:
+            by, gone = noticed_by(each.target, source, range(begin, until), journal.unsound())
         limit -= 1
-        journal.append(key=each.key, module=each.target, mutant=each.mutant.what, by=by, stages=until)
+        journal.append(key=each.key, module=each.target, mutant=each.mutant.what, by=by, stages=gone)
         took = f"{time.monotonic() - began:.0f} s"
         print(f"{each.key} {each.target}: {each.mutant.what}: {by or 'survives'} ({took})", flush=True)
     journal.confirm()

@@ -531,6 +531,7 @@ def run_main(wires, monkeypatch, folder, steps):
     step, waiting = Guard.step, list(steps)
 
     def next_step(guard, seconds):
+        assert seconds <= 0.5  # a signal is looked at after each step
         if not waiting:
             signal.raise_signal(signal.SIGTERM)
             return
