@@ -286,7 +286,9 @@ def test_exactly_what_the_rate_has_room_for_may_come():
 
 
 def test_what_a_policy_leaves_out_gives_no_room():
-    field = Field({"name": "x", "at": 0, "code": "f", "least": -9, "most": 9, "rate": 8, "near": POSITION_FIELD["near"]})
+    field = Field(
+        {"name": "x", "at": 0, "code": "f", "least": -9, "most": 9, "rate": 8, "near": POSITION_FIELD["near"]}
+    )
     field.see(0.0, 0.0)
     field.keep(struct.pack("<f", 5.0), 0.0)
     assert field.refusal(struct.pack("<f", 0.5), 0.0)
