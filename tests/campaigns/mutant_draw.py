@@ -11,7 +11,7 @@ must pass without the mutant.
 
 What was found is appended to the journal, one line of JSON each; a mutant that has a line is not judged again, so that
 the runs of several days add up. `--again` judges the survivors once more, by tests that were added. Exit status 1 if
-less than nine of ten are noticed, or a survivor has no explanation.
+less than nine of ten are noticed, a survivor has no explanation, or mutants of the draw are not judged yet.
 """
 
 import argparse
@@ -297,7 +297,7 @@ def report(journal: Journal, drawn: list[Drawn]) -> int:
     print(
         f"{len(drawn)} drawn, {len(known)} judged, {share:.1%} noticed; {len(alive)} survive, {unexplained} unexplained"
     )
-    return int(share < ASKED or unexplained > 0)
+    return int(share < ASKED or unexplained > 0 or any(each.key not in journal.lines for each in drawn))
 
 
 def main() -> int:
