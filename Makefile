@@ -5,7 +5,7 @@ export PYTHON
 CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host random_kills daemon_days daemon_kills fuzz_frames fuzz_drives fuzz_guard fuzz_files fault_injection systemd_units kill_drives two_hosts scales web
 
 .DEFAULT_GOAL := help
-.PHONY: servopeer repeats motortorque moving fleetdays batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies pictures container lock audit sbom
+.PHONY: mutantdraw servopeer repeats motortorque moving fleetdays batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies pictures container lock audit sbom
 
 help: ## Say what can be done
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
@@ -95,6 +95,9 @@ fleetdays: .venv/.dev ## Long campaign outside make test: a fleet over sixty day
 
 mutants: .venv/.dev ## Long campaign outside make test: changes of the source must make a test fail (MODULES="sim_gap/*/*.py" ARGS="--draw 50")
 	$(BIN)/python tests/campaigns/mutants.py $(if $(MODULES),--modules $(foreach each,$(MODULES),'$(each)')) $(ARGS)
+
+mutantdraw: .venv/.dev ## Long campaign outside make test: 500 mutants drawn over the packages; its journal adds runs up (ARGS="--limit 50")
+	$(BIN)/python tests/campaigns/mutant_draw.py $(ARGS)
 
 wheel: .venv/.dev ## Build the wheel into dist/ and run the demo from it in an empty environment (ARGS="python3.12 python3.13")
 	scripts/test-wheel $(ARGS)

@@ -1,6 +1,6 @@
 """Campaign: every call of the daemon to its dependencies fails once, over a simulated hour.
 
-python tests/campaigns/fault_injection.py [--stride 40] [--runs 40] [--minutes 60] [--bursts]
+python tests/campaigns/fault_injection.py [--stride 40] [--runs 40] [--rests 0 10] [--minutes 60] [--bursts]
 
 Dependencies are record store (statements, commits), journal, disk of the recordings, pipe to the bus process, and the
 socket of systemd. In run r the calls fail whose number leaves r when divided by the stride, so that all runs together
@@ -63,6 +63,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--stride", type=int, default=40)
     parser.add_argument("--runs", type=int, default=0, help="only this many of the runs, evenly spread")
+    parser.add_argument(
+        "--rests", type=int, nargs=2, metavar=("FROM", "TO"), help="only the runs from one to before another"
+    )
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--bursts", action="store_true")
     given = parser.parse_args()
@@ -78,8 +81,9 @@ def main() -> int:
             for which in DEPENDENCIES
         ]
     else:
-        kept = np.linspace(0, given.stride, given.runs or given.stride, endpoint=False).astype(int)
-        runs = [(f"rest {rest}", lambda name, count, of=rest: count % given.stride == of) for rest in kept.tolist()]
+        kept = np.linspace(0, given.stride, given.runs or given.stride, endpoint=False).astype(int).tolist()
+        kept = kept if given.rests is None else range(*given.rests)
+        runs = [(f"rest {rest}", lambda name, count, of=rest: count % given.stride == of) for rest in kept]
     calls, failed, bad = dict.fromkeys(DEPENDENCIES, 0), dict.fromkeys(DEPENDENCIES, 0), 0
     for what, fails in runs:
         began = time.process_time()

@@ -15,7 +15,6 @@ import argparse
 import contextlib
 import functools
 import importlib
-import importlib.abc
 import importlib.util
 import os
 import pickle
@@ -37,6 +36,7 @@ import numpy  # noqa: F401
 import pydantic  # noqa: F401
 import pytest
 import yaml  # noqa: F401
+from mutated import install
 from mutations import Mutant, mutants
 
 sys.dont_write_bytecode = True
@@ -75,33 +75,14 @@ class Broken(Exception):
     """A module whose tests fail as it is."""
 
 
-class Mutated(importlib.abc.MetaPathFinder, importlib.abc.SourceLoader):
-    """Imports one module from a text instead of its file."""
-
-    def __init__(self, name: str, path: Path, source: str) -> None:
-        self.name, self.path, self.source = name, path, source
-
-    def find_spec(self, name: str, path: object = None, target: object = None) -> ModuleSpec | None:
-        """Ours for the one module."""
-        return importlib.util.spec_from_loader(name, self) if name == self.name else None
-
-    def get_filename(self, name: str) -> str:
-        """Where it would have come from."""
-        return str(self.path)
-
-    def get_data(self, path: str) -> bytes:
-        """The text."""
-        return self.source.encode()
-
-
 def noticed(target: str, source: str, tests: list[str]) -> bool:
     """Whether the tests fail, or hang, on a mutant's source; they run in a child of this process."""
     child = os.fork()
     if child == 0:
         signal.setitimer(signal.ITIMER_PROF, SECONDS)
-        _silence()
+        silence()
         name = target.removesuffix(".py").replace("/", ".")
-        sys.meta_path.insert(0, Mutated(name, ROOT / target, source))
+        install(name, ROOT / target, source)
         status = pytest.main([*OPTIONS, "-x", *tests])
         os._exit(0 if status in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED) else 1)
     return os.waitpid(child, 0)[1] != 0
@@ -146,7 +127,7 @@ class Survey:
         child = os.fork()
         if child == 0:
             os.close(ours)
-            _silence()
+            silence()
             sys.settrace(self.trace)
             threading.settrace(self.trace)
             status = pytest.main([*OPTIONS, *tests], plugins=[self])
@@ -177,7 +158,8 @@ def _spec(name: str) -> ModuleSpec | None:
     return None
 
 
-def _silence() -> None:
+def silence() -> None:
+    """Nothing is printed from now on, in this process."""
     silent = os.open(os.devnull, os.O_WRONLY)
     os.dup2(silent, 1)
     os.dup2(silent, 2)

@@ -43,6 +43,13 @@ def command(mode, torque=0.0, position=0.0):
     return Command(np.full(N, mode, np.int8), np.full(N, torque), np.full(N, position))
 
 
+def test_numbers_of_the_kernel_and_the_schema_are_what_they_are_elsewhere():
+    flags = bus_guard.EXTENDED, bus_guard.REMOTE, bus_guard.ERROR
+    assert flags == (socket.CAN_EFF_FLAG, socket.CAN_RTR_FLAG, socket.CAN_ERR_FLAG)
+    assert (bus_guard.FD_FLAGS, bus_guard.SCHEMA) == (5, "armlink.guard/1")
+    assert (bus_guard.FRAME.size, bus_guard.FD_FRAME.size) == (16, 72)
+
+
 def test_all_that_a_link_does_passes():
     bus, link = guarded(CONTENT)
     random = np.random.default_rng(4)
@@ -158,6 +165,17 @@ def test_segmented_and_block_writes_are_refused():
         assert policy.refusal(0x601, bytes.fromhex(data), 10.0) == ""
 
 
+@pytest.mark.parametrize("length", [0, 1, 4, 7])
+def test_a_request_that_is_cut_short_is_refused(length):
+    assert Policy(CONTENT).refusal(0x601, bytes.fromhex("4064600000000000")[:length], 10.0)
+
+
+def test_a_refused_frame_is_named_with_its_bytes():
+    policy = Policy(CONTENT)
+    assert policy.refusal(0x201, b"", 10.0).startswith("201h with no data: ")
+    assert policy.refusal(0x201, b"\x0f\x01", 10.0).startswith("201h with 0f 01: ")
+
+
 hostile = st.one_of(
     st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8)),
     st.tuples(
@@ -265,6 +283,18 @@ def test_exactly_what_the_rate_has_room_for_may_come():
     field.keep(struct.pack("<h", 4), 0.0)
     assert refusal(field, 6, 0.25) == ""
     assert refusal(field, 7, 0.25)
+
+
+def test_what_a_policy_leaves_out_gives_no_room():
+    field = Field(
+        {"name": "x", "at": 0, "code": "f", "least": -9, "most": 9, "rate": 8, "near": POSITION_FIELD["near"]}
+    )
+    field.see(0.0, 0.0)
+    field.keep(struct.pack("<f", 5.0), 0.0)
+    assert field.refusal(struct.pack("<f", 0.5), 0.0)
+    assert field.refusal(struct.pack("<f", 5.5), 0.0)
+    assert field.refusal(struct.pack("<f", 5.5), 1.0)
+    assert field.refusal(struct.pack("<f", 0.0), 0.5)  # the reading is too old
 
 
 def test_only_the_two_newest_readings_are_where_the_joint_is():
@@ -414,7 +444,7 @@ def test_a_full_queue_is_tried_for_a_while(wires, monkeypatch):
         assert len(times) < 10
     assert 3 <= len(times) <= 7
     wire.other.close()
-    assert not wire.port.send(0x80, b"")
+    assert wire.port.send(0x80, b"") is False
 
 
 def test_a_reading_that_is_cut_short_is_none():
@@ -503,6 +533,7 @@ def run_main(wires, monkeypatch, folder, steps):
     step, waiting = Guard.step, list(steps)
 
     def next_step(guard, seconds):
+        assert seconds <= 0.5  # a signal is looked at after each step
         if not waiting:
             signal.raise_signal(signal.SIGTERM)
             return

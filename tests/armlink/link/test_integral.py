@@ -44,3 +44,12 @@ def test_a_load_is_taken_over_within_two_seconds():
         ahead = integral.update(limits, POSITION, 0.0, 0.0, Seen(ahead + 40.0 * sag, -sag, 0.0, 0.0, True))
     assert ahead == pytest.approx(4.0, abs=0.05)
     assert math.isfinite(ahead)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_errors_within_the_deadband_are_left_to_stiction(side):
+    limits = JointLimits(50.0, 1.0, 0.01, -3.0, 3.0, 10.0, 10.0, 3.0, 0.1, 0.1, PERIOD, 40.0, 2.0)
+    integral = Integral()
+    for _ in range(50):
+        assert integral.update(limits, POSITION, 0.0, 0.0, Seen(1.0, -side * 4.9e-4, 0.0, 0.0, True)) == 1.0
+    assert side * (integral.update(limits, POSITION, 0.0, 0.0, Seen(1.0, -side * 5.1e-4, 0.0, 0.0, True)) - 1.0) > 0.0

@@ -5,6 +5,7 @@ import resource
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from armlink.errors import BadInput, Refused
 from armlink.link.integral import slowest_time
 from calib.arm.sweep_section import SweepSection
 from calib.commands.screen import unsettled_said
+from calib.motion.mover import STOP_TOLERANCE, Mover
 from calib.motion.settle_rule import SettleRule
 from calib.motion.static_reading import StaticReading
 from calib.motion.trajectory import trajectory
@@ -239,3 +241,19 @@ def test_a_reading_of_the_wrong_width_is_refused(tmp_path: Path) -> None:
         writer.append(reading)
     with pytest.raises(BadInput, match="not one per joint"):
         load_data(tmp_path / "set")
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_how_far_a_stop_may_be_from_its_place(side: int) -> None:
+    place, most = side * 2.0, STOP_TOLERANCE + 0.025 * 2.0
+    limits, names = SimpleNamespace(upper=[2.0], lower=[-2.0]), SimpleNamespace(names=["j1"])
+    mover = SimpleNamespace(limits=limits, link=names, contacts={}, position=[place - side * (most - 1e-6)])
+    Mover._check_stop(mover, 0, side)  # type: ignore[arg-type]
+    assert mover.contacts == {(0, side): mover.position[0]}
+    mover.position = [place - side * (most + 1e-6)]
+    with pytest.raises(Refused, match=f"its stop should be at {place:.3f} rad"):
+        Mover._check_stop(mover, 0, side)  # type: ignore[arg-type]
+    furthest = 2 * STOP_TOLERANCE + 0.03 * 2.0
+    Mover._check_creep(mover, 0, side, place + side * (furthest - 1e-6))  # type: ignore[arg-type]
+    with pytest.raises(Refused, match=f"no stop found at {place:.3f} rad"):
+        Mover._check_creep(mover, 0, side, place + side * (furthest + 1e-6))  # type: ignore[arg-type]
