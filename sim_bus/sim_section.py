@@ -108,7 +108,7 @@ class SimSection(Section):
     links: tuple[LinkBody, ...] | None = None
     sensors: Sensors = Sensors()
     effects: tuple[EffectEntry, ...] = ()
-    device: Literal["ours", "cia402", "epos4", "nanotec", "copley", "sample", "velocity"] | None = None
+    device: Literal["ours", "cia402", "epos4", "nanotec", "copley", "sample", "profile", "velocity"] | None = None
     """Which CiA 402 devices the joints have; default: ours, or a stock one if the arm file reads torque elsewhere."""
     realism: Realism = Realism(level=0.0)
     """Small troubles of a real arm, on top of `effects`."""

@@ -148,10 +148,13 @@ class SimulatedArm:
         return slot is not None and slot[0].kind <= 240
 
     def advance(self, duration: float) -> None:
-        """Advance simulated time [s], in steps of at most one SYNC period."""
+        """Advance simulated time [s], in equal steps of about a SYNC period, or less.
+
+        A cycle that is a little late is one step: a short one after it would sample the torque at another phase.
+        """
         remaining = duration
+        piece = duration / max(1, round(duration / self.period))
         while remaining > 1e-9:
-            piece = min(remaining, self.period)
             for drive in self.drive_at.values():
                 drive.control(piece)
             self.drives.loops.advance(piece, self._synchronous)

@@ -6,13 +6,20 @@ Nothing in a drive with the MIT law bounds kp (q* − q) + kd (dq* − dq) + τ 
 import math
 
 from armlink.drives.mit_packing import Grid, MitCommand
-from armlink.drives.orders import Limits
+from armlink.drives.orders import Limits, Mode, Order, Power
 
 DAMPING_SHARE = 0.9
 """Damping takes at most this share of the torque limit; the rest is for rounding."""
 SOFTER, SOFTER_STEPS = 0.8, 30
 """Factor by which both gains are lowered, again and again, while the sum of the law is beyond the limit."""
 Steps = tuple[int, int, int, int, int]
+ON, POSITION, TORQUE = Power.ON, int(Mode.POSITION), int(Mode.TORQUE)
+
+
+def order_of(command: MitCommand) -> Order:
+    """The order that a command stands for: position control where it has stiffness."""
+    position, velocity, kp, kd, torque = command
+    return Order(ON, False, POSITION if kp > 0 else TORQUE, position, velocity, torque, kp, kd)
 
 
 def round_within(command: MitCommand, grid: Grid, limits: Limits, position: float, velocity: float) -> Steps:

@@ -6,11 +6,37 @@ Each field is an unsigned number of steps from the lower end of its range; the r
 """
 
 import math
+from enum import IntEnum
 from functools import lru_cache
 from typing import NamedTuple
 
 MIT_BITS = (16, 12, 12, 12, 12)
 """Bits of q, dq, kp, kd and τ in an MIT command; other frames of the same fields have others."""
+
+
+class Special(IntEnum):
+    """Last byte of a special command: seven bytes FFh, then this; sent to the drive's command id."""
+
+    CLEAR_ERROR = 0xFB
+    """CubeMars has none."""
+    ENABLE = 0xFC
+    DISABLE = 0xFD
+    SET_ZERO = 0xFE
+
+
+SPECIALS = frozenset(int(command) for command in Special)
+
+
+def special(command: Special) -> bytes:
+    """The eight bytes of a special command."""
+    return bytes([0xFF] * 7 + [command])
+
+
+def special_of(data: bytes) -> Special | None:
+    """The special command in `data`, or None."""
+    if len(data) == 8 and data[:7] == b"\xff" * 7 and data[7] in SPECIALS:
+        return Special(data[7])
+    return None
 
 
 class Ranges(NamedTuple):

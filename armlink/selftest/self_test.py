@@ -16,8 +16,8 @@ from armlink.link.faults import bus_fault
 from armlink.link.gate_limits import drive_limits
 from armlink.link.joints.groups import traits_of
 from armlink.link.link import Link
-from armlink.link.park import let_go, park
-from armlink.link.types import Sample, Tell
+from armlink.link.park import let_go, park, speeds, straight
+from armlink.link.types import Command, Sample, Tell
 
 CHECKS = ("set-up", "answers", "enables and holds", "silence", "park")
 CYCLES = 50
@@ -29,6 +29,8 @@ HELD = 0.05
 """A joint that moves further than this while it should hold ends the test [rad]."""
 FELL = 0.5
 """A joint whose drive falls free may move this far in the test of its silence [rad]."""
+LEAN = 0.2
+"""So far a joint is led to where gravity pulls at it, if its drive does not tell its state [rad], and within 2 s."""
 PATIENCE = 3.0
 """So many deadlines are waited for a reaction."""
 KEEPS_ON = "nothing stops this joint when its host dies: do not drive it"
@@ -191,10 +193,36 @@ class SelfTest:
     def _silence(self, joint: int) -> None:
         """No command for one joint, all others commanded as before: what does its drive do, and is that its trait?"""
         link = self.link
-        name, limit = link.names[joint], link.section.deadline
+        name, trait = link.names[joint], traits_of(link.groups, link.n)[joint].silence
+        does, seconds = self._left_alone(joint)
+        if does is None:  # its drive tells no state: it shows it where gravity pulls
+            self._lean(joint)
+            does, seconds = self._left_alone(joint)
+        if does is None:
+            found = "its drive tells no state, and the joint carries no load here: repeat it where gravity pulls at it"
+            self._add(name, "silence", "not run", found)
+            return
+        told = f"{does} within {seconds * 1e3:.0f} ms without a command, by its trait it {trait}"
+        if does == "keeps on":
+            told += f": {KEEPS_ON}"
+        good = does == trait or (does, trait) == ("holds", "damps")
+        self._add(name, "silence", "passed" if good else "failed", told, seconds)
+
+    def _lean(self, joint: int) -> None:
+        """Lead a joint away from where it hangs, towards the middle of its way."""
+        link = self.link
+        start = np.array(link.commander.loop.latest_position)
+        goal, middle = start.copy(), sum(link.windows[joint]) / 2
+        goal[joint] += LEAN if middle > start[joint] else -LEAN
+        for target in straight(start, goal, speeds(link, LEAN), link.period):
+            link.cycle(Command.hold(target))
+
+    def _left_alone(self, joint: int) -> tuple[Silence | None, float]:
+        """What a drive does without commands, None where it does not tell, and after how long [s]; then it is ON."""
+        link, limit = self.link, self.link.section.deadline
         group = next(group for group in link.groups if joint in group.places)
-        drive, trait = group.places.index(joint), traits_of(link.groups, link.n)[joint].silence
-        self.progress(f"{name}: no commands for {limit * 1e3:.0f} ms")
+        drive = group.places.index(joint)
+        self.progress(f"{link.names[joint]}: no commands for {limit * 1e3:.0f} ms")
         loop, on = link.commander.loop, [Power.ON] * link.n
         standing = np.array(loop.latest_position)
         loop.withheld = frozenset([joint])
@@ -211,18 +239,13 @@ class SelfTest:
                 for _ in range(ASKED_CYCLES):
                     self._cycle(on, standing, FELL)
                 found = group.drives.power(drive)
-            does = self._reaction(
-                found, group.drives.lets_go(drive), float(abs(loop.latest_position - standing)[joint])
-            )
+            moved = float(abs(loop.latest_position - standing)[joint])
+            does = None if found is Power.UNKNOWN else self._reaction(found, group.drives.lets_go(drive), moved)
         finally:
             loop.withheld = frozenset()
-        told = f"{does} within {seconds * 1e3:.0f} ms without a command, by its trait it {trait}"
-        if does == "keeps on":
-            told += f": {KEEPS_ON}"
-        good = does == trait or (does, trait) == ("holds", "damps")
-        self._add(name, "silence", "passed" if good else "failed", told, seconds)
         link.commander.settle()
         link.commander.walk(Power.ON)
+        return does, seconds
 
     @staticmethod
     def _reaction(found: Power, free: bool, moved: float) -> Silence:

@@ -5,8 +5,8 @@ Each part holds its own state and calls only parts further down:
     ActiveRecords          records in force, and whether the controllers hold them
     Observation            one observer against one pair of records: ObserverFeed
     RecalibrationWorkflow  proposals, decisions, writes, the check after a write
-    DailyDiagnosis         the day's recording, diagnosed by a process of its own; what wears
-    PoseTours, ObserverStorage, ArmState, LiveWindow, Recordings
+    DailyDiagnosis         the day's busiest minute, diagnosed by a process of its own; what wears
+    PoseTours, ObserverStorage, ArmState, LiveWindow, Recordings, BusiestMinute
     BusJobs                work that waits for the bus, one job at a time
     EventLog               events to the journal, the stream's Hub and the process's log
     Journal                the file; Configuration and Environment are given
@@ -29,6 +29,7 @@ from calib.daemon.observing.recalibration_workflow import RecalibrationWorkflow
 from calib.daemon.settings import Configuration, DaemonSection
 from calib.daemon.state.arm_state import ArmState
 from calib.daemon.state.bus_jobs import BusJobs
+from calib.daemon.state.busiest_minute import BusiestMinute
 from calib.daemon.state.event_log import EventLog
 from calib.daemon.state.journal import Journal
 from calib.daemon.state.live_window import LiveWindow
@@ -64,8 +65,11 @@ class Service:
         self.jobs = BusJobs(environment.run, self.journal)
         self.arm_state = ArmState(arm, self.events, monotonic)
         self.window = LiveWindow(len(arm.joint_names))
-        self.diagnosis = DailyDiagnosis(self.configuration, environment, self.events, directory / "diagnosis")
-        self.recordings = Recordings(directory / "recordings", self.configuration, self.diagnosis.finished)
+        self.busiest = BusiestMinute(arm.require_link().rate)
+        self.recordings = Recordings(directory / "recordings", self.configuration)
+        self.diagnosis = DailyDiagnosis(
+            self.configuration, environment, self.events, self.busiest, directory / "diagnosis"
+        )
         self.storage = ObserverStorage(self.journal, environment)
         self.recalibrations = RecalibrationWorkflow(
             self.configuration, store, self.arm_state, self.journal, self.events, self.jobs
@@ -144,6 +148,7 @@ class Service:
             self.arm_state.heard(message)
             self.window.append(message)
             self.recordings.append(message)
+            self.busiest.append(message)
             if self.records.observation is not None:
                 self.records.observation.handle(message)
         elif isinstance(message, Up):

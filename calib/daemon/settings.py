@@ -31,8 +31,8 @@ class DiagnosisSettings(Section):
     enabled: bool = True
     hours: Positive = 24.0
     """Time from one to the next [h]."""
-    travel: Positive = 20.0
-    """Least path of all joints together in a recording that is diagnosed [rad]."""
+    travel: Positive = 10.0
+    """Least path of all joints together in the minute that is diagnosed [rad]."""
     sim: Path | None = None
     """Nominal model: MJCF, URDF or arm file, a path from the arm file; by default the arm file itself."""
 

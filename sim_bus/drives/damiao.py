@@ -14,15 +14,13 @@ from armlink.drives.damiao.frames import (
     WRITE,
     Register,
     Reply,
-    Special,
     State,
     pack_reply,
     pack_value,
-    special_of,
     unpack_value,
 )
 from armlink.drives.damiao.models import MODELS
-from armlink.drives.mit_packing import MitCommand, MitFeedback, Ranges, unpack_command
+from armlink.drives.mit_packing import MitCommand, MitFeedback, Ranges, Special, special_of, unpack_command
 from sim_bus.drives.motor import Motor
 from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
 

@@ -8,6 +8,7 @@ from zlib import crc32
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.drives.damiao.models import MODELS
 from armlink.errors import BadInput
+from sim_bus.drives.cubemars import CubeMarsDrive, CubeMarsFront
 from sim_bus.drives.damiao import DamiaoDrive, DamiaoFront
 from sim_bus.drives.moteus import MoteusDrive, MoteusFront
 from sim_bus.drives.motor import Motor
@@ -48,6 +49,10 @@ def _damiao(arm: ArmFile, joints: Sequence[Joint], send: Send) -> Front:
     return DamiaoFront(drives)
 
 
+def _cubemars(arm: ArmFile, joints: Sequence[Joint], send: Send) -> Front:
+    return CubeMarsFront([CubeMarsDrive(motor, send, each.settings) for each, motor in joints])
+
+
 def _robstride(arm: ArmFile, joints: Sequence[Joint], send: Send) -> Front:
     return RobStrideFront(
         [
@@ -73,6 +78,7 @@ def _odrive(arm: ArmFile, joints: Sequence[Joint], send: Send) -> Front:
 
 
 FAMILIES: dict[str, Callable[[ArmFile, Sequence[Joint], Send], Front]] = {
+    "cubemars": _cubemars,
     "damiao": _damiao,
     "robstride": _robstride,
     "moteus": _moteus,

@@ -48,6 +48,9 @@ DEVICES: dict[str, Device] = {
     ),
     "nanotec": Device(absent=frozenset({0x2100, (0x1010, 4), 0x6076, 0x60B2, (0x1400, 5)}), fixed_exponent=True),
     "copley": Device(absent=frozenset({0x2100, (0x1010, 4), (0x1400, 5), 0x60B2}), values={(0x6076, 0): 0}),
+    "profile": Device(
+        absent=frozenset({0x2100, (0x1010, 4), 0x60B2, (0x1400, 5)}), modes=frozenset({1, 4}), hidden_modes=1 << 3
+    ),
     "velocity": Device(
         absent=frozenset({0x2100, (0x1010, 4), 0x60B2, (0x1400, 5), 0x6071, 0x607A, 0x607D, 0x6081, 0x6087}),
         modes=frozenset({9}),
@@ -57,8 +60,9 @@ DEVICES: dict[str, Device] = {
         unmappable=frozenset({(0x6060, 0), (0x6061, 0)}),
     ),
 }
-"""`ours` has our torque sensor record, `cia402` all of the profile; `velocity` has cyclic velocity alone, as drives of
-axes whose controller closes the position loop; the others are as their makers' data sheets."""
+"""`ours` has our torque sensor record, `cia402` all of the profile; `profile` has the profile modes alone; `velocity`
+has cyclic velocity alone, as drives of axes whose controller closes the position loop; the others are as their makers'
+data sheets."""
 
 
 def device_of(joint: LinkJoint, named: str | None) -> Device:

@@ -31,7 +31,10 @@ TUNING_POSES = 50
 """Number of poses; the loops are tuned for the largest inertia among them."""
 EXTRAPOLATED = 1.0
 """A cyclic position target that is late is extrapolated for this many interpolation times, then held, as drives do (one
-cycle is usual), so that jitter of SYNC is no jerk."""
+cycle is usual), so that a late SYNC is no jerk."""
+LOCKING = 8.0
+"""Interpolation times in which a cyclic position target falls into step with SYNC: drives lock their interpolation to
+it, so that its jitter hardly changes the speed of the target."""
 SPARE_ACCELERATION = 100.0
 """The loops are tuned for the bare arm's inertia plus rated torque divided by this acceleration [rad/s²]."""
 
@@ -72,6 +75,8 @@ class Loops:
         self._max_torque_in = signals[0x6072, 0]
         self.interpolation = np.zeros(self.n)
         """Interpolation time of cyclic position targets (60C2h) [s]."""
+        self._aim, self._since = self._target.copy(), 0.0
+        """Position target of the last SYNC [rad], and the time since then [s]."""
         self._left = np.zeros(self.n)
         """Time for which position targets go on at their rates without another SYNC [s]."""
         self.lowest, self.highest = np.full(self.n, -np.inf), np.full(self.n, np.inf)
@@ -93,6 +98,7 @@ class Loops:
         velocity = float(plant.motor_velocity[joint])
         self._torque[joint] = torque if kind == TORQUE else 0.0
         self._target[joint], self._rate[joint] = plant.motor_position[joint], 0.0
+        self._aim[joint] = self._target[joint]
         self.kind[joint], self.mode[joint], self.stopping[joint] = kind, mode, False
         for waiting in self._fresh.values():
             waiting[joint] = False
@@ -209,17 +215,30 @@ class Loops:
         if self._any_position:
             if synchronous:
                 wanted = np.minimum(np.maximum(self._position_in, self.lowest), self.highest)
-                time = np.maximum(self.interpolation, duration)
-                rate = (self._sensors.angle_of(wanted * UNIT) - self._target) / time
-                np.copyto(self._rate, rate, where=self._cyclic_position)
-                np.subtract(time + EXTRAPOLATED * self.interpolation, duration, out=self._left)
+                self._approach(self._sensors.angle_of(wanted * UNIT), duration)
             else:
                 share = np.minimum(np.maximum(self._left, 0.0) / duration, 1.0)
                 np.copyto(self._rate, self._rate * share, where=self._cyclic_position)
                 self._left -= duration
+            self._since += duration
         if self._any_stopping:
             slower = np.maximum(np.abs(self._rate) - self.deceleration * duration, 0.0) * np.sign(self._rate)
             np.copyto(self._rate, slower, where=self.stopping)
+
+    def _approach(self, aim: Array, duration: float) -> None:
+        """Set the rates that bring the cyclic position targets to `aim` [rad] an interpolation time after this SYNC.
+
+        The speed is that of the aims from SYNC to SYNC; what the target is ahead of it or behind is caught up slowly.
+        """
+        time = np.maximum(self.interpolation, duration)
+        cycles = np.maximum(np.round(self._since / time), 1.0)
+        rate = (aim - self._aim) / (cycles * time)
+        locking = np.where(self.interpolation > 0.0, LOCKING, 1.0)
+        rate += (aim - rate * time - self._target) / (locking * time)
+        np.copyto(self._rate, rate, where=self._cyclic_position)
+        np.copyto(self._aim, aim, where=self._cyclic_position)
+        np.subtract(time + EXTRAPOLATED * self.interpolation, duration, out=self._left)
+        self._since = 0.0
 
     def _follow_profiles(self, duration: float) -> None:
         """Follow profile torque (slope 6087h), profile position (6081h, 6083h) and cyclic velocity (60FFh)."""

@@ -177,7 +177,7 @@ def _checked(
     for recording, label in zip(matched, labels, strict=False):
         require_length(recording, label)
     if all(is_position_only(recording) for recording in matched):
-        checked, found = check_position_only(matched, labels[: len(matched)], stated)
+        checked, found = check_position_only(sim.arm, matched, labels[: len(matched)], stated)
     else:
         checked, found = check_recordings(sim.arm, matched, labels[: len(matched)], stated)
     return sim, checked, (*findings, *found)

@@ -9,6 +9,7 @@ from gcomp.arrays import Array
 from sim_gap.attribution.friction_compensation import Compensation
 from sim_gap.attribution.residual_laws import ResidualLaw
 from sim_gap.checks.finding import Finding
+from sim_gap.closed_loop.training.bands import SHARE, Band
 from sim_gap.residuals.where import Location
 from sim_gap.search.estimate import Value
 
@@ -108,6 +109,8 @@ class Diagnosis:
     laws: tuple[ResidualLaw, ...] = ()
     """Laws of what is left, which no effect of the library accounts for."""
     notes: tuple[str, ...] = ()
+    band: Band | None = None
+    """90 % band of the motion, where no recording has a torque channel."""
     unit: str = "N·m"
     """Of the gap: N·m, or rad where no recording has a torque channel."""
     friction_compensation: tuple[Compensation, ...] = ()
@@ -163,12 +166,18 @@ class Diagnosis:
                     for each in (roll.effects if roll else ())
                 ],
             },
+            **({} if self.band is None else {"band": _band(self.band)}),
             "unexplained": _round(self.unexplained),
             "left_out": _round(self.left_out),
             "notes": list(self.notes),
             "friction_compensation": [each.to_json() for each in self.friction_compensation],
             "checks": [finding.to_json() for finding in self.checks],
         }
+
+
+def _band(band: Band) -> dict[str, Any]:
+    values = {"holds": band.holds, "half_width": band.width, "unexplained": band.unexplained}
+    return {"share": SHARE, **{name: _list(x) for name, x in values.items()}}
 
 
 def _cause(cause: Cause) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.effects.laws import LAWS
+from sim_gap.residuals.layout import Layout
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.normal_equations import NormalEquations
 from sim_gap.search.stepwise import Search
@@ -64,7 +65,7 @@ class LawTest:
     def _holds(self, law: Term, own: Sequence[Term]) -> bool:
         """Whether these terms are of the law's own family and a case of it: then both say the same."""
         normal, family = self.search.normal, LAWS[law.effect].family
-        if any(term.effect.split(".")[0] != family for term in own):
+        if any(_family(term, normal.layout) != family for term in own):
             return False
         at, of = normal.at[law], np.concatenate([normal.at[term] for term in own])
         law_gram, across, power = np.zeros((len(at), len(at))), np.zeros((len(at), len(of))), np.zeros(len(of))
@@ -76,6 +77,11 @@ class LawTest:
                 law_gram += weight * block.whole[np.ix_(ours, ours)]
                 across[:, shown] += weight * block.whole[np.ix_(ours, theirs[shown])]
         return bool(np.all(power - _explained(law_gram, across) <= CONTAINED * power))
+
+
+def _family(term: Term, layout: Layout) -> str:
+    """Family of a cause: without a torque sensor, an offset of the torque is the drive's."""
+    return "actuator" if layout.sensor is None and term.effect == "torque.offset" else term.effect.split(".")[0]
 
 
 def _explained(gram: Array, across: Array) -> Array:

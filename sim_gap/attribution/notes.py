@@ -15,7 +15,8 @@ from sim_gap.residuals.preprocess import ABSENT
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.residuals.stuck_channels import Stuck
 from sim_gap.residuals.where import Location, locate
-from sim_gap.search.estimate import Estimate
+from sim_gap.search.estimate import NOMINAL, Estimate
+from sim_gap.search.torque_constants import CONSTANT, shares_a_factor
 
 ALIKE = 0.05
 """A general law that scores worse than a cause by less than this is noted."""
@@ -33,7 +34,7 @@ def notes(
 ) -> tuple[str, ...]:
     """All notes; `fit` is the training set, `judge` the held-out set with the remaining residual `left`."""
     usual = (*_noisy(fit), *_spiked((fit, judge)), *_stuck(stuck, fit), *_impacts(fit))
-    known = (*usual, *_bound(estimate, fit, judge), *_alike(found))
+    known = (*usual, *_common_factor(estimate, fit), *_bound(estimate, fit, judge), *_alike(found))
     return (*known, *_remaining(judge, left), *_at_rest(fit))
 
 
@@ -78,6 +79,18 @@ def _impacts(data: ResidualSet) -> tuple[str, ...]:
         f"{data.signals[0].arm.names[joint]}: the torque jumps when it changes sign, as in a gear with backlash; these "
         f"samples ({near.mean():.0%} of the time) are left out of the comparison"
         for joint, near in data.impacts.items()
+    )
+
+
+def _common_factor(estimate: Estimate | None, fit: ResidualSet) -> tuple[str, ...]:
+    """A note for torque constants that motor torque alone tells: masses may have a factor in common with them."""
+    if estimate is None or not shares_a_factor(fit.layout, estimate.terms):
+        return ()
+    return (
+        f"{CONSTANT}: a factor common to all torque constants and all masses is not determined by {fit.layout.motor} "
+        "alone: with all links 1 % heavier than in the model, all constants, friction and rotor inertias are 1 % "
+        f"larger; the intervals allow for masses that are {2 * NOMINAL:.0%} off; creep sweeps with a weighed mass "
+        "(armlink sweep) determine it",
     )
 
 

@@ -71,6 +71,7 @@ def diagnose_positions(
         rollout=_rollout(found),
         notes=tuple(_notes(found)),
         checks=tuple(checks),
+        band=found.band,
         unit="rad",
         internals=found,
     )

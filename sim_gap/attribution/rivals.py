@@ -106,7 +106,7 @@ class Rivals:
         about, kept = converged(nominal, terms, {term: c for term, c in start.items() if term in rest})
         if other.key not in {term.key for term in kept}:
             return float("inf")
-        again = Search(NormalEquations(about, kept), kept)
+        again = Search(NormalEquations(about, kept), kept, usual=self.search.usual)
         return again.score - self.search.score
 
 

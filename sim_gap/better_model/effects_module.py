@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sim_gap.better_model import forward_effects as forward
+from sim_gap.effects.sensor_nonlinearity import is_gradual
 from sim_gap.model.load import SimModel
 from sim_gap.search.estimate import Estimate
 from sim_gap.search.term import Term
@@ -26,6 +27,8 @@ def joint_effects(sim: SimModel, estimate: Estimate, terms: Sequence[Term]) -> l
         values = {name: each.value for name, each in estimate.parameters(term).items()}
         if term.effect == "torque.offset" and estimate.store.data.layout.sensor is None:
             values = {"lost": values["offset"]}
+        if term.effect == "torque.hysteresis" and is_gradual(term.shape):
+            values["gradual"] = 1.0
         out.append((term.effect, sim.arm.names[term.place], values))
     return out
 

@@ -38,6 +38,8 @@ PASSIVE = ("friction.stribeck", "friction.load", "friction.asymmetric", "transmi
 """Effects that act on the joints themselves."""
 CREEPING = 0.01
 """Speed below which the direction of a motion is not defined [rad/s]."""
+GRADUAL = (0.25, 0.75, 1.25, 1.75)
+"""Half widths of the plays of a hysteresis that sets in gradually, as shares of its width."""
 GEARED = "actuator.gain in the model's gear"
 """A drive's gain that the model's actuators have; a torque that is applied past them needs it too."""
 HORIZON_S, WINDOWS, STEP_S = 0.5, 40, 0.002
@@ -66,7 +68,7 @@ class Effects:
         self._commands: list[tuple[float, Array]] = []
         self._followed: Array | None = None
         self._passed: list[tuple[float, Array]] = []
-        self._play: Array = np.zeros(len(self.joints))
+        self._plays: Array = np.zeros((len(GRADUAL), len(self.joints)))
         self._whole: Array = np.zeros(model.nv)
         self.temperature: Array | None = None
         """Of the joints [°C], (n,), for laws of temperature; None leaves those out."""
@@ -202,11 +204,13 @@ class Effects:
             if name == "torque.crosstalk":
                 source = torque[int(parameters["source"]) - 1]
                 mixed[self.joints.index(joint)] += parameters["coefficient"] * source
-        width = self.values("torque.hysteresis", "width")
-        self._play = np.clip(self._play, mixed - width, mixed + width)
-        dead = np.maximum(np.abs(self._play) - self.values("torque.deadband", "width"), 0.0)
+        gradual = self.values("torque.hysteresis", "gradual")
+        halves = self.values("torque.hysteresis", "width") * (1.0 + gradual * (np.array(GRADUAL)[:, None] - 1.0))
+        self._plays = np.clip(self._plays, mixed - halves, mixed + halves)
+        held = self._plays.mean(axis=0)
+        dead = np.maximum(np.abs(held) - self.values("torque.deadband", "width"), 0.0)
         limit = self.values("torque.saturation", "limit", np.inf)
-        bent = np.clip(np.sign(self._play) * dead, -limit, limit)
+        bent = np.clip(np.sign(held) * dead, -limit, limit)
         drift = self.values("torque.drift", "rate") * time + self.values("torque.offset", "offset")
         return np.asarray(self.values("torque.gain", "gain", 1.0) * bent + drift)
 

@@ -10,9 +10,9 @@ from dataclasses import replace
 from armlink.errors import BadInput
 from armlink.recording.corrections import Corrections, parse_corrections
 from armlink.recording.recording import Recording
-from sim_gap.checks.clock import even_times, without_repeats
+from sim_gap.checks.clock import even_times, find_dropped, without_repeats
 from sim_gap.checks.finding import Finding
-from sim_gap.checks.joint_range import find_beyond_range
+from sim_gap.checks.joint_range import find_beyond_range, find_counts
 from sim_gap.checks.mapping import SURE, find_mapping
 from sim_gap.checks.rigid_fit import as_mounted, fit_rigid, motion_of
 from sim_gap.checks.torque_source import find_delay, find_scale, find_source, find_unsigned
@@ -46,9 +46,11 @@ def check_recording(
     arm: RigidArm, recording: Recording, label: str, stated: Corrections
 ) -> tuple[Recording, list[Finding]]:
     """Check and correct one recording. Raises BadInput for a finding that is not certain."""
+    for finding in find_counts(recording, stated):
+        raise BadInput(f"{label}: {finding.sentence()}")
     recording, repeated = without_repeats(recording)
     recording, jitter = even_times(recording, stated)
-    found = [*repeated, *jitter]
+    found = [*repeated, *jitter, *([] if repeated else find_dropped(recording))]
     s = prepare(recording, arm, label)
     for channel in s.channels:
         for look in (_unsigned, _mapping, _source):

@@ -1,4 +1,4 @@
-"""The rows' times: jitter of receipt, and rows that repeat the one before."""
+"""The rows' times: jitter of receipt, rows that repeat the one before, and rows that are missing."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ SMOOTHER = 0.7
 """Roughness of the positions on even times over that on the recorded ones, below which the recorded are of receipt."""
 REPEATED = 0.03
 """Share of repeated rows in motion from which a recording is said to repeat."""
+DROPPED, EVEN, NEAR = 0.05, 0.95, 0.25
+"""Share of missing samples from which they are said to be; share of the steps that must be within `NEAR` of a whole
+number of periods, or the rate changed and nothing is missing."""
 
 
 def even_times(recording: Recording, stated: Corrections) -> tuple[Recording, list[Finding]]:
@@ -83,6 +86,21 @@ def without_repeats(recording: Recording) -> tuple[Recording, list[Finding]]:
     evidence = f"{share:.0%} of the rows in motion repeat the row before in every channel: old messages read again"
     kept = slice_rows(recording, ~(same & moving))
     return kept, [Finding("duplicate", "t", "all", evidence, "record each message once", True)]
+
+
+def find_dropped(recording: Recording) -> list[Finding]:
+    """Samples of an even clock that are missing; the others keep their times."""
+    steps = np.diff(recording.t)
+    if steps.size < 50:
+        return []
+    short = steps[steps < 1.5 * float(np.quantile(steps, 0.1))]
+    periods = steps / float(np.mean(short)) if short.size else np.ones_like(steps)
+    whole = np.maximum(np.round(periods), 1.0)
+    missing = float((whole - 1.0).sum() / whole.sum())
+    if missing < DROPPED or np.mean(np.abs(periods - whole) < NEAR) < EVEN:
+        return []
+    evidence = f"{missing:.0%} of the samples are missing, up to {whole.max() - 1.0:.0f} one after the other"
+    return [Finding("dropped", "t", "all", evidence, "record every message; the gaps are filled in between", True)]
 
 
 def _fast(position: Array) -> NDArray[np.bool_]:

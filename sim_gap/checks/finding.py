@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 from typing import Any, Literal
 
-Kind = Literal["order", "sign", "scale", "zero", "unsigned", "effort_source", "clock", "jitter", "filter", "duplicate"]
+Kind = Literal[
+    "order", "sign", "scale", "zero", "unsigned", "effort_source", "clock", "jitter", "filter", "duplicate", "dropped"
+]
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Positions against the ranges that the model's joints have: an arm cannot be where its model says that it cannot."""
+"""Positions that no joint can have: whole numbers, which are counts, and angles beyond the ranges of the model."""
 
 import numpy as np
 
@@ -9,6 +9,45 @@ from sim_gap.model.rigid_body import RigidArm
 
 BEYOND = 0.2
 """Distance beyond the end of its range from which a joint is not there [rad]; zeros and soft limits differ by less."""
+FAR = 20.0
+"""Range of a position [rad] from which whole numbers alone are counts, and a servo's turns are likely degrees."""
+
+
+def find_counts(recording: Recording, stated: Corrections) -> list[Finding]:
+    """Positions of whole numbers alone: counts of encoders, of which the number a turn has to be given."""
+    found = []
+    for j, q in enumerate(recording.position.T):
+        q = q[np.isfinite(q)]
+        if stated.states("units", f"q_{j + 1}") or not q.size or np.ptp(q) < FAR or np.any(q != np.round(q)):
+            continue
+        follows = ",q_cmd=counts:TURN" if recording.position_command is not None else ""
+        evidence = f"holds whole numbers from {q.min():.0f} to {q.max():.0f}: counts of an encoder, or degrees?"
+        option = f"--units q=counts:TURN{follows} (counts a turn of the joint), or q=deg, or q=rad if it is right"
+        found.append(Finding("scale", "q", recording.names[j], evidence, option, False))
+    return found
+
+
+def find_far(arm: RigidArm, recording: Recording, stated: Corrections) -> list[Finding]:
+    """Servos of joints without a range that turn further than a cable lets them: degrees."""
+    found = []
+    for j, q in enumerate(recording.position.T):
+        if (
+            np.all(np.isfinite(arm.range[j]))
+            or stated.states("units", f"q_{j + 1}")
+            or np.nanmax(q) - np.nanmin(q) < FAR
+        ):
+            continue
+        evidence = f"runs from {np.nanmin(q):.1f} to {np.nanmax(q):.1f} rad: degrees?"
+        found.append(
+            Finding("scale", "q", arm.names[j], evidence, f"{_degrees(recording)}, or q=rad if it is right", False)
+        )
+    return found
+
+
+def _degrees(recording: Recording) -> str:
+    """Option for positions, and what follows them, in degrees."""
+    beside = (("dq", recording.velocity), ("q_cmd", recording.position_command))
+    return "--units q=deg" + "".join(f",{name}=deg" for name, values in beside if values is not None)
 
 
 def find_beyond_range(arm: RigidArm, recording: Recording, stated: Corrections) -> list[Finding]:
@@ -27,5 +66,7 @@ def find_beyond_range(arm: RigidArm, recording: Recording, stated: Corrections) 
         option = (
             f"--zero {column}=ANGLE, --sign {column}=-1 or --map, or --zero {column}=0 if the model's range is wrong"
         )
+        if most - least > 2.0 * np.pi:
+            option = f"{_degrees(recording)}, {option}"
         found.append(Finding("zero", "q", arm.names[j], evidence, option, False))
     return found

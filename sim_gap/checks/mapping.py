@@ -32,6 +32,8 @@ FITS = 0.65
 """Share of variance that the joints concerned must have explained after a correction (median), and strong ones each."""
 PLAUSIBLE = 0.4, 2.5
 """Coefficient of the model's torque on a strong joint after a correction."""
+IDLE = 0.5
+"""The model's own part over the reading from which a motor is all but idle, if the reading does not hold that part."""
 SPRUNG = 0.97
 """Share of variance explained from which a joint has a spring; a turned sign looks like one by less."""
 TURN = math.pi / 180.0
@@ -86,7 +88,7 @@ def _best(
         if float((fit.cost - fit_rigid(arm, hypothesis.change(few)).cost).sum()) < SCREENED * SURE:
             continue
         better = fit_rigid(arm, hypothesis.change(motion))
-        fall = float((fit.cost - better.cost).sum())
+        fall = float(_told(hypothesis, motion.channel, better, fit.cost - better.cost).sum())
         worse = float(np.max(better.cost - fit.cost))
         doubted = worse >= MOST_WORSE * fall or _contradicts(better, hypothesis.joints)
         if fall > most[doubted]:
@@ -94,6 +96,20 @@ def _best(
             if best is None or best[3] or not doubted:
                 best = (hypothesis, better, fall, doubted)
     return best
+
+
+def _told(hypothesis: Hypothesis, channel: str, fit: RigidFit, falls: Array) -> Array:
+    """Falls of the cost by joint with a hypothesis, without those that the model has no part in, (n,).
+
+    At a joint that others drag along, its motor all but idle, the model's torque is carried by friction and rotor: the
+    motor reads a small difference of the three, which any change may happen to fit better, with a coefficient of the
+    model that no arm has. So it is with an angle unit that makes the model's torque too small by far.
+    """
+    low, high = PLAUSIBLE
+    nothing = (channel != "tau") & (fit.own_share > IDLE) & (fit.scale < 0.5 * low)
+    if hypothesis.kind == "scale":
+        nothing |= (fit.scale > high) & (fit.own_share * fit.scale > STRONG_SHARE)
+    return np.where(nothing, np.minimum(falls, 0.0), falls)
 
 
 def _contradicts(fit: RigidFit, joints: Sequence[int]) -> bool:

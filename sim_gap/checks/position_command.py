@@ -1,6 +1,7 @@
-"""Checks of recordings without a torque channel: times, and commanded against measured positions."""
+"""Checks of recordings without a torque channel: times, units, and commanded against measured positions."""
 
 from collections.abc import Sequence
+from itertools import chain
 
 import numpy as np
 
@@ -8,8 +9,10 @@ from armlink.errors import BadInput
 from armlink.recording.corrections import Corrections
 from armlink.recording.recording import TORQUE_CHANNELS, Recording
 from gcomp.arrays import Array
-from sim_gap.checks.clock import even_times, without_repeats
+from sim_gap.checks.clock import even_times, find_dropped, without_repeats
 from sim_gap.checks.finding import Finding
+from sim_gap.checks.joint_range import find_beyond_range, find_counts, find_far
+from sim_gap.model.rigid_body import RigidArm
 
 FOLLOWS = 0.5
 """Correlation of a command with its joint's position below which they do not belong together."""
@@ -28,7 +31,7 @@ def is_position_only(recording: Recording) -> bool:
 
 
 def check_position_only(
-    recordings: Sequence[Recording], labels: Sequence[str], stated: Corrections
+    arm: RigidArm, recordings: Sequence[Recording], labels: Sequence[str], stated: Corrections
 ) -> tuple[list[Recording], list[Finding]]:
     """Recordings on their sample times, without repeated rows, and the findings.
 
@@ -41,11 +44,19 @@ def check_position_only(
                 f"{label}: neither a torque channel nor a commanded position holds a number: record tau_1 …, "
                 "tau_motor_1 … or tau_cmd_1 …, or q_cmd_1 …"
             )
+        _require_pairs(recording, label, stated)
+        looks = (
+            find_counts(recording, stated),
+            find_beyond_range(arm, recording, stated),
+            find_far(arm, recording, stated),
+        )
+        for finding in chain(*looks):
+            raise BadInput(f"{label}: {finding.sentence()}")
         recording, repeated = without_repeats(recording)
         recording, jitter = even_times(recording, stated)
-        _require_pairs(recording, label, stated)
+        dropped = [] if repeated else find_dropped(recording)
         checked.append(recording)
-        found += [finding for finding in (*repeated, *jitter) if finding not in found]
+        found += [finding for finding in (*repeated, *jitter, *dropped) if finding not in found]
     return checked, found
 
 

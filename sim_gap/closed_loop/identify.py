@@ -17,6 +17,7 @@ from sim_gap.closed_loop.fit import Fit, evaluate, improve
 from sim_gap.closed_loop.judge import Covariance, Stage, covariance, rms_on, stages
 from sim_gap.closed_loop.parameters import EFFECTS
 from sim_gap.closed_loop.search import Search
+from sim_gap.closed_loop.training.bands import Band, band
 from sim_gap.closed_loop.training.export import Exported, exported, native_fit
 from sim_gap.closed_loop.windows import Windows, thinned, windows_of
 from sim_gap.model.load import SimModel
@@ -42,6 +43,7 @@ class Identified:
     nominal_has_controller: bool
     stages: tuple[Stage, ...]
     spread: Covariance
+    band: Band
     train_before: Array
     train_after: Array
     heldout_before: Array
@@ -91,6 +93,7 @@ def identify(
     before = _bare(search, own.complete)
     native = native_fit(search, fit)
     margin = _margin(search, fit, floor)
+    spread = covariance(search, fit)
     return Identified(
         sim=sim,
         search=search,
@@ -99,7 +102,8 @@ def identify(
         controller=kind,
         nominal_has_controller=own.complete,
         stages=found,
-        spread=covariance(search, fit),
+        spread=spread,
+        band=band(search, fit, spread, judged),
         train_before=rms_on(fitted, before),
         train_after=rms_on(fitted, fit),
         heldout_before=rms_on(judged, before),

@@ -163,7 +163,11 @@ def thinned(data: Windows, count: int) -> Windows:
     """At most `count` of the windows, evenly spread over the recordings."""
     if data.count <= count:
         return data
-    chosen = np.unique(np.linspace(0, data.count - 1, count).round().astype(int))
+    return of_windows(data, np.unique(np.linspace(0, data.count - 1, count).round().astype(int)))
+
+
+def of_windows(data: Windows, chosen: NDArray[np.intp]) -> Windows:
+    """Some of the windows, by their numbers."""
     values: dict[str, Any] = {name: x[..., chosen] for name, x in vars(data).items() if isinstance(x, np.ndarray)}
     return replace(data, **values, columns={name: x[..., chosen] for name, x in data.columns.items()})
 

@@ -144,6 +144,8 @@ class SearchHints:
     """The same for given recordings and place."""
     discrete: frozenset[int] = frozenset()
     """Entries of the shape that are the number of something (a joint, a recording): they are not refined."""
+    forms: Callable[[Shape], tuple[Shape, ...]] = lambda shape: (shape,)
+    """The same effect in other forms, which are compared once it is found."""
     linearised_at: int | None = None
     """Entry of the shape at which a nonlinear effect is linearised, by its secant; None if it is linear."""
     relinearise: Callable[[Array, Shape], Shape] = lambda coefficients, _shape: (float(coefficients[0]),)

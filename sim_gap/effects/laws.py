@@ -1,7 +1,8 @@
 """General laws: what a gap may follow if its cause is not in the library. They are compared with, never reported.
 
 A law is a smooth function of one quantity (position, velocity, acceleration, load or time: the regimes of a gap) in one
-channel of one joint, a delay to second order, any rigid body fixed to a link, or gravity of another direction or size.
+channel of one joint, a position that is read with a constant or proportional error, a delay to second order, any rigid
+body fixed to a link, or gravity of another direction or size.
 A cause that a law could replace is not certain, for unknown effects could look the same in this motion.
 """
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.effects.effect import Effect, Plausibility, Shape, Signature
+from sim_gap.effects.position import moving, reads
 from sim_gap.residuals.layout import Columns, Layout
 from sim_gap.residuals.preprocess import Signals
 
@@ -78,7 +80,7 @@ _LAWS = (
         "law.load",
         "torque",
         "any sensor error that is constant or proportional to the torque",
-        Signature.at_sensor(lambda s, joint, _: _linear(s.model[:, joint]), "any"),
+        Signature.at_sensor(lambda s, joint, _: _linear(s.model[:, joint])),
     ),
     Law(
         "law.motor_load",
@@ -115,6 +117,12 @@ _LAWS = (
         "actuator",
         "any delay or lag of the drive",
         Signature.at_command(lambda s, joint, _: _derivatives(s.reading["tau_cmd"][:, joint], s.rate)),
+    ),
+    Law(
+        "law.position_reading",
+        "position",
+        "any error of the position sensor that is constant or proportional to the position",
+        moving(reads(lambda q: (np.ones_like(q), q, 0 * q, np.ones_like(q), 0 * q, 0 * q))),
     ),
     Law("law.body", "link", "any rigid body fixed to a link", Signature(_body)),
     Law("law.gravity", "base", "gravity of another direction or size", Signature(_gravity, whole_arm=True)),

@@ -59,7 +59,7 @@ def moving(moves: Moves, shaped: bool = False) -> Signature:
     )
 
 
-def _reads(error: Error) -> Moves:
+def reads(error: Error) -> Moves:
     """Moves for an error of the reading, a function of the reading."""
 
     def moves(signals: Signals, _layout: Layout, joint: int) -> Array:
@@ -95,20 +95,20 @@ FROM_ZERO = SearchHints(shapes=((0.0,),), linearised_at=0)
 EFFECTS = (
     Effect(
         "position.offset",
-        moving(_reads(lambda q: (np.ones_like(q), 0 * q, 0 * q)), shaped=True),
+        moving(reads(lambda q: (np.ones_like(q), 0 * q, 0 * q)), shaped=True),
         Plausibility(prior_std=_small),
         FROM_ZERO,
     ),
     Effect(
         "position.gain",
-        moving(_reads(lambda q: (q, np.ones_like(q), 0 * q)), shaped=True),
+        moving(reads(lambda q: (q, np.ones_like(q), 0 * q)), shaped=True),
         Plausibility(prior_std=_small, allows=between(-WORST_GAIN, WORST_GAIN)),
         FROM_ZERO,
         parameters_of=as_gain,
     ),
     Effect(
         "position.eccentricity",
-        moving(_reads(lambda q: (np.sin(q), np.cos(q), np.cos(q), -np.sin(q), -np.sin(q), -np.cos(q)))),
+        moving(reads(lambda q: (np.sin(q), np.cos(q), np.cos(q), -np.sin(q), -np.sin(q), -np.cos(q)))),
         Plausibility(prior_std=lambda _signals, _place: np.full(2, 0.1), allows=_within_a_few_degrees),
         SearchHints(shapes_for=_far_enough),
         parameters_of=_amplitude_and_phase,

@@ -19,6 +19,8 @@ from sim_gap.effects.effect import (
 )
 from sim_gap.residuals.preprocess import Signals
 
+GRADUAL = (0.25, 0.75, 1.25, 1.75)
+"""Half widths of the plays of a hysteresis that sets in gradually, as in strain gauges, as shares of their mean."""
 PLAY_HZ = 50.0
 """Rate at which a play operator is evaluated; smooth torques change little from one sample to the next."""
 
@@ -32,11 +34,9 @@ def _other_joints(signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
     return tuple((float(source + 1),) for source in range(signals[0].n) if source != place)
 
 
-def _distorted(distort: Callable[[Array, float, float], Array]) -> Signature:
-    """Reading less true torque, `distort(torque (K,), level, rate)`."""
-    return Signature.at_sensor(
-        lambda s, joint, shape: distort(s.smooth_model[:, joint], shape[0], s.rate), side="distortion"
-    )
+def _distorted(distort: Callable[[Array, Shape, float], Array]) -> Signature:
+    """Reading less true torque, `distort(torque (K,), shape, rate)`; the shape begins with a level."""
+    return Signature.at_sensor(lambda s, joint, shape: distort(s.passed_on[:, joint], shape, s.rate), side="distortion")
 
 
 def _shares(*shares: float) -> Callable[[Sequence[Signals], int], tuple[Shape, ...]]:
@@ -48,6 +48,21 @@ def _exceeded(signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
     """Levels that the torque exceeds during some of the time [N·m]."""
     shares = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995, 0.999)
     return tuple((largest(signals, place, share),) for share in shares)
+
+
+def _stays_behind(torque: Array, shape: Shape, rate: float) -> Array:
+    """Reading less true torque with hysteresis: one play, or if the shape says so several of growing width."""
+    shares = GRADUAL if is_gradual(shape) else (1.0,)
+    return np.asarray(np.mean([play(torque, share * shape[0], rate) for share in shares], axis=0) - torque)
+
+
+def is_gradual(shape: Shape) -> bool:
+    """Whether a hysteresis of this shape sets in gradually."""
+    return len(shape) > 1
+
+
+def _abrupt_and_gradual(shape: Shape) -> tuple[Shape, ...]:
+    return (shape[:1], (shape[0], float(len(GRADUAL))))
 
 
 def play(x: Array, half: float, rate: float) -> Array:
@@ -65,6 +80,8 @@ def play(x: Array, half: float, rate: float) -> Array:
     return np.asarray(np.interp(np.arange(len(x)), np.arange(len(coarse)) * step, out))
 
 
+CUT_OFF = Plausibility(prior_mean=1.0, prior_std=lambda _signals, _place: np.full(1, CLIPPED), allows=NEAR_ONE)
+"""What a level cuts off is lost altogether."""
 EFFECTS = (
     Effect(
         "torque.crosstalk",
@@ -73,24 +90,26 @@ EFFECTS = (
         SearchHints(shapes_for=_other_joints, discrete=frozenset({0})),
         parameters_of=as_fitted_and_shape,
     ),
-    Effect(  # the width is the deviation after a long way: real hysteresis sets in less abruptly than a play
+    Effect(  # the width is the deviation after a long way
         "torque.hysteresis",
-        _distorted(lambda torque, half, rate: play(torque, half, rate) - torque),
+        _distorted(_stays_behind),
         Plausibility(allows=NEAR_ONE),
-        SearchHints(shapes_for=_shares(0.01, 0.03, 0.06, 0.12, 0.25)),
+        SearchHints(
+            shapes_for=_shares(0.01, 0.03, 0.06, 0.12, 0.25), discrete=frozenset({1}), forms=_abrupt_and_gradual
+        ),
+        parameters_of=as_share_of_shape,
+    ),
+    Effect(  # the width is what is lost beyond the band
+        "torque.deadband",
+        _distorted(lambda torque, shape, _rate: -np.clip(torque, -shape[0], shape[0])),
+        CUT_OFF,
+        SearchHints(shapes_for=_shares(0.02, 0.05, 0.1, 0.2, 0.4, 0.8)),
         parameters_of=as_share_of_shape,
     ),
     Effect(
-        "torque.deadband",
-        _distorted(lambda torque, half, _rate: -np.clip(torque, -half, half)),
-        Plausibility(allows=NEAR_ONE),
-        SearchHints(shapes_for=_shares(0.02, 0.05, 0.1, 0.2, 0.4)),
-        parameters_of=as_shape,
-    ),
-    Effect(
         "torque.saturation",
-        _distorted(lambda torque, limit, _rate: np.clip(torque, -limit, limit) - torque),
-        Plausibility(prior_mean=1.0, prior_std=lambda _signals, _place: np.full(1, CLIPPED), allows=NEAR_ONE),
+        _distorted(lambda torque, shape, _rate: np.clip(torque, -shape[0], shape[0]) - torque),
+        CUT_OFF,
         SearchHints(shapes_for=_exceeded),
         parameters_of=as_shape,
     ),

@@ -57,9 +57,10 @@ def _recordings(path: Path) -> list[Path]:
 
 
 def diagnose_case(case: Case) -> dict[str, Any]:
-    """The JSON result of one case, or `{"error": line}` if it cannot be diagnosed."""
+    """The JSON result of one case with what is watched, or `{"error": line}` if it cannot be diagnosed."""
     from armlink.recording.files import load_recording
     from sim_gap.attribution.diagnose import diagnose
+    from sim_gap.fleet.watched import watched
 
     paths = [*case.train, *case.heldout]
     try:
@@ -68,7 +69,7 @@ def diagnose_case(case: Case) -> dict[str, Any]:
         answer = diagnose(case.sim, recordings[:count], recordings[count:], labels=[str(path) for path in paths])
     except ArmlinkError as error:
         return {"error": str(error)}
-    return answer.to_json()
+    return answer.to_json() | {"watched": watched(answer)}
 
 
 def diagnose_fleet(cases: list[Case], client: Any) -> Iterator[tuple[str, dict[str, Any]]]:

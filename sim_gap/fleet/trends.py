@@ -1,15 +1,17 @@
 """Trends of a fleet: which parameter of which arm changes, since when, and which arm differs from the others.
 
-A series is one parameter (friction of joint 2, say) of one arm over its dated diagnoses. Diagnoses of one arm on one
-motion share their systematic errors, so that a change is judged by the scatter from one diagnosis to the next and not
-by the intervals of each.
+A series is one parameter (friction of joint 2, say) of one arm over its dated diagnoses: those that are watched at
+every joint (`sim_gap.fleet.watched`), and those of the causes. Diagnoses of one arm on one motion share their
+systematic errors, so that a change is judged by the scatter from one diagnosis to the next and not by the intervals of
+each.
 """
 
 import re
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,8 +22,15 @@ FIRST, LAST = 7, 5
 """Number of diagnoses at the start that are the reference, and at the end that are compared with it."""
 SURE = 5.0
 """Multiple of the difference's standard deviation from which a parameter has changed, in two diagnoses running."""
-LEAST = 0.01
-"""Least change, as a share of the reference."""
+LEAST = {"friction.coulomb": 0.05, "friction.viscous": 0.05, "torque.gain": 0.005, "actuator.gain": 0.005}
+LEAST_OTHER = 0.01
+"""Least change by effect, as a share of the reference: friction varies with temperature, a gain does not."""
+LEAST_SEEN = 0.05
+"""Least change of what is watched, as a share of its interval's half width."""
+NO_WEAR = frozenset({"cycles", "phase"})
+"""Parameters that say where an effect is, and not how large."""
+CLEAR = 3.0
+"""Multiple of the usual interval above which a watched value is left out: the joint hardly moved that day."""
 POOLED = 6
 """Weight of the fleet's scatter against an arm's own, as a number of diagnoses."""
 ARMS, DIFFERS = 5, 0.25
@@ -74,6 +83,13 @@ class _Series:
     dates: list[datetime]
     values: Array
     """NaN where a diagnosis has not found the parameter, (K,)."""
+    interval: Array
+    """Half widths of the 95 % intervals of what is watched; NaN otherwise, (K,)."""
+
+    @property
+    def watched(self) -> bool:
+        """Whether a parameter that is not there is unknown; else it is too small to be found."""
+        return bool(np.isfinite(self.interval).any())
 
 
 def date_of(case: str) -> datetime | None:
@@ -93,7 +109,7 @@ def fleet_trends(answers: Mapping[str, Mapping[str, Any]]) -> list[Trend]:
     An arm with a case without a date, or with fewer than FIRST + LAST + 1 cases, has none.
     """
     series = _series(answers)
-    noise = {key: _scatter(one.values) for key, one in series.items()}
+    noise = {key: _scatter(one) for key, one in series.items()}
     pooled: dict[tuple[str, str], list[float]] = defaultdict(list)
     for (_, effect, _, parameter), (own, count, size) in noise.items():
         if count >= FIRST and size > 0.0:
@@ -145,55 +161,94 @@ def _series(answers: Mapping[str, Mapping[str, Any]], dated: bool = True) -> dic
         if dated and (arm in undated or len(cases) < FIRST + LAST + 1):
             continue
         cases.sort(key=lambda pair: pair[0])
-        dates = [date for date, _ in cases]
-        for k, (_, answer) in enumerate(cases):
-            for (effect, joint, parameter), (value, unit) in _values(answer).items():
-                key = arm, effect, joint, parameter
-                out.setdefault(key, _Series(unit, dates, np.full(len(cases), np.nan))).values[k] = value
-    return out
+        with_watched = [case for case in cases if case[1].get("watched")]
+        if dated and len(with_watched) >= FIRST + LAST + 1:
+            _add(out, arm, with_watched, _watched_values)
+        followed = {key[1] for key in out if key[0] == arm}
+        _add(out, arm, cases, partial(_values, leave=followed))
+    return {key: _without_unclear(one) for key, one in out.items()}
 
 
-def _values(answer: Mapping[str, Any]) -> dict[tuple[str, str, str], tuple[float, str]]:
+Read = Callable[[Mapping[str, Any]], dict[tuple[str, str, str], tuple[float, float, str]]]
+"""Value, half width and unit of the parameters of an answer, by effect, joint and name."""
+
+
+def _add(out: dict[Key, _Series], arm: str, cases: Sequence[tuple[datetime, Mapping[str, Any]]], read: Read) -> None:
+    dates = [date for date, _ in cases]
+    for k, (_, answer) in enumerate(cases):
+        for key, (value, half, unit) in read(answer).items():
+            if (arm, *key) not in out:
+                out[arm, *key] = _Series(unit, dates, *np.full((2, len(cases)), np.nan))
+            one = out[arm, *key]
+            one.values[k], one.interval[k] = value, half
+
+
+def _without_unclear(one: _Series) -> _Series:
+    if one.watched:
+        one.values[one.interval > CLEAR * np.nanmedian(one.interval)] = np.nan
+    return one
+
+
+def _watched_values(answer: Mapping[str, Any]) -> dict[tuple[str, str, str], tuple[float, float, str]]:
     return {
-        (cause["effect"], joint, name): (float(one["value"]), one["unit"])
-        for cause in (*answer.get("causes", ()), *answer.get("minor", ()))
-        if not cause["effect"].startswith("law.")
-        for joint, parameters in cause["parameters"].items()
-        for name, one in parameters.items()
+        (one["effect"], one["joint"], one["parameter"]): (
+            float(one["value"]),
+            0.5 * (float(one["ci95"][1]) - float(one["ci95"][0])),
+            one["unit"],
+        )
+        for one in answer["watched"]
     }
 
 
-def _scatter(values: Array) -> tuple[float, int, float]:
-    """Standard deviation from one diagnosis to the next, the number of differences behind it, and the usual size."""
-    there = values[np.isfinite(values)]
+def _values(
+    answer: Mapping[str, Any], leave: Collection[str] = ()
+) -> dict[tuple[str, str, str], tuple[float, float, str]]:
+    return {
+        (cause["effect"], joint, name): (float(one["value"]), float("nan"), one["unit"])
+        for cause in (*answer.get("causes", ()), *answer.get("minor", ()))
+        if not cause["effect"].startswith("law.") and cause["effect"] not in leave
+        for joint, parameters in cause["parameters"].items()
+        for name, one in parameters.items()
+        if name not in NO_WEAR
+    }
+
+
+def _scatter(one: _Series) -> tuple[float, int, float]:
+    """Standard deviation from one diagnosis to the next, the number of differences behind it, and what it is in
+    proportion to over the fleet: the interval of what is watched, which wear does not change; else the usual size."""
+    there = one.values[np.isfinite(one.values)]
+    size = float(np.nanmedian(one.interval if one.watched else np.abs(one.values)))
     steps = np.diff(there)
     if len(steps) < 2:
-        return 0.0, 0, float(np.median(np.abs(there))) if len(there) else 0.0
+        return 0.0, 0, size
     own = 1.4826 * float(np.median(np.abs(steps - np.median(steps)))) / np.sqrt(2.0)
-    return float(own), len(steps), float(np.median(np.abs(there)))
+    return float(own), len(steps), size
 
 
-def _window(values: Array) -> float:
+def _window(one: _Series, part: slice) -> float:
     """Mean of the diagnoses that have the parameter; zero if nearly none has it, NaN if it comes and goes."""
+    values = one.values[part]
     share = float(np.isfinite(values).mean())
     if share >= FOUND:
         return float(np.nanmean(values))
-    return 0.0 if share <= 1.0 - FOUND else float("nan")
+    return 0.0 if share <= 1.0 - FOUND and not one.watched else float("nan")
 
 
 def _trend(key: Key, one: _Series, noise: float) -> Trend | None:
     """The change of one series, if there is one."""
-    start = _window(one.values[:FIRST])
-    least = max(SURE * noise * float(np.sqrt(1.0 / FIRST + 1.0 / LAST)), LEAST * abs(start), 1e-12)
+    start = _window(one, slice(FIRST))
+    seen = LEAST_SEEN * float(np.nanmedian(one.interval)) if one.watched else 0.0
+    share = LEAST.get(key[1], LEAST_OTHER)
+    least = max(SURE * noise * float(np.sqrt(1.0 / FIRST + 1.0 / LAST)), share * abs(start), seen, 1e-12)
     hidden = HIDDEN * float(np.nanmin(np.abs(one.values)))
     running = 0
     for k in range(FIRST + LAST - 1, len(one.values)):
-        now = _window(one.values[k - LAST + 1 : k + 1])
+        now = _window(one, slice(k - LAST + 1, k + 1))
         needed = max(least, hidden) if start == 0.0 or now == 0.0 else least
         running = running + 1 if abs(now - start) > needed else 0
         if running == 2:
             since = one.dates[_began(one, start, k)].date().isoformat()
-            now = _window(one.values[-LAST:])
+            now = _window(one, slice(-LAST, None))
             return Trend(*key, one.unit, start, now, since, one.dates[k].date().isoformat())
     return None
 

@@ -99,6 +99,11 @@ class Signals:
         """Nominal torque without the noise of the accelerations, which would disturb plays and clips, (K, n)."""
         return low_pass(min(CALM_HZ, 0.4 * self.rate), self.rate)(self.model)
 
+    @property
+    def passed_on(self) -> Array:
+        """The same with what the sensor has added up to where it is looked at, (K, n)."""
+        return self.smooth_model if self.found is None else self.smooth_model + self.found.bent
+
     @cached_property
     def motor_model(self) -> Array:
         """Torque at the motor, with the model's own rotors, friction and springs [N·m], (K, n)."""

@@ -20,6 +20,10 @@ Values = Mapping[Term, Array]
 """Coefficients of the terms of an estimate."""
 
 
+STAGES = (("timing.delay", "torque.crosstalk"), ("torque.hysteresis",), ("torque.deadband",), ("torque.saturation",))
+"""What happens in a torque sensor before its gain, in this order: each stage gets what the one before passes on."""
+
+
 @dataclass(frozen=True, eq=False)
 class About:
     """One recording about an estimate."""
@@ -33,6 +37,12 @@ class About:
     """Reported motor torque per torque at the motor, (n,)."""
     motor_slope: Array
     """Change of the reported motor torque with the torque of its joint, (K, n)."""
+    stages: tuple[Signals, ...]
+    """The signals with the torque as it enters each stage of the sensors (`STAGES`)."""
+
+    def entering(self, term: Term) -> Signals:
+        """The signals as a term meets them: in a sensor, with the torque that earlier stages pass on."""
+        return self.stages[_stage(term)] if term.form.signature.side == "distortion" else self.signals
 
 
 @dataclass(eq=False)
@@ -54,20 +64,41 @@ def about(read: Signals, layout: Layout, values: Values) -> About:
     s = replace(parts.signals, found=still) if values else read
     parts.signals = s
     lost, bent = np.zeros_like(read.q), np.zeros_like(read.q)
-    for side, total, channel in (("motor", lost, layout.motor_side), ("distortion", bent, layout.sensor)):
+    for term, c in values.items():
+        if term.form.signature.side == "motor":
+            _add_to(lost, layout.motor_side, _share(parts, s, layout, term, c))
+    stages: list[Signals] = []
+    for stage in range(len(STAGES)):
+        entering = replace(s, found=replace(still, bent=bent.copy())) if bent.any() else s
+        stages.append(entering)
         for term, c in values.items():
-            if term.form.signature.side == side:
-                rows = {row: x @ c for row, x in _columns(s, layout, term).items()}
-                parts.add(term, rows)
-                for (name, joint), share in rows.items():
-                    if name == channel:
-                        total[:, joint] += share
+            if term.form.signature.side == "distortion" and _stage(term) == stage:
+                _add_to(bent, layout.sensor, _share(parts, entering, layout, term, c))
     if values:
         s = replace(s, found=replace(still, lost=lost, bent=bent))
     for term, c in values.items():
         if term not in parts.shares:
             parts.add(term, {row: x @ c for row, x in _columns(s, layout, term).items()})
-    return About(s, parts.shares, *_gains(s, values))
+    return About(s, parts.shares, *_gains(s, values), tuple(stages))
+
+
+def _stage(term: Term) -> int:
+    """The stage of the sensor in which a term acts."""
+    return next(k for k, effects in enumerate(STAGES) if term.effect in effects)
+
+
+def _share(parts: _Parts, s: Signals, layout: Layout, term: Term, c: Array) -> Columns:
+    """The torque that a term adds to its rows."""
+    rows = {row: x @ c for row, x in _columns(s, layout, term).items()}
+    parts.add(term, rows)
+    return rows
+
+
+def _add_to(total: Array, channel: str | None, rows: Columns) -> None:
+    """Add what a channel's rows have to a torque of all joints."""
+    for (name, joint), share in rows.items():
+        if name == channel:
+            total[:, joint] += share
 
 
 def _columns(s: Signals, layout: Layout, term: Term) -> Columns:

@@ -79,6 +79,8 @@ class ColumnStore:
         if term in self.values or term.effect.startswith("law."):  # a law has to contain the effects that it contains
             return None
         signature = term.form.signature
+        if any(one.entering(term) is not one.stages[0] for one in self.about if signature.side == "distortion"):
+            return None
         rigid = signature.side == "link" and signature.moves is None
         everywhere = signature.side == "link" or term.effect == "torque.crosstalk"
         for store, same in self._close:
@@ -187,7 +189,7 @@ class ColumnStore:
         if values is not None and signature.slopes is not None:
             plain = signature.slopes(one.signals, layout, term.shape, values)
         else:
-            plain = signature.columns(one.signals, layout, term.place, term.shape)
+            plain = signature.columns(one.entering(term), layout, term.place, term.shape)
         own = self._through(one, term, plain) if self.values else plain
         if values is not None:
             share = one.shares[term]

@@ -14,6 +14,7 @@ from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.normal_equations import CORRELATED, NormalEquations
 from sim_gap.search.stepwise import Search
 from sim_gap.search.term import Term
+from sim_gap.search.torque_constants import shares_a_factor
 
 NOMINAL, WORSE, WORST = 0.01, 0.5, 0.2
 """Undetected error of the nominal mass moments of all links, relative: NOMINAL, or WORSE times the largest error found
@@ -119,17 +120,16 @@ class Estimate:
         They shift the coefficients by A⁻¹ XᵀW Z z, A⁻¹ being `inverse`. The mean square of z about zero follows from
         its usual size and the residual.
         """
-        links, scale = self._other_links()
-        size = len(scale)
+        errors = self._errors_of_links()
+        size = errors.shape[1]
         if not size:
             return np.zeros_like(inverse)
         pull, own, seen = np.zeros((len(inverse), size)), np.eye(size), np.zeros(size)
         for (weight, x, residual, _), row in zip(self._jacobian, self.normal.rows, strict=True):
             z, valid = np.zeros((len(residual), size)), self.store.data.valid[row]
-            for k, link in enumerate(links):
+            for link in np.flatnonzero(np.any(errors.reshape(-1, 3, size), axis=(1, 2))).tolist():
                 if row in (columns := self.store.columns(Term("link.mass_moment", link))):
-                    z[:, 3 * k : 3 * k + 3] = columns[row][valid]
-            z *= scale
+                    z += columns[row][valid] @ errors[3 * link : 3 * link + 3]
             pull += weight * x.T @ z
             own += weight * z.T @ z
             seen += weight * z.T @ residual
@@ -138,15 +138,22 @@ class Estimate:
         mean = spread @ seen
         return np.asarray(moved @ (spread + np.outer(mean, mean)) @ moved.T)
 
-    def _other_links(self) -> tuple[list[int], Array]:
-        """Links whose mass moment is not a term, and the usual error of each of its components [kg·m], (3 L,)."""
+    def _errors_of_links(self) -> Array:
+        """Changes of all links' mass moments [kg·m] by undetected errors of usual size, (3 n, Z).
+
+        Each component of each link whose mass moment is not a term; with torque constants that only motor torque
+        tells, all masses in common, too.
+        """
         arm = self.store.data.signals[0].arm
         found = {term.place: self.of(term) for term in self.terms if term.effect == "link.mass_moment"}
         usual = np.maximum(np.linalg.norm(arm.inertial[:, 1:4], axis=1), SHORT_M * arm.inertial[:, 0])
         wrong = max((float(np.linalg.norm(found[link]) / usual[link]) for link in found), default=0.0)
         share = min(max(NOMINAL, WORSE * wrong), WORST)
-        links = [link for link in range(arm.n) if link not in found]
-        return links, np.repeat(share * usual[links], 3)
+        open_links = np.repeat([link not in found for link in range(arm.n)], 3)
+        errors = [np.diag(share * np.repeat(usual, 3))[:, open_links]]
+        if shares_a_factor(self.normal.layout, self.terms):
+            errors.append(NOMINAL * arm.inertial[:, 1:4].reshape(-1, 1))
+        return np.hstack(errors)
 
     def parameters(self, term: Term) -> dict[str, Value]:
         """Reported parameters with 95 % intervals."""

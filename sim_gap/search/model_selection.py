@@ -14,18 +14,32 @@ from sim_gap.search.gauss_newton import Values, converged
 from sim_gap.search.normal_equations import NormalEquations, Weighted
 from sim_gap.search.stepwise import TRIES, Search, shortlist
 from sim_gap.search.term import Term
+from sim_gap.search.torque_constants import CONSTANTS, drives_are_off, every_constant, price_of_all
 
 
 def select_model(store: ColumnStore, library: Sequence[str]) -> Search:
     """Search the library, refine the shapes of the selected terms, and drop those that no longer earn their place."""
     offered, active = first_search(store, library)
     store.keep(offered)
+    search = searched_again(store, active, offered)
+    if drives_are_off(search):
+        again = searched_again(store, every_constant(search, offered), offered, CONSTANTS)
+        search = again if again.score + price_of_all(again) < search.score else search
+    for held in (store, search.normal.store.beside(None)):  # frees the columns of rivals and of the estimate before
+        held.keep(search.active)
+    return search
+
+
+def searched_again(
+    store: ColumnStore, active: Sequence[Term], offered: Sequence[Term], usual: frozenset[str] = frozenset()
+) -> Search:
+    """The terms offered, searched about the fit of those that are active, until both agree."""
     chosen = refine(store, one_each([canonical(term) for term in active]))
     values: Values = {}
     near: ColumnStore | None = None
     rounds = 0
     for _ in range(MOST_ROUNDS):
-        search = about_itself(store, chosen, offered, values, near)
+        search = about_itself(store, chosen, offered, values, near, usual)
         keys = {term.key for term in search.active}
         gone = {term.key for term in chosen} - keys
         if rounds == ROUNDS and not gone:
@@ -40,8 +54,6 @@ def select_model(store: ColumnStore, library: Sequence[str]) -> Search:
         near = search.normal.store
         values = near.values
         chosen = one_each([canonical(term) for term in search.active])
-    for held in (store, search.normal.store.beside(None)):  # frees the columns of rivals and of the estimate before
-        held.keep(search.active)
     return search
 
 
@@ -55,7 +67,12 @@ def first_search(store: ColumnStore, library: Sequence[str]) -> tuple[list[Term]
 
 
 def about_itself(
-    nominal: ColumnStore, chosen: list[Term], offered: Sequence[Term], start: Values, near: ColumnStore | None = None
+    nominal: ColumnStore,
+    chosen: list[Term],
+    offered: Sequence[Term],
+    start: Values,
+    near: ColumnStore | None = None,
+    usual: frozenset[str] = frozenset(),
 ) -> Search:
     """The chosen terms and their rivals with columns evaluated about the fit of the chosen ones, from coefficients
     `start` on. `near` is the store of an earlier fit, whose columns of rivals serve if it is close."""
@@ -67,7 +84,7 @@ def about_itself(
     keys = {term.key for term in chosen}
     others = [term for term in with_levels(store, offered) if term.key not in keys]
     rivals = relinearised_in_place(store, chosen, others)
-    return Search(NormalEquations(store, [*chosen, *rivals]), chosen)
+    return Search(NormalEquations(store, [*chosen, *rivals]), chosen, usual=usual)
 
 
 def with_levels(store: ColumnStore, offered: Sequence[Term]) -> list[Term]:
@@ -145,7 +162,7 @@ def without_doubtful(search: Search) -> Search:
 
 
 def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
-    """Move each shape to the best fit between its neighbours on the starting grid (golden section)."""
+    """Move each shape, in its best form, to the best fit between its neighbours on the grid (golden section)."""
     out = list(active)
     for _ in range(3):
         out = relinearised(store, out)
@@ -155,29 +172,33 @@ def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
             continue
         free, low, high = found
 
-        def fit(value: float, term: Term = term, free: int = free) -> float:
-            trial = [term.reshaped(free, value) if other == term else other for other in out]
-            normal = NormalEquations(store, trial)
+        def fit(other: Term, term: Term = term) -> float:
+            normal = NormalEquations(store, [other if each == term else each for each in out])
             start = normal.square.sum(0) / np.maximum(normal.count.sum(0), 1.0)
             squares = normal.mean_square(*Weighted(normal, start).fit(normal.terms))
             return float(0.5 * np.log(squares + normal.floor**2)[normal.seen].sum())
 
-        value = golden(fit, low, high)
-        if fit(value) < fit(term.shape[free]):
-            out[out.index(term)] = term.reshaped(free, value)
+        def best(form: Term, low: float, high: float, free: int = free) -> Term:
+            return form.reshaped(free, golden(lambda value: fit(form.reshaped(free, value)), low, high))
+
+        size = term.shape[free]
+        trials = [term, best(term, low, high), *(best(form, 0.5 * size, 1.5 * size) for form in term.forms)]
+        out[out.index(term)] = min(trials, key=fit)
     return out
 
 
 def _between(data: ResidualSet, term: Term) -> tuple[int, float, float] | None:
-    """The free entry of a term's shape and its neighbours on the starting grid; None if it has none."""
+    """The free entry of a term's shape, and the neighbours on the starting grid of the value there that is closest to
+    its own, which levels about an estimate may miss by a little; None if it has none."""
     free = term.free
     if free is None:
         return None
     grid = sorted({shape[free] for shape in term.form.hints.grid(data.signals, term.place)})
     value = term.shape[free]
-    lower, upper = [x for x in grid if x < value - 1e-9], [x for x in grid if x > value + 1e-9]
+    closest = int(np.argmin(np.abs(np.array(grid) - value)))
+    lower, upper = grid[:closest], grid[closest + 1 :]
     beyond = sorted((0.5 * value, 1.5 * value))
-    return free, (lower[-1] if lower else beyond[0]), (upper[0] if upper else beyond[1])
+    return free, lower[-1] if lower else beyond[0], upper[0] if upper else beyond[1]
 
 
 def relinearised(store: ColumnStore, active: list[Term]) -> list[Term]:

@@ -35,6 +35,8 @@ class Search:
     """How often each effect and place was added, which bounds the search."""
     least: float = 1e-4
     """Least improvement of the score by a term that is added."""
+    usual: frozenset[str] = frozenset()
+    """Effects that this arm is known to have: the question is how large they are, and they are not charged for."""
 
     def __post_init__(self) -> None:
         self.reweigh()
@@ -87,7 +89,8 @@ class Search:
         """Number of parameters that a term is charged for: effective coefficients, shape, and its prior penalty."""
         form = term.form
         shape = len(term.shape) * (form.hints.linearised_at is None)
-        return self.normal.freedom(term) + shape + form.plausibility.prior_penalty
+        free = term.effect in self.usual
+        return 0.0 if free else self.normal.freedom(term) + shape + form.plausibility.prior_penalty
 
     def with_beneath(self, term: Term, terms: Sequence[Term]) -> list[Term]:
         """`terms` plus `term` plus what it needs; another shape of the same effect at that place is replaced."""

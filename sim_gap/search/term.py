@@ -49,6 +49,12 @@ class Term:
         entries = [i for i in range(len(self.shape)) if i not in hints.discrete]
         return entries[0] if len(entries) == 1 and hints.linearised_at is None else None
 
+    @property
+    def forms(self) -> "tuple[Term, ...]":
+        """The same effect in its other forms."""
+        shapes = self.form.hints.forms(self.shape)
+        return tuple(Term(self.effect, self.place, shape) for shape in shapes if shape != self.shape)
+
     def covers(self, layout: Layout) -> tuple[Key, ...]:
         """Keys of the terms that it contains."""
         return self.form.hints.covers(layout, self.place)

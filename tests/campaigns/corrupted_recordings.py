@@ -15,11 +15,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.signal import lfilter
 
 from armlink.errors import BadInput
 from armlink.recording.corrections import AS_IT_IS
 from armlink.recording.files import load_recording
-from armlink.recording.recording import Recording, take_joints
+from armlink.recording.recording import TORQUE_CHANNELS, Recording, take_joints
 from sim_gap.checks.check import check_recording
 from sim_gap.checks.rigid_fit import as_mounted, fit_rigid, motion_of
 from sim_gap.model.load import load_model
@@ -115,6 +116,26 @@ def repeats(recording: Recording, random: np.random.Generator) -> Recording:
     return replace(recording, **{name: values[rows] for name, values in recording.channels().items()})
 
 
+def dropped(recording: Recording, random: np.random.Generator) -> Recording:
+    kept = random.random(recording.t.size) > 0.3
+    return replace(
+        recording, **{name: values[kept] for name, values in recording.channels().items()}, t=recording.t[kept]
+    )
+
+
+def counts(recording: Recording, random: np.random.Generator) -> Recording:
+    per_rad = random.choice([1024, 4096, 16384, 2**17, 2**20]) / (2.0 * np.pi)
+    velocity = None if recording.velocity is None else recording.velocity * per_rad
+    return replace(recording, position=np.round(recording.position * per_rad), velocity=velocity)
+
+
+def velocity_filtered(recording: Recording, random: np.random.Generator) -> Recording | None:
+    if recording.velocity is None:
+        return None
+    slow = 1.0 - np.exp(-np.median(np.diff(recording.t)) / random.uniform(0.1, 0.4))
+    return replace(recording, velocity=lfilter([slow], [1.0, slow - 1.0], recording.velocity, axis=0))
+
+
 def velocity_degrees(recording: Recording, _: np.random.Generator) -> Recording | None:
     return None if recording.velocity is None else replace(recording, velocity=np.degrees(recording.velocity))
 
@@ -138,6 +159,9 @@ CORRUPTIONS: dict[str, Corruption] = {
     "skew": skew,
     "jitter": jitter,
     "repeats": repeats,
+    "dropped": dropped,
+    "encoder counts": counts,
+    "velocity filtered": velocity_filtered,
     "velocity in degrees": velocity_degrees,
     "velocity order": velocity_order,
 }
@@ -148,6 +172,18 @@ def said(arm, recording: Recording) -> str:
         return "; ".join(f"{each.finding} {each.option}" for each in check_recording(arm, recording, "r", AS_IT_IS)[1])
     except BadInput as error:
         return f"refused: {error}"
+
+
+def as_recorded(realdata: Path):
+    """Name, nominal arm and recording of every real recording with torque."""
+    for path in sorted(realdata.glob("*/*.csv.gz")):
+        recording, folder = load_recording(path), path.parent.name
+        if all(getattr(recording, name) is None for name in TORQUE_CHANNELS):
+            continue
+        model = realdata / folder.removesuffix("_loads") / "sim.xml"
+        if path.name.startswith("designc"):
+            model = model.with_name("sim_design_c.xml")
+        yield f"{folder}/{path.name}", load_model(model, (), recording.n).arm, recording
 
 
 def left_by_model(arm, recording: Recording) -> float:
@@ -167,8 +203,8 @@ def main() -> int:
     for folder, file in ARMS:
         recording = load_recording(asked.realdata / folder / f"{file}.csv.gz")
         arms[folder] = load_model(asked.realdata / folder / "sim.xml", (), recording.n).arm, recording
-    alarms = {folder: text for folder, (arm, recording) in arms.items() if (text := said(arm, recording))}
-    print("as recorded:", alarms or "no finding", flush=True)
+    alarms = {name: text for name, arm, recording in as_recorded(asked.realdata) if (text := said(arm, recording))}
+    print("as recorded, all recordings with torque:", alarms or "no finding", flush=True)
     random, seen, noticed, unseen = np.random.default_rng(asked.seed), Counter(), Counter(), 0
     while seen.total() < asked.draws:
         kind = list(CORRUPTIONS)[random.integers(len(CORRUPTIONS))]

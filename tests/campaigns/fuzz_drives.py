@@ -16,7 +16,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
-    arms = ["six-damiao", "six-robstride", "six-moteus", "six-odrive", "six-cia402"]
+    arms = ["six-damiao", "six-cubemars", "six-robstride", "six-moteus", "six-odrive", "six-cia402"]
     parser.add_argument("--arm", nargs="*", default=arms)
     asked = parser.parse_args()
     for arm in asked.arm:

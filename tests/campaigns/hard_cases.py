@@ -1,4 +1,4 @@
-"""Hard cases one at a time, swept with and without the mass on the simulated bus, and judged (issue 5's second demand).
+"""Hard cases one at a time, swept with and without the mass on the simulated bus, and judged.
 
     .venv/bin/python tests/campaigns/hard_cases.py --seeds 1 20
 

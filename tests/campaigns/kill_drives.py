@@ -26,6 +26,7 @@ from armlink.drives.registry import family
 
 DRIVES = {
     "damiao": {"family": "damiao", "id": 2, "reply": 0x12, "model": "DM4340", "kp": 40, "kd": 1.0},
+    "cubemars": {"family": "cubemars", "id": 2, "model": "AK80-9", "can_timeout": 10_000, "kp": 40, "kd": 1.0},
     "robstride": {"family": "robstride", "id": 3, "model": "RS01", "kp": 40, "kd": 1.0},
     "moteus": {"family": "moteus", "id": 4},
     "odrive": {"family": "odrive", "node": 5},
@@ -65,7 +66,8 @@ def one_try(name: str, arm: serving.Served, group: str, number: int) -> float:
         time.sleep(0.02 * (number % 10) / 10)
         os.kill(host.pid, signal.SIGKILL)
         struck = time.monotonic()
-        falls = family(name).traits.silence == "falls"
+        described = serving.pendulum(DRIVES[name])
+        falls = family(name).build(described, described.require_link().joints).traits(0).silence == "falls"
         done = serving.wait_for(lambda: not arm.drive.motor.powered if falls else arm.drive.mode == 11, LONGEST)
         return time.monotonic() - struck if done else float("inf")
 

@@ -1,4 +1,4 @@
-"""Sweep, calibrate and identify random arms and the bundled ones, and tell what came out (issue 5's first demand).
+"""Sweep, calibrate and identify random arms and the bundled ones, and tell what came out.
 
     .venv/bin/python tests/campaigns/random_arms.py --seeds 1 20
 

@@ -1,8 +1,8 @@
 """Hosts that are not ours: each family's stock client sways all joints of a bundled arm, on a bus of python-can.
 
-`stock_hosts.py ARM six-damiao 239.74.163.77 --seconds 600`: damiao-motor, moteus, odrive-can, canopen, and robstride
-with the motion commands of the manual, which that package lacks. Of armlink they use the arm file's numbers (ids,
-direction, zero, gear) and nothing else.
+`stock_hosts.py ARM six-damiao 239.74.163.77 --seconds 600`: damiao-motor, moteus, odrive-can, canopen,
+TMotorCANControl, and robstride with the motion commands of the manual, which it lacks. Of armlink they use the arm
+file's numbers (ids, direction, zero, gear) and nothing else.
 """
 
 import argparse
@@ -87,6 +87,32 @@ def damiao(way: Way, channel: str, seconds: float) -> None:
 def gains(joint: int) -> tuple[float, float]:
     """kp [N·m/rad] and kd [N·m·s/rad] of MIT commands."""
     return (100.0, 4.0) if joint < 3 else (25.0, 1.0)
+
+
+def cubemars(way: Way, channel: str, seconds: float) -> None:
+    """TMotorCANControl, with one of its managers a motor; its bus is opened here, for it would configure can0."""
+    from TMotorCANControl.mit_can import CAN_Manager, TMotorManager_mit_can
+
+    class Manager(CAN_Manager):  # type: ignore[misc]
+        def __del__(self) -> None: ...
+
+    replies = [{"can_id": 0, "can_mask": 0x7FF, "extended": False}]  # udp_multicast gives back what one sends
+    manager = CAN_Manager._instance = object.__new__(Manager)
+    manager.bus = can.Bus(interface="udp_multicast", channel=channel, can_filters=replies)
+    manager.notifier = can.Notifier(manager.bus, [])
+    with contextlib.ExitStack() as stack, warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a busy machine: no data for 0.1 s
+        motors = [stack.enter_context(TMotorManager_mit_can(row.settings.model, row.settings.id)) for row in way.rows]
+        way.begin()
+        for _ in ticks(seconds):
+            for joint, motor in enumerate(motors):
+                (q, dq), (kp, kd) = way.at(joint), gains(joint)
+                motor.set_impedance_gains_real_unit_full_state_feedback(K=kp, B=kd)
+                motor.set_output_angle_radians(q)
+                motor.set_output_velocity_radians_per_second(dq)
+                motor.update()
+    manager.notifier.stop()
+    manager.bus.shutdown()
 
 
 def robstride(way: Way, channel: str, seconds: float) -> None:
@@ -250,6 +276,7 @@ def map_pdos(node: Any) -> None:
 HOSTS: dict[str, Callable[[Way, str, float], Any]] = {
     "six-damiao": damiao,
     "six-robstride": robstride,
+    "six-cubemars": cubemars,
     "six-moteus": moteus,
     "six-odrive": odrive,
     "six-cia402": cia402,

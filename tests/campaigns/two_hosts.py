@@ -43,11 +43,13 @@ MOST_STARTS = 10
 """A busy machine may take so many times as long to begin."""
 PATIENCE = 5.0
 """Deadline of the drives [s]: the machine is full."""
+LONGEST_TIMEOUT = 100_000
+"""The same of CubeMars drives, as long as they can be set to [cycles of theirs]."""
 MOVED = 0.2
 """A listener must have seen every joint move so far [rad]."""
 FOLLOWED = 0.08
 """RMS of target less position, at most [rad]: the joints sag, and MIT drives have no integral term."""
-WITH_GAINS = ("six-damiao", "six-robstride")
+WITH_GAINS = ("six-damiao", "six-robstride", "six-cubemars")
 TORQUE, STEPS = 0.1, 0.03
 """RMS of commanded less motor torque of drives with gains, at most: a share of the RMS of the motor torque, and what
 the steps of the frames add [N·m]."""
@@ -98,6 +100,9 @@ class Bus:
         content = yaml.safe_load(bundled_arms()[name].read_text(encoding="utf-8"))
         content["link"] |= {"rate": RATE, "deadline": PATIENCE}
         content["link"]["bus"] |= {"interface": "udp_multicast", "channel": group}
+        for joint in content["link"]["joints"]:
+            if "can_timeout" in joint["drive"]:
+                joint["drive"]["can_timeout"] = LONGEST_TIMEOUT
         self.arm = folder / f"{name}.yaml"
         self.arm.write_text(yaml.safe_dump(content))
         self._environment = os.environ | {"CAN_CONFIG": json.dumps({"port": port})}

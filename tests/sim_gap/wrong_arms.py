@@ -19,6 +19,9 @@ THREE = """
 </worldbody></mujoco>
 """
 
+LANDS = 0.3
+"""Torque at which the play of a gear is crossed [N·m]."""
+
 
 @dataclass
 class Wrong:
@@ -39,6 +42,8 @@ class Wrong:
     ripple: np.ndarray | float = 0.0
     cycles: float = 9.0
     position_offset: np.ndarray | float = 0.0
+    play: np.ndarray | float = 0.0
+    """Full width of the play between motor, where positions are read, and link [rad]."""
     payload: float = 0.0
     payload_at: tuple[float, float, float] = (0.02, 0.03, 0.2)
     moved: dict[int, tuple[float, float, float]] = field(default_factory=dict)
@@ -79,6 +84,9 @@ def record(
     t, q, v, a = motion(nominal.nv, seconds, rate, seed)
     true = q + wrong.position_offset
     link = _inverse(_truth(nominal, wrong), true, v, a) + wrong.spring * true
+    if np.any(wrong.play):
+        true = true - 0.5 * np.asarray(wrong.play) * np.tanh(link / LANDS)
+        link = _inverse(_truth(nominal, wrong), true, v, a) + wrong.spring * true
     level = wrong.coulomb + wrong.load * np.abs(link) + wrong.breakaway * np.exp(-((v / wrong.stribeck_velocity) ** 2))
     friction = np.tanh(v / 0.002) * level * (1 + wrong.ratio * np.sign(v)) + wrong.viscous * v
     motor = link + friction + wrong.rotor * a + wrong.ripple * np.sin(wrong.cycles * true + 0.4)

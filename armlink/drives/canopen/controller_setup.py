@@ -57,6 +57,8 @@ class Identity:
     state: State = State.UNKNOWN
     answers: int = 1
     """How many answered one request at this node id; more than one is a duplicated id."""
+    lost: tuple[str, ...] = ()
+    """Objects that a stock device of the arm file lacks, each with what is lost by it."""
 
 
 def milliseconds(seconds: float) -> int:
@@ -165,7 +167,14 @@ def examined(services: NodeServices, settings: CanopenSettings) -> Profile:
     profile = examine(services, settings)
     if profile is OURS:
         return profile
-    return replace(profile, by_velocity=supports(offered_modes(services), CYCLIC_VELOCITY))
+    offered = offered_modes(services)
+    profile_alone = supports(offered, Mode.PROFILE_TORQUE) and not supports(offered, Mode.TORQUE)
+    leading = (Mode.POSITION, Mode.PROFILE_POSITION, CYCLIC_VELOCITY)
+    return replace(
+        profile,
+        position_mode=next(int(mode) for mode in leading if supports(offered, mode)),
+        torque_mode=int(Mode.PROFILE_TORQUE if profile_alone else Mode.TORQUE),
+    )
 
 
 def _enters(services: NodeServices, mode: int, told: bool) -> bool:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen import pdo
-from armlink.drives.canopen.cia402 import supports
+from armlink.drives.canopen.cia402 import CYCLIC_VELOCITY, supports
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import Pdo
 from armlink.drives.canopen.sdo import NodeServices
@@ -62,8 +62,15 @@ class Profile:
         """Whether the device has an object."""
         return entry not in self.absent
 
-    by_velocity: bool = False
-    """Whether cyclic velocity is the only mode that serves: target velocities take the place of positions."""
+    position_mode: int = int(Mode.POSITION)
+    """Mode of the device in which positions are led: cyclic, else profile position, else cyclic velocity."""
+    torque_mode: int = int(Mode.TORQUE)
+    """Mode of the device for torque control: cyclic, else profile torque."""
+
+    @property
+    def by_velocity(self) -> bool:
+        """Whether cyclic velocity is the only mode that serves: target velocities take the place of positions."""
+        return self.position_mode == CYCLIC_VELOCITY
 
     def usable_modes(self, supported: int) -> frozenset[int]:
         """Modes that the device can be ordered in while it cycles, of `supported` ones (bits of 6502h).
@@ -72,10 +79,10 @@ class Profile:
         """
         if self.by_velocity:
             return frozenset((int(Mode.OFF), int(Mode.POSITION)))
-        modes = frozenset(int(mode) for mode in Mode if supports(supported, mode))
-        if self.modes_by_pdo:
-            return modes
-        return modes & {min((Mode.POSITION, Mode.PROFILE_POSITION), key=lambda mode: mode not in modes)}
+        modes = {int(mode) for mode in Mode if supports(supported, mode)}
+        stand_ins = ((self.position_mode, Mode.POSITION), (self.torque_mode, Mode.TORQUE))
+        modes |= {int(mode) for own, mode in stand_ins if own in modes}
+        return frozenset(modes if self.modes_by_pdo else modes & {int(Mode.POSITION), self.position_mode})
 
     @property
     def lost(self) -> tuple[str, ...]:
@@ -118,6 +125,11 @@ def profile_of(settings: CanopenSettings) -> Profile:
     return Profile(reading=entry, torque_scale=torque.scale, torque_zero=torque.offset)
 
 
+def lacking(services: NodeServices) -> frozenset[Entry]:
+    """Optional objects that a device does not have, by asking for each; raises BusFault where it does not answer."""
+    return frozenset(entry for entry in LOST if not services.has(entry))
+
+
 def examine(services: NodeServices, settings: CanopenSettings) -> Profile:
     """The profile of a device, by asking it for each object; one with our record must have them all.
 
@@ -125,7 +137,7 @@ def examine(services: NodeServices, settings: CanopenSettings) -> Profile:
     """
     if settings.torque == "record":
         return OURS
-    absent = frozenset(entry for entry in LOST if not services.has(entry))
+    absent = lacking(services)
     sheet = services.remote.object_dictionary
     modes = [sheet.get_variable(entry.index, 0) for entry in (objects.MODE, objects.MODE_DISPLAY)]
     by_pdo = all(each is None or each.pdo_mappable for each in modes) and _takes(services, pdo.RPDO2)

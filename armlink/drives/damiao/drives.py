@@ -6,28 +6,15 @@ from dataclasses import dataclass
 
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import Frame
-from armlink.drives.base import BasicDrives, no_order
 from armlink.drives.damiao import frames
-from armlink.drives.damiao.frames import READ, WRITE, Register, Special, State
+from armlink.drives.damiao.frames import READ, WRITE, Register, State
 from armlink.drives.damiao.models import delivered
 from armlink.drives.damiao.set_up import LARGEST_RANGE, prepare, read_registers
-from armlink.drives.family import BROADCAST, Ask
-from armlink.drives.mit_leash import damping, round_within
-from armlink.drives.mit_packing import (
-    Grid,
-    MitCommand,
-    Ranges,
-    command_in,
-    feedback_in,
-    grid_of,
-    pack_command,
-    pack_steps,
-    unpack_command,
-    unwrap,
-)
-from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
+from armlink.drives.family import Ask
+from armlink.drives.mit_drives import MitDrives, MitKnown
+from armlink.drives.mit_packing import Ranges, Special, feedback_in, special, unwrap
+from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup
 from armlink.drives.traits import Traits
-from armlink.errors import BusFault
 
 TRAITS = Traits(torque="current", calibration="host", silence="falls", bounds=(), cadence="reply", frame="11")
 OTHER_MODES = {0x100: "position", 0x200: "velocity", 0x300: "force"}
@@ -35,7 +22,6 @@ OTHER_MODES = {0x100: "position", 0x200: "velocity", 0x300: "force"}
 IDENTITY = (Register.HARDWARE_VERSION, Register.SOFTWARE_VERSION, Register.SERIAL_NUMBER, Register.REPLY_ID)
 REGISTER_KINDS = frozenset((READ, WRITE))
 ENABLED = int(State.ENABLED)
-ON, POSITION, TORQUE = Power.ON, int(Mode.POSITION), int(Mode.TORQUE)
 POWERS: dict[int | None, Power] = {State.DISABLED: Power.OFF, State.LOST_COMMUNICATION: Power.STOPPED}
 RANGE_FIELDS: dict[int, str] = {
     Register.POSITION_RANGE: "position",
@@ -55,56 +41,34 @@ FAULTS = {
 
 
 @dataclass
-class _Known:
-    """What is known of one drive."""
+class _Known(MitKnown):
+    """Its ranges are those that its model is delivered with, until its registers are known."""
 
-    ranges: Ranges | None = None
-    """By its registers; before they are known those that its model is delivered with, None for an unknown model."""
-    grid: Grid | None = None
-    """Of these ranges."""
-    limits: Limits | None = None
     state: int | None = None
-    position: float = math.nan
-    """Unwrapped [rad]."""
-    velocity: float = math.nan
-    damping: bool = False
-    """The newest frame damps, whatever was ordered."""
-    sent: Order | None = None
-
-    def use(self, ranges: Ranges | None) -> None:
-        """Code and decode by these ranges from now on."""
-        self.ranges, self.grid = ranges, None if ranges is None else grid_of(ranges)
 
 
-class DamiaoDrives(BasicDrives):
+class DamiaoDrives(MitDrives):
     """The drives of one bus; see `Drives`."""
 
     def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
         """Nothing is sent."""
-        super().__init__(joints, TRAITS)
-        self._settings = [joint.settings for joint in joints]
-        self._known = [_Known() for _ in joints]
+        self._known: list[_Known] = [_Known() for _ in joints]
+        super().__init__(joints, TRAITS, self._known)
         for known, settings in zip(self._known, self._settings, strict=True):
             known.use(delivered(settings.model))
-        self._joint_of = {settings.id: joint for joint, settings in enumerate(self._settings)}
         self._replies = {(each.reply, each.id & 0xF): joint for joint, each in reversed([*enumerate(self._settings)])}
         """Joint by reply id and by the id in a reply."""
         self._asked: tuple[int, int, int] | None = None
         """Joint, READ or WRITE and register of the newest register request of another host."""
 
-    def routes(self) -> Mapping[int, int]:
-        """Reply ids; drives that share one are told apart by the id in their replies."""
-        replies = [settings.reply for settings in self._settings]
-        return {reply: joint if replies.count(reply) == 1 else BROADCAST for joint, reply in enumerate(replies)}
-
     def commands(self) -> Mapping[int, str]:
         """See Drives."""
-        found = {frames.REGISTERS_ID: "register request"}
-        for drive, joint in self._joint_of.items():
-            name = self.names[joint]
-            found[drive] = f"MIT command to {name}"
-            found |= {drive + offset: f"{mode} command to {name}" for offset, mode in OTHER_MODES.items()}
-        return found
+        others = {
+            drive + offset: f"{mode} command to {self.names[joint]}"
+            for drive, joint in self._joint_of.items()
+            for offset, mode in OTHER_MODES.items()
+        }
+        return {frames.REGISTERS_ID: "register request", **super().commands(), **others}
 
     def poll(self, first: bool) -> list[Frame]:
         """Requests for the state alone."""
@@ -168,41 +132,13 @@ class DamiaoDrives(BasicDrives):
             return self._damp(joint)
         known.sent = None
         if order.power is Power.OFF and on:
-            return drive, frames.special(Special.DISABLE)
+            return drive, special(Special.DISABLE)
         if order.power is Power.ON and order.walk:
             if known.state == State.DISABLED:
-                return drive, frames.special(Special.ENABLE)
+                return drive, special(Special.ENABLE)
             if known.state is not None:
-                return drive, frames.special(Special.CLEAR_ERROR)
+                return drive, special(Special.CLEAR_ERROR)
         return frames.REGISTERS_ID, frames.refresh_request(drive)
-
-    def _command(self, joint: int, order: Order) -> Frame:
-        known = self._known[joint]
-        grid, limits = known.grid, known.limits
-        if grid is None or limits is None:
-            raise BusFault(f"{self.names[joint]}: a command before the set-up")
-        _, _, mode, position, velocity, torque, kp, kd, _ = order
-        asked = MitCommand(position, velocity, kp, kd, torque)
-        if mode != POSITION:
-            asked = MitCommand(position, velocity, 0.0, 0.0, torque)
-        data = pack_steps(*round_within(asked, grid, limits, known.position, known.velocity))
-        known.sent = _order_of(command_in(data, grid))
-        return self._settings[joint].id, data
-
-    def _damp(self, joint: int) -> Frame:
-        """No stiffness, no torque: the joint sinks slowly, and no torque leaves the limit on the way."""
-        known = self._known[joint]
-        assert known.ranges is not None
-        assert known.limits is not None
-        known.damping = True
-        command = damping(self._settings[joint].kd, known.position, known.velocity, known.limits.max_torque)
-        data = pack_command(command, known.ranges)
-        known.sent = _order_of(unpack_command(data, known.ranges))._replace(power=Power.STOPPED)
-        return self._settings[joint].id, data
-
-    def sent(self, joint: int) -> Order | None:
-        """See Drives."""
-        return self._known[joint].sent
 
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
         """See Drives."""
@@ -273,15 +209,7 @@ class DamiaoDrives(BasicDrives):
             asked = self._joint_of.get(data[0] | data[1] << 8)
             self._asked = None if asked is None else (asked, data[2], data[3])
             return None
-        joint = self._joint_of.get(can_id)
-        if joint is None or len(data) != 8:
-            return None
-        special = frames.special_of(data)
-        if special is not None:
-            power = {Special.ENABLE: Power.ON, Special.DISABLE: Power.OFF}.get(special)
-            return None if power is None else (joint, no_order()._replace(power=power))
-        ranges = self._known[joint].ranges
-        return None if ranges is None else (joint, _order_of(unpack_command(data, ranges)))
+        return super().command_of(can_id, data)
 
 
 def _fault_text(state: int) -> str:
@@ -289,8 +217,3 @@ def _fault_text(state: int) -> str:
         return ""
     words = FAULTS[State(state)] if state in FAULTS else "unknown state"
     return f"{words} (state {state:X}h)"
-
-
-def _order_of(command: MitCommand) -> Order:
-    position, velocity, kp, kd, torque = command
-    return Order(ON, False, POSITION if kp > 0 else TORQUE, position, velocity, torque, kp, kd)

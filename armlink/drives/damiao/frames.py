@@ -14,15 +14,6 @@ REGISTERS_ID = 0x7FF
 READ, WRITE, REFRESH = 0x33, 0x55, 0xCC
 
 
-class Special(IntEnum):
-    """Last byte of a special command: seven bytes FFh, then this."""
-
-    CLEAR_ERROR = 0xFB
-    ENABLE = 0xFC
-    DISABLE = 0xFD
-    SET_ZERO = 0xFE
-
-
 class Register(IntEnum):
     """Registers that armlink uses; all can be read."""
 
@@ -45,7 +36,6 @@ class Register(IntEnum):
     LARGEST_CURRENT = 59
 
 
-SPECIALS = frozenset(int(command) for command in Special)
 INTEGER_REGISTERS = frozenset((7, 8, 9, 10, 13, 14, 15, 16, 35, 36))
 """Registers with a 32-bit unsigned value; all others are floats."""
 TIMEOUT_UNIT = 50e-6
@@ -78,18 +68,6 @@ class Reply(NamedTuple):
     feedback: MitFeedback
     stage_temperature: int
     rotor_temperature: int
-
-
-def special(command: Special) -> bytes:
-    """A special command, sent to the drive's command id."""
-    return bytes([0xFF] * 7 + [command])
-
-
-def special_of(data: bytes) -> Special | None:
-    """The special command in `data`, or None."""
-    if len(data) == 8 and data[:7] == b"\xff" * 7 and data[7] in SPECIALS:
-        return Special(data[7])
-    return None
 
 
 def read_request(drive: int, register: int) -> bytes:

@@ -4,10 +4,10 @@ import math
 from collections.abc import Callable, Iterable
 
 from armlink.drives.damiao import frames
-from armlink.drives.damiao.frames import READ, TIMEOUT_UNIT, WRITE, Register, Special, State
+from armlink.drives.damiao.frames import READ, TIMEOUT_UNIT, WRITE, Register, State
 from armlink.drives.damiao.settings import DamiaoSettings
 from armlink.drives.family import Ask
-from armlink.drives.mit_packing import Ranges
+from armlink.drives.mit_packing import Ranges, Special, special
 from armlink.drives.orders import Gains, Limits, Mode, Setup
 from armlink.errors import BadInput, BusFault
 
@@ -34,7 +34,7 @@ def prepare(ask: Ask, name: str, settings: DamiaoSettings, limits: Limits) -> tu
     Raises BusFault, BadInput.
     """
     drive = settings.id
-    ask.send(drive, frames.special(Special.DISABLE))
+    ask.send(drive, special(Special.DISABLE))
     values = read_registers(ask, drive, (*SCALES, Register.REPLY_ID, *NOTED))
     if None in values.values():
         raise BusFault(f"{name}: no answer from {settings.address}: is it powered, and its id right?")

@@ -8,7 +8,7 @@ from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import EXTENDED, Frame
 from armlink.drives.base import BasicDrives, no_order
 from armlink.drives.family import ANY, BROADCAST, Ask
-from armlink.drives.mit_leash import damping, round_within
+from armlink.drives.mit_leash import damping, order_of, round_within
 from armlink.drives.mit_packing import MitCommand, Ranges, grid_of
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
 from armlink.drives.robstride import frames
@@ -143,7 +143,7 @@ class RobStrideDrives(BasicDrives):
 
     def _motion(self, joint: int, frame: Frame, power: Power) -> Frame:
         known = self._known[joint]
-        known.sent = _order_of(frames.unpack_motion(*frame, known.ranges))._replace(power=power)
+        known.sent = order_of(frames.unpack_motion(*frame, known.ranges))._replace(power=power)
         return frame
 
     def sent(self, joint: int) -> Order | None:
@@ -230,7 +230,7 @@ class RobStrideDrives(BasicDrives):
             return None
         kind = frames.kind_of(can_id)
         if kind == Type.MOTION:
-            return joint, _order_of(frames.unpack_motion(can_id, data, self._known[joint].ranges))
+            return joint, order_of(frames.unpack_motion(can_id, data, self._known[joint].ranges))
         powers: dict[int, Power] = {Type.ENABLE: Power.ON, Type.STOP: Power.OFF}
         power = powers.get(kind)
         return None if power is None else (joint, no_order()._replace(power=power))
@@ -246,8 +246,3 @@ def _power(known: _Known) -> Power:
 
 def _fault_text(bits: int) -> str:
     return f"{fault_names(bits)} (fault bits {bits:02X}h)" if bits else ""
-
-
-def _order_of(command: MitCommand) -> Order:
-    mode = Mode.POSITION if command.kp > 0 else Mode.TORQUE
-    return Order(Power.ON, False, mode, command.position, command.velocity, command.torque, command.kp, command.kd)

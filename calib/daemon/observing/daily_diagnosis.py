@@ -1,21 +1,22 @@
 """The diagnosis of the arm's own recordings once a day, and the trend of its friction, ripple, play and gains.
 
 `armlink gap trend` does it in a process of its own, at low priority and the first to be killed if memory is short: this
-package knows nothing of simulation models. The recording of the day in which the arm moved most is diagnosed.
+package knows nothing of simulation models. The minute of the day in which the arm moved most is diagnosed.
 """
 
 import contextlib
 import json
 import os
-import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 from calib.daemon.environment import Environment
 from calib.daemon.settings import Configuration, DiagnosisSettings
+from calib.daemon.state.busiest_minute import BusiestMinute
 from calib.daemon.state.event_log import EventLog
 
 KEPT = 7
@@ -24,20 +25,29 @@ LONGEST = timedelta(minutes=30)
 """A diagnosis that takes longer is ended."""
 TOLD, FOUND = "trend.json", "trend.new.json"
 """Changes that were told, and those of the diagnosis under way."""
+STAMP = "%Y%m%dT%H%M%SZ"
+"""Names of the recordings."""
+UNFINISHED, WRITTEN = "unfinished", object()
+"""Name of the recording while it is written; the sign that it is whole."""
 NICE, FIRST_TO_KILL = 10, "1000"
 """Niceness and oom_score_adj of the process."""
 
 
 class DailyDiagnosis:
-    """Chooses a recording, starts the process, tells its answer and what changes."""
+    """Writes the recording, starts the process, tells its answer and what changes."""
 
     def __init__(
-        self, configuration: Configuration, environment: Environment, events: EventLog, directory: Path
+        self,
+        configuration: Configuration,
+        environment: Environment,
+        events: EventLog,
+        busiest: BusiestMinute,
+        directory: Path,
     ) -> None:
         """Recordings and answers are kept in `directory`, which is made with the first one."""
         self._configuration, self._environment, self._events = configuration, environment, events
-        self._directory = directory
-        self._best: tuple[float, Path] | None = None
+        self._busiest, self._directory = busiest, directory
+        self._writing: Iterator[None] | None = None
         self._process: subprocess.Popen[str] | None = None
         self._begun = self._last = max((_date(path) for path in directory.glob("*.mcap")), default=environment.wall())
         self._failure = ""
@@ -46,33 +56,49 @@ class DailyDiagnosis:
     def _settings(self) -> DiagnosisSettings:
         return self._configuration.settings.diagnosis
 
-    def finished(self, recording: Path, travel: float) -> None:
-        """A recording is whole; `travel` is the path of all joints together in it [rad]."""
-        if self._settings.enabled and travel >= max(self._settings.travel, self._best[0] if self._best else 0.0):
-            self._best = travel, recording
-
     def tick(self) -> None:
-        """Start the diagnosis if it is due, or tell what came of it."""
+        """Write the recording and start the diagnosis if it is due, or tell what came of it."""
         now = self._environment.wall()
         if self._process is not None:
             self._ended(now)
-        elif self._best is not None and now - self._last >= timedelta(hours=self._settings.hours):
-            recording, self._best, self._last = self._best[1], None, now
-            try:
-                self._start(recording, now)
-            except OSError as error:
-                self._failed(f"{recording.name}: {error}")
+            return
+        if self._writing is None:
+            self._writing = self._due(now)
+        if self._writing is not None:
+            self._write_on(self._writing, now)
 
     def close(self) -> None:
         """End a diagnosis under way; it is made again with the next recording."""
+        self._writing = None
         process, self._process = self._process, None
         if process is not None:
             process.kill()
             process.communicate()
 
-    def _start(self, recording: Path, now: datetime) -> None:
-        self._directory.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(recording, self._directory / f"{now:%Y%m%dT%H%M%SZ}.mcap")
+    def _due(self, now: datetime) -> Iterator[None] | None:
+        """The writing of the busiest minute, if a day has passed and the arm has moved."""
+        settings = self._settings
+        if not settings.enabled or now - self._last < timedelta(hours=settings.hours):
+            return None
+        minute = self._busiest.take(settings.travel)
+        if minute is None:
+            return None
+        self._last = now
+        return minute.write(self._directory / UNFINISHED, self._configuration.names)
+
+    def _write_on(self, writing: Iterator[None], now: datetime) -> None:
+        """Write another part; after the last one, begin."""
+        try:
+            self._directory.mkdir(parents=True, exist_ok=True)
+            if next(writing, WRITTEN) is WRITTEN:
+                self._writing = None
+                self._start(now)
+        except OSError as error:
+            self._writing = None
+            self._failed(str(error))
+
+    def _start(self, now: datetime) -> None:
+        (self._directory / UNFINISHED).replace(self._directory / f"{now:{STAMP}}.mcap")
         for old in sorted(self._directory.glob("*.mcap"))[:-KEPT]:
             old.unlink(missing_ok=True)
         arm = self._configuration.arm.path
@@ -136,7 +162,7 @@ class DailyDiagnosis:
 
 def _date(recording: Path) -> datetime:
     try:
-        return datetime.strptime(f"{recording.stem}+0000", "%Y%m%dT%H%M%SZ%z")
+        return datetime.strptime(f"{recording.stem}+0000", f"{STAMP}%z")
     except ValueError:
         return datetime.min.replace(tzinfo=UTC)
 

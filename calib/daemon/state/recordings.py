@@ -1,13 +1,9 @@
 """The daemon's own recordings: MCAP files of some minutes each; the oldest are dropped when the quota is full."""
 
 import logging
-from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
-import numpy as np
-
-from armlink.arrays import Array
 from armlink.recording.mcap import RecordingWriter
 from calib.daemon.loop.loop_messages import Batch
 from calib.daemon.settings import Configuration, RecordingSettings
@@ -25,15 +21,10 @@ class Recordings:
     Files are numbered, because the clock that stamps their names may be set back.
     """
 
-    def __init__(self, directory: Path, configuration: Configuration, finished: Callable[[Path, float], None]) -> None:
-        """Files go to `directory`, which is made with the first one.
-
-        `finished` gets each file that is whole, and the path of all joints together in it [rad].
-        """
-        self._directory, self._configuration, self._finished = directory, configuration, finished
+    def __init__(self, directory: Path, configuration: Configuration) -> None:
+        """Files go to `directory`, which is made with the first one."""
+        self._directory, self._configuration = directory, configuration
         self._writer: RecordingWriter | None = None
-        self._path, self._travel = directory, 0.0
-        self._at: Array | None = None
         self._begun = self._last = self._due = -float("inf")
         self._failed_at = -float("inf")
 
@@ -63,8 +54,6 @@ class Recordings:
                 writer.__exit__(None, None, None)
             except OSError as error:
                 log.error("recordings: %s", error)
-            else:
-                self._finished(self._path, self._travel)
 
     def _old(self, t: float) -> bool:
         return self._writer is not None and t - self._begun > self._settings.minutes * 60.0
@@ -76,10 +65,6 @@ class Recordings:
                 continue
             self._due = max(self._due + 1 / self._settings.rate, t + 0.5 / self._settings.rate)
             self._writer.append(t - self._begun, {name: values[k] for name, values in batch.channels.items()})
-            at = batch.channels["position"][k]
-            if self._at is not None:
-                self._travel += float(np.nansum(np.abs(at - self._at)))
-            self._at = at
 
     def _rotate(self, t: float) -> None:
         self.close()
@@ -88,9 +73,7 @@ class Recordings:
         last = max((path.name for path in self._directory.glob("*.mcap")), default="0")
         number = int(last.partition("-")[0]) + 1 if last.partition("-")[0].isdigit() else 1
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-        self._path = self._directory / f"{number:08d}-{stamp}.mcap"
-        self._writer = RecordingWriter(self._path, self._configuration.names)
-        self._travel, self._at = 0.0, None
+        self._writer = RecordingWriter(self._directory / f"{number:08d}-{stamp}.mcap", self._configuration.names)
         self._begun = self._due = t
 
     def _keep_quota(self) -> None:

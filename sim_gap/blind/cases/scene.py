@@ -80,6 +80,11 @@ class Scene:
         model = compiled(other)
         return inverse(model, *self.motion) - other.armature * self.motion[2] - self.torque
 
+    def change_at_rest(self, other: Arm) -> Array:
+        """Change of the gravity torque with another arm in place of this one, (K', n)."""
+        still = np.zeros_like(self.motion[0])
+        return inverse(compiled(other), self.motion[0], still, still) - self.gravity
+
     def feed_forward(self, command: Array) -> Array:
         """Nominal torque along a trajectory at `motion.RATE`, rotors included (K, n)."""
         return inverse(self.model, command, *derivatives(command))

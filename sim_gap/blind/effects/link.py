@@ -12,6 +12,9 @@ from sim_gap.blind.cases.true_arm import TrueArm
 from sim_gap.blind.effects.drawn import Draw, Drawn, sensor_level
 
 XYZ = ("x", "y", "z")
+WEIGHS = 0.1
+"""Share of a moved mass's torque that is its weight, below which it shows as an inertia alone."""
+UPRIGHT = "the axis is upright: a moved mass shows by its inertia alone"
 INERTIA = (("xx", 0, 0), ("xy", 0, 1), ("xz", 0, 2), ("yy", 1, 1), ("yz", 1, 2), ("zz", 2, 2))
 
 
@@ -31,11 +34,15 @@ def mass_moment(scene: Scene, random: np.random.Generator) -> Drawn | None:
         moment = unit * wanted
         if np.linalg.norm(moment) / arm.mass[link] > shift:
             continue
+        moved = arm.with_moved(link, moment)
+        weighs = float(rms(scene.change_at_rest(moved))[link]) > WEIGHS * float(rms(scene.change(moved))[link])
 
         def apply(true: TrueArm, link: int = link, moment: Array = moment) -> None:
             true.arm = true.arm.with_moved(link, moment)
 
-        return Drawn.at(scene, link, "link.mass_moment", dict(zip(XYZ, moment.tolist(), strict=True)), apply)
+        values = dict(zip(XYZ, moment.tolist(), strict=True))
+        why, others = ("", ()) if weighs else (UPRIGHT, ("link.inertia",))
+        return Drawn.at(scene, link, "link.mass_moment", values, apply, undecided=why, confused_with=others)
     return None
 
 

@@ -1,6 +1,7 @@
 """Each drive family on its simulated drives, without the link: set-up, cycle, silence, faults, limits, any bytes."""
 
 import math
+import re
 import struct
 from contextlib import suppress
 from functools import cache
@@ -33,8 +34,9 @@ from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
-ARMS = ("six-damiao", "six-robstride", "six-moteus", "six-odrive")
-MIT = ARMS[:2]
+ARMS = ("six-damiao", "six-cubemars", "six-robstride", "six-moteus", "six-odrive")
+MIT = ARMS[:3]
+PACKED_ALIKE = ARMS[:2]
 every_arm = pytest.mark.parametrize("name", ARMS)
 NAN = math.nan
 
@@ -267,8 +269,9 @@ def told(name, bench, joint, frames):
     row = bench.link.joints[joint].settings
     found = []
     for can_id, data in frames:
-        if name == "six-damiao" and can_id == row.id and data[:7] != b"\xff" * 7:
-            p, v, t = (bench.simulated[joint].registers[register] for register in (21, 22, 23))
+        if name in PACKED_ALIKE and can_id == row.id and data[:7] != b"\xff" * 7:
+            device = bench.simulated[joint]
+            p, v, t = device.coding[:3] if name == "six-cubemars" else (device.registers[r] for r in (21, 22, 23))
             bits = int.from_bytes(data, "big")
             q, dq = bits >> 48, bits >> 36 & 0xFFF
             kp, kd, torque = bits >> 24 & 0xFFF, bits >> 12 & 0xFFF, bits & 0xFFF
@@ -333,6 +336,8 @@ def lies(name, draw, bench, joint):
     row = bench.link.joints[joint].settings
     if name == "six-damiao":
         return row.reply, draw.draw(st.binary(max_size=8))
+    if name == "six-cubemars":
+        return row.reply, bytes([row.id]) + draw.draw(st.binary(max_size=7))
     if name == "six-robstride":
         head = draw.draw(st.integers(0, 255))
         return 2 << 24 | head << 16 | row.id << 8 | row.host | EXTENDED, draw.draw(st.binary(max_size=8))
@@ -525,3 +530,77 @@ def test_a_register_answer_is_no_reading():
     assert bench.drives.take(0x11, struct.pack("<HBBf", 1, 0x33, 21, 12.5), 0.0) is None
     assert bench.drives.take(0x11, damiao.read_request(1, 9), 0.0) is None
     assert bench.drives._known[0].position == before
+
+
+# ---- keys of CubeMars drives
+
+
+def cubemars_pair(tmp_path, *drives):
+    names = [f"j{place}" for place in range(len(drives))]
+    rows = [
+        {"name": name, "drive": drive, "rated_torque": 1.0, "max_torque": 1.0}
+        for name, drive in zip(names, drives, strict=True)
+    ]
+    joints = [{"name": name, "lower": -1.0, "upper": 1.0} for name in names]
+    content = {"name": "pair", "kinematics": {"joints": joints}, "link": {"joints": rows}}
+    return parse_arm(content, tmp_path / "pair.yaml")
+
+
+AK = {"family": "cubemars", "id": 1, "model": "AK80-9", "kp": 10, "kd": 0.5}
+
+
+def test_cubemars_ranges_are_the_models_or_those_of_the_arm_file(tmp_path):
+    own = {"position_range": 95.5, "velocity_range": 45.0, "torque_range": 18.0}
+    arm = cubemars_pair(tmp_path, {**AK, "velocity_range": 25.64}, {**AK, "id": 2, "model": "V1", **own})
+    assert [tuple(joint.settings.ranges) for joint in arm.link.joints] == [
+        (12.5, 25.64, 18.0, 500.0, 5.0),
+        (95.5, 45.0, 18.0, 500.0, 5.0),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("drives", "says"),
+    [
+        ([{**AK, "model": "AK1"}], "model 'AK1' is not known: give one of AK10-9"),
+        ([{**AK, "reply": 1}], "reply 0x01 is the drive's own id"),
+        ([AK, {**AK, "id": 2, "reply": 1}], "j1: drive.reply 0x01 is the id of j0's commands"),
+        ([AK, {"family": "canopen", "node": 5}], "j1: a CANopen node takes CubeMars replies on id 0 for NMT commands"),
+        ([{**AK, "can_timeout": -1}], "drive.can_timeout: "),
+    ],
+)
+def test_cubemars_keys_that_cannot_be(tmp_path, drives, says):
+    def build():
+        arm = cubemars_pair(tmp_path, *drives)
+        family("cubemars").build(arm, [joint for joint in arm.link.joints if joint.settings.family == "cubemars"])
+
+    with pytest.raises(BadInput, match=re.escape(says)) as caught:
+        build()
+    assert "\n" not in str(caught.value)
+
+
+def test_a_drive_that_restarted_and_makes_no_torque_is_a_fault():
+    """Its replies tell no state: what its commands ask for and what it makes are compared, for the deadline."""
+    bench = Bench("six-cubemars")
+    bench.set_up()
+    bench.walk()
+    bench.simulated[1].reboot()
+    began, fault = bench.arm.time, None
+    while fault is None and bench.arm.time < began + 1.0:
+        bench.cycle([bench.order(j, mode=Mode.TORQUE, torque=2.0 if j == 1 else 0.1) for j in range(6)])
+        fault = bench.drives.fault([Mode.TORQUE] * 6, bench.arm.time)
+    assert 0.1 < bench.arm.time - began < 0.15
+    assert "shoulder (id 02h): makes no torque although its commands ask for some" in str(fault)
+    bench.drives.forget()
+    assert bench.walk()
+
+
+def test_a_cubemars_drive_that_answers_another_host_is_not_told_to_leave_motor_mode():
+    bench, other = Bench("six-cubemars"), Bench("six-cubemars")
+    other.set_up()
+    other.walk()
+    frames = other.cycle([other.order(j) for j in range(6)])
+    replies = other.heard[-6:]
+    bench.wait = lambda done, timeout: [bench.hear(*frame) for frame in replies] and done()
+    assert [each.present for each in bench.drives.identify(bench)] == [True] * 6
+    assert bench.log == []
+    assert len(frames) == 6

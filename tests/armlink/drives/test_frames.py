@@ -3,6 +3,7 @@
 import math
 import struct
 from itertools import islice
+from types import SimpleNamespace
 
 import can
 import cantools
@@ -13,15 +14,20 @@ from hypothesis import strategies as st
 from moteus import multiplex, protocol
 from odrive_can import get_dbc
 from robstride.client import Client
+from TMotorCANControl.mit_can import CAN_Manager, MIT_Params
 
+from armlink.drives.cubemars import frames as cubemars
 from armlink.drives.damiao import frames as damiao
 from armlink.drives.mit_packing import (
     MitCommand,
     MitFeedback,
     Ranges,
+    Special,
     grid_of,
     pack_command,
     pack_feedback,
+    special,
+    special_of,
     unpack_command,
     unpack_feedback,
     unwrap,
@@ -111,9 +117,9 @@ def test_damiao_reply_by_hand_and_by_the_stock_client():
 
 
 def test_damiao_special_commands_and_registers_by_hand():
-    assert damiao.special(damiao.Special.ENABLE).hex() == "fffffffffffffffc"
-    assert damiao.special_of(bytes.fromhex("fffffffffffffffd")) is damiao.Special.DISABLE
-    assert damiao.special_of(bytes.fromhex("ffffffffffffff00")) is None
+    assert special(Special.ENABLE).hex() == "fffffffffffffffc"
+    assert special_of(bytes.fromhex("fffffffffffffffd")) is Special.DISABLE
+    assert special_of(bytes.fromhex("ffffffffffffff00")) is None
     assert damiao.read_request(0x102, 21).hex() == "0201331500000000"
     assert damiao.write_request(2, 10, 1).hex() == "0200550a01000000"  # uint32
     assert damiao.write_request(2, 23, 28.0).hex() == "020055170000e041"  # float
@@ -128,6 +134,50 @@ def test_no_request_of_ours_stores_to_flash():
     requests = [damiao.read_request(1, 7), damiao.write_request(1, 9, 2000), damiao.refresh_request(1)]
     assert all(request[2] != 0xAA for request in requests)
     assert not hasattr(robstride, "save_frame")
+
+
+# ---- CubeMars
+
+AK80_9 = Ranges(12.5, 50.0, 18.0)
+
+
+def test_cubemars_reply_by_hand_and_by_the_stock_client():
+    """Id 5, q 8000h, dq C00h, tau 400h, 36 °C, error 3."""
+    data = bytes.fromhex("05" + "8000" + "c00" + "400" + "24" + "03")
+    reply = cubemars.unpack_reply(data, AK80_9)
+    assert (reply.drive, reply.temperature, reply.error) == (5, 36, 3)
+    assert reply.feedback == pytest.approx((0.00019, 25.0183, -8.9978), abs=1e-4)
+    assert cubemars.error_text(reply.error) == "overvoltage (error 3)"
+    theirs = CAN_Manager.parse_MIT_message(SimpleNamespace(debug=False), data, "AK80-9")
+    assert tuple(theirs)[:3] == pytest.approx(tuple(reply.feedback))
+    assert (theirs.temperature, theirs.error) == (36, 3)
+    assert cubemars.pack_reply(reply, AK80_9) == data
+    short = cubemars.unpack_reply(data[:6], AK80_9)  # as firmware 1.0 has it
+    assert (short.feedback, short.temperature, short.error) == (reply.feedback, None, None)
+    assert cubemars.pack_reply(short, AK80_9) == data[:6]
+    assert cubemars.unpack_reply(data[:7], AK80_9) is None
+
+
+def test_ranges_of_the_models_are_those_of_the_stock_client_or_of_the_newer_manual():
+    newer = {"AK60-6": (12.5, 45.0, 15.0)}  # 50 rad/s in the client
+    for model, ranges in cubemars.MODELS.items():
+        theirs = MIT_Params.get(model)
+        if theirs is not None:
+            assert ranges == newer.get(model, (theirs["P_max"], theirs["V_max"], theirs["T_max"]))
+
+
+@given(st.tuples(st.floats(-12.4, 12.4), st.floats(-49, 49), st.floats(0, 499), st.floats(0, 4.99), st.floats(-17, 17)))
+def test_cubemars_commands_beside_the_stock_client(values):
+    """It divides by 2^bits instead of 2^bits − 1 and truncates: at most two steps apart, in every field."""
+    q, dq, kp, kd, torque = values
+    sent = []
+    client = SimpleNamespace(debug=False, send_MIT_message=lambda drive, data: sent.append((drive, bytes(data))))
+    CAN_Manager.MIT_controller(client, 5, "AK80-9", q, dq, kp, kd, torque)
+    ours = pack_command(MitCommand(*values), AK80_9)
+    assert sent[0][0] == 5
+    for shift, bits in ((48, 16), (36, 12), (24, 12), (12, 12), (0, 12)):
+        pair = [int.from_bytes(data, "big") >> shift & (1 << bits) - 1 for data in (ours, sent[0][1])]
+        assert abs(pair[0] - pair[1]) <= 2
 
 
 # ---- RobStride

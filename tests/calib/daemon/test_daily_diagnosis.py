@@ -6,16 +6,21 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from fast_daemon import FastDaemon
 
 from armlink.arm_file import load_arm
+from armlink.link.types import Stats
+from armlink.recording.files import load_recording
 from calib.daemon.environment import Environment
+from calib.daemon.loop.loop_messages import CHANNELS, Batch
 from calib.daemon.observing.daily_diagnosis import DailyDiagnosis
 from calib.daemon.settings import Configuration, DaemonSection, DiagnosisSettings
+from calib.daemon.state.busiest_minute import SECONDS, BusiestMinute
 
-SECONDS = 300.0
-"""A process of low priority is given this time on a busy machine."""
+PATIENCE = 300.0
+"""A process of low priority is given this time on a busy machine [s]."""
 
 
 class Bench:
@@ -27,45 +32,82 @@ class Bench:
         configuration = Configuration(load_arm("sarcos"), settings, listen_only=True)
         nothing: Any = None
         environment = Environment(time.monotonic, lambda: self.time, nothing, nothing)
-        self.daily = DailyDiagnosis(configuration, environment, self, directory)  # type: ignore[arg-type]
+        self.busiest, self.joints, self.now = BusiestMinute(250.0), len(configuration.names), 0.0
+        self.daily = DailyDiagnosis(configuration, environment, self, self.busiest, directory)  # type: ignore[arg-type]
+
+    def work(self, travel: float) -> None:
+        """A minute in which the first joint goes `travel` [rad]."""
+        for seconds, angle in ((SECONDS, 0.0), (0.1, travel)):
+            t = self.now + np.arange(0.0, seconds, 0.004)
+            position = np.zeros((len(t), self.joints))
+            position[:, 0] = angle
+            channels = dict.fromkeys(CHANNELS, position)
+            self.busiest.append(Batch(t, channels, np.zeros(self.joints, int), np.zeros(self.joints), Stats()))
+            self.now = t[-1] + 0.004
+
+    def due(self) -> None:
+        """A day later, until the process has begun."""
+        self.time += timedelta(hours=24)
+        for _ in range(100):
+            self.daily.tick()
 
     def say(self, *event: Any) -> None:
         self.said.append(event)
 
     def day(self) -> None:
         """A day later, until something was said or the time is over."""
-        before, end = len(self.said), time.monotonic() + SECONDS
+        before, end = len(self.said), time.monotonic() + PATIENCE
         self.time += timedelta(hours=24)
         while len(self.said) == before and time.monotonic() < end:
             self.daily.tick()
-            time.sleep(0.02)
-            if self.daily._process is None:
+            if self.daily._process is not None:
+                time.sleep(0.02)
+            elif self.daily._writing is None:
                 return
 
 
-def recording(folder: Path, name: str) -> Path:
-    path = folder / name
-    path.write_bytes(name.encode())
-    return path
-
-
-def test_the_recording_with_the_most_motion_is_taken_once_a_day(tmp_path: Path) -> None:
+def test_the_minute_with_the_most_motion_is_taken_once_a_day(tmp_path: Path) -> None:
     bench = Bench(tmp_path / "diagnosis")
-    for name, travel in (("little", 25.0), ("most", 80.0), ("less", 60.0), ("still", 0.0)):
-        bench.daily.finished(recording(tmp_path, name), travel)
+    for travel in (25.0, 80.0, 60.0, 0.0):
+        bench.work(travel)
     bench.daily.tick()
     assert not (tmp_path / "diagnosis").exists()
-    bench.time += timedelta(hours=24)
-    bench.daily.tick()
+    bench.due()
     bench.daily.close()
-    (kept,) = (tmp_path / "diagnosis").glob("*.mcap")
+    (kept,) = (tmp_path / "diagnosis").glob("*")
     assert kept.name == "20261102T000000Z.mcap"
-    assert kept.read_bytes() == b"most"
+    found = load_recording(kept)
+    assert found.position[-1, 0] == 80.0
+    assert len(found.t) == 15_025
+    assert found.t[0] == 0.0
+    np.testing.assert_allclose(np.diff(found.t), 0.004, atol=1e-8)
+    bench.due()
+    assert bench.daily._process is None, "each minute is diagnosed once"
+
+
+def test_a_pause_ends_a_minute(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "diagnosis")
+    for _ in range(2):
+        bench.work(20.0)
+        bench.now += 5.0
+    minute = bench.busiest.take(0.0)
+    assert minute is not None
+    assert minute.travel == 20.0
+
+
+def test_a_fast_bus_is_thinned() -> None:
+    fast = BusiestMinute(1000.0)
+    t = np.arange(0.0, 60.1, 0.001)
+    channels = dict.fromkeys(CHANNELS, np.zeros((len(t), 2)))
+    fast.append(Batch(t, channels, np.zeros(2, int), np.zeros(2), Stats()))
+    minute = fast.take(0.0)
+    assert minute is not None
+    assert len(minute.parts[0][0]) == len(t) / 4
 
 
 def test_a_day_without_motion_has_none(tmp_path: Path) -> None:
     bench = Bench(tmp_path / "diagnosis")
-    bench.daily.finished(recording(tmp_path, "still"), 1.0)
+    bench.work(1.0)
     bench.day()
     assert bench.said == []
 
@@ -73,7 +115,7 @@ def test_a_day_without_motion_has_none(tmp_path: Path) -> None:
 def test_why_there_is_none_is_said_once(tmp_path: Path) -> None:
     bench = Bench(tmp_path / "diagnosis")
     for _ in range(2):
-        bench.daily.finished(recording(tmp_path, "any"), 30.0)
+        bench.work(30.0)
         bench.day()
     ((kind, joint, text, _),) = bench.said
     assert (kind, joint) == ("diagnosis", None)
@@ -86,23 +128,36 @@ def test_the_answer_of_one_that_was_ended_is_not_that_of_the_next(tmp_path: Path
     folder.mkdir()
     left = {"newest": {"case": "old", "answer": {"verdict": "no_gap", "causes": []}}, "trends": []}
     (folder / "trend.new.json").write_text(json.dumps(left))
-    bench.daily.finished(recording(tmp_path, "any"), 30.0)
+    bench.work(30.0)
     bench.day()
     assert "no model file" in bench.said[0][2]
 
 
-def test_a_recording_that_the_quota_took_is_no_end_of_the_daemon(tmp_path: Path) -> None:
+def test_a_directory_that_cannot_be_written_is_no_end_of_the_daemon(tmp_path: Path) -> None:
+    (tmp_path / "diagnosis").write_text("a file")
     bench = Bench(tmp_path / "diagnosis")
-    bench.daily.finished(tmp_path / "gone.mcap", 30.0)
+    bench.work(30.0)
     bench.day()
-    assert "gone.mcap" in bench.said[0][2]
+    assert "diagnosis" in bench.said[0][2]
+    (tmp_path / "diagnosis").unlink()
+    bench.work(30.0)
+    bench.day()
+    assert "no model file" in bench.said[1][2]
+
+
+def test_a_recording_half_written_is_none(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "diagnosis")
+    bench.work(30.0)
+    bench.time += timedelta(hours=24)
+    bench.daily.tick()
+    bench.daily.close()
+    assert not list((tmp_path / "diagnosis").glob("*.mcap"))
 
 
 def test_closing_ends_the_process(tmp_path: Path) -> None:
     bench = Bench(tmp_path / "diagnosis")
-    bench.daily.finished(recording(tmp_path, "any"), 30.0)
-    bench.time += timedelta(hours=24)
-    bench.daily.tick()
+    bench.work(30.0)
+    bench.due()
     process = bench.daily._process
     assert process is not None
     bench.daily.close()
@@ -111,10 +166,10 @@ def test_closing_ends_the_process(tmp_path: Path) -> None:
 
 def test_one_that_takes_too_long_is_ended(tmp_path: Path) -> None:
     bench = Bench(tmp_path / "diagnosis")
-    bench.daily.finished(recording(tmp_path, "any"), 30.0)
-    bench.time += timedelta(hours=24)
-    bench.daily.tick()
-    bench.time += timedelta(hours=1)
+    bench.work(30.0)
+    bench.due()
+    assert bench.daily._process is not None
+    bench.daily._begun -= timedelta(hours=1)
     bench.daily.tick()
     assert "took longer than 30 min" in bench.said[0][2]
 
@@ -122,10 +177,10 @@ def test_one_that_takes_too_long_is_ended(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_service_diagnoses_what_it_has_recorded(tmp_path: Path) -> None:
     """Its recordings of the arm at work, against the arm file's own masses, after its day of three minutes."""
-    settings = DaemonSection.model_validate({"recording": {"minutes": 1.0}, "diagnosis": {"hours": 0.05}})
+    settings = DaemonSection.model_validate({"diagnosis": {"hours": 0.05}})
     daemon = FastDaemon(tmp_path, 1, settings)
     daemon.run(300)
-    end = time.monotonic() + SECONDS
+    end = time.monotonic() + PATIENCE
     while not daemon.of_kind("diagnosis") and time.monotonic() < end:
         time.sleep(0.1)
         daemon.service.tick()

@@ -52,7 +52,7 @@ class Client:
 
 @pytest.fixture
 def arm():
-    with served(DRIVE, fd=False) as arm:
+    with served(DRIVE, fd=False, rate=50) as arm:  # a slow client is not to read old frames
         yield arm
 
 

@@ -14,7 +14,7 @@ from serving import pendulum
 from armlink.arm_file import parse_arm
 from armlink.bus.port import CLASSICAL
 from armlink.drives.damiao import frames as damiao
-from armlink.drives.mit_packing import MitCommand, Ranges, pack_command
+from armlink.drives.mit_packing import MitCommand, Ranges, Special, pack_command, special
 from armlink.errors import BadInput
 from sim_bus.bus.fault_injector import Injector
 from sim_bus.bus.fault_kinds import parse_fault
@@ -27,6 +27,7 @@ DAMIAO = {"family": "damiao", "id": 2, "reply": 0x12, "model": "DM4340", "kp": 4
 DM4340 = Ranges(12.5, 10.0, 28.0)
 FAMILIES = [
     DAMIAO,
+    {"family": "cubemars", "id": 6, "model": "AK80-9", "can_timeout": 4000, "kp": 40, "kd": 1.0},
     {"family": "robstride", "id": 3, "model": "RS01", "kp": 40, "kd": 1.0},
     {"family": "moteus", "id": 4},
     {"family": "odrive", "node": 5},
@@ -49,7 +50,7 @@ def command(**values):
     return pack_command(MitCommand(**fields), DM4340)
 
 
-ENABLE = damiao.special(damiao.Special.ENABLE)
+ENABLE = special(Special.ENABLE)
 
 
 # ---- several families on one arm
@@ -60,6 +61,7 @@ def mixed():
         {"family": "canopen", "node": 5},
         DAMIAO,
         {"family": "robstride", "id": 3, "model": "RS01", "kp": 40, "kd": 1.0},
+        {"family": "cubemars", "id": 6, "model": "AK80-9", "kp": 40, "kd": 1.0},
         {"family": "moteus", "id": 0x21},
         {"family": "odrive", "node": 20, "gear": 8.0},
     ]
@@ -88,8 +90,9 @@ def test_each_drive_of_a_mixed_arm_answers_its_own_frames():
     read_mode = bytes.fromhex("110050")
     for can_id, data, answer in (
         (0x605, bytes.fromhex("4000100000000000"), 0x585),
-        (0x002, damiao.special(damiao.Special.CLEAR_ERROR), 0x12),
+        (0x002, special(Special.CLEAR_ERROR), 0x12),
         (0x8300FD03, bytes(8), 0x828003FD),
+        (0x006, special(Special.DISABLE), 0x000),
         (0x80008021, read_mode, 0x80002100),
         (0x40000280, bytes(8), 0x280),
     ):
@@ -147,7 +150,7 @@ def test_without_power_a_joint_is_free_and_it_makes_no_torque():
         arm.advance(0.004)
     assert reply.feedback.position == pytest.approx(0.0, abs=0.03)  # sags: 0.3 rad at the joint against gravity
     assert float(arm.plant.position[0]) == pytest.approx(0.3, abs=0.03)
-    ask(arm, damiao.special(damiao.Special.DISABLE))
+    ask(arm, special(Special.DISABLE))
     arm.advance(0.3)
     assert float(arm.plant.position[0]) < 0.2
     assert abs(ask(arm, damiao.refresh_request(2), damiao.REGISTERS_ID)[0].feedback.torque) < 0.01

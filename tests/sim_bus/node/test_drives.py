@@ -156,8 +156,10 @@ def torque_on_a_way(jitter: float) -> np.ndarray:
     return np.array(readings[50:])
 
 
-def test_jitter_of_sync_is_no_jerk() -> None:
-    assert np.abs(torque_on_a_way(1e-4) - torque_on_a_way(0.0)).max() < 0.2
+def test_jitter_of_sync_is_neither_a_jerk_nor_a_bias() -> None:
+    difference = torque_on_a_way(1e-4) - torque_on_a_way(0.0)
+    assert np.abs(difference).max() < 0.1
+    assert abs(difference.mean()) < 0.005
 
 
 def test_targets_and_readings_of_position_share_the_sensors_gain() -> None:

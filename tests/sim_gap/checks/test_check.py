@@ -165,6 +165,40 @@ def test_a_joint_beyond_its_range_is_refused_unless_the_user_says_that_it_is_the
     assert check(narrow, motor, parse_corrections(zero=["q_2=0"]))[1] == []
 
 
+def test_rows_that_are_missing_are_said(arm, motor):
+    kept = np.random.default_rng(6).random(motor.t.size) > 0.2
+    gaps = replace(motor, **{name: values[kept] for name, values in motor.channels().items()}, t=motor.t[kept])
+    corrected, (finding,) = check(arm, replace(gaps, velocity=None))
+    assert (finding.finding, finding.corrected) == ("dropped", True)
+    np.testing.assert_array_equal(corrected.t, gaps.t)
+
+
+def test_counts_are_refused_with_the_option(arm, motor):
+    counts = replace(motor, position=np.round(motor.position * 4096 / (2.0 * np.pi)), velocity=None)
+    with pytest.raises(BadInput, match=r"q of joint_1: holds whole numbers .*--units q=counts:TURN"):
+        check(arm, counts)
+
+
+@pytest.mark.parametrize(
+    ("run", "model_of"),
+    [
+        ("meas_elbow", "sim"),
+        ("meas_elbow_half", "sim"),
+        ("designc_elbow", "sim_design_c"),
+        ("designc_shoulder", "sim_design_c"),
+    ],
+)
+def test_an_idle_motor_whose_joint_is_dragged_along_has_no_sign(realdata, run, model_of):
+    """What it reads is the difference of torques that nearly cancel: no evidence, in either sign or unit."""
+    recording = load_recording(realdata / "double_pendulum" / f"{run}.csv.gz")
+    real = load_model(realdata / "double_pendulum" / f"{model_of}.xml", (), 2).arm
+    assert check(real, recording)[1] == []
+    driven = 0 if run.endswith("shoulder") else 1
+    both = turned(turned(recording, "motor_torque", [driven]), "torque_command", [driven])
+    options = {finding.option for finding in check(real, both)[1]}
+    assert f"--sign tau_motor_{driven + 1}=-1" in options
+
+
 def test_an_order_that_explains_far_more_but_makes_one_joint_worse_is_asked_about(arm, motor):
     """With columns 1 and 3 exchanged, and the torque of what is then joint 1 read by a broken sensor."""
     random = np.random.default_rng(5)

@@ -104,6 +104,13 @@ def test_actuator_entries_hold_the_fit(answer, tmp_path: Path, monkeypatch) -> N
         write_actuators(answer.internals, tmp_path / "servos.py", 0.0)
 
 
+def test_the_band_holds_its_share_of_other_motion(answer) -> None:
+    told = answer.to_json()["band"]
+    assert told["share"] == 0.9
+    assert all(0.8 < share <= 0.98 for share in told["holds"])
+    assert all(0.0 < width < 0.2 * gap for width, gap in zip(told["half_width"], answer.heldout_before, strict=True))
+
+
 def test_report_shows_every_joint(answer, tmp_path: Path) -> None:
     write_report(answer, tmp_path / "gap.html")
     page = (tmp_path / "gap.html").read_text()
@@ -117,6 +124,7 @@ def test_report_shows_every_joint(answer, tmp_path: Path) -> None:
         (lambda q, c: -c, "--sign q_cmd_1=-1"),
         (lambda q, c: c[:, ::-1], "--map"),
         (lambda q, c: np.rad2deg(c), "--units q_cmd_1=deg"),
+        (lambda q, c: np.rad2deg(c, out=c) * (1.0 + 0.0 * np.rad2deg(q, out=q)), "--units q=deg,q_cmd=deg"),
         (lambda q, c: np.full_like(c, np.nan), "neither a torque channel nor a commanded position"),
     ],
 )

@@ -2,6 +2,7 @@
 
 import json
 import time
+from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import wrong_arms
 from typer.testing import CliRunner
 
 from armlink.arm_file import load_arm
-from armlink.recording.files import save_recording
+from armlink.recording.mcap import save_mcap
 from calib.daemon.environment import Environment
 from calib.daemon.observing.daily_diagnosis import DailyDiagnosis
 from calib.daemon.settings import Configuration, DaemonSection, DiagnosisSettings
@@ -46,10 +47,20 @@ def folder(tmp_path: Path) -> Path:
     return made
 
 
-def worn(path: Path) -> Path:
+def worn(path: Path) -> None:
     wrong = wrong_arms.Wrong(coulomb=np.array([0.0, WORN, 0.0]))
-    save_recording(wrong_arms.record(wrong_arms.model(), wrong, 1, seconds=20.0, rate=50.0), path)
-    return path
+    save_mcap(wrong_arms.record(wrong_arms.model(), wrong, 1, seconds=20.0, rate=50.0), path)
+
+
+class WornMinute:
+    """In place of what the daemon has heard: always the same minute."""
+
+    def take(self, least: float) -> "WornMinute":
+        return self
+
+    def write(self, path: Path, names: tuple[str, ...]) -> Iterator[None]:
+        worn(path)
+        yield
 
 
 def test_by_command(folder: Path) -> None:
@@ -93,10 +104,10 @@ def test_by_the_daemon(folder: Path) -> None:
         Configuration(load_arm("sarcos"), settings, listen_only=True),
         Environment(time.monotonic, lambda: now[0], nothing, nothing),  # type: ignore[arg-type]
         events,  # type: ignore[arg-type]
+        WornMinute(),  # type: ignore[arg-type]
         folder,
     )
     for day in range(2):
-        daily.finished(worn(folder.parent / "moved.mcap"), 50.0)
         now[0] += timedelta(hours=24)
         end = time.monotonic() + 300.0
         while len([event for event in said if event[0] == "diagnosis"]) <= day and time.monotonic() < end:

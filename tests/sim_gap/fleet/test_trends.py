@@ -72,6 +72,50 @@ def test_wear_is_seen_before_half_of_it_and_nowhere_else(seed):
         assert np.sign(trend.now - trend.before) == np.sign(WORN[trend.arm][3])
 
 
+def with_watched(days: int, play: float, first: int = 0) -> dict[str, dict]:
+    """Answers of one arm without a cause; a play that is watched from day `first` on grows from day 20 on."""
+    random, out = np.random.default_rng(5), {}
+    for day in range(days):
+        value = 1e-4 * random.normal() + play * max(day - 20, 0) / 20.0
+        rows = [
+            {
+                "effect": effect,
+                "joint": "joint_1",
+                "parameter": name,
+                "value": x,
+                "ci95": [x - 0.01, x + 0.01],
+                "unit": "",
+            }
+            for effect, name, x in (
+                ("transmission.backlash", "width", value),
+                ("friction.coulomb", "torque", 1.0 + 0.01 * random.normal()),
+            )
+        ]
+        known = {"watched": rows} if day >= first else {}
+        out[f"arm/{date(2026, 9, 1) + timedelta(days=day)}"] = {"causes": [], "minor": [], **known}
+    return out
+
+
+def test_what_is_watched_is_followed_without_a_cause():
+    (one,) = fleet_trends(with_watched(40, 0.0035))
+    assert (one.effect, one.joint, one.parameter) == ("transmission.backlash", "joint_1", "width")
+    assert date.fromisoformat(one.noticed) < date(2026, 9, 1) + timedelta(days=30)
+    assert fleet_trends(with_watched(40, 0.0)) == []
+
+
+def test_what_is_watched_only_from_some_day_on_has_not_changed_by_that():
+    assert fleet_trends(with_watched(60, 0.0, first=8)) == []
+    assert fleet_trends(with_watched(60, 0.0, first=55)) == []
+
+
+def test_a_day_on_which_a_joint_hardly_moved_does_not_count():
+    answers = with_watched(40, 0.0)
+    for case in list(answers)[30:34]:
+        width = answers[case]["watched"][0]
+        width |= {"value": 0.5, "ci95": [-1.0, 2.0]}
+    assert fleet_trends(answers) == []
+
+
 def test_an_arm_that_differs_from_the_fleet_is_named_without_dates():
     random = np.random.default_rng(4)
     answers = {

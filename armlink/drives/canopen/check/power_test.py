@@ -160,7 +160,7 @@ class PowerTest:
             slow = [
                 f"{int(mode)} (displays {self.drives.known.displays[joint]})"
                 for mode in since
-                if since[mode][joint] is None
+                if since[mode][joint] is None and mode in link.setups[joint].modes
             ]
             times = [seconds for mode in since if (seconds := since[mode][joint]) is not None]
             found = f"does not enter mode {', '.join(slow)}" if slow else "follows 6060h"
@@ -170,14 +170,15 @@ class PowerTest:
         """Time until each joint displays a mode, None where it does not within the deadline."""
         link, start = self.link, self.link.clock.now()
         times: list[float | None] = [None] * link.n
-        for joint in range(link.n):
-            self.loop.send(RPDO2.cob_base + self.drives.nodes[joint], bytes([mode]))
+        asked = [self.drives.cycle.own_mode(joint, mode) for joint in range(link.n)]
+        for node, own in zip(self.drives.nodes, asked, strict=True):
+            self.loop.send(RPDO2.cob_base + node, bytes([own]))
         while None in times and link.clock.now() - start <= link.section.deadline:
             self._cycle(off)
             now = link.clock.now() - start
             times = [
-                now if time is None and shown == mode else time
-                for time, shown in zip(times, self.drives.known.displays, strict=True)
+                now if time is None and shown == own else time
+                for time, shown, own in zip(times, self.drives.known.displays, asked, strict=True)
             ]
         return times
 

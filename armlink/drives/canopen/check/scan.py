@@ -1,13 +1,15 @@
 """Scan of a bus: which nodes are present, their identity and state; reads only."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
 
 from armlink.bus.port import Port
 from armlink.clock import Clock
 from armlink.drives.canopen.controller_setup import Identity, identify
 from armlink.drives.canopen.eds_file import bundled
 from armlink.drives.canopen.object_dictionary import SDO_REQUEST_ID
+from armlink.drives.canopen.profile import Profile, lacking
 from armlink.drives.canopen.sdo import NodeServices, Pump, PumpedNetwork
 
 SEARCH_SECONDS = 0.3
@@ -31,10 +33,11 @@ def reading_network(port: Port, clock: Clock) -> tuple[PumpedNetwork, Pump]:
     return network, pump
 
 
-def scan_bus(port: Port, clock: Clock, joints: Mapping[int, str]) -> list[Identity]:
+def scan_bus(port: Port, clock: Clock, joints: Mapping[int, str], stock: Collection[int] = ()) -> list[Identity]:
     """Every node that answers a read of its device type, and the nodes of `joints` (node id → joint name) that do not.
 
-    Sorted by node id. Raises BusFault if a node that answered stops answering.
+    Nodes of `stock` are asked for the optional objects of the profile, too. Sorted by node id. Raises BusFault if one
+    that answered stops answering.
     """
     network, pump = reading_network(port, clock)
     found = _search(port, pump, network)
@@ -45,7 +48,9 @@ def scan_bus(port: Port, clock: Clock, joints: Mapping[int, str]) -> list[Identi
         if found[node] > 1:  # both nodes would answer every request
             identities.append(Identity(name, node, present=True, answers=found[node]))
         elif found[node]:
-            identities.append(identify(NodeServices(network, name, node, dictionary, pump)))
+            services = NodeServices(network, name, node, dictionary, pump)
+            lost = Profile(absent=lacking(services)).lost if node in stock else ()
+            identities.append(replace(identify(services), lost=lost))
         else:
             identities.append(Identity(name, node, present=False))
     return identities

@@ -42,11 +42,11 @@ def scan_report(
         port = opened.open_port()
         found = []
         for place, member in enumerate(port.members if isinstance(port, GroupPort) else (port,)):
-            here = joints
-            if arm is not None and isinstance(opened, BusGroup):
-                named = [joint for joint in arm.require_link().joints if opened.tags[joint.bus] >> BUS_SHIFT == place]
-                here = {joint.settings.node: joint.name for joint in named}
-            found += scan_bus(member, clock, here)
+            named = [] if arm is None else arm.require_link().joints
+            if isinstance(opened, BusGroup):
+                named = [joint for joint in named if opened.tags[joint.bus] >> BUS_SHIFT == place]
+            stock = {joint.settings.node for joint in named if joint.settings.torque != "record"}
+            found += scan_bus(member, clock, {joint.settings.node: joint.name for joint in named}, stock)
         channel = str(opened.channel_info)
     finally:
         opened.shutdown()
@@ -64,7 +64,11 @@ def scan_report(
             table.add_row(str(each.node), each.joint, *told, identity, str(each.serial), style=style)
         else:
             table.add_row(str(each.node), each.joint, "[red]no answer[/red]")
-    Console(stderr=True).print(table if found else f"{channel}: no node answers")
+    console = Console(stderr=True)
+    console.print(table if found else f"{channel}: no node answers")
+    for lost in dict.fromkeys(lost for each in found for lost in each.lost):
+        lacking = [each.joint for each in found if lost in each.lost]
+        console.print(f"{', '.join(lacking)} {'lacks' if len(lacking) == 1 else 'lack'} {lost}", soft_wrap=True)
     nodes = [{**vars(each), "state": each.state.value, "mismatches": wrong.get(each.node, [])} for each in found]
     write(json, {"bus": channel, "nodes": nodes})
     missing = [f"{each.joint} (node {each.node})" for each in found if not each.present]

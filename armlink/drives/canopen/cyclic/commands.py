@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from armlink.bus.port import Frame
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen.cia402 import (
-    CYCLIC_VELOCITY,
     Control,
     State,
     loop_gain,
@@ -39,6 +38,8 @@ class CommandFrames:
         """Whether the host's heartbeat is sent; not, so that the joints' watching it is put to the test."""
         self.heartbeat: Frame = (objects.HEARTBEAT_ID + host, _OPERATIONAL)
         self._wires: Sequence[Wire] = ()
+        self._own: list[dict[int, int]] = []
+        """Modes of orders that a device stands in for by another of its own."""
         self._rows: list[tuple[int, Callable[..., bytes], float, int, float, float, float, int, int]] = []
         m = len(known.names)
         self._sent: list[bytes | None] = [None] * m
@@ -59,7 +60,8 @@ class CommandFrames:
     def use(self, wires: Sequence[Wire]) -> None:
         """From now on these layouts, scales and windows."""
         self._wires, self._rows = wires, []
-        self._any_velocity = any(wire.by_velocity for wire in wires)
+        pairs = [{int(Mode.POSITION): w.profile.position_mode, int(Mode.TORQUE): w.profile.torque_mode} for w in wires]
+        self._own = [{mode: own for mode, own in each.items() if mode != own} for each in pairs]
         for joint, wire in enumerate(wires):
             limits, unit = wire.limits, wire.unit
             low, high = math.ceil(limits.lower / unit.position), math.floor(limits.upper / unit.position)
@@ -87,7 +89,7 @@ class CommandFrames:
                     word = ENABLE
                     if mode and self.own_mode(joint, mode) != self.modes[joint]:
                         self._select(joint, mode, modes, now)
-                    if mode == PROFILE_POSITION:
+                    if self.modes[joint] == PROFILE_POSITION:
                         word = set_point_control(self._known.statuses[joint])
                 else:
                     word = QUICK_STOP if power is Power.STOPPED else DISABLE_VOLTAGE
@@ -128,11 +130,11 @@ class CommandFrames:
 
     def own_modes(self, modes: Sequence[int]) -> Sequence[int]:
         """The devices' modes for those of orders."""
-        return [self.own_mode(joint, mode) for joint, mode in enumerate(modes)] if self._any_velocity else modes
+        return [self.own_mode(joint, mode) for joint, mode in enumerate(modes)] if any(self._own) else modes
 
     def own_mode(self, joint: int, mode: int) -> int:
         """The device's mode for one of an order."""
-        return CYCLIC_VELOCITY if self._wires[joint].by_velocity and mode == Mode.POSITION else mode
+        return self._own[joint].get(mode, mode)
 
     def _select(self, joint: int, mode: int, frames: list[Frame], now: float) -> None:
         mode, wire = self.own_mode(joint, mode), self._wires[joint]

@@ -1,0 +1,269 @@
+"""CubeMars AK drives on one bus, in MIT mode: one command and one reply a cycle.
+
+A reply tells no state, so the state here is what was ordered and answered. A drive that makes no torque although its
+commands ask for some has left its motor mode. One that got no command for the link's deadline counts as stopped by its
+CAN timeout, whether it was or not: the timeout is set over the serial port, and nothing on the bus tells it.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from armlink.arm_file import ArmFile, LinkJoint
+from armlink.bus.port import Frame
+from armlink.drives.cubemars.frames import NO_COMMAND, Reply, error_text, unpack_reply
+from armlink.drives.cubemars.settings import CubeMarsSettings
+from armlink.drives.family import Ask
+from armlink.drives.mit_drives import MitDrives, MitKnown
+from armlink.drives.mit_packing import Special, pack_command, special, unwrap
+from armlink.drives.orders import DriveIdentity, Gains, Limits, Mode, Order, Power, Reading, Setup, law_torque
+from armlink.drives.traits import Traits
+from armlink.errors import BadInput, BusFault
+
+TRAITS = Traits(torque="current", calibration="host", silence="keeps on", bounds=(), cadence="reply", frame="11")
+"""Of a drive with the default keys; with a CAN timeout it lets go."""
+NMT_ID = 0
+LISTEN = 0.1
+"""A drive that answers another host is heard within this time [s]."""
+LOADED = 0.02
+"""Commands that ask for more than this share of the torque range show whether the drive follows them."""
+FOLLOWS = 0.5
+"""A drive that makes less than this share of the torque that is asked for does not follow."""
+
+
+@dataclass
+class _Known(MitKnown):
+    """What is known of one drive."""
+
+    on: bool | None = None
+    """In motor mode, by the newest switching that was answered."""
+    switched: Special | None = None
+    """Newest switching, while it waits for its answer."""
+    skip: bool = False
+    """The next reply answers a switching that a command follows at once: no reading."""
+    commanded: float = -math.inf
+    """When the newest command was made [s]."""
+    lacking: float = math.inf
+    """Since when it makes less torque than it is asked for [s]."""
+    stopped: bool = False
+    """It was left without commands for longer than the deadline."""
+    asked: bool = False
+    """The next reply tells whether the newest order is still followed."""
+
+
+class CubeMarsDrives(MitDrives):
+    """The drives of one bus; see `Drives`."""
+
+    def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
+        """Nothing is sent. Raises BadInput where one drive's replies have another's id."""
+        self._known: list[_Known] = [_Known() for _ in joints]
+        super().__init__(joints, TRAITS, self._known)
+        self._traits = [
+            replace(traits, silence="falls") if settings.can_timeout else traits
+            for traits, settings in zip(self._traits, self._settings, strict=True)
+        ]
+        for joint, (known, settings) in enumerate(zip(self._known, self._settings, strict=True)):
+            known.use(settings.ranges)
+            other = self._joint_of.get(settings.reply)
+            if other is not None:
+                raise BadInput(
+                    f"{arm.path}: {self.names[joint]}: drive.reply {settings.reply:#04x} is the id of "
+                    f"{self.names[other]}'s commands: replies need an id that is no drive's (master id, usually 0)"
+                )
+        self._replies = {(each.reply, each.id): joint for joint, each in enumerate(self._settings)}
+        self._spare_canopen(arm)
+
+    def _spare_canopen(self, arm: ArmFile) -> None:
+        """Raise BadInput where CANopen nodes share the bus and would take replies for NMT commands."""
+        buses = {row.bus for row, each in zip(self.rows, self._settings, strict=True) if each.reply == NMT_ID}
+        others = [each for each in arm.require_link().joints if each.settings.family == "canopen"]
+        for joint in others:
+            if joint.bus in buses:
+                raise BadInput(
+                    f"{arm.path}: {joint.name}: a CANopen node takes CubeMars replies on id 0 for NMT commands: put "
+                    "it on another bus, or set another master id in the drives (drive.reply)"
+                )
+
+    # ---- set-up
+
+    def identify(self, ask: Ask) -> list[DriveIdentity]:
+        """See Drives: only a drive that nobody is heard to drive is asked, by what also leaves motor mode."""
+        for known in self._known:
+            known.position = math.nan
+        ask.wait(lambda: all(math.isfinite(known.position) for known in self._known), LISTEN)
+        found = []
+        for joint, (known, settings) in enumerate(zip(self._known, self._settings, strict=True)):
+            there = math.isfinite(known.position) or self._exit(ask, joint) is not None
+            name = f"CubeMars {settings.model}".strip() if there else ""
+            found.append(DriveIdentity(joint, settings.address, there, name, power=self.power(joint)))
+        return found
+
+    def _exit(self, ask: Ask, joint: int) -> Reply | None:
+        """Leave motor mode; the reply, None where there is none."""
+        return ask((self._settings[joint].id, special(Special.DISABLE)), self._reply_of(joint))
+
+    def _reply_of(self, joint: int) -> Callable[[int, bytes], Reply | None]:
+        def reply(can_id: int, data: bytes) -> Reply | None:
+            known = self._known[joint]
+            assert known.ranges is not None
+            mine = self._replies.get((can_id, data[0])) == joint if data else False
+            return unpack_reply(data, known.ranges) if mine else None
+
+        return reply
+
+    def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
+        """See Drives: no torque, then out of motor mode; nothing in such a drive can be read or set over CAN."""
+        return [self._prepare(ask, joint, limit) for joint, limit in enumerate(limits)]
+
+    def _prepare(self, ask: Ask, joint: int, limit: Limits) -> Setup:
+        known, settings, name = self._known[joint], self._settings[joint], self.names[joint]
+        ranges = known.ranges
+        assert ranges is not None
+        if not (-ranges.position <= limit.lower and limit.upper <= ranges.position):
+            raise BadInput(
+                f"{name}: its position window {limit.lower:.2f} to {limit.upper:.2f} rad at the drive exceeds the "
+                f"range ±{ranges.position:.2f} rad of its frames: correct zero and direction, or limit the joint"
+            )
+        ask((settings.id, pack_command(NO_COMMAND, ranges)), self._reply_of(joint))
+        reply = self._exit(ask, joint)
+        if reply is None:
+            raise BusFault(
+                f"{name}: no answer from {settings.address} on id {settings.reply:02X}h: is it powered, in MIT mode, "
+                "and are its CAN and master ids right?"
+            )
+        self._known[joint] = known = _Known(ranges, known.grid, limit, reply.feedback.position, on=False)
+        self.powers[joint], self.faults[joint] = Power.OFF, error_text(reply.error)
+        return Setup(
+            position=reply.feedback.position,
+            torque=0.0,
+            position_step=ranges.position_quantum,
+            modes=frozenset((int(Mode.POSITION), int(Mode.TORQUE))),
+            gains=Gains(settings.kp, settings.kd, ranges.kp, ranges.kd),
+            notes=(_watched(settings), "scales by the arm file: the drive tells none"),
+            scales={
+                "position range, rad": ranges.position,
+                "velocity range, rad/s": ranges.velocity,
+                "torque range, N·m": ranges.torque,
+            },
+        )
+
+    # ---- cycle
+
+    def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
+        """See Drives."""
+        return [
+            frame
+            for joint, order in enumerate(orders)
+            if order is not None
+            for frame in self._frames(joint, order, now)
+        ]
+
+    def _frames(self, joint: int, order: Order, now: float) -> list[Frame]:
+        known, drive = self._known[joint], self._settings[joint].id
+        if known.limits is None:
+            raise BusFault(f"{self.names[joint]}: a command before the set-up")
+        if known.on and now - known.commanded > known.limits.deadline:
+            known.on, known.stopped, self.powers[joint] = None, True, Power.STOPPED
+        known.damping = False
+        if known.on and order.power is not Power.OFF:
+            known.commanded = now
+            return [self._command(joint, order) if order.power is Power.ON else self._damp(joint)]
+        known.sent, known.lacking = None, math.inf
+        assert known.ranges is not None
+        quiet = drive, pack_command(NO_COMMAND, known.ranges)
+        if order.power is Power.ON and order.walk and known.on is False:
+            # motor mode goes on with the command that was in force when it was left
+            known.switched, known.skip, known.commanded, known.stopped = Special.ENABLE, True, now, False
+            return [(drive, special(Special.ENABLE)), quiet]
+        if known.on:
+            known.on = None
+            return [quiet]
+        known.switched = Special.DISABLE
+        return [(drive, special(Special.DISABLE))]
+
+    def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
+        """See Drives."""
+        joint = self._replies.get((can_id, data[0])) if data else None
+        if joint is None:
+            return None
+        known = self._known[joint]
+        assert known.ranges is not None
+        reply = unpack_reply(data, known.ranges)
+        if reply is None:
+            return None
+        position, velocity, torque = reply.feedback
+        if math.isfinite(known.position):
+            position = unwrap(position, known.position, 2 * known.ranges.position)
+        known.position, known.velocity = position, velocity
+        if known.switched is not None:
+            known.on, known.switched = known.switched is Special.ENABLE, None
+        if known.skip:
+            known.skip = False
+            return None
+        self._judge(joint, torque, now)
+        fault = error_text(reply.error) or self._idle_text(joint, now)
+        power = Power.FAULT if fault else self._power(known)
+        temperature = math.nan if reply.temperature is None else float(reply.temperature)
+        return self.note(Reading(joint, position, velocity, torque, math.nan, temperature, power, fault))
+
+    def _judge(self, joint: int, torque: float, now: float) -> None:
+        """Whether the drive makes the torque of the newest command, by a reading of it [N·m]."""
+        known = self._known[joint]
+        if known.sent is None or known.ranges is None:
+            return
+        wanted = law_torque(known.sent, known.position, known.velocity)
+        shown = abs(wanted) > LOADED * known.ranges.torque
+        follows = torque * math.copysign(1.0, wanted) > FOLLOWS * abs(wanted)
+        known.lacking = min(known.lacking, now) if shown and not follows else math.inf
+        if known.asked:
+            known.asked = False
+            known.on, known.stopped = (follows if shown else None), shown and not follows
+
+    def _idle_text(self, joint: int, now: float) -> str:
+        known = self._known[joint]
+        if known.limits is None or not now - known.lacking > known.limits.deadline:
+            return ""
+        return "makes no torque although its commands ask for some: it has left motor mode, or restarted"
+
+    @staticmethod
+    def _power(known: _Known) -> Power:
+        if known.stopped:
+            return Power.STOPPED
+        if known.on:
+            return Power.STOPPED if known.damping else Power.ON
+        return Power.UNKNOWN if known.on is None else Power.OFF
+
+    def state_request(self, joint: int) -> list[Frame]:
+        """See Drives: a command of no torque, whose reply has the torque that the drive made until then."""
+        known = self._known[joint]
+        if known.limits is None or known.ranges is None:
+            return []
+        known.asked = True
+        return [(self._settings[joint].id, pack_command(NO_COMMAND, known.ranges))]
+
+    def lets_go(self, joint: int) -> bool:
+        """See Drives."""
+        return not self._known[joint].on
+
+    def stalled(self, modes: Sequence[int]) -> str:
+        """See BasicDrives."""
+        return self.own_stop()
+
+    def own_stop(self) -> str:
+        """See Drives."""
+        for joint, known in enumerate(self._known):
+            if known.stopped:
+                return f"{self.where(joint)}: without a command for its deadline: its CAN timeout has let it go"
+        return ""
+
+    def forget(self, restarts: bool = False) -> None:
+        """See Drives."""
+        super().forget(restarts)
+        for known in self._known:
+            known.stopped, known.lacking = False, math.inf
+
+
+def _watched(settings: CubeMarsSettings) -> str:
+    if not settings.can_timeout:
+        return "no CAN timeout stated (drive.can_timeout): it keeps on after its host died"
+    return f"CAN timeout of {settings.can_timeout} cycles as stated: it cannot be read over CAN"

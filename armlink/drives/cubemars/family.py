@@ -1,0 +1,13 @@
+"""The CubeMars family, as the registry finds it."""
+
+from armlink.drives.cubemars.drives import TRAITS, CubeMarsDrives
+from armlink.drives.cubemars.settings import CubeMarsSettings
+from armlink.drives.family import Family
+
+FAMILY = Family(
+    name="cubemars",
+    traits=TRAITS,
+    settings=CubeMarsSettings,
+    build=CubeMarsDrives,
+    summary="CubeMars AK (firmware 1 and 2), MIT mode",
+)

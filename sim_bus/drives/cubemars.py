@@ -1,0 +1,119 @@
+"""Simulated CubeMars AK drives in MIT mode: replies without a state, CAN timeout by cycles of the drive's own loop."""
+
+import math
+from collections.abc import Callable
+
+from armlink.bus.port import EXTENDED, REMOTE
+from armlink.drives.cubemars.frames import NO_COMMAND, Reply, pack_reply
+from armlink.drives.cubemars.settings import CubeMarsSettings
+from armlink.drives.mit_packing import MitFeedback, Ranges, Special, special_of, unpack_command
+from sim_bus.drives.motor import Motor
+from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, SimulatedDrive
+
+LOOP_RATE = 40_000.0
+"""Cycles of the drive's loop a second: those of the open firmware that it descends from, bgkatz/motorcontrol."""
+ENCODER_FAULT = 5
+ZEROING = 1.0
+"""After its zero was set a drive answers nothing for so long [s]."""
+
+
+class CubeMarsDrive(SimulatedDrive):
+    """One AK drive, with the CAN timeout that its arm file states."""
+
+    def __init__(self, motor: Motor, send: Callable[[int, bytes], None], settings: CubeMarsSettings) -> None:
+        """Out of motor mode."""
+        super().__init__(motor, send)
+        self.id, self.reply = settings.id, settings.reply
+        self.can_timeout = settings.can_timeout
+        self._ranges = settings.ranges
+        self.motor_mode, self.command, self.error = False, NO_COMMAND, 0
+        self._zero, self._deaf_until = 0.0, -math.inf
+
+    @property
+    def coding(self) -> Ranges:
+        """Ranges by which it really codes and decodes."""
+        if not self.faults:
+            return self._ranges
+        position, velocity, torque, kp, kd = self._ranges
+        return Ranges(
+            position * self.scale("position"), velocity * self.scale("velocity"), torque * self.scale("torque"), kp, kd
+        )
+
+    @property
+    def patience(self) -> float:
+        """See SimulatedDrive."""
+        return self.can_timeout / LOOP_RATE
+
+    def receive(self, can_id: int, data: bytes) -> None:
+        """A command; in another mode than MIT none is understood."""
+        if len(data) != 8 or "drive.mode" in self.faults or self.now < self._deaf_until:
+            return
+        special = special_of(data)
+        if special is Special.ENABLE:
+            self.motor_mode = not self.error and not self.latched
+        elif special is Special.DISABLE:
+            self.motor_mode = False
+        elif special is Special.SET_ZERO:
+            self._zero, self._deaf_until = self.motor.position, self.now + ZEROING
+            return
+        elif special is None and self.motor_mode:
+            self.command = unpack_command(data, self.coding)
+        self._answer()
+        self.heard = self.now
+        self._follow()
+
+    def _follow(self) -> None:
+        """In motor mode the newest command, that of before it was left included; else free."""
+        if not self.motor_mode:
+            self.motor.free()
+            return
+        command, coding = self.command, self.coding
+        position = self.motor.position
+        target = command.position + position - self._shown(position)
+        self.motor.impede(command.kp, command.kd, target, command.velocity, command.torque, coding.torque)
+
+    def _shown(self, position: float) -> float:
+        """Position as the drive shows it, within its range."""
+        largest = self.coding.position
+        return (position - self._zero + largest) % (2 * largest) - largest
+
+    def _answer(self) -> None:
+        motor, coding = self.motor, self.coding
+        feedback = MitFeedback(self._shown(motor.position), motor.velocity, motor.torque)
+        temperature = int(MOTOR_TEMPERATURE + motor.heating)
+        self.answer(self.reply, pack_reply(Reply(self.id, feedback, temperature, self.error), coding))
+
+    def trip(self) -> None:
+        """CAN timeout: its command becomes one of no torque; motor mode goes on."""
+        self.command = NO_COMMAND
+        self.motor_mode = self.motor_mode and not self.latched
+        self.motor.free()
+
+    def reboot(self) -> None:
+        """See SimulatedDrive."""
+        self.motor_mode, self.command, self.error = False, NO_COMMAND, 0
+        self.motor.free()
+
+    def lose_feedback(self) -> None:
+        """Encoder fault: out of motor mode."""
+        self.error, self.motor_mode = ENCODER_FAULT, False
+        self.motor.free()
+
+
+class CubeMarsFront:
+    """All CubeMars drives on one bus: which of them a frame is for."""
+
+    def __init__(self, drives: list[CubeMarsDrive]) -> None:
+        """`drives` have different ids."""
+        self.drives = drives
+        self._addressed = {drive.id: drive for drive in drives}
+
+    def on_frame(self, can_id: int, data: bytes) -> None:
+        """A frame from the bus."""
+        if not can_id & (EXTENDED | REMOTE) and (drive := self._addressed.get(can_id)) is not None:
+            drive.on_frame(can_id, data)
+
+    def joint_of(self, can_id: int) -> int | None:
+        """See Front; None where several drives share a reply id."""
+        found = [drive.joint for drive in self.drives if drive.reply == can_id]
+        return found[0] if len(found) == 1 else None

@@ -1,0 +1,102 @@
+"""Bands of closed-loop motion: what parameters that are not known, and what no parameter explains, leave open.
+
+The band of a joint at each instant joins the spread of simulations with draws of all parameters and the spread of what
+a fit leaves of recordings that it has not seen: one after the other is left out of the training ones. It is scaled so
+that it holds its share of those.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcomp.arrays import Array
+from sim_gap.closed_loop.fit import Fit, batch, improve, residuals, root_mean_squares
+from sim_gap.closed_loop.judge import Covariance, draw, joint_rms
+from sim_gap.closed_loop.search import Search
+from sim_gap.closed_loop.simulate import simulate
+from sim_gap.closed_loop.windows import Windows, of_windows
+
+SHARE = 0.9
+"""Share of the motion that a band should hold."""
+FOLDS, STEPS = 3, 3
+"""Parts of a single recording of which each is left out of a fit, and the steps of such a fit."""
+DRAWS = 40
+"""Simulations with drawn parameters."""
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """Band about the corrected simulation, (J,) each."""
+
+    holds: Array
+    """Share of the held-out samples within it."""
+    width: Array
+    """RMS of half of it on held-out motion [rad]."""
+    unexplained: Array
+    """Standard deviation of what no parameter explains [rad]: noise to add to the draws."""
+
+
+def band(search: Search, fit: Fit, spread: Covariance, heldout: Windows) -> Band:
+    """The band that follows from the training windows of `search`, judged on the held-out ones."""
+    data, points = search.data, drawn(search, fit, spread)
+    left, groups = left_of_others(search, fit)
+    each = root_mean_squares(data, left)
+    unexplained = joint_rms(data, each)
+    size = np.sqrt(_variance(data, points) + unexplained[:, None] ** 2)
+    factor = np.array([_quantile(left[:, j], size[:, j], data.weight[:, j]) for j in range(data.joints)])
+    other = residuals(heldout, batch([fit.point]))[0]
+    wider = _uncertainty(np.stack([(each[:, groups == g] ** 2).mean(1) for g in np.unique(groups)]))
+    half = (wider * factor)[:, None] * np.sqrt(_variance(heldout, points) + unexplained[:, None] ** 2)
+    counts = np.maximum(heldout.weight.sum((0, 2)), 1.0)
+    holds = ((np.abs(other) <= half) * heldout.weight).sum((0, 2)) / counts
+    return Band(holds, np.sqrt((half**2 * heldout.weight).sum((0, 2)) / counts), wider * unexplained)
+
+
+def _uncertainty(squares: Array) -> Array:
+    """Factor on the spread, by one standard error of the mean square that G recordings leave (G, J), (J,)."""
+    if len(squares) < 2:
+        return np.ones(squares.shape[1])
+    error = squares.std(axis=0, ddof=1) / np.sqrt(len(squares))
+    return np.asarray(np.sqrt(1.0 + error / np.maximum(squares.mean(0), 1e-300)))
+
+
+def left_of_others(search: Search, fit: Fit) -> tuple[Array, NDArray[np.intp]]:
+    """What is left of each training window by a fit to the other recordings, of thirds if there is one, (To, J, W), and
+    the number of its recording or third (W,)."""
+    data = search.data
+    groups = data.recording
+    if len(np.unique(groups)) == 1:
+        groups = np.arange(data.count) * FOLDS // data.count
+    out = np.zeros_like(data.measured)
+    for group in np.unique(groups):
+        own, others = np.flatnonzero(groups == group), np.flatnonzero(groups != group)
+        alone = improve(of_windows(data, others), replace(fit, rms=None), search.scales, STEPS) if len(others) else fit
+        out[..., own] = residuals(of_windows(data, own), batch([alone.point]))[0]
+    return out, groups
+
+
+def drawn(search: Search, fit: Fit, spread: Covariance, count: int = DRAWS) -> list[dict[str, Array]]:
+    """Points with parameters drawn from their joint distribution."""
+    places = {name: j for j, name in enumerate(search.data.arm.names)}
+    out = []
+    for row in draw(search, fit, spread, count):
+        point = {name: values.copy() for name, values in fit.point.items()}
+        for key, value in row.items():
+            joint, _, name = key.rpartition(".")
+            if key in fit.shared:
+                point[key][:] = value
+            else:
+                point[name][places[joint]] = value
+        out.append(point)
+    return out
+
+
+def _variance(data: Windows, points: list[dict[str, Array]]) -> Array:
+    """Variance of the simulated positions over the points, (To, J, W) [rad²]."""
+    return np.asarray(simulate(data, batch(points)).var(axis=0))
+
+
+def _quantile(left: Array, size: Array, weight: Array) -> float:
+    """Multiple of `size` within which the share SHARE of the samples lies."""
+    return float(np.quantile((np.abs(left) / size)[weight > 0.0], SHARE))

@@ -1,0 +1,52 @@
+"""Torque constants of drives where motor torque alone is recorded.
+
+Such recordings know torque constants and masses only up to a factor that all have in common: with links twice as heavy
+and every constant twice as large, the drives report the same. The links are taken as the model has them, and then one
+drive's constant is as doubtful as another's. A search that adds one effect after the other may end elsewhere, with one
+drive's constant as the model has it and all masses changed in proportion.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sim_gap.effects.registry import effects
+from sim_gap.residuals.layout import Layout
+from sim_gap.search.stepwise import Search
+from sim_gap.search.term import Term
+
+CONSTANT = "actuator.gain"
+CONSTANTS = frozenset({CONSTANT})
+LINKS = ("link.mass_moment", "link.inertia", "link.payload")
+OFF = 0.05
+"""A torque constant is off from this share on."""
+
+
+def drives_are_off(search: Search) -> bool:
+    """Whether drives of an arm without torque sensors have another torque constant than they take it for.
+
+    Several have, or one has while links seem to be wrong.
+    """
+    if search.normal.layout.sensor is not None:
+        return False
+    index, values = search.weighted.fit(search.active)
+    found = [term for term in search.active if term.effect == CONSTANT]
+    own = [float(values[index == search.normal.at[term][0]][0]) for term in found]
+    off, links = int(np.sum(np.abs(own) > OFF)), any(term.effect in LINKS for term in search.active)
+    return off > 1 or (off == 1 and links)
+
+
+def price_of_all(search: Search) -> float:
+    """Price of the constants of all drives together: that of one effect that few arms have."""
+    return search.normal.price * (1 + effects()[CONSTANT].plausibility.prior_penalty)
+
+
+def shares_a_factor(layout: Layout, terms: Sequence[Term]) -> bool:
+    """Whether the terms have torque constants that are known only up to a factor common to them and all masses."""
+    return layout.sensor is None and any(term.effect == CONSTANT for term in terms)
+
+
+def every_constant(search: Search, offered: Sequence[Term]) -> list[Term]:
+    """Where to search from again: every drive's constant free, the links as in the model, all else as found."""
+    drives = [term for term in offered if term.effect == CONSTANT]
+    return [*drives, *(term for term in search.active if term.effect not in (CONSTANT, *LINKS))]

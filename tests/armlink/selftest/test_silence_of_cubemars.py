@@ -1,0 +1,101 @@
+"""Drives that tell no state: what the self-test finds out of their silence, and when they are not driven."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from armlink.arm_file import parse_arm
+from armlink.cli import run
+from armlink.errors import Refused
+from armlink.link.link import Link
+from armlink.selftest.self_test import SelfTest
+from sim_bus.bus.lock_step import LockStepBus
+from sim_bus.simulated_arm import SimulatedArm
+from sim_bus.truth import Truth
+
+
+def content(upright=False, **keys):
+    """Two joints that hang, or, where the first axis is upright, one that gravity never loads."""
+    drive = {"family": "cubemars", "model": "AK80-9", "kp": 30, "kd": 1.0, "can_timeout": 4000} | keys
+    row = {"rated_torque": 9.0, "max_torque": 15.0, "max_torque_rate": 100.0}
+    names = ("hinge_1", "hinge_2")
+    tilt = {"alpha": 1.5707963} if upright else {}
+    return {
+        "name": "pair",
+        "kinematics": {
+            "gravity": [0.0, 0.0, 9.81] if upright else [9.81, 0.0, 0.0],
+            "joints": [
+                {"name": name, "a": 0.25, **tilt, "lower": -2.0, "upper": 2.0 + 0.1 * place}
+                for place, name in enumerate(names)
+            ],
+        },
+        "link": {
+            "bus": {"interface": "armlink_sim", "channel": "pair.yaml"},
+            "joints": [
+                {"name": name, "drive": {**drive, "id": place}, **row} for place, name in enumerate(names, start=1)
+            ],
+        },
+        "sim": {
+            "links": [{"mass": 1.0, "com": [0.2, 0.0, 0.0], "inertia": [0.004] * 3}] * 2,
+            "sensors": {"noise": [0.01, 0.01], "bits": 17},
+            "start": [0.0, 1.5] if upright else [0.0, 0.0],
+        },
+    }
+
+
+def checked(described, fault=None):
+    arm = parse_arm(described, Path("pair.yaml"))
+    simulated = SimulatedArm(arm, Truth.of(arm), 1)
+    if fault:
+        simulated.device(0).inject(fault, 0.0)
+    with Link(arm, LockStepBus(arm=simulated)) as link:
+        results = {(each.joint, each.check): each for each in SelfTest(link).run(True)}
+    return results, simulated
+
+
+def test_a_drive_with_a_can_timeout_lets_go_of_a_joint_that_hung_at_rest():
+    """Where it hangs it carries nothing: it is led to where gravity pulls at it, and falls from there."""
+    results, simulated = checked(content())
+    for name in ("hinge_1", "hinge_2"):
+        silent = results[name, "silence"]
+        assert silent.outcome == "passed", silent.found
+        assert silent.found.startswith("falls within")
+    assert not any(simulated.device(joint).motor.powered and simulated.device(joint).command.kp for joint in (0, 1))
+
+
+def test_a_can_timeout_that_is_stated_and_not_set_is_found():
+    results, _ = checked(content(), "watchdog.off")
+    assert results["hinge_1", "silence"].outcome == "failed"
+    assert "keeps on within" in results["hinge_1", "silence"].found
+    assert "do not drive it" in results["hinge_1", "silence"].found
+    assert results["hinge_2", "silence"].outcome == "passed"
+
+
+def test_a_joint_that_carries_no_load_shows_nothing_and_that_is_said():
+    results, _ = checked(content(upright=True))
+    assert results["hinge_1", "silence"].outcome == "not run"
+    assert "tells no state, and the joint carries no load here" in results["hinge_1", "silence"].found
+    assert results["hinge_2", "silence"].outcome == "passed"
+
+
+def test_without_a_can_timeout_it_is_scanned_and_checked_and_not_driven(tmp_path, monkeypatch, capsys):
+    described = content(can_timeout=0)
+    arm = parse_arm(described, Path("pair.yaml"))
+    simulated = SimulatedArm(arm, Truth.of(arm), 1)
+    with Link(arm, LockStepBus(arm=simulated)) as link:
+        link.start()
+        with pytest.raises(Refused, match="hinge_1: nothing stops its drive when this host dies"):
+            link.enable()
+    assert not any(device.motor.powered for device in (simulated.device(0), simulated.device(1)))
+    monkeypatch.chdir(tmp_path)
+    Path("pair.yaml").write_text(yaml.safe_dump(described))
+    assert run(["scan", "pair.yaml"]) == 0
+    assert capsys.readouterr().err.count("CubeMars AK80-9") == 2
+    assert run(["check", "pair.yaml", "--json", "-"]) == 1
+    checks = {(each["joint"], each["check"]): each for each in json.loads(capsys.readouterr().out)["checks"]}
+    assert checks["hinge_1", "answers"]["outcome"] == "passed"
+    assert checks["hinge_1", "silence"]["outcome"] == "failed"
+    assert "drive.can_timeout" in checks["hinge_1", "set-up"]["found"]
+    assert "it would keep on after its host died" in checks["hinge_1", "enables and holds"]["found"]

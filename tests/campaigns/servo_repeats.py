@@ -1,0 +1,88 @@
+"""Position-only diagnoses of one arm: do bands hold its other motion, and do two recordings give the same parameters?
+
+    python tests/campaigns/servo_repeats.py [--arms 10]
+    python tests/campaigns/servo_repeats.py --sim MODEL.xml --first REC … --second REC … --heldout REC …
+
+Simulated two-joint servo arms with drawn gain, friction and damping, or recordings of a real arm, are diagnosed twice,
+from different recordings. Printed are, of each, the share of the held-out motion within the 90 % band, and the
+parameters of both whose values lie in each other's 95 % intervals, and whose intervals overlap. Exit status 1 if the
+bands hold less than 85 or more than 95 % over all joints, or less than 90 % of the intervals overlap.
+"""
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "sim_gap"))
+from servo_arm import model_text, record, written
+
+from armlink.recording.files import load_recording
+from sim_gap.attribution.diagnose import diagnose
+from sim_gap.attribution.diagnosis import Diagnosis
+
+HELD, OVERLAP = (0.85, 0.95), 0.9
+
+
+def intervals(answer: Diagnosis) -> dict[tuple[str, str, str], tuple[float, float, float]]:
+    """Value and ends of the interval by effect, joint and parameter."""
+    return {
+        (cause.effect, joint, name): (one.value, one.low, one.high)
+        for cause in (*answer.causes, *answer.minor)
+        for joint, values in cause.parameters.items()
+        for name, one in values.items()
+    }
+
+
+def simulated(arms: int, seed: int) -> Iterator[tuple[str, list[Diagnosis]]]:
+    """Both diagnoses of each simulated arm."""
+    random = np.random.default_rng(seed)
+    for number in range(arms):
+        kp, friction, damping = random.uniform(8.0, 25.0), random.uniform(0.05, 0.4), random.uniform(0.4, 1.2)
+        real = model_text(kp=kp, friction=friction, damping=damping)
+        with tempfile.TemporaryDirectory() as folder:
+            sim = written(Path(folder), model_text(kp=120.0, friction=0.0))
+            other = [record(real, 1000 * number + 9, 28.0)]
+            train = [record(real, 1000 * number + k, 35.0) for k in (1, 2)]
+            yield f"arm {number} (kp {kp:.1f}, {friction:.2f} N·m)", [diagnose(sim, [one], other) for one in train]
+
+
+def recorded(asked: argparse.Namespace) -> Iterator[tuple[str, list[Diagnosis]]]:
+    """Both diagnoses of a real arm."""
+    other = [load_recording(path) for path in asked.heldout]
+    sets = [[load_recording(path) for path in paths] for paths in (asked.first, asked.second)]
+    yield asked.sim.parent.name, [diagnose(asked.sim, train, other) for train in sets]
+
+
+def main() -> int:
+    """Diagnose, compare, print."""
+    options = argparse.ArgumentParser(description=__doc__)
+    options.add_argument("--arms", type=int, default=10)
+    options.add_argument("--seed", type=int, default=1)
+    options.add_argument("--sim", type=Path)
+    for name in ("first", "second", "heldout"):
+        options.add_argument(f"--{name}", type=Path, nargs="+")
+    asked = options.parse_args()
+    holds, inside, overlap = [], [], []
+    for name, answers in recorded(asked) if asked.sim else simulated(asked.arms, asked.seed):
+        one, two = (intervals(answer) for answer in answers)
+        for key in sorted(one.keys() & two.keys()):
+            (a, a_low, a_high), (b, b_low, b_high) = one[key], two[key]
+            inside += [a_low <= b <= a_high, b_low <= a <= b_high]
+            overlap.append(max(a_low, b_low) <= min(a_high, b_high))
+            if not overlap[-1]:
+                print(f"  apart: {key} {a:.4g} ({a_low:.4g} to {a_high:.4g}), {b:.4g} ({b_low:.4g} to {b_high:.4g})")
+        own = [answer.band.holds for answer in answers if answer.band is not None]
+        holds += own
+        print(name, answers[0].verdict, "bands hold", *(np.round(each, 3) for each in own), flush=True)
+    share = float(np.mean(holds))
+    print(f"90 % bands hold {share:.1%} of the held-out motion")
+    print(f"{np.mean(inside):.1%} of {len(inside)} values in the other's interval, {np.mean(overlap):.1%} overlap")
+    return int(not HELD[0] <= share <= HELD[1] or np.mean(overlap) < OVERLAP)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
