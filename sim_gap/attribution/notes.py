@@ -90,7 +90,7 @@ def _common_factor(estimate: Estimate | None, fit: ResidualSet) -> tuple[str, ..
         f"{CONSTANT}: a factor common to all torque constants and all masses is not determined by {fit.layout.motor} "
         "alone: with all links 1 % heavier than in the model, all constants, friction and rotor inertias are 1 % "
         f"larger; the intervals allow for masses that are {2 * NOMINAL:.0%} off; creep sweeps with a weighed mass "
-        "(armlink sweep) determine it",
+        "determine it",
     )
 
 
