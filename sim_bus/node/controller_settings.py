@@ -52,5 +52,5 @@ def bring_into_force(node: Node, drives: Drives) -> None:
     drives.quick_stop_option[joint] = node.value(0x605A)
     drives.following_window[joint] = np.inf if window == UNWATCHED else window * UNIT
     loops.deceleration[joint] = max(node.value(0x6085), 1) * UNIT
-    loops.interpolation[joint] = node.value(0x60C2, 1) * 10.0 ** node.value(0x60C2, 2)
+    loops.interpolate(joint, node.value(0x60C2, 1) * 10.0 ** node.value(0x60C2, 2))
     loops.lowest[joint], loops.highest[joint] = node.value(0x607D, 1), node.value(0x607D, 2)

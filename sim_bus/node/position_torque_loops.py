@@ -73,8 +73,10 @@ class Loops:
         self._feed_forward_in, self._profile_velocity = signals[0x60B2, 0], signals[0x6081, 0]
         self._profile_acceleration, self._torque_slope = signals[0x6083, 0], signals[0x6087, 0]
         self._max_torque_in = signals[0x6072, 0]
-        self.interpolation = np.zeros(self.n)
-        """Interpolation time of cyclic position targets (60C2h) [s]."""
+        self.interpolation, self._longest = np.zeros(self.n), 0.0
+        """Interpolation time of cyclic position targets (60C2h) [s], and the longest one."""
+        self._locking = np.ones(self.n)
+        """Share of what a target is ahead or behind that is caught up in an interpolation time."""
         self._aim, self._since = self._target.copy(), 0.0
         """Position target of the last SYNC [rad], and the time since then [s]."""
         self._left = np.zeros(self.n)
@@ -82,6 +84,12 @@ class Loops:
         self.lowest, self.highest = np.full(self.n, -np.inf), np.full(self.n, np.inf)
         """Software position limits (607Dh) in user units."""
         self.reconfigure()
+
+    def interpolate(self, joint: int, seconds: float) -> None:
+        """Set the interpolation time of a joint [s]; 0: targets are reached in the step after SYNC."""
+        self.interpolation[joint] = seconds
+        self._longest = float(self.interpolation.max())
+        self._locking[joint] = 1.0 / LOCKING if seconds > 0.0 else 1.0
 
     def fresh(self, index: int, rows: NDArray[np.intp] | int) -> None:
         """Mark targets in object `index` as received for the joints `rows`."""
@@ -230,12 +238,12 @@ class Loops:
 
         The speed is that of the aims from SYNC to SYNC; what the target is ahead of it or behind is caught up slowly.
         """
-        time = np.maximum(self.interpolation, duration)
-        cycles = np.maximum(np.round(self._since / time), 1.0)
-        rate = (aim - self._aim) / (cycles * time)
-        locking = np.where(self.interpolation > 0.0, LOCKING, 1.0)
-        rate += (aim - rate * time - self._target) / (locking * time)
-        np.copyto(self._rate, rate, where=self._cyclic_position)
+        time, way = np.maximum(self.interpolation, duration), aim - self._aim
+        cycles = round(self._since / max(self._longest, duration))
+        if cycles > 1:
+            way /= cycles
+        behind = aim - way - self._target
+        np.copyto(self._rate, (way + behind * self._locking) / time, where=self._cyclic_position)
         np.copyto(self._aim, aim, where=self._cyclic_position)
         np.subtract(time + EXTRAPOLATED * self.interpolation, duration, out=self._left)
         self._since = 0.0
