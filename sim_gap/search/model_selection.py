@@ -14,7 +14,7 @@ from sim_gap.search.gauss_newton import Values, converged
 from sim_gap.search.normal_equations import NormalEquations, Weighted
 from sim_gap.search.stepwise import TRIES, Search, shortlist
 from sim_gap.search.term import Term
-from sim_gap.search.torque_constants import CONSTANTS, drives_are_off, every_constant, price_of_all
+from sim_gap.search.torque_constants import CONSTANTS, drives_are_off, every_constant, most_are_off, price_of_all
 
 
 def select_model(store: ColumnStore, library: Sequence[str]) -> Search:
@@ -24,7 +24,8 @@ def select_model(store: ColumnStore, library: Sequence[str]) -> Search:
     search = searched_again(store, active, offered)
     if drives_are_off(search):
         again = searched_again(store, every_constant(search, offered), offered, CONSTANTS)
-        search = again if again.score + price_of_all(again) < search.score else search
+        better = again.score + price_of_all(again) < search.score
+        search = again if better and most_are_off(again) else search
     for held in (store, search.normal.store.beside(None)):  # frees the columns of rivals and of the estimate before
         held.keep(search.active)
     return search

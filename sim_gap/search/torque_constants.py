@@ -8,8 +8,6 @@ drive's constant as the model has it and all masses changed in proportion.
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from sim_gap.effects.registry import effects
 from sim_gap.residuals.layout import Layout
 from sim_gap.search.stepwise import Search
@@ -29,11 +27,19 @@ def drives_are_off(search: Search) -> bool:
     """
     if search.normal.layout.sensor is not None:
         return False
+    off, links = _count_off(search), any(term.effect in LINKS for term in search.active)
+    return off > 1 or (off == 1 and links)
+
+
+def most_are_off(search: Search) -> bool:
+    """Whether most drives have another constant: those of an arm come from one maker, and are in doubt together."""
+    return 2 * _count_off(search) > search.normal.layout.n
+
+
+def _count_off(search: Search) -> int:
     index, values = search.weighted.fit(search.active)
     found = [term for term in search.active if term.effect == CONSTANT]
-    own = [float(values[index == search.normal.at[term][0]][0]) for term in found]
-    off, links = int(np.sum(np.abs(own) > OFF)), any(term.effect in LINKS for term in search.active)
-    return off > 1 or (off == 1 and links)
+    return sum(abs(float(values[index == search.normal.at[term][0]][0])) > OFF for term in found)
 
 
 def price_of_all(search: Search) -> float:
