@@ -32,12 +32,7 @@ class CubeMarsDrive(SimulatedDrive):
     @property
     def coding(self) -> Ranges:
         """Ranges by which it really codes and decodes."""
-        if not self.faults:
-            return self._ranges
-        position, velocity, torque, kp, kd = self._ranges
-        return Ranges(
-            position * self.scale("position"), velocity * self.scale("velocity"), torque * self.scale("torque"), kp, kd
-        )
+        return self.miscoded(self._ranges)
 
     @property
     def patience(self) -> float:

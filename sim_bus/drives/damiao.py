@@ -66,10 +66,7 @@ class DamiaoDrive(SimulatedDrive):
         made_of = (told, tuple(faults.items()) if faults else ())
         if made_of != self._coded:
             self._coded = made_of
-            position, velocity, torque = (max(each, LEAST_RANGE) for each in told)
-            self._coding = Ranges(
-                position * self.scale("position"), velocity * self.scale("velocity"), torque * self.scale("torque")
-            )
+            self._coding = self.miscoded(Ranges(*(max(each, LEAST_RANGE) for each in told)))
         return self._coding
 
     @property

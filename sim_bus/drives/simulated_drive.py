@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 
 from armlink.bus.port import CLASSICAL
+from armlink.drives.mit_packing import Ranges
 from sim_bus.drives.motor import Motor
 
 STAGE_TEMPERATURE, MOTOR_TEMPERATURE = 31.0, 33.0
@@ -113,3 +114,12 @@ class SimulatedDrive:
     def scale(self, quantity: str) -> float:
         """Factor by which the drive's coding of `position`, `velocity` or `torque` differs from its registers."""
         return self.faults.get(f"scale.{quantity}", 1.0)
+
+    def miscoded(self, ranges: Ranges) -> Ranges:
+        """Ranges by which a drive with the MIT law really codes and decodes, whose registers tell `ranges`."""
+        if not self.faults:
+            return ranges
+        position, velocity, torque = (self.scale(quantity) for quantity in ("position", "velocity", "torque"))
+        return ranges._replace(
+            position=ranges.position * position, velocity=ranges.velocity * velocity, torque=ranges.torque * torque
+        )

@@ -16,7 +16,8 @@ from armlink.drives.cubemars.settings import CubeMarsSettings
 from armlink.drives.family import Ask
 from armlink.drives.mit_drives import MitDrives, MitKnown
 from armlink.drives.mit_packing import Special, pack_command, special, unwrap
-from armlink.drives.orders import DriveIdentity, Gains, Limits, Mode, Order, Power, Reading, Setup, law_torque
+from armlink.drives.mit_setup import mit_setup, require_window
+from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup, law_torque
 from armlink.drives.traits import Traits
 from armlink.errors import BadInput, BusFault
 
@@ -119,11 +120,7 @@ class CubeMarsDrives(MitDrives):
         known, settings, name = self._known[joint], self._settings[joint], self.names[joint]
         ranges = known.ranges
         assert ranges is not None
-        if not (-ranges.position <= limit.lower and limit.upper <= ranges.position):
-            raise BadInput(
-                f"{name}: its position window {limit.lower:.2f} to {limit.upper:.2f} rad at the drive exceeds the "
-                f"range ±{ranges.position:.2f} rad of its frames: correct zero and direction, or limit the joint"
-            )
+        require_window(name, limit, ranges)
         ask((settings.id, pack_command(NO_COMMAND, ranges)), self._reply_of(joint))
         reply = self._exit(ask, joint)
         if reply is None:
@@ -133,19 +130,8 @@ class CubeMarsDrives(MitDrives):
             )
         self._known[joint] = known = _Known(ranges, known.grid, limit, reply.feedback.position, on=False)
         self.powers[joint], self.faults[joint] = Power.OFF, error_text(reply.error)
-        return Setup(
-            position=reply.feedback.position,
-            torque=0.0,
-            position_step=ranges.position_quantum,
-            modes=frozenset((int(Mode.POSITION), int(Mode.TORQUE))),
-            gains=Gains(settings.kp, settings.kd, ranges.kp, ranges.kd),
-            notes=(_watched(settings), "scales by the arm file: the drive tells none"),
-            scales={
-                "position range, rad": ranges.position,
-                "velocity range, rad/s": ranges.velocity,
-                "torque range, N·m": ranges.torque,
-            },
-        )
+        notes = (_watched(settings), "scales by the arm file: the drive tells none")
+        return mit_setup(reply.feedback.position, settings.kp, settings.kd, ranges, notes)
 
     # ---- cycle
 

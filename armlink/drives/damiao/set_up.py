@@ -8,7 +8,8 @@ from armlink.drives.damiao.frames import READ, TIMEOUT_UNIT, WRITE, Register, St
 from armlink.drives.damiao.settings import DamiaoSettings
 from armlink.drives.family import Ask
 from armlink.drives.mit_packing import Ranges, Special, special
-from armlink.drives.orders import Gains, Limits, Mode, Setup
+from armlink.drives.mit_setup import mit_setup, require_window
+from armlink.drives.orders import Limits, Setup
 from armlink.errors import BadInput, BusFault
 
 SCALES = (Register.POSITION_RANGE, Register.VELOCITY_RANGE, Register.TORQUE_RANGE)
@@ -45,11 +46,7 @@ def prepare(ask: Ask, name: str, settings: DamiaoSettings, limits: Limits) -> tu
             f"the arm file says reply: {settings.reply:#04x}"
         )
     ranges = _ranges(name, known)
-    if not (-ranges.position <= limits.lower and limits.upper <= ranges.position):
-        raise BadInput(
-            f"{name}: its position window {limits.lower:.2f} to {limits.upper:.2f} rad at the drive exceeds the range "
-            f"±{ranges.position:.2f} rad of its frames (register 21): correct zero and direction, or limit the joint"
-        )
+    require_window(name, limits, ranges, " (register 21)")
     _set(ask, name, drive, Register.CONTROL_MODE, frames.MIT_MODE, "the drive is not in MIT mode")
     deadman = round(limits.deadline / TIMEOUT_UNIT)
     _set(ask, name, drive, Register.TIMEOUT, deadman, "it would keep on after its host died")
@@ -94,19 +91,7 @@ def _result(ask: Ask, name: str, settings: DamiaoSettings, ranges: Ranges, known
         f"gear {known[Register.GEAR_RATIO]:g}",
         f"current limit {known[Register.OVER_CURRENT] * known[Register.LARGEST_CURRENT]:g} A",
     ]
-    return Setup(
-        position=reply.feedback.position,
-        torque=0.0,
-        position_step=ranges.position_quantum,
-        modes=frozenset((int(Mode.POSITION), int(Mode.TORQUE))),
-        gains=Gains(settings.kp, settings.kd, ranges.kp, ranges.kd),
-        notes=tuple(notes),
-        scales={
-            "position range, rad": ranges.position,
-            "velocity range, rad/s": ranges.velocity,
-            "torque range, N·m": ranges.torque,
-        },
-    )
+    return mit_setup(reply.feedback.position, settings.kp, settings.kd, ranges, notes)
 
 
 def _answer(drive: int, kind: int, register: int) -> Callable[[int, bytes], float | None]:

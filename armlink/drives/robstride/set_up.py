@@ -5,11 +5,12 @@ from collections.abc import Callable
 from armlink.bus.port import EXTENDED, Frame
 from armlink.drives.family import Ask
 from armlink.drives.mit_packing import Ranges
-from armlink.drives.orders import Gains, Limits, Mode, Setup
+from armlink.drives.mit_setup import mit_setup, require_window
+from armlink.drives.orders import Limits, Setup
 from armlink.drives.robstride import frames
 from armlink.drives.robstride.frames import MOTION_MODE, TIMEOUT_UNIT, Feedback, Parameter, Type
 from armlink.drives.robstride.settings import RobStrideSettings
-from armlink.errors import BadInput, BusFault
+from armlink.errors import BusFault
 
 TOLERANCE = 1e-3
 """Relative difference between a float that was written and its reading."""
@@ -38,11 +39,7 @@ def read_parameter(ask: Ask, settings: RobStrideSettings, parameter: int) -> flo
 
 def prepare(ask: Ask, name: str, settings: RobStrideSettings, limits: Limits, ranges: Ranges) -> Setup:
     """Set-up of one drive: stopped, motion mode, torque limit, deadman, each read back. Raises BusFault, BadInput."""
-    if not (-ranges.position <= limits.lower and limits.upper <= ranges.position):
-        raise BadInput(
-            f"{name}: its position window {limits.lower:.2f} to {limits.upper:.2f} rad at the drive exceeds the range "
-            f"±{ranges.position:.2f} rad of its frames: correct zero and direction, or limit the joint"
-        )
+    require_window(name, limits, ranges)
     feedback = ask(_extended(frames.stop_frame(settings.id, settings.host)), _feedback(settings, ranges))
     if feedback is None:
         raise BusFault(f"{name}: no answer from {settings.address}: is it powered, its id right, its protocol private?")
@@ -51,19 +48,8 @@ def prepare(ask: Ask, name: str, settings: RobStrideSettings, limits: Limits, ra
     _set(ask, name, settings, Parameter.LIMIT_TORQUE, most, "its own torque limit is not in force")
     deadman = round(limits.deadline / TIMEOUT_UNIT)
     _set(ask, name, settings, Parameter.TIMEOUT, deadman, "it would keep on after its host died")
-    return Setup(
-        position=feedback.motion.position,
-        torque=0.0,
-        position_step=2 * ranges.position / 0xFFFF,
-        modes=frozenset((int(Mode.POSITION), int(Mode.TORQUE))),
-        gains=Gains(settings.kp, settings.kd, ranges.kp, ranges.kd),
-        notes=(f"scales of {settings.model} by its manual: the drive has no register for them",),
-        scales={
-            "position range, rad": ranges.position,
-            "velocity range, rad/s": ranges.velocity,
-            "torque range, N·m": ranges.torque,
-        },
-    )
+    notes = (f"scales of {settings.model} by its manual: the drive has no register for them",)
+    return mit_setup(feedback.motion.position, settings.kp, settings.kd, ranges, notes)
 
 
 def _set(ask: Ask, name: str, settings: RobStrideSettings, parameter: Parameter, value: float, otherwise: str) -> None:

@@ -40,6 +40,7 @@ class CommandFrames:
         self._wires: Sequence[Wire] = ()
         self._own: list[dict[int, int]] = []
         """Modes of orders that a device stands in for by another of its own."""
+        self._any_own = False
         self._rows: list[tuple[int, Callable[..., bytes], float, int, float, float, float, int, int]] = []
         m = len(known.names)
         self._sent: list[bytes | None] = [None] * m
@@ -62,6 +63,7 @@ class CommandFrames:
         self._wires, self._rows = wires, []
         pairs = [{int(Mode.POSITION): w.profile.position_mode, int(Mode.TORQUE): w.profile.torque_mode} for w in wires]
         self._own = [{mode: own for mode, own in each.items() if mode != own} for each in pairs]
+        self._any_own = any(self._own)
         for joint, wire in enumerate(wires):
             limits, unit = wire.limits, wire.unit
             low, high = math.ceil(limits.lower / unit.position), math.floor(limits.upper / unit.position)
@@ -130,7 +132,7 @@ class CommandFrames:
 
     def own_modes(self, modes: Sequence[int]) -> Sequence[int]:
         """The devices' modes for those of orders."""
-        return [self.own_mode(joint, mode) for joint, mode in enumerate(modes)] if any(self._own) else modes
+        return [self.own_mode(joint, mode) for joint, mode in enumerate(modes)] if self._any_own else modes
 
     def own_mode(self, joint: int, mode: int) -> int:
         """The device's mode for one of an order."""
