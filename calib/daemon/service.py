@@ -148,7 +148,8 @@ class Service:
             self.arm_state.heard(message)
             self.window.append(message)
             self.recordings.append(message)
-            self.busiest.append(message)
+            if self.configuration.settings.diagnosis.enabled:
+                self.busiest.append(message)
             if self.records.observation is not None:
                 self.records.observation.handle(message)
         elif isinstance(message, Up):
