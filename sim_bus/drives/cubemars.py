@@ -8,7 +8,7 @@ from armlink.drives.cubemars.frames import NO_COMMAND, Reply, pack_reply
 from armlink.drives.cubemars.settings import CubeMarsSettings
 from armlink.drives.mit_packing import MitFeedback, Ranges, Special, special_of, unpack_command
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, SimulatedDrive
+from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, AddressedFront, SimulatedDrive
 
 LOOP_RATE = 40_000.0
 """Cycles of the drive's loop a second: those of the open firmware that it descends from, bgkatz/motorcontrol."""
@@ -95,13 +95,11 @@ class CubeMarsDrive(SimulatedDrive):
         self.motor.free()
 
 
-class CubeMarsFront:
-    """All CubeMars drives on one bus: which of them a frame is for."""
+class CubeMarsFront(AddressedFront[CubeMarsDrive]):
+    """All CubeMars drives on one bus, which have different ids."""
 
     def __init__(self, drives: list[CubeMarsDrive]) -> None:
-        """`drives` have different ids."""
-        self.drives = drives
-        self._addressed = {drive.id: drive for drive in drives}
+        super().__init__(drives, (drive.id for drive in drives))
 
     def on_frame(self, can_id: int, data: bytes) -> None:
         """A frame from the bus."""

@@ -23,7 +23,13 @@ from armlink.drives.moteus.frames import (
     unpack,
 )
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
+from sim_bus.drives.simulated_drive import (
+    BUS_VOLTAGE,
+    MOTOR_TEMPERATURE,
+    STAGE_TEMPERATURE,
+    AddressedFront,
+    SimulatedDrive,
+)
 
 TURN = 2 * math.pi
 DEFAULT_TIMEOUT = 0.1
@@ -240,13 +246,11 @@ def _shown(asked: Subframe, shown: dict[int, float]) -> Subframe:
     return Subframe(REPLY, asked.register, value, INT32 if whole and asked.resolution == FLOAT else asked.resolution)
 
 
-class MoteusFront:
-    """All moteus controllers on one bus: which of them a frame is for."""
+class MoteusFront(AddressedFront[MoteusDrive]):
+    """All moteus controllers on one bus, which have different ids."""
 
     def __init__(self, drives: list[MoteusDrive]) -> None:
-        """`drives` have different ids."""
-        self.drives = drives
-        self._addressed = {drive.drive: drive for drive in drives}
+        super().__init__(drives, (drive.drive for drive in drives))
 
     def on_frame(self, can_id: int, data: bytes) -> None:
         """A frame from the bus."""
@@ -261,5 +265,4 @@ class MoteusFront:
 
     def joint_of(self, can_id: int) -> int | None:
         """See Front."""
-        drive = self._addressed.get(can_id >> 8 & 0x7F) if can_id & 0x1FFFFFFF < 0x10000 else None
-        return None if drive is None else drive.joint
+        return self.joint_at(can_id >> 8 & 0x7F) if can_id & 0x1FFFFFFF < 0x10000 else None

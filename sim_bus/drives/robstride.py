@@ -23,7 +23,12 @@ from armlink.drives.robstride.frames import (
     unpack_value,
 )
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, SimulatedDrive
+from sim_bus.drives.simulated_drive import (
+    BUS_VOLTAGE,
+    MOTOR_TEMPERATURE,
+    AddressedFront,
+    SimulatedDrive,
+)
 
 NO_COMMAND = MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
 HOST = 0xFD
@@ -190,13 +195,11 @@ class RobStrideDrive(SimulatedDrive):
         self._stop()
 
 
-class RobStrideFront:
-    """All RobStride drives on one bus: which of them a frame is for."""
+class RobStrideFront(AddressedFront[RobStrideDrive]):
+    """All RobStride drives on one bus, which have different ids."""
 
     def __init__(self, drives: list[RobStrideDrive]) -> None:
-        """`drives` have different ids."""
-        self.drives = drives
-        self._addressed = {drive.drive: drive for drive in drives}
+        super().__init__(drives, (drive.drive for drive in drives))
 
     def on_frame(self, can_id: int, data: bytes) -> None:
         """A frame from the bus."""
@@ -208,5 +211,4 @@ class RobStrideFront:
 
     def joint_of(self, can_id: int) -> int | None:
         """See Front."""
-        drive = self._addressed.get(can_id >> 8 & 0xFF) if can_id & EXTENDED else None
-        return None if drive is None else drive.joint
+        return self.joint_at(can_id >> 8 & 0xFF) if can_id & EXTENDED else None

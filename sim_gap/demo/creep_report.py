@@ -13,7 +13,7 @@ from calib.report.figures import COLOURS, GREY, PANEL, verify_figure
 from calib.report.page import ReportTable, Section, paragraph, render
 from sim_gap.demo.creep_run import CreepDemo, worst_gain_error
 from sim_gap.demo.show import gap_line
-from sim_gap.demo.summary import SCHEMA, measured, numbers
+from sim_gap.demo.summary import numbers
 from sim_gap.report.page import sections as gap_sections
 
 SHOWN = (("gain", 4), ("offset", 3), ("zero", 4), ("coulomb", 3), ("load", 3), ("viscous", 3))
@@ -21,46 +21,43 @@ SHOWN = (("gain", 4), ("offset", 3), ("zero", 4), ("coulomb", 3), ("load", 3), (
 
 
 def summary(result: CreepDemo) -> dict[str, Any]:
-    """The demo's dictionary; null where a value cannot be determined."""
-    fit, check, truth = result.fit, result.gravity_check, result.truth
+    """`summary.json` of an arm without torque sensors."""
+    fit, truth = result.fit, result.truth
     true = {"gain": truth.gain, "offset": truth.offset, "position_offset": truth.position_offset}
     found = {"gain": "gain", "offset": "offset", "position_offset": "zero"}
-    return {
-        "schema": SCHEMA,
-        "arm": result.arm,
-        "seed": result.seed,
-        "joints": list(result.names),
-        "sensors": {
-            name: {
-                "true": numbers(true[name]),
-                "estimated": numbers(values_told(result.fit, family)),
-                "ci95": _intervals(result, family),
-            }
-            for name, family in found.items()
-        },
-        "friction": {
-            "coulomb": {
-                "true": numbers(result.coulomb),
-                "estimated": numbers(fit.value("coulomb")),
-                "ci95": _intervals(result, "coulomb"),
+    return result.to_json(
+        {
+            "sensors": {
+                name: {
+                    "true": numbers(true[name]),
+                    "estimated": numbers(values_told(result.fit, family)),
+                    "ci95": _intervals(result, family),
+                }
+                for name, family in found.items()
             },
-            **{
-                family: {"estimated": numbers(fit.value(family)), "ci95": _intervals(result, family)}
-                for family in ("load", "viscous", "asymmetry")
+            "friction": {
+                "coulomb": {
+                    "true": numbers(result.coulomb),
+                    "estimated": numbers(fit.value("coulomb")),
+                    "ci95": _intervals(result, "coulomb"),
+                },
+                **{
+                    family: {"estimated": numbers(fit.value(family)), "ci95": _intervals(result, family)}
+                    for family in ("load", "viscous", "asymmetry")
+                },
             },
-        },
-        "not_identifiable": {f"{joint}.{parameter}": reason for (joint, parameter), reason in missing(fit).items()},
-        "disturbed": list(fit.findings),
-        "sag": None
-        if result.sag is None
-        else {
-            "poses": result.sag.poses,
-            "nominal": numbers(result.sag.nominal),
-            "calibrated": numbers(result.sag.calibrated),
-        },
-        "drift": None,
-        **measured(check, result.verify, result.gap, result.bus, result.wall_s, result.sim_s),
-    }
+            "not_identifiable": {f"{joint}.{parameter}": reason for (joint, parameter), reason in missing(fit).items()},
+            "disturbed": list(fit.findings),
+            "sag": None
+            if result.sag is None
+            else {
+                "poses": result.sag.poses,
+                "nominal": numbers(result.sag.nominal),
+                "calibrated": numbers(result.sag.calibrated),
+            },
+            "drift": None,
+        }
+    )
 
 
 def creep_table(result: CreepDemo) -> Table:

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from armlink.link.types import Stats
 from calib.arm.kinematics import model_arm
 from calib.arm.sweep_section import CreepSection, sweep_section
 from calib.creep.fit import CreepFit, fit_creep
@@ -21,15 +20,13 @@ from calib.plan.types import Sweep, SweepPlan
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
 from calib.sweep.dataset import SweepData
-from calib.sweep.verify import Verification
 from gcomp.arrays import Array
-from sim_bus.truth import Truth
-from sim_gap.attribution.diagnosis import Diagnosis
-from sim_gap.demo.bench import Bench, GravityCheck, check_gravity
+from sim_gap.demo.bench import Bench, check_gravity
 from sim_gap.demo.gap import diagnose_recordings
 from sim_gap.demo.motion import record_pair
 from sim_gap.demo.narrator import Narrator
 from sim_gap.demo.sag import Sag, mean_sag, sag_poses
+from sim_gap.demo.summary import DemoRun
 
 QUICK = CreepSection(span=1.1, speeds=(0.2, 0.14))
 """Shorter and faster creeps than on a real arm, for two minutes: they cost a factor of two in precision."""
@@ -38,27 +35,15 @@ RECORDED_S = (30.0, 20.0)
 BY = "armlink demo"
 
 
-@dataclass(frozen=True, eq=False)
-class CreepDemo:
-    """Everything that the demo found, beside the truth."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CreepDemo(DemoRun):
+    """Run of an arm without torque sensors."""
 
-    arm: str
-    seed: int
-    names: tuple[str, ...]
-    truth: Truth
-    """Sensors at the end of the sweeps."""
     coulomb: Array
     """True Coulomb friction (n,) [N·m]."""
-    data: tuple[SweepData, ...]
     fit: CreepFit
     record: CalibrationRecord
-    gravity_check: GravityCheck
-    verify: Verification
     sag: Sag | None
-    gap: Diagnosis
-    bus: Stats
-    wall_s: float
-    sim_s: float
 
 
 def quick(arm: ArmFile) -> ArmFile:
@@ -119,21 +104,21 @@ def run_creep_demo(
     stats = link.stats
     link.disable()
     return CreepDemo(
-        arm.name,
-        seed,
-        link.names,
-        truth,
-        bench.simulated.true_friction,
-        passes,
-        fit,
-        record,
-        gravity_check,
-        check,
-        sag,
-        answer,
-        stats,
-        teller.elapsed,
-        bench.simulated.time,
+        arm=arm.name,
+        seed=seed,
+        names=link.names,
+        truth=truth,
+        coulomb=bench.simulated.true_friction,
+        data=passes,
+        fit=fit,
+        record=record,
+        gravity_check=gravity_check,
+        verify=check,
+        sag=sag,
+        gap=answer,
+        bus=stats,
+        wall_s=teller.elapsed,
+        sim_s=bench.simulated.time,
     )
 
 

@@ -134,21 +134,21 @@ def _work(
     stats = link.stats
     link.disable()
     return DemoResult(
-        arm.name,
-        seed,
-        link.names,
-        bench.described,
-        bench.truth,
-        data,
-        sensors,
-        gravity,
-        gravity_check,
-        check,
-        drift,
-        answer,
-        stats,
-        teller.elapsed,
-        bench.simulated.time,
+        arm=arm.name,
+        seed=seed,
+        names=link.names,
+        described=bench.described,
+        truth=bench.truth,
+        data=data,
+        sensors=sensors,
+        gravity=gravity,
+        gravity_check=gravity_check,
+        verify=check,
+        drift=drift,
+        gap=answer,
+        bus=stats,
+        wall_s=teller.elapsed,
+        sim_s=bench.simulated.time,
     )
 
 
