@@ -22,14 +22,9 @@ from armlink.drives.moteus.frames import (
     pack_reply,
     unpack,
 )
+from sim_bus.drives.front import AddressedFront
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import (
-    BUS_VOLTAGE,
-    MOTOR_TEMPERATURE,
-    STAGE_TEMPERATURE,
-    AddressedFront,
-    SimulatedDrive,
-)
+from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
 
 TURN = 2 * math.pi
 DEFAULT_TIMEOUT = 0.1
@@ -69,7 +64,7 @@ class MoteusDrive(SimulatedDrive):
     def __init__(self, motor: Motor, send: Callable[[int, bytes], None], drive: int, serial: int) -> None:
         """As configured for its joint: gains tuned, encoder at the output."""
         super().__init__(motor, send)
-        self.drive, self.serial = drive, serial
+        self.address, self.serial = drive, serial
         self.mode, self.fault_code = Mode.STOPPED, 0
         self.command: dict[int, float] = dict(COMMANDS)
         self._gains = motor.tuned
@@ -109,7 +104,7 @@ class MoteusDrive(SimulatedDrive):
         self._reply(source, content)
 
     def _reply(self, source: int, content: bytes) -> None:
-        answer = identifier(self.drive, source)
+        answer = identifier(self.address, source)
         self.answer(answer | EXTENDED * (answer > 0x7FF), content)
 
     # ---- registers
@@ -247,10 +242,7 @@ def _shown(asked: Subframe, shown: dict[int, float]) -> Subframe:
 
 
 class MoteusFront(AddressedFront[MoteusDrive]):
-    """All moteus controllers on one bus, which have different ids."""
-
-    def __init__(self, drives: list[MoteusDrive]) -> None:
-        super().__init__(drives, (drive.drive for drive in drives))
+    """All moteus controllers on one bus: which of them a frame is for."""
 
     def on_frame(self, can_id: int, data: bytes) -> None:
         """A frame from the bus."""

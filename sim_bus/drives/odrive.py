@@ -6,14 +6,9 @@ from collections.abc import Callable
 from armlink.bus.port import EXTENDED, REMOTE
 from armlink.drives.odrive import frames
 from armlink.drives.odrive.frames import AxisError, AxisState, Message, identifier, pack, unpack
+from sim_bus.drives.front import AddressedFront
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import (
-    BUS_VOLTAGE,
-    MOTOR_TEMPERATURE,
-    STAGE_TEMPERATURE,
-    AddressedFront,
-    SimulatedDrive,
-)
+from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
 
 TURN = 2 * math.pi
 HEARTBEAT_PERIOD = 0.1
@@ -45,7 +40,7 @@ class ODriveAxis(SimulatedDrive):
     ) -> None:
         """Configured over USB: gains tuned, watchdog time [s] (0: off), period of each cyclic message [s]."""
         super().__init__(motor, send)
-        self.node, self.serial = node, serial
+        self.address, self.serial = node, serial
         self.state, self.errors, self.reason = AxisState.IDLE, 0, 0
         self.control_mode, self.input_mode = frames.POSITION_CONTROL, frames.PASSTHROUGH
         stiffness, damping, integral = motor.tuned
@@ -180,7 +175,7 @@ class ODriveAxis(SimulatedDrive):
             content[Message.TORQUES] = (self._input[2], torque)
         values = content.get(command)
         if values is not None:
-            self.answer(identifier(self.node, command), pack(Message(command), *values))
+            self.answer(identifier(self.address, command), pack(Message(command), *values))
 
     # ---- faults
 
@@ -206,10 +201,7 @@ class ODriveAxis(SimulatedDrive):
 
 
 class ODriveFront(AddressedFront[ODriveAxis]):
-    """All ODrive axes on one bus, which have different node ids."""
-
-    def __init__(self, drives: list[ODriveAxis]) -> None:
-        super().__init__(drives, (drive.node for drive in drives))
+    """All ODrive axes on one bus: which of them a frame is for."""
 
     def on_frame(self, can_id: int, data: bytes) -> None:
         """A frame from the bus."""

@@ -1,8 +1,7 @@
 """Common part of simulated drives that are no CANopen nodes: motor, frames out, injected firmware faults."""
 
 import math
-from collections.abc import Callable, Iterable
-from typing import Generic, TypeVar
+from collections.abc import Callable
 
 from armlink.bus.port import CLASSICAL
 from armlink.drives.mit_packing import Ranges
@@ -18,6 +17,8 @@ class SimulatedDrive:
 
     LATCHES = False
     """Whether a trip of the watchdog ends only by a command of its own."""
+    address: int
+    """Its id on the bus, where its family has but one."""
 
     def __init__(self, motor: Motor, send: Callable[[int, bytes], None]) -> None:
         """`send(can_id, data)` puts a frame on the drive's bus."""
@@ -124,20 +125,3 @@ class SimulatedDrive:
         return ranges._replace(
             position=ranges.position * position, velocity=ranges.velocity * velocity, torque=ranges.torque * torque
         )
-
-
-D = TypeVar("D", bound=SimulatedDrive)
-
-
-class AddressedFront(Generic[D]):
-    """All drives of a family on one bus: which of them a frame is for. A family says where the address stands."""
-
-    def __init__(self, drives: list[D], addresses: Iterable[int]) -> None:
-        """`drives` in arm order, each with an address of its own."""
-        self.drives = drives
-        self._addressed = dict(zip(addresses, drives, strict=True))
-
-    def joint_at(self, address: int) -> int | None:
-        """Joint of the drive with this address."""
-        drive = self._addressed.get(address)
-        return None if drive is None else drive.joint

@@ -35,10 +35,11 @@ RECORDED_S = (30.0, 20.0)
 BY = "armlink demo"
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class CreepDemo(DemoRun):
-    """Run of an arm without torque sensors."""
+@dataclass(frozen=True, eq=False)
+class CreepDemo:
+    """Demo of an arm without torque sensors."""
 
+    run: DemoRun
     coulomb: Array
     """True Coulomb friction (n,) [N·m]."""
     fit: CreepFit
@@ -76,7 +77,7 @@ def run_creep_demo(
             teller.say(each.reason)
     with teller.stage("fitting torque constants, friction, zeros and mass moments, all joints together"):
         fit = fit_creep(arm, passes)
-    truth = bench.simulated.true_sensors
+    bench = replace(bench, truth=bench.simulated.true_sensors)
     record = calibration_record(fit, arm)
     gravity = gravity_record(fit, arm, record)
     store.put(gravity, arm, by=BY, reason="creep sweeps")
@@ -93,7 +94,7 @@ def run_creep_demo(
         check = verify_creeping(
             link, arm, gravity, record, poses=8, seed=seed, progress=lambda k, n: report(k, n, None, f"pose {k}")
         )
-    gravity_check = check_gravity(replace(bench, truth=truth), fit.beta, record, seed)
+    gravity_check = check_gravity(bench, fit.beta, record, seed)
     sag = None
     if nominal is not None:
         with teller.stage("holding the same poses by a tenth of the gains and the records"):
@@ -103,23 +104,8 @@ def run_creep_demo(
         answer = diagnosis.result()
     stats = link.stats
     link.disable()
-    return CreepDemo(
-        arm=arm.name,
-        seed=seed,
-        names=link.names,
-        truth=truth,
-        coulomb=bench.simulated.true_friction,
-        data=passes,
-        fit=fit,
-        record=record,
-        gravity_check=gravity_check,
-        verify=check,
-        sag=sag,
-        gap=answer,
-        bus=stats,
-        wall_s=teller.elapsed,
-        sim_s=bench.simulated.time,
-    )
+    run = DemoRun.of(bench, seed, (gravity_check, check), answer, stats, teller.elapsed)
+    return CreepDemo(run, bench.simulated.true_friction, fit, record, sag)
 
 
 def _passes(bench: Bench, plan: SweepPlan, folder: Path, teller: Narrator) -> tuple[SweepData, ...]:
@@ -150,4 +136,4 @@ def _first_of_each(plan: SweepPlan) -> tuple[Sweep, ...]:
 def worst_gain_error(result: CreepDemo) -> float:
     """Largest relative error of the gains that were found."""
     found = result.fit.found("gain")
-    return float(np.abs(result.fit.value("gain") / result.truth.gain - 1)[found].max(initial=0.0))
+    return float(np.abs(result.fit.value("gain") / result.run.truth.gain - 1)[found].max(initial=0.0))

@@ -36,7 +36,7 @@ from sim_gap.demo.motion import record_pair
 from sim_gap.demo.narrator import Narrator
 from sim_gap.demo.report import write_report
 from sim_gap.demo.show import calibration_table, drift_line, gap_line, verify_table
-from sim_gap.demo.summary import DemoResult, summary
+from sim_gap.demo.summary import DemoResult, DemoRun, summary
 
 RECORDED_S = (40.0, 25.0)
 """Length of the gap's recordings [s]."""
@@ -133,23 +133,8 @@ def _work(
     teller.say(gap_line(answer))
     stats = link.stats
     link.disable()
-    return DemoResult(
-        arm=arm.name,
-        seed=seed,
-        names=link.names,
-        described=bench.described,
-        truth=bench.truth,
-        data=data,
-        sensors=sensors,
-        gravity=gravity,
-        gravity_check=gravity_check,
-        verify=check,
-        drift=drift,
-        gap=answer,
-        bus=stats,
-        wall_s=teller.elapsed,
-        sim_s=bench.simulated.time,
-    )
+    run = DemoRun.of(bench, seed, (gravity_check, check), answer, stats, teller.elapsed)
+    return DemoResult(run, bench.described, sensors, gravity, drift)
 
 
 def _sweeps(bench: Bench, folder: Path, seed: int, teller: Narrator) -> tuple[SweepData, SweepData]:

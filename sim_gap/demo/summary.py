@@ -10,12 +10,11 @@ from armlink.link.types import Stats
 from calib.fit.gravity_fit import GravityFit
 from calib.fit.sensor_fit import SensorFit
 from calib.records.records import Parameter
-from calib.sweep.dataset import SweepData
 from calib.sweep.verify import Verification
 from gcomp.arm.arm import Arm
 from sim_bus.truth import Truth
 from sim_gap.attribution.diagnosis import Diagnosis
-from sim_gap.demo.bench import GravityCheck
+from sim_gap.demo.bench import Bench, GravityCheck
 from sim_gap.demo.drift import Drift
 
 SCHEMA = "armlink.demo/1"
@@ -23,22 +22,34 @@ SHOWN: tuple[tuple[Parameter, int], ...] = (("gain", 4), ("offset", 3), ("positi
 """Sensor parameters that the demo draws and finds, with the digits to show."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class DemoRun:
-    """A run of the demo beside the hidden truth, whatever the arm's drives."""
+    """Setting, hidden truth and measurements of a demo, whatever the arm's drives."""
 
     arm: str
     seed: int
     names: tuple[str, ...]
     truth: Truth
     """Sensors at the end of the sweeps."""
-    data: tuple[SweepData, ...]
     gravity_check: GravityCheck
     verify: Verification
     gap: Diagnosis
     bus: Stats
     wall_s: float
     sim_s: float
+
+    @classmethod
+    def of(
+        cls,
+        bench: Bench,
+        seed: int,
+        checks: tuple[GravityCheck, Verification],
+        gap: Diagnosis,
+        bus: Stats,
+        wall_s: float,
+    ) -> "DemoRun":
+        """As the bench is at the end of the demo, its truth as it was after the sweeps."""
+        return cls(bench.arm.name, seed, bench.link.names, bench.truth, *checks, gap, bus, wall_s, bench.simulated.time)
 
     def to_json(self, found: dict[str, Any]) -> dict[str, Any]:
         """The summary; `found` is what only this kind of demo has. Null where a value cannot be determined."""
@@ -68,10 +79,11 @@ class DemoRun:
         }
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class DemoResult(DemoRun):
-    """Run of an arm with torque sensors, one of which drifts."""
+@dataclass(frozen=True, eq=False)
+class DemoResult:
+    """Demo of an arm with torque sensors, one of which drifts."""
 
+    run: DemoRun
     described: Arm
     sensors: SensorFit
     gravity: GravityFit
@@ -81,11 +93,11 @@ class DemoResult(DemoRun):
 def summary(result: DemoResult) -> dict[str, Any]:
     """`summary.json` of an arm with torque sensors."""
     drift = result.drift
-    return result.to_json(
+    return result.run.to_json(
         {
             "sensors": {
                 name: {
-                    "true": numbers(getattr(result.truth, name)),
+                    "true": numbers(getattr(result.run.truth, name)),
                     "estimated": numbers(result.sensors.value(name)),
                     "ci95": [None if row[0] is None else row for row in map(numbers, result.sensors.ci95(name))],
                 }
@@ -95,7 +107,7 @@ def summary(result: DemoResult) -> dict[str, Any]:
                 f"{joint}.{parameter}": reason for (joint, parameter), reason in result.sensors.reasons.items()
             },
             "drift": {
-                "joint": result.names[drift.joint],
+                "joint": result.run.names[drift.joint],
                 "gain": drift.gain,
                 "offset": drift.offset,
                 "detected_after_s": None if drift.detected is None else number(drift.detected - drift.began),
