@@ -26,13 +26,11 @@ from sim_gap.demo.gap import diagnose_recordings
 from sim_gap.demo.motion import record_pair
 from sim_gap.demo.narrator import Narrator
 from sim_gap.demo.sag import Sag, mean_sag, sag_poses
+from sim_gap.demo.script import BY, CREEP_RECORDED_S
 from sim_gap.demo.summary import DemoRun
 
 QUICK = CreepSection(span=1.1, speeds=(0.2, 0.14))
 """Shorter and faster creeps than on a real arm, for two minutes: they cost a factor of two in precision."""
-RECORDED_S = (30.0, 20.0)
-"""Length of the gap's recordings [s]."""
-BY = "armlink demo"
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +86,7 @@ def run_creep_demo(
     install(admit(record, arm, store), store, link, by=BY, reason="creep sweeps", check=None)
     teller.say(f"record {record.id} kept by the host and in force: it corrects readings and commands")
     with teller.stage("recording motion for the gap diagnosis") as report:
-        recordings = record_pair(bench, record, folder, seed, RECORDED_S, report, motor_only=True)
+        recordings = record_pair(bench, record, folder, seed, CREEP_RECORDED_S, report, motor_only=True)
     diagnosis = other_core.submit(diagnose_recordings, arm.path, recordings)
     with teller.stage("verifying at poses that the fit has not seen, creeping both ways") as report:
         check = verify_creeping(
@@ -104,7 +102,7 @@ def run_creep_demo(
         answer = diagnosis.result()
     stats = link.stats
     link.disable()
-    run = DemoRun.of(bench, seed, (gravity_check, check), answer, stats, teller.elapsed)
+    run = DemoRun(bench, seed, gravity_check, check, answer, stats, teller.elapsed, bench.simulated.time)
     return CreepDemo(run, bench.simulated.true_friction, fit, record, sag)
 
 

@@ -26,11 +26,9 @@ SHOWN: tuple[tuple[Parameter, int], ...] = (("gain", 4), ("offset", 3), ("positi
 class DemoRun:
     """Setting, hidden truth and measurements of a demo, whatever the arm's drives."""
 
-    arm: str
+    bench: Bench
+    """With the truth as it was after the sweeps."""
     seed: int
-    names: tuple[str, ...]
-    truth: Truth
-    """Sensors at the end of the sweeps."""
     gravity_check: GravityCheck
     verify: Verification
     gap: Diagnosis
@@ -38,18 +36,20 @@ class DemoRun:
     wall_s: float
     sim_s: float
 
-    @classmethod
-    def of(
-        cls,
-        bench: Bench,
-        seed: int,
-        checks: tuple[GravityCheck, Verification],
-        gap: Diagnosis,
-        bus: Stats,
-        wall_s: float,
-    ) -> "DemoRun":
-        """As the bench is at the end of the demo, its truth as it was after the sweeps."""
-        return cls(bench.arm.name, seed, bench.link.names, bench.truth, *checks, gap, bus, wall_s, bench.simulated.time)
+    @property
+    def arm(self) -> str:
+        """Name of the arm file."""
+        return self.bench.arm.name
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Joints, base to tip."""
+        return self.bench.link.names
+
+    @property
+    def truth(self) -> Truth:
+        """Of the sensors."""
+        return self.bench.truth
 
     def to_json(self, found: dict[str, Any]) -> dict[str, Any]:
         """The summary; `found` is what only this kind of demo has. Null where a value cannot be determined."""
