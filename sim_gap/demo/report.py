@@ -72,7 +72,9 @@ def _sweeps(result: DemoResult) -> Section:
         " Lines are the fit of all sweeps together: a sinusoid each, A sin(θ + Φ). A colour is a sweep;"
         " those with the reference mass are the larger ones."
     )
-    return Section("Sweeps and their sinusoids", paragraph(text), [sweep_figure(result.described, result.sensors)])
+    return Section(
+        "Sweeps and their sinusoids", paragraph(text), [sweep_figure(result.run.bench.described, result.sensors)]
+    )
 
 
 def _gravity(result: DemoResult) -> Section:

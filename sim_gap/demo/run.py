@@ -131,7 +131,7 @@ def _work(
     stats = link.stats
     link.disable()
     run = DemoRun(bench, seed, gravity_check, check, answer, stats, teller.elapsed, bench.simulated.time)
-    return DemoResult(run, bench.described, sensors, gravity, drift)
+    return DemoResult(run, sensors, gravity, drift)
 
 
 def _sweeps(bench: Bench, folder: Path, seed: int, teller: Narrator) -> tuple[SweepData, SweepData]:

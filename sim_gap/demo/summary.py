@@ -11,7 +11,6 @@ from calib.fit.gravity_fit import GravityFit
 from calib.fit.sensor_fit import SensorFit
 from calib.records.records import Parameter
 from calib.sweep.verify import Verification
-from gcomp.arm.arm import Arm
 from sim_bus.truth import Truth
 from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.demo.bench import Bench, GravityCheck
@@ -84,7 +83,6 @@ class DemoResult:
     """Demo of an arm with torque sensors, one of which drifts."""
 
     run: DemoRun
-    described: Arm
     sensors: SensorFit
     gravity: GravityFit
     drift: Drift
