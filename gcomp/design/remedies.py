@@ -7,7 +7,8 @@ import numpy as np
 
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
-from gcomp.design.sweep_design import SKETCH_STEPS, Sweep, candidate_sweeps, readings_of
+from gcomp.design.choices import SKETCH_STEPS
+from gcomp.design.sweep_design import Sweep, candidate_sweeps, readings_of
 from gcomp.identify.block_qr import fold
 from gcomp.identify.identifiability import analyse, describe_null_space
 from gcomp.identify.natural_units import natural_units
