@@ -6,7 +6,7 @@ python tests/campaigns/mutant_draw.py --explain KEY "why no test can tell it fro
 
 Every mutant has a key: a digest of seed, module, line of source and change. Those with the lowest keys are drawn, so
 that a change of other lines leaves the draw as it is. `--record tests/calib …` first runs tests without a mutant, and
-notes which of them come past which mutants of the draw (mutants/reach.json, which adds up). A mutant is then judged by
+notes which of them come past which mutants of the draw (.mutant_reach.json, which adds up). A mutant is then judged by
 the tests that come past it, the cheapest first, within a limit of processor time. All tests are collected once, and run
 in forked children with the mutant put into the functions that are loaded; where that cannot be done, everything is
 loaded anew. A test that notices, or hangs, must do so twice, and pass without the mutant in between.
@@ -32,12 +32,16 @@ from typing import Any, NamedTuple
 import mutant_probes
 from mutant_reach import Reach
 from mutant_runs import Collected, collected, failing, module_name
-from mutants import PACKAGES, ROOT
+from mutants import PACKAGES, ROOT, mirrors
 from mutations import Mutant, mutants
 
 JOURNAL = Path(__file__).parent / "mutant_draw.jsonl"
 SECONDS = 40.0
-"""Processor time of the tests by which one mutant is judged, as they take it without [s]."""
+"""Time of the tests by which one mutant is judged, as they take it without [s]."""
+SLOWEST = 4.0
+"""How many times as long they may take with it."""
+FEW = 5
+"""Tests that judge a mutant that none comes past."""
 ASKED = 0.9
 NONE = "no change"
 """What is said of a mutant that is written another way only."""
@@ -65,20 +69,26 @@ def ranking(seed: int, modules: list[str]) -> list[Drawn]:
     return sorted(found, key=lambda each: each.key)
 
 
-def chosen(reach: Reach, each: Drawn) -> list[str]:
-    """Tests that come past a mutant, the cheapest first, its module's own before others; as many as its time allows."""
-    own = f"test_{Path(each.target).name}::"
+def chosen(reach: Reach, each: Drawn, seconds: float) -> list[str]:
+    """Tests that come past a mutant, the cheapest first, those that name its module before others; as many as its time
+    allows. Where none does, a few of the nearest, which may notice that the module cannot be loaded.
+    """
+    files = tuple(f"{file}::" for file in mirrors(each.target))
+
+    def seconds_of(test: str) -> float:
+        seen = reach.tests[test]
+        return max(seen["cpu"], 0.5 * seen["clock"]) + 0.02
 
     def cost(test: str) -> float:
-        return (reach.tests[test]["cpu"] + 0.02) * (1 if own in test else 3)
+        return seconds_of(test) * (1 if test.startswith(files) else 4)
 
     tests, spent = [], 0.0
     for test in sorted(reach.of(each.key), key=cost):
-        tests.append(test)
-        spent += reach.tests[test]["cpu"]
-        if spent > SECONDS:
+        spent += seconds_of(test)
+        if tests and spent > seconds:
             break
-    return tests
+        tests.append(test)
+    return tests or sorted(reach.near(each.target), key=cost)[:FEW]
 
 
 class Journal:
@@ -115,7 +125,7 @@ class Judge:
     """Judges mutants one after the other, with their tests collected."""
 
     def __init__(self, journal: Journal, todo: list[tuple[Drawn, list[str]]]) -> None:
-        self._journal, self._todo, self._unsound = journal, todo, set[str]()
+        self._journal, self._todo, self._sound = journal, todo, dict[str, bool]()
 
     def __call__(self, server: Collected) -> None:
         """Judge all."""
@@ -128,26 +138,32 @@ class Judge:
 
     def _one(self, server: Collected, each: Drawn, source: str, tests: list[str]) -> str:
         """The test that notices, twice, and passes without the mutant; an empty text if none does."""
-        tests = [test for test in server.known(tests) if test not in self._unsound]
+        tests = [test for test in server.known(tests) if self._sound.get(test, True)]
         runs = functools.partial(server.failing, each.target)
         if tests and not server.can(each.target, source):
             runs = functools.partial(failing, each.target)
-        while tests and (found := runs(source, tests, SECONDS * 2)):
-            if not runs(None, found[:1], SECONDS) and runs(source, found[:1], SECONDS):
-                return found[0]
-            self._unsound.add(found[0])
-            tests = [test for test in tests if test != found[0]]
+        while tests and (found := runs(source, tests, SLOWEST * SECONDS)):
+            test = found[0]
+            if "::" not in test or (runs(source, [test], SLOWEST * SECONDS) and self._is_sound(server, test)):
+                return test  # the file alone: it cannot be imported
+            tests = [each for each in tests if each != test]
         return ""
 
+    def _is_sound(self, server: Collected, test: str) -> bool:
+        """Whether a test passes without a mutant."""
+        if test not in self._sound:
+            self._sound[test] = not server.failing("", None, [test], SLOWEST * SECONDS)
+        return self._sound[test]
 
-def judge(journal: Journal, drawn: list[Drawn], limit: int, again: bool) -> None:
+
+def judge(journal: Journal, drawn: list[Drawn], limit: int, again: bool, seconds: float) -> None:
     """Judge the mutants that have no line, or the survivors `again`; at most so many."""
     reach = Reach()
 
     def open_(known: dict[str, Any]) -> bool:
         return not known or (again and not known["by"] and "why" not in known)
 
-    todo = [(each, chosen(reach, each)) for each in drawn if open_(journal.lines.get(each.key, {}))][:limit]
+    todo = [(each, chosen(reach, each, seconds)) for each in drawn if open_(journal.lines.get(each.key, {}))][:limit]
     if todo:
         sys.dont_write_bytecode = False  # of the tests; a mutant has none
         collected(sorted({test.split("::")[0] for _, tests in todo for test in tests}), Judge(journal, todo))
@@ -178,8 +194,10 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=23)
     parser.add_argument("--journal", type=Path, default=JOURNAL)
     parser.add_argument("--modules", nargs="+", default=[f"{name}/**/*.py" for name in PACKAGES], metavar="GLOB")
+    parser.add_argument("--within", nargs="+", default=[""], metavar="FOLDER", help="judge those of the draw in these")
     parser.add_argument("--limit", type=int, default=10**6, help="judge at most this many now")
     parser.add_argument("--record", nargs="+", default=[], metavar="TESTS", help="note what these tests come past")
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="time of the tests that judge one mutant")
     parser.add_argument("--again", action="store_true", help="judge the survivors that have no explanation once more")
     parser.add_argument("--report", action="store_true", help="judge none, say what is known")
     parser.add_argument("--explain", nargs=2, metavar=("KEY", "WHY"))
@@ -196,7 +214,8 @@ def main() -> int:
             record(drawn, [tests])
         return 0
     if not given.report:
-        judge(journal, drawn, given.limit, given.again)
+        here = [each for each in drawn if each.target.startswith(tuple(given.within))]
+        judge(journal, here, given.limit, given.again, given.seconds)
     return report(journal, drawn)
 
 

@@ -20,7 +20,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent.parent
 OPTIONS = ["-q", "-p", "no:cacheprovider", "-m", "not vcan and not slow"]
-MOST, STILL = 12.0, 60.0
+MOST, STILL = 5.0, 30.0
 """Processor time and time by the clock after which a test is cut short: it is too dear to judge mutants by [s]."""
 
 
@@ -83,7 +83,7 @@ class Record:
 class Reach:
     """What was recorded, in a file that adds up."""
 
-    def __init__(self, path: Path = ROOT / "mutants" / "reach.json") -> None:
+    def __init__(self, path: Path = ROOT / ".mutant_reach.json") -> None:
         self.path = path
         self.tests, self.hits = dict[str, dict[str, Any]](), dict[str, list[str]]()
         if path.exists():
@@ -100,7 +100,6 @@ class Reach:
                 found[key].add(owner)
         self.tests.update(tests)
         self.hits = {key: sorted(owners) for key, owners in found.items()}
-        self.path.parent.mkdir(exist_ok=True)
         self.path.write_text(json.dumps({"tests": self.tests, "hits": self.hits}), encoding="utf-8")
 
     def of(self, key: str) -> list[str]:
@@ -111,6 +110,14 @@ class Reach:
             for test, seen in self.tests.items()
             if not seen["failed"] and (test in owners or owners.intersection(seen["fixtures"]))
         ]
+
+    def near(self, target: str) -> list[str]:
+        """Tests in the folder that mirrors a module's, or the nearest above that has any."""
+        for folder in Path(target).parents:
+            found = [test for test in self.tests if test.startswith(f"{Path('tests') / folder}/")]
+            if found := [test for test in found if not self.tests[test]["failed"]]:
+                return found
+        return []
 
 
 def main() -> int:

@@ -137,6 +137,7 @@ class Collected:
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         """In place of running every test once."""
+        session.config.pluginmanager.unregister(name="terminalreporter")
         self._items, self._live = {item.nodeid: item for item in session.items}, load()
         self._judge(self)
         return True
