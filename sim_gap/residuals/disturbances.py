@@ -22,7 +22,7 @@ AROUND_S = 0.2
 """Time before and after that is left out, too: the length of the comparison's low pass [s]."""
 LONGEST_S = 0.6
 """Longest disturbance, without the time around it [s]: what lasts is a property of the arm, or a body it took up."""
-RARE = 0.01
+RARE = 0.02
 """Largest share of a recording's time that is disturbed: what happens more often is a property of the arm."""
 
 Mask = NDArray[np.bool_]

@@ -4,9 +4,9 @@
 
 One line a draw, then what was noticed by kind; the recordings as they are must be no finding. Exit status 1 below 98 %
 of the draws that can be told. Which can is judged apart from the check, by MuJoCo's inverse dynamics: a draw changes
-nothing that the recording could tell if the nominal model fits the spoiled recording as well as the sound one, to
-within the difference of the halves of the sound one. So it is with the zero of a last joint on whose axis its mass
-lies, or with two wrist joints of which friction is all that is read.
+nothing that the recording could tell if the nominal model fits the spoiled recording as well as the sound one, to 5 %.
+So it is with the zero of a last joint on whose axis its mass lies, or with two wrist joints of which friction is all
+that is read.
 """
 
 import argparse
@@ -30,6 +30,9 @@ from sim_gap.model.load import load_model
 
 ARMS = (("ur10e", "train_a"), ("tx40", "recording"), ("ur10", "recording"), ("panda", "recording"), ("lwr4", "train"))
 GOAL = 0.98
+AS_WELL = 0.05
+"""Most by which the model may fit a spoiled recording worse, logarithm of RMS, for it to fit as well: masses that are
+off by a few per cent do as much."""
 Corruption = Callable[[Recording, np.random.Generator], Recording | None]
 
 
@@ -215,17 +218,14 @@ def left_by_mujoco(model: mujoco.MjModel, recording: Recording) -> np.ndarray:
     return left
 
 
-def tells(model: mujoco.MjModel, sound: Recording, spoiled: Recording) -> tuple[float, float]:
-    """How much worse the nominal model fits the spoiled recording, and how much its halves differ when it is sound.
+def worse_by(model: mujoco.MjModel, sound: Recording, spoiled: Recording) -> float:
+    """How much worse the nominal model fits the spoiled recording: logarithm of RMS, mean over the joints."""
 
-    Each is a mean over the joints of a logarithm of RMS; a half's model and friction are those of the whole.
-    """
-
-    def size(left: np.ndarray) -> float:
+    def size(recording: Recording) -> float:
+        left = left_by_mujoco(model, recording)
         return float(np.mean(np.log(np.sqrt(np.mean(left**2, axis=0)) + 1e-6)))
 
-    first, second = np.array_split(whole := left_by_mujoco(model, sound), 2)
-    return size(left_by_mujoco(model, spoiled)) - size(whole), abs(size(first) - size(second))
+    return size(spoiled) - size(sound)
 
 
 def main() -> int:
@@ -253,10 +253,9 @@ def main() -> int:
         noticed[kind] += bool(text)
         if not text:
             model = mujoco.MjModel.from_xml_path(str(asked.realdata / folder / "sim.xml"))
-            worse, halves = tells(model, recording, spoiled)
-            unseen += worse <= halves
-            verdict = "cannot be told" if worse <= halves else "MISSED"
-            text = f"NOTHING, {verdict}: fits worse by {worse:.3f}, halves of the sound one differ by {halves:.3f}"
+            worse = worse_by(model, recording, spoiled)
+            unseen += worse <= AS_WELL
+            text = f"NOTHING, {'cannot be told' if worse <= AS_WELL else 'MISSED'}: fits worse by {worse:.3f}"
         print(f"{kind:20s} {folder:6s} {text}"[:200], flush=True)
     for kind in seen:
         print(f"{kind:20s} {noticed[kind]} of {seen[kind]}")
