@@ -17,20 +17,15 @@ from calib.plan.collisions import check_plan
 from calib.plan.sweep_plan import plan_sweep
 from calib.plan.types import Sweep, SweepPlan
 from calib.sweep.dataset import DataWriter, Manifest, PlanLine, SweepData, load_data
-from calib.sweep.scout import SCOUT, SLOWER, rough_model, run_scout
+from calib.sweep.scout import SCOUT, rough_model, run_scout
 from calib.sweep.stalls import OnStall, bridged, give_up, restart, stall_line
+from calib.sweep.thresholds import APPROACH, GAP, RETRIES, SLOWER
 from gcomp.arrays import Array
 
 Progress = Callable[[int, int, float, str], None]
 """Called after each reading with (readings done, readings in all, seconds left, what is being done)."""
 
-APPROACH = 0.03
-"""Each step is approached over at least this way [rad]."""
-GAP = 0.02
-"""Distance from a stop at which creeping begins [rad]."""
 BARS = "▁▂▃▄▅▆▇█"
-RETRIES = 3
-"""How often a joint that slipped or stalled is tried again before the sweep gives up."""
 
 
 def run_sweep(

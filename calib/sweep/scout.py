@@ -12,12 +12,9 @@ from calib.motion.mover import Mover, Stalled
 from calib.motion.static_reading import StaticReading, stack
 from calib.plan.rough_gravity import GravityGuess, guess_gravity
 from calib.plan.types import SweepPlan
+from calib.sweep.thresholds import SCOUT_ACCELERATION, SLOWER, SLOWEST
 
 SCOUT = "scout"
-SCOUT_ACCELERATION = 1.0
-"""Nothing is known of the arm's weight yet [rad/s²]."""
-SLOWER, SLOWEST = 0.4, 0.15
-"""Factor on the acceleration after a joint did not follow, and where that ends [rad/s²]."""
 
 
 def run_scout(mover: Mover, plan: SweepPlan, done: Collection[int], save: Callable[[StaticReading], None]) -> None:

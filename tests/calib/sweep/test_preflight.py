@@ -15,7 +15,8 @@ from armlink.errors import Refused
 from armlink.link.link import Link
 from calib.arm.drive_limits import Limits
 from calib.motion.encoder_check import EncoderFault
-from calib.sweep.preflight import HOT, find_stops, listen
+from calib.sweep.preflight import find_stops, listen
+from calib.sweep.thresholds import HOT
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.sim_section import EffectEntry
 from sim_bus.simulated_arm import SimulatedArm
