@@ -71,7 +71,8 @@ def ranking(seed: int, modules: list[str]) -> list[Drawn]:
 
 def chosen(reach: Reach, each: Drawn, seconds: float) -> list[str]:
     """Tests that come past a mutant, the cheapest first, those that name its module before others; as many as its time
-    allows. Where none does, a few of the nearest, which may notice that the module cannot be loaded.
+    allows. Where none does, files of tests that name the module and were not recorded; else a few of the nearest, which
+    may notice that the module cannot be loaded.
     """
     files = tuple(f"{file}::" for file in mirrors(each.target))
 
@@ -88,6 +89,8 @@ def chosen(reach: Reach, each: Drawn, seconds: float) -> list[str]:
         if tests and spent > seconds:
             break
         tests.append(test)
+    if not tests:
+        tests = [file.rstrip(":") for file in files if not reach.has(file)]
     return tests or sorted(reach.near(each.target), key=cost)[:FEW]
 
 
@@ -124,8 +127,9 @@ def record(drawn: list[Drawn], tests: list[str]) -> None:
 class Judge:
     """Judges mutants one after the other, with their tests collected."""
 
-    def __init__(self, journal: Journal, todo: list[tuple[Drawn, list[str]]]) -> None:
-        self._journal, self._todo, self._sound = journal, todo, dict[str, bool]()
+    def __init__(self, journal: Journal, todo: list[tuple[Drawn, list[str]]], seconds: float) -> None:
+        self._journal, self._todo, self._seconds = journal, todo, seconds
+        self._sound = dict[str, bool]()
 
     def __call__(self, server: Collected) -> None:
         """Judge all."""
@@ -142,7 +146,7 @@ class Judge:
         runs = functools.partial(server.failing, each.target)
         if tests and not server.can(each.target, source):
             runs = functools.partial(failing, each.target)
-        while tests and (found := runs(source, tests, SLOWEST * SECONDS)):
+        while tests and (found := runs(source, tests, self._seconds)):
             test = found[0]
             if "::" not in test or (runs(source, [test], SLOWEST * SECONDS) and self._is_sound(server, test)):
                 return test  # the file alone: it cannot be imported
@@ -166,7 +170,10 @@ def judge(journal: Journal, drawn: list[Drawn], limit: int, again: bool, seconds
     todo = [(each, chosen(reach, each, seconds)) for each in drawn if open_(journal.lines.get(each.key, {}))][:limit]
     if todo:
         sys.dont_write_bytecode = False  # of the tests; a mutant has none
-        collected(sorted({test.split("::")[0] for _, tests in todo for test in tests}), Judge(journal, todo))
+        collected(
+            sorted({test.split("::")[0] for _, tests in todo for test in tests}),
+            Judge(journal, todo, SLOWEST * seconds),
+        )
 
 
 def report(journal: Journal, drawn: list[Drawn]) -> int:

@@ -111,6 +111,10 @@ class Reach:
             if not seen["failed"] and (test in owners or owners.intersection(seen["fixtures"]))
         ]
 
+    def has(self, file: str) -> bool:
+        """Whether tests of a file were recorded."""
+        return any(test.startswith(file) for test in self.tests)
+
     def near(self, target: str) -> list[str]:
         """Tests in the folder that mirrors a module's, or the nearest above that has any."""
         for folder in Path(target).parents:

@@ -143,8 +143,10 @@ class Collected:
         return True
 
     def known(self, tests: list[str]) -> list[str]:
-        """Those that are still there."""
-        return [test for test in tests if test in self._items]
+        """Those that are still there; of a file all."""
+        files = {test for test in tests if "::" not in test}
+        inside = [test for test in self._items if test.partition("::")[0] in files]
+        return [*(test for test in tests if test in self._items), *inside]
 
     def can(self, target: str, source: str) -> bool:
         """Whether a mutant can be put in."""
