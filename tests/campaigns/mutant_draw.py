@@ -217,8 +217,7 @@ def main() -> int:
         return 0
     drawn = ranking(given.seed, given.modules)[: given.draw]
     if given.record:
-        for tests in given.record:
-            record(drawn, [tests])
+        record(drawn, given.record)
         return 0
     if not given.report:
         here = [each for each in drawn if each.target.startswith(tuple(given.within))]
