@@ -7,9 +7,9 @@ python tests/campaigns/mutant_draw.py --explain KEY "why no test can tell it fro
 Every mutant has a key: a digest of seed, module, line of source and change. Those with the lowest keys are drawn, so
 that a change of other lines leaves the draw as it is. `--record tests/calib …` first runs tests without a mutant, and
 notes which of them come past which mutants of the draw (.mutant_reach.json, which adds up). A mutant is then judged by
-the tests that come past it, the cheapest first, within a limit of processor time. All tests are collected once, and run
-in forked children with the mutant put into the functions that are loaded; where that cannot be done, everything is
-loaded anew. A test that notices, or hangs, must do so twice, and pass without the mutant in between.
+the tests that come past it, the cheapest first, within a limit of time; before them by those added since. All tests are
+collected once, and run in forked children with the mutant put into the functions that are loaded; where that cannot be
+done, everything is loaded anew. A test that notices, or hangs, must do so twice, and pass without the mutant as well.
 
 What was found is appended to the journal, one line of JSON each; a mutant that has a line is not judged again, so that
 the runs of several days add up. `--again` judges the survivors once more, by tests that were added. Exit status 1 if
@@ -127,8 +127,8 @@ def record(drawn: list[Drawn], tests: list[str]) -> None:
 class Judge:
     """Judges mutants one after the other, with their tests collected."""
 
-    def __init__(self, journal: Journal, todo: list[tuple[Drawn, list[str]]], seconds: float) -> None:
-        self._journal, self._todo, self._seconds = journal, todo, seconds
+    def __init__(self, journal: Journal, reach: Reach, todo: list[tuple[Drawn, list[str]]], seconds: float) -> None:
+        self._journal, self._reach, self._todo, self._seconds = journal, reach, todo, seconds
         self._sound = dict[str, bool]()
 
     def __call__(self, server: Collected) -> None:
@@ -142,7 +142,10 @@ class Judge:
 
     def _one(self, server: Collected, each: Drawn, source: str, tests: list[str]) -> str:
         """The test that notices, twice, and passes without the mutant; an empty text if none does."""
-        tests = [test for test in server.known(tests) if self._sound.get(test, True)]
+        folder = f"tests/{each.target.split('/')[0]}/"
+        new = [test for test in server.known(self._reach.changed(folder)) if test not in self._reach.tests]
+        tests = [*(test for test in new if not server.draws(test)), *server.known(tests), *filter(server.draws, new)]
+        tests = [test for test in tests if self._sound.get(test, True)]
         runs = functools.partial(server.failing, each.target)
         if tests and not server.can(each.target, source):
             runs = functools.partial(failing, each.target)
@@ -170,10 +173,10 @@ def judge(journal: Journal, drawn: list[Drawn], limit: int, again: bool, seconds
     todo = [(each, chosen(reach, each, seconds)) for each in drawn if open_(journal.lines.get(each.key, {}))][:limit]
     if todo:
         sys.dont_write_bytecode = False  # of the tests; a mutant has none
-        collected(
-            sorted({test.split("::")[0] for _, tests in todo for test in tests}),
-            Judge(journal, todo, SLOWEST * seconds),
-        )
+        folders = {each.target.split("/")[0] for each, _ in todo}
+        files = {test.split("::")[0] for _, tests in todo for test in tests}
+        files.update(file for folder in folders for file in reach.changed(f"tests/{folder}/"))
+        collected(sorted(files), Judge(journal, reach, todo, SLOWEST * seconds))
 
 
 def report(journal: Journal, drawn: list[Drawn]) -> int:

@@ -142,6 +142,10 @@ class Collected:
         self._judge(self)
         return True
 
+    def draws(self, test: str) -> bool:
+        """Whether a test is one of many drawn examples, which takes long."""
+        return hasattr(getattr(self._items[test], "function", None), "hypothesis")
+
     def known(self, tests: list[str]) -> list[str]:
         """Those that are still there; of a file all."""
         files = {test for test in tests if "::" not in test}
