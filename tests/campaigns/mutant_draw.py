@@ -26,6 +26,7 @@ import sys
 import tempfile
 import time
 from collections import Counter, defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -163,14 +164,18 @@ class Judge:
         return self._sound[test]
 
 
-def judge(journal: Journal, drawn: list[Drawn], limit: int, again: bool, seconds: float) -> None:
-    """Judge the mutants that have no line, or the survivors `again`; at most so many."""
-    reach = Reach()
+def judge(
+    journal: Journal, drawn: list[Drawn], limit: int, again: bool, seconds: float, by: Sequence[str] = ()
+) -> None:
+    """Judge the mutants that have no line, or the survivors `again`; at most so many. Files `by` replace the choice."""
+    reach = Reach() if not by else Reach(Path(os.devnull))
 
     def open_(known: dict[str, Any]) -> bool:
         return not known or (again and not known["by"] and "why" not in known)
 
-    todo = [(each, chosen(reach, each, seconds)) for each in drawn if open_(journal.lines.get(each.key, {}))][:limit]
+    todo = [(each, [*by] or chosen(reach, each, seconds)) for each in drawn if open_(journal.lines.get(each.key, {}))][
+        :limit
+    ]
     if todo:
         sys.dont_write_bytecode = False  # of the tests; a mutant has none
         folders = {each.target.split("/")[0] for each, _ in todo}
@@ -205,6 +210,8 @@ def main() -> int:
     parser.add_argument("--journal", type=Path, default=JOURNAL)
     parser.add_argument("--modules", nargs="+", default=[f"{name}/**/*.py" for name in PACKAGES], metavar="GLOB")
     parser.add_argument("--within", nargs="+", default=[""], metavar="FOLDER", help="judge those of the draw in these")
+    parser.add_argument("--keys", nargs="+", default=[""], metavar="KEY", help="judge these of the draw alone")
+    parser.add_argument("--by", nargs="+", default=[], metavar="FILE", help="judge by these tests")
     parser.add_argument("--limit", type=int, default=10**6, help="judge at most this many now")
     parser.add_argument("--record", nargs="+", default=[], metavar="TESTS", help="note what these tests come past")
     parser.add_argument("--seconds", type=float, default=SECONDS, help="time of the tests that judge one mutant")
@@ -224,7 +231,8 @@ def main() -> int:
         return 0
     if not given.report:
         here = [each for each in drawn if each.target.startswith(tuple(given.within))]
-        judge(journal, here, given.limit, given.again, given.seconds)
+        here = [each for each in here if each.key.startswith(tuple(given.keys))]
+        judge(journal, here, given.limit, given.again, given.seconds, given.by)
     return report(journal, drawn)
 
 

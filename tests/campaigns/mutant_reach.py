@@ -88,7 +88,7 @@ class Reach:
     def __init__(self, path: Path = ROOT / ".mutant_reach.json") -> None:
         self.path = path
         self.tests, self.hits = dict[str, dict[str, Any]](), dict[str, list[str]]()
-        if path.exists():
+        if path.is_file():
             content = json.loads(path.read_text(encoding="utf-8"))
             self.tests, self.hits = content["tests"], content["hits"]
 
