@@ -79,12 +79,13 @@ def chosen(reach: Reach, each: Drawn, seconds: float) -> list[str]:
 
     def seconds_of(test: str) -> float:
         seen = reach.tests[test]
-        return max(seen["cpu"], 0.5 * seen["clock"]) + 0.02
+        return max(float(seen["cpu"]), 0.5 * float(seen["clock"])) + 0.02
 
     def cost(test: str) -> float:
         return seconds_of(test) * (1 if test.startswith(files) else 4)
 
-    tests, spent = [], 0.0
+    tests: list[str] = []
+    spent = 0.0
     for test in sorted(reach.of(each.key), key=cost):
         spent += seconds_of(test)
         if tests and spent > seconds:
