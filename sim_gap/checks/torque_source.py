@@ -26,6 +26,9 @@ SURE, SCREENED = 0.7, 0.3
 """Fall of the cost from which a delay is certain; share of it that a delay must reach on few rows to be looked at."""
 REPEATS = 0.5
 """Share of that fall by which any other minimum of the cost must be higher."""
+ABSENT, HELD = 3.0, 0.2
+"""The model's torque is absent from a joint's reading if its own part is this multiple of all that is read, and comes
+back with a coefficient below this; on recordings of real arms the first stays below 1.2."""
 UNRELATED = 0.4
 """Correlation with the model's torque below which a reading that never changes its sign does not follow it."""
 
@@ -42,6 +45,25 @@ def find_scale(arm: RigidArm, fit: RigidFit, motion: Motion, stated: Corrections
     evidence = f"reads the model's torque times {joints}: amperes, or another unit?"
     option = f"--units {motion.channel}=A:K (N·m/A at the joint, or one each: K1;K2;…), or {motion.channel}=N·m"
     return [Finding("scale", motion.channel, "all", evidence, option, False)]
+
+
+def find_absent(arm: RigidArm, fit: RigidFit, motion: Motion, stated: Corrections) -> list[Finding]:
+    """Joints whose link-side sensor should read several times all that it does: the column of another joint.
+
+    A column that varies with another joint's motion may fit as well as the joint's own, by a spring or a rotor that no
+    arm has, so that nothing is gained by an exchange. A motor is not judged: its gear's friction may hold the load.
+    """
+    if motion.channel != "tau" or stated.states("units", f"{motion.channel}_1") or stated.columns or stated.joints:
+        return []
+    found = []
+    for j in np.flatnonzero((fit.own_share > ABSENT) & (fit.scale < HELD)).tolist():
+        evidence = (
+            f"varies by {fit.spread[j]:.2g} N·m, while the model's torque varies by {fit.own_share[j]:.0f} times as "
+            "much and is not in it: another joint's column?"
+        )
+        option = f"--map {motion.channel}_{j + 1}=COLUMN, or --units {motion.channel}=N·m if it is right"
+        found.append(Finding("order", motion.channel, arm.names[j], evidence, option, False))
+    return found
 
 
 def _weighted_median(values: Array, weights: Array) -> float:
