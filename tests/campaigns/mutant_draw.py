@@ -7,9 +7,9 @@ python tests/campaigns/mutant_draw.py --explain KEY "why no test can tell it fro
 Every mutant has a key: a digest of seed, module, line of source and change. Those with the lowest keys are drawn, so
 that a change of other lines leaves the draw as it is. `--record tests/calib …` first runs tests without a mutant, and
 notes which of them come past which mutants of the draw (.mutant_reach.json, which adds up). A mutant is then judged by
-the tests that come past it, the cheapest first, within a limit of processor time. All tests are collected once, and run
-in forked children with the mutant put into the functions that are loaded; where that cannot be done, everything is
-loaded anew. A test that notices, or hangs, must do so twice, and pass without the mutant in between.
+the tests that come past it, the cheapest first, within a limit of time; before them by those added since. All tests are
+collected once, and run in forked children with the mutant put into the functions that are loaded; where that cannot be
+done, everything is loaded anew. A test that notices, or hangs, must do so twice, and pass without the mutant as well.
 
 What was found is appended to the journal, one line of JSON each; a mutant that has a line is not judged again, so that
 the runs of several days add up. `--again` judges the survivors once more, by tests that were added. Exit status 1 if
@@ -26,6 +26,7 @@ import sys
 import tempfile
 import time
 from collections import Counter, defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -71,23 +72,27 @@ def ranking(seed: int, modules: list[str]) -> list[Drawn]:
 
 def chosen(reach: Reach, each: Drawn, seconds: float) -> list[str]:
     """Tests that come past a mutant, the cheapest first, those that name its module before others; as many as its time
-    allows. Where none does, a few of the nearest, which may notice that the module cannot be loaded.
+    allows. Where none does, files of tests that name the module and were not recorded; else a few of the nearest, which
+    may notice that the module cannot be loaded.
     """
     files = tuple(f"{file}::" for file in mirrors(each.target))
 
     def seconds_of(test: str) -> float:
         seen = reach.tests[test]
-        return max(seen["cpu"], 0.5 * seen["clock"]) + 0.02
+        return max(float(seen["cpu"]), 0.5 * float(seen["clock"])) + 0.02
 
     def cost(test: str) -> float:
         return seconds_of(test) * (1 if test.startswith(files) else 4)
 
-    tests, spent = [], 0.0
+    tests: list[str] = []
+    spent = 0.0
     for test in sorted(reach.of(each.key), key=cost):
         spent += seconds_of(test)
         if tests and spent > seconds:
             break
         tests.append(test)
+    if not tests:
+        tests = [file.rstrip(":") for file in files if not reach.has(file)]
     return tests or sorted(reach.near(each.target), key=cost)[:FEW]
 
 
@@ -124,8 +129,9 @@ def record(drawn: list[Drawn], tests: list[str]) -> None:
 class Judge:
     """Judges mutants one after the other, with their tests collected."""
 
-    def __init__(self, journal: Journal, todo: list[tuple[Drawn, list[str]]]) -> None:
-        self._journal, self._todo, self._sound = journal, todo, dict[str, bool]()
+    def __init__(self, journal: Journal, reach: Reach, todo: list[tuple[Drawn, list[str]]], seconds: float) -> None:
+        self._journal, self._reach, self._todo, self._seconds = journal, reach, todo, seconds
+        self._sound = dict[str, bool]()
 
     def __call__(self, server: Collected) -> None:
         """Judge all."""
@@ -138,11 +144,14 @@ class Judge:
 
     def _one(self, server: Collected, each: Drawn, source: str, tests: list[str]) -> str:
         """The test that notices, twice, and passes without the mutant; an empty text if none does."""
-        tests = [test for test in server.known(tests) if self._sound.get(test, True)]
+        folder = f"tests/{each.target.split('/')[0]}/"
+        new = [test for test in server.known(self._reach.changed(folder)) if test not in self._reach.tests]
+        tests = [*(test for test in new if not server.draws(test)), *server.known(tests), *filter(server.draws, new)]
+        tests = [test for test in tests if self._sound.get(test, True)]
         runs = functools.partial(server.failing, each.target)
         if tests and not server.can(each.target, source):
             runs = functools.partial(failing, each.target)
-        while tests and (found := runs(source, tests, SLOWEST * SECONDS)):
+        while tests and (found := runs(source, tests, self._seconds)):
             test = found[0]
             if "::" not in test or (runs(source, [test], SLOWEST * SECONDS) and self._is_sound(server, test)):
                 return test  # the file alone: it cannot be imported
@@ -156,17 +165,24 @@ class Judge:
         return self._sound[test]
 
 
-def judge(journal: Journal, drawn: list[Drawn], limit: int, again: bool, seconds: float) -> None:
-    """Judge the mutants that have no line, or the survivors `again`; at most so many."""
-    reach = Reach()
+def judge(
+    journal: Journal, drawn: list[Drawn], limit: int, again: bool, seconds: float, by: Sequence[str] = ()
+) -> None:
+    """Judge the mutants that have no line, or the survivors `again`; at most so many. Files `by` replace the choice."""
+    reach = Reach() if not by else Reach(Path(os.devnull))
 
     def open_(known: dict[str, Any]) -> bool:
         return not known or (again and not known["by"] and "why" not in known)
 
-    todo = [(each, chosen(reach, each, seconds)) for each in drawn if open_(journal.lines.get(each.key, {}))][:limit]
+    todo = [(each, [*by] or chosen(reach, each, seconds)) for each in drawn if open_(journal.lines.get(each.key, {}))][
+        :limit
+    ]
     if todo:
         sys.dont_write_bytecode = False  # of the tests; a mutant has none
-        collected(sorted({test.split("::")[0] for _, tests in todo for test in tests}), Judge(journal, todo))
+        folders = {each.target.split("/")[0] for each, _ in todo}
+        files = {test.split("::")[0] for _, tests in todo for test in tests}
+        files.update(file for folder in folders for file in reach.changed(f"tests/{folder}/"))
+        collected(sorted(files), Judge(journal, reach, todo, SLOWEST * seconds))
 
 
 def report(journal: Journal, drawn: list[Drawn]) -> int:
@@ -195,6 +211,8 @@ def main() -> int:
     parser.add_argument("--journal", type=Path, default=JOURNAL)
     parser.add_argument("--modules", nargs="+", default=[f"{name}/**/*.py" for name in PACKAGES], metavar="GLOB")
     parser.add_argument("--within", nargs="+", default=[""], metavar="FOLDER", help="judge those of the draw in these")
+    parser.add_argument("--keys", nargs="+", default=[""], metavar="KEY", help="judge these of the draw alone")
+    parser.add_argument("--by", nargs="+", default=[], metavar="FILE", help="judge by these tests")
     parser.add_argument("--limit", type=int, default=10**6, help="judge at most this many now")
     parser.add_argument("--record", nargs="+", default=[], metavar="TESTS", help="note what these tests come past")
     parser.add_argument("--seconds", type=float, default=SECONDS, help="time of the tests that judge one mutant")
@@ -210,12 +228,12 @@ def main() -> int:
         return 0
     drawn = ranking(given.seed, given.modules)[: given.draw]
     if given.record:
-        for tests in given.record:
-            record(drawn, [tests])
+        record(drawn, given.record)
         return 0
     if not given.report:
         here = [each for each in drawn if each.target.startswith(tuple(given.within))]
-        judge(journal, here, given.limit, given.again, given.seconds)
+        here = [each for each in here if each.key.startswith(tuple(given.keys))]
+        judge(journal, here, given.limit, given.again, given.seconds, given.by)
     return report(journal, drawn)
 
 

@@ -4,6 +4,7 @@ python tests/campaigns/mutant_reach.py FOLDER-WITH-PROBES TESTS... (mutant_draw 
 """
 
 import json
+import math
 import os
 import signal
 import sys
@@ -72,6 +73,7 @@ class Record:
                 "cpu": round(time.process_time() - cpu + below, 3),
                 "clock": round(time.monotonic() - clock, 3),
                 "fixtures": wide,
+                "at": time.time(),
             }
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
@@ -86,7 +88,7 @@ class Reach:
     def __init__(self, path: Path = ROOT / ".mutant_reach.json") -> None:
         self.path = path
         self.tests, self.hits = dict[str, dict[str, Any]](), dict[str, list[str]]()
-        if path.exists():
+        if path.is_file():
             content = json.loads(path.read_text(encoding="utf-8"))
             self.tests, self.hits = content["tests"], content["hits"]
 
@@ -110,6 +112,16 @@ class Reach:
             for test, seen in self.tests.items()
             if not seen["failed"] and (test in owners or owners.intersection(seen["fixtures"]))
         ]
+
+    def changed(self, folder: str) -> list[str]:
+        """Files in a folder that were written after its tests were recorded."""
+        since = min((seen["at"] for test, seen in self.tests.items() if test.startswith(folder)), default=math.inf)
+        files = sorted((ROOT / folder).rglob("test_*.py"))
+        return [str(file.relative_to(ROOT)) for file in files if file.stat().st_mtime > since]
+
+    def has(self, file: str) -> bool:
+        """Whether tests of a file were recorded."""
+        return any(test.startswith(file) for test in self.tests)
 
     def near(self, target: str) -> list[str]:
         """Tests in the folder that mirrors a module's, or the nearest above that has any."""

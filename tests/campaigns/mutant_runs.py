@@ -142,9 +142,15 @@ class Collected:
         self._judge(self)
         return True
 
+    def draws(self, test: str) -> bool:
+        """Whether a test is one of many drawn examples, which takes long."""
+        return hasattr(getattr(self._items[test], "function", None), "hypothesis")
+
     def known(self, tests: list[str]) -> list[str]:
-        """Those that are still there."""
-        return [test for test in tests if test in self._items]
+        """Those that are still there; of a file all."""
+        files = {test for test in tests if "::" not in test}
+        inside = [test for test in self._items if test.partition("::")[0] in files]
+        return [*(test for test in tests if test in self._items), *inside]
 
     def can(self, target: str, source: str) -> bool:
         """Whether a mutant can be put in."""

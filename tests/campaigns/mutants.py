@@ -236,7 +236,9 @@ def main() -> int:
     """Run, tell, judge."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default="", help="file name, such as gate.py")
-    parser.add_argument("--match", default="", help="mutants with this in what is said of them, such as gate.py:13")
+    parser.add_argument(
+        "--match", default="", help="regular expression for what is said of mutants, such as 'gate.py:13'"
+    )
     parser.add_argument("--list", action="store_true", help="say what the mutants are, and end")
     parser.add_argument("--modules", nargs="+", default=[], metavar="GLOB", help="modules, instead of the gate's")
     parser.add_argument("--draw", type=int, default=0, help="this many mutants of the modules, at random")
@@ -250,7 +252,9 @@ def main() -> int:
     else:
         targets = {target: tests for target, tests in TARGETS.items() if given.only in ("", Path(target).name)}
         work = [(target, list(mutants(ROOT / target)), tests) for target, tests in targets.items()]
-    work = [(target, [each for each in found if given.match in each.what], tests) for target, found, tests in work]
+    work = [
+        (target, [each for each in found if re.search(given.match, each.what)], tests) for target, found, tests in work
+    ]
     if given.list:
         print("\n".join(f"{target}: {each.what}" for target, found, _ in work for each in found))
         return 0

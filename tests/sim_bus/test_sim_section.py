@@ -108,11 +108,12 @@ def test_effects_and_drifts_of_the_command_line() -> None:
         "friction.coulomb",
         "friction.coulomb:joint_9:1",
         "nothing:joint_1:1",
-        "friction.coulomb:joint_1:",
-        ":joint_1:1",
         "friction.coulomb:joint_1:x y",
     ):
         with pytest.raises(BadInput, match="--effect"):
+            parse_effect(wrong, joints)
+    for wrong in ("friction.coulomb", "friction.coulomb:joint_1:", ":joint_1:1"):
+        with pytest.raises(BadInput, match=f"--effect '{wrong}': expected ID:JOINT:"):
             parse_effect(wrong, joints)
     for wrong in ("joint_1:1.03", "joint_1:a:0@1", "knee:1:0@1", "joint_1:0:0@1"):
         with pytest.raises(BadInput, match="--drift"):

@@ -105,3 +105,9 @@ def test_a_rated_torque_that_is_off_is_refused_at_the_start():
     arm, true = arm_with("six-cia402", {2: ("torque", 1.15)}), load_arm("six-cia402")
     with Link(arm, LockStepBus(arm=SimulatedArm(true, Truth.of(true)))) as link, pytest.raises(BadInput, match="6076h"):
         link.start()
+
+
+def test_the_law_of_gains_takes_the_command_of_the_sample_before():
+    found = {each.text: each.ratio for each in law(track(noise=0.005))}
+    assert len(found) == 2
+    assert all(ratio == pytest.approx(1.0, abs=0.01) for ratio in found.values()), found

@@ -15,7 +15,10 @@ def test_a_position_command_has_the_registers_of_the_reference():
     assert set(COMMANDS) == {each.value for each in moteus.Register if 0x20 <= each <= 0x2D}
 
 
-@pytest.mark.parametrize("register", sorted({*SCALES} - {0x01C, 0x01D}))  # of these two the package knows no scale
+REGISTERS = sorted({*SCALES, *range(0x20, 0x2A)} - {0x01C, 0x01D})  # of these two the package knows no scale
+
+
+@pytest.mark.parametrize("register", REGISTERS)
 def test_a_step_of_each_register_is_that_of_the_reference(register):
     for step, resolution in zip(SCALES[register], (moteus.INT8, moteus.INT16, moteus.INT32), strict=True):
         assert 5 * step == pytest.approx(scale_register(register, resolution, 5), rel=1e-6)

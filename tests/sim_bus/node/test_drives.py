@@ -143,6 +143,18 @@ def test_cyclic_position_follows_within_a_milliradian_at_rest() -> None:
     np.testing.assert_allclose(rig.reading_position * UNIT, goal * UNIT, atol=1e-3)
 
 
+def test_a_joint_that_starts_to_move_at_constant_speed_is_on_its_way_after_sixty_milliseconds() -> None:
+    rig, way = Rig(one_joint()), 0.0
+    rig.start(CSP)
+    rig.run(0.5)
+    start = rig.position[0]
+    for _ in range(16):
+        way += 1.0 * 0.004
+        rig.position[0] = start + round(way / UNIT)
+        rig.cycle()
+    assert rig.position[0] * UNIT == pytest.approx(rig.arm.plant.motor_position[0], abs=1e-3)
+
+
 def torque_on_a_way(jitter: float) -> np.ndarray:
     """Torque readings [N·m] of a joint at constant speed while SYNC comes up to `jitter` [s] early or late."""
     rig, random, readings = Rig(one_joint()), np.random.default_rng(2), []

@@ -39,6 +39,15 @@ def test_a_lost_heartbeat_does_what_6007_says(option: int, status: int) -> None:
     assert rig.status(5) & (0x4F if status in (0x08, 0x40) else 0x6F) == status
 
 
+def test_heartbeats_of_others_do_not_stand_for_the_hosts() -> None:
+    rig = running(3, heartbeat=50)
+    cycles_with_heartbeat(rig, 0.1)
+    for _ in range(20):
+        rig.bus.put(0x700 + HOST + 1, b"\5")
+        rig.cycle()
+    assert rig.status(5) & 0x6F == 0x07
+
+
 def test_the_consumer_is_armed_by_the_first_heartbeat_only() -> None:
     rig = running(heartbeat=50)
     rig.arm.advance(1.0)

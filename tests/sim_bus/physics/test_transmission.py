@@ -12,6 +12,7 @@ from armlink.arm_file import ArmFile, load_arm, parse_arm
 from armlink.errors import BadInput
 from sim_bus.effects.registry import effects, imperfections
 from sim_bus.physics.plant import Plant
+from sim_bus.physics.transmission import ROTOR_SHARE
 from sim_bus.sim_section import EffectEntry
 
 CSP, CST = 8, 10
@@ -234,3 +235,14 @@ def test_all_effects_together_change_while_the_arm_holds(seed: int) -> None:
         assert all(rig.status(node) & 0x6F == 0x27 for node in rig.nodes)
     rig.run(0.6)
     np.testing.assert_allclose(rig.arm.plant.motor_position, rig.arm.plant.position)
+
+
+def test_the_motor_behind_a_spring_has_a_share_of_the_joints_inertia_in_the_middle_of_its_range() -> None:
+    arm = load_arm("sarcos")
+    names = arm.joint_names
+    entry = EffectEntry(**effect("transmission.elasticity", names[0], stiffness=5000.0))
+    plant = Plant(arm, imperfections(names, [entry]))
+    middle = (plant.lower + plant.upper) / 2
+    assert np.abs(middle).max() > 0.1
+    assert plant.rotor_inertia[0] == pytest.approx(ROTOR_SHARE * plant.inertia(middle)[0, 0])
+    assert np.isinf(plant.rotor_inertia[1:]).all()

@@ -81,7 +81,9 @@ def test_a_stock_device_passes_the_check_and_what_it_lacks_is_told(written, caps
     assert all(": " in text for text in absent)  # each with what is lost by it
     assert run(["scan", path, "--json", "-"]) == 0
     scanned = capsys.readouterr()
-    assert set(json.loads(scanned.out)["nodes"][0]["lost"]) == absent
+    (node,) = json.loads(scanned.out)["nodes"]
+    assert set(node["lost"]) == absent
+    assert node["name"] == ("EPOS4" if device == "epos4" else "armlink joint")
     assert "hinge lacks 1400h:05 RPDO1 event timer: no deadline for commands" in scanned.err
 
 
