@@ -42,7 +42,7 @@ PARAMETERS = {
         Parameter("load", "N·m/(N·m)", 0.0, 0.1, 0.0, 2.0),
         Parameter("asymmetry", "1", 0.0, 0.1, -0.95, 0.95),
         Parameter("armature", "kg·m²", 0.0, 0.3, 0.0, np.inf, "inertia"),
-        Parameter("spring", "N·m/rad", 0.0, 0.1, -np.inf, np.inf, "torque"),
+        Parameter("spring", "N·m/rad", 0.0, 0.1, 0.0, np.inf, "torque"),
         Parameter("offset", "N·m", 0.0, 0.1, -np.inf, np.inf, "torque"),
         Parameter("zero", "rad", 0.0, 0.02, -0.5, 0.5),
         Parameter("gain", "1", 1.0, 0.05, 0.2, 3.0),

@@ -56,6 +56,7 @@ def main() -> int:
             "out-model": "a.xml",
         }
         options = [f"--{name}={file}" for name, file in files.items()]
+        options += [f"--zero=q_{j + 1}=0" for j in range(load_model(ARM).n)]  # the motion leaves the model's ranges
         command = [str(Path(sys.executable).with_name("armlink")), "gap", "diagnose", f"--sim={ARM}", *options]
         subprocess.run(command, cwd=scratch, check=True, capture_output=True, env={**os.environ, **ONE_THREAD})
     used = resource.getrusage(resource.RUSAGE_CHILDREN)

@@ -3,7 +3,7 @@ import numpy as np
 from servo_arm import model_text, record
 
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point
-from sim_gap.closed_loop.fit import Fit, batch, evaluate, jacobian
+from sim_gap.closed_loop.fit import Fit, batch, evaluate, jacobian, moved
 from sim_gap.closed_loop.judge import joint_rms
 from sim_gap.closed_loop.parameters import Scales
 from sim_gap.closed_loop.rivals import _like
@@ -88,3 +88,11 @@ def test_an_effect_begins_in_place_of_another_with_the_torque_closest_to_it() ->
     torque = 0.3 * first - 1.2 * second
     np.testing.assert_allclose(_like(torque, [first, second, third]), [0.3, -1.2, 0.0], atol=1e-6)
     np.testing.assert_allclose(_like(torque, [2.0 * torque, 0.0 * torque]), [0.5, 0.0], atol=1e-6)
+
+
+def test_a_spring_does_not_push_away_from_its_rest() -> None:
+    """As in the fit of torques; a negative one fits the range of one recording and nothing beyond."""
+    data, _ = _windows()
+    ones = np.ones(data.joints)
+    assert moved("spring", 0.1, -50.0, Scales(ones, ones, ones, ones), 0) == 0.0
+    assert moved("offset", 0.1, -50.0, Scales(ones, ones, ones, ones), 0) < 0.0
