@@ -10,18 +10,3 @@ from calib.api import open_link as open_link
 from calib.api import sweep as sweep
 from calib.api import verify as verify
 from sim_gap.api import diagnose as diagnose
-
-__all__ = [
-    "ArmFile",
-    "ArmlinkError",
-    "Recording",
-    "calibrate",
-    "diagnose",
-    "identify",
-    "load_arm",
-    "load_recording",
-    "observe",
-    "open_link",
-    "sweep",
-    "verify",
-]

@@ -4,9 +4,10 @@ Arms and data are given as objects or as paths; every function raises armlink.Ar
 is wrong and how to put it right.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 from armlink.arm_file import SIMULATED, ArmFile, Bus, load_arm
 from armlink.errors import BadInput
@@ -31,6 +32,7 @@ from calib.sweep.run import Progress, run_sweep
 from calib.sweep.verify import Verification, run_verify
 from gcomp.arrays import Array
 
+T = TypeVar("T")
 ArmLike: TypeAlias = ArmFile | str | Path
 """An arm file: loaded, its path, or the name of a bundled arm."""
 SweepLike: TypeAlias = SweepData | str | Path
@@ -228,12 +230,17 @@ def observe(
     return Observation(names, events, found.gain, found.gain_std, found.offset, found.offset_std, observer.rows)
 
 
+def _loaded(given: object, kind: type[T], load: Callable[[str | Path], T], expected: str) -> T:
+    """`given`, or what lies at the path that it is."""
+    if isinstance(given, kind):
+        return given
+    if isinstance(given, str | Path):
+        return load(given)
+    raise BadInput(f"{expected}, not {type(given).__name__}")
+
+
 def _arm(arm: object) -> ArmFile:
-    if isinstance(arm, ArmFile):
-        return arm
-    if isinstance(arm, str | Path):
-        return load_arm(arm)
-    raise BadInput(f"arm: expected an ArmFile, a path or a bundled arm's name, not {type(arm).__name__}")
+    return _loaded(arm, ArmFile, load_arm, "arm: expected an ArmFile, a path or a bundled arm's name")
 
 
 def _sweeps(function: str, sweeps: tuple[object, ...]) -> list[SweepData]:
@@ -262,8 +269,4 @@ def _arm_of(data: list[SweepData], arm: ArmLike | None) -> ArmFile:
 
 
 def _recording(recording: object) -> Recording:
-    if isinstance(recording, Recording):
-        return recording
-    if isinstance(recording, str | Path):
-        return load_recording(recording)
-    raise BadInput(f"recording: expected a Recording or the path of one, not {type(recording).__name__}")
+    return _loaded(recording, Recording, load_recording, "recording: expected a Recording or the path of one")

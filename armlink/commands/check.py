@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from armlink.commands.options import Arm, Json, OtherBus
+
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
@@ -24,8 +26,8 @@ WARNING = (
 
 
 def check(
-    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
-    bus: Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")] = None,
+    arm: Arm,
+    bus: OtherBus = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the joints are enabled.")] = False,
     passive: Annotated[bool, typer.Option("--passive", help="Only what needs no power: read, configure.")] = False,
     host: Annotated[
@@ -41,7 +43,7 @@ def check(
     seconds: Annotated[
         float, typer.Option(min=1.0, max=3600.0, help="How long --host measures, and --scales hand or listen [s].")
     ] = 20.0,
-    json: Annotated[Path | None, typer.Option(help="Write the answer here; - is standard output.")] = None,
+    json: Json = None,
 ) -> int:
     """Check identity, objects, PDO mapping, limits, calibration; then, with power, quick stop, deadline and heartbeat.
 

@@ -1,13 +1,10 @@
 """Lists the drive families that are installed, and what their drives are like."""
 
-from pathlib import Path
-from typing import Annotated
-
-import typer
+from armlink.commands.options import Json
 
 
 def drives(
-    json: Annotated[Path | None, typer.Option(help="Write the answer here; - is standard output.")] = None,
+    json: Json = None,
 ) -> int:
     """List the drive families with their traits: torque, calibration, silence, bounds, cadence, frames.
 

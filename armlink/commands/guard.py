@@ -5,12 +5,14 @@ from typing import Annotated
 
 import typer
 
+from armlink.commands.options import OtherBus
+
 
 def guard(
     arm: Annotated[str | None, typer.Argument(help="Bundled arm or path of an arm file.")] = None,
     out: Annotated[Path | None, typer.Option(help="Write the policy here (JSON).")] = None,
     path: Annotated[bool, typer.Option("--path", help="Print where the guard's file is, and nothing else.")] = False,
-    bus: Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")] = None,
+    bus: OtherBus = None,
 ) -> int:
     """Write what a guard of this arm's bus may pass: identifiers, and bounds of torque, position and their rates.
 

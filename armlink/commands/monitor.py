@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from armlink.commands.options import Arm, OtherBus
+
 if TYPE_CHECKING:
     from rich.console import Console, Group
 
@@ -21,8 +23,8 @@ COLUMNS = ("joint", "node", "position\nrad", "torque\nN·m", "motor\nN·m", "sta
 
 
 def monitor(
-    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
-    bus: Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")] = None,
+    arm: Arm,
+    bus: OtherBus = None,
     once: Annotated[bool, typer.Option("--once", help="Show one table and end.")] = False,
     cycles: Annotated[int, typer.Option(min=0, help="End after this many refreshes (5 a second); 0: Ctrl-C.")] = 0,
     sync: Annotated[bool, typer.Option("--sync", help="Start the nodes and send SYNC, where no host does.")] = False,

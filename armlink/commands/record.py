@@ -5,11 +5,13 @@ from typing import Annotated
 
 import typer
 
+from armlink.commands.options import Arm, OtherBus
+
 SUFFIX = ".mcap"
 
 
 def record(
-    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
+    arm: Arm,
     out: Annotated[
         Path | None,
         typer.Argument(help="File to write, .mcap; convert makes others of it.", show_default=False),
@@ -17,7 +19,7 @@ def record(
     frames: Annotated[
         Path | None, typer.Option(help="Write every frame here as it is: .asc, .blf or .log, by suffix.")
     ] = None,
-    bus: Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")] = None,
+    bus: OtherBus = None,
     seconds: Annotated[float, typer.Option(min=0.0, help="Length; 0: until Ctrl-C or SIGTERM.")] = 0.0,
     json: Annotated[Path | None, typer.Option(help="Write what was recorded here; - is standard output.")] = None,
 ) -> int:

@@ -5,9 +5,11 @@ from typing import Annotated
 
 import typer
 
+from armlink.commands.options import Arm
+
 
 def replay(
-    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
+    arm: Arm,
     source: Annotated[
         Path, typer.Argument(help="Raw frames (.asc, .blf, .log) or a recording (.mcap, .parquet, .csv, .csv.gz).")
     ],

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from armlink.commands.options import Json, OtherBus
+
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
 
@@ -14,8 +16,8 @@ SEARCHED = "canopen"
 
 def scan(
     arm: Annotated[str | None, typer.Argument(help="Bundled arm or path of an arm file; without: all nodes.")] = None,
-    bus: Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")] = None,
-    json: Annotated[Path | None, typer.Option(help="Write the answer here; - is standard output.")] = None,
+    bus: OtherBus = None,
+    json: Json = None,
 ) -> int:
     """List the nodes that answer on a bus; with an arm file also those of its joints that do not (exit status 3).
 

@@ -22,9 +22,9 @@ from armlink.link.types import Sample, Stats
 
 COLLECT_SHARE = 0.8
 """Share of a period after the commands in which their replies are waited for."""
-REST_SHARE, REST_GROWTH = 0.9, 1.02
-"""The loop sleeps through this share of the time that the replies have taken of late, instead of waking for each; from
-one cycle to the next that time grows by this factor at most, so that the quickest of late counts."""
+EARLIER, LATER = 0.998, 1.03
+"""The loop sleeps until the replies should all have come, instead of waking for each: a little earlier from cycle to
+cycle while they all had, later once one had not."""
 LEAST_REST = 1e-4
 """Shorter rests are not worth their system call [s]."""
 OWED_CYCLES = 25
@@ -56,8 +56,8 @@ class Loop:
         """Takes frames that no drive of ours sends, such as those of another host."""
         self._port, self._clock = port, clock
         self._patience = 0.0 if lock_step else COLLECT_SHARE * period
-        self._rest = 0.0 if lock_step else math.inf
-        """Time from the commands until it looks for replies [s]; inf until it is known how long they take."""
+        self._rest = 0.0
+        """Time from the commands until it looks for replies [s]."""
         self._alone = self.groups[0] if len(self.groups) == 1 else None
         traits = traits_of(self.groups, self.n)
         cadences = {each.cadence for each in traits}
@@ -138,19 +138,32 @@ class Loop:
         """Take in all that came between cycles; replies among it are late: newest known, but of no sample."""
         board = self.board
         board.awaited = 0
-        self._take_what_is_there()
-        self._keep_late()
+        if self._take_what_is_there() or self._owed_for:
+            self._keep_late()
         self.watch.cycle_ends(self.stats.frames - self._counted)
         self._counted = self.stats.frames
         if board.slow_came:
             self._keep_slow(self._clock.now())
         board.drop()
 
-    def _take_what_is_there(self) -> None:
-        for _ in range(MOST_FRAMES):
-            if not self.receive(0.0):
-                return
-        self.watch.flooded = True
+    def _take_what_is_there(self) -> int:
+        """Take in the frames that are there, counted all at once; how many they were."""
+        receive, fast, came, size = self._port.receive, self._fast, 0, 0
+        while came < MOST_FRAMES:
+            frame = receive(0.0)
+            if frame is None:
+                break
+            can_id, data = frame
+            came, size = came + 1, size + len(data)
+            take = fast.get(can_id)
+            if take is not None:
+                take(data)
+            else:
+                self.take(can_id, data)
+        else:
+            self.watch.flooded = True
+        self.count(came, size)
+        return came
 
     def _keep_late(self) -> None:
         """Replies that came after their cycle: as old as the last commands at least."""
@@ -190,7 +203,6 @@ class Loop:
             self._pass_time(self.period)
         self.synced = now
         delay = self._collect(now)
-        self._take_what_is_there()
         self.stats.missed += board.awaited
         timely = None if board.awaited <= 0 and not self._owed_for else self._timely()
         sample = self.sample(now)
@@ -198,20 +210,23 @@ class Loop:
         return sample
 
     def _collect(self, now: float) -> float:
-        """Take in the replies to commands that left at `now`; how long they took [s]."""
-        board, clock, end = self.board, self._clock, now + self._patience
-        if board.awaited > 0 and LEAST_REST < self._rest < self._patience:
-            clock.sleep_until(now + self._rest)
-        for _ in range(MOST_FRAMES):
-            if board.awaited <= 0:
-                break
-            if not self.receive(0.0):
-                remaining = end - clock.now()
-                if remaining <= 0 or not self.receive(remaining):
-                    break
+        """Take in the replies to commands that left at `now`; how long they took [s], or what was waited for them."""
+        board, clock, patience = self.board, self._clock, self._patience
+        rested = self._rest
+        if board.awaited > 0 and rested >= LEAST_REST:
+            clock.sleep_until(now + rested)
+        self._take_what_is_there()
         delay = clock.now() - now
         if board.awaited <= 0:
-            self._rest = min(REST_SHARE * delay, REST_GROWTH * self._rest)
+            self._rest = EARLIER * rested
+            return delay
+        while board.awaited > 0 and delay < patience and not self.watch.flooded:
+            in_time = self.receive(patience - delay)
+            self._take_what_is_there()
+            delay = clock.now() - now
+            if not in_time:
+                break
+        self._rest = min(max(LATER * rested, LEAST_REST), LATER * delay, patience)
         return delay
 
     def _encode(self, orders: Sequence[Order], now: float) -> list[Frame]:

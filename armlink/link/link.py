@@ -16,7 +16,8 @@ from armlink.bus.can_bus import CanBus
 from armlink.clock import Clock, MonotonicClock
 from armlink.drives.family import Guarded
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Setup, law_torque
-from armlink.errors import BadInput, BusFault, Refused, Silence
+from armlink.errors import BadInput, BusFault, HostLate, Refused, Silence
+from armlink.link.bus_load import bus_loads
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.faults import bus_fault
@@ -80,6 +81,9 @@ class Link(Calibrations):
         self._last: Command | None = None
         self._limits: list[Limits] = []
         self._hold: ArmHold | None = None
+        loads = () if self._lock_step else bus_loads(arm)
+        self._overload = next((f"{load.what}: {load.remedy}" for load in loads if load.share > 1), "")
+        """Why frames come late or never, on a bus that cannot carry the cycle."""
 
     @classmethod
     def open(cls, arm: ArmFile, bus: str | None = None) -> "Link":
@@ -185,6 +189,8 @@ class Link(Calibrations):
         if missing:
             channel = self.bus.channel_info
             raise BusFault(f"no answer from {', '.join(missing)} on {channel}: is it powered, and its id right?")
+        if self._overload:
+            log.warning("%s: %s", self.arm.name, self._overload)
         self.require_alone()
         self._set_up()
         loop = self._loop
@@ -280,7 +286,11 @@ class Link(Calibrations):
         require_deadman(self)
         self._forget()
         self.commander.settle()
-        sample = self.commander.walk(Power.ON)
+        try:
+            sample = self.commander.walk(Power.ON)
+        except BusFault as fault:
+            self._mind_overload(fault)
+            raise
         self._forget()
         self._enabled = True
         self._last = Command.hold(np.array(self._loop.latest_position))
@@ -340,8 +350,9 @@ class Link(Calibrations):
         self._last = command
         try:
             sample = self.commander.command(command)
-        except BaseException:
+        except BaseException as error:
             self.stop()
+            self._mind_overload(error)
             raise
         if command.guard is not None:
             try:
@@ -350,6 +361,11 @@ class Link(Calibrations):
                 crossed.sample = sample
                 raise
         return sample
+
+    def _mind_overload(self, error: BaseException) -> None:
+        """What no drive is to blame for: a bus that cannot carry the cycle."""
+        if self._overload and isinstance(error, BusFault) and not isinstance(error, HostLate):
+            error.args = (f"{error}; {self._overload}",)
 
     def play(self, setpoints: Setpoints) -> Samples:
         """One row a cycle, and the sample of each; raises as cycle. To stop early, close the iterator.

@@ -6,6 +6,7 @@ would let it fall. When the job falls silent while joints are under torque contr
 under position control they keep their targets.
 """
 
+import math
 import pickle
 import socket
 import sys
@@ -32,6 +33,8 @@ SWITCH = 5e-4
 """Longest time for which another thread of this process holds up a cycle [s]."""
 SILENT = 3.0
 """A job that says nothing for this long while joints are under torque control is gone [s]."""
+TOLD_EVERY = 7e-3
+"""Samples wait for each other for this long at most [s]: waking the job costs as much as half a cycle."""
 ENABLING = ("enable", "recover")
 
 
@@ -44,7 +47,9 @@ class DriveLoop:
         self._chunks: deque[Setpoints] = deque()
         self._source: Iterator[Sample] | None = None
         self._last: Command | None = None
-        self._id, self._row = 0, -1
+        self._id, self._row, self._rows = 0, -1, 0
+        self._flushed = -math.inf
+        """When the job was last sent what waits for it [s]."""
         self._controlled = False
         """Whether a controller is being run."""
         self.called = False
@@ -74,6 +79,7 @@ class DriveLoop:
                 if id != self._id:
                     self._begin(id)
                 self._chunks.append(setpoints)
+                self._rows += len(setpoints)
             case Run(id, controller):
                 self._begin(id)
                 self._unpickled = self._beside.submit(pickle.loads, controller)
@@ -87,7 +93,7 @@ class DriveLoop:
 
     def _begin(self, id: int) -> None:
         self._chunks.clear()
-        self._source, self._id, self._row, self._controlled = None, id, -1, False
+        self._source, self._id, self._row, self._rows, self._controlled = None, id, -1, 0, False
         self._unpickled = None
 
     def _call(self, call: Call) -> None:
@@ -125,7 +131,11 @@ class DriveLoop:
             self._channel.put(Stopped(error))
         else:
             self._channel.put((self._id, row, pack(sample, *self._link.sent)), True)
-            self._mind_silence()
+            now = time.monotonic()
+            self._mind_silence(now)
+            if row + 1 != self._rows and now - self._flushed < TOLD_EVERY:
+                return
+            self._flushed = now
         self._channel.flush()
 
     def _next(self) -> tuple[int, Sample]:
@@ -151,8 +161,8 @@ class DriveLoop:
         self._source, self._controlled, self._unpickled = None, False, None
         self._last = Command.hold(self._link.latest_position)
 
-    def _mind_silence(self) -> None:
-        if self._last is None or time.monotonic() - self._heard < SILENT:
+    def _mind_silence(self, now: float) -> None:
+        if self._last is None or now - self._heard < SILENT:
             return
         if np.isin(self._last.mode, TORQUE_MODES).any():
             self._hold_here()

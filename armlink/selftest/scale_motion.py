@@ -16,7 +16,8 @@ from armlink.link.link import Link
 from armlink.link.listener import Listener
 from armlink.link.park import speeds, straight
 from armlink.link.types import Command, Sample, Setpoints, Tell
-from armlink.selftest.scales import Evidence, ScaleFinding, Track, gather, judge
+from armlink.selftest.scales import Evidence, ScaleFinding, gather, judge
+from armlink.selftest.track import Track
 
 REACH = 0.35
 """Distance by which this host moves every joint to both sides [rad]."""

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from armlink.arrays import Array
+from armlink.selftest.track import Track
 
 QUANTITIES = ("position", "velocity", "torque")
 OFF = math.log(1.06)
@@ -48,30 +49,6 @@ LAW_SIGMA = 0.02
 """A coefficient of the law counts if it is known to this, relative to 1."""
 PAST_STOP = 1.03
 """A way longer than that between the stops cannot be true, whoever moved the joint."""
-
-
-@dataclass(frozen=True, eq=False)
-class Track:
-    """Readings of one joint and what was commanded at the time, all (K,), NaN where there was none."""
-
-    t: Array
-    """[s]."""
-    position: Array
-    """[rad]."""
-    velocity: Array
-    """[rad/s]."""
-    torque: Array
-    """Motor torque as the drive reports it [N·m], no calibration applied."""
-    target: Array
-    """Commanded position [rad]."""
-    rate: Array
-    """Commanded velocity [rad/s]."""
-    ahead: Array
-    """Commanded torque [N·m]."""
-    kp: Array
-    """[N·m/rad]."""
-    kd: Array
-    """[N·m·s/rad]."""
 
 
 @dataclass(frozen=True)

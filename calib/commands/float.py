@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from armlink.commands.options import Arm, OtherBus
+
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
     from calib.records.records import CalibrationRecord
@@ -12,8 +14,8 @@ if TYPE_CHECKING:
 
 
 def hold_afloat(
-    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
-    bus: Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")] = None,
+    arm: Arm,
+    bus: OtherBus = None,
     seconds: Annotated[float, typer.Option(min=0.0, help="End after so long; 0 is until Ctrl-C [s].")] = 0.0,
     record: Annotated[
         str | None, typer.Option(help="Id of a gravity record; default: the current one, else the model's inertials.")

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calib.commands.options import Arm, JsonFile, Store
+from armlink.commands.options import Arm
+from calib.commands.options import JsonFile, Store
 
 if TYPE_CHECKING:
     from calib.records.store import Activation, ControllerWrite

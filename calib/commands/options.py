@@ -5,7 +5,6 @@ from typing import Annotated
 
 import typer
 
-Arm = Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")]
 Sweeps = Annotated[list[Path], typer.Argument(help="Data sets of sweep, without and with load.")]
 SweepsArm = Annotated[str | None, typer.Option("--arm", help="Arm file, if it is no longer where sweep found it.")]
 Bus = Annotated[str | None, typer.Option(help="With --apply: INTERFACE:CHANNEL[@BITRATE].")]

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from calib.commands.options import Arm, Bus, Check, Flash, JsonFile, Replaced, Store
+from armlink.commands.options import Arm
+from calib.commands.options import Bus, Check, Flash, JsonFile, Replaced, Store
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile

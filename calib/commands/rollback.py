@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calib.commands.options import Arm, Bus, Check, Replaced, Store
+from armlink.commands.options import Arm
+from calib.commands.options import Bus, Check, Replaced, Store
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from armlink.commands.options import Arm, OtherBus
+
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
     from armlink.loop.driver import ArmDriver
@@ -15,9 +17,9 @@ if TYPE_CHECKING:
 
 
 def sweep(
-    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
+    arm: Arm,
     out: Annotated[Path | None, typer.Option(help="Directory of the data set, new or empty.")] = None,
-    bus: Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")] = None,
+    bus: OtherBus = None,
     reference_mass: Annotated[
         float, typer.Option(min=0.0, help="Mass now attached to the tip [kg]; 0 for the pass without.")
     ] = 0.0,

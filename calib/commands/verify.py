@@ -5,14 +5,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from armlink.commands.options import Arm, OtherBus
+
 if TYPE_CHECKING:
     from calib.records.records import CalibrationRecord, GravityRecord
     from calib.sweep.verify import Verification
 
 
 def verify(
-    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
-    bus: Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")] = None,
+    arm: Arm,
+    bus: OtherBus = None,
     record: Annotated[
         list[str] | None, typer.Option(help="Id of a gravity or calibration record; default: the current ones.")
     ] = None,

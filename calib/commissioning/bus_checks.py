@@ -3,19 +3,17 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from armlink.arm_file import SIMULATED, ArmFile, Bus, LinkJoint
+from armlink.arm_file import SIMULATED, ArmFile, Bus
 from armlink.bus.can_bus import CanBus
 from armlink.bus.open import open_link_bus, resolve_bus
-from armlink.drives.registry import family
 from armlink.errors import ArmlinkError
+from armlink.link.bus_load import HIGH_LOAD, bus_loads
 from armlink.link.joints.groups import make_groups
 from armlink.link.link import Link
-from calib.commissioning.finding import SetupFinding
+from calib.commissioning.finding import Level, SetupFinding
 
 INTERFACES = Path("/sys/class/net")
 """Where Linux lists its network interfaces."""
-HIGH_LOAD = 0.8
-"""Share of the bit rate above which frames come late; a choice."""
 
 
 def bus_findings(arm_file: ArmFile, spec: str | None = None) -> Iterator[SetupFinding]:
@@ -55,23 +53,10 @@ def bus_findings(arm_file: ArmFile, spec: str | None = None) -> Iterator[SetupFi
 
 def _load(arm_file: ArmFile) -> Iterator[SetupFinding]:
     """Whether the cycle's frames fit the bit rate."""
-    link = arm_file.require_link()
-    for bus in dict.fromkeys(joint.bus for joint in link.joints):
-        count = sum(joint.bus == bus for joint in link.joints)
-        rate = link.buses[bus].bitrate if bus else link.bus.bitrate
-        load = link.rate * _cycle_bits(arm_file, [joint for joint in link.joints if joint.bus == bus]) / rate
-        if load > HIGH_LOAD:
-            what = f"{count} joints at {link.rate:g} Hz load the bus by up to {load:.0%} of {rate} bit/s"
-            remedy = f"lower link.rate to {int(link.rate * HIGH_LOAD / load)} Hz, or spread the joints over link.buses"
-            yield SetupFinding("error" if load > 1 else "warning", what, f"{arm_file.path}: link.rate", remedy)
-
-
-def _cycle_bits(arm_file: ArmFile, joints: list[LinkJoint]) -> float:
-    """Bit times that a cycle of the joints of one bus takes at most."""
-    found = 0.0
-    for name in dict.fromkeys(joint.settings.family for joint in joints):
-        found += family(name).build(arm_file, [each for each in joints if each.settings.family == name]).cycle_bits()
-    return found
+    for load in bus_loads(arm_file):
+        if load.share > HIGH_LOAD:
+            level: Level = "error" if load.share > 1 else "warning"
+            yield SetupFinding(level, load.what, f"{arm_file.path}: link.rate", load.remedy)
 
 
 def _absent_interface(bus: Bus) -> SetupFinding | None:

@@ -12,7 +12,8 @@ from calib.arm.sweep_section import SweepSection, sweep_section
 from calib.arm.unseen import NO_LEVER, SHORTEST, VERTICAL, known_lever, vertical
 from calib.creep.design import Candidate, choose
 from calib.creep.parameters import Doubt
-from calib.plan.collisions import POINTS, Geometry
+from calib.plan.choices import POINTS
+from calib.plan.collisions import Geometry
 from calib.plan.poses import require_range
 from calib.plan.types import Side, Sweep, SweepPlan
 from gcomp.arm.arm import Arm

@@ -1,7 +1,6 @@
 """Runs one pass of creep sweeps through the link; each reading is on disk before the next sweep begins."""
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +38,6 @@ def run_creep(
     reference_mass: float = 0.0,
     resume: bool = False,
     progress: Progress | None = None,
-    clock: Callable[[], float] = time.monotonic,
     seed: int = 0,
     on_stall: OnStall = give_up,
     plan: SweepPlan | None = None,
@@ -60,7 +58,7 @@ def run_creep(
             check_creeps(arm, ground.geometry, used, mover.command.position)
         if data.plan is None:
             writer.append(PlanLine(plan=used, resolution=tuple(mover.known_resolution.tolist())))
-        run = _Pass(mover, writer, ground, used, progress or (lambda *_: None), clock, on_stall)
+        run = _Pass(mover, writer, ground, used, progress or (lambda *_: None), on_stall)
         run.made = {reading.sweep for reading in data.readings}
         for sweep in used.sweeps:
             if sweep.name not in run.made and not any(_names(stall, sweep) for stall in data.stalls):
@@ -89,13 +87,12 @@ class _Pass:
         ground: CreepGround,
         plan: SweepPlan,
         progress: Progress,
-        clock: Callable[[], float],
         on_stall: OnStall,
     ) -> None:
         self._mover, self._writer, self._ground, self._plan = mover, writer, ground, plan
-        self._progress, self._clock, self._on_stall = progress, clock, on_stall
+        self._progress, self._on_stall = progress, on_stall
         self._creep, self._home = ground.section.creep, np.array(plan.scout[0])
-        self._began, self._contacts = clock(), 0
+        self._began, self._contacts = time.monotonic(), 0
         self.made: set[str] = set()
 
     def sweep(self, sweep: Sweep) -> None:
@@ -198,6 +195,6 @@ class _Pass:
 
     def _report(self, sweep: Sweep, readings: list[StaticReading]) -> None:
         done, total = len(self.made), len(self._plan.sweeps)
-        left = (self._clock() - self._began) / max(done, 1) * (total - done)
+        left = (time.monotonic() - self._began) / max(done, 1) * (total - done)
         up = [float(each.torque[sweep.joint]) for each in readings if each.direction.sum() > 0]
         self._progress(done, total, left, f"{sweep.name} {sparkline(up) if up else ''}")

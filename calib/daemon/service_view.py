@@ -14,18 +14,7 @@ from armlink.link.joints.groups import state_name
 from calib.daemon.observing.observation import Observation
 from calib.daemon.service import Service
 from calib.daemon.state.history_reader import HistoryReader
-from calib.daemon.view.api_models import (
-    BusHealth,
-    DrawnArm,
-    EventRecord,
-    HistoryPoint,
-    JointEstimate,
-    JointNow,
-    JointsItem,
-    Proposal,
-    RecordsInForce,
-    Status,
-)
+from calib.daemon.view import api_models
 from calib.daemon.view.drawn_arm import drawn_arm
 from calib.daemon.view.fan_out import Client
 from calib.daemon.view.view import Decisions, NoSuch
@@ -39,18 +28,18 @@ class ServiceView:
     def __init__(self, service: Service) -> None:
         self._service, self._version = service, version("armlink")
         self._history = HistoryReader(service.journal.path)
-        self._arm: DrawnArm | None = None
+        self._arm: api_models.DrawnArm | None = None
         self.decisions: Decisions = service.recalibrations
 
     @property
     def _observation(self) -> Observation | None:
         return self._service.records.observation
 
-    def status(self) -> Status:
+    def status(self) -> api_models.Status:
         """State, bus and records."""
         service, observation = self._service, self._observation
         arm_state, configuration, now = service.arm_state, service.configuration, service.environment.monotonic()
-        return Status(
+        return api_models.Status(
             state=service.state,
             detail=service.trouble or arm_state.fault or service.records.detail or arm_state.silent,
             arm=configuration.arm.name,
@@ -62,7 +51,7 @@ class ServiceView:
             t=now,
             uptime_s=now - service.started,
             bus=self._bus(),
-            records=RecordsInForce(
+            records=api_models.RecordsInForce(
                 calibration=None if observation is None else observation.feed.calibration.id,
                 gravity=None if observation is None else observation.feed.gravity.id,
             ),
@@ -76,7 +65,7 @@ class ServiceView:
             report=_newest_report(service.directory),
         )
 
-    def joints(self) -> tuple[JointNow, ...]:
+    def joints(self) -> tuple[api_models.JointNow, ...]:
         """Every joint as of the newest samples, base to tip."""
         names, arm_state = self._service.configuration.names, self._service.arm_state
         batch = arm_state.batch
@@ -106,7 +95,7 @@ class ServiceView:
             channels=channels | {"torque": torque, "model_torque": model},
         )
 
-    def arm(self) -> DrawnArm:
+    def arm(self) -> api_models.DrawnArm:
         """The arm's shape; read from its model on the first call. Raises NoSuch."""
         if self._arm is None:
             try:
@@ -125,7 +114,7 @@ class ServiceView:
                 model[known] = self._observation.feed.observer.model_torque(position[known])
         return torque, model
 
-    def estimates(self) -> tuple[JointEstimate, ...]:
+    def estimates(self) -> tuple[api_models.JointEstimate, ...]:
         """Every joint's gain and offset, base to tip; empty while there is no gravity record."""
         if self._observation is None:
             return ()
@@ -133,7 +122,7 @@ class ServiceView:
         estimate, limits = feed.observer.estimate(), feed.observer.limits()
         gain, offset = (feed.calibration.values(name) for name in ("gain", "offset"))
         return tuple(
-            JointEstimate(
+            api_models.JointEstimate(
                 joint=name,
                 gain=estimate.gain[j],
                 gain_std=estimate.gain_std[j],
@@ -150,19 +139,19 @@ class ServiceView:
             for j, name in enumerate(feed.names)
         )
 
-    def events(self, after: int = 0, limit: int = 500) -> tuple[EventRecord, ...]:
+    def events(self, after: int = 0, limit: int = 500) -> tuple[api_models.EventRecord, ...]:
         """Events with a larger id, oldest first."""
-        return tuple(EventRecord(**row) for row in self._service.journal.events(after, limit))
+        return tuple(api_models.EventRecord(**row) for row in self._service.journal.events(after, limit))
 
     def history(
         self, joint: str | None, since: datetime | None = None, until: datetime | None = None, most: int = 2000
-    ) -> tuple[HistoryPoint, ...]:
+    ) -> tuple[api_models.HistoryPoint, ...]:
         """Estimates over time, oldest first; raises NoSuch."""
         return tuple(point for page in self.history_pages(joint, since, until, most) for point in page)
 
     def history_pages(
         self, joint: str | None, since: datetime | None = None, until: datetime | None = None, most: int = 2000
-    ) -> Iterator[tuple[HistoryPoint, ...]]:
+    ) -> Iterator[tuple[api_models.HistoryPoint, ...]]:
         """Likewise in pieces; raises NoSuch at the first."""
         names, reader = self._service.configuration.names, self._history
         if joint is not None and joint not in names:
@@ -172,7 +161,7 @@ class ServiceView:
             for page in reader.pages(chosen):
                 yield tuple(_point(names[j], j, *point) for point in page if len(point[3]["gain"]) > j)
 
-    def proposals(self, limit: int = 200) -> tuple[Proposal, ...]:
+    def proposals(self, limit: int = 200) -> tuple[api_models.Proposal, ...]:
         """Newest first."""
         return tuple(row.answer() for row in self._service.journal.proposals(limit))
 
@@ -182,10 +171,10 @@ class ServiceView:
         client.put(self.snapshot())
         return client
 
-    def snapshot(self) -> JointsItem:
+    def snapshot(self) -> api_models.JointsItem:
         """The present joints as an item of the stream."""
         environment = self._service.environment
-        return JointsItem(
+        return api_models.JointsItem(
             time=environment.wall(),
             t=environment.monotonic(),
             state=self._service.state,
@@ -198,7 +187,7 @@ class ServiceView:
         if self._service.hub.clients:
             self._service.hub.publish(self.snapshot())
 
-    def _bus(self) -> BusHealth:
+    def _bus(self) -> api_models.BusHealth:
         arm_state = self._service.arm_state
         counted: dict[str, Any] = {}
         if arm_state.batch is not None:
@@ -207,7 +196,7 @@ class ServiceView:
             if not arm_state.connected:
                 counted |= {"rate_hz": 0.0, "load": 0.0}
         fault = arm_state.fault or arm_state.silent or None
-        return BusHealth(connected=bool(arm_state.connected), fault=fault, **counted)
+        return api_models.BusHealth(connected=bool(arm_state.connected), fault=fault, **counted)
 
 
 def _newest_report(directory: Path) -> Path | None:
@@ -225,8 +214,8 @@ def _number(value: float) -> float | None:
 
 def _joint(
     name: str, position: float, torque: float, model: float, temperature: float, state: str, age: float
-) -> JointNow:
-    return JointNow(
+) -> api_models.JointNow:
+    return api_models.JointNow(
         joint=name,
         position=_number(position),
         torque=_number(torque),
@@ -240,6 +229,6 @@ def _joint(
 
 def _point(
     joint: str, j: int, time: datetime, t: float, record: str | None, estimate: dict[str, list[float]]
-) -> HistoryPoint:
+) -> api_models.HistoryPoint:
     values = {name: estimate[name][j] for name in ("gain", "gain_std", "offset", "offset_std")}
-    return HistoryPoint(time=time, t=t, joint=joint, record=record, **values)
+    return api_models.HistoryPoint(time=time, t=t, joint=joint, record=record, **values)

@@ -12,23 +12,13 @@ import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
-from calib.field.linear_model import UNKNOWN_MOMENT, Belief, Solution, belief_of, field_columns, solve
+from calib.field.linear_model import Belief, Solution, belief_of, field_columns, solve
+from calib.field.thresholds import DRIFT, GAIN_STD, OFFSET_STD, PAYLOAD_EVIDENCE, ROUNDS, UNKNOWN_MOMENT
 from calib.records.records import CalibrationRecord, GravityRecord, Parameter
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array, Mask
 from gcomp.gravity.torque import gravity_regressor
 from gcomp.identify.readings import StaticReadings
-
-GAIN_STD = 0.02
-"""Relative standard deviation above which a gain counts as not separable from the offset."""
-OFFSET_STD = 0.005
-"""Likewise of an offset, as a share of rated torque."""
-DRIFT = 0.05
-"""Standard deviation allowed for the drift of a gain that these rows do not show, as a ratio."""
-ROUNDS = 4
-"""Gauss-Newton steps, each with the noise scaled to the residuals' scatter."""
-PAYLOAD_EVIDENCE = 10.0
-"""BIC difference up to which a payload that explains the rows worse than new gains and offsets is not excluded."""
 
 
 @dataclass(frozen=True, eq=False)

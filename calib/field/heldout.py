@@ -3,13 +3,11 @@
 import numpy as np
 
 from calib.field.field_fit import FieldFit
+from calib.field.thresholds import BLOCK
 from calib.fit.heldout import FEWEST
 from calib.records.records import CalibrationRecord
 from gcomp.arrays import Array
 from gcomp.identify.readings import StaticReadings
-
-BLOCK = 24
-"""Rows that are held out together, since neighbours are correlated: six seconds of a recording."""
 
 
 def heldout_errors(rows: StaticReadings, fit: FieldFit, before: CalibrationRecord) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""Every threshold of the observer, with its unit and the source of its value.
+"""Every threshold of the observer at rest, with its unit and the source of its value; some hold in motion too.
 
 Values from docs/theory.md, section 6, are marked §6; the simulations there support them. The others follow from the
 reason given, and tests/campaigns/daemon_days.py bounds the result: time to find a drift, errors after recalibration,

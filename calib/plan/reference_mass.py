@@ -3,19 +3,12 @@
 import numpy as np
 
 from calib.arm.drive_limits import Limits
+from calib.plan.choices import ASSUMED_GRAVITY, HAND, MASS_SHARES
 from calib.plan.rough_gravity import GravityGuess, reach
 from calib.plan.stop_selection import Candidates
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.gravity.torque import gravity_regressor
-
-MASS_SHARES = (0.3, 0.5, 0.7)
-"""Shares of the torque beyond gravity that the reference mass may take, tried from the smallest; a choice."""
-ASSUMED_GRAVITY = 0.6
-"""Share of max_torque that gravity is assumed to take before any measurement: drives have 1.5 to 2.2 times gravity in
-tests/calib/drawn_arms.py."""
-HAND = 0.15
-"""Largest distance of the reference mass from the flange [m], as in tests/calib/drawn_arms.py."""
 
 
 def reference_masses(

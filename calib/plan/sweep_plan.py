@@ -13,6 +13,7 @@ from calib.plan.bias_torque import (
     required_bias,
     travel_acceleration,
 )
+from calib.plan.choices import DEAD_LEVER, ENOUGH, FINEST, MORE_POSES, SERVO_GAP
 from calib.plan.poses import Poses, scout_poses, sweep_range
 from calib.plan.predicted_precision import predicted_gain_std, worst_gain_std
 from calib.plan.reference_mass import reference_masses
@@ -21,17 +22,6 @@ from calib.plan.stop_selection import Candidates, choose_stops, guessed_moments
 from calib.plan.sweep_options import PlannedArm, sweep_options
 from calib.plan.types import Sweep, SweepPlan
 from gcomp.arrays import Array, Mask
-
-DEAD_LEVER = 0.005
-"""Γ/g below which a joint is swept at one combination, for its offset alone (docs/theory.md, section 4.4)."""
-SERVO_GAP = 0.05
-"""Distance from the stop at which a servo-held joint rests [rad]; a choice."""
-MORE_POSES = 2
-"""Stop combinations per joint that may be added to reach the gains' precision; a choice: each takes minutes."""
-FINEST = 3.0
-"""Largest factor of precision by averaging longer: nine times the samples; a choice."""
-ENOUGH = 1.2
-"""Factor by which the gains may be less precise than asked without a note; a choice."""
 
 
 def plan_sweep(

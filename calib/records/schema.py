@@ -1,42 +1,37 @@
 """Tables of the record store. A change here needs a migration in `calib/records/migrations/versions`."""
 
+from typing import Any
+
 import sqlalchemy as sa
 
 TABLES = sa.MetaData()
+
+
+def _texts(*names: str) -> list[sa.Column[str]]:
+    return [sa.Column(name, sa.String, nullable=False) for name in names]
+
+
+def _of_a_record() -> list[sa.Column[Any]]:
+    """Columns of a numbered row that is about a record."""
+    return [
+        sa.Column("number", sa.Integer, primary_key=True, autoincrement=True),
+        sa.Column("record", sa.String(8), sa.ForeignKey("records.id"), nullable=False),
+    ]
+
+
+def _body() -> sa.Column[str]:
+    return sa.Column("body", sa.Text, nullable=False)
+
+
 RECORDS = sa.Table(
     "records",
     TABLES,
     sa.Column("id", sa.String(8), primary_key=True),
-    sa.Column("kind", sa.String, nullable=False),
-    sa.Column("arm", sa.String, nullable=False),
-    sa.Column("serial", sa.String, nullable=False),
-    sa.Column("created", sa.String, nullable=False),
-    sa.Column("body", sa.Text, nullable=False),
+    *_texts("kind", "arm", "serial", "created"),
+    _body(),
 )
-ACTIVATIONS = sa.Table(
-    "activations",
-    TABLES,
-    sa.Column("number", sa.Integer, primary_key=True, autoincrement=True),
-    sa.Column("record", sa.String(8), sa.ForeignKey("records.id"), nullable=False),
-    sa.Column("kind", sa.String, nullable=False),
-    sa.Column("arm", sa.String, nullable=False),
-    sa.Column("serial", sa.String, nullable=False),
-    sa.Column("at", sa.String, nullable=False),
-    sa.Column("by", sa.String, nullable=False),
-    sa.Column("reason", sa.String, nullable=False),
-)
-WRITES = sa.Table(
-    "writes",
-    TABLES,
-    sa.Column("number", sa.Integer, primary_key=True, autoincrement=True),
-    sa.Column("record", sa.String(8), sa.ForeignKey("records.id"), nullable=False),
-    sa.Column("arm", sa.String, nullable=False),
-    sa.Column("serial", sa.String, nullable=False),
-    sa.Column("at", sa.String, nullable=False),
-    sa.Column("by", sa.String, nullable=False),
-    sa.Column("stage", sa.String, nullable=False),
-    sa.Column("body", sa.Text, nullable=False),
-)
+ACTIVATIONS = sa.Table("activations", TABLES, *_of_a_record(), *_texts("kind", "arm", "serial", "at", "by", "reason"))
+WRITES = sa.Table("writes", TABLES, *_of_a_record(), *_texts("arm", "serial", "at", "by", "stage"), _body())
 """Journal of writes to controllers: stage `begun` with the calibrations held before, then `finished` or `undone`."""
 
 MIGRATIONS = ("0001", "0002")

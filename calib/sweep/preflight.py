@@ -4,7 +4,7 @@ A drive that gets too hot later says so by an emergency, which ends any sweep.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -144,7 +144,7 @@ def find_stops(
             if report is not None:
                 report(2 * count + end + 1, 2 * link.n)
     mover.travel(middle, 1.0)
-    return Preflight(found.names, found.noise, found.torque, stops, found.expected, found.temperature)
+    return replace(found, stops=stops)
 
 
 def _noise(values: Array) -> float:

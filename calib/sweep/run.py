@@ -41,7 +41,6 @@ def run_sweep(
     reference_mass: float = 0.0,
     resume: bool = False,
     progress: Progress | None = None,
-    clock: Callable[[], float] = time.monotonic,
     seed: int = 0,
     on_stall: OnStall = give_up,
 ) -> SweepData:
@@ -57,7 +56,7 @@ def run_sweep(
     with DataWriter(out, manifest, resume) as writer:
         data = load_data(out)
         mover = bridged(link, on_stall, lambda: Mover(link, sweep_section(arm), Limits.of(arm)))
-        run = _Pass(mover, writer, list(data.readings), progress or (lambda *_: None), clock, on_stall)
+        run = _Pass(mover, writer, list(data.readings), progress or (lambda *_: None), on_stall)
         if data.plan is None:
             first = plan_sweep(arm, seed=seed, reference_mass=reference_mass)
             check_plan(arm, first)
@@ -103,7 +102,6 @@ class _Pass:
         writer: DataWriter,
         readings: list[StaticReading],
         progress: Progress,
-        clock: Callable[[], float],
         on_stall: OnStall = give_up,
     ) -> None:
         self._on_stall = on_stall
@@ -111,15 +109,14 @@ class _Pass:
         self.section: SweepSection = mover.section
         self.total, self.acceleration = 0, 1.0
         self.refuge = mover.position.copy()
-        self._progress, self._clock = progress, clock
-        self._began, self._at_start = clock(), len(readings)
+        self._progress, self._began, self._at_start = progress, time.monotonic(), len(readings)
 
     def save(self, reading: StaticReading) -> None:
         """Put a reading on disk and report."""
         self.writer.append(reading)
         self.readings.append(reading)
         made = len(self.readings) - self._at_start
-        left = (self._clock() - self._began) / made * max(self.total - len(self.readings), 0)
+        left = (time.monotonic() - self._began) / made * max(self.total - len(self.readings), 0)
         self._progress(len(self.readings), self.total, left, self._text(reading))
 
     def _text(self, reading: StaticReading) -> str:

@@ -7,13 +7,15 @@ import numpy as np
 
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
-from gcomp.design.sweep_design import SKETCH_STEPS, Sweep, candidate_sweeps, readings_of
+from gcomp.design.choices import SKETCH_STEPS
+from gcomp.design.sweep_design import Sweep, candidate_sweeps, readings_of
 from gcomp.identify.block_qr import fold
-from gcomp.identify.identifiability import NULL_STD, analyse, describe_null_space
+from gcomp.identify.identifiability import analyse, describe_null_space
 from gcomp.identify.natural_units import natural_units
 from gcomp.identify.parameters import Parameters, free_mask, parameter_names
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import expected_readings, predict_and_jacobian
+from gcomp.identify.thresholds import NULL_STD
 
 
 def remedies(

@@ -13,12 +13,9 @@ from numpy.typing import ArrayLike
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array, Mask
+from gcomp.design.choices import EXCHANGES
 from gcomp.gravity.torque import gravity_regressor, gravity_stiffness
 from gcomp.identify.parameters import Parameters, family_slices
-
-EXCHANGES = 2
-"""Rounds in which every selected candidate is compared once more with all others. Further rounds changed 4 of 28
-designs (the paper's arm and ten random ones, both criteria)."""
 
 Criterion = Literal["D", "A"]
 Cost = Callable[[list[list[int]], int, int], Array]

@@ -15,12 +15,7 @@ from gcomp.identify.natural_units import natural_units
 from gcomp.identify.parameters import Parameters, Prior, family_slices, parameter_names, prior_vectors
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import expected_readings, predict
-
-MAX_STD = {"gain": 0.2, "offset": 0.5, "position_gain": 0.1, "position_offset": 0.35, "beta": 0.5, "rho": 0.2}
-"""Standard deviation beyond which a value is of no use, per family: as a share of the gain, of the readings' RMS for
-offsets, of that over g for mass moments; rad; m (docs/theory.md, section 7.3)."""
-DOUBT = 2.0
-"""Weighted squares per degree of freedom above which another start is tried (docs/theory.md, section 7.2)."""
+from gcomp.identify.thresholds import DOUBT, MAX_STD
 
 
 @dataclass(frozen=True, eq=False)

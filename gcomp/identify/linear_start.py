@@ -7,20 +7,11 @@ from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array, Mask
 from gcomp.gravity.torque import gravity_regressor
 from gcomp.identify.block_qr import least_squares
-from gcomp.identify.identifiability import NULL_RATIO
 from gcomp.identify.natural_units import natural_units
 from gcomp.identify.parameters import Parameters, family_slices
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import joint_positions
-
-SANE_GAIN_RATIO = 5.0
-"""Factor to the start beyond which a gain counts as not determined by its readings (docs/theory.md, section 7.2)."""
-
-
-FACTORS = (1.0, 0.7, 1.4, 0.5, 2.0, -1.0, -0.7, -1.4, -0.5, -2.0)
-"""Common factors tried for such gains: position errors make (L) shrink κ towards zero but keep sign and ratios."""
-SMALLEST_RATIO = 1e-2
-"""Share of its start below which the sign of a κ is not determined either."""
+from gcomp.identify.thresholds import FACTORS, NULL_RATIO, SANE_GAIN_RATIO, SMALLEST_RATIO
 
 
 def linear_start(

@@ -7,6 +7,7 @@ from armlink.bus.port import EXTENDED, REMOTE
 from armlink.drives.cubemars.frames import NO_COMMAND, Reply, pack_reply
 from armlink.drives.cubemars.settings import CubeMarsSettings
 from armlink.drives.mit_packing import MitFeedback, Ranges, Special, special_of, unpack_command
+from sim_bus.drives.front import AddressedFront
 from sim_bus.drives.motor import Motor
 from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, SimulatedDrive
 
@@ -23,7 +24,7 @@ class CubeMarsDrive(SimulatedDrive):
     def __init__(self, motor: Motor, send: Callable[[int, bytes], None], settings: CubeMarsSettings) -> None:
         """Out of motor mode."""
         super().__init__(motor, send)
-        self.id, self.reply = settings.id, settings.reply
+        self.address, self.reply = settings.id, settings.reply
         self.can_timeout = settings.can_timeout
         self._ranges = settings.ranges
         self.motor_mode, self.command, self.error = False, NO_COMMAND, 0
@@ -76,7 +77,7 @@ class CubeMarsDrive(SimulatedDrive):
         motor, coding = self.motor, self.coding
         feedback = MitFeedback(self._shown(motor.position), motor.velocity, motor.torque)
         temperature = int(MOTOR_TEMPERATURE + motor.heating)
-        self.answer(self.reply, pack_reply(Reply(self.id, feedback, temperature, self.error), coding))
+        self.answer(self.reply, pack_reply(Reply(self.address, feedback, temperature, self.error), coding))
 
     def trip(self) -> None:
         """CAN timeout: its command becomes one of no torque; motor mode goes on."""
@@ -95,13 +96,8 @@ class CubeMarsDrive(SimulatedDrive):
         self.motor.free()
 
 
-class CubeMarsFront:
+class CubeMarsFront(AddressedFront[CubeMarsDrive]):
     """All CubeMars drives on one bus: which of them a frame is for."""
-
-    def __init__(self, drives: list[CubeMarsDrive]) -> None:
-        """`drives` have different ids."""
-        self.drives = drives
-        self._addressed = {drive.id: drive for drive in drives}
 
     def on_frame(self, can_id: int, data: bytes) -> None:
         """A frame from the bus."""

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from importlib.metadata import entry_points
-from typing import Protocol
 from zlib import crc32
 
 from armlink.arm_file import ArmFile, LinkJoint
@@ -10,31 +9,14 @@ from armlink.drives.damiao.models import MODELS
 from armlink.errors import BadInput
 from sim_bus.drives.cubemars import CubeMarsDrive, CubeMarsFront
 from sim_bus.drives.damiao import DamiaoDrive, DamiaoFront
+from sim_bus.drives.front import Front
 from sim_bus.drives.moteus import MoteusDrive, MoteusFront
 from sim_bus.drives.motor import Motor
 from sim_bus.drives.odrive import ODriveAxis, ODriveFront, cyclic_periods
 from sim_bus.drives.robstride import RobStrideDrive, RobStrideFront
-from sim_bus.drives.simulated_drive import SimulatedDrive
 
 Send = Callable[[int, bytes], None]
 Joint = tuple[LinkJoint, Motor]
-
-
-class Front(Protocol):
-    """The drives of one family on one bus."""
-
-    @property
-    def drives(self) -> Sequence[SimulatedDrive]:
-        """In arm order."""
-        ...
-
-    def on_frame(self, can_id: int, data: bytes) -> None:
-        """A frame from the bus."""
-        ...
-
-    def joint_of(self, can_id: int) -> int | None:
-        """Joint whose drive sends frames of this identifier, or None."""
-        ...
 
 
 def _damiao(arm: ArmFile, joints: Sequence[Joint], send: Send) -> Front:

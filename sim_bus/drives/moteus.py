@@ -22,6 +22,7 @@ from armlink.drives.moteus.frames import (
     pack_reply,
     unpack,
 )
+from sim_bus.drives.front import AddressedFront
 from sim_bus.drives.motor import Motor
 from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
 
@@ -63,7 +64,7 @@ class MoteusDrive(SimulatedDrive):
     def __init__(self, motor: Motor, send: Callable[[int, bytes], None], drive: int, serial: int) -> None:
         """As configured for its joint: gains tuned, encoder at the output."""
         super().__init__(motor, send)
-        self.drive, self.serial = drive, serial
+        self.address, self.serial = drive, serial
         self.mode, self.fault_code = Mode.STOPPED, 0
         self.command: dict[int, float] = dict(COMMANDS)
         self._gains = motor.tuned
@@ -103,7 +104,7 @@ class MoteusDrive(SimulatedDrive):
         self._reply(source, content)
 
     def _reply(self, source: int, content: bytes) -> None:
-        answer = identifier(self.drive, source)
+        answer = identifier(self.address, source)
         self.answer(answer | EXTENDED * (answer > 0x7FF), content)
 
     # ---- registers
@@ -240,13 +241,8 @@ def _shown(asked: Subframe, shown: dict[int, float]) -> Subframe:
     return Subframe(REPLY, asked.register, value, INT32 if whole and asked.resolution == FLOAT else asked.resolution)
 
 
-class MoteusFront:
+class MoteusFront(AddressedFront[MoteusDrive]):
     """All moteus controllers on one bus: which of them a frame is for."""
-
-    def __init__(self, drives: list[MoteusDrive]) -> None:
-        """`drives` have different ids."""
-        self.drives = drives
-        self._addressed = {drive.drive: drive for drive in drives}
 
     def on_frame(self, can_id: int, data: bytes) -> None:
         """A frame from the bus."""
@@ -261,5 +257,4 @@ class MoteusFront:
 
     def joint_of(self, can_id: int) -> int | None:
         """See Front."""
-        drive = self._addressed.get(can_id >> 8 & 0x7F) if can_id & 0x1FFFFFFF < 0x10000 else None
-        return None if drive is None else drive.joint
+        return self.joint_at(can_id >> 8 & 0x7F) if can_id & 0x1FFFFFFF < 0x10000 else None

@@ -4,18 +4,9 @@ import math
 from collections.abc import Callable
 
 from armlink.bus.port import EXTENDED, REMOTE
-from armlink.drives.odrive.frames import (
-    INPUT_FEED_FORWARD,
-    PASSTHROUGH,
-    POSITION_CONTROL,
-    TORQUE_CONTROL,
-    AxisError,
-    AxisState,
-    Message,
-    identifier,
-    pack,
-    unpack,
-)
+from armlink.drives.odrive import frames
+from armlink.drives.odrive.frames import AxisError, AxisState, Message, identifier, pack, unpack
+from sim_bus.drives.front import AddressedFront
 from sim_bus.drives.motor import Motor
 from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
 
@@ -49,9 +40,9 @@ class ODriveAxis(SimulatedDrive):
     ) -> None:
         """Configured over USB: gains tuned, watchdog time [s] (0: off), period of each cyclic message [s]."""
         super().__init__(motor, send)
-        self.node, self.serial = node, serial
+        self.address, self.serial = node, serial
         self.state, self.errors, self.reason = AxisState.IDLE, 0, 0
-        self.control_mode, self.input_mode = POSITION_CONTROL, PASSTHROUGH
+        self.control_mode, self.input_mode = frames.POSITION_CONTROL, frames.PASSTHROUGH
         stiffness, damping, integral = motor.tuned
         self._position_gain, self._velocity_gain = stiffness / damping, damping
         """[1/s], [N·m·s/rad]."""
@@ -94,7 +85,7 @@ class ODriveAxis(SimulatedDrive):
         elif command == Message.INPUT_POSITION:
             ahead = self.scale("torque")
             position, velocity, torque = values
-            velocity, torque = velocity * INPUT_FEED_FORWARD, torque * INPUT_FEED_FORWARD
+            velocity, torque = velocity * frames.INPUT_FEED_FORWARD, torque * frames.INPUT_FEED_FORWARD
             self._take_input(position * TURN * self.scale("position"), velocity * TURN, torque * ahead)
         elif command == Message.INPUT_TORQUE:
             self._take_input(self._input[0], 0.0, values[0] * self.scale("torque"))
@@ -138,10 +129,10 @@ class ODriveAxis(SimulatedDrive):
             return
         position, velocity, torque = self._input
         limit = self._current_limit * TORQUE_CONSTANT
-        if self.control_mode == TORQUE_CONTROL:
+        if self.control_mode == frames.TORQUE_CONTROL:
             self._integral = 0.0
             self.motor.impede(0.0, 0.0, 0.0, 0.0, torque, limit)
-        elif self.control_mode == POSITION_CONTROL:
+        elif self.control_mode == frames.POSITION_CONTROL:
             error = position - self.motor.position
             most, wanted = self._velocity_limit, velocity + self._position_gain * error
             short = max(-most, min(most, wanted)) - self.motor.velocity
@@ -184,7 +175,7 @@ class ODriveAxis(SimulatedDrive):
             content[Message.TORQUES] = (self._input[2], torque)
         values = content.get(command)
         if values is not None:
-            self.answer(identifier(self.node, command), pack(Message(command), *values))
+            self.answer(identifier(self.address, command), pack(Message(command), *values))
 
     # ---- faults
 
@@ -195,7 +186,7 @@ class ODriveAxis(SimulatedDrive):
     def reboot(self) -> None:
         """See SimulatedDrive."""
         self.state, self.errors, self.reason = AxisState.IDLE, 0, 0
-        self.control_mode, self.input_mode = POSITION_CONTROL, PASSTHROUGH
+        self.control_mode, self.input_mode = frames.POSITION_CONTROL, frames.PASSTHROUGH
         self.motor.free()
 
     def inject(self, fault: str, value: float) -> None:
@@ -209,13 +200,8 @@ class ODriveAxis(SimulatedDrive):
         self._disarm(AxisError.MISSING_ESTIMATE)
 
 
-class ODriveFront:
+class ODriveFront(AddressedFront[ODriveAxis]):
     """All ODrive axes on one bus: which of them a frame is for."""
-
-    def __init__(self, drives: list[ODriveAxis]) -> None:
-        """`drives` have different node ids."""
-        self.drives = drives
-        self._addressed = {drive.node: drive for drive in drives}
 
     def on_frame(self, can_id: int, data: bytes) -> None:
         """A frame from the bus."""
@@ -227,5 +213,4 @@ class ODriveFront:
 
     def joint_of(self, can_id: int) -> int | None:
         """See Front."""
-        drive = self._addressed.get(can_id >> 5) if can_id < 0x800 else None
-        return None if drive is None else drive.joint
+        return self.joint_at(can_id >> 5) if can_id < 0x800 else None

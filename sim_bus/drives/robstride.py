@@ -22,6 +22,7 @@ from armlink.drives.robstride.frames import (
     unpack_motion,
     unpack_value,
 )
+from sim_bus.drives.front import AddressedFront
 from sim_bus.drives.motor import Motor
 from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, SimulatedDrive
 
@@ -41,7 +42,7 @@ class RobStrideDrive(SimulatedDrive):
     def __init__(self, motor: Motor, send: Callable[[int, bytes], None], drive: int, model: str, serial: int) -> None:
         """As the maker delivers it: deadman off, motion mode."""
         super().__init__(motor, send)
-        self.drive, self.serial = drive, serial
+        self.address, self.serial = drive, serial
         self._ranges = RANGES[model]
         self._stored: dict[int, float] = {
             Parameter.RUN_MODE: MOTION_MODE,
@@ -90,7 +91,7 @@ class RobStrideDrive(SimulatedDrive):
             self._host = data_of(can_id) & 0xFF
         if kind == Type.IDENTITY:
             self.answer(
-                identifier(Type.IDENTITY, self.drive, IDENTITY_TARGET) | EXTENDED, self.serial.to_bytes(8, "little")
+                identifier(Type.IDENTITY, self.address, IDENTITY_TARGET) | EXTENDED, self.serial.to_bytes(8, "little")
             )
         elif kind == Type.READ:
             self._read(int.from_bytes(data[:2], "little"))
@@ -135,7 +136,7 @@ class RobStrideDrive(SimulatedDrive):
             return
         motor = self.motor
         motion = MitFeedback(motor.position, motor.velocity, motor.torque)
-        feedback = Feedback(self.drive, self.fault_bits, self.mode, motion, MOTOR_TEMPERATURE)
+        feedback = Feedback(self.address, self.fault_bits, self.mode, motion, MOTOR_TEMPERATURE)
         can_id, data = pack_feedback(feedback, self._host, self.coding, kind)
         self.answer(can_id | EXTENDED, data)
 
@@ -148,7 +149,7 @@ class RobStrideDrive(SimulatedDrive):
         }
         value = (live | self.parameters).get(parameter)
         unknown = NEVER_READ << 8 if value is None else 0
-        head = identifier(Type.READ, unknown | self.drive, self._host)
+        head = identifier(Type.READ, unknown | self.address, self._host)
         content = bytes(4) if value is None else pack_value(parameter, value)
         self.answer(head | EXTENDED, parameter.to_bytes(2, "little") + bytes(2) + content)
 
@@ -190,13 +191,8 @@ class RobStrideDrive(SimulatedDrive):
         self._stop()
 
 
-class RobStrideFront:
+class RobStrideFront(AddressedFront[RobStrideDrive]):
     """All RobStride drives on one bus: which of them a frame is for."""
-
-    def __init__(self, drives: list[RobStrideDrive]) -> None:
-        """`drives` have different ids."""
-        self.drives = drives
-        self._addressed = {drive.drive: drive for drive in drives}
 
     def on_frame(self, can_id: int, data: bytes) -> None:
         """A frame from the bus."""
@@ -208,5 +204,4 @@ class RobStrideFront:
 
     def joint_of(self, can_id: int) -> int | None:
         """See Front."""
-        drive = self._addressed.get(can_id >> 8 & 0xFF) if can_id & EXTENDED else None
-        return None if drive is None else drive.joint
+        return self.joint_at(can_id >> 8 & 0xFF) if can_id & EXTENDED else None

@@ -17,6 +17,8 @@ class SimulatedDrive:
 
     LATCHES = False
     """Whether a trip of the watchdog ends only by a command of its own."""
+    address: int
+    """Its id on the bus, where its family has but one."""
 
     def __init__(self, motor: Motor, send: Callable[[int, bytes], None]) -> None:
         """`send(can_id, data)` puts a frame on the drive's bus."""

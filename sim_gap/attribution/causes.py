@@ -2,14 +2,14 @@
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.attribution.confidence import confidence
-from sim_gap.attribution.diagnosis import Cause, Signs
+from sim_gap.attribution.diagnosis import HINT, Cause, Signs
 from sim_gap.attribution.law_test import LawTest
 from sim_gap.attribution.rivals import Rivals
 from sim_gap.attribution.steadiness import STEADY, steadiness
@@ -91,6 +91,11 @@ class _Scorer:
         np.maximum.at(out, self.joint[self.counts], (before - after)[self.counts])
         noisy = np.array([by_row or layout.beyond(joint) > 0 for joint in range(layout.n)])
         return np.where(noisy, out, whole)
+
+    def missed(self, terms: Sequence[Term]) -> float:
+        """Largest increase of a joint's RMS without these terms, the others fitted again [N·m]."""
+        rest = [term for term in self.estimate.terms if term not in terms]
+        return float(np.max(self.rms(rest) - self.rms(list(self.estimate.terms))))
 
     def _by_joint(self, squares: Array) -> Array:
         out = np.zeros(self.heldout.layout.n)
@@ -188,6 +193,7 @@ def causes(
     scorer = _Scorer(estimate, heldout)
     fitted = _Scorer(estimate, estimate.store.data)
     law_test = LawTest(estimate.store, estimate.terms)
+    hints: list[Term] = []
     for step in ordered(estimate, scorer):
         main = relevant_terms(step, estimate, heldout, scorer, quiet)
         if quiet and main and steadiness(estimate, heldout, main) < STEADY:
@@ -197,7 +203,9 @@ def causes(
             if terms:
                 bound = not any(_is_held_out(term, heldout) for term in terms)
                 out.append(_cause(step, terms, fitted if bound else scorer, (rivals, law_test), names))
-    return found, minor
+                hints += terms if out is found and out[-1].confidence < HINT else ()
+    missed = max(one.missed(hints) for one in (scorer, fitted))
+    return [replace(each, fall=min(each.fall, missed)) if each.confidence < HINT else each for each in found], minor
 
 
 def _is_held_out(term: Term, heldout: ResidualSet) -> bool:

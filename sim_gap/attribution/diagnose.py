@@ -29,6 +29,7 @@ from sim_gap.checks.position_command import check_position_only, is_position_onl
 from sim_gap.effects.registry import library_without
 from sim_gap.model.arm_joints import hinges_of
 from sim_gap.model.load import SimModel, load_compiled, load_model
+from sim_gap.residuals.besides import without_disturbances
 from sim_gap.residuals.preprocess import prepare, require_length
 from sim_gap.residuals.residual_set import ResidualSet, residual_sets
 from sim_gap.search.column_store import ColumnStore
@@ -108,12 +109,12 @@ def diagnose(
     _require_motion(fit)
     library = library_without(withhold)
     search, estimate = _fitted(fit, library)
-    judge = placed(estimate, judge)
+    judge = _placed(estimate, judge)
     if "link.payload" in library and (lent := lacking(estimate, judge)):
         more, rest, recordings = _lent(fit, judge, heldout, lent)
         other, again = _fitted(more, library)
         if body_of(again) is not None:
-            search, estimate, judge, heldout = other, again, placed(again, rest), recordings
+            search, estimate, judge, heldout = other, again, _placed(again, rest), recordings
             heldout_is += f"; of {', '.join(judge.signals[k].label for k in lent)} the second half, for {LENT}"
     fit = estimate.store.data
     quiet = not fit.impacts and is_quiet(judge) and is_quiet(fit)
@@ -127,7 +128,21 @@ def diagnose(
     return replace(made, checks=findings, notes=(*made.notes, *told), friction_compensation=tuple(compensated))
 
 
+def _placed(estimate: Estimate, heldout: ResidualSet) -> ResidualSet:
+    """The held-out recordings by the body that they have (`placed`), without what disturbed the arm."""
+    judge = placed(estimate, heldout)
+    return without_disturbances(judge, estimate.predict(judge))
+
+
 def _fitted(fit: ResidualSet, library: Sequence[str]) -> tuple[Search, Estimate]:
+    """The search of the library and the fit (`_searched`); again without what disturbed the arm, if anything did."""
+    search, estimate = _searched(fit, library)
+    data = estimate.store.data
+    undisturbed = without_disturbances(data, estimate.predict(data))
+    return (search, estimate) if undisturbed is data else _searched(undisturbed, library)
+
+
+def _searched(fit: ResidualSet, library: Sequence[str]) -> tuple[Search, Estimate]:
     """The search of the library and the fit; again if a body is mounted in different ways, kept if that is better."""
     search = select_model(ColumnStore(fit), library)
     estimate = Estimate(search.normal.store, search.active)

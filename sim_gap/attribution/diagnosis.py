@@ -47,7 +47,8 @@ class Cause:
     gap_after: float
     confidence: float
     fall: float
-    """Largest decrease of a joint's held-out RMS [N·m]."""
+    """Largest decrease of a joint's held-out RMS when it is added [N·m]; of a hint, at most what is lost without all
+    hints together, since of what it took in its turn the surer causes may take most."""
     signs: Signs
     """The signs that the confidence follows from."""
     confounded_with: tuple[str, ...] = ()

@@ -10,6 +10,7 @@ from sim_gap.attribution.diagnosis import Cause
 from sim_gap.attribution.residual_laws import ResidualLaw
 from sim_gap.attribution.verdict import row_rms
 from sim_gap.effects.laws import LAWS
+from sim_gap.residuals.disturbances import AROUND_S
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.preprocess import ABSENT
 from sim_gap.residuals.residual_set import ResidualSet
@@ -33,7 +34,7 @@ def notes(
     left: dict[Row, Array],
 ) -> tuple[str, ...]:
     """All notes; `fit` is the training set, `judge` the held-out set with the remaining residual `left`."""
-    usual = (*_noisy(fit), *_spiked((fit, judge)), *_stuck(stuck, fit), *_impacts(fit))
+    usual = (*_noisy(fit), *_spiked((fit, judge)), *_stuck(stuck, fit), *_impacts(fit), *_disturbed((fit, judge)))
     known = (*usual, *_common_factor(estimate, fit), *_bound(estimate, fit, judge), *_alike(found))
     return (*known, *_remaining(judge, left), *_at_rest(fit))
 
@@ -80,6 +81,19 @@ def _impacts(data: ResidualSet) -> tuple[str, ...]:
         f"samples ({near.mean():.0%} of the time) are left out of the comparison"
         for joint, near in data.impacts.items()
     )
+
+
+def _disturbed(sets: Sequence[ResidualSet]) -> tuple[str, ...]:
+    """A note for each disturbance."""
+    lines = (
+        f"{s.label}: at {one.start:.1f} s several joints are far off at once, {s.arm.names[one.joint]} by "
+        f"{one.torque:.2g} N·m, as at no other time: something touched the arm or torques were misread; "
+        f"{one.end - one.start + 2.0 * AROUND_S:.1f} s are left out"
+        for data in sets
+        for s in data.signals
+        for one in s.disturbances
+    )
+    return tuple(dict.fromkeys(lines))
 
 
 def _common_factor(estimate: Estimate | None, fit: ResidualSet) -> tuple[str, ...]:

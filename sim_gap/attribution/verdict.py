@@ -53,7 +53,7 @@ def closed(data: ResidualSet, left: dict[Row, Array]) -> bool:
 
 
 def carries(cause: Cause, found: Sequence[Cause]) -> bool:
-    """Whether a cause carries the explanation: it takes off a good part of what the most important one does."""
+    """Whether a cause carries the explanation: a good part of what the most important one takes off is lost without."""
     return cause.fall >= CARRIES * max(each.fall for each in found)
 
 

@@ -16,6 +16,7 @@ from sim_gap.checks.joint_range import find_beyond_range, find_counts
 from sim_gap.checks.mapping import SURE, find_mapping
 from sim_gap.checks.rigid_fit import as_mounted, fit_rigid, motion_of
 from sim_gap.checks.torque_source import (
+    find_absent,
     find_delay,
     find_gain_command,
     find_same,
@@ -103,7 +104,8 @@ def _source(arm: RigidArm, s: Signals, channel: str, _: Recording, stated: Corre
     """Findings on the channel's scale and on what it is a reading of."""
     motion = motion_of(s, channel)
     fit = fit_rigid(as_mounted(arm, motion), motion)
-    return [*find_scale(arm, fit, motion, stated), *find_source(fit, s, motion, stated)]
+    scale = find_scale(arm, fit, motion, stated) or find_absent(arm, fit, motion, stated)
+    return [*scale, *find_source(fit, s, motion, stated)]
 
 
 def _corrected(recording: Recording, finding: Finding, label: str) -> Recording:

@@ -14,8 +14,7 @@ from sim_gap.closed_loop.columns import shared_effects, with_columns
 from sim_gap.closed_loop.compete import select
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of, starting_fit
 from sim_gap.closed_loop.fit import Fit, evaluate, improve
-from sim_gap.closed_loop.judge import Covariance, Stage, covariance, rms_on, stages
-from sim_gap.closed_loop.parameters import EFFECTS
+from sim_gap.closed_loop.judge import Covariance, Stage, covariance, groups_of, rms_on, stages, taken_out
 from sim_gap.closed_loop.search import Search
 from sim_gap.closed_loop.training.bands import Band, band
 from sim_gap.closed_loop.training.export import Exported, exported, native_fit
@@ -90,7 +89,7 @@ def identify(
     fit = improve(fitted, replace(fit, rms=None), scales, 6)
     progress("each effect on held-out data")
     found = tuple(stages(replace(search, data=data), evaluate(data, fit), judged))
-    before = _bare(search, own.complete)
+    before = _bare(search, fit, own.complete)
     native = native_fit(search, fit)
     margin = _margin(search, fit, floor)
     spread = covariance(search, fit)
@@ -141,13 +140,13 @@ def gain_scales(gains: Sequence[str], labels: Sequence[str]) -> list[float]:
     return [found[i] / found[0] for i in range(len(labels))]
 
 
-def _bare(search: Search, complete: bool) -> Fit:
-    """The nominal model with its own controller, or with one that is fitted without any effect."""
-    point = {name: values.copy() for name, values in search.nominal.items()}
+def _bare(search: Search, fit: Fit, complete: bool) -> Fit:
+    """The nominal model with its own controller, or with that of the fit, fitted again without any effect."""
     if complete:
-        return Fit(point, ((),) * search.data.joints)
-    names = tuple(n for e in EFFECTS.values() if e.id in search.kept for n in e.parameters if n != "feed")
-    return improve(search.data, Fit(point, (names,) * search.data.joints), search.scales, 6)
+        return Fit({name: values.copy() for name, values in search.nominal.items()}, ((),) * search.data.joints)
+    for group in groups_of(fit, search):
+        fit = taken_out(search, fit, group)
+    return improve(search.data, replace(fit, rms=None), search.scales, 6)
 
 
 def _frozen(sim: SimModel, data: Windows) -> frozenset[str]:

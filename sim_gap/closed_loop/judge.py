@@ -1,4 +1,4 @@
-"""What each effect is worth: its interval, what it lowers on held-out data, and which other effect would do as well."""
+"""What each effect is worth: its interval, and what it lowers on held-out data."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.closed_loop.candidates import ranked
 from sim_gap.closed_loop.columns import UNIT, shared_effects
 from sim_gap.closed_loop.fit import LOGARITHMIC, Fit, evaluate, improve, jacobian, moved
 from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS
-from sim_gap.closed_loop.search import PRICE, Search, effect_there, with_effect, without
+from sim_gap.closed_loop.rivals import Group, rivals_of
+from sim_gap.closed_loop.search import Search, effect_there, without
 from sim_gap.closed_loop.windows import Windows
 
 SYSTEMATIC = 0.02
@@ -19,8 +19,6 @@ LEAST_SHRINK = 0.05
 """Least relative fall of a joint's held-out RMS by a cause; less is a minor one."""
 LOOSE = 0.35
 """Relative standard deviation of a gain from which its scale is not decided."""
-Group = tuple[str, tuple[int, ...]]
-"""An effect with the joints that have it; no joints for one of the whole arm."""
 
 
 def groups_of(fit: Fit, search: Search) -> list[Group]:
@@ -153,55 +151,6 @@ def _worth(search: Search, current: Fit, trial: Fit) -> float:
     assert trial.rms is not None
     fall = joint_rms(search.data, current.rms) - joint_rms(search.data, trial.rms)
     return float((fall / np.maximum(search.floor, 0.1 * search.scales.angle)).max())
-
-
-def rivals_of(search: Search, fit: Fit, group: Group, bare: Fit) -> tuple[float, tuple[str, ...]]:
-    """Loss of the score with the best other effect in a group's place, and those effects that lose next to nothing.
-
-    `bare` is the fit without the group.
-    """
-    effect, joints = group
-    assert fit.rms is not None
-    base = search.score(fit)
-    loss = float((search.score(bare) - base).sum())
-    if effect == "controller.stiffness":
-        return loss, _scale_rivals(search, fit)
-    others = [e for e in EFFECTS if e != effect and e not in search.excluded]
-    j = max(joints, key=lambda i: float((search.score(bare) - base)[i]), default=-1)
-    close: list[str] = list(_ALWAYS.get(effect, ()))
-    least = loss
-    places = [j] if j >= 0 else [int(np.argmax(search.score(bare) - base))]
-    whole = float((search.score(bare) - base)[places[0]]) if j >= 0 else loss
-    for place in places:
-        for _, other in ranked(search, bare, others)[place][:2]:
-            trial = with_effect(search, bare, other, place)
-            only = replace(
-                trial, active=tuple(own if k == place else () for k, own in enumerate(trial.active)), shared=()
-            )
-            score = search.score(improve(search.data, only, search.scales, 4))
-            lost = float(score[place] - base[place]) if j >= 0 else float((score - base).sum())
-            least = min(least, lost + max(loss - whole, 0.0))
-            if lost < max(PRICE, 0.1 * whole):
-                close.append(other)
-    return least, tuple(dict.fromkeys(close))
-
-
-_ALWAYS = {
-    "controller.dead_zone": ("transmission.backlash",),
-}
-"""Effects that positions alone never separate."""
-
-
-def _scale_rivals(search: Search, fit: Fit) -> tuple[str, ...]:
-    """`actuator.rotor_inertia` if some joint's gain can be half as large again with all else fitted around it."""
-    point = {name: x.copy() for name, x in fit.point.items()}
-    active = [tuple(dict.fromkeys((*(n for n in own if n != "kp"), "armature"))) for own in fit.active]
-    point["kp"] = point["kp"] * 1.5
-    for name in ("coulomb", "viscous", "kd", "ki", "stribeck", "armature", "dead"):
-        point[name] = point[name] * (1.5 if name != "dead" else 1.0)
-    trial = improve(search.data, replace(fit, point=point, active=tuple(active), shared=(), rms=None), search.scales, 4)
-    lost = search.score(trial) - search.score(fit)
-    return ("actuator.rotor_inertia",) if bool((lost < PRICE).any()) else ()
 
 
 def undecided_scale(fit: Fit, spread: "Covariance") -> list[int]:

@@ -5,12 +5,14 @@ from typing import Annotated
 
 import typer
 
+from armlink.commands.options import Arm, OtherBus
+
 
 def collect(
-    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
+    arm: Arm,
     motion: Annotated[Path, typer.Option(help="Motion with columns t and q_cmd_i, as gap plan writes it.")],
     out: Annotated[Path, typer.Option(help="Recording to write (.mcap).")],
-    bus: Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")] = None,
+    bus: OtherBus = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write rows and seconds here; - is standard output.")
     ] = None,

@@ -6,9 +6,11 @@ from typing import Annotated
 
 import typer
 
+from armlink.commands.options import Arm
+
 
 def plan(
-    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
+    arm: Arm,
     out: Annotated[Path, typer.Option(help="Write the motion here (.csv with t and q_cmd_i).")],
     answer: Annotated[
         Path | None, typer.Option(help="Result of gap diagnose --json: its undecided joints are moved.")

@@ -14,8 +14,7 @@ from gcomp.gravity.torque import gravity_torque
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
-
-GRAVITY_POSES = 500
+from sim_gap.demo.script import GRAVITY_POSES
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from calib.report.figures import COLOURS, GREY, PANEL, verify_figure
 from calib.report.page import ReportTable, Section, paragraph, render
 from sim_gap.demo.creep_run import CreepDemo, worst_gain_error
 from sim_gap.demo.show import gap_line
-from sim_gap.demo.summary import SCHEMA, measured, numbers
+from sim_gap.demo.summary import numbers
 from sim_gap.report.page import sections as gap_sections
 
 SHOWN = (("gain", 4), ("offset", 3), ("zero", 4), ("coulomb", 3), ("load", 3), ("viscous", 3))
@@ -21,46 +21,43 @@ SHOWN = (("gain", 4), ("offset", 3), ("zero", 4), ("coulomb", 3), ("load", 3), (
 
 
 def summary(result: CreepDemo) -> dict[str, Any]:
-    """The demo's dictionary; null where a value cannot be determined."""
-    fit, check, truth = result.fit, result.gravity_check, result.truth
+    """`summary.json` of an arm without torque sensors."""
+    fit, truth = result.fit, result.run.truth
     true = {"gain": truth.gain, "offset": truth.offset, "position_offset": truth.position_offset}
     found = {"gain": "gain", "offset": "offset", "position_offset": "zero"}
-    return {
-        "schema": SCHEMA,
-        "arm": result.arm,
-        "seed": result.seed,
-        "joints": list(result.names),
-        "sensors": {
-            name: {
-                "true": numbers(true[name]),
-                "estimated": numbers(values_told(result.fit, family)),
-                "ci95": _intervals(result, family),
-            }
-            for name, family in found.items()
-        },
-        "friction": {
-            "coulomb": {
-                "true": numbers(result.coulomb),
-                "estimated": numbers(fit.value("coulomb")),
-                "ci95": _intervals(result, "coulomb"),
+    return result.run.to_json(
+        {
+            "sensors": {
+                name: {
+                    "true": numbers(true[name]),
+                    "estimated": numbers(values_told(result.fit, family)),
+                    "ci95": _intervals(result, family),
+                }
+                for name, family in found.items()
             },
-            **{
-                family: {"estimated": numbers(fit.value(family)), "ci95": _intervals(result, family)}
-                for family in ("load", "viscous", "asymmetry")
+            "friction": {
+                "coulomb": {
+                    "true": numbers(result.coulomb),
+                    "estimated": numbers(fit.value("coulomb")),
+                    "ci95": _intervals(result, "coulomb"),
+                },
+                **{
+                    family: {"estimated": numbers(fit.value(family)), "ci95": _intervals(result, family)}
+                    for family in ("load", "viscous", "asymmetry")
+                },
             },
-        },
-        "not_identifiable": {f"{joint}.{parameter}": reason for (joint, parameter), reason in missing(fit).items()},
-        "disturbed": list(fit.findings),
-        "sag": None
-        if result.sag is None
-        else {
-            "poses": result.sag.poses,
-            "nominal": numbers(result.sag.nominal),
-            "calibrated": numbers(result.sag.calibrated),
-        },
-        "drift": None,
-        **measured(check, result.verify, result.gap, result.bus, result.wall_s, result.sim_s),
-    }
+            "not_identifiable": {f"{joint}.{parameter}": reason for (joint, parameter), reason in missing(fit).items()},
+            "disturbed": list(fit.findings),
+            "sag": None
+            if result.sag is None
+            else {
+                "poses": result.sag.poses,
+                "nominal": numbers(result.sag.nominal),
+                "calibrated": numbers(result.sag.calibrated),
+            },
+            "drift": None,
+        }
+    )
 
 
 def creep_table(result: CreepDemo) -> Table:
@@ -68,8 +65,8 @@ def creep_table(result: CreepDemo) -> Table:
     table = Table(title="torque constants, zeros and friction: estimated ± 95 % (true)")
     for column in ("joint", HEADINGS["gain"], HEADINGS["zero"], HEADINGS["coulomb"]):
         table.add_column(column, justify="left" if column == "joint" else "right")
-    truths = {"gain": result.truth.gain, "zero": result.truth.position_offset, "coulomb": result.coulomb}
-    for joint, name in enumerate(result.names):
+    truths = {"gain": result.run.truth.gain, "zero": result.run.truth.position_offset, "coulomb": result.coulomb}
+    for joint, name in enumerate(result.run.names):
         cells = [f"{_cell(result, family, joint)} ({truth[joint]:.3f})" for family, truth in truths.items()]
         table.add_row(name, *cells)
     return table
@@ -78,22 +75,23 @@ def creep_table(result: CreepDemo) -> Table:
 def write_creep_report(result: CreepDemo, path: Path) -> None:
     """Write the page; raises OSError."""
     parts = [_overview(result), _calibration(result), _sweeps(result), _gravity(result)]
-    subtitle = f"simulated arm {result.arm}, hidden truth of seed {result.seed}"
-    render(path, "armlink demo", [*parts, *gap_sections(result.gap)], subtitle)
+    subtitle = f"simulated arm {result.run.arm}, hidden truth of seed {result.run.seed}"
+    render(path, "armlink demo", [*parts, *gap_sections(result.run.gap)], subtitle)
 
 
 def _overview(result: CreepDemo) -> Section:
-    check = result.gravity_check
+    run = result.run
+    check = run.gravity_check
     loaded = check.max_torque > 1e-6
     share = check.rms_error[loaded] / check.max_torque[loaded]
-    unseen = [name for name, seen in zip(result.names, result.fit.found("gain"), strict=True) if not seen]
+    unseen = [name for name, seen in zip(run.names, result.fit.found("gain"), strict=True) if not seen]
     items = [
-        f"{result.bus.frames:,} CAN frames in {result.sim_s:.0f} s of the arm's time at {result.bus.rate_hz:.0f} Hz;"
-        f" {result.wall_s:.0f} s on this machine.",
+        f"{run.bus.frames:,} CAN frames in {run.sim_s:.0f} s of the arm's time at {run.bus.rate_hz:.0f} Hz;"
+        f" {run.wall_s:.0f} s on this machine.",
         f"Torque constants found to {worst_gain_error(result):.2%} at worst"
         + (f"; not observable on {', '.join(unseen)}." if unseen else "."),
         f"Gravity torque in true N·m within {share.max():.2%} RMS of each joint's largest, at {check.poses} poses.",
-        gap_line(result.gap) + ".",
+        gap_line(run.gap) + ".",
     ]
     if result.sag is not None:
         before, after = (np.degrees(each.max()) for each in (result.sag.nominal, result.sag.calibrated))
@@ -109,8 +107,8 @@ def _overview(result: CreepDemo) -> Section:
 
 def _calibration(result: CreepDemo) -> Section:
     rows = [
-        [escape(name), f"{result.truth.gain[j]:.4f}", *(_cell(result, family, j) for family, _ in SHOWN)]
-        for j, name in enumerate(result.names)
+        [escape(name), f"{result.run.truth.gain[j]:.4f}", *(_cell(result, family, j) for family, _ in SHOWN)]
+        for j, name in enumerate(result.run.names)
     ]
     header = ("joint", "true reading per N·m", *(HEADINGS[family] for family, _ in SHOWN))
     reasons = [f"{joint}, {what.replace('_', ' ')}: {why}" for (joint, what), why in missing(result.fit).items()]
@@ -133,9 +131,9 @@ def _sweeps(result: CreepDemo) -> Section:
 
 
 def _sweep_figure(result: CreepDemo) -> Any:
-    fit, n = result.fit, len(result.names)
+    fit, n = result.fit, len(result.run.names)
     rows, residual = fit.rows, fit.solution.residual
-    figure = make_subplots(rows=n, cols=1, subplot_titles=[f"{name}: reading [N·m]" for name in result.names])
+    figure = make_subplots(rows=n, cols=1, subplot_titles=[f"{name}: reading [N·m]" for name in result.run.names])
     for joint in range(n):
         own = np.flatnonzero(rows.joint == joint)
         for number, sweep in enumerate(np.unique(rows.sweep[own])):
@@ -155,13 +153,13 @@ def _sweep_figure(result: CreepDemo) -> Any:
 
 
 def _gravity(result: CreepDemo) -> Section:
-    check, verify, sag = result.gravity_check, result.verify, result.sag
+    check, verify, sag = result.run.gravity_check, result.run.verify, result.sag
     columns = [verify.rms, check.rms_error, check.max_torque]
     header = ["joint", "RMS, model to half sums", "RMS, model to truth", "largest torque"]
     if sag is not None:
         columns += [np.degrees(sag.nominal), np.degrees(sag.calibrated)]
         header += ["sag, nominal model [°]", "sag, calibrated [°]"]
-    rows = [[escape(name), *(f"{column[j]:.4f}" for column in columns)] for j, name in enumerate(result.names)]
+    rows = [[escape(name), *(f"{column[j]:.4f}" for column in columns)] for j, name in enumerate(result.run.names)]
     text = f"Model torque and half sums of short creeps at {len(verify.position)} poses that were not used for any fit."
     table = ReportTable(header, rows, f"N·m; the truth is the plant's own gravity at {check.poses} random poses.")
     return Section("Gravity model", paragraph(text), [verify_figure(verify)], [table])

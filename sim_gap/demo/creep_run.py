@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from armlink.link.types import Stats
 from calib.arm.kinematics import model_arm
 from calib.arm.sweep_section import CreepSection, sweep_section
 from calib.creep.fit import CreepFit, fit_creep
@@ -21,44 +20,29 @@ from calib.plan.types import Sweep, SweepPlan
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
 from calib.sweep.dataset import SweepData
-from calib.sweep.verify import Verification
 from gcomp.arrays import Array
-from sim_bus.truth import Truth
-from sim_gap.attribution.diagnosis import Diagnosis
-from sim_gap.demo.bench import Bench, GravityCheck, check_gravity
+from sim_gap.demo.bench import Bench, check_gravity
 from sim_gap.demo.gap import diagnose_recordings
 from sim_gap.demo.motion import record_pair
 from sim_gap.demo.narrator import Narrator
 from sim_gap.demo.sag import Sag, mean_sag, sag_poses
+from sim_gap.demo.script import BY, CREEP_RECORDED_S
+from sim_gap.demo.summary import DemoRun
 
 QUICK = CreepSection(span=1.1, speeds=(0.2, 0.14))
 """Shorter and faster creeps than on a real arm, for two minutes: they cost a factor of two in precision."""
-RECORDED_S = (30.0, 20.0)
-"""Length of the gap's recordings [s]."""
-BY = "armlink demo"
 
 
 @dataclass(frozen=True, eq=False)
 class CreepDemo:
-    """Everything that the demo found, beside the truth."""
+    """Demo of an arm without torque sensors."""
 
-    arm: str
-    seed: int
-    names: tuple[str, ...]
-    truth: Truth
-    """Sensors at the end of the sweeps."""
+    run: DemoRun
     coulomb: Array
     """True Coulomb friction (n,) [N·m]."""
-    data: tuple[SweepData, ...]
     fit: CreepFit
     record: CalibrationRecord
-    gravity_check: GravityCheck
-    verify: Verification
     sag: Sag | None
-    gap: Diagnosis
-    bus: Stats
-    wall_s: float
-    sim_s: float
 
 
 def quick(arm: ArmFile) -> ArmFile:
@@ -91,7 +75,7 @@ def run_creep_demo(
             teller.say(each.reason)
     with teller.stage("fitting torque constants, friction, zeros and mass moments, all joints together"):
         fit = fit_creep(arm, passes)
-    truth = bench.simulated.true_sensors
+    bench = replace(bench, truth=bench.simulated.true_sensors)
     record = calibration_record(fit, arm)
     gravity = gravity_record(fit, arm, record)
     store.put(gravity, arm, by=BY, reason="creep sweeps")
@@ -102,13 +86,13 @@ def run_creep_demo(
     install(admit(record, arm, store), store, link, by=BY, reason="creep sweeps", check=None)
     teller.say(f"record {record.id} kept by the host and in force: it corrects readings and commands")
     with teller.stage("recording motion for the gap diagnosis") as report:
-        recordings = record_pair(bench, record, folder, seed, RECORDED_S, report, motor_only=True)
+        recordings = record_pair(bench, record, folder, seed, CREEP_RECORDED_S, report, motor_only=True)
     diagnosis = other_core.submit(diagnose_recordings, arm.path, recordings)
     with teller.stage("verifying at poses that the fit has not seen, creeping both ways") as report:
         check = verify_creeping(
             link, arm, gravity, record, poses=8, seed=seed, progress=lambda k, n: report(k, n, None, f"pose {k}")
         )
-    gravity_check = check_gravity(replace(bench, truth=truth), fit.beta, record, seed)
+    gravity_check = check_gravity(bench, fit.beta, record, seed)
     sag = None
     if nominal is not None:
         with teller.stage("holding the same poses by a tenth of the gains and the records"):
@@ -118,23 +102,8 @@ def run_creep_demo(
         answer = diagnosis.result()
     stats = link.stats
     link.disable()
-    return CreepDemo(
-        arm.name,
-        seed,
-        link.names,
-        truth,
-        bench.simulated.true_friction,
-        passes,
-        fit,
-        record,
-        gravity_check,
-        check,
-        sag,
-        answer,
-        stats,
-        teller.elapsed,
-        bench.simulated.time,
-    )
+    run = DemoRun(bench, seed, gravity_check, check, answer, stats, teller.elapsed, bench.simulated.time)
+    return CreepDemo(run, bench.simulated.true_friction, fit, record, sag)
 
 
 def _passes(bench: Bench, plan: SweepPlan, folder: Path, teller: Narrator) -> tuple[SweepData, ...]:
@@ -165,4 +134,4 @@ def _first_of_each(plan: SweepPlan) -> tuple[Sweep, ...]:
 def worst_gain_error(result: CreepDemo) -> float:
     """Largest relative error of the gains that were found."""
     found = result.fit.found("gain")
-    return float(np.abs(result.fit.value("gain") / result.truth.gain - 1)[found].max(initial=0.0))
+    return float(np.abs(result.fit.value("gain") / result.run.truth.gain - 1)[found].max(initial=0.0))

@@ -15,16 +15,14 @@ from calib.sweep.verify import Verification
 from gcomp.arrays import Array
 from sim_gap.demo.bench import Bench
 from sim_gap.demo.narrator import Report
-
-GAIN, OFFSET = 1.03, 0.3
-OFFSET_SHARE = 0.05
-"""The offset drift is no more than this share of rated torque."""
-QUIET_SECONDS = 30.0
-"""Ordinary work before the drift begins [s]."""
-SECONDS = 300.0
-"""Ordinary work at most [s]."""
-SETTLED_SECONDS = 15.0
-"""Ordinary work watched after a recalibration [s]."""
+from sim_gap.demo.script import (
+    DRIFT_GAIN,
+    DRIFT_OFFSET,
+    DRIFT_OFFSET_SHARE,
+    QUIET_SECONDS,
+    SETTLED_SECONDS,
+    WORK_SECONDS,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +62,7 @@ def run_drift(
     rated = bench.arm.require_link().rated_torques
     observer = Observer.of_records(described, calibration, gravity, rated)
     joint = drifting_joint(calibration, check, rated)
-    offset = min(OFFSET, OFFSET_SHARE * limits[joint].rated_torque)
+    offset = min(DRIFT_OFFSET, DRIFT_OFFSET_SHARE * limits[joint].rated_torque)
     speed = np.array([each.max_velocity for each in limits])
     state = _Course(report, bench, joint, offset)
     history = watch(
@@ -79,14 +77,14 @@ def run_drift(
             np.random.default_rng([seed, 8]),
             WorkMotion.of_drives(with_integral=all(setup.gains is None for setup in link.setups)),
         ),
-        SECONDS,
+        WORK_SECONDS,
         recalibrator,
         state,
     )
     name = link.names[joint]
     return Drift(
         joint,
-        GAIN,
+        DRIFT_GAIN,
         offset,
         state.began,
         _first(history, name, ("alarm", "outliers"), state.began),
@@ -118,14 +116,14 @@ class _Course:
             self._start = sample.t
         if self.began == np.inf and sample.t - self._start >= QUIET_SECONDS:
             self.began = sample.t
-            self._bench.simulated.drift(self._joint, GAIN, self._offset)
+            self._bench.simulated.drift(self._joint, DRIFT_GAIN, self._offset)
             self.error_before = self._bench.sensor_error(self._joint)
         written = [t for t, outcome in history.recalibrations if outcome.applied]
         if int(sample.t * 10) % 10 == 0:
             doing = (
                 "the arm works" if self.began == np.inf else "the sensor has drifted" if not written else "put right"
             )
-            self._report(sample.t - self._start, SECONDS, None, doing)
+            self._report(sample.t - self._start, WORK_SECONDS, None, doing)
         return bool(written) and sample.t - written[-1] >= SETTLED_SECONDS
 
 

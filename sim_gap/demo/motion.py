@@ -13,18 +13,7 @@ from calib.records.records import CalibrationRecord
 from gcomp.arrays import Array
 from sim_gap.demo.bench import Bench
 from sim_gap.demo.narrator import Report
-
-TONES = 3
-BAND = (0.08, 0.3)
-"""Frequencies of the sines [Hz]."""
-RANGE_SHARE = 0.35
-"""Amplitude at most, as a share of half the joint's range."""
-SPEED_SHARE = 0.6
-"""Speed at most, as a share of the joint's max_velocity."""
-ACCELERATION = 1.0
-"""At most [rad/s²], for drives that have little torque left over gravity."""
-FADE = 2.0
-"""Time over which the motion begins [s]."""
+from sim_gap.demo.script import ACCELERATION, BAND, FADE, RANGE_SHARE, SPEED_SHARE, TONES
 
 
 def multisine(bench: Bench, seconds: float, seed: int) -> Array:

@@ -16,25 +16,26 @@ from sim_gap.report.page import sections as gap_sections
 def write_report(result: DemoResult, path: Path) -> None:
     """Write the page; raises OSError."""
     parts = [_overview(result), _calibration(result), _sweeps(result), _gravity(result), _drift(result)]
-    subtitle = f"simulated arm {result.arm}, hidden truth of seed {result.seed}"
-    render(path, "armlink demo", [*parts, *gap_sections(result.gap)], subtitle)
+    subtitle = f"simulated arm {result.run.arm}, hidden truth of seed {result.run.seed}"
+    render(path, "armlink demo", [*parts, *gap_sections(result.run.gap)], subtitle)
 
 
 def _overview(result: DemoResult) -> Section:
-    sensors, check = result.sensors, result.gravity_check
-    error = np.abs(sensors.value("gain") / result.truth.gain - 1)
+    run = result.run
+    sensors, check = result.sensors, run.gravity_check
+    error = np.abs(sensors.value("gain") / run.truth.gain - 1)
     loaded = check.max_torque > 1e-6
     share = check.rms_error[loaded] / check.max_torque[loaded]
     unseen = sorted({name for name, parameter in sensors.reasons if parameter == "gain"})
     items = [
-        f"{result.bus.frames:,} CAN frames in {result.sim_s:.0f} s of the arm's time at {result.bus.rate_hz:.0f} Hz,"
-        f" {result.bus.load:.0%} bus load, {result.bus.missed} missed; {result.wall_s:.0f} s on this machine.",
+        f"{run.bus.frames:,} CAN frames in {run.sim_s:.0f} s of the arm's time at {run.bus.rate_hz:.0f} Hz,"
+        f" {run.bus.load:.0%} bus load, {run.bus.missed} missed; {run.wall_s:.0f} s on this machine.",
         f"Torque gains found to {np.nanmax(error):.2%} at worst"
         + (f"; not observable on {', '.join(unseen)}." if unseen else "."),
         f"Gravity torque of the identified model within {share.max():.2%} RMS of each joint's largest, at"
         f" {check.poses} random poses.",
-        drift_line(result.names, result.drift) + ".",
-        gap_line(result.gap) + ".",
+        drift_line(run.names, result.drift) + ".",
+        gap_line(run.gap) + ".",
     ]
     text = "The fit saw only what came over the bus. What is called true was opened after everything was estimated."
     return Section(
@@ -43,9 +44,9 @@ def _overview(result: DemoResult) -> Section:
 
 
 def _calibration(result: DemoResult) -> Section:
-    fit, truth = result.sensors, result.truth
+    fit, truth = result.sensors, result.run.truth
     rows = []
-    for j, name in enumerate(result.names):
+    for j, name in enumerate(result.run.names):
         row = [escape(name)]
         for parameter, digits in SHOWN:
             value, (low, high) = fit.value(parameter)[j], fit.ci95(parameter)[j]
@@ -71,15 +72,17 @@ def _sweeps(result: DemoResult) -> Section:
         " Lines are the fit of all sweeps together: a sinusoid each, A sin(θ + Φ). A colour is a sweep;"
         " those with the reference mass are the larger ones."
     )
-    return Section("Sweeps and their sinusoids", paragraph(text), [sweep_figure(result.described, result.sensors)])
+    return Section(
+        "Sweeps and their sinusoids", paragraph(text), [sweep_figure(result.run.bench.described, result.sensors)]
+    )
 
 
 def _gravity(result: DemoResult) -> Section:
-    check, verify = result.gravity_check, result.verify
+    check, verify = result.run.gravity_check, result.run.verify
     rows = [
         [escape(name), *(f"{x:.4f}" for x in numbers)]
         for name, *numbers in zip(
-            result.names, verify.rms, check.rms_error, check.max_abs_error, check.max_torque, strict=True
+            result.run.names, verify.rms, check.rms_error, check.max_abs_error, check.max_torque, strict=True
         )
     ]
     header = ("joint", "RMS, model to sensor", "RMS, model to truth", "largest error", "largest torque")
@@ -94,5 +97,5 @@ def _drift(result: DemoResult) -> Section:
         " sensor at every stop, finds which joint changed and how, writes a new record and puts the controller right:"
         " no reference mass, no special motion. Estimates are against the calibration installed at that time."
     )
-    line = paragraph(drift_line(result.names, result.drift) + ".")
+    line = paragraph(drift_line(result.run.names, result.drift) + ".")
     return Section("Drift and automatic recalibration", paragraph(text) + line, [drift_figure(result.drift)])

@@ -35,12 +35,9 @@ from sim_gap.demo.gap import diagnose_recordings
 from sim_gap.demo.motion import record_pair
 from sim_gap.demo.narrator import Narrator
 from sim_gap.demo.report import write_report
+from sim_gap.demo.script import BY, RECORDED_S
 from sim_gap.demo.show import calibration_table, drift_line, gap_line, verify_table
-from sim_gap.demo.summary import DemoResult, summary
-
-RECORDED_S = (40.0, 25.0)
-"""Length of the gap's recordings [s]."""
-BY = "armlink demo"
+from sim_gap.demo.summary import DemoResult, DemoRun, summary
 
 
 def run_demo(
@@ -133,23 +130,8 @@ def _work(
     teller.say(gap_line(answer))
     stats = link.stats
     link.disable()
-    return DemoResult(
-        arm.name,
-        seed,
-        link.names,
-        bench.described,
-        bench.truth,
-        data,
-        sensors,
-        gravity,
-        gravity_check,
-        check,
-        drift,
-        answer,
-        stats,
-        teller.elapsed,
-        bench.simulated.time,
-    )
+    run = DemoRun(bench, seed, gravity_check, check, answer, stats, teller.elapsed, bench.simulated.time)
+    return DemoResult(run, sensors, gravity, drift)
 
 
 def _sweeps(bench: Bench, folder: Path, seed: int, teller: Narrator) -> tuple[SweepData, SweepData]:

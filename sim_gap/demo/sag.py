@@ -13,12 +13,7 @@ from gcomp.arrays import Array
 from gcomp.gravity.batch import GravityModel
 from sim_gap.demo.bench import Bench
 from sim_gap.demo.motion import travel
-
-POSES = 3
-SECONDS = 2.0
-"""For which each pose is held [s]."""
-SHARE = 0.1
-"""Of the arm file's gains."""
+from sim_gap.demo.script import SAG_POSES, SAG_SECONDS, WEAK_SHARE
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +44,8 @@ class WeakHold:
 
 
 def sag_poses(plan: SweepPlan) -> Array:
-    """Poses to hold (POSES, n) [rad]: where creeps of the joints next to the base begin; home lies between them."""
-    return np.array([sweep.rest for sweep in plan.sweeps[::-2][:POSES]])
+    """Poses to hold (SAG_POSES, n) [rad]: where creeps of the joints next to the base begin; home lies between them."""
+    return np.array([sweep.rest for sweep in plan.sweeps[::-2][:SAG_POSES]])
 
 
 def mean_sag(bench: Bench, plan: SweepPlan, beta: Array, zero: Array) -> Array:
@@ -60,7 +55,7 @@ def mean_sag(bench: Bench, plan: SweepPlan, beta: Array, zero: Array) -> Array:
     """
     link, home = bench.link, np.array(plan.scout[0])
     drives = [joint.settings for joint in bench.arm.require_link().joints]
-    kp, kd = np.array([SHARE * each.kp for each in drives]), np.array([each.kd for each in drives])
+    kp, kd = np.array([WEAK_SHARE * each.kp for each in drives]), np.array([each.kd for each in drives])
     model, away = GravityModel(bench.described, beta), []
     for pose in sag_poses(plan):
         travel(bench, link.position_sent, home)
@@ -77,6 +72,6 @@ def _hold(link: ArmDriver, controller: WeakHold) -> Array:
     with closing(link.run(controller)) as samples:
         for sample in samples:
             seen.append(sample.position)
-            if len(seen) >= SECONDS * link.rate:
+            if len(seen) >= SAG_SECONDS * link.rate:
                 break
     return np.array(seen[-round(0.5 * link.rate) :])

@@ -1,6 +1,7 @@
-"""What the comparison leaves aside: motor rows at rest and in creep, and lines of the spectrum above the pass band."""
+"""What the comparison leaves aside: motor rows at rest and in creep, disturbances, and lines above the pass band."""
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.residuals.channel_noise import spectrum
+from sim_gap.residuals.disturbances import calm, disturbances, far_off
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.preprocess import BAND_HZ, CHANNELS, Signals
 from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
@@ -46,6 +48,32 @@ def left_out(data: ResidualSet) -> float:
     for (row, _), mask in regimes(data).items():
         judged[row] |= mask
     return 1.0 - float(np.mean([mask.mean() for mask in judged.values()]))
+
+
+def without_disturbances(data: ResidualSet, explained: Mapping[Row, Array]) -> ResidualSet:
+    """The recordings with the samples of disturbances not `known`; the set itself if there are none.
+
+    `explained` is the prediction of an estimate, (K,) per row.
+    """
+    signals, first = [], 0
+    for s, length in zip(data.signals, data.lengths, strict=True):
+        part = slice(first, first + length)
+        far, judged, left = np.zeros((length, s.n), bool), np.zeros((length, s.n), bool), np.zeros((length, s.n))
+        for row in data.rows:
+            valid, joint = data.valid[row][part], row[1]
+            rest = (data.values[row] - explained[row])[part] * valid
+            far[:, joint] |= far_off(rest, valid, data.floor[row], data.margin[row])
+            judged[:, joint] |= valid
+            left[:, joint] = np.maximum(left[:, joint], np.abs(rest))
+        found = disturbances(data.time[part], far, judged, left)
+        if found:
+            quiet = calm(s.t, found)[:, None]
+            known = {channel: there * quiet for channel, there in s.known.items()}
+            s = replace(s, known=known, disturbances=(*s.disturbances, *found))
+        signals.append(s)
+        first += length
+    same = all(new is old for new, old in zip(signals, data.signals, strict=True))
+    return data if same else ResidualSet(tuple(signals), data.layout)
 
 
 def slides(data: ResidualSet, row: Row) -> bool:

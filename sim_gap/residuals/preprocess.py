@@ -18,6 +18,7 @@ from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.model.rigid_body import CREEP, Motion, RigidArm
 from sim_gap.residuals.channel_noise import band_noise
+from sim_gap.residuals.disturbances import Disturbance
 from sim_gap.residuals.resampling import SLOW_HZ, bridged, coverage, low_pass, thinner
 from sim_gap.residuals.spikes import Spikes, around_spikes, counted, spikes_of
 from sim_gap.residuals.stuck_channels import Stuck, stuck_intervals
@@ -76,6 +77,8 @@ class Signals:
     """Channels that are stuck for some time, in which they are not `known`."""
     spikes: tuple[Spikes, ...] = ()
     """Channels with isolated spikes, which were interpolated; around them they are not `known`."""
+    disturbances: tuple[Disturbance, ...] = ()
+    """Moments at which something touched the arm, or torques were misread; there they are not `known`."""
     found: "Found | None" = None
     """What an estimate has found, if q, v, a and arm are those of the estimate."""
 

@@ -36,3 +36,14 @@ def enabled(link):
     link.start()
     link.enable()
     return link
+
+
+@pytest.fixture
+def relinked(bus):
+    """A started link to joints that hold in quick stop, as the one before it left them."""
+    with Link(make_arm(), bus) as link:
+        link.start()
+        link.enable()
+    with Link(make_arm(), bus) as link:
+        link.start()
+        yield link

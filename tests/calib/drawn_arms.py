@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from rank_test import undetermined
+from sweep_arms import arm_content, largest_torque
 
 from armlink.arm_file import ArmFile, load_arm, parse_arm
 from armlink.link.link import Link
@@ -75,16 +76,10 @@ def drawn_arm(seed: int, n: int | None = None, *, upright: bool | None = None, *
     drives: list[dict[str, Any]] = [
         {"name": f"j{i + 1}", "node": i + 1, "rated_torque": 50.0, "max_torque": 80.0} for i in range(n)
     ]
-    content: dict[str, Any] = {
-        "name": f"drawn{seed}",
-        "kinematics": {"gravity": (9.80665 * down / np.linalg.norm(down)).tolist(), "joints": joints},
-        "link": {"joints": drives},
-        "sim": {"links": links},
-        **({"sweep": sweep} if sweep else {}),
-    }
-    bare = parse_arm(content, Path(f"drawn{seed}.yaml"))
-    poses = random.uniform(middle - half, middle + half, (300, n))
-    largest = np.abs(SimulatedArm(bare, Truth.of(bare)).gravity_torque(poses)).max(axis=0)
+    content = arm_content(f"drawn{seed}", 9.80665 * down / np.linalg.norm(down), joints, drives, links)
+    if sweep:
+        content["sweep"] = sweep
+    largest = largest_torque(content, random.uniform(middle - half, middle + half, (300, n)))
     headroom = random.uniform(1.5, 2.2)
     for drive, torque in zip(drives, largest, strict=True):
         limit = float(max(headroom * torque, 0.08 * largest.max(), 2.0))

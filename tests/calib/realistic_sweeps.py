@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from sweep_arms import SAMPLES, reading_of
 
 from armlink.arm_file import ArmFile
-from calib.motion.static_reading import StaticReading
 from calib.plan.sweep_plan import plan_sweep
 from calib.plan.types import SweepPlan
 from calib.sweep.dataset import Manifest, SweepData
@@ -23,8 +23,8 @@ from sim_bus.physics.sensors import NOISE_BLOCK
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
-SAMPLES, JITTER = 40, 3e-4
-"""Samples of a reading; standard deviation of where a joint comes to rest [rad]."""
+JITTER = 3e-4
+"""Standard deviation of where a joint comes to rest [rad]."""
 READING, SWEEP, WAY = 1.6, 6.0, 6
 """Seconds from one reading to the next, and more from sweep to sweep; points of the way between two poses."""
 
@@ -84,15 +84,7 @@ def make_pass(arm: ArmFile, resting: RestingArm, plan: SweepPlan, mass: float) -
 
     def keep(got, sweep: str, index: int, servo, joint: int | None, direction: int) -> None:
         shown, reading, motor = got
-        made = StaticReading.of(
-            resting.time,
-            shown,
-            reading,
-            count=SAMPLES,
-            position_std=np.zeros(n),
-            torque_std=noise,
-            motor_torque=motor,
-        )
+        made = reading_of(resting.time, shown, reading, noise, motor)
         readings.append(made.within(sweep, index, np.array(servo), joint, direction))
 
     for index, pose in enumerate(plan.scout):

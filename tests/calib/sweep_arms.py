@@ -43,16 +43,8 @@ def random_arm(seed: int, n: int, *, headroom: float = 1.8, vertical: bool = Fal
         for mass in np.linspace(5.0, 1.2, n)
     ]
     drives = [{"name": f"j{i + 1}", "node": i + 1, "rated_torque": 50.0, "max_torque": 80.0} for i in range(n)]
-    content = {
-        "name": f"random{seed}",
-        "kinematics": {"gravity": (9.81 * down / np.linalg.norm(down)).tolist(), "joints": joints},
-        "link": {"joints": drives},
-        "sim": {"links": links},
-        **sections,
-    }
-    arm = parse_arm(content, Path(f"random{seed}.yaml"))
-    poses = random.uniform(middle - half, middle + half, (200, n))
-    largest = np.abs(SimulatedArm(arm, Truth.of(arm)).gravity_torque(poses)).max(axis=0)
+    content = {**arm_content(f"random{seed}", 9.81 * down / np.linalg.norm(down), joints, drives, links), **sections}
+    largest = largest_torque(content, random.uniform(middle - half, middle + half, (200, n)))
     for drive, torque in zip(drives, largest, strict=True):
         limit = max(headroom * float(torque), 3.0)
         drive |= {"max_torque": limit, "rated_torque": 0.7 * limit, "max_torque_rate": 4 * limit}
@@ -62,6 +54,28 @@ def random_arm(seed: int, n: int, *, headroom: float = 1.8, vertical: bool = Fal
     ]
     content["sim"] = {"links": links, "effects": friction}
     return parse_arm(content, Path(f"random{seed}.yaml"))
+
+
+def arm_content(name: str, gravity: np.ndarray, joints: list, drives: list, links: list) -> dict[str, Any]:
+    """An arm file of these parts."""
+    return {
+        "name": name,
+        "kinematics": {"gravity": gravity.tolist(), "joints": joints},
+        "link": {"joints": drives},
+        "sim": {"links": links},
+    }
+
+
+def largest_torque(content: dict[str, Any], poses: np.ndarray) -> np.ndarray:
+    """Largest gravity torque of an arm file's joints at poses (P, n) [rad], (n,) [N·m]."""
+    arm = parse_arm(content, Path(f"{content['name']}.yaml"))
+    return np.asarray(np.abs(SimulatedArm(arm, Truth.of(arm)).gravity_torque(poses)).max(axis=0))
+
+
+def reading_of(t: float, shown: np.ndarray, torque: np.ndarray, noise: np.ndarray, motor: np.ndarray) -> StaticReading:
+    """A static reading of SAMPLES samples, of a position that is quiet."""
+    quiet = np.zeros(len(shown))
+    return StaticReading.of(t, shown, torque, count=SAMPLES, position_std=quiet, torque_std=noise, motor_torque=motor)
 
 
 def with_section(arm: ArmFile, **section: Any) -> ArmFile:
@@ -94,15 +108,9 @@ def synthetic_pass(arm: ArmFile, truth: Truth, plan: SweepPlan, mass: float, ran
         torque = simulated.gravity_torque(angle)[0]
         reading = truth.gain * torque + truth.offset + random.normal(0, noise / np.sqrt(SAMPLES))
         readings.append(
-            StaticReading.of(
-                float(len(readings)),
-                shown,
-                reading,
-                count=SAMPLES,
-                position_std=np.zeros(n),
-                torque_std=noise,
-                motor_torque=torque,
-            ).within(sweep_name, index, np.array(servo), joint, direction)
+            reading_of(float(len(readings)), shown, reading, noise, torque).within(
+                sweep_name, index, np.array(servo), joint, direction
+            )
         )
     manifest = Manifest.of(arm, mass)
     return SweepData(Path(f"pass-{mass:g}"), manifest, tuple(readings), plan, np.full(n, RESOLUTION), "0" * 64)

@@ -2,9 +2,11 @@
 
     python tests/campaigns/corrupted_recordings.py --draws 200 [--realdata DIR]
 
-One line a draw, then what was noticed by kind; the recordings as they are must be no finding. Exit status 1 below 98 %.
-A draw that passed is marked `unseen` if the model explains the spoiled data as well as the sound ones (the zero of a
-last joint on whose axis its mass lies, two wrist joints in which friction is all): no torque can tell it.
+One line a draw, then what was noticed by kind; the recordings as they are must be no finding. Exit status 1 below 98 %
+of the draws that can be told. Which can is judged apart from the check, by MuJoCo's inverse dynamics: a draw changes
+nothing that the recording could tell if the nominal model fits the spoiled recording as well as the sound one, to 5 %.
+So it is with the zero of a last joint on whose axis its mass lies, or with two wrist joints of which friction is all
+that is read.
 """
 
 import argparse
@@ -14,22 +16,23 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import mujoco
 import numpy as np
-from scipy.signal import lfilter
+from scipy.optimize import nnls
+from scipy.signal import lfilter, savgol_filter
 
 from armlink.errors import BadInput
 from armlink.recording.corrections import AS_IT_IS
 from armlink.recording.files import load_recording
 from armlink.recording.recording import TORQUE_CHANNELS, Recording, take_joints
 from sim_gap.checks.check import check_recording
-from sim_gap.checks.rigid_fit import as_mounted, fit_rigid, motion_of
 from sim_gap.model.load import load_model
-from sim_gap.residuals.preprocess import prepare
 
 ARMS = (("ur10e", "train_a"), ("tx40", "recording"), ("ur10", "recording"), ("panda", "recording"), ("lwr4", "train"))
 GOAL = 0.98
-UNSEEN = 0.15
-"""Rise of the logarithm of what the model leaves, over all joints, below which sound recordings differ as much."""
+AS_WELL = 0.05
+"""Most by which the model may fit a spoiled recording worse, logarithm of RMS, for it to fit as well: masses that are
+off by a few per cent do as much."""
 Corruption = Callable[[Recording, np.random.Generator], Recording | None]
 
 
@@ -186,11 +189,43 @@ def as_recorded(realdata: Path):
         yield f"{folder}/{path.name}", load_model(model, (), recording.n).arm, recording
 
 
-def left_by_model(arm, recording: Recording) -> float:
-    """Logarithm of what the model leaves of the torques, summed over the joints, gravity along the axis that fits."""
-    s = prepare(recording, arm, "r")
-    motion = motion_of(s, s.channels[0])
-    return float(fit_rigid(as_mounted(arm, motion), motion).cost.sum())
+def left_by_mujoco(model: mujoco.MjModel, recording: Recording) -> np.ndarray:
+    """What the nominal model leaves of each joint's torque at best, (K, n) [N·m], 25 rows a second.
+
+    MuJoCo's inverse dynamics along the smoothed positions, with a gain, an offset, friction and a rotor of each joint
+    that are fitted: gains not negative, nor friction and rotors where a motor feels them.
+    """
+    t = np.arange(recording.t[0], recording.t[-1], 0.01)
+    q, y = (
+        np.column_stack([np.interp(t, recording.t, column) for column in values.T])
+        for values in (recording.position, getattr(recording, torque_channel(recording)))
+    )
+    window = {"window_length": 31, "polyorder": 3, "axis": 0}
+    q, v, a = (savgol_filter(q, deriv=order, delta=0.01, **window) for order in range(3))
+    y = savgol_filter(y, **window)
+    data, rows = mujoco.MjData(model), range(30, len(t) - 30, 4)
+    torque = np.empty((len(rows), recording.n))
+    for k, row in enumerate(rows):
+        data.qpos[:], data.qvel[:], data.qacc[:] = q[row], v[row], a[row]
+        mujoco.mj_inverse(model, data)
+        torque[k] = data.qfrc_inverse
+    left = np.empty_like(torque)
+    for j in range(recording.n):
+        own = [np.tanh(v[rows, j] / 0.01), v[rows, j], a[rows, j]]
+        both = own if recording.motor_torque is not None else [*own, *(-x for x in own)]
+        columns = np.column_stack([torque[:, j], *both, np.ones(len(rows)), -np.ones(len(rows))])
+        left[:, j] = y[rows, j] - columns @ nnls(columns, y[rows, j])[0]
+    return left
+
+
+def worse_by(model: mujoco.MjModel, sound: Recording, spoiled: Recording) -> float:
+    """How much worse the nominal model fits the spoiled recording: logarithm of RMS, mean over the joints."""
+
+    def size(recording: Recording) -> float:
+        left = left_by_mujoco(model, recording)
+        return float(np.mean(np.log(np.sqrt(np.mean(left**2, axis=0)) + 1e-6)))
+
+    return size(spoiled) - size(sound)
 
 
 def main() -> int:
@@ -217,18 +252,16 @@ def main() -> int:
         seen[kind] += 1
         noticed[kind] += bool(text)
         if not text:
-            rise = left_by_model(arm, spoiled) - left_by_model(arm, recording)
-            unseen += rise < UNSEEN
-            text = f"NOTHING, {'unseen' if rise < UNSEEN else 'MISSED'}: the cost rises by {rise:.2f}"
+            model = mujoco.MjModel.from_xml_path(str(asked.realdata / folder / "sim.xml"))
+            worse = worse_by(model, recording, spoiled)
+            unseen += worse <= AS_WELL
+            text = f"NOTHING, {'cannot be told' if worse <= AS_WELL else 'MISSED'}: fits worse by {worse:.3f}"
         print(f"{kind:20s} {folder:6s} {text}"[:200], flush=True)
     for kind in seen:
         print(f"{kind:20s} {noticed[kind]} of {seen[kind]}")
-    share = noticed.total() / seen.total()
     told = seen.total() - unseen
-    print(
-        f"noticed: {noticed.total()} of {seen.total()}, {share:.1%}; of those that the model can see {told}, ", end=""
-    )
-    print(f"{noticed.total() / max(told, 1):.1%}")
+    share = noticed.total() / max(told, 1)
+    print(f"noticed: {noticed.total()} of {seen.total()}; of the {told} that can be told {share:.1%}")
     return 0 if share >= GOAL and not alarms else 1
 
 

@@ -34,7 +34,8 @@ from gcomp.gravity.batch import GravityModel
 from sim_gap.demo.bench import Bench
 from sim_gap.demo.creep_run import quick
 from sim_gap.demo.motion import travel
-from sim_gap.demo.sag import SHARE, WeakHold, sag_poses
+from sim_gap.demo.sag import WeakHold, sag_poses
+from sim_gap.demo.script import WEAK_SHARE
 
 LEFT = 0.25
 """Largest share of the nominal model's sag and drift that may be left."""
@@ -67,7 +68,7 @@ def moved(bench: Bench, plan: SweepPlan, model: GravityModel, zero: Array, relea
     link, home, seen = bench.link, np.array(plan.scout[0]), []
     drives = [joint.settings for joint in bench.arm.require_link().joints]
     kp, kd = np.array([each.kp for each in drives]), np.array([each.kd for each in drives])
-    kp, held = (SHARE * kp, kd) if released is None else (kp.copy(), kd.copy())
+    kp, held = (WEAK_SHARE * kp, kd) if released is None else (kp.copy(), kd.copy())
     if released is not None:
         kp[released], held[released] = 0.0, 0.0
     for pose in sag_poses(plan):

@@ -21,6 +21,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
 
+from bounds import exit_status
 from daemon_bench import DaemonBench
 from fast_daemon import QUIET, FastDaemon
 
@@ -246,12 +247,7 @@ def two(given: argparse.Namespace) -> list[str]:
 
 
 SCENARIOS: dict[str, Callable[[argparse.Namespace], list[str]]] = {
-    "drifts": drifts,
-    "payloads": payloads,
-    "slow": slow,
-    "two": two,
-    "quiet": quiet,
-    "frames": frames,
+    each.__name__: each for each in (drifts, payloads, slow, two, quiet, frames)
 }
 
 
@@ -268,10 +264,7 @@ def main() -> int:
 
     logging.getLogger("armlink.daemon").setLevel(logging.CRITICAL)
     wrong = [line for name in given.only for line in SCENARIOS[name](given)]
-    for line in wrong:
-        print(f"FAILED: {line}")
-    print("passed" if not wrong else f"{len(wrong)} bounds failed")
-    return int(bool(wrong))
+    return exit_status(wrong)
 
 
 if __name__ == "__main__":

@@ -30,6 +30,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
 
+from bounds import exit_status
 from fast_daemon import QUIET, FastDaemon
 
 from armlink.arm_file import ArmFile
@@ -312,10 +313,7 @@ def main() -> int:
     given = parser.parse_args()
     wrong = kill_service(given) if given.kills else []
     wrong += kill_daemon(given) if given.bus_kills else []
-    for line in wrong:
-        print(f"FAILED: {line}")
-    print("passed" if not wrong else f"{len(wrong)} bounds failed")
-    return int(bool(wrong))
+    return exit_status(wrong)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from armlink.link.cyclic_exchange import Loop
 from armlink.link.link import Link
 from armlink.link.types import Command
 from tests.armlink.fake_joints import make_arm
-from tests.armlink.link.test_gate_bytes import ENABLE, MAX_TORQUE, TORQUE_UNIT, N, Observed, check
+from tests.armlink.link.test_gate_bytes import N, Observed, judge
 
 BATCH = 25
 """Frames a cycle."""
@@ -103,21 +103,6 @@ def fuzz_link(rng: random.Random, frames: int) -> tuple[int, int]:
                 refused += 1
             judge(bus, last)
     return done, refused
-
-
-def judge(bus: Observed, last: dict[int, tuple[int, tuple[int, int, int]]]) -> None:
-    """Every RPDO1 that left in one cycle, against every limit."""
-    modes = {node: state[0] for node, state in last.items()}
-    for can_id, data, told in bus.left:
-        node = can_id & 0x7F
-        if can_id & 0x780 == 0x300:
-            modes[node] = struct.unpack("<b", data)[0]
-            continue
-        now = struct.unpack("<Hhi", data)
-        assert abs(now[1]) * TORQUE_UNIT <= MAX_TORQUE
-        if now[0] & ENABLE == ENABLE:
-            check(modes[node], now, last[node], told)
-        last[node] = (modes[node], now)
 
 
 def fuzz_sdo(rng: random.Random, frames: int) -> tuple[int, int]:

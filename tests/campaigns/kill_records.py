@@ -24,9 +24,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
+from fake_controllers import ARM, NAMES
 from postgres import server
 
-from armlink.arm_file import ArmFile, parse_arm
 from armlink.errors import BadInput
 from armlink.link.types import Calibration
 from armlink.torque_calibration import UNCALIBRATED
@@ -35,20 +35,10 @@ from calib.install.plausibility import admit_rollback
 from calib.records.records import CalibrationRecord, JointCalibration, provenance
 from calib.records.store import RecordStore
 
-NAMES = ("shoulder", "elbow")
 LONGEST = 0.4
 """The child is killed after at most this long [s]: some twenty records."""
 
 
-def arm_file() -> ArmFile:
-    """A made-up arm of two joints."""
-    joints = [{"name": name, "a": 0.3, "lower": -1.0, "upper": 1.0} for name in NAMES]
-    link = [{"name": name, "node": k + 1, "rated_torque": 50.0, "max_torque": 60.0} for k, name in enumerate(NAMES)]
-    content = {"name": "bench", "serial": "7", "kinematics": {"joints": joints}, "link": {"joints": link}}
-    return parse_arm(content, Path("bench.yaml"))
-
-
-ARM = arm_file()
 EMPTY = {"gain": 1.0, "offset": 0.0, "record_id": 0, "date": 0}
 
 

@@ -56,8 +56,8 @@ class Live:
                 self._by_file[each.__code__.co_filename][each.__code__.co_qualname].append(each)
         gc.freeze()
 
-    def patch(self, path: Path, source: str) -> bool:
-        """Exchange the code of what a mutant changes; whether that was possible, else nothing is changed."""
+    def patch(self, path: Path, source: str, only_ask: bool = False) -> bool:
+        """Exchange the code of what a mutant changes; whether that is possible, else nothing is changed."""
         exchanges = []
         for name, place, count, code in changed(path, source) or ():
             live = self._by_file[str(path)][name]
@@ -68,6 +68,6 @@ class Live:
             if any(each.__code__.co_freevars != code.co_freevars for each in targets):
                 return False
             exchanges += [(each, code) for each in targets]
-        for target, code in exchanges:
+        for target, code in () if only_ask else exchanges:
             target.__code__ = code
         return bool(exchanges)

@@ -1,13 +1,15 @@
 """Campaign: mutants drawn over the five packages. Nine of ten must be noticed by the tests of their package.
 
+python tests/campaigns/mutant_draw.py [--draw 500] [--seed 23] --record tests/armlink tests/calib …
 python tests/campaigns/mutant_draw.py [--draw 500] [--seed 23] [--journal FILE] [--limit 50] [--again | --report]
 python tests/campaigns/mutant_draw.py --explain KEY "why no test can tell it from the original"
 
 Every mutant has a key: a digest of seed, module, line of source and change. Those with the lowest keys are drawn, so
-that a change of other lines leaves the draw as it is. A mutant is judged by the tests of its module's own file, then by
-those that import the module, those of its sub-package, and the others of its package, the nearest by imports first,
-each within a limit of processor time; `--stages 2` leaves the last ones to a later run. A test that fails, or hangs,
-must pass without the mutant.
+that a change of other lines leaves the draw as it is. `--record tests/calib …` first runs tests without a mutant, and
+notes which of them come past which mutants of the draw (.mutant_reach.json, which adds up). A mutant is then judged by
+the tests that come past it, the cheapest first, within a limit of processor time. All tests are collected once, and run
+in forked children with the mutant put into the functions that are loaded; where that cannot be done, everything is
+loaded anew. A test that notices, or hangs, must do so twice, and pass without the mutant in between.
 
 What was found is appended to the journal, one line of JSON each; a mutant that has a line is not judged again, so that
 the runs of several days add up. `--again` judges the survivors once more, by tests that were added. Exit status 1 if
@@ -15,41 +17,34 @@ less than nine of ten are noticed, a survivor has no explanation, or mutants of 
 """
 
 import argparse
-import ast
-import contextlib
 import functools
 import hashlib
-import importlib
 import json
-import math
 import os
-import signal
+import subprocess
 import sys
 import tempfile
 import time
-import traceback
 from collections import Counter, defaultdict
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import pytest
-from live_patch import Live
-from mutants import OPTIONS, PACKAGES, ROOT, mirrors, silence
-from mutated import install, install_in_children
+import mutant_probes
+from mutant_reach import Reach
+from mutant_runs import Collected, collected, failing, module_name
+from mutants import PACKAGES, ROOT, mirrors
 from mutations import Mutant, mutants
 
 JOURNAL = Path(__file__).parent / "mutant_draw.jsonl"
-LIMITS = (10.0, 10.0, 15.0, 30.0)
-"""Processor time of the tests of the module's own file, that import it, of its sub-package, of its package [s]."""
-NEAR = 2
-"""The tests of later stages have little to do with the module: one that notices must do so twice."""
-HANGS, STILL = 20.0, 240.0
-"""A test that takes more processor time, or more time by the clock, hangs [s]."""
+SECONDS = 40.0
+"""Time of the tests by which one mutant is judged, as they take it without [s]."""
+SLOWEST = 4.0
+"""How many times as long they may take with it."""
+FEW = 5
+"""Tests that judge a mutant that none comes past."""
 ASKED = 0.9
 NONE = "no change"
 """What is said of a mutant that is written another way only."""
-FINE = (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED, pytest.ExitCode.INTERRUPTED)
 
 
 class Drawn(NamedTuple):
@@ -74,147 +69,26 @@ def ranking(seed: int, modules: list[str]) -> list[Drawn]:
     return sorted(found, key=lambda each: each.key)
 
 
-@functools.cache
-def imports(path: Path) -> frozenset[str]:
-    """Modules of ours that a file names in its imports, their packages included."""
-    names = set[str]()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            names.update(alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            names.update({node.module, *(f"{node.module}.{alias.name}" for alias in node.names)})
-    return frozenset(name for name in names if name.split(".")[0] in PACKAGES)
-
-
-@functools.cache
-def importers() -> dict[str, list[str]]:
-    """Module → modules that import it."""
-    found = defaultdict(list)
-    for package in PACKAGES:
-        for path in sorted((ROOT / package).rglob("*.py")):
-            for each in imports(path):
-                found[each].append(_name(path))
-    return found
-
-
-def _name(path: Path) -> str:
-    return str(path.relative_to(ROOT)).removesuffix(".py").removesuffix("/__init__").replace("/", ".")
-
-
-def distances(name: str) -> dict[str, int]:
-    """How many imports lead from a module to this one, at least."""
-    far, edge = {name: 0}, [name]
-    while edge:
-        following = {each for module in edge for each in importers().get(module, ()) if each not in far}
-        far.update(dict.fromkeys(following, far[edge[0]] + 1))
-        edge = sorted(following)
-    return far
-
-
-def stages(target: str) -> Iterator[list[str]]:
-    """Files of tests that may notice a mutant of a module: its own, its sub-package's, its package's."""
-    own = mirrors(target)
-    first = [file for file in own[:1] if Path(file).name == f"test_{Path(target).name}"]
-    yield first
-    yield [file for file in own if file not in first]
-    far, parts = distances(_name(ROOT / target)), Path(target).parts
-
-    def nearest(folder: Path) -> list[str]:
-        files = {
-            path: min((far[name] for name in imports(path) if name in far), default=99)
-            for path in folder.rglob("test_*.py")
-        }
-        return [str(path.relative_to(ROOT)) for path in sorted(files, key=lambda path: (files[path], str(path)))]
-
-    part = nearest(ROOT / "tests" / Path(*parts[:2])) if len(parts) > 2 else []
-    yield [file for file in part if file not in own]
-    yield [file for file in nearest(ROOT / "tests" / parts[0]) if file not in {*own, *part}]
-
-
-class Watch:
-    """A pytest plugin: notes to a file which test runs and which fails, and ends the session after its time."""
-
-    def __init__(self, notes: Path, seconds: float) -> None:
-        self._notes, self._end = notes.open("a", buffering=1), time.process_time() + seconds
-
-    @pytest.hookimpl(trylast=True)
-    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        """Tests of many drawn examples last: the others notice most, and sooner."""
-        items.sort(key=lambda item: hasattr(getattr(item, "function", None), "hypothesis"))
-
-    def pytest_runtest_logstart(self, nodeid: str, location: object) -> None:
-        self._notes.write(f"> {nodeid}\n")
-        signal.setitimer(signal.ITIMER_PROF, HANGS)
-        signal.setitimer(signal.ITIMER_REAL, STILL)
-
-    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        if report.failed:
-            self._notes.write(f"! {report.nodeid}\n")
-
-    def pytest_collectreport(self, report: pytest.CollectReport) -> None:
-        if report.failed:
-            self._notes.write(f"! {report.nodeid}\n")
-
-    def pytest_runtest_teardown(self, item: pytest.Item, nextitem: pytest.Item | None) -> None:
-        if time.process_time() > self._end:
-            item.session.shouldstop = "enough"
-
-
-def _run(target: str, source: str | None, words: list[str], seconds: float, notes: Path) -> int:
-    """In the child: pytest with this source of the module."""
-    os.setpgid(0, 0)
-    silence()
-    if source is not None:
-        name = _name(ROOT / target)
-        if not load().patch(ROOT / target, source):
-            install(name, ROOT / target, source)
-            for module in [each for each in sys.modules if each.split(".")[0] in PACKAGES]:
-                del sys.modules[module]
-        (site := notes.parent / "site").mkdir()
-        install_in_children(site, name, ROOT / target, source)
-    return int(pytest.main([*OPTIONS, *words], plugins=[Watch(notes, seconds)]))
-
-
-def failing(target: str, source: str | None, tests: list[str], seconds: float, *options: str) -> list[str]:
-    """The tests that fail, or hang, with this source. They run in a child."""
-    with tempfile.TemporaryDirectory(prefix="armlink-mutant-") as folder:
-        notes = Path(folder) / "notes"
-        notes.touch()
-        child = os.fork()
-        if child == 0:
-            status: int = 70
-            try:
-                status = _run(target, source, [*options, *tests], seconds, notes)
-            except BaseException:
-                notes.write_text(f"E {traceback.format_exc()}")
-            finally:
-                os._exit(status)
-        status = os.waitpid(child, 0)[1]
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(child, signal.SIGKILL)  # what its tests have left
-        lines = notes.read_text(encoding="utf-8").splitlines()
-    if lines and lines[0].startswith("E "):
-        raise RuntimeError("\n".join(lines))
-    found = [line[2:] for line in lines if line.startswith("!")]
-    if found or (os.WIFEXITED(status) and os.WEXITSTATUS(status) in FINE):
-        return found
-    started = [line[2:] for line in lines if line.startswith(">")]
-    return [started[-1] if started else tests[0]]
-
-
-def noticed_by(target: str, source: str, places: range, unsound: list[str]) -> tuple[str, int]:
-    """The test of these stages that notices a mutant, an empty text if none does; how many stages were gone through.
-
-    Where these stages have no tests, the next one that has any is taken.
+def chosen(reach: Reach, each: Drawn, seconds: float) -> list[str]:
+    """Tests that come past a mutant, the cheapest first, those that name its module before others; as many as its time
+    allows. Where none does, a few of the nearest, which may notice that the module cannot be loaded.
     """
-    options, ran, last = ["-x", *(word for test in unsound for word in ("--deselect", test))], False, places.stop
-    for place, (files, seconds) in enumerate(zip(stages(target), LIMITS, strict=True)):
-        if not files or place < places.start or (ran and place >= places.stop):
-            continue
-        found, ran, last = failing(target, source, files, seconds, *options), True, max(last, place + 1)
-        if found and (place < NEAR or failing(target, source, found[:1], seconds)):
-            return found[0], last
-    return "", last
+    files = tuple(f"{file}::" for file in mirrors(each.target))
+
+    def seconds_of(test: str) -> float:
+        seen = reach.tests[test]
+        return max(seen["cpu"], 0.5 * seen["clock"]) + 0.02
+
+    def cost(test: str) -> float:
+        return seconds_of(test) * (1 if test.startswith(files) else 4)
+
+    tests, spent = [], 0.0
+    for test in sorted(reach.of(each.key), key=cost):
+        spent += seconds_of(test)
+        if tests and spent > seconds:
+            break
+        tests.append(test)
+    return tests or sorted(reach.near(each.target), key=cost)[:FEW]
 
 
 class Journal:
@@ -234,52 +108,65 @@ class Journal:
             file.write(json.dumps(line, ensure_ascii=False) + "\n")
         self._take(line)
 
-    def unsound(self) -> list[str]:
-        """Tests that fail without a mutant."""
-        return [key for key, line in self.lines.items() if line.get("sound") is False]
 
-    def confirm(self) -> None:
-        """Run the tests that have noticed a mutant without one; what a test noticed that fails then is open again."""
-        by = {line["by"] for line in self.lines.values() if line.get("by", NONE) not in (NONE, "")} - set(self.lines)
-        tests = sorted(test for test in by if "::" in test)  # else the file could not even be imported
-        bad = failing("", None, tests, math.inf) if tests else []
-        for test in tests:
-            self.append(key=test, sound=test not in bad)
-        for key in [key for key, line in self.lines.items() if line.get("by") in bad]:
-            self.append(key=key, by="", stages=0)
-
-
-@functools.cache
-def load() -> Live:
-    """Load every module of ours, so that the children need not."""
-    for package in PACKAGES:
-        for path in sorted((ROOT / package).rglob("*.py")):
-            if "migrations" not in path.parts and path.name != "__main__.py":  # run, never imported
-                importlib.import_module(_name(path))
-    return Live()
-
-
-def judge(journal: Journal, drawn: list[Drawn], limit: int, until: int, again: bool) -> None:
-    """Judge the mutants that have no line, or none of the later stages, or the survivors `again`; at most so many."""
-    load()
-    sys.dont_write_bytecode = False  # of the tests; a mutant has none
-    journal.confirm()
+def record(drawn: list[Drawn], tests: list[str]) -> None:
+    """Record which of the tests come past which mutants."""
+    places = defaultdict[str, list[tuple[str, int]]](list)
     for each in drawn:
-        known = journal.lines.get(each.key, {"by": "", "stages": 0})
-        begin = 0 if again else known["stages"]
-        if known["by"] or "why" in known or begin >= until:
-            continue
-        if limit <= 0:
-            break
-        began, source = time.monotonic(), each.mutant.source()
-        by, gone = NONE, until
-        if source is not None:
-            by, gone = noticed_by(each.target, source, range(begin, until), journal.unsound())
-        limit -= 1
-        journal.append(key=each.key, module=each.target, mutant=each.mutant.what, by=by, stages=gone)
-        took = f"{time.monotonic() - began:.0f} s"
-        print(f"{each.key} {each.target}: {each.mutant.what}: {by or 'survives'} ({took})", flush=True)
-    journal.confirm()
+        places[each.target].append((each.key, each.mutant.lines.start))
+    with tempfile.TemporaryDirectory(prefix="armlink-reach-") as folder:
+        for target, found in places.items():
+            mutant_probes.write(Path(folder), module_name(target), ROOT / target, found)
+        os.environ[mutant_probes.FILE] = str(Path(folder) / "reached")
+        subprocess.run([sys.executable, str(Path(__file__).parent / "mutant_reach.py"), folder, *tests], check=True)
+
+
+class Judge:
+    """Judges mutants one after the other, with their tests collected."""
+
+    def __init__(self, journal: Journal, todo: list[tuple[Drawn, list[str]]]) -> None:
+        self._journal, self._todo, self._sound = journal, todo, dict[str, bool]()
+
+    def __call__(self, server: Collected) -> None:
+        """Judge all."""
+        for each, tests in self._todo:
+            began, source = time.monotonic(), each.mutant.source()
+            by = NONE if source is None else self._one(server, each, source, tests)
+            self._journal.append(key=each.key, module=each.target, mutant=each.mutant.what, by=by, tests=len(tests))
+            took = f"{len(tests)} tests, {time.monotonic() - began:.1f} s"
+            print(f"{each.key} {each.target}: {each.mutant.what}: {by or 'survives'} ({took})", flush=True)
+
+    def _one(self, server: Collected, each: Drawn, source: str, tests: list[str]) -> str:
+        """The test that notices, twice, and passes without the mutant; an empty text if none does."""
+        tests = [test for test in server.known(tests) if self._sound.get(test, True)]
+        runs = functools.partial(server.failing, each.target)
+        if tests and not server.can(each.target, source):
+            runs = functools.partial(failing, each.target)
+        while tests and (found := runs(source, tests, SLOWEST * SECONDS)):
+            test = found[0]
+            if "::" not in test or (runs(source, [test], SLOWEST * SECONDS) and self._is_sound(server, test)):
+                return test  # the file alone: it cannot be imported
+            tests = [each for each in tests if each != test]
+        return ""
+
+    def _is_sound(self, server: Collected, test: str) -> bool:
+        """Whether a test passes without a mutant."""
+        if test not in self._sound:
+            self._sound[test] = not server.failing("", None, [test], SLOWEST * SECONDS)
+        return self._sound[test]
+
+
+def judge(journal: Journal, drawn: list[Drawn], limit: int, again: bool, seconds: float) -> None:
+    """Judge the mutants that have no line, or the survivors `again`; at most so many."""
+    reach = Reach()
+
+    def open_(known: dict[str, Any]) -> bool:
+        return not known or (again and not known["by"] and "why" not in known)
+
+    todo = [(each, chosen(reach, each, seconds)) for each in drawn if open_(journal.lines.get(each.key, {}))][:limit]
+    if todo:
+        sys.dont_write_bytecode = False  # of the tests; a mutant has none
+        collected(sorted({test.split("::")[0] for _, tests in todo for test in tests}), Judge(journal, todo))
 
 
 def report(journal: Journal, drawn: list[Drawn]) -> int:
@@ -307,8 +194,10 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=23)
     parser.add_argument("--journal", type=Path, default=JOURNAL)
     parser.add_argument("--modules", nargs="+", default=[f"{name}/**/*.py" for name in PACKAGES], metavar="GLOB")
+    parser.add_argument("--within", nargs="+", default=[""], metavar="FOLDER", help="judge those of the draw in these")
     parser.add_argument("--limit", type=int, default=10**6, help="judge at most this many now")
-    parser.add_argument("--stages", type=int, default=len(LIMITS), help="judge by the first of the stages only")
+    parser.add_argument("--record", nargs="+", default=[], metavar="TESTS", help="note what these tests come past")
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="time of the tests that judge one mutant")
     parser.add_argument("--again", action="store_true", help="judge the survivors that have no explanation once more")
     parser.add_argument("--report", action="store_true", help="judge none, say what is known")
     parser.add_argument("--explain", nargs=2, metavar=("KEY", "WHY"))
@@ -320,8 +209,13 @@ def main() -> int:
         journal.append(key=given.explain[0], why=given.explain[1])
         return 0
     drawn = ranking(given.seed, given.modules)[: given.draw]
+    if given.record:
+        for tests in given.record:
+            record(drawn, [tests])
+        return 0
     if not given.report:
-        judge(journal, drawn, given.limit, given.stages, given.again)
+        here = [each for each in drawn if each.target.startswith(tuple(given.within))]
+        judge(journal, here, given.limit, given.again, given.seconds)
     return report(journal, drawn)
 
 

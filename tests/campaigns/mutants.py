@@ -43,7 +43,7 @@ sys.dont_write_bytecode = True
 
 ROOT = Path(__file__).parent.parent.parent
 TARGETS = {
-    "armlink/link/gate.py": ["tests/armlink/link/test_gate.py"],
+    "armlink/link/gate.py": ["tests/armlink/link/test_gate.py", "tests/armlink/link/test_gate_leash.py"],
     "armlink/link/gate_limits.py": ["tests/armlink/link/test_gate_limits.py"],
     "armlink/guard/bus_guard.py": ["tests/armlink/guard/test_bus_guard.py"],
     "armlink/drives/canopen/cia402.py": ["tests/armlink/drives/canopen/test_cia402.py"],
@@ -55,12 +55,14 @@ EXPLAINED = {
     "0x10, 0x20': 32 becomes 33": "bit 0 is set by enable already",
     "(0 if acknowledged else NEW_SET_POINT)': 0 becomes 1": "bit 0 is set by enable already",
     "bool(supported >> (mode - 1) & 1))': 32 becomes 33": "6502h has 32 bits: there is none for mode 33",
-    "0.0 becomes 1.0": "stands for a mode that needs no number; any finite one does",
+    "in POSITION_MODES else 0.0):': 0.0 becomes 1.0": "stands for a mode that needs no number; any finite one does",
     "value if lower <= value <= upper else max(lower, min(upper, value))': condition always false": "the quick way out",
     "value if lower <= value <= upper else max(lower, min(upper, value))': LtE becomes Lt": "max and min do the same",
     "for each in began)': Lt becomes LtE": "a number at the bound itself is within it",
     "for each in began)': Gt becomes GtE": "a number at the bound itself is within it",
     "'if self.rate != math.inf:': condition always true": "the room of a rate without bound is not asked for",
+    "(goal if goal > upper else upper) + room:': Lt becomes LtE": "a goal at the bound is the bound",
+    "(goal if goal > upper else upper) + room:': Gt becomes GtE": "a goal at the bound is the bound",
     "'return \"\"': returns None": "asked only whether it is true; the field of Passed has its own default",
 }
 """Part of a mutant's description → why no test can tell it from the original."""
@@ -234,6 +236,7 @@ def main() -> int:
     """Run, tell, judge."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default="", help="file name, such as gate.py")
+    parser.add_argument("--match", default="", help="mutants with this in what is said of them, such as gate.py:13")
     parser.add_argument("--list", action="store_true", help="say what the mutants are, and end")
     parser.add_argument("--modules", nargs="+", default=[], metavar="GLOB", help="modules, instead of the gate's")
     parser.add_argument("--draw", type=int, default=0, help="this many mutants of the modules, at random")
@@ -247,6 +250,7 @@ def main() -> int:
     else:
         targets = {target: tests for target, tests in TARGETS.items() if given.only in ("", Path(target).name)}
         work = [(target, list(mutants(ROOT / target)), tests) for target, tests in targets.items()]
+    work = [(target, [each for each in found if given.match in each.what], tests) for target, found, tests in work]
     if given.list:
         print("\n".join(f"{target}: {each.what}" for target, found, _ in work for each in found))
         return 0

@@ -86,7 +86,20 @@ class Changed(ast.NodeTransformer):
         if self.at == self.place:
             self.at += 10**6
             return self.change(node)
-        return self.generic_visit(node)
+        return _visit_but_annotations(self, node)
+
+
+def _visit_but_annotations(visitor: ast.NodeTransformer, node: ast.AST) -> ast.AST:
+    """Visit what a node consists of, without its annotation."""
+    kept = {
+        field: getattr(node, field) for field in ("annotation", "returns") if getattr(node, field, None) is not None
+    }
+    for field in kept:
+        setattr(node, field, None)
+    visitor.generic_visit(node)
+    for field, value in kept.items():
+        setattr(node, field, value)
+    return node
 
 
 def ordered(tree: ast.AST) -> list[ast.AST]:
@@ -96,7 +109,7 @@ def ordered(tree: ast.AST) -> list[ast.AST]:
     class Seen(ast.NodeTransformer):
         def visit(self, node: ast.AST) -> ast.AST:
             seen.append(node)
-            return self.generic_visit(node)
+            return _visit_but_annotations(self, node)
 
     Seen().visit(copy.deepcopy(tree))
     return seen

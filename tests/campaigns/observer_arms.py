@@ -17,6 +17,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
 
+from bounds import exit_status
 from drawn_arms import drawn_arm
 from real_arm import RealArm
 
@@ -262,13 +263,7 @@ def quiet(level: int, given: argparse.Namespace) -> list[str]:
 
 
 SCENARIOS: dict[str, Callable[[int, argparse.Namespace], list[str]]] = {
-    "drifts": drifts,
-    "payloads": payloads,
-    "contacts": contacts,
-    "warm_up": warm_up,
-    "slow": slow,
-    "noticed": noticed,
-    "quiet": quiet,
+    each.__name__: each for each in (drifts, payloads, contacts, warm_up, slow, noticed, quiet)
 }
 
 
@@ -283,10 +278,7 @@ def main() -> int:
     parser.add_argument("--only", nargs="*", choices=sorted(SCENARIOS), default=list(SCENARIOS))
     given = parser.parse_args()
     wrong = [line for name in given.only for level in given.levels for line in SCENARIOS[name](level, given)]
-    for line in wrong:
-        print(f"FAILED: {line}")
-    print("passed" if not wrong else f"{len(wrong)} bounds failed")
-    return int(bool(wrong))
+    return exit_status(wrong)
 
 
 if __name__ == "__main__":

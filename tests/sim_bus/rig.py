@@ -1,7 +1,9 @@
 """A simulated arm behind raw frames, written out by hand: what the tests of this folder drive it with."""
 
 import struct
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,9 +32,19 @@ def one_joint(**sim: Any) -> ArmFile:
         "link": {"joints": [{"name": "hinge", "node": 5, "rated_torque": 10.0, "max_torque": 20.0}]},
         "sim": {**section, **sim},
     }
-    from pathlib import Path
-
     return parse_arm(content, Path("pendulum.yaml"))
+
+
+class Hand:
+    """A clock moved by hand."""
+
+    time = 0.0
+
+    def now(self) -> float:
+        return self.time
+
+    def sleep_until(self, instant: float) -> None:
+        self.time = max(self.time, instant)
 
 
 class Rig:
@@ -108,3 +120,13 @@ class Rig:
 
     def status(self, node: int) -> int:
         return int(struct.unpack("<H", self.read(node, 0x6041))[0])
+
+
+def wait_for(condition: Callable[[], Any], seconds: float = 20.0) -> bool:
+    """Whether `condition` comes true; the time is that of a busy machine, not a bound."""
+    end = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.005)
+    return True

@@ -64,6 +64,20 @@ def test_an_arm_from_a_model_file_takes_its_inertials_and_stops_from_there(tmp_p
     np.testing.assert_allclose(arm.plant.upper, [1.0, 2.0])
 
 
+@pytest.mark.parametrize("angle", ["radian", "degree"])
+def test_stops_of_the_arm_file_come_before_those_of_a_model_file(tmp_path: Path, angle: str) -> None:
+    (tmp_path / "arm.xml").write_text(
+        f"""<mujoco><compiler angle="{angle}"/><worldbody><body><joint name="hinge" axis="0 1 0" range="-1 1"/>
+        <inertial pos="0.1 0 0" mass="1" diaginertia="0.01 0.01 0.01"/></body></worldbody></mujoco>"""
+    )
+    controllers = [{"name": "hinge", "node": 3, "rated_torque": 20.0, "max_torque": 30.0}]
+    kinematics = {"gravity": [0.0, 0.0, -9.81], "model": "arm.xml", "stops": {"hinge": [-0.5, 0.8]}}
+    content = {"name": "one", "kinematics": kinematics, "link": {"joints": controllers}, "sim": {}}
+    described = parse_arm(content, tmp_path / "arm.yaml")
+    plant = SimulatedArm(described, Truth.of(described)).plant
+    np.testing.assert_allclose([plant.lower, plant.upper], [[-0.5], [0.8]])
+
+
 def test_truth_is_drawn_within_its_ranges_and_frozen() -> None:
     arm = load_arm("sarcos")
     rated = arm.require_link().rated_torques
@@ -94,6 +108,8 @@ def test_effects_and_drifts_of_the_command_line() -> None:
         "friction.coulomb",
         "friction.coulomb:joint_9:1",
         "nothing:joint_1:1",
+        "friction.coulomb:joint_1:",
+        ":joint_1:1",
         "friction.coulomb:joint_1:x y",
     ):
         with pytest.raises(BadInput, match="--effect"):

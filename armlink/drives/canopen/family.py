@@ -69,10 +69,10 @@ def examine(arm: ArmFile, bus: CanBus, name: str) -> Iterator[DriveFinding]:
 
 
 FAMILY = Family(
-    name="canopen",
-    traits=TRAITS,
-    settings=CanopenSettings,
-    build=build,
+    "canopen",
+    TRAITS,
+    CanopenSettings,
+    build,
     self_test=self_test,
     search=search,
     find=find,

@@ -5,9 +5,5 @@ from armlink.drives.cubemars.settings import CubeMarsSettings
 from armlink.drives.family import Family
 
 FAMILY = Family(
-    name="cubemars",
-    traits=TRAITS,
-    settings=CubeMarsSettings,
-    build=CubeMarsDrives,
-    summary="CubeMars AK (firmware 1 and 2), MIT mode",
+    "cubemars", TRAITS, CubeMarsSettings, CubeMarsDrives, summary="CubeMars AK (firmware 1 and 2), MIT mode"
 )

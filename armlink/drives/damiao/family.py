@@ -5,9 +5,5 @@ from armlink.drives.damiao.settings import DamiaoSettings
 from armlink.drives.family import Family
 
 FAMILY = Family(
-    name="damiao",
-    traits=TRAITS,
-    settings=DamiaoSettings,
-    build=DamiaoDrives,
-    summary="Damiao DM-J (OpenArm, YAM, reBot B601-DM), MIT mode",
+    "damiao", TRAITS, DamiaoSettings, DamiaoDrives, summary="Damiao DM-J (OpenArm, YAM, reBot B601-DM), MIT mode"
 )

@@ -65,7 +65,6 @@ class _Known:
     limits: Limits | None = None
     mode: int | None = None
     fault: int = 0
-    position: float = math.nan
     sent: Order | None = None
 
 
@@ -144,7 +143,7 @@ class MoteusDrives(BasicDrives):
             position = values.get(Register.POSITION, math.nan) * TURN
             if not math.isfinite(position):
                 raise BusFault(f"{name}: reports no position")
-            known.limits, known.position, known.mode = limit, position, None
+            known.limits, known.mode = limit, None
             found.append(
                 Setup(
                     position=position,
@@ -254,7 +253,6 @@ class MoteusDrives(BasicDrives):
         position = values.get(Register.POSITION, math.nan)
         if not abs(position) < LARGEST_POSITION:
             position = math.nan
-        known.position = position * TURN
         return self.note(
             Reading(
                 joint,

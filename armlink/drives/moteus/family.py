@@ -4,10 +4,4 @@ from armlink.drives.family import Family
 from armlink.drives.moteus.drives import TRAITS, MoteusDrives
 from armlink.drives.moteus.settings import MoteusSettings
 
-FAMILY = Family(
-    name="moteus",
-    traits=TRAITS,
-    settings=MoteusSettings,
-    build=MoteusDrives,
-    summary="mjbots moteus r4, c1, n1, x1, on CAN FD",
-)
+FAMILY = Family("moteus", TRAITS, MoteusSettings, MoteusDrives, summary="mjbots moteus r4, c1, n1, x1, on CAN FD")

@@ -5,9 +5,5 @@ from armlink.drives.odrive.drives import TRAITS, ODriveDrives
 from armlink.drives.odrive.settings import ODriveSettings
 
 FAMILY = Family(
-    name="odrive",
-    traits=TRAITS,
-    settings=ODriveSettings,
-    build=ODriveDrives,
-    summary="ODrive Pro, S1, Micro with firmware 0.6, CANSimple",
+    "odrive", TRAITS, ODriveSettings, ODriveDrives, summary="ODrive Pro, S1, Micro with firmware 0.6, CANSimple"
 )

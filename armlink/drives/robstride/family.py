@@ -5,9 +5,9 @@ from armlink.drives.robstride.drives import TRAITS, RobStrideDrives
 from armlink.drives.robstride.settings import RobStrideSettings
 
 FAMILY = Family(
-    name="robstride",
-    traits=TRAITS,
-    settings=RobStrideSettings,
-    build=RobStrideDrives,
+    "robstride",
+    TRAITS,
+    RobStrideSettings,
+    RobStrideDrives,
     summary="RobStride RS00 to RS06 (reBot B601-RS), private protocol",
 )

@@ -6,14 +6,15 @@ from typing import Annotated
 
 import typer
 
+from armlink.commands.options import Arm, OtherBus
 from calib.commands.options import JsonFile
 
 COLOURS = {"error": "red", "warning": "yellow", "hint": "cyan"}
 
 
 def doctor(
-    arm: Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")],
-    bus: Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")] = None,
+    arm: Arm,
+    bus: OtherBus = None,
     offline: Annotated[bool, typer.Option("--offline", help="Leave the bus alone.")] = False,
     json_file: JsonFile = None,
 ) -> int:

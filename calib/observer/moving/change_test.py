@@ -13,20 +13,11 @@ import numpy as np
 from calib.creep.parameters import family_slices
 from calib.observer.cause_test import Verdict, smallest_noticed, solved
 from calib.observer.config import ObserverConfig
-from calib.observer.moving.belief import USUAL_ROWS, MotorBelief
+from calib.observer.moving.belief import MotorBelief
 from calib.observer.moving.passages import Passage
+from calib.observer.moving.thresholds import FEWEST, INEXACT, MISFIT, PAYLOAD_ROUNDS, USUAL_ROWS
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array
-
-FEWEST = 6
-"""Rows of a joint from which a change of its drive can be told."""
-MISFIT = 8.0
-"""χ² above its degrees of freedom, in standard deviations, from which nothing explains the rows: 120 rows then scatter
-by 1.4 times what was learned. Friction of a joint is never quite what it was; a contact is far beyond."""
-INEXACT = 0.03
-"""Most that a change's own shape may be off, as a share."""
-ROUNDS = 2
-"""Further linearisations of a payload."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +137,7 @@ class ChangeTest:
         arm, values = self._belief.arm, np.zeros(4)
         per_unit = np.column_stack(payload_columns(arm))
         fit = self._least_squares(candidate, self._white, values)
-        for _ in range(ROUNDS):
+        for _ in range(PAYLOAD_ROUNDS):
             values = fit.values
             residual, jacobian, _ = self._belief.linearised(self._passages, per_unit @ values)
             columns = jacobian[:, family_slices(arm.n)["beta"]] @ per_unit

@@ -193,11 +193,17 @@ def test_damiao_set_up_refuses(spoil, says):
     assert str(caught.value).startswith("shoulder")
 
 
-def test_damiao_mode_is_written_and_read_back():
-    bench = Bench("six-damiao")
+def set_up_in_mode(arm, mode):
+    """A bench whose drives were in this mode of control before they were set up."""
+    bench = Bench(arm)
     for device in bench.simulated:
-        device.inject("drive.mode", 2)
+        device.inject("drive.mode", mode)
     bench.set_up()
+    return bench
+
+
+def test_damiao_mode_is_written_and_read_back():
+    bench = set_up_in_mode("six-damiao", 2)
     assert [device.registers[10] for device in bench.simulated] == [1] * 6
     assert [device.registers[9] for device in bench.simulated] == [2000] * 6
 
@@ -210,10 +216,7 @@ def test_robstride_without_a_deadman_is_refused():
 
 
 def test_robstride_modes_and_limits_are_read_back():
-    bench = Bench("six-robstride")
-    for device in bench.simulated:
-        device.inject("drive.mode", 1)
-    bench.set_up()
+    bench = set_up_in_mode("six-robstride", 1)
     assert [device.parameters[0x7005] for device in bench.simulated] == [0] * 6
     assert [device.parameters[0x700B] for device in bench.simulated] == [36.0, 36.0, 18.0, 6.0, 6.0, 5.5]
     assert [device.parameters[0x7028] for device in bench.simulated] == [2000] * 6

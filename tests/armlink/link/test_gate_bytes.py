@@ -139,6 +139,23 @@ def check(frame_mode, now, before, told):
         assert abs(position * UNIT) <= max(WINDOW, abs(start)) + UNIT
 
 
+def judge(bus, last):
+    """Every RPDO1 that left in one cycle, against every limit; `last` has each node's mode and the one before."""
+    modes, seen = {node: state[0] for node, state in last.items()}, dict.fromkeys(bus.nodes, 0)
+    for can_id, data, told in bus.left:
+        node = can_id & 0x7F
+        if can_id & 0x780 == 0x300:
+            modes[node] = struct.unpack("<b", data)[0]
+            continue
+        now = struct.unpack("<Hhi", data)
+        assert abs(now[1]) * TORQUE_UNIT <= MAX_TORQUE
+        seen[node] += 1
+        if now[0] & ENABLE == ENABLE:
+            assert seen[node] == 1  # whatever was refused, nothing is enabled any more after this cycle
+            check(modes[node], now, last[node], told)
+        last[node] = (modes[node], now)
+
+
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 @given(steps)
 def test_no_byte_that_leaves_exceeds_a_limit(steps):
@@ -164,19 +181,7 @@ def test_no_byte_that_leaves_exceeds_a_limit(steps):
                 link.cycle(command)
             except ArmlinkError:
                 assert not link._enabled
-            modes, seen = {node: state[0] for node, state in last.items()}, dict.fromkeys(bus.nodes, 0)
-            for can_id, data, told in bus.left:
-                node = can_id & 0x7F
-                if can_id & 0x780 == 0x300:
-                    modes[node] = struct.unpack("<b", data)[0]
-                    continue
-                now = struct.unpack("<Hhi", data)
-                assert abs(now[1]) * TORQUE_UNIT <= MAX_TORQUE
-                seen[node] += 1
-                if now[0] & ENABLE == ENABLE:
-                    assert seen[node] == 1  # whatever was refused, nothing is enabled any more after this cycle
-                    check(modes[node], now, last[node], told)
-                last[node] = (modes[node], now)
+            judge(bus, last)
 
 
 def test_what_leaves_after_a_command_of_a_wrong_shape_is_a_quick_stop(enabled, bus):

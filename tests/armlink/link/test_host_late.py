@@ -10,6 +10,7 @@ from armlink.arm_file import load_arm
 from armlink.bus.port import Frame
 from armlink.drives.orders import Power
 from armlink.errors import HostLate
+from armlink.link.cycle import Commander
 from armlink.link.types import Command
 from armlink.selftest.host import STOPPED, EchoPort, echo_commander
 
@@ -43,16 +44,22 @@ class StandingStill(EchoPort):
         return super().receive(timeout)
 
 
-@pytest.mark.parametrize("place", PLACES)
-@pytest.mark.parametrize("still", [0.06, 0.18, 2.0])
-def test_it_is_the_host_wherever_it_stands_still(place: str, still: float) -> None:
+def standing() -> tuple[StandingStill, Commander]:
+    """A port, and what commands its joints, which have answered for three cycles without power."""
     clock = FakeClock()
     port = StandingStill(clock)
     commander = echo_commander(load_arm("sarcos"), port, clock)
     commander.max_age = DEADLINE
-    hold = Command.hold(port.standing)
     for _ in range(3):
         commander.stand([Power.OFF] * N)
+    return port, commander
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("still", [0.06, 0.18, 2.0])
+def test_it_is_the_host_wherever_it_stands_still(place: str, still: float) -> None:
+    port, commander = standing()
+    hold = Command.hold(port.standing)
     for _ in range(50):
         commander.command(hold)
     port.place, port.still = place, still
@@ -69,13 +76,8 @@ def test_it_is_the_host_wherever_it_stands_still(place: str, still: float) -> No
 
 @pytest.mark.parametrize("place", PLACES)
 def test_a_short_stop_is_bridged(place: str) -> None:
-    clock = FakeClock()
-    port = StandingStill(clock)
-    commander = echo_commander(load_arm("sarcos"), port, clock)
-    commander.max_age = DEADLINE
+    port, commander = standing()
     hold = Command.hold(port.standing)
-    for _ in range(3):
-        commander.stand([Power.OFF] * N)
     for k in range(50):
         port.place, port.still = place, 0.04 if k == 20 else port.still
         port.stand_still("before the cycle")

@@ -223,17 +223,12 @@ def test_an_interruption_while_leaving_is_a_quick_stop_too(arm_of, bus, monkeypa
     assert bus.closed
 
 
-def test_a_joint_in_quick_stop_is_enabled_without_losing_power(arm_of, bus):
-    with Link(arm_of(), bus) as link:
-        link.start()
-        link.enable()
-    with Link(arm_of(), bus) as link:
-        link.start()
-        bus.nodes[1].commands.clear()
-        link.enable()
-        controls = [control for control, *_ in bus.nodes[1].commands]
-        assert controls[-1] == 15
-        assert bus.nodes[1].status == ENABLED
+def test_a_joint_in_quick_stop_is_enabled_without_losing_power(relinked, bus):
+    bus.nodes[1].commands.clear()
+    relinked.enable()
+    controls = [control for control, *_ in bus.nodes[1].commands]
+    assert controls[-1] == 15
+    assert bus.nodes[1].status == ENABLED
 
 
 def test_disable_takes_the_power_and_leaving_changes_nothing_more(arm_of, bus):

@@ -381,16 +381,11 @@ def test_frames_cut_short_raise_nothing_else(enabled, bus, can_id, data):
 # ---- entering power
 
 
-def test_a_joint_that_holds_in_quick_stop_keeps_its_power_on_the_way_back(arm_of, bus):
-    with Link(arm_of(), bus) as link:
-        link.start()
-        link.enable()
-    with Link(arm_of(), bus) as link:
-        link.start()
-        for node in bus.nodes.values():
-            node.commands.clear()
-        link.enable()
-        assert {word for node in bus.nodes.values() for word, *_ in node.commands} == {0x02, 0x0F}
+def test_a_joint_that_holds_in_quick_stop_keeps_its_power_on_the_way_back(relinked, bus):
+    for node in bus.nodes.values():
+        node.commands.clear()
+    relinked.enable()
+    assert {word for node in bus.nodes.values() for word, *_ in node.commands} == {0x02, 0x0F}
 
 
 def test_while_it_is_enabled_a_joint_keeps_its_target(link, bus):

@@ -63,6 +63,8 @@ def test_rollback_makes_the_old_record_current(kept, capsys) -> None:
         (["rollback", "sarcos", "--to", "deadbeef"], 1, "no record deadbeef"),
         (["history", "nowhere"], 2, "no arm file nowhere"),
         (["history", "sarcos", "--record", "deadbeef"], 1, "no record deadbeef"),
+        (["recalibrate", "sarcos", "nowhere.csv"], 2, "nowhere.csv"),
+        (["recalibrate", "nowhere", "x.csv"], 2, "no arm file nowhere"),
     ],
 )
 def test_what_cannot_be_done_is_one_line(kept, capsys, arguments, status, said) -> None:

@@ -3,6 +3,7 @@
 import shutil
 import sqlite3
 from pathlib import Path
+from typing import Any
 
 import pytest
 from failing_calls import DEPENDENCIES, events, watched_drift
@@ -180,20 +181,26 @@ def test_a_state_that_is_read_only_at_the_start_is_one_line(tmp_path: Path, monk
         Journal(path)
 
 
+class NoCommit:
+    """A database that takes everything but the end of a transaction."""
+
+    def __init__(self, real: sqlite3.Connection) -> None:
+        self.real = real
+
+    def execute(self, statement: str, *values: Any) -> object:
+        if statement == "COMMIT":
+            raise sqlite3.OperationalError("database or disk is full")
+        return self.real.execute(statement, *values)
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self.real, name)
+
+
 def test_what_cannot_be_committed_is_not_half_kept(tmp_path: Path) -> None:
     journal = Journal(tmp_path / "journal.db", lambda: 0.0)
     real = journal._db
 
-    class NoCommit:
-        def execute(self, statement: str, *values: object) -> object:
-            if statement == "COMMIT":
-                raise sqlite3.OperationalError("database or disk is full")
-            return real.execute(statement, *values)
-
-        def __getattr__(self, name: str) -> object:
-            return getattr(real, name)
-
-    journal._db = NoCommit()  # type: ignore[assignment]
+    journal._db = NoCommit(real)  # type: ignore[assignment]
     with pytest.raises(sqlite3.OperationalError), journal.transaction():
         real.execute("INSERT INTO history(time, t, record, estimate) VALUES ('a', 0, 'b', '{}')")
     assert not real.in_transaction
@@ -274,17 +281,8 @@ def test_a_write_whose_outcome_the_journal_does_not_take_is_kept_later(tmp_path:
     streamed = daemon.service.hub.subscribe()
     real = daemon.service.journal._db
 
-    class NoCommit:
-        def execute(self, statement: str, *values: object) -> object:
-            if statement == "COMMIT":
-                raise sqlite3.OperationalError("disk is full")
-            return real.execute(statement, *values)
-
-        def __getattr__(self, name: str) -> object:
-            return getattr(real, name)
-
     def written(joint: int) -> None:
-        daemon.service.journal._db = NoCommit()  # type: ignore[assignment]
+        daemon.service.journal._db = NoCommit(real)  # type: ignore[assignment]
         if bus == "fails too":
             raise BusFault("joint gone")
 

@@ -253,20 +253,6 @@ def test_the_command_keeps_a_record_and_says_what_it_could_not_separate(kept, tm
     assert store.current(CalibrationRecord, ARM) == installed
 
 
-@pytest.mark.parametrize(
-    ("arguments", "status", "said"),
-    [
-        (["recalibrate", "sarcos", "nowhere.csv"], 2, "nowhere.csv"),
-        (["recalibrate", "nowhere", "x.csv"], 2, "no arm file nowhere"),
-    ],
-)
-def test_what_cannot_be_used_is_one_line(kept, capsys, arguments, status, said) -> None:
-    assert run([*arguments, "--store", kept[0]]) == status
-    error = capsys.readouterr().err
-    assert said in error
-    assert error.count("\n") == 1
-
-
 def test_without_a_gravity_record_it_says_how_to_make_one(tmp_path, capsys) -> None:
     assert run(["recalibrate", "sarcos", "x.csv", "--store", str(tmp_path / "empty.db")]) == 1
     assert ": armlink sweep " in capsys.readouterr().err

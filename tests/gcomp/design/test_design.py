@@ -57,6 +57,14 @@ def test_greedy_choice_is_the_best_of_all_on_a_small_arm(rng) -> None:
     assert log_volume(design.prediction) == pytest.approx(min(every), abs=1e-6)
 
 
+def test_the_other_joints_are_at_each_combination_of_their_stops_once(sarcos) -> None:
+    poses = stop_combinations(sarcos, 2)
+    others = np.arange(7) != 2
+    assert poses[:, 2] == pytest.approx(np.full(64, (sarcos.lower[2] + sarcos.upper[2]) / 2))
+    assert len({tuple(pose) for pose in poses}) == len(poses) == 64
+    assert np.all((poses == sarcos.lower)[:, others] | (poses == sarcos.upper)[:, others])
+
+
 def test_resting_joints_lean_on_stops_and_the_swept_one_feels_gravity(sarcos) -> None:
     design = choose_sweeps(sarcos, GUESS, sigma=SIGMA, unknown=MOMENTS, poses=2, steps=13, margin=0.05)
     assert [sweep.joint for sweep in design.sweeps] == [joint for joint in range(7) for _ in range(2)]

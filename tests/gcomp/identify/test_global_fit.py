@@ -141,7 +141,7 @@ def test_robust_loss_survives_outliers_with_honest_intervals(loss: str, sarcos) 
         found = identify_global(sarcos, spoilt, unknown=("gain", "offset", "beta", "rho"), loss=loss)
         known = found.std.vector > 0
         scores.append((found.values.vector - true.vector)[known] / found.std.vector[known])
-    assert np.std(scores) < 1.5
+    assert 0.6 < np.std(scores) < 1.5
     plain = identify_global(sarcos, spoilt, unknown=("gain", "offset", "beta", "rho"))
     assert errors(found.values, true).max() < errors(plain.values, true).max()
 

@@ -1,32 +1,16 @@
 """The simulated arm in real time: physics advance when a frame or a timer needs them, and give what lock-step gives."""
 
 import struct
-from collections.abc import Iterator
 
 import can
 import numpy as np
 import pytest
-from rig import Rig, one_joint
+from rig import Hand, Rig, one_joint
 
 from armlink.bus.adapters import as_bus
 from sim_bus.bus.server import TICK, Server
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
-
-
-class Hand:
-    """A clock moved by hand."""
-
-    time = 0.0
-
-    def now(self) -> float:
-        return self.time
-
-
-@pytest.fixture
-def ends() -> Iterator[tuple[can.BusABC, can.BusABC]]:
-    with can.Bus("server", interface="virtual") as arm_end, can.Bus("server", interface="virtual") as host_end:
-        yield arm_end, host_end
 
 
 def test_only_frames_and_timers_that_need_it_advance_the_physics(ends: tuple[can.BusABC, can.BusABC]) -> None:

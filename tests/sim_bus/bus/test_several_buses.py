@@ -5,6 +5,7 @@ import threading
 import can
 import pytest
 import yaml
+from rig import Hand
 
 from armlink.arm_file import load_arm
 from armlink.bus.bus_group import BusGroup
@@ -143,7 +144,7 @@ def test_a_node_and_another_drive_on_two_buses_move_as_one_arm(path, turned):
 
 
 def test_frames_on_a_bus_without_nodes_reach_no_node_of_another(path):
-    described, clock = with_drives(path, None, DAMIAO), HandTime()
+    described, clock = with_drives(path, None, DAMIAO), Hand()
     arm = SimulatedArm(described, Truth.of(described))
     nodes, host = (open_link_bus(None, described.require_link()) for _ in range(2))
     server = Server(arm, nodes, now=clock.now)
@@ -168,7 +169,7 @@ def test_frames_on_a_bus_without_nodes_reach_no_node_of_another(path):
 
 def serials_of_an_arm_that_moves_as_one(path, *drives):
     """Serial numbers on the buses of an arm of two joints, which follows its targets."""
-    described, clock = with_drives(path, *drives), HandTime()
+    described, clock = with_drives(path, *drives), Hand()
     arm = SimulatedArm(described, Truth.of(described))
     nodes, host = (open_link_bus(None, described.require_link()) for _ in range(2))
     server = Server(arm, nodes, now=clock.now)
@@ -187,19 +188,6 @@ def serials_of_an_arm_that_moves_as_one(path, *drives):
         assert link.stats.missed == 0
     nodes.shutdown()
     return serials
-
-
-class HandTime:
-    """A clock that the test moves on."""
-
-    def __init__(self):
-        self.time = 0.0
-
-    def now(self):
-        return self.time
-
-    def sleep_until(self, instant):
-        self.time = max(self.time, instant)
 
 
 def test_drives_with_the_same_ids_on_two_buses_move_as_one_arm(path):

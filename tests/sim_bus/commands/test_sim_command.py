@@ -5,12 +5,11 @@ import signal
 import struct
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import can
 import pytest
-from rig import one_joint
+from rig import Hand, one_joint
 
 from armlink.bus.adapters import as_bus
 from armlink.cli import run
@@ -40,21 +39,6 @@ def test_what_cannot_be_done_is_said_in_one_line(
     error = capsys.readouterr().err
     assert message in error
     assert error.strip().count("\n") == 0
-
-
-class Hand:
-    """A clock moved by hand."""
-
-    time = 0.0
-
-    def now(self) -> float:
-        return self.time
-
-
-@pytest.fixture
-def ends() -> Iterator[tuple[can.BusABC, can.BusABC]]:
-    with can.Bus("sim", interface="virtual") as arm_end, can.Bus("sim", interface="virtual") as host_end:
-        yield arm_end, host_end
 
 
 def receive(bus: can.BusABC) -> list[tuple[int, bytes]]:

@@ -2,7 +2,6 @@
 
 import queue
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import count
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import can
+from rig import wait_for as wait_for
 
 from armlink.arm_file import ArmFile, Bus, parse_arm
 from armlink.bus.open import open_bus
@@ -94,13 +94,3 @@ def served(drive: dict[str, Any], fd: bool = False, bus: Bus | None = None, **li
         yield served
     finally:
         served.close()
-
-
-def wait_for(condition: Callable[[], Any], seconds: float = 20.0) -> bool:
-    """Whether `condition` comes true; the time is that of a busy machine, not a bound."""
-    end = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.005)
-    return True

@@ -5,7 +5,7 @@ import time
 
 import canopen
 import pytest
-from serving import GRAVITY_TORQUE, served, wait_for
+from serving import GRAVITY_TORQUE, wait_for
 
 from armlink.drives.canopen.eds_file import bundled_path
 
@@ -13,12 +13,6 @@ DRIVE = {"family": "canopen", "node": 5, "torque": "motor"}
 UNIT = 2 * math.pi / 2**20
 RATED, HOST = 10.0, 0x7E
 STATE, ENABLED, QUICK_STOP, FAULT, SWITCH_ON_DISABLED = 0x6F, 0x27, 0x07, 0x08, 0x40
-
-
-@pytest.fixture
-def arm():
-    with served(DRIVE) as arm:
-        yield arm
 
 
 @pytest.fixture

@@ -5,18 +5,12 @@ import warnings
 
 import can
 import pytest
-from serving import GRAVITY_TORQUE, served, wait_for
+from serving import GRAVITY_TORQUE, wait_for
 from TMotorCANControl.mit_can import CAN_Manager, TMotorManager_mit_can
 
 DRIVE = {"family": "cubemars", "id": 0x02, "model": "AK80-9", "can_timeout": 40_000, "kp": 40, "kd": 1.0}
 AMPERE = 0.091 * 9 / 0.59
 """Torque of the frame that the client sends for one ampere [N·m]."""
-
-
-@pytest.fixture
-def arm():
-    with served(DRIVE) as arm:
-        yield arm
 
 
 class Manager(CAN_Manager):

@@ -5,15 +5,9 @@ import warnings
 
 import pytest
 from damiao_motor import DaMiaoController
-from serving import GRAVITY_TORQUE, served, wait_for
+from serving import GRAVITY_TORQUE, wait_for
 
 DRIVE = {"family": "damiao", "id": 0x02, "reply": 0x12, "model": "DM4340", "kp": 40, "kd": 1.0}
-
-
-@pytest.fixture
-def arm():
-    with served(DRIVE) as arm:
-        yield arm
 
 
 @pytest.fixture

@@ -9,17 +9,11 @@ import struct
 import can
 import pytest
 from robstride.client import Client, MotorMode, RunMode
-from serving import GRAVITY_TORQUE, served, wait_for
+from serving import GRAVITY_TORQUE, wait_for
 
 DRIVE = {"family": "robstride", "id": 0x7F, "model": "RS01", "kp": 40, "kd": 1.0}
 MOTOR, HOST = 0x7F, 0xAA
 P, V, T = 12.57, 44.0, 17.0
-
-
-@pytest.fixture
-def arm():
-    with served(DRIVE) as arm:
-        yield arm
 
 
 @pytest.fixture

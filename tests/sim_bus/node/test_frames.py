@@ -163,6 +163,29 @@ def test_a_calibration_record_comes_into_force_only_with_its_crc(rig: Rig) -> No
     assert rig.read(5, 0x2100, 2) + rig.read(5, 0x2100, 3) == content[:8]
 
 
+@pytest.mark.parametrize(("gain", "offset"), [(0.0, 0.0), (np.nan, 0.0), (np.inf, 0.0), (1.1, np.nan), (1.1, np.inf)])
+def test_a_calibration_record_of_no_use_is_refused(rig: Rig, gain: float, offset: float) -> None:
+    content = struct.pack("<ffII", gain, offset, 77, 1)
+    for sub, data in zip((4, 5, 7, 8), (content[:4], content[4:8], content[8:12], content[12:]), strict=True):
+        rig.write(5, 0x2100, sub, data)
+    rig.write(5, 0x2100, 9, struct.pack("<I", zlib.crc32(content)))
+    assert abort_code(rig.write(5, 0x2100, 6, b"\1")) == 0x06090030
+    assert rig.read(5, 0x2100, 2) == struct.pack("<f", 1.0)
+
+
+@pytest.mark.parametrize(("sub", "kept"), [(1, False), (2, True), (4, False)])
+def test_restoring_all_or_the_devices_own_parameters_forgets_the_record(rig: Rig, sub: int, kept: bool) -> None:
+    content = struct.pack("<ffII", 1.25, -0.5, 77, 1)
+    for place, data in zip((4, 5, 7, 8), (content[:4], content[4:8], content[8:12], content[12:]), strict=True):
+        rig.write(5, 0x2100, place, data)
+    rig.write(5, 0x2100, 9, struct.pack("<I", zlib.crc32(content)))
+    rig.write(5, 0x2100, 6, b"\1")
+    assert rig.write(5, 0x1010, 4, b"save")[0] == 0x60
+    assert rig.write(5, 0x1011, sub, b"load")[0] == 0x60
+    rig.send(0, b"\x81\x05")
+    assert rig.read(5, 0x2100, 2) == struct.pack("<f", 1.25 if kept else 1.0)
+
+
 def test_the_reading_is_corrected_by_the_record_in_force_and_the_record_survives_only_if_stored() -> None:
     arm = one_joint(sensors={"gain": [1.25], "offset": [-0.5], "noise": [0.0], "bits": 20})
     rig = Rig(arm, Truth.of(arm))

@@ -15,6 +15,7 @@ import can
 import canopen
 import pytest
 from canopen.profiles.p402 import BaseNode402
+from rig import wait_for
 
 pytestmark = pytest.mark.vcan
 
@@ -64,15 +65,6 @@ def node(simulated: None) -> Iterator[BaseNode402]:
     yield node
     network.sync.stop()
     network.disconnect()
-
-
-def wait_for(condition, seconds: float = 10.0) -> bool:
-    end = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.02)
-    return True
 
 
 def map_for_canopen(node: BaseNode402) -> None:

@@ -9,7 +9,7 @@ from wrong_arms import THREE, motion
 
 from armlink.recording.corrections import AS_IT_IS
 from sim_gap.checks.rigid_fit import Motion, fit_rigid
-from sim_gap.checks.torque_source import find_delay, find_source
+from sim_gap.checks.torque_source import find_absent, find_delay, find_source
 from sim_gap.model.load import load_model
 
 RATE, LATE = 25.0, 0.4
@@ -53,3 +53,21 @@ def test_friction_is_looked_for_in_joints_that_move(friction: float, found: int)
     moved = Motion(q, v, a, read, "tau")
     findings = find_source(fit_rigid(arm, moved), SimpleNamespace(reading={"tau"}), moved, AS_IT_IS)
     assert len(findings) == found
+
+
+@pytest.mark.parametrize("column", [0, 2])
+def test_a_link_sensor_without_the_models_torque_is_asked_about(column: int):
+    """The gear of a motor may hold the load, a sensor on the link feels it."""
+    arm = load_model(mujoco.MjModel.from_xml_string(THREE)).arm
+    _, q, v, a = motion(3, 60.0, RATE, seed=3)
+    read = arm.torque(q, v, a)
+    small = 0.05 * np.random.default_rng(2).normal(size=len(q))
+    for channel, count in (("tau", 1), ("tau_motor", 0)):
+        wrong = read.copy()
+        wrong[:, column] = small
+        moved = Motion(q, v, a, wrong, channel)
+        found = find_absent(arm, fit_rigid(arm, moved), moved, AS_IT_IS)
+        assert len(found) == count
+        assert all(each.joint == arm.names[column] and not each.corrected for each in found)
+    sound = Motion(q, v, a, read + small[:, None], "tau")
+    assert not find_absent(arm, fit_rigid(arm, sound), sound, AS_IT_IS)

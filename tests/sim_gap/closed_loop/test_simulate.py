@@ -6,6 +6,7 @@ from sim_gap.closed_loop.controller import nominal_controller, nominal_point
 from sim_gap.closed_loop.fit import Fit, batch, evaluate, jacobian
 from sim_gap.closed_loop.judge import joint_rms
 from sim_gap.closed_loop.parameters import Scales
+from sim_gap.closed_loop.rivals import _like
 from sim_gap.closed_loop.simulate import simulate
 from sim_gap.closed_loop.windows import windows_of
 from sim_gap.model.load import load_model
@@ -79,3 +80,11 @@ def test_back_emf_damps_only_while_the_servo_is_on() -> None:
     same, free = (np.abs(simulate(each, batch([point])) - simulate(each, batch([braked]))).max() for each in (on, off))
     assert same < 1e-12
     assert free > 1e-3
+
+
+def test_an_effect_begins_in_place_of_another_with_the_torque_closest_to_it() -> None:
+    random = np.random.default_rng(4)
+    first, second, third = random.normal(size=(3, 50, 2, 4))
+    torque = 0.3 * first - 1.2 * second
+    np.testing.assert_allclose(_like(torque, [first, second, third]), [0.3, -1.2, 0.0], atol=1e-6)
+    np.testing.assert_allclose(_like(torque, [2.0 * torque, 0.0 * torque]), [0.5, 0.0], atol=1e-6)

@@ -1,28 +1,14 @@
 """A daemon's view that tests fill by hand: what the web layer does must not depend on a bus."""
 
-import asyncio
 import math
-from collections import deque
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
 
 from armlink.arm_file import load_arm
-from calib.daemon.view.api_models import (
-    BusHealth,
-    DrawnArm,
-    EventItem,
-    EventRecord,
-    HistoryPoint,
-    JointEstimate,
-    JointNow,
-    JointsItem,
-    Proposal,
-    RecordsInForce,
-    State,
-    Status,
-)
+from calib.daemon.view import api_models
 from calib.daemon.view.drawn_arm import drawn_arm
+from calib.daemon.view.fan_out import Client, Hub
 from calib.daemon.view.view import NoSuch, NotPossible
 from calib.daemon.view.window import Window
 
@@ -30,61 +16,38 @@ NOW = datetime(2026, 5, 1, 8, 0, tzinfo=UTC)
 NAMES = tuple(f"joint_{i}" for i in range(1, 8))
 
 
-class MadeUpSubscription:
-    """A queue of a few items."""
-
-    def __init__(self, view: "MadeUpView") -> None:
-        self._view = view
-        self.items: deque[JointsItem | EventItem] = deque([view.item()], maxlen=50)
-        self.more = asyncio.Event()
-
-    async def get(self) -> JointsItem | EventItem:
-        while not self.items:
-            self.more.clear()
-            await self.more.wait()
-        return self.items.popleft()
-
-    def close(self) -> None:
-        self._view.clients.discard(self)
-
-
 class MadeUpView:
     """Seven joints at rest; `tick()` publishes one item, `happen()` an event."""
 
     def __init__(self) -> None:
-        self.clients: set[MadeUpSubscription] = set()
+        self.hub = Hub()
         self.decisions = self
         self.begin()
 
     def begin(self) -> None:
         """As it is at the start."""
-        self.state, self.fault, self.t = State.OBSERVING, None, 0.0
+        self.state, self.fault, self.t = api_models.State.OBSERVING, None, 0.0
         self.report = None
-        self.log: list[EventRecord] = []
-        self.points: list[HistoryPoint] = []
-        self.offered: list[Proposal] = []
+        self.log: list[api_models.EventRecord] = []
+        self.points: list[api_models.HistoryPoint] = []
+        self.offered: list[api_models.Proposal] = []
         self.shift = 0.0
         self.moves = True
 
     def tick(self, seconds: float = 0.1) -> None:
         self.t += seconds
-        item = self.item()
-        for client in self.clients:
-            client.items.append(item)
-            client.more.set()
+        self.hub.publish(self.item())
 
-    def happen(self, kind: str, joint: str | None = None, text: str = "", **evidence: object) -> EventRecord:
-        record = EventRecord(
+    def happen(self, kind: str, joint: str | None = None, text: str = "", **evidence: object) -> api_models.EventRecord:
+        record = api_models.EventRecord(
             id=len(self.log) + 1, time=self.time(), t=self.t, kind=kind, joint=joint, text=text, evidence=evidence
         )
         self.log.append(record)
-        for client in self.clients:
-            client.items.append(EventItem(event=record))
-            client.more.set()
+        self.hub.publish(api_models.EventItem(event=record))
         return record
 
-    def propose(self, joint: str = "joint_2") -> Proposal:
-        proposal = Proposal(
+    def propose(self, joint: str = "joint_2") -> api_models.Proposal:
+        proposal = api_models.Proposal(
             id=len(self.offered) + 1,
             time=self.time(),
             state="pending",
@@ -105,16 +68,18 @@ class MadeUpView:
     def time(self) -> datetime:
         return NOW + timedelta(seconds=self.t)
 
-    def item(self) -> JointsItem:
-        return JointsItem(time=self.time(), t=self.t, state=self.state, bus=self.bus(), joints=self.joints())
+    def item(self) -> api_models.JointsItem:
+        return api_models.JointsItem(time=self.time(), t=self.t, state=self.state, bus=self.bus(), joints=self.joints())
 
-    def bus(self) -> BusHealth:
+    def bus(self) -> api_models.BusHealth:
         if self.fault:
-            return BusHealth(connected=False, fault=self.fault)
-        return BusHealth(connected=True, rate_hz=250.0, load=0.42, frames=1200 + int(self.t * 4000), missed=0)
+            return api_models.BusHealth(connected=False, fault=self.fault)
+        return api_models.BusHealth(
+            connected=True, rate_hz=250.0, load=0.42, frames=1200 + int(self.t * 4000), missed=0
+        )
 
-    def status(self) -> Status:
-        return Status(
+    def status(self) -> api_models.Status:
+        return api_models.Status(
             state=self.state,
             detail=self.fault or "",
             arm="sarcos",
@@ -126,16 +91,16 @@ class MadeUpView:
             t=self.t,
             uptime_s=self.t,
             bus=self.bus(),
-            records=RecordsInForce(calibration="77aa01cd", gravity="0b5c11ee"),
+            records=api_models.RecordsInForce(calibration="77aa01cd", gravity="0b5c11ee"),
             rows=120,
             pending_proposals=sum(each.state == "pending" for each in self.offered),
             last_event=len(self.log),
             report=self.report,
         )
 
-    def joints(self) -> tuple[JointNow, ...]:
+    def joints(self) -> tuple[api_models.JointNow, ...]:
         return tuple(
-            JointNow(
+            api_models.JointNow(
                 joint=name,
                 position=0.3 * math.sin(self.t * self.moves + k),
                 torque=5.0 * math.cos(self.t + k) + 0.02 + self.shift * (k == 1),
@@ -163,12 +128,12 @@ class MadeUpView:
         channels["temperature"][:, 0] = np.nan
         return Window(NAMES, self.time(), t - t[0], channels)
 
-    def arm(self) -> DrawnArm:
+    def arm(self) -> api_models.DrawnArm:
         return drawn_arm(load_arm("sarcos"))
 
-    def estimates(self) -> tuple[JointEstimate, ...]:
+    def estimates(self) -> tuple[api_models.JointEstimate, ...]:
         return tuple(
-            JointEstimate(
+            api_models.JointEstimate(
                 joint=name,
                 gain=1.0 + 0.012 * (k == 1),
                 gain_std=0.001,
@@ -182,12 +147,12 @@ class MadeUpView:
             for k, name in enumerate(NAMES)
         )
 
-    def events(self, after: int = 0, limit: int = 500) -> tuple[EventRecord, ...]:
+    def events(self, after: int = 0, limit: int = 500) -> tuple[api_models.EventRecord, ...]:
         return tuple(event for event in self.log if event.id > after)[:limit]
 
     def history(
         self, joint: str | None, since: datetime | None = None, until: datetime | None = None, most: int = 2000
-    ) -> tuple[HistoryPoint, ...]:
+    ) -> tuple[api_models.HistoryPoint, ...]:
         if joint is None:
             return tuple(point for name in NAMES for point in self.history(name, since, until, most))
         if joint not in NAMES:
@@ -199,21 +164,21 @@ class MadeUpView:
     def history_pages(self, *query):
         yield self.history(*query)
 
-    def proposals(self, limit: int = 200) -> tuple[Proposal, ...]:
+    def proposals(self, limit: int = 200) -> tuple[api_models.Proposal, ...]:
         return tuple(self.offered[:limit])
 
-    def approve(self, proposal: int, by: str) -> Proposal:
+    def approve(self, proposal: int, by: str) -> api_models.Proposal:
         return self._decide(proposal, "approved", by)
 
-    def reject(self, proposal: int, by: str) -> Proposal:
+    def reject(self, proposal: int, by: str) -> api_models.Proposal:
         return self._decide(proposal, "rejected", by)
 
-    def subscribe(self) -> MadeUpSubscription:
-        client = MadeUpSubscription(self)
-        self.clients.add(client)
+    def subscribe(self) -> Client:
+        client = self.hub.subscribe()
+        client.put(self.item())
         return client
 
-    def _decide(self, number: int, state: str, by: str) -> Proposal:
+    def _decide(self, number: int, state: str, by: str) -> api_models.Proposal:
         for place, proposal in enumerate(self.offered):
             if proposal.id == number:
                 if proposal.state != "pending":

@@ -180,7 +180,7 @@ def test_a_client_that_does_not_read_is_cut_off(server: Served, view: MadeUpView
 
     def flood() -> bool:
         view.tick()
-        return len(view.clients) == 1
+        return len(view.hub.clients) == 1
 
     with (
         ThreadPoolExecutor(1) as pool,
@@ -189,7 +189,7 @@ def test_a_client_that_does_not_read_is_cut_off(server: Served, view: MadeUpView
     ):
         deaf.connect(str(server.path))
         deaf.sendall(b"GET /api/stream HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        until(server, lambda: len(view.clients) == 2)
+        until(server, lambda: len(view.hub.clients) == 2)
         reading = pool.submit(first, items(answer), "event")
         until(server, flood)
         server.do(lambda: view.happen("drift"))
@@ -200,7 +200,7 @@ def test_a_client_that_does_not_read_is_cut_off(server: Served, view: MadeUpView
 def test_a_client_that_goes_is_forgotten(server: Served, view: MadeUpView) -> None:
     with server.client().stream("GET", "/api/stream") as answer:
         first(items(answer), "joints")
-    until(server, lambda: not view.clients)
+    until(server, lambda: not view.hub.clients)
 
 
 def test_there_is_an_end_to_the_number_of_clients(server: Served, view: MadeUpView, monkeypatch) -> None:

@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from calib.observer.moving.passages import WIDTH, Passage, PassageDetector
+from calib.observer.moving.passages import Passage, PassageDetector
+from calib.observer.moving.thresholds import WIDTH
 
 PERIOD = 0.02
 

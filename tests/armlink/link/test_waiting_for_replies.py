@@ -1,0 +1,94 @@
+"""The loop sleeps until the replies should be there, instead of waking for each, and takes those that come later."""
+
+from collections.abc import Sequence
+
+from armlink.arm_file import load_arm
+from armlink.bus.port import Frame
+from armlink.drives.orders import Power
+from armlink.link.cycle import Commander
+from armlink.link.types import Command
+from armlink.selftest.host import EchoPort, echo_commander
+
+N = 7
+BETWEEN = 1.3e-4
+"""Time of one reply on the wire [s]."""
+
+
+class WaitedFor:
+    """Time that also counts how often it was waited for."""
+
+    def __init__(self) -> None:
+        self.time, self.waits = 10.0, 0
+
+    def now(self) -> float:
+        return self.time
+
+    def sleep_until(self, instant: float) -> None:
+        self.waits += 1
+        self.time = max(self.time, instant)
+
+
+class OneByOne(EchoPort):
+    """Replies take their time on the wire, one after the other."""
+
+    def __init__(self, clock: WaitedFor, first: float) -> None:
+        super().__init__(load_arm("sarcos"))
+        self.clock, self.first, self.left = clock, first, 0.0
+
+    def send_all(self, frames: Sequence[Frame]) -> None:
+        self.left = self.clock.time + self.first
+        super().send_all(frames)
+
+    def receive(self, timeout: float) -> Frame | None:
+        comes = self.left + BETWEEN if self._waiting else float("inf")
+        if comes > self.clock.time + timeout:
+            self.clock.time += timeout
+            return None
+        if comes > self.clock.time:
+            self.clock.waits += 1
+            self.clock.time = comes
+        self.left = comes
+        return super().receive(0.0)
+
+
+def cycles(commander: Commander, hold: Command, count: int) -> list[float]:
+    return [commander.command(hold).delay for _ in range(count)]
+
+
+def test_a_cycle_wakes_twice_and_misses_nothing() -> None:
+    clock = WaitedFor()
+    port = OneByOne(clock, 3e-4)
+    commander = echo_commander(load_arm("sarcos"), port, clock)
+    hold = Command.hold(port.standing)
+    for _ in range(3):
+        commander.stand([Power.OFF] * N)
+    cycles(commander, hold, 300)
+    clock.waits, missed = 0, commander.loop.stats.missed
+    taken = 3e-4 + N * BETWEEN
+    delays = cycles(commander, hold, 500)
+    assert clock.waits < 2.2 * 500
+    assert taken - 1e-9 <= min(delays)
+    assert max(delays) < 1.05 * taken
+    port.first = 9e-4  # from now on the drives take 0.6 ms longer
+    delays = cycles(commander, hold, 300)
+    assert min(delays) >= taken + 6e-4 - 1e-9
+    assert commander.loop.stats.missed == missed
+    clock.waits = 0
+    cycles(commander, hold, 500)
+    assert clock.waits < 2.2 * 500
+
+
+def test_replies_that_never_come_cost_no_more_than_their_share_of_the_period() -> None:
+    clock = WaitedFor()
+    port = OneByOne(clock, 3e-4)
+    commander = echo_commander(load_arm("sarcos"), port, clock)
+    hold = Command.hold(port.standing)
+    for _ in range(3):
+        commander.stand([Power.OFF] * N)
+    commander.max_age = 10.0
+    cycles(commander, hold, 3)
+    port.first = 0.1
+    begun = clock.time
+    delays = cycles(commander, hold, 200)
+    assert max(delays) <= 0.8 * commander.period + 1e-9
+    assert abs(clock.time - begun - 200 * commander.period) < 2 * commander.period

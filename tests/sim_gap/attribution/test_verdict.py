@@ -1,0 +1,41 @@
+"""A hint that the surer causes can do without does not make an explanation ambiguous."""
+
+import numpy as np
+from wrong_arms import Wrong, model, record
+
+from sim_gap.attribution.causes import _Scorer
+from sim_gap.attribution.diagnosis import Cause, Signs
+from sim_gap.attribution.verdict import carries
+from sim_gap.model.load import load_model
+from sim_gap.residuals.layout import layout_of
+from sim_gap.residuals.preprocess import prepare
+from sim_gap.residuals.residual_set import ResidualSet
+from sim_gap.search.column_store import ColumnStore
+from sim_gap.search.estimate import Estimate
+from sim_gap.search.term import Term
+
+SIGNS = Signs(1.0, 0.0, 1.0, 0.0)
+
+
+def cause(effect: str, fall: float, confidence: float) -> Cause:
+    return Cause(effect, ("joint_1",), {}, 10.0, 10.0 - fall, confidence, fall, SIGNS)
+
+
+def test_a_cause_carries_by_what_it_takes_off():
+    found = [cause("link.payload", 10.0, 0.95), cause("friction.stribeck", 5.0, 0.1), cause("torque.drift", 1.0, 0.1)]
+    assert [carries(each, found) for each in found] == [True, True, False]
+
+
+def test_what_is_missed_without_a_term_is_what_no_other_takes():
+    """Friction that grows with speed: Stribeck friction takes part of it, and is hardly missed beside viscous."""
+    recording = record(
+        model(), Wrong(coulomb=0.4, viscous=0.8), seed=1, seconds=30.0, rate=50.0, channels=("tau_motor",)
+    )
+    signals = prepare(recording, load_model(model()).arm)
+    data = ResidualSet((signals,), layout_of([signals]))
+    terms = [Term("friction.coulomb", j) for j in range(3)] + [Term("friction.viscous", j) for j in range(3)]
+    slow = Term("friction.stribeck", 1, (0.25,))
+    scorer = _Scorer(Estimate(ColumnStore(data), [*terms, slow]), data)
+    alone = np.max(scorer.rms(terms[:3]) - scorer.rms([*terms[:3], slow]))
+    assert scorer.missed([slow]) < 0.1 * alone
+    assert scorer.missed([slow, terms[4]]) > 0.5 * alone
