@@ -1,10 +1,11 @@
 """The reading of a creeping joint whose torque is a current, and its derivatives (docs/theory.md, section 11).
 
-    v = g (1 + w·warmth) (τ + (s + a)(F_c + μ|τ| + u(q)) + F_v q̇ + c(q) + κ (q − q̄)) + o
+    v = g (1 + w·warmth) (τ + (s + a)(F_c + μ|τ|) + s·u(q) + F_v q̇ + c(q) + κ (q − q̄)) + o
 
 τ is the gravity torque of joint i at the angles q + zero − lag·q̇, with the reference mass where it hangs: torque is
 read a little later than the position; s is the direction. c is a line of ripple, of a given period; κ a spring's
-stiffness, which is 0 unless one is looked for.
+stiffness, which is 0 unless one is looked for. The product a·u is left out: a millinewton-metre or so, it would be all
+that tells a from the offset where torque keeps its sign, and no arm is as exact as that.
 """
 
 import numpy as np
@@ -68,8 +69,8 @@ class CreepModel:
         uneven = x[at["uneven"]].reshape(self.n, -1)[j]
         ripple = x[at["ripple"]].reshape(self.n, 2)[j]
         level, both = coulomb + load * size, side + asymmetry
-        level = level + (self._waves * uneven).sum(axis=1)
-        motor = torque + both * level + (self._ripple * ripple).sum(axis=1)
+        motor = torque + both * level + side * (self._waves * uneven).sum(axis=1)
+        motor = motor + (self._ripple * ripple).sum(axis=1)
         motor = motor + x[at["viscous"]][j] * rows.velocity + x[at["spring"]][j] * self._stretch
         scale = 1 + warming * rows.warmth
         predicted: Array = gain * scale * motor + x[at["offset"]][j]
@@ -91,7 +92,7 @@ class CreepModel:
             jacobian[each, at[family].start + j] = column
         width = 2 * HARMONICS
         for k in range(width):
-            jacobian[each, at["uneven"].start + width * j + k] = slope * both * self._waves[:, k]
+            jacobian[each, at["uneven"].start + width * j + k] = slope * side * self._waves[:, k]
         for k in range(2):
             jacobian[each, at["ripple"].start + 2 * j + k] = slope * self._ripple[:, k]
         by_torque = slope * (1 + both * load * np.sign(torque))
