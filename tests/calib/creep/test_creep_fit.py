@@ -96,7 +96,9 @@ def test_a_loaded_pass_alone_after_the_empty_one_passes_warming_off_as_scale() -
         fit = fitted(made)
         stds[order] = fit.std("gain") / made.warm_gain
         assert (np.abs(fit.value("gain") / made.warm_gain - 1) < 3 * stds[order]).all()
-    assert np.median(stds["empty loaded"] / stds["empty loaded empty"]) > 1.5
+    worse = stds["empty loaded"] / stds["empty loaded empty"]
+    assert worse.min() > 1
+    assert worse.max() > 3
 
 
 def test_without_a_mass_no_torque_constant_is_given() -> None:
