@@ -219,12 +219,20 @@ class Commander:
         return modes, command.torque.tolist(), command.position.tolist()
 
     def _seen(self, now: float, healthy: bool) -> list[Seen]:
-        loop, seen = self.loop, []
-        for joint in range(self.n):
-            torque = loop.latest_motor_torque[joint] if now - loop.slow_seen[joint] <= self._slow_age else math.nan
-            velocity = loop.latest_velocity[joint] if now - loop.speed_seen[joint] <= self._slow_age else math.nan
-            seen.append(Seen(torque, loop.latest_position[joint], velocity, now - loop.seen[joint], healthy))
-        return seen
+        loop, oldest = self.loop, now - self._slow_age
+        torques = zip(loop.latest_motor_torque, loop.slow_seen, strict=True)
+        velocities = zip(loop.latest_velocity, loop.speed_seen, strict=True)
+        rows = zip(torques, velocities, loop.latest_position, loop.seen, strict=True)
+        return [
+            Seen(
+                torque if told >= oldest else math.nan,
+                position,
+                velocity if moved >= oldest else math.nan,
+                now - came,
+                healthy,
+            )
+            for (torque, told), (velocity, moved), position, came in rows
+        ]
 
     def _verify(self, joint: int, sent: Order) -> None:
         """Raise Refused where the bytes that are about to leave order a joint something beyond a limit."""

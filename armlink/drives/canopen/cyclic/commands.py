@@ -41,7 +41,9 @@ class CommandFrames:
         self._own: list[dict[int, int]] = []
         """Modes of orders that a device stands in for by another of its own."""
         self._any_own = False
-        self._rows: list[tuple[int, Callable[..., bytes], float, int, float, float, float, int, int]] = []
+        self._rows: list[tuple[bool, int, Callable[..., bytes], float, int, float, float, float, int, int]] = []
+        self._readers: list[tuple[int, Callable[[bytes], tuple[int, ...]], float, float]] = []
+        """Size of RPDO1, what unpacks it, and the units of its torque (NaN: it has none) and position."""
         m = len(known.names)
         self._sent: list[bytes | None] = [None] * m
         self._aimed = [math.nan] * m
@@ -60,7 +62,7 @@ class CommandFrames:
 
     def use(self, wires: Sequence[Wire]) -> None:
         """From now on these layouts, scales and windows."""
-        self._wires, self._rows = wires, []
+        self._wires, self._rows, self._readers = wires, [], []
         pairs = [{int(Mode.POSITION): w.profile.position_mode, int(Mode.TORQUE): w.profile.torque_mode} for w in wires]
         self._own = [{mode: own for mode, own in each.items() if mode != own} for each in pairs]
         self._any_own = any(self._own)
@@ -71,13 +73,16 @@ class CommandFrames:
             pack, torque = wire.layouts[RPDO1.name].pack, unit.torque if wire.with_torque else 0.0
             most = int(limits.max_torque / torque) if torque else 0
             window = (limits.lower, limits.upper, low, high)
-            self._rows.append((RPDO1.cob_base + wire.node, pack, torque, most, unit.position, *window))
+            row = (wire.by_velocity, RPDO1.cob_base + wire.node, pack, torque, most, unit.position, *window)
+            layout = wire.layouts[RPDO1.name]
+            self._rows.append(row)
+            self._readers.append((layout.size, layout.unpack, torque or math.nan, unit.position))
 
     def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
         """RPDO2 where a mode changes, RPDO1 of every joint with an order, heartbeat when due, SYNC."""
         modes: list[Frame] = []
         commands: list[Frame] = []
-        rows = self._rows
+        rows, modes_now, any_own = self._rows, self.modes, self._any_own
         for joint, order in enumerate(orders):
             if order is None:
                 self._sent[joint], self._walking[joint] = None, False
@@ -89,21 +94,23 @@ class CommandFrames:
                 self._walking[joint] = False
                 if power is Power.ON:
                     word = ENABLE
-                    if mode and self.own_mode(joint, mode) != self.modes[joint]:
+                    if mode and (self.own_mode(joint, mode) if any_own else mode) != modes_now[joint]:
                         self._select(joint, mode, modes, now)
-                    if self.modes[joint] == PROFILE_POSITION:
+                    if modes_now[joint] == PROFILE_POSITION:
                         word = set_point_control(self._known.statuses[joint])
                 else:
                     word = QUICK_STOP if power is Power.STOPPED else DISABLE_VOLTAGE
-            can_id, pack, torque_unit, most, position_unit, lower, upper, low, high = rows[joint]
-            if self._wires[joint].by_velocity:
+            by_velocity, can_id, pack, torque_unit, most, position_unit, lower, upper, low, high = rows[joint]
+            if by_velocity:
                 data = self._velocity_frame(joint, word, order)
             else:
                 if not lower <= position <= upper:
                     low, high = -INT32_MAX - 1, INT32_MAX
-                target = max(low, min(high, round(position / position_unit)))
+                target = round(position / position_unit)
+                target = low if target < low else high if target > high else target
                 if torque_unit:
-                    data = pack(word, max(-most, min(most, int(torque / torque_unit))), target)
+                    amount = int(torque / torque_unit)
+                    data = pack(word, most if amount > most else -most if amount < -most else amount, target)
                 else:
                     data = pack(word, target)
             self._words[joint], self._sent[joint] = word, data
@@ -164,19 +171,18 @@ class CommandFrames:
 
     def decoded(self, joint: int, data: bytes) -> Order | None:
         """What RPDO1 with these bytes orders a joint; None where they are too few or too many."""
-        wire = self._wires[joint]
-        layout, unit = wire.layouts[RPDO1.name], wire.unit
-        if len(data) != layout.size:
+        size, unpack, torque_unit, position_unit = self._readers[joint]
+        if len(data) != size:
             return None
-        values = layout.unpack(data)
-        torque = values[1] * unit.torque if wire.with_torque else math.nan
+        values = unpack(data)
+        torque = values[1] * torque_unit
         word = values[0] & 0x8F
         power = Power.ON if word == ENABLE else Power.STOPPED if word & 0x86 == QUICK_STOP else Power.OFF
-        if wire.by_velocity:
-            velocity, gain = values[-1] * unit.velocity, loop_gain(self._period)
+        if self._rows[joint][0]:
+            velocity, gain = values[-1] * self._wires[joint].unit.velocity, loop_gain(self._period)
             mode = Mode.POSITION if self.modes[joint] else OFF
             return Order(power, False, mode, self._aim(joint, velocity / gain), velocity, math.nan, 0.0, 0.0)
-        return Order(power, False, self.modes[joint], values[-1] * unit.position, 0.0, torque, 0.0, 0.0)
+        return Order(power, False, self.modes[joint], values[-1] * position_unit, 0.0, torque, 0.0, 0.0)
 
     def _aim(self, joint: int, way: float) -> float:
         """Where a velocity leads that would be so much way by the position loop [rad].

@@ -56,8 +56,8 @@ class ReadingFrames:
             board.errors += 1
         elif scale:
             position, torque = unpack(data)
-            board.reading(place, position * unit, (torque - zero) * scale)
-            self._known.positions[joint] = position * unit
+            self._known.positions[joint] = seen = position * unit
+            board.reading(place, seen, (torque - zero) * scale)
         else:
             self._known.positions[joint] = seen = unpack(data)[0] * unit
             board.reading(place, seen, math.nan)
