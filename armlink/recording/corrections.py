@@ -68,8 +68,9 @@ class Corrections:
                 continue  # the times as they stand
             _place(channels, channel, source, "--clock")
             channels[channel] = _shifted(recording.t, channels[channel], shift)
-        if self.effort == "motor" and "tau" in channels and "tau_motor" not in channels:
-            channels["tau_motor"] = channels.pop("tau")
+        if self.effort == "motor" and "tau" in channels:
+            effort = channels.pop("tau")
+            channels.setdefault("tau_motor", effort)
         if self.effort == "link" and "tau_motor" in channels and "tau" not in channels:
             channels["tau"] = channels.pop("tau_motor")
         t = recording.t * self.units["t"][0] if "t" in self.units else recording.t

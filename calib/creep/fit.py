@@ -13,13 +13,13 @@ from armlink.torque_calibration import GAIN_RANGE
 from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
-from calib.creep.contact import Disturbed, disturbed_sweeps
 from calib.creep.model import CreepModel
-from calib.creep.parameters import Doubt, family_slices, prior
+from calib.creep.parameters import HARMONICS, Doubt, family_slices, prior
+from calib.creep.pushes import WIDE_SHARE, Disturbed, Spring, disturbed_sweeps, springs
+from calib.creep.ripple import ripple_cycles
 from calib.creep.rows import CreepRows
-from calib.creep.scatter import scatter
+from calib.creep.scatter import Scatter, scatter
 from calib.creep.solve import Solution, solve
-from calib.creep.spring import WIDE_SHARE, Spring, springs
 from calib.sweep.dataset import SweepData
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
@@ -28,9 +28,13 @@ ROUNDS = 4
 """Times that the scatter of the readings is estimated again."""
 SEEN = 0.3
 """A parameter is found if the data leave so much of what was doubted beforehand, as a share of it."""
-LOOSEST = 0.05
+LOOSEST = 0.02
 """Largest standard deviation of a gain that is of use, as a share of it."""
 QUANTILE = 1.96
+LEAST_COULOMB = 1e-3
+"""Least friction that scales its unevenness, as a share of rated torque."""
+ASSUMED = 4.0
+"""Harmonics for which the doubt of the friction's unevenness counts, beside those that were measured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,10 +45,10 @@ class CreepFit:
     rows: CreepRows
     solution: Solution
     prior_std: Array
-    sigma: Array
-    """Scatter of each row's reading (R,) [N·m]."""
-    factor: Array
-    """Factor of the standard deviations for what neighbouring bins have in common (n,)."""
+    scatter: Scatter
+    """Of the readings."""
+    ripple: Array
+    """Periods in a turn of the ripple that each joint has, 0 for none (n,)."""
     disturbed: tuple[Disturbed, ...] = ()
     """Sweeps that were left out, and why."""
     springs: tuple[Spring, ...] = ()
@@ -106,13 +110,15 @@ class CreepFit:
 
     @cached_property
     def residual_rms(self) -> Array:
-        """(n,) [N·m]."""
+        """(n,) [N·m], with the ripple, which records do not hold."""
         own = [self.solution.residual[self.rows.joint == joint] for joint in range(self.arm.n)]
-        return np.array([np.sqrt(np.mean(each**2)) if each.size else np.nan for each in own])
+        ripple = self.value("gain") * np.linalg.norm(self.value("ripple").reshape(-1, 2), axis=1) / np.sqrt(2)
+        ripple = np.where(self.ripple > 0, ripple, 0.0)
+        return np.hypot(ripple, [np.sqrt(np.mean(each**2)) if each.size else np.nan for each in own])
 
     def gravity(self, rows: NDArray[np.intp] | slice = slice(None)) -> Array:
         """Gravity torque that the fit has at its rows [N·m]."""
-        return CreepModel(self.arm, self.rows).gravity(self.solution.x)[rows]
+        return CreepModel(self.arm, self.rows, self.ripple).gravity(self.solution.x)[rows]
 
 
 def fit_creep(arm_file: ArmFile, passes: Sequence[SweepData]) -> CreepFit:
@@ -140,26 +146,49 @@ def fit_rows(
         plain = _fitted(arm, rows, rated, doubt)
     plain = replace(plain, disturbed=left_out, sources=sources or {})
     free = _fitted(arm, rows, rated, replace(doubt, spring_share=WIDE_SHARE), plain.solution.x)
-    pulled = springs(CreepModel(arm, rows), free.solution, rated)
+    pulled = springs(CreepModel(arm, rows, free.ripple), free.solution, rated)
     if not pulled:
         return plain
     return replace(free, disturbed=left_out, springs=pulled, sources=sources or {})
 
 
 def _fitted(arm: Arm, rows: CreepRows, rated: Array, doubt: Doubt, start: Array | None = None) -> CreepFit:
-    model = CreepModel(arm, rows)
-    sigma, factor = 0.01 * rated[rows.joint], np.ones(arm.n)
-    coulomb = 0.02 * rated
-    mean, std = prior(arm, rated, doubt, rows.by_temperature, coulomb)
+    model, slices = CreepModel(arm, rows), family_slices(arm.n)
+    scattered = Scatter.even(rows, 0.01 * rated[rows.joint])
+    coulomb, uneven = 0.02 * rated, np.full(HARMONICS, doubt.uneven)
+    mean, std = prior(arm, rated, doubt, rows.by_temperature, coulomb, uneven)
     x = mean.copy() if start is None else start
     for _ in range(ROUNDS):
-        found = solve(model, sigma * factor[rows.joint], mean, std, x)
+        found = solve(model, scattered, mean, std, x)
         x = found.x
-        coulomb = np.abs(x[model.slices["coulomb"]])
-        mean, std = prior(arm, rated, doubt, rows.by_temperature, coulomb)
+        coulomb = np.maximum(np.abs(x[slices["coulomb"]]), LEAST_COULOMB * rated)
+        uneven = _unevenness(found, std, coulomb, doubt)
+        mean, std = prior(arm, rated, doubt, rows.by_temperature, coulomb, uneven)
         freedom = 1 - _used(found, std) / len(rows)
-        sigma, factor = scatter(rows, found.residual, rated, freedom)
-    return CreepFit(arm, rows, found, std, sigma, factor)
+        by_degree = _temperature_std(rows) * x[slices["warming"]][rows.joint] * rows.reading
+        scattered = scatter(rows, found.residual, rated, freedom, by_degree)
+        if not model.ripple.any():
+            model = CreepModel(arm, rows, ripple_cycles(rows, found.residual, arm.n))
+    return CreepFit(arm, rows, found, std, scattered, model.ripple)
+
+
+def _unevenness(found: Solution, std: Array, coulomb: Array, doubt: Doubt) -> Array:
+    """Usual size of each harmonic of the friction over position (HARMONICS,), as a share of the Coulomb friction.
+
+    That of all joints' harmonics of one order, which count by what the data tell of them, and of `ASSUMED` more of the
+    size that is doubted beforehand.
+    """
+    place = family_slices(len(coulomb))["uneven"]
+    shares = found.x[place].reshape(-1, HARMONICS, 2) / coulomb[:, None, None]
+    told = (1 - np.diag(found.covariance)[place] / std[place] ** 2).clip(0.0).reshape(shares.shape)
+    size = (ASSUMED * doubt.uneven**2 + (shares**2).sum(axis=(0, 2))) / (ASSUMED + told.sum(axis=(0, 2)))
+    return np.asarray(np.sqrt(size))
+
+
+def _temperature_std(rows: CreepRows) -> float:
+    """Standard deviation that the rounding of the temperatures leaves [K]; 0 where none are told."""
+    steps = np.diff(np.unique(rows.warmth.round(6))) if rows.by_temperature else np.empty(0)
+    return float(steps.min(initial=1.0)) / np.sqrt(12) if steps.size else 0.0
 
 
 def _used(found: Solution, std: Array) -> float:

@@ -1,10 +1,11 @@
 """The reading of a creeping joint whose torque is a current, and its derivatives (docs/theory.md, section 11).
 
-    v = g (1 + w·warmth) (τ + (s + a)(F_c + μ|τ|) + s·u(q) + F_v q̇ + κ (q − q̄)) + o
+    v = g (1 + w·warmth) (τ + (s + a)(F_c + μ|τ|) + s·u(q) + F_v q̇ + c(q) + κ (q − q̄)) + o
 
-κ is a spring's stiffness, which is 0 unless one is looked for; τ the gravity torque of joint i at the angles
-q + zero − lag·q̇, with the reference mass where it hangs: torque is read a little later than the position; s is the
-direction.
+τ is the gravity torque of joint i at the angles q + zero − lag·q̇, with the reference mass where it hangs: torque is
+read a little later than the position; s is the direction. c is a line of ripple, of a given period; κ a spring's
+stiffness, which is 0 unless one is looked for. The product a·u is left out: a millinewton-metre or so, it would be all
+that tells a from the offset where torque keeps its sign, and no arm is as exact as that.
 """
 
 import numpy as np
@@ -21,8 +22,8 @@ from gcomp.gravity.torque import gravity_stiffness
 class CreepModel:
     """Readings of given rows for given parameters."""
 
-    def __init__(self, arm: Arm, rows: CreepRows) -> None:
-        """Prepare for R rows."""
+    def __init__(self, arm: Arm, rows: CreepRows, ripple: Array | None = None) -> None:
+        """Prepare for R rows; `ripple` (n,) are its periods in a turn of each joint, 0 where there is none."""
         self.arm, self.rows, self.n = arm, rows, arm.n
         self.slices = family_slices(arm.n)
         self.size = self.slices["rho"].stop
@@ -31,6 +32,9 @@ class CreepModel:
         own = rows.position[self._each, rows.joint]
         waves = [f(k * own) for k in range(1, HARMONICS + 1) for f in (np.cos, np.sin)]
         self._waves = np.stack(waves, axis=1)
+        self.ripple = np.zeros(self.n) if ripple is None else ripple
+        cycles = self.ripple[rows.joint]
+        self._ripple = np.stack([np.cos(cycles * own), np.sin(cycles * own)], axis=1) * (cycles > 0)[:, None]
         means = [own[rows.joint == joint].mean() if (rows.joint == joint).any() else 0.0 for joint in range(self.n)]
         self._stretch = own - np.array(means)[rows.joint]
 
@@ -63,8 +67,10 @@ class CreepModel:
         coulomb, load, asymmetry = (x[at[name]][j] for name in ("coulomb", "load", "asymmetry"))
         side, size = rows.side, np.abs(torque)
         uneven = x[at["uneven"]].reshape(self.n, -1)[j]
+        ripple = x[at["ripple"]].reshape(self.n, 2)[j]
         level, both = coulomb + load * size, side + asymmetry
         motor = torque + both * level + side * (self._waves * uneven).sum(axis=1)
+        motor = motor + (self._ripple * ripple).sum(axis=1)
         motor = motor + x[at["viscous"]][j] * rows.velocity + x[at["spring"]][j] * self._stretch
         scale = 1 + warming * rows.warmth
         predicted: Array = gain * scale * motor + x[at["offset"]][j]
@@ -87,6 +93,8 @@ class CreepModel:
         width = 2 * HARMONICS
         for k in range(width):
             jacobian[each, at["uneven"].start + width * j + k] = slope * side * self._waves[:, k]
+        for k in range(2):
+            jacobian[each, at["ripple"].start + 2 * j + k] = slope * self._ripple[:, k]
         by_torque = slope * (1 + both * load * np.sign(torque))
         jacobian[:, at["beta"]] = by_torque[:, None] * of_joint
         jacobian[:, at["rho"]] = (by_torque * rows.mass)[:, None] * (of_joint @ self._by_point)

@@ -17,14 +17,14 @@ LAST_ZERO = 1e-6
 the place of the mass (docs/theory.md, 4.1). A measured place resolves it."""
 FAMILIES = (
     "gain", "offset", "coulomb", "load", "viscous", "asymmetry", "warming", "zero", "lag", "spring", "uneven",
-    "beta", "rho",
+    "ripple", "beta", "rho",
 )  # fmt: skip
 """In the order of the vector."""
 
 
 def family_slices(n: int) -> dict[str, slice]:
     """Place of each family in the vector of an arm of n joints."""
-    sizes = {"lag": 1, "uneven": 2 * HARMONICS * n, "beta": 2 * n, "rho": 3}
+    sizes = {"lag": 1, "uneven": 2 * HARMONICS * n, "ripple": 2 * n, "beta": 2 * n, "rho": 3}
     slices, begin = {}, 0
     for family in FAMILIES:
         slices[family] = slice(begin, begin + sizes.get(family, n))
@@ -63,6 +63,8 @@ class Doubt:
     """How much later than the position the torque is read, one for all joints: drives filter it, or average it [s]."""
     uneven: float = 0.15
     """Friction over position, as a share of the joint's Coulomb friction."""
+    ripple: float = 0.3
+    """Ripple of torque over position, as a share of the joint's Coulomb friction."""
     rho: float = 0.3
     """Place of the mass [m]."""
     spring_share: float = 1e-5
@@ -76,8 +78,13 @@ class Doubt:
         return cls(zero=section.creep.zero_std, point=section.known_point)
 
 
-def prior(arm: Arm, rated: Array, doubt: Doubt, by_temperature: bool, coulomb: Array) -> tuple[Array, Array]:
-    """(Mean, standard deviation) of the vector; `coulomb` (n,) scales the friction over position [N·m]."""
+def prior(
+    arm: Arm, rated: Array, doubt: Doubt, by_temperature: bool, coulomb: Array, uneven: Array | None = None
+) -> tuple[Array, Array]:
+    """(Mean, standard deviation) of the vector.
+
+    `coulomb` (n,) scales the friction over position [N·m], of which `uneven` (HARMONICS,) are the harmonics' shares.
+    """
     n, slices = arm.n, family_slices(arm.n)
     mean, std = np.zeros(slices["rho"].stop), np.empty(slices["rho"].stop)
     mean[slices["gain"]] = 1.0
@@ -85,6 +92,7 @@ def prior(arm: Arm, rated: Array, doubt: Doubt, by_temperature: bool, coulomb: A
     if by_temperature:
         mean[slices["warming"]] = doubt.warming_mean
     gravity = float(np.linalg.norm(arm.gravity))
+    shares = np.full(HARMONICS, doubt.uneven) if uneven is None else uneven
     values = {
         "gain": doubt.gain,
         "offset": doubt.offset_share * rated,
@@ -96,7 +104,8 @@ def prior(arm: Arm, rated: Array, doubt: Doubt, by_temperature: bool, coulomb: A
         "zero": doubt.zero,
         "lag": doubt.lag,
         "spring": doubt.spring_share * rated,
-        "uneven": np.repeat(doubt.uneven * np.maximum(coulomb, 1e-3 * rated), 2 * HARMONICS),
+        "uneven": np.outer(np.maximum(coulomb, 1e-3 * rated), np.repeat(shares, 2)).ravel(),
+        "ripple": np.repeat(doubt.ripple * np.maximum(coulomb, 1e-3 * rated), 2),
         "beta": np.repeat(3.0 * float(rated.max()) / gravity, 2 * n),
         "rho": doubt.rho,
     }

@@ -11,6 +11,10 @@ from calib.motion.static_reading import StaticReading
 from calib.sweep.dataset import SweepData
 from gcomp.arrays import Array, Mask
 
+STEADY = 0.02
+"""Largest difference of a bin's speed from the middle one of its creep, as a share: beyond, inertia takes torque."""
+ROUGH = 6.0
+"""Where the speeds of a creep scatter more: so many times the middle size of these differences."""
 COMMON_MODE = 1.0
 """Spread of the logged temperatures from which they, and not time, say how warm a drive is [K]."""
 
@@ -56,7 +60,7 @@ class CreepRows:
 
     @classmethod
     def of(cls, passes: Sequence[SweepData]) -> Self:
-        """All creep readings of the passes, in the order in which they were made."""
+        """All readings of the passes at steady speed, in the order in which they were made."""
         ordered = sorted(passes, key=lambda data: (data.manifest.created, data.path.name))
         found: list[tuple[StaticReading, SweepData, float, str]] = []
         clock = 0.0
@@ -72,7 +76,7 @@ class CreepRows:
         names = tuple(dict.fromkeys(name for *_, name in found))
         side = np.array([each.direction.sum() for each in readings])
         warmth, warmest = _warmth(readings, joint, np.array([t for *_, t, _ in found]), ordered)
-        return cls(
+        made = cls(
             joint=joint,
             position=np.array([each.position for each in readings]),
             reading=np.array(raw)[rows, joint],
@@ -84,6 +88,20 @@ class CreepRows:
             by_temperature=bool(np.isfinite(warmest).any()),
             warmest=warmest,
         )
+        return made.kept(_steady(made))
+
+
+def _steady(rows: CreepRows) -> Mask:
+    """Rows at the constant speed of their creep (R,): a loop that still settles at its beginning speeds up or slows."""
+    steady = np.ones(len(rows), dtype=bool)
+    for sweep in range(len(rows.sweeps)):
+        for side in (-1.0, 1.0):
+            own = np.flatnonzero((rows.sweep == sweep) & (rows.side == side))
+            if own.size:
+                speed = np.abs(rows.velocity[own])
+                off = np.abs(speed / np.median(speed) - 1)
+                steady[own] = off <= max(STEADY, ROUGH * float(np.median(off)))
+    return steady
 
 
 def _warmth(

@@ -1,9 +1,14 @@
-"""How far the readings of a creep scatter about the fit, and for how many independent readings they count.
+"""How far the readings of a creep scatter about the fit, and what they have in common.
 
-What the model lacks (friction over position, cogging) leaves residuals that are alike over neighbouring bins. A bin
-then counts for less than one reading: its standard deviation is multiplied by the root of 1 + 2 Σ ρ_k, with the
-correlations ρ_k of residuals k bins apart, summed up to the first that is not positive.
+Half sum and half difference of both directions at one place scatter each in its own way: what the model lacks of
+gravity is alike in both directions and touches no friction; what it lacks of friction has opposite signs and touches no
+gravity. Both scatters are measured. What is left of either is alike over neighbouring bins, too; a bin then counts for
+less than one reading: its variance is multiplied by 1 + 2 Σ ρ_k, with the correlations ρ_k of residuals k bins apart,
+summed up to the first that chance could make.
 """
+
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,52 +18,95 @@ from gcomp.arrays import Array
 
 LEAST_SHARE = 1e-4
 """Least standard deviation of a row, as a share of rated torque: rounding of the sums that the readings are."""
-USUAL_ROWS = 10
-"""Rows that the usual scatter of a joint's sweeps counts for, beside those of a sweep itself."""
+USUAL_BINS = 5
+"""Bins that the usual scatter of a joint's sweeps counts for, beside those of a sweep itself."""
 MOST = 16.0
 """Most that a variance is multiplied by; a choice, for sweeps of a dozen bins."""
 
 
-def scatter(rows: CreepRows, residual: Array, rated: Array, freedom: float) -> tuple[Array, Array]:
-    """(Standard deviation of each row (R,) [N·m], factor for what neighbours have in common, by joint (n,)).
+@dataclass(frozen=True, eq=False)
+class Scatter:
+    """Covariance of the rows, sweep by sweep."""
+
+    sigma: Array
+    """Standard deviation of each row (R,) [N·m]."""
+    blocks: tuple[tuple[NDArray[Any], Array], ...]
+    """Rows (K,) of each sweep, and the inverse of the triangular root of their covariance (K, K)."""
+
+    @classmethod
+    def even(cls, rows: CreepRows, sigma: Array) -> "Scatter":
+        """Rows that have nothing in common."""
+        blocks = [np.flatnonzero(rows.sweep == sweep) for sweep in np.unique(rows.sweep)]
+        return cls(sigma, tuple((each, np.asarray(np.diag(1 / sigma[each]))) for each in blocks))
+
+    def whitened(self, columns: Array) -> Array:
+        """Columns (R, …) of which the rows have unit variance and nothing in common."""
+        white = np.empty_like(columns)
+        for rows, whitening in self.blocks:
+            white[rows] = whitening @ columns[rows]
+        return white
+
+
+def scatter(rows: CreepRows, residual: Array, rated: Array, freedom: float, by_degree: Array) -> Scatter:
+    """Scatter of the rows as their residuals (R,) [N·m] have it.
 
     A sweep in which the arm swung scatters more than others of its joint: its own scatter counts, drawn towards the
-    joint's as by `USUAL_ROWS` further rows. `freedom` is rows less unknowns, as a share of the rows.
+    joint's as by `USUAL_BINS` further bins. `freedom` is rows less unknowns, as a share of the rows; `by_degree` (R,)
+    [N·m] is what the temperature's uncertainty makes of each reading, alike in all rows of a sweep.
     """
-    n = len(rated)
-    sigma, factor = np.zeros(len(rows)), np.ones(n)
-    for joint in range(n):
-        own = np.flatnonzero(rows.joint == joint)
-        if not own.size:
-            continue
-        square = residual**2 / max(freedom, 0.2)
-        sweeps = [own[rows.sweep[own] == sweep] for sweep in np.unique(rows.sweep[own])]
-        usual = float(np.median([square[each].mean() for each in sweeps]))
-        for each in sweeps:
-            variance = (square[each].sum() + USUAL_ROWS * usual) / (each.size + USUAL_ROWS)
-            sigma[each] = max(float(np.sqrt(variance)), LEAST_SHARE * float(rated[joint]))
-        factor[joint] = np.sqrt(_inflation(rows, residual / sigma.clip(1e-12), own))
-    return sigma, factor
+    sigma, blocks = np.zeros(len(rows)), []
+    residual = residual / np.sqrt(max(freedom, 0.2))
+    for joint in range(len(rated)):
+        pairs = [_paired(rows, joint, sweep) for sweep in np.unique(rows.sweep[rows.joint == joint])]
+        floor = (LEAST_SHARE * float(rated[joint])) ** 2 / 2
+        alike = _spread([(residual[up] + residual[down]) / 2 for up, down, _ in pairs], floor)
+        opposite = _spread([(residual[up] - residual[down]) / 2 for up, down, _ in pairs], floor)
+        for (up, down, single), a, b in zip(pairs, alike, opposite, strict=True):
+            each = np.concatenate([up, down, single])
+            covariance = np.diag(np.full(each.size, a + b))
+            for k in range(up.size):
+                covariance[k, up.size + k] = covariance[up.size + k, k] = a - b
+            covariance += np.outer(by_degree[each], by_degree[each])
+            sigma[each] = np.sqrt(np.diag(covariance))
+            blocks.append((each, np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), float)))
+    return Scatter(sigma, tuple(blocks))
 
 
-def _inflation(rows: CreepRows, residual: Array, own: NDArray[np.intp]) -> float:
-    """1 + 2 Σ ρ_k over the sweeps of one joint."""
-    series = []
-    for sweep in np.unique(rows.sweep[own]):
-        for side in (-1.0, 1.0):
-            each = own[(rows.sweep[own] == sweep) & (rows.side[own] == side)]
-            if each.size >= 4:
-                joint = rows.joint[each[0]]
-                series.append(residual[each[np.argsort(rows.position[each, joint])]])
+def _paired(rows: CreepRows, joint: int, sweep: int) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """(Rows upwards, rows downwards at the same places, rows of places that only one direction has), by position."""
+    own = np.flatnonzero(rows.sweep == sweep)
+    own = own[np.argsort(rows.position[own, joint])]
+    up, down = own[rows.side[own] > 0], own[rows.side[own] <= 0]
+    if up.size < 2 or not down.size:
+        return own[:0], own[:0], own
+    there, back = rows.position[up, joint], rows.position[down, joint]
+    nearest = np.abs(there[:, None] - back[None, :]).argmin(axis=1)
+    same = np.abs(there - back[nearest]) < float(np.median(np.diff(there))) / 2
+    _, first = np.unique(nearest[same], return_index=True)
+    up, down = up[same][first], down[nearest[same][first]]
+    return up, down, own[~np.isin(own, np.concatenate([up, down]))]
+
+
+def _spread(series: list[Array], floor: float) -> list[float]:
+    """Variance of each of a joint's sweeps, with what neighbouring bins have in common."""
+    means = [float(np.mean(one**2)) for one in series if one.size]
+    usual = max(float(np.median(means)) if means else 0.0, floor)
+    variances = [max((float(one @ one) + USUAL_BINS * usual) / (one.size + USUAL_BINS), floor) for one in series]
+    common = _inflation([one / np.sqrt(each) for one, each in zip(series, variances, strict=True) if one.size >= 4])
+    return [common * each for each in variances]
+
+
+def _inflation(series: list[Array]) -> float:
+    """1 + 2 Σ ρ_k."""
     if not series:
         return 1.0
-    power = sum(float((one**2).sum()) for one in series) / sum(one.size for one in series)
+    power = sum(float(one @ one) for one in series) / sum(one.size for one in series)
     total = 1.0
     for lag in range(1, max(one.size for one in series) // 2):
         pairs = [(one[lag:], one[:-lag]) for one in series if one.size > lag]
         count = sum(a.size for a, _ in pairs)
-        alike = sum(float((a * b).sum()) for a, b in pairs) / count / max(power, 1e-30)
-        if alike <= 0.0:
+        alike = sum(float(a @ b) for a, b in pairs) / count / max(power, 1e-30)
+        if alike <= 1 / np.sqrt(count):  # no more than chance makes of independent bins
             break
         total += 2 * alike
     return min(total, MOST)

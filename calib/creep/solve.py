@@ -6,6 +6,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from calib.creep.model import CreepModel
+from calib.creep.scatter import Scatter
 from gcomp.arrays import Array
 
 STEPS = 60
@@ -29,20 +30,20 @@ class Solution:
         return invert(self.information)
 
 
-def solve(model: CreepModel, sigma: Array, mean: Array, std: Array, start: Array) -> Solution:
-    """The parameters for rows of standard deviation sigma (R,), with the prior's mean and std (P,), from `start`."""
+def solve(model: CreepModel, scatter: Scatter, mean: Array, std: Array, start: Array) -> Solution:
+    """The parameters for rows that scatter so, with the prior's mean and std (P,), from `start`."""
     x, damping = start.copy(), 1e-6
     reading = model.rows.reading
 
     def cost(at: Array) -> float:
-        return float((((reading - model.predict(at)) / sigma) ** 2).sum() + (((at - mean) / std) ** 2).sum())
+        return float((scatter.whitened(reading - model.predict(at)) ** 2).sum() + (((at - mean) / std) ** 2).sum())
 
     now = cost(x)
     for _ in range(STEPS):
         predicted, jacobian = model.linearised(x)
-        weighted = jacobian / sigma[:, None]
+        weighted = scatter.whitened(jacobian)
         information = weighted.T @ weighted + np.diag(1 / std**2)
-        downhill = weighted.T @ ((reading - predicted) / sigma) - (x - mean) / std**2
+        downhill = weighted.T @ scatter.whitened(reading - predicted) - (x - mean) / std**2
         before = now
         for _ in range(12):
             damped = information + damping * np.diag(np.diag(information))
@@ -55,7 +56,7 @@ def solve(model: CreepModel, sigma: Array, mean: Array, std: Array, start: Array
         if before - now <= SMALL * now:
             break
     predicted, jacobian = model.linearised(x)
-    weighted = jacobian / sigma[:, None]
+    weighted = scatter.whitened(jacobian)
     return Solution(x, reading - predicted, weighted.T @ weighted + np.diag(1 / std**2))
 
 

@@ -137,6 +137,8 @@ class Plant:
         self._motors = None if imperfections.prompt_motors else LateMotors(imperfections, self.motor_torque)
         self._plain = self._steady_friction and self._motors is None and self._gears is None
         self._lost, self._uneven = np.zeros(self.n), np.zeros(self.n)
+        self._passed_on: Array | None = None
+        """Link torque half-way through the last step: a drive whose target stands still in it ends with less torque."""
         self.data.qfrc_applied[:] = 0.0
         self._set_friction()
         self.set_servo(*self._servo)
@@ -252,7 +254,7 @@ class Plant:
             return
         slope, gears = (end - start) / count, self._gears
         level, began = start + 0.5 * slope, self.motor_velocity
-        for _ in range(count):
+        for place in range(count):
             data.ctrl[:] = level if self._motors is None else self._asked(level, duration / count)
             if not self._steady_friction:
                 self._set_friction()
@@ -260,6 +262,8 @@ class Plant:
                 data.qfrc_applied[:] = gears.forces(data, self._lost)
                 data.qfrc_applied[self._dof] += self._pulled
             mujoco.mj_step(model, data)
+            if place == count // 2 and self._has_uneven:
+                self._passed_on = self.link_torque
             if self.averages:
                 self._made += self._motor_torques * (duration / count)
             level = level + slope
@@ -298,7 +302,8 @@ class Plant:
             self.data.qfrc_applied[self._dof] = self._pulled - self._lost
         self._sag = self._imperfections.compliance * torque
         if self._has_uneven:
-            self._uneven = unevenness(self._imperfections, position, self.velocity, torque, self.data.time)
+            load = torque if self._passed_on is None else self._passed_on
+            self._uneven = unevenness(self._imperfections, position, self.velocity, load, self.data.time)
             self._set_friction()
 
     def _set_friction(self) -> None:

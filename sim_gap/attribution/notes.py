@@ -17,7 +17,7 @@ from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.residuals.stuck_channels import Stuck
 from sim_gap.residuals.where import Location, locate
 from sim_gap.search.estimate import NOMINAL, Estimate
-from sim_gap.search.torque_constants import CONSTANT, shares_a_factor
+from sim_gap.search.torque_constants import CONSTANT, MASSES, masses_may_be_constants, shares_a_factor
 
 ALIKE = 0.05
 """A general law that scores worse than a cause by less than this is noted."""
@@ -97,7 +97,13 @@ def _disturbed(sets: Sequence[ResidualSet]) -> tuple[str, ...]:
 
 
 def _common_factor(estimate: Estimate | None, fit: ResidualSet) -> tuple[str, ...]:
-    """A note for torque constants that motor torque alone tells: masses may have a factor in common with them."""
+    """A note for torque constants, or masses, that motor torque alone tells: only their products are known."""
+    if estimate is not None and masses_may_be_constants(fit.layout, estimate.terms):
+        return (
+            f"{MASSES}: {fit.layout.motor} alone tells only products of masses and torque constants: constants of all "
+            "drives that are off by the same factor would look like this, too; creep sweeps with a weighed mass tell "
+            "them apart",
+        )
     if estimate is None or not shares_a_factor(fit.layout, estimate.terms):
         return ()
     return (

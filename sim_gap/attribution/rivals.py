@@ -7,6 +7,7 @@ from sim_gap.search.gauss_newton import converged
 from sim_gap.search.normal_equations import NormalEquations
 from sim_gap.search.stepwise import Search, shortlist
 from sim_gap.search.term import Term
+from sim_gap.search.torque_constants import CONSTANT, MASSES, masses_may_be_constants
 
 AS_GOOD = 0.036
 """A rival is as good if its score (½ log of the mean square) is worse by no more than this: the price of three
@@ -92,6 +93,8 @@ class Rivals:
                     own.append(other.effect)
             if weakest >= evidence or not rivals:
                 evidence, rivals = max(evidence, weakest), own
+        if effect == MASSES and masses_may_be_constants(search.normal.layout, search.active):
+            rivals = [CONSTANT, *rivals]
         confounded = tuple(dict.fromkeys(rivals))
         if not confounded:
             return Weighed(evidence, (), None)

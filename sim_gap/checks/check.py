@@ -15,7 +15,15 @@ from sim_gap.checks.finding import Finding
 from sim_gap.checks.joint_range import find_beyond_range, find_counts
 from sim_gap.checks.mapping import SURE, find_mapping
 from sim_gap.checks.rigid_fit import as_mounted, fit_rigid, motion_of
-from sim_gap.checks.torque_source import find_absent, find_delay, find_scale, find_source, find_unsigned
+from sim_gap.checks.torque_source import (
+    find_absent,
+    find_delay,
+    find_gain_command,
+    find_same,
+    find_scale,
+    find_source,
+    find_unsigned,
+)
 from sim_gap.checks.velocity import follows_position, sound_velocity
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.residuals.preprocess import TRIM_S, Signals, prepare
@@ -50,7 +58,12 @@ def check_recording(
         raise BadInput(f"{label}: {finding.sentence()}")
     recording, repeated = without_repeats(recording)
     recording, jitter = even_times(recording, stated)
-    found = [*repeated, *jitter, *([] if repeated else find_dropped(recording))]
+    same = find_same(recording, stated)
+    for finding in same:
+        recording = _corrected(recording, finding, label)
+    if same and (law := find_gain_command(recording, stated)):
+        same, recording = [*same, *law], replace(recording, torque_command=None)
+    found = [*repeated, *jitter, *([] if repeated else find_dropped(recording)), *same]
     s = prepare(recording, arm, label)
     for channel in s.channels:
         for look in (_unsigned, _mapping, _source):

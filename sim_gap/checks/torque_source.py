@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from armlink.recording.corrections import Corrections
+from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.checks.finding import Finding
 from sim_gap.checks.rigid_fit import FEW, FLOOR, Motion, RigidFit, fit_model
@@ -26,6 +27,9 @@ SURE, SCREENED = 0.7, 0.3
 """Fall of the cost from which a delay is certain; share of it that a delay must reach on few rows to be looked at."""
 REPEATS = 0.5
 """Share of that fall by which any other minimum of the cost must be higher."""
+LAWFUL, STEPS = 0.3, 50
+"""Least share of the variance of a command's steps that a law of gains explains (half on OpenArm, where positions,
+velocities and targets are rounded on the bus); least number of such steps."""
 ABSENT, HELD = 3.0, 0.2
 """The model's torque is absent from a joint's reading if its own part is this multiple of all that is read, and comes
 back with a coefficient below this; on recordings of real arms the first stays below 1.2."""
@@ -90,6 +94,38 @@ def find_unsigned(arm: RigidArm, motion: Motion, stated: Corrections) -> list[Fi
             option = f"record signed torque, or --sign {motion.channel}_{j + 1}=1 if it is right"
             found.append(Finding("unsigned", motion.channel, arm.names[j], evidence, option, False))
     return found
+
+
+def find_same(recording: Recording, stated: Corrections) -> list[Finding]:
+    """A channel taken for a link sensor's that repeats the motors': arms without sensors have one reading of torque."""
+    link, motor = recording.torque, recording.motor_torque
+    if stated.effort or link is None or motor is None or not np.array_equal(link, motor, equal_nan=True):
+        return []
+    evidence = "is that of tau_motor in every sample: these drives have one reading of torque, their motors'"
+    return [Finding("effort_source", "tau", "all", evidence, "--effort-is motor", True)]
+
+
+def find_gain_command(recording: Recording, stated: Corrections) -> list[Finding]:
+    """Commanded torque that is the law of drives with gains at the row's readings: kp (q_cmd − q) + kd (…) + τ.
+
+    The drive follows the position within its cycle, and the command may be another one already: the law then differs
+    from the torque made by kp times the way of half a cycle or more, which is far more than friction's uncertainty.
+    """
+    command, target, velocity = recording.torque_command, recording.position_command, recording.velocity
+    if "tau_cmd" in stated.clock or command is None or target is None or velocity is None:
+        return []
+    lawful = 0
+    for own, error, speed in zip(command.T, (target - recording.position).T, velocity.T, strict=True):
+        steps = np.diff(np.stack([own, error, speed]), axis=1)
+        steps = steps[:, np.isfinite(steps).all(axis=0)]
+        if steps.shape[1] < STEPS or np.ptp(steps[0]) == 0.0 or np.ptp(steps[1]) == 0.0:
+            continue
+        law = np.linalg.lstsq(steps[1:].T, steps[0], rcond=None)[0]
+        lawful += bool(np.var(law @ steps[1:]) > LAWFUL * np.var(steps[0]) and law[0] > 0.0)
+    if 2 * lawful <= recording.position.shape[1]:
+        return []
+    evidence = "is kp (q_cmd − q) of its own row, of which the drive's time within the cycle is not known; left out"
+    return [Finding("clock", "tau_cmd", "all", evidence, "--clock tau_cmd=0 (keep it)", True)]
 
 
 def find_source(fit: RigidFit, s: Signals, motion: Motion, stated: Corrections) -> list[Finding]:

@@ -3,7 +3,8 @@
 Such recordings know torque constants and masses only up to a factor that all have in common: with links twice as heavy
 and every constant twice as large, the drives report the same. The links are taken as the model has them, and then one
 drive's constant is as doubtful as another's. A search that adds one effect after the other may end elsewhere, with one
-drive's constant as the model has it and all masses changed in proportion.
+drive's constant as the model has it and all masses changed in proportion. Where the constants of all drives are off by
+one factor, the masses are named, and the answer says that they may be the constants.
 """
 
 from collections.abc import Sequence
@@ -15,7 +16,8 @@ from sim_gap.search.term import Term
 
 CONSTANT = "actuator.gain"
 CONSTANTS = frozenset({CONSTANT})
-LINKS = ("link.mass_moment", "link.inertia", "link.payload")
+MASSES = "link.mass_moment"
+LINKS = (MASSES, "link.inertia", "link.payload")
 OFF = 0.05
 """A torque constant is off from this share on."""
 
@@ -50,6 +52,13 @@ def price_of_all(search: Search) -> float:
 def shares_a_factor(layout: Layout, terms: Sequence[Term]) -> bool:
     """Whether the terms have torque constants that are known only up to a factor common to them and all masses."""
     return layout.sensor is None and any(term.effect == CONSTANT for term in terms)
+
+
+def masses_may_be_constants(layout: Layout, terms: Sequence[Term]) -> bool:
+    """Whether mass moments of most links are named, and torque constants all off alike would look the same."""
+    links = {term.place for term in terms if term.effect == MASSES}
+    constants = any(term.effect == CONSTANT for term in terms)
+    return layout.sensor is None and not constants and 2 * len(links) > layout.n
 
 
 def every_constant(search: Search, offered: Sequence[Term]) -> list[Term]:

@@ -3,8 +3,11 @@
     .venv/bin/python tests/campaigns/creep_float.py --seeds 0 2
 
 Sag: all joints held by a tenth of their gains with gravity fed forward. Drift: one joint after the other is released,
-with gravity fed forward alone, while the others are held. Both as the mean over poses; the wrong model has masses that
-are off by up to 20 % and one link's centre of mass off by 3 cm. Exit status 1 where more than a quarter is left.
+with gravity fed forward alone, while the others are held. Both as the mean over poses, from where the stiff loops left
+the joints: friction stops these up to a degree beside the pose asked for. The wrong model has masses that are off by
+up to 20 % and one link's centre of mass off by 3 cm. Where friction holds the arm with the nominal model, too, and all
+joints together move by less than STANDS, nothing is there of which a share could be left: they must then move by less
+with the records as well, and the line says so. Exit status 1 where more than a quarter is left.
 """
 
 import argparse
@@ -36,6 +39,10 @@ from sim_gap.demo.script import WEAK_SHARE
 
 LEFT = 0.25
 """Largest share of the nominal model's sag and drift that may be left."""
+STANDS = np.radians(0.5)
+"""Movement of all joints together below which friction holds an arm [rad]: half a degree, of seven joints."""
+SETTLE = 1.0
+"""For which the stiff loops hold before [s]."""
 SECONDS = 1.0
 """For which a joint is released [s]."""
 
@@ -57,7 +64,7 @@ def wrong_model(arm: ArmFile, folder: Path, seed: int) -> ArmFile:
 
 
 def moved(bench: Bench, plan: SweepPlan, model: GravityModel, zero: Array, released: int | None) -> Array:
-    """Mean movement (n,) [rad] from the poses within `SECONDS`, all joints held weakly or one released."""
+    """Mean movement (n,) [rad] from rest within `SECONDS`, all joints held weakly or one released."""
     link, home, seen = bench.link, np.array(plan.scout[0]), []
     drives = [joint.settings for joint in bench.arm.require_link().joints]
     kp, kd = np.array([each.kp for each in drives]), np.array([each.kd for each in drives])
@@ -68,10 +75,12 @@ def moved(bench: Bench, plan: SweepPlan, model: GravityModel, zero: Array, relea
         travel(bench, link.position_sent, home)
         travel(bench, home, pose)
         hold, away = WeakHold(model, zero, pose, kp, held), np.zeros(link.n)
-        sample = link.cycle(Command.hold(pose))
+        for _ in range(round(SETTLE * link.rate)):
+            sample = link.cycle(Command.hold(pose))
+        began = sample.position
         for _ in range(round((2.0 if released is None else SECONDS) * link.rate)):
             sample = link.cycle(hold.command(sample))
-            away = np.abs(sample.position - pose)
+            away = np.abs(sample.position - began)
             if released is not None and away[released] > 0.3:
                 break
         seen.append(away)
@@ -106,11 +115,12 @@ def run(seed: int, folder: Path, wrong: bool) -> bool:
     link.disable()
     good = True
     for what, old, new in zip(("sag", "drift"), before, after, strict=True):
-        share = float(np.sum(new) / np.sum(old))
-        good &= share <= LEFT
+        share, stood = float(np.sum(new) / np.sum(old)), float(np.sum(old)) < STANDS
+        good &= float(np.sum(new)) < STANDS if stood else share <= LEFT
         print(
             f"{seed:>3} {'wrong' if wrong else 'right':>5} model, {what}: {np.degrees(old).round(2).tolist()}° before,"
-            f" {np.degrees(new).round(2).tolist()}° after; {share:.1%} is left",
+            f" {np.degrees(new).round(2).tolist()}° after;"
+            + (f" friction holds it, by less than {np.degrees(STANDS):g}°" if stood else f" {share:.1%} is left"),
             flush=True,
         )
     return good

@@ -1,5 +1,7 @@
 """Arms without torque sensors: torque constants of all drives from motor torque alone."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -74,3 +76,14 @@ def test_the_written_model_has_constants_friction_and_rotors(answer, tmp_path):
     assert closed.actuator_gear[:, 0] == pytest.approx(CONSTANTS, rel=0.01)
     assert closed.dof_armature == pytest.approx(DRIVES.rotor, rel=0.1)
     assert closed.dof_frictionloss == pytest.approx(DRIVES.coulomb, rel=0.1)
+
+
+def test_constants_that_are_all_off_alike_may_be_masses_and_the_answer_says_so(model_file):
+    alike = replace(DRIVES, motor_gain=np.array([0.79, 0.81, 0.8]))
+    made = [record(model(), alike, seed, 40.0, 50.0, channels=("tau_motor",)) for seed in (1, 2)]
+    answer = diagnose(str(model_file), made[:1], made[1:])
+    masses = next(cause for cause in answer.causes if cause.effect == "link.mass_moment")
+    assert masses.confounded_with[0] == "actuator.gain"
+    assert "known payload" in masses.separate_by
+    assert answer.verdict == "ambiguous"
+    assert any("only products of masses and torque constants" in note for note in answer.notes)
