@@ -136,23 +136,28 @@ def fit_rows(
     """Fit rows; rated torque (n,) [N·m] scales what is doubted beforehand. Disturbed sweeps are left out by name."""
     doubt = doubt or Doubt()
     left_out: tuple[Disturbed, ...] = ()
-    plain = _fitted(arm, rows, rated, doubt)
+    plain = _fitted(arm, rows, rated, doubt, ripple=False)  # which a contact would be taken for
     for _ in range(len(rows.sweeps)):
         found = disturbed_sweeps(arm, plain.rows, plain.solution.residual, rated)
         if not found:
             break
         left_out = (*left_out, *found)
         rows = rows.kept(~np.isin(rows.sweep, [each.sweep for each in found]))
-        plain = _fitted(arm, rows, rated, doubt)
+        plain = _fitted(arm, rows, rated, doubt, ripple=False)
+    plain = _fitted(arm, rows, rated, doubt, plain.solution.x)
     plain = replace(plain, disturbed=left_out, sources=sources or {})
-    free = _fitted(arm, rows, rated, replace(doubt, spring_share=WIDE_SHARE), plain.solution.x)
+    loose = replace(doubt, spring_share=WIDE_SHARE)
+    free = _fitted(arm, rows, rated, loose, plain.solution.x, ripple=False)
     pulled = springs(CreepModel(arm, rows, free.ripple), free.solution, rated)
     if not pulled:
         return plain
+    free = _fitted(arm, rows, rated, loose, free.solution.x)
     return replace(free, disturbed=left_out, springs=pulled, sources=sources or {})
 
 
-def _fitted(arm: Arm, rows: CreepRows, rated: Array, doubt: Doubt, start: Array | None = None) -> CreepFit:
+def _fitted(
+    arm: Arm, rows: CreepRows, rated: Array, doubt: Doubt, start: Array | None = None, ripple: bool = True
+) -> CreepFit:
     model, slices = CreepModel(arm, rows), family_slices(arm.n)
     scattered = Scatter.even(rows, 0.01 * rated[rows.joint])
     coulomb, uneven = 0.02 * rated, np.full(HARMONICS, doubt.uneven)
@@ -166,8 +171,8 @@ def _fitted(arm: Arm, rows: CreepRows, rated: Array, doubt: Doubt, start: Array 
         mean, std = prior(arm, rated, doubt, rows.by_temperature, coulomb, uneven)
         freedom = 1 - _used(found, std) / len(rows)
         by_degree = _temperature_std(rows) * x[slices["warming"]][rows.joint] * rows.reading
-        scattered = scatter(rows, found.residual, rated, freedom, by_degree)
-        if not model.ripple.any():
+        scattered = scatter(rows, found.residual, rated, freedom, by_degree, ripple)
+        if ripple and not model.ripple.any():
             model = CreepModel(arm, rows, ripple_cycles(rows, found.residual, arm.n))
     return CreepFit(arm, rows, found, std, scattered, model.ripple)
 

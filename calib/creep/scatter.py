@@ -47,12 +47,15 @@ class Scatter:
         return white
 
 
-def scatter(rows: CreepRows, residual: Array, rated: Array, freedom: float, by_degree: Array) -> Scatter:
+def scatter(
+    rows: CreepRows, residual: Array, rated: Array, freedom: float, by_degree: Array, apart: bool = True
+) -> Scatter:
     """Scatter of the rows as their residuals (R,) [N·m] have it.
 
     A sweep in which the arm swung scatters more than others of its joint: its own scatter counts, drawn towards the
     joint's as by `USUAL_BINS` further bins. `freedom` is rows less unknowns, as a share of the rows; `by_degree` (R,)
-    [N·m] is what the temperature's uncertainty makes of each reading, alike in all rows of a sweep.
+    [N·m] is what the temperature's uncertainty makes of each reading, alike in all rows of a sweep. Without
+    `apart` both directions have one variance, and nothing in common: a contact would pass for scatter of the half sums.
     """
     sigma, blocks = np.zeros(len(rows)), []
     residual = residual / np.sqrt(max(freedom, 0.2))
@@ -61,6 +64,8 @@ def scatter(rows: CreepRows, residual: Array, rated: Array, freedom: float, by_d
         floor = (LEAST_SHARE * float(rated[joint])) ** 2 / 2
         alike = _spread([(residual[up] + residual[down]) / 2 for up, down, _ in pairs], floor)
         opposite = _spread([(residual[up] - residual[down]) / 2 for up, down, _ in pairs], floor)
+        if not apart:
+            alike = opposite = [(a + b) / 2 for a, b in zip(alike, opposite, strict=True)]
         for (up, down, single), a, b in zip(pairs, alike, opposite, strict=True):
             each = np.concatenate([up, down, single])
             covariance = np.diag(np.full(each.size, a + b))
