@@ -7,6 +7,7 @@ from armlink.bus.bus_group import BusGroup
 from armlink.bus.can_bus import MessageBus
 from armlink.errors import BadInput, BusFault
 
+VIRTUAL_INTERFACES = ("virtual", "udp_multicast")
 FORM = "INTERFACE:CHANNEL[@BITRATE], for example socketcan:can0 or socketcan:can0@1000000"
 
 
@@ -28,6 +29,11 @@ def resolve_bus(spec: str | None, section: Bus) -> Bus:
     bus = parse_bus(spec, section.bitrate)
     same = {"fd": section.fd, "options": section.options} if bus.interface == section.interface else {}
     return bus.model_copy(update=same)
+
+
+def is_virtual(bus: Bus) -> bool:
+    """Whether a bus that other programs can open has no wire, and no bit rate."""
+    return bus.interface in VIRTUAL_INTERFACES or (bus.interface == "socketcan" and bus.channel.startswith("vcan"))
 
 
 def open_bus(spec: str | None, section: Bus) -> MessageBus:

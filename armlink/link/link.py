@@ -17,7 +17,7 @@ from armlink.clock import Clock, MonotonicClock
 from armlink.drives.family import Guarded
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Setup, law_torque
 from armlink.errors import BadInput, BusFault, HostLate, Refused, Silence
-from armlink.link.bus_load import bus_loads
+from armlink.link.bus_load import overload
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.faults import bus_fault
@@ -55,8 +55,13 @@ class Link(Calibrations):
     go without their host, leaving it in order parks the arm if its file says where (`link.park`).
     """
 
-    def __init__(self, arm: ArmFile, bus: "CanBus | can.BusABC", clock: Clock | None = None) -> None:
-        """Take `bus` (python-can's too, closed on leaving) and a clock: by default the bus's own or the machine's."""
+    def __init__(
+        self, arm: ArmFile, bus: "CanBus | can.BusABC", clock: Clock | None = None, overloaded: str = ""
+    ) -> None:
+        """Take `bus` (python-can's too, closed on leaving) and a clock: by default the bus's own or the machine's.
+
+        `overloaded` says why frames come late or never, on a bus that cannot carry the cycle (`overload`).
+        """
         self.arm, self.bus = arm, as_bus(bus)
         self.section = section = arm.require_link()
         self.names = tuple(joint.name for joint in section.joints)
@@ -81,16 +86,14 @@ class Link(Calibrations):
         self._last: Command | None = None
         self._limits: list[Limits] = []
         self._hold: ArmHold | None = None
-        loads = () if self._lock_step else bus_loads(arm)
-        self._overload = next((f"{load.what}: {load.remedy}" for load in loads if load.share > 1), "")
-        """Why frames come late or never, on a bus that cannot carry the cycle."""
+        self._overloaded = overloaded
 
     @classmethod
     def open(cls, arm: ArmFile, bus: str | None = None) -> "Link":
         """Open the bus `INTERFACE:CHANNEL[@BITRATE]`, by default the arm file's; raises BadInput or BusFault."""
         from armlink.bus.open import open_link_bus
 
-        return cls(arm, open_link_bus(bus, arm.require_link()))
+        return cls(arm, open_link_bus(bus, arm.require_link()), overloaded=overload(arm, bus))
 
     def __enter__(self) -> Self:
         """The link itself."""
@@ -189,8 +192,8 @@ class Link(Calibrations):
         if missing:
             channel = self.bus.channel_info
             raise BusFault(f"no answer from {', '.join(missing)} on {channel}: is it powered, and its id right?")
-        if self._overload:
-            log.warning("%s: %s", self.arm.name, self._overload)
+        if self._overloaded:
+            log.warning("%s: %s", self.arm.name, self._overloaded)
         self.require_alone()
         self._set_up()
         loop = self._loop
@@ -364,8 +367,8 @@ class Link(Calibrations):
 
     def _mind_overload(self, error: BaseException) -> None:
         """What no drive is to blame for: a bus that cannot carry the cycle."""
-        if self._overload and isinstance(error, BusFault) and not isinstance(error, HostLate):
-            error.args = (f"{error}; {self._overload}",)
+        if self._overloaded and isinstance(error, BusFault) and not isinstance(error, HostLate):
+            error.args = (f"{error}; {self._overloaded}",)
 
     def play(self, setpoints: Setpoints) -> Samples:
         """One row a cycle, and the sample of each; raises as cycle. To stop early, close the iterator.

@@ -33,7 +33,7 @@ SWITCH = 5e-4
 """Longest time for which another thread of this process holds up a cycle [s]."""
 SILENT = 3.0
 """A job that says nothing for this long while joints are under torque control is gone [s]."""
-TOLD_EVERY = 7e-3
+SENT_EVERY = 7e-3
 """Samples wait for each other for this long at most [s]: waking the job costs as much as half a cycle."""
 ENABLING = ("enable", "recover")
 
@@ -133,7 +133,7 @@ class DriveLoop:
             self._channel.put((self._id, row, pack(sample, *self._link.sent)), True)
             now = time.monotonic()
             self._mind_silence(now)
-            if row + 1 != self._rows and now - self._flushed < TOLD_EVERY:
+            if row + 1 != self._rows and now - self._flushed < SENT_EVERY:
                 return
             self._flushed = now
         self._channel.flush()

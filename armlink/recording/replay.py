@@ -10,7 +10,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.bus.frame_log import LogBus, LogReader, is_log
-from armlink.bus.open import open_bus, parse_bus
+from armlink.bus.open import is_virtual, open_bus, parse_bus
 from armlink.bus.port import Port, Stamped
 from armlink.clock import Clock, MonotonicClock
 from armlink.drives.family import Replays
@@ -23,7 +23,6 @@ from armlink.recording.recording import Recording
 if TYPE_CHECKING:
     from rich.console import Console
 
-VIRTUAL_INTERFACES = ("virtual", "udp_multicast")
 _REFRESH = 0.2  # [s]
 
 
@@ -52,9 +51,7 @@ def play_onto(arm: ArmFile, source: Path, recording: Recording, spec: str, speed
 
     Raises BadInput for a bus that is not virtual, BusFault if it cannot be opened or takes no frames.
     """
-    described = parse_bus(spec)
-    virtual = described.interface == "socketcan" and described.channel.startswith("vcan")
-    if not virtual and described.interface not in VIRTUAL_INTERFACES:
+    if not is_virtual(parse_bus(spec)):
         raise BadInput(
             f"bus {spec}: replay goes onto a virtual bus only: virtual:…, udp_multicast:… or socketcan:vcan…"
         )

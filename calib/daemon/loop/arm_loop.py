@@ -108,6 +108,7 @@ class ArmLoop:
     def _open(self) -> Message:
         options = self.options
         from armlink.bus.open import open_link_bus
+        from armlink.link.bus_load import overload
 
         bus = options.open_bus() if options.open_bus else open_link_bus(options.bus, options.arm.require_link())
         self._heard = math.inf
@@ -115,7 +116,7 @@ class ArmLoop:
             self._source = Listener(options.arm, bus)
             self._heard = self._source.clock.now()
             return self._up(None)
-        link = Link(options.arm, bus)
+        link = Link(options.arm, bus, overloaded=overload(options.arm, options.bus))
         self._source = link
         self._hold = self._hold or ArmHold(bus, link.addresses)  # for good: through a passing fault too
         link.start()

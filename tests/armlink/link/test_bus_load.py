@@ -8,7 +8,7 @@ import pytest
 from fake_joints import FakeBus, make_arm
 
 from armlink.errors import BusFault, HostLate
-from armlink.link.bus_load import bus_loads
+from armlink.link.bus_load import bus_loads, overload
 from armlink.link.link import Link
 from armlink.link.types import Command
 
@@ -26,13 +26,31 @@ def test_the_load_is_every_frame_with_all_its_stuff_bits() -> None:
     assert load.remedy == "lower link.rate to 827 Hz, or spread the joints over link.buses"
 
 
+@pytest.mark.parametrize(
+    ("spec", "expected"),
+    [
+        (None, "193% of 125000 bit/s: lower link.rate to 103 Hz, or spread the joints over link.buses"),
+        ("socketcan:can1@250000", ""),
+        ("slcan:/dev/ttyACM0", "193% of 125000 bit/s"),
+        ("socketcan:vcan0", ""),
+        ("udp_multicast:239.0.0.1", ""),
+        ("armlink_sim:arm", ""),
+    ],
+)
+def test_the_bus_that_is_opened_counts_not_the_arm_files(spec: str | None, expected: str) -> None:
+    said = overload(make_arm(3, link=at(250, 125_000)), spec)
+    assert expected in said
+    assert bool(said) == bool(expected)
+
+
 @pytest.fixture
 def overloaded() -> Iterator[tuple[Link, FakeBus]]:
     """In real time, as far as the link can tell."""
     bus = FakeBus(range(1, 4))
     names = ("channel_info", "open_port", "open_listening_port", "shutdown")
     timed = SimpleNamespace(clock=None, **{name: getattr(bus, name) for name in names})
-    with Link(make_arm(3, link=at(250, 125_000)), timed, bus.clock) as link:
+    arm = make_arm(3, link=at(250, 125_000))
+    with Link(arm, timed, bus.clock, overload(arm)) as link:
         yield link, bus
 
 

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from armlink.arm_file import load_arm
 from armlink.bus.port import Frame
 from armlink.drives.orders import Power
-from armlink.link.cycle import Commander
 from armlink.link.types import Command
 from armlink.selftest.host import EchoPort, echo_commander
 
@@ -51,44 +50,48 @@ class OneByOne(EchoPort):
         return super().receive(0.0)
 
 
-def cycles(commander: Commander, hold: Command, count: int) -> list[float]:
-    return [commander.command(hold).delay for _ in range(count)]
+class Held:
+    """An arm that holds where it stands."""
+
+    def __init__(self) -> None:
+        self.clock = WaitedFor()
+        self.port = OneByOne(self.clock, 3e-4)
+        self.commander = echo_commander(load_arm("sarcos"), self.port, self.clock)
+        for _ in range(3):
+            self.commander.stand([Power.OFF] * N)
+
+    def delays(self, count: int) -> list[float]:
+        """Of so many cycles, from SYNC to the last reply or the end of waiting [s]."""
+        hold = Command.hold(self.port.standing)
+        return [self.commander.command(hold).delay for _ in range(count)]
 
 
 def test_a_cycle_wakes_twice_and_misses_nothing() -> None:
-    clock = WaitedFor()
-    port = OneByOne(clock, 3e-4)
-    commander = echo_commander(load_arm("sarcos"), port, clock)
-    hold = Command.hold(port.standing)
-    for _ in range(3):
-        commander.stand([Power.OFF] * N)
-    cycles(commander, hold, 300)
-    clock.waits, missed = 0, commander.loop.stats.missed
+    held = Held()
+    clock, port, stats = held.clock, held.port, held.commander.loop.stats
+    held.delays(300)
+    clock.waits, missed = 0, stats.missed
     taken = 3e-4 + N * BETWEEN
-    delays = cycles(commander, hold, 500)
+    delays = held.delays(500)
     assert clock.waits < 2.2 * 500
     assert taken - 1e-9 <= min(delays)
     assert max(delays) < 1.05 * taken
     port.first = 9e-4  # from now on the drives take 0.6 ms longer
-    delays = cycles(commander, hold, 300)
+    delays = held.delays(300)
     assert min(delays) >= taken + 6e-4 - 1e-9
-    assert commander.loop.stats.missed == missed
+    assert stats.missed == missed
     clock.waits = 0
-    cycles(commander, hold, 500)
+    held.delays(500)
     assert clock.waits < 2.2 * 500
 
 
 def test_replies_that_never_come_cost_no_more_than_their_share_of_the_period() -> None:
-    clock = WaitedFor()
-    port = OneByOne(clock, 3e-4)
-    commander = echo_commander(load_arm("sarcos"), port, clock)
-    hold = Command.hold(port.standing)
-    for _ in range(3):
-        commander.stand([Power.OFF] * N)
-    commander.max_age = 10.0
-    cycles(commander, hold, 3)
-    port.first = 0.1
-    begun = clock.time
-    delays = cycles(commander, hold, 200)
-    assert max(delays) <= 0.8 * commander.period + 1e-9
-    assert abs(clock.time - begun - 200 * commander.period) < 2 * commander.period
+    held = Held()
+    period = held.commander.period
+    held.commander.max_age = 10.0
+    held.delays(3)
+    held.port.first = 0.1
+    begun = held.clock.time
+    delays = held.delays(200)
+    assert max(delays) <= 0.8 * period + 1e-9
+    assert abs(held.clock.time - begun - 200 * period) < 2 * period

@@ -70,11 +70,10 @@ class CommandFrames:
             limits, unit = wire.limits, wire.unit
             low, high = math.ceil(limits.lower / unit.position), math.floor(limits.upper / unit.position)
             self._aimed[joint] = math.nan
-            pack, torque = wire.layouts[RPDO1.name].pack, unit.torque if wire.with_torque else 0.0
+            layout, torque = wire.layouts[RPDO1.name], unit.torque if wire.with_torque else 0.0
             most = int(limits.max_torque / torque) if torque else 0
             window = (limits.lower, limits.upper, low, high)
-            row = (wire.by_velocity, RPDO1.cob_base + wire.node, pack, torque, most, unit.position, *window)
-            layout = wire.layouts[RPDO1.name]
+            row = (wire.by_velocity, RPDO1.cob_base + wire.node, layout.pack, torque, most, unit.position, *window)
             self._rows.append(row)
             self._readers.append((layout.size, layout.unpack, torque or math.nan, unit.position))
 
@@ -178,7 +177,7 @@ class CommandFrames:
         torque = values[1] * torque_unit
         word = values[0] & 0x8F
         power = Power.ON if word == ENABLE else Power.STOPPED if word & 0x86 == QUICK_STOP else Power.OFF
-        if self._rows[joint][0]:
+        if self._wires[joint].by_velocity:
             velocity, gain = values[-1] * self._wires[joint].unit.velocity, loop_gain(self._period)
             mode = Mode.POSITION if self.modes[joint] else OFF
             return Order(power, False, mode, self._aim(joint, velocity / gain), velocity, math.nan, 0.0, 0.0)
