@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit
 from threadpoolctl import threadpool_limits
 
 from armlink.arm_file import ArmFile
@@ -194,7 +194,7 @@ def fit_sensors(arm_file: ArmFile, data: Sequence[SweepData]) -> SensorFit:
 
 def _quantiles(freedom: Parameters) -> Parameters:
     """Student quantiles of 95 % intervals at degrees of freedom."""
-    return Parameters.from_vector(stats.t.ppf(0.975, freedom.vector), len(freedom.gain))
+    return Parameters.from_vector(stdtrit(freedom.vector, 0.975), len(freedom.gain))
 
 
 def _fit(arm_file: ArmFile, rows: SweepReadings, **extra: Prior) -> Goodness:

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy.special import fdtrc
 
 from calib.fit.refinement import Extra, Refined
 from calib.fit.sweep_readings import SweepReadings
@@ -77,7 +77,7 @@ def strongest_effect(kinematics: Arm, rows: SweepReadings, kept: Mask, refined: 
             continue
         left = max(total - gain, 1e-6 * total + 1e-9)
         ratio = (gain / m) / (left / free)
-        p_value = float(stats.f.sf(ratio, m, free))
+        p_value = float(fdtrc(m, free, ratio))
         own = linear.joint == effect.joint
         shape = (columns * linear.sigma[:, None] @ coefficient)[own]
         size = float(np.std(shape)) if len(shape) else 0.0

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from gcomp.arrays import Array
 from sim_gap.residuals.layout import Row
@@ -182,7 +182,7 @@ class Estimate:
         jacobian = np.stack(slopes, axis=1)
         spread = np.sqrt(np.maximum(np.diag(jacobian @ self.covariance[np.ix_(chosen, chosen)] @ jacobian.T), 0.0))
         blocks = int(self.store.data.blocks.max()) + 1
-        half = spread * student.ppf(0.975, max(blocks - 1, 1))
+        half = spread * stdtrit(max(blocks - 1, 1), 0.975)
         return {
             name: Value(float(c), float(c - h), float(c + h), unit)
             for (name, unit), c, h in zip(effect.reported, centre, half, strict=True)
