@@ -24,6 +24,7 @@ def run_pytest(folder: Path, text: str, ci: str) -> subprocess.CompletedProcess[
     (folder / "pytest.ini").write_text("[pytest]\naddopts = -ra\nmarkers = vcan\n")
     (folder / "test_it.py").write_text(text)
     environment = {**os.environ, "CI": ci, "ARMLINK_REALDATA": "/nowhere", "ARMLINK_NO_VCAN": "this kernel has no vcan"}
+    environment["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(folder)]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
 

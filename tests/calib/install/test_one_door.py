@@ -31,9 +31,19 @@ OBJECTS = ("STAGED_GAIN", "STAGED_OFFSET", "ACTIVATE")
 
 
 @cache
-def trees() -> dict[str, ast.Module]:
-    paths = (path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py")))
-    return {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text(encoding="utf-8")) for path in paths}
+def nodes() -> list[tuple[str, str, ast.AST]]:
+    """(File, function, node) of the whole source, each file from the top."""
+    found: list[tuple[str, str, ast.AST]] = []
+
+    def visit(node: ast.AST, path: str, function: str) -> None:
+        for child in ast.iter_child_nodes(node):
+            found.append((path, function, child))
+            visit(child, path, child.name if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef) else function)
+
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            visit(ast.parse(path.read_text(encoding="utf-8")), path.relative_to(ROOT).as_posix(), "")
+    return found
 
 
 def names_in(node: ast.AST) -> list[object]:
@@ -47,36 +57,25 @@ def names_in(node: ast.AST) -> list[object]:
     return [node.value] if isinstance(node, ast.Constant) else []
 
 
-def mentions(name: str) -> Iterator[tuple[str, str, type[ast.AST]]]:
-    """(File, function, kind of node) of every use of a name; its definitions are none."""
-
-    def visit(node: ast.AST, path: str, function: str) -> Iterator[tuple[str, str, type[ast.AST]]]:
-        for child in ast.iter_child_nodes(node):
-            if name in names_in(child):
-                yield path, function, type(child)
-            inner = child.name if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef) else function
-            yield from visit(child, path, inner)
-
-    for path, tree in trees().items():
-        yield from visit(tree, path, "")
+@cache
+def uses() -> dict[object, list[tuple[str, str, type[ast.AST]]]]:
+    """Name → (file, function, kind of node) of every use of it; its definitions are none."""
+    found: dict[object, list[tuple[str, str, type[ast.AST]]]] = {}
+    for path, function, node in nodes():
+        for name in names_in(node):
+            found.setdefault(name, []).append((path, function, type(node)))
+    return found
 
 
 def users(name: str) -> set[tuple[str, str]]:
-    return {(path, function) for path, function, _ in mentions(name)}
+    return {(path, function) for path, function, _ in uses()[name]}
 
 
 def calls(*names: str) -> Iterator[tuple[str, str, ast.expr | None]]:
     """(File, function, first argument) of every call of a function or method of these names."""
-
-    def visit(node: ast.AST, path: str, function: str) -> Iterator[tuple[str, str, ast.expr | None]]:
-        for child in ast.iter_child_nodes(node):
-            if isinstance(child, ast.Call) and set(names) & set(names_in(child.func)):
-                yield path, function, child.args[0] if child.args else None
-            inner = child.name if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef) else function
-            yield from visit(child, path, inner)
-
-    for path, tree in trees().items():
-        yield from visit(tree, path, "")
+    for path, function, node in nodes():
+        if isinstance(node, ast.Call) and set(names) & set(names_in(node.func)):
+            yield path, function, node.args[0] if node.args else None
 
 
 # ---- by the source
@@ -92,7 +91,7 @@ def test_only_the_door_calls_write_calibration() -> None:
 
 def test_only_a_forwarder_asks_the_bus_process_to_write() -> None:
     """By name, in a `Call`; functions in a `Call` (`RemoteLink.inside`) are subject to the test above."""
-    said = {(path, function) for path, function, kind in mentions("write_calibration") if kind is ast.Constant}
+    said = {(path, function) for path, function, kind in uses()["write_calibration"] if kind is ast.Constant}
     assert said == {(LOOP, "_do"), *((path, "write_calibration") for path in ASKS)}
 
 
@@ -114,18 +113,13 @@ NAMED = ("armlink/drives/canopen/check/guard_rules.py", "_record_writes")
 def test_only_write_calibration_uses_the_wire_format() -> None:
     assert users("write_record") == {(DRIVES, "write_calibration")}
     for name in OBJECTS:
-        uses = {use for use in users(name) if not use[0].endswith("object_dictionary.py")}
-        assert uses - {NAMED} == {(WIRE, "write_record")}
+        used = {use for use in users(name) if not use[0].endswith("object_dictionary.py")}
+        assert used - {NAMED} == {(WIRE, "write_record")}
 
 
 def test_only_the_gates_admit_a_record() -> None:
-    calls = {
-        (path, call.func.id)
-        for path, tree in trees().items()
-        for call in ast.walk(tree)
-        if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Admitted"
-    }
-    assert calls == {(GATES, "Admitted")}
+    admitted = {path for path, _, _ in calls("Admitted")}
+    assert admitted == {GATES}
 
 
 # ---- as it runs
