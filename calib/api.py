@@ -27,7 +27,8 @@ from calib.observer.choice import observer_of
 from calib.observer.config import ObserverConfig
 from calib.observer.events import Event
 from calib.records.records import CalibrationRecord, GravityRecord
-from calib.sweep.dataset import SweepData, load_data
+from calib.sweep.data_sets import data_sets
+from calib.sweep.dataset import SweepData
 from calib.sweep.run import Progress, run_sweep
 from calib.sweep.verify import Verification, run_verify
 from gcomp.arrays import Array
@@ -246,16 +247,13 @@ def _arm(arm: object) -> ArmFile:
 def _sweeps(function: str, sweeps: tuple[object, ...]) -> list[SweepData]:
     if not sweeps:
         raise BadInput(f"{function}: give the data sets of sweep, or their folders")
-    found = []
+    given: list[Path | SweepData] = []
     for each in sweeps:
-        if isinstance(each, SweepData):
-            found.append(each)
-        elif isinstance(each, str | Path):
-            found.append(load_data(Path(each)))
-        else:
+        if not isinstance(each, SweepData | str | Path):
             kind = type(each).__name__
             raise BadInput(f"{function}: expected data sets of sweep or their folders, one argument each, not {kind}")
-    return found
+        given.append(Path(each) if isinstance(each, str) else each)
+    return data_sets(given)
 
 
 def _calibrated(arm_file: ArmFile, data: list[SweepData]) -> Calibrated:

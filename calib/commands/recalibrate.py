@@ -80,23 +80,28 @@ def _rows(
     from armlink.recording.files import load_recording
     from armlink.torque_calibration import UNCALIBRATED, per_joint
     from calib.field.rows import rows_of_recording, rows_of_sweeps
+    from calib.sweep.data_sets import labels
     from calib.sweep.dataset import load_data
 
     n = len(arm_file.joint_names)
     blank = per_joint([UNCALIBRATED] * n)
     installed = blank if held is None else held.torque_calibration(blank)
-    parts, sources = [], {}
-    for number, path in enumerate(data):
+    parts, sources = [], dict[str, str]()
+    for number, (path, label) in enumerate(zip(data, labels(data), strict=True)):
         if path.is_dir():
             sweeps = load_data(path).require(arm_file)
             parts.append(rows_of_sweeps(sweeps, number))
-            sources[path.name] = sweeps.digest
-            continue
-        recording = load_recording(path)
-        if recording.n != n:
-            raise BadInput(f"{path}: {recording.n} joints, but {arm_file.name} has {n}")
-        parts.append(rows_of_recording(recording, installed, number, str(path)))
-        sources[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
+            digest = sweeps.digest
+        else:
+            recording = load_recording(path)
+            if recording.n != n:
+                raise BadInput(f"{path}: {recording.n} joints, but {arm_file.name} has {n}")
+            parts.append(rows_of_recording(recording, installed, number, str(path)))
+            digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        if digest in sources.values():
+            twin = next(name for name, known in sources.items() if known == digest)
+            raise BadInput(f"{path}: the same data as {twin}, which would count twice: give one of them")
+        sources[label] = digest
     return parts[0].joined(*parts[1:]), sources
 
 

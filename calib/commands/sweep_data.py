@@ -11,9 +11,9 @@ if TYPE_CHECKING:
 def load_sweeps(command: str, directories: list[Path], arm: str | None) -> "tuple[list[SweepData], ArmFile]":
     """Data sets and the arm file that they were made with, or `arm`; raises BadInput."""
     from armlink.errors import BadInput
-    from calib.sweep.dataset import load_data
+    from calib.sweep.data_sets import data_sets
 
     if not directories:
         raise BadInput(f"{command}: give the directories that sweep wrote")
-    data = [load_data(path) for path in directories]
+    data = data_sets(directories)
     return data, data[0].load_arm(arm)

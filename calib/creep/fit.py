@@ -20,6 +20,7 @@ from calib.creep.ripple import ripple_cycles
 from calib.creep.rows import CreepRows
 from calib.creep.scatter import Scatter, scatter
 from calib.creep.solve import Solution, solve
+from calib.sweep.data_sets import digests
 from calib.sweep.dataset import SweepData
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
@@ -126,7 +127,7 @@ def fit_creep(arm_file: ArmFile, passes: Sequence[SweepData]) -> CreepFit:
     rows = CreepRows.of(passes)
     if not len(rows):
         raise BadInput(f"{passes[0].path}: no creep sweeps: sweep with sweep.motion: creep")
-    doubt, sources = Doubt.of(sweep_section(arm_file)), {data.path.name: data.digest for data in passes}
+    doubt, sources = Doubt.of(sweep_section(arm_file)), digests(passes)
     return fit_rows(gcomp_arm(arm_file), rows, Limits.of(arm_file).rated, doubt, sources)
 
 

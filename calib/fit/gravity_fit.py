@@ -12,6 +12,7 @@ from calib.arm.kinematics import gcomp_arm
 from calib.fit.sensor_fit import SensorFit
 from calib.fit.sweep_readings import SweepReadings, sweep_readings
 from calib.records.records import CalibrationRecord, GravityRecord, matrix, provenance
+from calib.sweep.data_sets import digests
 from calib.sweep.dataset import SweepData
 from gcomp.arrays import Array, Mask
 from gcomp.errors import GcompError
@@ -83,7 +84,7 @@ def identify_gravity(
         identifiable=found,
         recursive=_recursion(arm_file, rows, calibration),
         residual_rms=_rms(residual),
-        sources={each.path.name: each.digest for each in data},
+        sources=digests(data),
     )
 
 

@@ -16,6 +16,7 @@ from calib.fit.findings import Finding
 from calib.fit.missing_values import missing_values
 from calib.fit.sweep_readings import SweepReadings, sweep_readings
 from calib.records.records import PARAMETERS, CalibrationRecord, JointCalibration, Parameter, matrix, provenance
+from calib.sweep.data_sets import digests
 from calib.sweep.dataset import SweepData
 from gcomp.arrays import Array
 from gcomp.identify.global_fit import GlobalFit, identify_global
@@ -188,7 +189,7 @@ def fit_sensors(arm_file: ArmFile, data: Sequence[SweepData]) -> SensorFit:
         quantile=_quantiles(good.refined.certainty),
         reasons=missing_values(fit, rows),
         gain_ratio=gain_ratio,
-        sources={each.path.name: each.digest for each in data},
+        sources=digests(data),
     )
 
 

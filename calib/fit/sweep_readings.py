@@ -9,6 +9,7 @@ import numpy.typing as npt
 from armlink.errors import BadInput
 from armlink.torque_calibration import TorqueCalibration
 from calib.motion.static_reading import StaticReading, batch, stack
+from calib.sweep.data_sets import labels
 from calib.sweep.dataset import SweepData
 from gcomp.arrays import Array, Mask
 from gcomp.identify.readings import StaticReadings
@@ -62,7 +63,8 @@ def sweep_readings(data: Sequence[SweepData]) -> SweepReadings:
     """All readings of data sets of one arm; raises BadInput if there are none or the arms differ."""
     _require_one_arm(data)
     taken = [reading for each in data for reading in each.readings]
-    names = [f"{each.path.name}/{reading.sweep}" for each in data for reading in each.readings]
+    folders = labels([each.path for each in data])
+    names = [f"{folder}/{reading.sweep}" for folder, one in zip(folders, data, strict=True) for reading in one.readings]
     source = np.repeat(np.arange(len(data)), [len(each.readings) for each in data])
     sweeps = tuple(dict.fromkeys(names))
     noise, sigma = _noise(taken, np.array(data[0].manifest.rated_torque))

@@ -33,14 +33,14 @@ class Spectrum:
 
     @classmethod
     def of(cls, triangle: Array, unit: Array) -> "Spectrum":
-        """Of a factor R (p, p) with RᵀR = JᵀJ, columns in units `unit` (p,)."""
+        """Of a factor R (p, p), or (m, p) of m < p readings, with RᵀR = JᵀJ; columns in units `unit` (p,)."""
         left, values, right = np.linalg.svd(triangle * unit)
-        keep = values > max(1 / NULL_STD, NULL_RATIO * values[0])
-        return cls(left[:, : len(values)][:, keep], values[keep], right[: len(values)][keep], right[~keep])
+        kept = int((values > max(1 / NULL_STD, NULL_RATIO * values[0])).sum())  # the values come in falling order
+        return cls(left[:, :kept], values[:kept], right[:kept], right[kept:])
 
 
 def analyse(triangle: Array, unit: Array) -> Information:
-    """Covariance and identifiability from a factor R (p, p) with RᵀR = JᵀJ and natural units (p,)."""
+    """Covariance and identifiability from a factor R (p or fewer, p) with RᵀR = JᵀJ and natural units (p,)."""
     spectrum = Spectrum.of(triangle, unit)
     spread = (spectrum.right.T / spectrum.values) * unit[:, None]
     determined = np.linalg.norm(spectrum.null, axis=0) < PARTICIPATION

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from armlink.cli import run
+
 pytestmark = pytest.mark.slow
 
 EXAMPLES = Path(__file__).parent.parent.parent / "examples"
@@ -49,6 +51,12 @@ def test_diagnose_a_gap_names_the_causes(tmp_path):
     causes = re.findall(r"^(\S+), confidence", printed, re.MULTILINE)
     assert set(causes) == {"friction.coulomb", "torque.gain"}
     assert re.search(r"torque\.gain.*'elbow': \[1\.0[34]", printed)
+
+
+def test_the_arm_of_the_examples_has_its_simulated_bus_for_commands_from_any_folder(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run(["scan", str(EXAMPLES / "planar3.yaml")]) == 0
+    assert "wrist" in capsys.readouterr().err
 
 
 def test_every_example_is_run_here():
