@@ -54,7 +54,7 @@ def _model(arm: str, tip: str | None, record: str | None, store: str | None) -> 
     from armlink.arm_file import MODEL_SUFFIXES, load_arm
     from armlink.errors import BadInput, Refused
     from calib.arm.kinematics import gcomp_arm, model_arm
-    from calib.records.missing import first_sweep
+    from calib.records.missing import way_to
     from calib.records.records import GravityRecord
     from calib.records.store import RecordStore
     from gcomp.arm.load import load_model
@@ -77,7 +77,7 @@ def _model(arm: str, tip: str | None, record: str | None, store: str | None) -> 
     if kept is None:
         raise Refused(
             f"{arm_file.name} {arm_file.serial}: its description has no inertials, and there is no gravity record yet:"
-            f" sweep it first: {first_sweep(arm_file)}"
+            f" {way_to(arm_file, 'gravity')}"
         )
     if not isinstance(kept, GravityRecord):
         raise BadInput(f"--record {record}: that is a {kept.kind} record, expected a gravity record")

@@ -3,12 +3,16 @@
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 
+MAKERS = {"calibration": "armlink calibrate", "gravity": "armlink identify"}
+"""Kind of record → the command that makes it."""
+
 
 def no_record(arm: ArmFile, kind: str) -> Refused:
-    """The refusal of work that needs a record of the `kind`, with the command that leads to one."""
-    return Refused(f"{arm.name} {arm.serial}: no {kind} record yet: sweep it first: {first_sweep(arm)}")
+    """The refusal of work that needs a record of the `kind`, with the commands that lead to one."""
+    return Refused(f"{arm.name} {arm.serial}: no {kind} record yet: {way_to(arm, kind)}")
 
 
-def first_sweep(arm: ArmFile) -> str:
-    """The command by which every record begins."""
-    return f"armlink sweep {arm.argument} --out unloaded"
+def way_to(arm: ArmFile, *kinds: str) -> str:
+    """The commands that make records of these kinds, from the first."""
+    made = " and ".join(MAKERS[kind] for kind in kinds)
+    return f"{made} {'make them' if len(kinds) > 1 else 'makes it'} from sweeps: armlink sweep {arm.argument} --out unloaded"

@@ -13,7 +13,7 @@ from calib.daemon.state.event_log import EventLog
 from calib.install.journaled_write import recover
 from calib.install.plausibility import GateRefused
 from calib.records.database import StoreFault, first_line
-from calib.records.missing import first_sweep
+from calib.records.missing import way_to
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.records.store import ControllerWrite, RecordStore
 
@@ -115,9 +115,9 @@ class ActiveRecords:
         arm = self._configuration.arm
         if calibration is None or gravity is None:
             found = {"calibration": calibration, "gravity": gravity}
-            missing = " and ".join(name for name, record in found.items() if record is None)
+            missing = [name for name, record in found.items() if record is None]
             of_arm = f"of {arm.name} {arm.serial}"
-            waits = f"waits for a {missing} record {of_arm}: {first_sweep(arm)}"
+            waits = f"waits for a {' and '.join(missing)} record {of_arm}: {way_to(arm, *missing)}"
             if waits != self.detail:
                 _LOG.warning(waits)
             self.detail = waits
