@@ -15,4 +15,5 @@ def no_record(arm: ArmFile, kind: str) -> Refused:
 def way_to(arm: ArmFile, *kinds: str) -> str:
     """The commands that make records of these kinds, from the first."""
     made = " and ".join(MAKERS[kind] for kind in kinds)
-    return f"{made} {'make them' if len(kinds) > 1 else 'makes it'} from sweeps: armlink sweep {arm.argument} --out unloaded"
+    makes = "makes it" if len(kinds) == 1 else "make them"
+    return f"{made} {makes} from sweeps: armlink sweep {arm.argument} --out unloaded"
