@@ -27,6 +27,8 @@ BLAME_SHARE = 0.5
 """A host that was late by this share of `link.deadline` explains a watchdog that acts at the whole of it."""
 SLOWEST = 4
 """Motor torque and velocity come in every this many cycles, at the least often."""
+LEAD_SHARE = 0.05
+"""Of the newest cycle in the mean time from a wake to its frames."""
 OFF, POSITION = int(Mode.OFF), int(Mode.POSITION)
 ALWAYS = (OFF, POSITION, int(Mode.TORQUE))
 """Modes that the set-up has checked; profile modes are checked in each command."""
@@ -52,6 +54,10 @@ class Commander:
         self._with_gains = False
         self._seen_now: list[Seen] = []
         self._due = 0.0
+        self.unhurried = False
+        """Whether nobody waits for the sample: replies are then taken in just before the next cycle, with one wake."""
+        self._lead = 0.0
+        """Time from that wake to the next frames, of late [s]."""
         self.late = 0.0
         """How late the present cycle began [s]."""
         self._gap, self._gap_at = 0.0, -math.inf
@@ -82,7 +88,10 @@ class Commander:
             if order.refused:
                 refused = True
         self._commanded, sent = modes, self.loop.synced
-        sample = self.loop.exchange(passed, math.inf if refused else now - age, self.max_age)
+        if self.loop.just_woke:
+            self._lead += LEAD_SHARE * (min(now - self.loop.woke, self.period / 4) - self._lead)
+        until = self._due - self._lead if self.unhurried and not self._lock_step else -math.inf
+        sample = self.loop.exchange(passed, math.inf if refused else now - age, self.max_age, until)
         sample.late = self.late
         if not self._lock_step:  # this process may have stood still at any line
             self._note_gap(self.loop.synced - sent, self.loop.synced)
@@ -295,9 +304,10 @@ class Commander:
 
     def _await_turn(self) -> None:
         if not self._lock_step:
-            self.clock.sleep_until(self._due)
+            if not self.loop.just_woke:
+                self.clock.sleep_until(self._due)
             now, stats = self.clock.now(), self.loop.stats
-            self.late = now - self._due
+            self.late = max(now - self._due, 0.0)
             stats.late += self.late > 0.1 * self.period
             stats.lateness.add(self.late)
             self._note_gap(now - self.loop.synced, now)

@@ -58,6 +58,10 @@ class Loop:
         self._patience = 0.0 if lock_step else COLLECT_SHARE * period
         self._rest = 0.0
         """Time from the commands until it looks for replies [s]."""
+        self.woke = -math.inf
+        """When it last began to take in replies that nobody waited for, by the clock [s]."""
+        self.just_woke = False
+        """Whether that was after the last commands: all that had come is taken in."""
         self._alone = self.groups[0] if len(self.groups) == 1 else None
         traits = traits_of(self.groups, self.n)
         cadences = {each.cadence for each in traits}
@@ -138,7 +142,7 @@ class Loop:
         """Take in all that came between cycles; replies among it are late: newest known, but of no sample."""
         board = self.board
         board.awaited = 0
-        if self._take_what_is_there() or self._owed_for:
+        if (not self.just_woke and self._take_what_is_there()) or self._owed_for:
             self._keep_late()
         self.watch.cycle_ends(self.stats.frames - self._counted)
         self._counted = self.stats.frames
@@ -176,16 +180,24 @@ class Loop:
 
     def settle(self) -> None:
         """After an interruption: nothing is owed, nothing was lost, no node is crowding the bus."""
+        self.just_woke = False
         self.drain()
         self.synced = -math.inf
         self.board.owed, self._owed_for = [0] * self.n, 0
         self._dropped = self._port.dropped
         self.watch.settle()
 
-    def exchange(self, orders: Sequence[Order], decided: float = math.inf, max_age: float = math.inf) -> Sample:
+    def exchange(
+        self,
+        orders: Sequence[Order],
+        decided: float = math.inf,
+        max_age: float = math.inf,
+        until: float = -math.inf,
+    ) -> Sample:
         """One cycle: the frames of the orders, then the readings that they bring; raises as `verify`.
 
-        Raises HostLate, and sends nothing, if the frames would leave more than `max_age` [s] after `decided` (clock).
+        Replies are taken in when all should have come, or at `until` (clock) if that is later. Raises HostLate, and
+        sends nothing, if the frames would leave more than `max_age` [s] after `decided` (clock).
         """
         board = self.board
         frames = self._encode(orders, self._clock.now())
@@ -201,22 +213,27 @@ class Loop:
         self.count(len(frames), sum([len(data) for _, data in frames]))
         if self._pass_time is not None:
             self._pass_time(self.period)
-        self.synced = now
-        delay = self._collect(now)
+        self.synced, self.just_woke = now, False
+        delay = self._collect(now, until)
         self.stats.missed += board.awaited
         timely = None if board.awaited <= 0 and not self._owed_for else self._timely()
         sample = self.sample(now)
         sample.timely, sample.delay = timely, delay
         return sample
 
-    def _collect(self, now: float) -> float:
+    def _collect(self, now: float, until: float) -> float:
         """Take in the replies to commands that left at `now`; how long they took [s], or what was waited for them."""
         board, clock, patience = self.board, self._clock, self._patience
         rested = self._rest
-        if board.awaited > 0 and rested >= LEAST_REST:
+        if unhurried := until > now + rested:
+            clock.sleep_until(until)
+            self.woke, self.just_woke = clock.now(), True
+        elif board.awaited > 0 and rested >= LEAST_REST:
             clock.sleep_until(now + rested)
         self._take_what_is_there()
         delay = clock.now() - now
+        if unhurried:
+            return delay
         if board.awaited <= 0:
             self._rest = EARLIER * rested
             return delay

@@ -380,7 +380,7 @@ class Link(Calibrations):
             command = setpoints.command(row)
             sample = self.cycle(command)
             yield sample
-            while not self._lock_step and sample.age.max() > patience:
+            while not self._lock_step and max(sample.age.tolist()) > patience:
                 sample = self.cycle(command)
 
     def run(self, controller: Controller) -> Samples:

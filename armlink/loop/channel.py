@@ -5,10 +5,13 @@ import select
 import socket
 import struct
 from collections import deque
+from itertools import islice
 from typing import Any
 
 _HEADER = struct.Struct("<I")
 CHUNK = 1 << 16
+AT_ONCE = 64
+"""Messages that leave with one call of the system."""
 MOST_SAMPLES = 15_000
 """Samples that wait for a reader which is busy: a minute at 250 Hz; older ones are dropped."""
 
@@ -55,20 +58,25 @@ class Channel:
     def flush(self, timeout: float = 0.0) -> bool:
         """Send what the socket takes, waiting at most `timeout` seconds for it; whether all has left. Raises Closed."""
         while self._waiting:
-            sample, content = self._waiting[0]
+            contents = [content for _, content in islice(self._waiting, AT_ONCE)]
+            contents[0] = contents[0][self._sent :]
             try:
-                self._sent += self._socket.send(memoryview(content)[self._sent :])
+                self._took(self._socket.sendmsg(contents))
             except BlockingIOError:
                 if timeout <= 0 or not select.select([], [self._socket], [], timeout)[1]:
                     return False
                 continue
             except OSError:
                 raise Closed from None
-            if self._sent == len(content):
-                self._waiting.popleft()
-                self._sent = 0
-                self._samples -= sample
         return True
+
+    def _took(self, size: int) -> None:
+        """So many more bytes have left."""
+        self._sent += size
+        while self._waiting and self._sent >= len(self._waiting[0][1]):
+            sample, content = self._waiting.popleft()
+            self._sent -= len(content)
+            self._samples -= sample
 
     def wait(self, timeout: float) -> None:
         """Return when something has come, or after `timeout` seconds."""

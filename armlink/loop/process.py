@@ -33,8 +33,9 @@ SWITCH = 5e-4
 """Longest time for which another thread of this process holds up a cycle [s]."""
 SILENT = 3.0
 """A job that says nothing for this long while joints are under torque control is gone [s]."""
-SENT_EVERY = 7e-3
-"""Samples wait for each other for this long at most [s]: waking the job costs as much as half a cycle."""
+TALK_EVERY = 7e-3
+"""Samples wait for each other for this long [s]: waking the job costs as much as half a cycle. While rows are played,
+the job is not heard more often either, and replies are waited for in those cycles alone."""
 ENABLING = ("enable", "recover")
 
 
@@ -48,8 +49,10 @@ class DriveLoop:
         self._source: Iterator[Sample] | None = None
         self._last: Command | None = None
         self._id, self._row, self._rows = 0, -1, 0
-        self._flushed = -math.inf
-        """When the job was last sent what waits for it [s]."""
+        self._talked = -math.inf
+        """When the job was last heard and sent what waits for it [s]."""
+        self._busy = False
+        """Whether rows are being played, and the job need be neither heard nor told."""
         self._controlled = False
         """Whether a controller is being run."""
         self.called = False
@@ -62,9 +65,10 @@ class DriveLoop:
     def run(self, ending: Ending) -> None:
         """Until the job has gone."""
         while not ending.due:
-            for message in self._channel.receive():
-                self._heard = time.monotonic()
-                self._handle(message)
+            if not self._busy:
+                for message in self._channel.receive():
+                    self._heard = time.monotonic()
+                    self._handle(message)
             if self._link.enabled:
                 self._cycle()
             else:
@@ -121,6 +125,10 @@ class DriveLoop:
 
     def _cycle(self) -> None:
         """One cycle: the next row, or the last command once more."""
+        now = time.monotonic()
+        due = now - self._talked >= TALK_EVERY
+        busy = not due and self._row + 2 < self._rows and not self._controlled
+        self._busy = self._link.commander.unhurried = busy
         try:
             row, sample = self._next()
         except Crossed as crossed:
@@ -131,11 +139,11 @@ class DriveLoop:
             self._channel.put(Stopped(error))
         else:
             self._channel.put((self._id, row, pack(sample, *self._link.sent)), True)
-            now = time.monotonic()
             self._mind_silence(now)
-            if row + 1 != self._rows and now - self._flushed < SENT_EVERY:
+            if not due and row + 1 != self._rows:
                 return
-            self._flushed = now
+            self._talked = now
+        self._busy = self._link.commander.unhurried = False
         self._channel.flush()
 
     def _next(self) -> tuple[int, Sample]:

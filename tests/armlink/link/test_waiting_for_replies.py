@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from armlink.arm_file import load_arm
 from armlink.bus.port import Frame
 from armlink.drives.orders import Power
@@ -16,10 +18,12 @@ BETWEEN = 1.3e-4
 class WaitedFor:
     """Time that also counts how often it was waited for."""
 
-    def __init__(self) -> None:
-        self.time, self.waits = 10.0, 0
+    def __init__(self, glance: float = 0.0) -> None:
+        """Each look at the clock takes `glance` [s], as computing does."""
+        self.time, self.waits, self.glance = 10.0, 0, glance
 
     def now(self) -> float:
+        self.time += self.glance
         return self.time
 
     def sleep_until(self, instant: float) -> None:
@@ -33,8 +37,10 @@ class OneByOne(EchoPort):
     def __init__(self, clock: WaitedFor, first: float) -> None:
         super().__init__(load_arm("sarcos"))
         self.clock, self.first, self.left = clock, first, 0.0
+        self.sent: list[float] = []
 
     def send_all(self, frames: Sequence[Frame]) -> None:
+        self.sent.append(self.clock.time)
         self.left = self.clock.time + self.first
         super().send_all(frames)
 
@@ -53,8 +59,8 @@ class OneByOne(EchoPort):
 class Held:
     """An arm that holds where it stands."""
 
-    def __init__(self) -> None:
-        self.clock = WaitedFor()
+    def __init__(self, glance: float = 0.0) -> None:
+        self.clock = WaitedFor(glance)
         self.port = OneByOne(self.clock, 3e-4)
         self.commander = echo_commander(load_arm("sarcos"), self.port, self.clock)
         for _ in range(3):
@@ -95,3 +101,45 @@ def test_replies_that_never_come_cost_no_more_than_their_share_of_the_period() -
     delays = held.delays(200)
     assert max(delays) <= 0.8 * period + 1e-9
     assert abs(held.clock.time - begun - 200 * period) < 2 * period
+
+
+def test_where_nobody_waits_for_the_sample_a_cycle_wakes_once_and_keeps_its_time() -> None:
+    """Replies are taken in before the next frames, by the time that this takes."""
+    held = Held(glance=2e-5)
+    period, stats = held.commander.period, held.commander.loop.stats
+    held.commander.unhurried = True
+    held.delays(200)
+    held.port.sent.clear()
+    missed, late, held.clock.waits = stats.missed, stats.late, 0
+    delays = held.delays(500)
+    between = np.diff(held.port.sent)
+    assert held.clock.waits == 500
+    assert (stats.missed, stats.late) == (missed, late)
+    assert abs(between.mean() - period) < 1e-6
+    assert between.min() > 0.95 * period
+    assert between.max() < 1.05 * period
+    assert max(delays) < period
+
+
+def test_in_a_hurry_again_it_waits_for_replies_and_for_its_turn() -> None:
+    held = Held(glance=2e-5)
+    period = held.commander.period
+    held.delays(300)
+    for unhurried in (True, False) * 20:
+        held.commander.unhurried = unhurried
+        held.port.sent.clear()
+        (delay,) = held.delays(1)
+        assert (delay > 0.9 * period) == unhurried
+    held.port.sent.clear()
+    held.delays(100)
+    assert abs(np.diff(held.port.sent) - period).max() < 1e-4
+
+
+def test_replies_that_nobody_waited_for_are_missed_where_they_did_not_come() -> None:
+    held = Held()
+    held.commander.max_age, held.commander.unhurried = 10.0, True
+    held.delays(20)
+    missed, begun, held.port.first = held.commander.loop.stats.missed, held.clock.time, 0.1
+    held.delays(100)
+    assert held.commander.loop.stats.missed - missed == 100 * N
+    assert abs(held.clock.time - begun - 100 * held.commander.period) < 2 * held.commander.period
