@@ -95,7 +95,7 @@ def _plan(arm_file: "ArmFile", seed: int, picture: Path | None) -> dict[str, Any
     from calib.creep.choice import sweep_motion
     from calib.creep.plan import creep_seconds, plan_creep
     from calib.plan.collisions import check_plan
-    from calib.plan.drawing import draw_plan, pass_seconds
+    from calib.plan.drawing import draw_plan, pass_seconds, stops_seconds
     from calib.plan.rough_gravity import guess_of_model
     from calib.plan.sweep_plan import plan_sweep
 
@@ -103,7 +103,7 @@ def _plan(arm_file: "ArmFile", seed: int, picture: Path | None) -> dict[str, Any
         planned = plan_creep(arm_file, seed=seed)
         print_plan(arm_file, planned)
         took = creep_seconds(planned)
-        print_lines([f"{len(planned.sweeps)} creeps both ways, about {took / 60:.0f} min a pass"])
+        print_lines([f"{len(planned.sweeps)} creeps both ways, about {_minutes(took)} a pass"])
         return {**planned.model_dump(mode="json"), "seconds": took, "picture": None}
     model = None if arm_file.model_path is None else model_arm(arm_file)
     planned = plan_sweep(arm_file, None if model is None else guess_of_model(model.arm, model.beta), seed=seed)
@@ -113,9 +113,14 @@ def _plan(arm_file: "ArmFile", seed: int, picture: Path | None) -> dict[str, Any
         draw_plan(arm_file, planned, picture)
         drawn = f"; drawn in {picture}"
     took, checked = pass_seconds(arm_file, planned), check_plan(arm_file, planned)
-    print_lines([f"about {took / 60:.0f} min a pass; {checked}{drawn}"])
+    before = f"{_minutes(stops_seconds(arm_file))} more for its stops before the first"
+    print_lines([f"about {_minutes(took)} a pass, {before}; {checked}{drawn}"])
     answer = {"seconds": took, "collisions": checked, "picture": None if picture is None else str(picture)}
     return {**planned.model_dump(mode="json"), **answer}
+
+
+def _minutes(seconds: float) -> str:
+    return f"{seconds / 60:.0f} min" if seconds >= 90 else f"{seconds:.0f} s"
 
 
 def _run(

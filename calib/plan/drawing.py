@@ -18,6 +18,8 @@ from gcomp.arrays import Array
 
 PRESS, READ = 1.0, 0.5
 """Seconds for creeping onto stops and pressing, and for settling and averaging of one reading: estimates."""
+SPEED_UP, STOP_CREEP = 0.3, 0.8
+"""Seconds lost to speeding up and slowing down on a way, and for creeping onto a stop and off it again: estimates."""
 COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#e377c2", "#8c564b")
 """One per joint."""
 GHOSTS = 4
@@ -55,6 +57,13 @@ def pass_seconds(arm_file: ArmFile, plan: SweepPlan) -> float:
         total += 2 * len(sweep.steps) * (travel(np.zeros(len(here)), one, sweep.acceleration) + READ)
         here = begin
     return total
+
+
+def stops_seconds(arm_file: ArmFile) -> float:
+    """Rough time in which each joint looks for both its stops, the others mid-range, before the first pass [s]."""
+    section, limits = sweep_section(arm_file), Limits.of(arm_file)
+    way = limits.upper - limits.lower  # half of it, all of it, half of it
+    return float(np.sum(2 * way / (section.travel_speed * limits.speed) + 6 * SPEED_UP + 2 * (PRESS + STOP_CREEP)))
 
 
 def draw_plan(arm_file: ArmFile, plan: SweepPlan, path: Path) -> None:

@@ -15,6 +15,7 @@ from armlink.errors import Refused
 from armlink.link.link import Link
 from calib.arm.drive_limits import Limits
 from calib.motion.encoder_check import EncoderFault
+from calib.plan.drawing import stops_seconds
 from calib.sweep.preflight import find_stops, listen
 from calib.sweep.thresholds import HOT
 from sim_bus.bus.lock_step import LockStepBus
@@ -101,12 +102,13 @@ def test_stops_are_found_where_the_arm_file_has_them_and_named_where_not() -> No
     wider = ARM.model_copy(update={"kinematics": ARM.kinematics.model_copy(update={"joints": tuple(rows)})})
     counted = []
     with enabled(simulated) as link:
-        listened = listen(link, ARM)
+        listened, begun = listen(link, ARM), simulated.time
         found = find_stops(link, ARM, listened, lambda done, total: counted.append((done, total)))
         limits = Limits.of(ARM)
         reading = (np.column_stack([limits.lower, limits.upper])) / simulated.truth.position_gain[:, None]
         np.testing.assert_allclose(found.stops, reading, atol=0.004)
         assert counted[-1] == (4, 4)
+        assert simulated.time - begun == pytest.approx(stops_seconds(ARM), rel=0.25)
         with pytest.raises(Refused, match=r"j2: blocked at .* its stop should be at"):
             find_stops(link, wider, listened)
 
