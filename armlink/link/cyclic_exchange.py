@@ -61,7 +61,7 @@ class Loop:
         self.woke = -math.inf
         """When it last began to take in replies that nobody waited for, by the clock [s]."""
         self.just_woke = False
-        """Whether that was after the last commands: all that had come is taken in."""
+        """Whether that was after the last commands."""
         self._alone = self.groups[0] if len(self.groups) == 1 else None
         traits = traits_of(self.groups, self.n)
         cadences = {each.cadence for each in traits}
@@ -141,8 +141,8 @@ class Loop:
     def drain(self) -> None:
         """Take in all that came between cycles; replies among it are late: newest known, but of no sample."""
         board = self.board
-        board.awaited = 0
-        if (not self.just_woke and self._take_what_is_there()) or self._owed_for:
+        complete, board.awaited = self.just_woke and board.awaited <= 0, 0
+        if (not complete and self._take_what_is_there()) or self._owed_for:
             self._keep_late()
         self.watch.cycle_ends(self.stats.frames - self._counted)
         self._counted = self.stats.frames
