@@ -66,9 +66,9 @@ def find_mapping(
 ) -> list[Finding]:
     """Findings on order, sign, zero and angle unit of a motion, one after the other.
 
-    `mounted` is the arm `as_mounted` in this motion, if it is known. `follows` are the channels (of `dq`, `q_cmd`) whose
-    columns agree with the positions' as they are recorded, so that what is wrong with a position is wrong with theirs.
-    All findings are corrected, or none is.
+    `mounted` is the arm `as_mounted` in this motion, if it is known. `follows` are the channels (of `dq`, `q_cmd`)
+    whose columns agree with the positions' as they are recorded, so that what is wrong with a position is wrong with
+    theirs. All findings are corrected, or none is.
     """
     fit = _as_an_arm(mounted or as_mounted(arm, motion), motion)
     taken: list[tuple[Hypothesis, float]] = []
