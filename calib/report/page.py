@@ -49,10 +49,11 @@ def render(path: Path, title: str, sections: Sequence[Section], subtitle: str = 
 
     environment = Environment(loader=PackageLoader("calib.report", "."), autoescape=False, trim_blocks=True)
     numbered = [(f"s{i}", section, [_figure(f) for f in section.figures]) for i, section in enumerate(sections, 1)]
-    page = environment.get_template("page.html.j2").render(
+    page = environment.get_template("page.html.j2").stream(
         title=escape(title), subtitle=escape(subtitle), sections=numbered, plotly=get_plotlyjs()
     )
-    path.write_text(page, encoding="utf-8")
+    with path.open("wb") as file:  # piece by piece: a page has ten megabytes
+        page.dump(file, encoding="utf-8")
 
 
 def _figure(figure: Any) -> str:

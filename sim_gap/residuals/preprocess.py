@@ -166,8 +166,9 @@ class Signals:
         return (np.abs(self.v) > CREEP).astype(float)
 
     def release(self) -> None:
-        """Free what is large and can be computed again."""
-        for name in ("_motion", "_wrenches", "gravity_columns", "_sensitivities"):
+        """Free what is large and can be computed again; of signals as they were read, not what is asked for again."""
+        once, again = ("_sensitivities", "_wrenches"), ("_motion", "gravity_columns")
+        for name in (*once, *(again if self.found is not None else ())):
             self.__dict__.pop(name, None)
 
     @property
