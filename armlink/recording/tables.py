@@ -3,6 +3,7 @@
 import csv
 import gzip
 import json
+import math
 import zlib
 from collections import Counter
 from collections.abc import Mapping
@@ -73,12 +74,13 @@ def load_csv(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> R
 def load_parquet(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> Recording:
     """Load Parquet with the columns of docs/formats.md, joint names from the schema's metadata; raises BadInput."""
     try:
-        schema = pa_parquet.read_schema(path)
-        require_width(schema.names, str(path))
-        header = _renamed(list(schema.names), columns, path)
-        wanted = {column: name for column, name in zip(header, schema.names, strict=True) if is_channel(column)}
-        require_size(8 * len(wanted) * pa_parquet.read_metadata(path).num_rows, str(path))
-        table = pa_parquet.read_table(path, columns=list(wanted.values())).select(list(wanted.values()))
+        with pa_parquet.ParquetFile(path) as file:  # `read_table` looks through data sets, and imports pandas
+            schema = file.schema_arrow
+            require_width(schema.names, str(path))
+            header = _renamed(list(schema.names), columns, path)
+            wanted = {column: name for column, name in zip(header, schema.names, strict=True) if is_channel(column)}
+            require_size(8 * len(wanted) * file.metadata.num_rows, str(path))
+            table = file.read(columns=list(wanted.values())).select(list(wanted.values()))
         table = table.rename_columns(list(wanted)).cast(pa.schema([(column, pa.float64()) for column in wanted]))
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise BadInput(f"{path}: {_first_line(error)}") from None
@@ -135,7 +137,7 @@ def save_parquet(recording: Recording, path: Path) -> None:
 
 
 def _recording(table: Any, header: list[str], source: str, names: tuple[str, ...]) -> Recording:
-    columns = {column: _numbers(table.column(column)) for column in table.column_names}
+    columns = {column: numbers(table.column(column)) for column in table.column_names}
     channels = channels_of(columns, source)
     ignored = [column for column in header if not is_channel(column)]
     warning = f"columns ignored because they are no channels: {', '.join(ignored)}" if ignored else ""
@@ -145,9 +147,19 @@ def _recording(table: Any, header: list[str], source: str, names: tuple[str, ...
     return Recording(t=columns["t"], names=names or default_names(n), warning=warning, **channels)  # type: ignore[arg-type]
 
 
-def _numbers(column: Any) -> Array:
-    values = column.to_numpy()
-    return np.asarray(values, dtype=np.float64)
+def numbers(column: Any) -> Array:
+    """Values of a chunked column of 64-bit numbers, NaN where it has none; Arrow's own conversions import pandas."""
+    return np.concatenate([np.zeros(0), *(_of_chunk(chunk) for chunk in column.chunks if len(chunk))])
+
+
+def _of_chunk(chunk: Any) -> Array:
+    there, values = chunk.buffers()
+    own = slice(chunk.offset, chunk.offset + len(chunk))
+    found = np.frombuffer(values, np.float64)[own]
+    if not chunk.null_count:
+        return found
+    known = np.unpackbits(np.frombuffer(there, np.uint8), bitorder="little")[own]
+    return np.where(known, found, math.nan)
 
 
 def _table(recording: Recording) -> Any:

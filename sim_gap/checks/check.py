@@ -14,7 +14,7 @@ from sim_gap.checks.clock import even_times, find_dropped, without_repeats
 from sim_gap.checks.finding import Finding
 from sim_gap.checks.joint_range import find_beyond_range, find_counts
 from sim_gap.checks.mapping import SURE, find_mapping
-from sim_gap.checks.rigid_fit import as_mounted, fit_rigid, motion_of
+from sim_gap.checks.rigid_fit import Motion, as_mounted, fit_rigid, motion_of
 from sim_gap.checks.torque_source import (
     find_absent,
     find_delay,
@@ -66,44 +66,53 @@ def check_recording(
     found = [*repeated, *jitter, *([] if repeated else find_dropped(recording)), *same]
     s = prepare(recording, arm, label)
     for channel in s.channels:
+        motion = motion_of(s, channel)
+        mounted = as_mounted(arm, motion)
         for look in (_unsigned, _mapping, _source):
-            findings = look(arm, s, channel, recording, stated)
+            findings = look(arm, mounted, s, motion, recording, stated)
             found += findings
             for finding in findings:
                 if not finding.corrected:
                     raise BadInput(f"{label}: {finding.sentence()}")
                 recording = _corrected(recording, finding, label)
-            if findings:
-                s = prepare(recording, arm, label)
+            if not findings:
+                continue
+            s = prepare(recording, arm, label)
             if channel not in s.channels:  # taken for another one
                 break
+            motion = motion_of(s, channel)
+            mounted = as_mounted(arm, motion)
     for finding in find_beyond_range(arm, recording, stated):
         raise BadInput(f"{label}: {finding.sentence()}")
     recording, velocity = sound_velocity(recording, stated)
     return recording, [*found, *velocity]
 
 
-def _unsigned(arm: RigidArm, s: Signals, channel: str, _: Recording, stated: Corrections) -> list[Finding]:
-    motion = motion_of(s, channel)
-    return find_unsigned(as_mounted(arm, motion), motion, stated)
+def _unsigned(
+    _arm: RigidArm, mounted: RigidArm, _: Signals, motion: Motion, _recording: Recording, stated: Corrections
+) -> list[Finding]:
+    return find_unsigned(mounted, motion, stated)
 
 
-def _mapping(arm: RigidArm, s: Signals, channel: str, recording: Recording, stated: Corrections) -> list[Finding]:
+def _mapping(
+    arm: RigidArm, mounted: RigidArm, s: Signals, motion: Motion, recording: Recording, stated: Corrections
+) -> list[Finding]:
     """Findings on clock, order, sign, zero and angle unit, in the order in which they are corrected."""
-    motion, follows = motion_of(s, channel), follows_position(recording)
-    mapping = find_mapping(arm, motion, stated, follows)
+    follows = follows_position(recording)
+    mapping = find_mapping(arm, motion, stated, follows, mounted)
     rate = (len(motion.q) - 1) / max(s.t[-1] - 2.0 * TRIM_S, 1e-9)
-    delay, fall = find_delay(as_mounted(arm, motion), motion, rate, stated)
+    delay, fall = find_delay(mounted, motion, rate, stated)
     if not delay or fall <= SURE + sum(finding.fall for finding in mapping):
         return mapping
     in_time = prepare(_corrected(recording, delay[0], s.label), arm, s.label)
-    return [*delay, *find_mapping(arm, motion_of(in_time, channel), stated, follows)]
+    return [*delay, *find_mapping(arm, motion_of(in_time, motion.channel), stated, follows)]
 
 
-def _source(arm: RigidArm, s: Signals, channel: str, _: Recording, stated: Corrections) -> list[Finding]:
+def _source(
+    arm: RigidArm, mounted: RigidArm, s: Signals, motion: Motion, _: Recording, stated: Corrections
+) -> list[Finding]:
     """Findings on the channel's scale and on what it is a reading of."""
-    motion = motion_of(s, channel)
-    fit = fit_rigid(as_mounted(arm, motion), motion)
+    fit = fit_rigid(mounted, motion)
     scale = find_scale(arm, fit, motion, stated) or find_absent(arm, fit, motion, stated)
     return [*scale, *find_source(fit, s, motion, stated)]
 

@@ -16,7 +16,17 @@ import numpy as np
 from armlink.recording.corrections import Corrections
 from gcomp.arrays import Array
 from sim_gap.checks.finding import Finding, Kind
-from sim_gap.checks.rigid_fit import STRONG_SHARE, Motion, RigidFit, as_mounted, changed, few_rows, fit_rigid
+from sim_gap.checks.rigid_fit import (
+    STRONG_SHARE,
+    Motion,
+    RigidFit,
+    as_mounted,
+    changed,
+    few_rows,
+    fit_model,
+    fit_models,
+    fit_rigid,
+)
 from sim_gap.model.rigid_body import RigidArm
 
 SURE = 0.3
@@ -51,13 +61,16 @@ class Hypothesis:
     change: Callable[[Motion], Motion]
 
 
-def find_mapping(arm: RigidArm, motion: Motion, stated: Corrections, follows: Sequence[str] = ()) -> list[Finding]:
+def find_mapping(
+    arm: RigidArm, motion: Motion, stated: Corrections, follows: Sequence[str] = (), mounted: RigidArm | None = None
+) -> list[Finding]:
     """Findings on order, sign, zero and angle unit of a motion, one after the other.
 
-    `follows` are the channels (of `dq`, `q_cmd`) whose columns agree with the positions' as they are recorded, so that
-    what is wrong with a position is wrong with theirs. All findings are corrected, or none is.
+    `mounted` is the arm `as_mounted` in this motion, if it is known. `follows` are the channels (of `dq`, `q_cmd`)
+    whose columns agree with the positions' as they are recorded, so that what is wrong with a position is wrong with
+    theirs. All findings are corrected, or none is.
     """
-    fit = _as_an_arm(arm, motion)
+    fit = _as_an_arm(mounted or as_mounted(arm, motion), motion)
     taken: list[tuple[Hypothesis, float]] = []
     doubted = False
     while not doubted and len(taken) < 2 * arm.n:
@@ -71,10 +84,10 @@ def find_mapping(arm: RigidArm, motion: Motion, stated: Corrections, follows: Se
     return [_finding(arm, hypothesis, fit, fall, sure) for hypothesis, fall in taken]
 
 
-def _as_an_arm(arm: RigidArm, motion: Motion) -> RigidFit:
+def _as_an_arm(mounted: RigidArm, motion: Motion) -> RigidFit:
     """The fit as it stands, gravity and springs included where they explain a joint: those are effects of the arm."""
-    mounted = as_mounted(arm, motion)
-    plain, sprung = fit_rigid(mounted, motion), fit_rigid(mounted, motion, springs=True)
+    model = mounted.torque(motion.q, motion.v, motion.a)
+    plain, sprung = fit_model(model, motion), fit_model(model, motion, springs=True)
     beside = (sprung.scale > PLAUSIBLE[0]) | (sprung.own_share < STRONG_SHARE)  # not in place of gravity
     return replace(plain, explained=np.where(beside & (sprung.explained > SPRUNG), sprung.explained, plain.explained))
 
@@ -83,9 +96,9 @@ def _best(
     arm: RigidArm, motion: Motion, fit: RigidFit, possible: Sequence[Hypothesis]
 ) -> tuple[Hypothesis, RigidFit, float, bool] | None:
     """The hypothesis that lowers the cost most, if by enough, and whether it is doubted; a doubted one comes last."""
-    best, most, few = None, {False: SURE, True: DOUBTED}, few_rows(motion)
-    for hypothesis in possible:
-        if float((fit.cost - fit_rigid(arm, hypothesis.change(few)).cost).sum()) < SCREENED * SURE:
+    best, most = None, {False: SURE, True: DOUBTED}
+    for hypothesis, screened in zip(possible, _screened(arm, few_rows(motion), possible), strict=True):
+        if float((fit.cost - screened.cost).sum()) < SCREENED * SURE:
             continue
         better = fit_rigid(arm, hypothesis.change(motion))
         fall = float(_told(hypothesis, motion.channel, better, fit.cost - better.cost).sum())
@@ -96,6 +109,15 @@ def _best(
             if best is None or best[3] or not doubted:
                 best = (hypothesis, better, fall, doubted)
     return best
+
+
+def _screened(arm: RigidArm, few: Motion, possible: Sequence[Hypothesis]) -> list[RigidFit]:
+    """The fits with each hypothesis; torques of all motions that they make in one recursion, for it costs by calls."""
+    motions = [few, *(hypothesis.change(few) for hypothesis in possible)]
+    moved = [k for k, motion in enumerate(motions) if k == 0 or motion.q is not few.q]
+    made = arm.torque(*(np.concatenate([getattr(motions[k], x) for k in moved]) for x in ("q", "v", "a")))
+    models = dict(zip(moved, np.split(made, len(moved)), strict=True))
+    return fit_models([(models.get(k, models[0]), motion) for k, motion in enumerate(motions)][1:])
 
 
 def _told(hypothesis: Hypothesis, channel: str, fit: RigidFit, falls: Array) -> Array:

@@ -87,16 +87,29 @@ def fit_rigid(arm: RigidArm, motion: Motion, springs: bool = False) -> RigidFit:
 
 def fit_model(model: Array, motion: Motion, springs: bool = False) -> RigidFit:
     """Fit the reading of every joint by a model torque (K, n); with `springs`, of either sign, too."""
+    return fit_models([(model, motion)], springs)[0]
+
+
+def fit_models(pairs: Sequence[tuple[Array, Motion]], springs: bool = False) -> list[RigidFit]:
+    """`fit_model` of several model torques and motions of one arm at once."""
+    moving = np.array([np.mean(np.abs(motion.v) > TURNING, axis=0) for _, motion in pairs])
+    sensed = np.array([[motion.channel == "tau"] for _, motion in pairs])
+    grams = np.array([_covariances(model, motion, springs) for model, motion in pairs])
+    fits = _joints(grams.reshape(-1, *grams.shape[2:]), (sensed | (moving < MOVING_SHARE)).ravel())
+    found = [RigidFit(*values.T) for values in fits.reshape(*moving.shape, -1)]
+    return [
+        replace(fit, friction=np.where(share < MOVING_SHARE, np.nan, fit.friction))
+        for fit, share in zip(found, moving, strict=True)
+    ]
+
+
+def _covariances(model: Array, motion: Motion, springs: bool) -> Array:
+    """Of model torque, direction, velocity, acceleration, position and reading of every joint, (n, 6, 6)."""
     turned = motion.q if springs else 0.0 * motion.q
     direction = np.clip(motion.v / TURNING, -1.0, 1.0)
     columns = np.stack([model, direction, motion.v, motion.a, turned, motion.reading]).transpose(2, 0, 1)
     columns = columns - columns.mean(-1, keepdims=True)
-    grams = columns @ columns.transpose(0, 2, 1) / len(model)
-    moving = np.mean(np.abs(motion.v) > TURNING, axis=0)
-    unsigned = (motion.channel == "tau") | (moving < MOVING_SHARE)
-    fits = [_joint(gram, both) for gram, both in zip(grams, unsigned.tolist(), strict=True)]
-    found = RigidFit(*(np.array(values) for values in zip(*fits, strict=True)))
-    return replace(found, friction=np.where(moving < MOVING_SHARE, np.nan, found.friction))
+    return np.asarray(columns @ columns.transpose(0, 2, 1) / len(model))
 
 
 def as_mounted(arm: RigidArm, motion: Motion) -> RigidArm:
@@ -122,45 +135,43 @@ def as_mounted(arm: RigidArm, motion: Motion) -> RigidArm:
     return arm if upside_down and opposite.sum() < found.sum() + 0.3 else turned
 
 
-def _joint(gram: Array, unsigned: bool) -> tuple[float, ...]:
-    """One joint from the covariance of model torque, direction, velocity, acceleration, position and reading, (6, 6).
+def _joints(grams: Array, unsigned: NDArray[np.bool_]) -> Array:
+    """The fields of `RigidFit` of J joints from their `_covariances` (J, 6, 6), (J, 6).
 
     A sensor on the link feels no gear, and a joint at rest no friction (`unsigned`): then the sign of those columns
     says nothing, and they have both.
     """
-    size = np.sqrt(np.diag(gram))
-    spread = float(size[-1])
-    if spread < 1e-9 or size[1] < 1e-6:  # nothing read, or a joint that rests
-        return 1.0, 1.0, 0.0, 0.0, np.nan, spread
+    size = np.sqrt(np.diagonal(grams, axis1=1, axis2=2))
+    spread = size[:, -1]
+    out = np.column_stack([np.tile([1.0, 1.0, 0.0, 0.0, np.nan], (len(grams), 1)), spread])
+    there = np.flatnonzero((spread >= 1e-9) & (size[:, 1] >= 1e-6))  # something is read, and the joint does not rest
     units = np.where(size > 1e-9, size, 1.0)
-    units[4] = size[4] if size[4] > 1e-6 else np.inf
-    scaled = gram / units / units[:, None]
+    units[:, 4] = np.where(size[:, 4] > 1e-6, size[:, 4], np.inf)
+    scaled = (grams / units[:, None] / units[:, :, None])[there]
     correlation, own = _partial(scaled)
-    free = _solved(scaled[:4, :4], scaled[:4, -1]) * spread / units[:4]
-    both = (1.0, -1.0)
-    signs = [(1.0,), *[both if unsigned else (1.0,)] * 3, *([both] if np.isfinite(units[4]) else [])]
-    coefficient, explained = _positive_fit(scaled, signs)
-    return (
-        explained,
-        coefficient * spread / float(units[0]),
-        correlation,
-        own * float(units[0]) / spread,
-        free[1],
-        spread,
-    )
+    free = _solved(scaled[:, :4, :4], scaled[:, :4, -1:])[:, 1, 0]
+    for k, j in enumerate(there.tolist()):
+        both = (1.0, -1.0)
+        signs = [(1.0,), *[both if unsigned[j] else (1.0,)] * 3, *([both] if np.isfinite(units[j, 4]) else [])]
+        coefficient, explained = _positive_fit(scaled[k], signs)
+        out[j, :2] = explained, coefficient * spread[j] / units[j, 0]
+    out[there, 2], out[there, 3] = correlation, own * units[there, 0] / spread[there]
+    out[there, 4] = free * spread[there] / units[there, 1]
+    return out
 
 
-def _partial(gram: Array) -> tuple[float, float]:
+def _partial(grams: Array) -> tuple[Array, Array]:
     """Correlation of the reading with the model given friction and rotor, and the standard deviation of the model's own
-    part."""
-    through = _solved(gram[1:4, 1:4], gram[1:4][:, [0, -1]])
-    left = gram[np.ix_([0, -1], [0, -1])] - gram[[0, -1], 1:4] @ through
-    own, rest = np.sqrt(np.maximum(np.diag(left), 0.0))
-    return float(left[0, 1] / (own * rest + 1e-12)), float(own)
+    part, (J,) each."""
+    through = _solved(grams[:, 1:4, 1:4], grams[:, 1:4][:, :, [0, -1]])
+    left = grams[:, [[0], [-1]], [0, -1]] - grams[:, [0, -1], 1:4] @ through
+    own, rest = np.sqrt(np.maximum(np.diagonal(left, axis1=1, axis2=2), 0.0)).T
+    return left[:, 0, 1] / (own * rest + 1e-12), own
 
 
-def _solved(gram: Array, side: Array) -> Array:
-    return np.asarray(np.linalg.lstsq(gram, side, rcond=1e-12)[0])
+def _solved(grams: Array, sides: Array) -> Array:
+    """Least squares of least norm from covariances (J, p, p) and (J, p, m), (J, p, m)."""
+    return np.asarray(np.linalg.pinv(grams, rcond=1e-12, hermitian=True) @ sides)
 
 
 def _positive_fit(gram: Array, signs: Sequence[tuple[float, ...]]) -> tuple[float, float]:

@@ -9,7 +9,7 @@ from armlink.recording.corrections import Corrections
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.checks.finding import Finding
-from sim_gap.checks.rigid_fit import FEW, FLOOR, Motion, RigidFit, fit_model
+from sim_gap.checks.rigid_fit import FEW, FLOOR, STRONG_CORRELATION, Motion, RigidFit, fit_model
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.residuals.preprocess import Signals
 
@@ -38,8 +38,13 @@ UNRELATED = 0.4
 
 
 def find_scale(arm: RigidArm, fit: RigidFit, motion: Motion, stated: Corrections) -> list[Finding]:
-    """A channel in another unit: the model's torque comes back with a coefficient that no arm has."""
+    """A channel in another unit: the model's torque comes back with a coefficient that no arm has.
+
+    One strong joint alone may carry a load: others that follow the model are asked too, a unit is that of all.
+    """
     strong = fit.strong & (fit.correlation > 0.0)
+    if strong.sum() == 1:
+        strong |= fit.correlation > STRONG_CORRELATION
     if stated.states("units", f"{motion.channel}_1") or not strong.any():
         return []
     scale = _weighted_median(fit.scale[strong], (fit.own_share * fit.spread)[strong])

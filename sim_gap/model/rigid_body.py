@@ -20,6 +20,8 @@ INERTIAL = ("mass", "mx", "my", "mz", "ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 Motion = tuple[list[Array], list[tuple[Array, Array, Array]]]
 """Rotation of each link to its parent (3, 3, K); angular velocity, angular acceleration and acceleration of its origin
 less gravity, in its own frame, (3, K) each."""
+Wrenches = tuple[list[Array], list[Array]]
+"""Force [N] and couple about its origin [N·m] that each joint passes on to its link, in its frame, (3, K) each."""
 
 
 @dataclass(frozen=True)
@@ -93,21 +95,25 @@ class RigidArm:
 
         q, v, a (K, n) in rad, rad/s, rad/s²; gravity (3,) in the base frame, by default the model's.
         """
-        turns, moves = self.motion(q, v, a, gravity)
+        motion = self.motion(q, v, a, gravity)
+        _, couples = self.wrenches(motion)
+        return np.stack([axis @ couple for axis, couple in zip(self.axis, couples, strict=True)], axis=1)
+
+    def wrenches(self, motion: Motion) -> Wrenches:
+        """What each joint passes on to the links that it carries so that they move so."""
+        turns, moves = motion
         forces, couples = [], []
         for j, (omega, alpha, push) in enumerate(moves):
-            mass, moment, inertia = self.inertial[j, 0], self.inertial[j, 1:4], _symmetric(self.inertial[j, 4:])
-            forces.append(mass * push + _cross(alpha, moment) + _cross(omega, _cross(omega, moment)))
-            couples.append(inertia @ alpha + _cross(omega, inertia @ omega) - _cross(push, moment))
-        tau: Array = np.empty_like(q)
+            mass, moment, inertia = self.inertial[j, 0], self.inertial[j, 1:4], symmetric(self.inertial[j, 4:])
+            forces.append(mass * push + cross(alpha, moment) + cross(omega, cross(omega, moment)))
+            couples.append(inertia @ alpha + cross(omega, inertia @ omega) - cross(push, moment))
         for j in reversed(range(self.n)):
-            tau[:, j] = self.axis[j] @ couples[j]
             up = self.parent[j]
             if up >= 0:
-                force = _out(turns[j], forces[j])
+                force = out_of(turns[j], forces[j])
                 forces[up] = forces[up] + force
-                couples[up] = couples[up] + _out(turns[j], couples[j]) - _cross(force, self.offset[j])
-        return tau
+                couples[up] = couples[up] + out_of(turns[j], couples[j]) - cross(force, self.offset[j])
+        return forces, couples
 
     def regressor(self, q: Array, v: Array, a: Array, gravity: Array | None = None) -> Array:
         """Columns of `torque` in the inertial parameters: τ = Σ_j Y[:, i, j] · inertial[j]; (K, n, n, 10)."""
@@ -128,7 +134,7 @@ class RigidArm:
         i = link
         while i >= 0:
             axis = np.broadcast_to(np.einsum("ijk,j->ik", down, self.axis[i]), (3, rows))
-            out[i] = _link_columns(axis, _cross(axis, np.broadcast_to(lever, (3, rows))), *moves[link])
+            out[i] = _link_columns(axis, cross(axis, np.broadcast_to(lever, (3, rows))), *moves[link])
             down = np.einsum("ijk,ljk->ilk", down, turns[i])
             lever = lever + np.einsum("ijk,j->ik", down, self.offset[i])
             i = self.parent[i]
@@ -146,10 +152,10 @@ class RigidArm:
             omega, alpha, push = moves[self.parent[j]] if self.parent[j] >= 0 else base
             if self.parent[j] >= 0:
                 lever = self.offset[j]
-                push = push + _cross(alpha, lever) + _cross(omega, _cross(omega, lever))
-            omega, alpha, push = _in(turn, omega), _in(turn, alpha), _in(turn, push)
+                push = push + cross(alpha, lever) + cross(omega, cross(omega, lever))
+            omega, alpha, push = into(turn, omega), into(turn, alpha), into(turn, push)
             spin = self.axis[j][:, None] * v[:, j]
-            alpha = alpha + self.axis[j][:, None] * a[:, j] + _cross(omega, spin)
+            alpha = alpha + self.axis[j][:, None] * a[:, j] + cross(omega, spin)
             turns.append(turn)
             moves.append((omega + spin, alpha, push))
         return turns, moves
@@ -168,15 +174,15 @@ def _link_columns(axis: Array, lever: Array, omega: Array, alpha: Array, push: A
     """Ten columns of one link for one joint: axis·(torque) + lever·(force), all in the link's frame, (10, K)."""
     out = np.empty((10, axis.shape[1]))
     out[0] = (lever * push).sum(0)
-    out[1:4] = _cross(lever, alpha) + _cross(_cross(lever, omega), omega) + _cross(push, axis)
-    gyro = _cross(axis, omega)
+    out[1:4] = cross(lever, alpha) + cross(cross(lever, omega), omega) + cross(push, axis)
+    gyro = cross(axis, omega)
     for column, (r, c) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)), start=4):
         value = axis[r] * alpha[c] + gyro[r] * omega[c]
         out[column] = value if r == c else value + axis[c] * alpha[r] + gyro[c] * omega[r]
     return out
 
 
-def _cross(x: Array, y: Array) -> Array:
+def cross(x: Array, y: Array) -> Array:
     """Cross product of vectors (3, K) with vectors (3, K) or one vector (3,)."""
     out = np.empty_like(x)
     for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
@@ -185,12 +191,12 @@ def _cross(x: Array, y: Array) -> Array:
     return out
 
 
-def _in(turn: Array, vector: Array) -> Array:
+def into(turn: Array, vector: Array) -> Array:
     """Into the rotated frame: Rᵀ x for rotations (3, 3, K) and vectors (3, K)."""
     return np.asarray(np.einsum("jik,jk->ik", turn, vector))
 
 
-def _out(turn: Array, vector: Array) -> Array:
+def out_of(turn: Array, vector: Array) -> Array:
     """Out of the rotated frame: R x."""
     return np.asarray(np.einsum("ijk,jk->ik", turn, vector))
 
@@ -204,7 +210,7 @@ def _turned(start: Array, axis: Array, angle: Array) -> Array:
     return np.asarray(parts[0][..., None] + parts[1][..., None] * sine + parts[2][..., None] * versine)
 
 
-def _symmetric(six: Array) -> Array:
+def symmetric(six: Array) -> Array:
     """(…, 6) as xx, xy, xz, yy, yz, zz → (…, 3, 3)."""
     return np.asarray(six[..., [[0, 1, 2], [1, 3, 4], [2, 4, 5]]])
 

@@ -24,6 +24,12 @@ ABOVE = 1.5
 SHARP, ASIDE, BESIDE = 30.0, 3, 20
 """A line exceeds the median of the bins from ASIDE to BESIDE bins away by this factor."""
 
+HUMP, NEAR, FAR = 8.0, 1.3, 1.8
+"""A resonance exceeds the median on either side, between these multiples of its frequency, by this factor."""
+SMOOTH, FEW_BINS, BROAD = 5, 6, 2.0
+"""Bins over which a spectrum is averaged to look for a resonance; fewest bins on either side to judge it by; multiple
+of a line's power from which it counts before the line."""
+
 Mask = NDArray[np.bool_]
 
 
@@ -99,13 +105,13 @@ def slow(data: ResidualSet, explained: Mapping[Row, Array], friction: Array, kno
 
 
 def fast(data: ResidualSet, recordings: Sequence[Recording]) -> list[Location]:
-    """Lines above the pass band: the largest of each channel and joint, with its frequency and RMS [N·m]."""
+    """Lines and resonances above the pass band: the largest of each channel and joint, with frequency and RMS [N·m]."""
     names, best = data.signals[0].arm.names, dict[Row, Location]()
     for recording in recordings:
         for channel, name in CHANNELS.items():
             values = getattr(recording, name)
             for joint in range(len(names)) if values is not None else ():
-                found = _line(recording.t, values[:, joint])
+                found = _peak(recording.t, values[:, joint])
                 row = (channel, joint)
                 if found and (row not in best or found[1] > best[row].rms):
                     hz, rms, share = found
@@ -115,8 +121,9 @@ def fast(data: ResidualSet, recordings: Sequence[Recording]) -> list[Location]:
     return [each for each in best.values() if each.clear]
 
 
-def _line(t: Array, values: Array) -> tuple[float, float, float] | None:
-    """Frequency [Hz], RMS and share of the power above the band of the sharpest line there; None without one."""
+def _peak(t: Array, values: Array) -> tuple[float, float, float] | None:
+    """Frequency [Hz], RMS and share of the power above the band of the sharpest line there, else of the highest
+    resonance; None without one."""
     there = np.isfinite(values)
     if there.sum() < 1024:
         return None
@@ -124,18 +131,48 @@ def _line(t: Array, values: Array) -> tuple[float, float, float] | None:
     step = float(np.median(np.diff(own)))
     even = np.arange(own[0], own[-1], step)
     frequency, density = spectrum(np.interp(even, own, x), 1.0 / step)
+    line, hump = _line(frequency, density), _resonance(frequency, density)
+    found = hump if line is None or (hump is not None and hump[1] > BROAD * line[1]) else line
+    if found is None:
+        return None
+    hz, power = found
+    total = float(np.sum(density[frequency > BAND_HZ]) * frequency[1])
+    return hz, float(np.sqrt(max(power, 0.0))), min(power / max(total, 1e-300), 1.0)
+
+
+def _line(frequency: Array, density: Array) -> tuple[float, float] | None:
+    """Frequency and power of the highest bin, if it stands alone."""
     bins = np.flatnonzero(frequency > ABOVE * BAND_HZ)
     bins = bins[(bins >= BESIDE) & (bins < len(density) - ASIDE)]
     if len(bins) < 2 * BESIDE:
         return None
     peak = int(bins[np.argmax(density[bins])])
     around = np.r_[peak - BESIDE : peak - ASIDE, peak + ASIDE + 1 : min(peak + BESIDE + 1, len(density))]
-    level, width = float(np.median(density[around])), float(frequency[1])
+    level = float(np.median(density[around]))
     if density[peak] < SHARP * level:
         return None
-    power = float(np.sum(density[peak - 2 : peak + 3] - level)) * width
-    total = float(np.sum(density[frequency > BAND_HZ])) * width
-    return float(frequency[peak]), float(np.sqrt(max(power, 0.0))), min(power / max(total, 1e-300), 1.0)
+    return float(frequency[peak]), float(np.sum(density[peak - 2 : peak + 3] - level) * frequency[1])
+
+
+def _resonance(frequency: Array, density: Array) -> tuple[float, float] | None:
+    """Frequency and power of the highest hump that falls off on either side, too broad for a line."""
+    smooth = np.convolve(density, np.ones(SMOOTH) / SMOOTH, mode="same")
+    highest = np.r_[False, (smooth[1:-1] >= smooth[:-2]) & (smooth[1:-1] > smooth[2:]), False]
+    best: tuple[float, float] | None = None
+    for peak in np.flatnonzero(highest & (frequency > ABOVE * BAND_HZ)).tolist():
+        f = frequency[peak]
+        below = (frequency >= max(f / FAR, BAND_HZ)) & (frequency <= f / NEAR)
+        above = (frequency >= f * NEAR) & (frequency <= f * FAR)
+        if min(below.sum(), above.sum()) < FEW_BINS:
+            continue
+        level = max(float(np.median(density[side])) for side in (below, above))
+        if smooth[peak] < HUMP * level:
+            continue
+        own = (frequency > f / NEAR) & (frequency < f * NEAR)
+        power = float(np.sum(density[own] - level) * frequency[1])
+        if smooth[peak] == smooth[own].max() and (best is None or power > best[1]):
+            best = float(f), power
+    return best
 
 
 def _known(data: ResidualSet, s: Signals, row: Row) -> Mask:

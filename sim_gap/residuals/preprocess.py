@@ -16,7 +16,8 @@ from scipy.signal import butter, sosfiltfilt, sosfreqz
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
-from sim_gap.model.rigid_body import CREEP, Motion, RigidArm
+from sim_gap.model.rigid_body import CREEP, Motion, RigidArm, Wrenches
+from sim_gap.model.torque_slopes import torque_slopes
 from sim_gap.residuals.channel_noise import band_noise
 from sim_gap.residuals.disturbances import Disturbance
 from sim_gap.residuals.resampling import SLOW_HZ, bridged, coverage, low_pass, thinner
@@ -140,21 +141,14 @@ class Signals:
     def _motion(self) -> Motion:
         return self.arm.motion(self.q, self.v, self.a)
 
+    @cached_property
+    def _wrenches(self) -> Wrenches:
+        return self.arm.wrenches(self._motion)
+
     def sensitivity(self, joint: int) -> tuple[Array, Array, Array]:
         """Derivatives of the model torque with respect to one joint's position, velocity, acceleration, (K, n) each."""
         if joint not in self._sensitivities:
-            unit = np.eye(self.n)[joint]
-            moved = [
-                (
-                    self.arm.torque(self.q + h * unit * (k == 0), self.v + h * unit * (k == 1), self.a)
-                    - self.arm.torque(self.q - h * unit * (k == 0), self.v - h * unit * (k == 1), self.a)
-                )
-                / (2.0 * h)
-                for k, h in ((0, 1e-5), (1, 1e-3))
-            ]
-            still = np.zeros_like(self.q)
-            inertia = self.arm.torque(self.q, still, still + unit, np.zeros(3))
-            self._sensitivities[joint] = moved[0], moved[1], inertia
+            self._sensitivities[joint] = torque_slopes(self.arm, self._motion, self._wrenches, self.v, joint)
         return self._sensitivities[joint]
 
     @cached_property
@@ -172,8 +166,9 @@ class Signals:
         return (np.abs(self.v) > CREEP).astype(float)
 
     def release(self) -> None:
-        """Free what is large and can be computed again."""
-        for name in ("_motion", "gravity_columns", "_sensitivities"):
+        """Free what is large and can be computed again; of signals as they were read, not what is asked for again."""
+        once, again = ("_sensitivities", "_wrenches"), ("_motion", "gravity_columns")
+        for name in (*once, *(again if self.found is not None else ())):
             self.__dict__.pop(name, None)
 
     @property

@@ -35,9 +35,8 @@ def stuck_intervals(
     starts, ends = np.r_[0, changes + 1], np.r_[changes, len(reading) - 1]
     out = []
     least = max(MOVED * float(np.ptp(model)), MOVED_NM)
-    for a, b in zip(starts.tolist(), ends.tolist(), strict=True):
-        if t[b] - t[a] < LONGEST_S:
-            continue
+    long = t[ends] - t[starts] >= LONGEST_S
+    for a, b in zip(starts[long].tolist(), ends[long].tolist(), strict=True):
         natural = len(changes) > 0 and (reading[a] == 0.0 or abs(reading[a]) >= np.abs(reading).max())
         meanwhile = (time >= t[a]) & (time <= t[b]) & ~held
         if not natural and meanwhile.any() and np.ptp(model[meanwhile]) > least:

@@ -102,10 +102,9 @@ class ColumnStore:
         return [about(s, self.data.layout, self.values) for s in self.data.signals]
 
     def release(self) -> None:
-        """Free what the columns were computed from, apart from what belongs to the recordings as they were read."""
+        """Free what the columns were computed from and no others will be."""
         for one in self.__dict__.get("about", ()):
-            if one.signals.found is not None:
-                one.signals.release()
+            one.signals.release()
 
     def keep(self, terms: Collection[Term]) -> None:
         """Forget the columns of all other terms; they are evaluated again when they are asked for."""

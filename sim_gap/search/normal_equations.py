@@ -110,17 +110,20 @@ class NormalEquations:
         return np.concatenate([*(self.at[term] for term in terms), *beside, np.zeros(0, np.intp)]).astype(np.intp)
 
     def solve(self, index: NDArray[np.intp], gram: Array, side: Array) -> Array:
-        """Coefficients at `index` from their weighted sums (p, p) and (p,), with the prior."""
+        """Coefficients at `index` from their weighted sums (…, p, p) and (…, p), with the prior."""
         matrix, right = gram + np.diag(self.prior[index]), side + self.pull[index]
-        scale = 1.0 / np.sqrt(np.diag(matrix))
-        return np.asarray(
-            scale * np.linalg.solve(matrix * scale * scale[:, None] + 1e-10 * np.eye(len(index)), scale * right)
-        )
+        scale = 1.0 / np.sqrt(np.diagonal(matrix, axis1=-2, axis2=-1))
+        scaled = matrix * scale[..., None, :] * scale[..., None] + 1e-10 * np.eye(len(index))
+        return np.asarray(scale * np.linalg.solve(scaled, (scale * right)[..., None])[..., 0])
 
     def mean_square(self, index: NDArray[np.intp], coefficients: Array) -> Array:
         """Mean square of the residual per row after subtracting the terms, (R,)."""
-        errors = sum((self.errors(index, coefficients, fold) for fold in range(self.folds)), np.zeros(len(self.rows)))
-        return np.asarray(errors / np.maximum(self.count.sum(0), 1.0))
+        squares = self.square.sum(0)
+        for r, block in enumerate(self.blocks):
+            there = block.position[index] >= 0
+            at, c = block.position[index[there]], coefficients[there]
+            squares[r] += c @ (block.whole[at[:, None], at] @ c - 2.0 * block.side.sum(0)[at])
+        return np.asarray(np.maximum(squares, 0.0) / np.maximum(self.count.sum(0), 1.0))
 
     def freedom(self, term: Term) -> float:
         """Effective number of a term's coefficients: those whose plausible size would show in the data; at least 1."""
@@ -151,16 +154,17 @@ class NormalEquations:
         sums = [change[b.index] @ b.whole @ change[b.index] for b in self.blocks]
         return np.asarray(np.array(sums) / np.maximum(self.count.sum(0), 1.0))
 
-    def errors(self, index: NDArray[np.intp], coefficients: Array, fold: int) -> Array:
-        """Sum of squares per row over one fold after subtracting the terms, (R,)."""
-        out = self.square[fold].copy()
-        for r, block in enumerate(self.blocks):
-            at = block.position[index]
-            there = at >= 0
-            at, c = at[there], coefficients[there]
-            if len(at):
-                out[r] += c @ (block.gram[fold][at[:, None], at] @ c - 2.0 * block.side[fold][at])
-        return np.asarray(np.maximum(out, 0.0))
+    def parts(self, index: NDArray[np.intp]) -> "list[_Part]":
+        """What the columns `index` sum up to in each row."""
+        return [block.part(index) for block in self.blocks]
+
+    def errors(self, parts: "Sequence[_Part]", coefficients: Array) -> Array:
+        """Mean square per row after subtracting columns with coefficients of each fold's own (F, p), (R,)."""
+        squares = self.square.copy()
+        for r, part in enumerate(parts):
+            c = coefficients[:, part.there]
+            squares[:, r] += np.sum(c * ((part.gram @ c[..., None])[..., 0] - 2.0 * part.side), axis=1)
+        return np.asarray(np.maximum(squares, 0.0).sum(0) / np.maximum(self.count.sum(0), 1.0))
 
 
 @dataclass(frozen=True)
@@ -186,6 +190,23 @@ class _Block:
         """Gram matrix over all folds, (p, p)."""
         return np.asarray(self.gram.sum(0))
 
+    def part(self, index: NDArray[np.intp]) -> "_Part":
+        """The sums of some columns."""
+        there = np.flatnonzero(self.position[index] >= 0)
+        at = self.position[index[there]]
+        return _Part(there, self.gram[:, at[:, None], at], self.side[:, at])
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Sums of one row over those of some columns that touch it."""
+
+    there: NDArray[np.intp]
+    """Positions of these columns among those asked for, (q,)."""
+    gram: Array
+    side: Array
+    """(F, q, q) and (F, q)."""
+
 
 class Weighted:
     """Normal equations with given row weights: fit, cross-validation, screening."""
@@ -206,24 +227,18 @@ class Weighted:
 
     def cross_validated(self, terms: Sequence[Term]) -> Array:
         """Mean square per row, each fold predicted from a fit to the others, (R,)."""
-        normal, index = self.normal, self.normal.index(terms)
-        gram, side = self._without_fold(index)
-        errors = np.zeros(len(normal.rows))
-        for fold in range(normal.folds):
-            errors += normal.errors(index, normal.solve(index, gram[fold], side[fold]), fold)
-        return np.asarray(errors / np.maximum(normal.count.sum(0), 1.0))
+        index = self.normal.index(terms)
+        parts = self.normal.parts(index)
+        return self.normal.errors(parts, self.normal.solve(index, *self._without_fold(index, parts)))
 
-    def _without_fold(self, index: NDArray[np.intp]) -> tuple[Array, Array]:
+    def _without_fold(self, index: NDArray[np.intp], parts: Sequence[_Part]) -> tuple[Array, Array]:
         """Weighted sums over all folds but one, for each fold, of the columns `index`, (F, p, p) and (F, p)."""
         folds, size = self.normal.folds, len(index)
         gram, side = np.zeros((folds, size, size)), np.zeros((folds, size))
-        for weight, block in zip(self.weights, self.normal.blocks, strict=True):
-            at = block.position[index]
-            there = np.flatnonzero(at >= 0)
-            if weight > 0.0 and len(there):
-                at = at[there]
-                gram[:, there[:, None], there] += weight * block.gram[:, at[:, None], at]
-                side[:, there] += weight * block.side[:, at]
+        for weight, part in zip(self.weights, parts, strict=True):
+            if weight > 0.0 and len(part.there):
+                gram[:, part.there[:, None], part.there] += weight * part.gram
+                side[:, part.there] += weight * part.side
         return self.gram[np.ix_(index, index)] - gram, self.side[index] - side
 
     def screen(self, terms: Sequence[Term], candidates: Sequence[Term]) -> list[tuple[float, Term]]:

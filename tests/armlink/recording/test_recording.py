@@ -1,9 +1,13 @@
 """Recordings: what is written comes back, and what cannot be used is said in one line."""
 
 import contextlib
+import math
+import subprocess
+import sys
 import zlib
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -11,6 +15,7 @@ from hypothesis import strategies as st
 from armlink.errors import BadInput
 from armlink.recording.files import load_recording, save_recording
 from armlink.recording.recording import Recording, slice_rows
+from armlink.recording.tables import numbers
 
 
 @pytest.fixture
@@ -138,3 +143,19 @@ def test_a_recording_of_wrong_shape_is_not_saved(recording, tmp_path):
     wrong = Recording(t=recording.t, position=recording.position, torque=recording.torque[:5])
     with pytest.raises(BadInput, match=r"channel torque has shape \(5, 3\), expected \(200, 3\)"):
         save_recording(wrong, tmp_path / "r.csv")
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_no_second_table_library_is_imported_to_load_a_table(recording, tmp_path, suffix):
+    """Arrow's `to_numpy` imports pandas where it is installed: a quarter of a second, 35 MB."""
+    save_recording(recording, tmp_path / f"a{suffix}")
+    code = f"import sys; from armlink.recording.files import load_recording; load_recording('a{suffix}')"
+    code += "; sys.exit('pandas' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=False).returncode == 0
+
+
+def test_numbers_of_a_column_in_pieces_and_with_gaps():
+    whole = pa.array([9.0, 1.0, None, 3.0])
+    column = pa.chunked_array([whole.slice(1), pa.array([], pa.float64()), pa.array([4.0, math.nan])])
+    np.testing.assert_array_equal(numbers(column), [1.0, math.nan, 3.0, 4.0, math.nan])
+    assert numbers(pa.chunked_array([], pa.float64())).shape == (0,)

@@ -11,8 +11,15 @@ from wrong_arms import THREE, motion
 from armlink.recording.corrections import AS_IT_IS, parse_corrections
 from armlink.recording.recording import Recording
 from sim_gap.checks.check import check_recording
-from sim_gap.checks.rigid_fit import Motion, fit_rigid
-from sim_gap.checks.torque_source import find_absent, find_delay, find_gain_command, find_same, find_source
+from sim_gap.checks.rigid_fit import Motion, RigidFit, fit_rigid
+from sim_gap.checks.torque_source import (
+    find_absent,
+    find_delay,
+    find_gain_command,
+    find_same,
+    find_scale,
+    find_source,
+)
 from sim_gap.model.load import load_model
 
 RATE, LATE = 25.0, 0.4
@@ -41,6 +48,18 @@ def test_a_motion_that_repeats_does_not_tell_by_how_many_periods():
     v, a = 0.5 * w * np.cos(w * t[:, None] + phase), -w * w * q
     findings, _ = find_delay(*late(t, q, v, a), RATE, AS_IT_IS)
     assert not findings
+
+
+@pytest.mark.parametrize(("others", "found"), [((1.9, 1.6), 0), ((2.6, 2.5), 1)])
+def test_a_load_at_the_last_joint_is_no_unit(others: tuple[float, float], found: int):
+    """A body of 1.5 kg on a link of 1.5 kg: the one strong joint reads 2.4 times the model, the others do not."""
+    arm = load_model(mujoco.MjModel.from_xml_string(THREE)).arm
+    scale, own, spread = np.array([*others, 2.43]), np.array([0.06, 0.07, 0.32]), np.array([16.0, 3.7, 2.1])
+    correlation, explained = np.array([0.93, 0.98, 0.99]), np.full(3, 0.99)
+    fit = RigidFit(explained, scale, correlation, own, np.zeros(3), spread)
+    assert fit.strong.tolist() == [False, False, True]
+    read = Motion(*np.zeros((4, 10, 3)), "tau")
+    assert len(find_scale(arm, fit, read, AS_IT_IS)) == found
 
 
 @pytest.mark.parametrize(("friction", "found"), [(0.0, 0), (3.0, 1)])

@@ -9,7 +9,7 @@ from sim_gap.residuals.preprocess import prepare
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.model_selection import candidates, without_doubtful
-from sim_gap.search.normal_equations import NormalEquations
+from sim_gap.search.normal_equations import NormalEquations, Weighted
 from sim_gap.search.stepwise import Search
 from sim_gap.search.term import Term
 
@@ -42,3 +42,35 @@ def test_a_term_that_explains_its_rows_stays():
     normal = normal_equations(Wrong(payload=0.5))
     search = Search(normal, [payload(normal)])
     assert without_doubtful(search) is search
+
+
+def test_errors_of_folds_predicted_from_the_others_are_those_of_fits_one_by_one():
+    """Least squares of the columns themselves, weighted and with the prior."""
+    normal = normal_equations(Wrong(payload=0.5, offset=np.array([0.4, 0.0, 0.0])))
+    terms = [term for term in normal.terms if term.effect in ("torque.offset", "link.mass_moment")]
+    data, store, rows = normal.store.data, normal.store, normal.rows
+    weighted = Weighted(normal, np.zeros(len(rows)))
+    squares = np.zeros(len(rows))
+    for fold in range(normal.folds):
+        stacked = [(store.wide(terms, row, normal.fixed), data.values[row], data.valid[row]) for row in rows]
+        roots = np.sqrt(weighted.weights)
+        x = np.concatenate([w * a[v & (data.folds != fold)] for w, (a, _, v) in zip(roots, stacked, strict=True)])
+        y = np.concatenate([w * b[v & (data.folds != fold)] for w, (_, b, v) in zip(roots, stacked, strict=True)])
+        index = normal.index(terms)
+        root = np.sqrt(normal.prior[index])
+        c = np.linalg.lstsq(np.vstack([x, np.diag(root)]), np.concatenate([y, normal.pull[index] / root]), rcond=None)[
+            0
+        ]
+        for r, (a, b, v) in enumerate(stacked):
+            pick = v & (data.folds == fold)
+            squares[r] += np.sum((b[pick] - a[pick] @ c) ** 2)
+    np.testing.assert_allclose(weighted.cross_validated(terms), squares / normal.count.sum(0), rtol=1e-5)
+
+
+def test_what_columns_were_computed_from_is_freed_with_them():
+    normal = normal_equations(Wrong(payload=0.5))
+    (signals,) = normal.store.data.signals
+    signals.sensitivity(0)
+    normal.store.release()
+    assert "_sensitivities" not in vars(signals)
+    assert "_wrenches" not in vars(signals)
