@@ -134,7 +134,8 @@ def _ordered(
 ) -> Iterator[tuple[Group, Fit]]:
     """The groups, each the one that lowers the training gap most beside those before it, with the fit up to there.
 
-    A group that was worth less than another beside fewer groups is not tried again until that one is worth less too.
+    A group that was worth less than another beside fewer groups is not tried again until that one is worth less too,
+    or until an effect that it needs is there.
     """
     worth = {group: float("inf") for group in groups}
     fresh: dict[Group, Fit] = {}
@@ -145,11 +146,16 @@ def _ordered(
             current = fresh[group]
             chosen.append(group)
             del worth[group]
+            worth |= {other: float("inf") for other in worth if group[0] in _needs(other)}
             fresh = {}
             yield group, current
         else:
             fresh[group] = with_only([*chosen, group])
             worth[group] = _worth(search, current, fresh[group], margin)
+
+
+def _needs(group: Group) -> tuple[str, ...]:
+    return EFFECTS[group[0]].needs if group[0] in EFFECTS else ()
 
 
 def _worth(search: Search, current: Fit, trial: Fit, margin: Array) -> float:
