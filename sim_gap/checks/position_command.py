@@ -11,6 +11,7 @@ from armlink.recording.recording import TORQUE_CHANNELS, Recording
 from gcomp.arrays import Array
 from sim_gap.checks.clock import even_times, find_dropped, without_repeats
 from sim_gap.checks.finding import Finding
+from sim_gap.checks.held_columns import exchange_option
 from sim_gap.checks.joint_range import find_beyond_range, find_counts, find_far
 from sim_gap.model.rigid_body import RigidArm
 
@@ -69,15 +70,17 @@ def _require_pairs(recording: Recording, label: str, stated: Corrections) -> Non
     if len(x) < 20:
         return
     match, slope = _match(x, y), _slope(x, y)
+    holds = _of_others(x, match, stated)
     for j, name in enumerate(recording.names):
         if x[:, j].std() < MOVES or stated.states("columns", f"q_cmd_{j + 1}"):
             continue
-        best = int(np.nanargmax(np.abs(match[j])))
         column = f"q_cmd_{j + 1}"
-        if best != j and abs(match[j, best]) > CLEARLY and abs(match[j, j]) < FOLLOWS:
+        if (other := holds.get(j)) is not None:
+            order = exchange_option("q_cmd", holds)
+            remedy = f"give the order, {order}" if order else f"--map {column}=COLUMN, or ={column} if it is right"
             raise BadInput(
-                f"{label}: {name}: {column} is followed by q_{best + 1} (correlation {match[j, best]:.2f}), not by "
-                f"q_{j + 1} ({match[j, j]:.2f}): give the order, --map q_cmd_{best + 1}={column}"
+                f"{label}: {name}: {column} is followed by q_{other + 1} (correlation {match[j, other]:.2f}), not by "
+                f"q_{j + 1} ({match[j, j]:.2f}): {remedy}"
             )
         if match[j, j] < -FOLLOWS and not stated.states("sign", column):
             raise BadInput(
@@ -89,6 +92,17 @@ def _require_pairs(recording: Recording, label: str, stated: Corrections) -> Non
                 f"{label}: {name}: q_{j + 1} moves {slope[j]:.3g} times as far as {column}: if the unit differs, "
                 f"--units {unit}"
             )
+
+
+def _of_others(x: Array, match: Array, stated: Corrections) -> dict[int, int]:
+    """Commands that another joint clearly follows, and their own does not → that joint."""
+    found = {}
+    for j in np.flatnonzero(x.std(0) >= MOVES).tolist():
+        best = int(np.abs(match[j]).argmax())
+        clear = abs(match[j, best]) > CLEARLY and abs(match[j, j]) < FOLLOWS
+        if best != j and clear and not stated.states("columns", f"q_cmd_{j + 1}"):
+            found[j] = best
+    return found
 
 
 def _match(x: Array, y: Array) -> Array:

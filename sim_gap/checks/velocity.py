@@ -9,6 +9,7 @@ from armlink.recording.corrections import Corrections
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.checks.finding import Finding
+from sim_gap.checks.held_columns import exchange_option
 
 SCALE = 0.7, 1.4
 """Velocity over derivative of the position outside which they disagree."""
@@ -100,7 +101,8 @@ def _listed(
 def _option(kind: str, joints: list[int], moves: NDArray[np.int_], best: NDArray[np.int_]) -> str:
     place = {int(j): i for i, j in enumerate(moves)}
     if kind == "order":
-        return "--map " + ",".join(f"dq_{int(moves[best[place[j]]]) + 1}=dq_{j + 1}" for j in joints)
+        option = exchange_option("dq", {j: int(moves[best[place[j]]]) for j in joints})
+        return option or "--units " + ",".join(f"dq_{j + 1}=rad" for j in joints) + " (keep it)"
     return f"--{'sign' if kind == 'sign' else 'units'} " + ",".join(
         f"dq_{j + 1}={'-1' if kind == 'sign' else 'deg'}" for j in joints
     )

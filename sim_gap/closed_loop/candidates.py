@@ -7,7 +7,7 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.closed_loop.fit import Fit, batch, jacobian, residuals
 from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS
-from sim_gap.closed_loop.search import PRICE, Search, effect_there, start_of
+from sim_gap.closed_loop.search import PRICE, Search, effect_there, level_of, start_of
 
 
 def ranked(search: Search, fit: Fit, own: Sequence[str]) -> list[list[tuple[float, str]]]:
@@ -26,15 +26,16 @@ def ranked(search: Search, fit: Fit, own: Sequence[str]) -> list[list[tuple[floa
         for j in range(search.data.joints):
             if effect_there(fit, effect, j) or any(not effect_there(fit, need, j) for need in EFFECTS[effect].needs):
                 continue
-            share = _explained(now[:, j], slopes[j], columns[:, :, j], signed=_one_sided(effect))
+            share = _explained(now[:, j], slopes[j], columns[:, :, j], signed=_one_sided(fit, effect, j))
             expected = -0.5 * float(search.samples[j]) * np.log(max(1.0 - share, 1e-6))
             falls[j].append((expected - PRICE * len(each), effect))
     return [sorted(each, reverse=True) for each in falls]
 
 
-def _one_sided(effect: str) -> bool:
+def _one_sided(fit: Fit, effect: str, joint: int) -> bool:
+    """Whether the effect's first parameter can only grow from where it is, or is a limit."""
     first = PARAMETERS[EFFECTS[effect].parameters[0]]
-    return bool(first.low == first.neutral or np.isinf(first.neutral))
+    return bool(fit.point[first.name][joint] <= first.low or np.isinf(first.neutral))
 
 
 def _change(search: Search, fit: Fit, effect: str) -> list[dict[str, Array]]:
@@ -46,7 +47,7 @@ def _change(search: Search, fit: Fit, effect: str) -> list[dict[str, Array]]:
         point = dict(fit.point)
         start = np.array([start_of(search, name, j) for j in range(search.data.joints)])
         if np.isinf(PARAMETERS[name].neutral):
-            point[name] = np.minimum(fit.point[name], start)
+            point[name] = level_of(search, fit, name)
         elif name == "gain":
             point[name] = fit.point[name] * 1.05
         else:

@@ -15,6 +15,8 @@ from sim_gap.closed_loop.search import LEAST_FALL, PRICE, Search, merged, only, 
 TRIES = 2
 """Candidates per joint that are fitted in a round."""
 ROUNDS = 6
+FAR = 10.0
+"""Factor between fitted and nominal gain from which the nominal controller is not where the search starts again."""
 Progress = Callable[[str], None]
 
 
@@ -37,6 +39,33 @@ def select(search: Search, fit: Fit, progress: Progress = lambda text: None) -> 
         if not open_joints:
             break
     return pruned(search, fit)
+
+
+def select_about(search: Search, fit: Fit, progress: Progress = lambda text: None) -> Fit:
+    """The better of two selections: from `fit`, whose gains and friction are free, and from the nominal model as it is.
+
+    A free gain with damping takes the place of a delay, of a limit or of friction, which then are not looked for any
+    more. A nominal controller that is far from the fitted one is no start.
+    """
+    found = select(search, fit, progress)
+    away = np.abs(np.log(found.point["kp"] / search.nominal["kp"]))
+    if search.open_controller or not np.all(away < np.log(FAR)):
+        return found
+    progress("from the model's own controller")
+    own = {name: values.copy() for name, values in search.nominal.items()}
+    other = select(replace(search, kept=frozenset()), Fit(own, ((),) * search.data.joints), progress)
+    return _better(search, found, other)
+
+
+def _better(search: Search, one: Fit, other: Fit) -> Fit:
+    """Of two fits that with the lower score, each parameter at its price; joint by joint where nothing couples them."""
+    scores = np.array([search.score(fit) + PRICE * np.array([len(own) for own in fit.active]) for fit in (one, other)])
+    if one.shared or other.shared:
+        whole = scores.sum(axis=1) + PRICE * np.array([len(one.shared), len(other.shared)])
+        return one if whole[0] <= whole[1] else other
+    for j in np.flatnonzero(scores[1] < scores[0]).tolist():
+        one = merged(one, other, j)
+    return evaluate(search.data, one)
 
 
 def _own_round(

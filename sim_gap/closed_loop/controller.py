@@ -99,6 +99,9 @@ def starting_fit(search: Search, own: Nominal, progress: Progress) -> tuple[Sear
     the servo is off at times, of that while it is on.
     """
     kinds = {"P": ()} if own.complete else KINDS
+    always_on = "actuator.back_emf" in search.excluded
+    if not own.complete and always_on:  # then all damping may be the servo's, which ends at a limit of its torque
+        search = replace(search, nominal={**search.nominal, "kv": np.full(search.data.joints, np.inf)})
     few = replace(search, data=thinned(search.data, FEW))
     fits: dict[str, Fit] = {}
     scores: dict[str, float] = {}
@@ -111,8 +114,7 @@ def starting_fit(search: Search, own: Nominal, progress: Progress) -> tuple[Sear
         e.id for e in EFFECTS.values() if e.controller and e.parameters[0] in kinds[kind]
     }
     if not own.complete:
-        switched = "actuator.back_emf" not in search.excluded
-        kept.add("actuator.back_emf" if switched else "friction.viscous")  # damping that the servo may make
+        kept.add("friction.viscous" if always_on else "actuator.back_emf")  # damping that the servo may make
     left_out = {"controller.feed_forward"} if not own.complete else set()
     if "feed" not in kinds[kind]:
         left_out.add("actuator.gain")

@@ -11,7 +11,7 @@ from armlink.errors import BadInput
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.closed_loop.columns import shared_effects, with_columns
-from sim_gap.closed_loop.compete import select
+from sim_gap.closed_loop.compete import select_about
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of, starting_fit
 from sim_gap.closed_loop.fit import Fit, evaluate, improve
 from sim_gap.closed_loop.judge import Covariance, Stage, covariance, groups_of, rms_on, stages, taken_out
@@ -83,15 +83,15 @@ def identify(
     never = frozenset(withhold) | _frozen(sim, fitted)
     search = Search(data, scales, nominal, floor, never)
     search, fit, kind = starting_fit(search, own, progress)
-    fit = select(search, fit, progress)
+    fit = select_about(search, fit, progress)
     progress("final fit")
     search = replace(search, data=fitted)
     fit = improve(fitted, replace(fit, rms=None), scales, 6)
     progress("each effect on held-out data")
-    found = tuple(stages(replace(search, data=data), evaluate(data, fit), judged))
+    margin = _margin(search, fit, floor)
+    found = tuple(stages(replace(search, data=data), evaluate(data, fit), judged, margin))
     before = _bare(search, fit, own.complete)
     native = native_fit(search, fit)
-    margin = _margin(search, fit, floor)
     spread = covariance(search, fit)
     return Identified(
         sim=sim,

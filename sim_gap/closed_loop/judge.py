@@ -75,8 +75,11 @@ class Stage:
     """Effects that would do as well."""
 
 
-def stages(search: Search, fit: Fit, heldout: Windows) -> list[Stage]:
-    """The groups in order of what each lowers when it is added to the nominal model and those above it."""
+def stages(search: Search, fit: Fit, heldout: Windows, margin: Array) -> list[Stage]:
+    """The groups in order of what each lowers when it is added to the nominal model and those above it.
+
+    `margin` is the gap that matters at each joint, (J,) [rad].
+    """
     groups = groups_of(fit, search)
 
     def with_only(some: Sequence[Group]) -> Fit:
@@ -89,7 +92,7 @@ def stages(search: Search, fit: Fit, heldout: Windows) -> list[Stage]:
 
     current = with_only(())
     before, final, out = _rms(heldout, current), _rms(heldout, fit), []
-    for number, (group, trial) in enumerate(_ordered(search, groups, with_only, current), start=1):
+    for number, (group, trial) in enumerate(_ordered(search, groups, with_only, current, margin), start=1):
         after = final if number == len(groups) else _rms(heldout, trial)
         bare = improve(search.data, taken_out(search, fit, group), search.scales, 4)
         falls = [_shrink(search, heldout, *pair) for pair in ((before, after), (_rms(heldout, bare), final))]
@@ -123,11 +126,16 @@ def _shrink(search: Search, data: Windows, before: Array, after: Array) -> Array
 
 
 def _ordered(
-    search: Search, groups: Sequence[Group], with_only: Callable[[Sequence[Group]], Fit], current: Fit
+    search: Search,
+    groups: Sequence[Group],
+    with_only: Callable[[Sequence[Group]], Fit],
+    current: Fit,
+    margin: Array,
 ) -> Iterator[tuple[Group, Fit]]:
     """The groups, each the one that lowers the training gap most beside those before it, with the fit up to there.
 
-    A group that was worth less than another beside fewer groups is not tried again until that one is worth less too.
+    A group that was worth less than another beside fewer groups is not tried again until that one is worth less too,
+    or until an effect that it needs is there.
     """
     worth = {group: float("inf") for group in groups}
     fresh: dict[Group, Fit] = {}
@@ -138,19 +146,24 @@ def _ordered(
             current = fresh[group]
             chosen.append(group)
             del worth[group]
+            worth |= {other: float("inf") for other in worth if group[0] in _needs(other)}
             fresh = {}
             yield group, current
         else:
             fresh[group] = with_only([*chosen, group])
-            worth[group] = _worth(search, current, fresh[group])
+            worth[group] = _worth(search, current, fresh[group], margin)
 
 
-def _worth(search: Search, current: Fit, trial: Fit) -> float:
+def _needs(group: Group) -> tuple[str, ...]:
+    return EFFECTS[group[0]].needs if group[0] in EFFECTS else ()
+
+
+def _worth(search: Search, current: Fit, trial: Fit, margin: Array) -> float:
     """Largest fall of a joint's RMS in units of what matters there, by a group."""
     assert current.rms is not None
     assert trial.rms is not None
     fall = joint_rms(search.data, current.rms) - joint_rms(search.data, trial.rms)
-    return float((fall / np.maximum(search.floor, 0.1 * search.scales.angle)).max())
+    return float((fall / margin).max())
 
 
 def undecided_scale(fit: Fit, spread: "Covariance") -> list[int]:

@@ -33,7 +33,7 @@ PARAMETERS = {
         Parameter("delay", "s", 0.0, 0.01, -0.02, 0.4),
         Parameter("slew", "rad/s", np.inf, 1.0, 0.02),
         Parameter("dead", "rad", 0.0, 0.5, 0.0, 0.2, "angle"),
-        Parameter("limit", "N·m", np.inf, 0.8, 1e-3, np.inf, "torque"),
+        Parameter("limit", "N·m", np.inf, 1.0, 1e-3, np.inf, "torque"),
         Parameter("coulomb", "N·m", 0.0, 0.2, 0.0, np.inf, "torque"),
         Parameter("viscous", "N·m·s/rad", 0.0, 0.2, 0.0, np.inf, "damping"),
         Parameter("back_emf", "N·m·s/rad", 0.0, 0.2, 0.0, np.inf, "damping"),

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.closed_loop.fit import Fit
+from sim_gap.closed_loop.fit import Fit, batch, residuals
 from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS, Scales
 from sim_gap.closed_loop.windows import Windows
 
@@ -13,6 +13,8 @@ INDEPENDENT_S = 0.5
 """Time over which residuals are correlated [s]."""
 PRICE = 4.0
 """Fall of the score that a parameter has to pay for."""
+LEVELS = {"slew": (0.2, 0.35, 0.5, 0.65, 0.8, 0.9), "limit": (0.6, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)}
+"""Levels at which a limit is tried, in units of the command's highest speed, or of the joint's own scale."""
 LEAST_FALL = 0.025
 """Least relative fall of a joint's RMS by an effect."""
 
@@ -60,15 +62,25 @@ def with_effect(search: Search, fit: Fit, effect: str, joint: int) -> Fit:
     active[joint] = (*active[joint], *names)
     point = {name: values.copy() for name, values in fit.point.items()}
     for name in names:
-        if not np.isfinite(point[name][joint]) or point[name][joint] == PARAMETERS[name].neutral:
+        if np.isinf(PARAMETERS[name].neutral):
+            point[name][joint] = level_of(search, fit, name)[joint]
+        elif point[name][joint] == PARAMETERS[name].neutral:
             point[name][joint] = start_of(search, name, joint)
     return replace(fit, active=tuple(active), point=point, rms=None)
 
 
+def level_of(search: Search, fit: Fit, name: str) -> Array:
+    """The best of some levels of a limit at every joint, (J,): one that is never reached has no slope to follow, and
+    one that is always reached leads nowhere."""
+    peak = np.abs(search.data.speed).max(axis=(0, 2)) if name == "slew" else search.scales.of(name)
+    levels = [np.minimum(fit.point[name], share * peak) for share in LEVELS[name]]
+    gaps = residuals(search.data, batch([{**fit.point, name: level} for level in levels]))
+    best = np.einsum("ptjw,ptjw->pj", gaps, gaps).argmin(axis=0)
+    return np.asarray(np.stack(levels)[best, np.arange(search.data.joints)])
+
+
 def start_of(search: Search, name: str, joint: int) -> float:
-    """Value at which a parameter enters a fit."""
-    if name == "slew":
-        return 0.8 * float(np.abs(search.data.speed[:, joint]).max())
+    """Value at which a parameter that is no limit enters a fit."""
     if name in ("stribeck_velocity", "gain"):
         return PARAMETERS[name].neutral
     return float(np.clip(search.scales.of(name)[joint], PARAMETERS[name].low, PARAMETERS[name].high))

@@ -51,7 +51,8 @@ def _run(data: Windows, values: Values, count: int) -> Array:
     armature, viscous, gain = of("armature"), of("viscous"), of("gain", 1.0)
     back_emf, brake = of("back_emf"), np.minimum(of("kv"), of("viscous"))
     coulomb, asymmetry = of("coulomb"), of("asymmetry")
-    limit, slew = of("limit", np.inf), of("slew", np.inf)
+    limit, slew, dead = of("limit", np.inf), of("slew", np.inf), of("dead")
+    most = slew * dt
     clipped, slewed = bool(np.isfinite(limit).any()), bool(np.isfinite(slew).any())
     braked = "kv" in active
     linear = [name for name in data.columns if name in active]
@@ -82,13 +83,12 @@ def _run(data: Windows, values: Values, count: int) -> Array:
                 for x, needed in zip((data.command, data.speed, data.feed), late_too, strict=True)
             )
         if slewed:
-            target += np.clip(command - target, -slew * dt, slew * dt)
+            target += _within(command - target, most)
             command = target
         error = command - q
         on = data.served[k]
         if "dead" in active:
-            dead = of("dead")
-            error = error - np.clip(error, -dead, dead)
+            error = error - _within(error, dead)
         torque = kp * error
         if "kd" in active:
             torque = torque + kd * speed
@@ -101,11 +101,11 @@ def _run(data: Windows, values: Values, count: int) -> Array:
         if clipped:
             wish = torque - (kd + brake) * v
             over = np.abs(wish) > limit
-            torque = np.where(over, np.clip(wish, -limit, limit), torque)
+            torque = np.where(over, _within(wish, limit), torque)
             free = on * ~over
         torque = torque * (gain * on)
         mass = data.inertia[k] + armature
-        x = np.clip(q - data.recorded[k], -1.5, 1.5)
+        x = _within(q - data.recorded[k], 1.5)
         square = x * x
         torque -= data.gravity[k] * (1.0 - 0.5 * square) + data.slope[k] * x * (1.0 - square / 6.0)
         torque -= data.coupling[k]
@@ -128,9 +128,14 @@ def _run(data: Windows, values: Values, count: int) -> Array:
         if "asymmetry" in active:
             hold = hold * (1.0 + asymmetry * np.sign(v))
         hold = hold * (dt / effective)
-        v -= np.clip(v, -hold, hold)
+        v -= _within(v, hold)
         q += dt * v
     return out
+
+
+def _within(x: Array, limit: Array | float) -> Array:
+    """x clipped to ± limit; on arrays as small as these several times as fast as `np.clip`."""
+    return np.asarray(np.minimum(np.maximum(x, -limit), limit))
 
 
 def _integral(data: Windows, feed: Array, delay: Array, kp: Array, ki: Array, gain: Array) -> Array:

@@ -112,6 +112,25 @@ def test_a_velocity_that_is_not_the_derivative_is_left_out(arm, motor, factor, k
     assert corrected.velocity is None
 
 
+@pytest.mark.parametrize(
+    ("holds", "option"),
+    [
+        ([1, 2, 0], "--map dq_2=dq_1,dq_3=dq_2,dq_1=dq_3"),
+        ([0, 0, 0], "--units dq_2=rad,dq_3=rad (keep it)"),
+        ([2, 1, 1], "--units dq_1=rad,dq_3=rad (keep it)"),
+    ],
+)
+def test_velocities_of_other_joints_are_mapped_where_every_joint_has_one(arm, motor, holds, option):
+    """A column of each joint is named once: what the option suggests can be pasted."""
+    rate = np.gradient(motor.position, motor.t, axis=0)
+    spoiled = replace(motor, velocity=rate[:, holds])
+    corrected, (finding,) = check(arm, spoiled)
+    assert (finding.finding, finding.option, corrected.velocity) == ("order", option, None)
+    if option.startswith("--map"):
+        stated = parse_corrections(columns=[option.removeprefix("--map ")])
+        assert check(arm, stated.apply(spoiled, "r.csv"), stated)[1] == []
+
+
 @pytest.mark.parametrize("constant", [0.08, 12.0])
 def test_amperes_are_refused_with_the_option(arm, motor, constant):
     amperes = replace(motor, motor_torque=motor.motor_torque / constant)

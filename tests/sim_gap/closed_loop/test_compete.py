@@ -1,0 +1,88 @@
+"""Where the model's own controller is right, what is wrong besides is found, and not another gain in its place."""
+
+from collections.abc import Collection
+from dataclasses import replace
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+from servo_arm import model_text, record
+
+from armlink.recording.recording import Recording
+from sim_gap.closed_loop import controller
+from sim_gap.closed_loop.compete import select_about
+from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of, starting_fit
+from sim_gap.closed_loop.fit import Fit
+from sim_gap.closed_loop.judge import _ordered
+from sim_gap.closed_loop.parameters import EFFECTS
+from sim_gap.closed_loop.search import Search, level_of, with_effect
+from sim_gap.closed_loop.windows import windows_of
+from sim_gap.model.load import load_model
+
+GAIN, LATE_ROWS, LIMIT = 40.0, 2, 0.4
+WEIGHTLESS = model_text(kp=GAIN, friction=0.0, damping=3.0).replace("<option ", '<option gravity="0 0 0" ')
+LOOKED_FOR = {"controller.stiffness", "controller.delay", "friction.viscous", "friction.coulomb"}
+
+
+def started(text: str, recording: Recording, more: Collection[str] = ()) -> tuple[Search, Fit]:
+    """The search on one recording, and the fit that it starts with."""
+    sim = load_model(mujoco.MjModel.from_xml_string(text), recording.names, recording.n)
+    data = windows_of(sim.arm, [recording], ["r.csv"])
+    own = nominal_controller(sim)
+    floor = np.full(recording.n, 2e-4)
+    search = Search(
+        data, scales_of(data), nominal_point(data, own), floor, frozenset(set(EFFECTS) - LOOKED_FOR - {*more})
+    )
+    search, fit, _ = starting_fit(search, own, lambda text: None)
+    return search, fit
+
+
+def test_a_delay_is_not_told_as_another_gain() -> None:
+    """Without gravity a lower gain with its damping follows as late as a delayed one."""
+    seen = record(WEIGHTLESS, 1, 14.0)
+    early = np.vstack([seen.position_command[LATE_ROWS:], np.repeat(seen.position_command[-1:], LATE_ROWS, axis=0)])
+    search, fit = started(WEIGHTLESS, replace(seen, position_command=early))
+    found = select_about(search, fit)
+    for own, kp, delay in zip(found.active, found.point["kp"], found.point["delay"], strict=True):
+        assert "delay" in own
+        assert delay == pytest.approx(LATE_ROWS / 50.0, abs=0.006)
+        assert kp == pytest.approx(GAIN, rel=0.05)
+
+
+def test_a_limit_is_tried_at_the_level_that_fits() -> None:
+    """The model has one that is never reached, from which no slope leads to the true one."""
+    real = WEIGHTLESS.replace('<position name="shoulder"', '<position forcerange="-0.35 0.35" name="shoulder"')
+    known = WEIGHTLESS.replace('<position name="shoulder"', '<position forcerange="-50 50" name="shoulder"')
+    search, _ = started(known, record(real, 2, 14.0))
+    nominal = Fit(search.nominal, ((), ()))
+    assert 0.2 < level_of(search, nominal, "limit")[0] < 0.6
+    assert with_effect(search, nominal, "actuator.saturation", 0).point["limit"][0] < 0.6
+
+
+def test_the_damping_of_a_servo_that_is_not_known_ends_at_its_limit(monkeypatch) -> None:
+    """Without the damping a joint at its limit runs away from its command, and no level of the limit fits."""
+    monkeypatch.setattr(controller, "KINDS", {"P": ("delay",)})
+    servo = f'<position kv="3" forcerange="-{LIMIT} {LIMIT}" name="shoulder"'
+    real = model_text(kp=GAIN, friction=0.0, damping=0.0).replace("<option ", '<option gravity="0 0 0" ')
+    text = real.replace('<position name="elbow"', '<position kv="3" name="elbow"')
+    text = text.replace('<position name="shoulder"', servo)
+    nothing_known = real[: real.index("<actuator>")] + "</mujoco>"
+    search, fit = started(nothing_known, record(text, 3, 14.0), {"actuator.saturation"})
+    found = select_about(search, fit)
+    assert found.point["limit"][0] == pytest.approx(LIMIT, rel=0.15)
+    assert np.isinf(found.point["limit"][1])
+
+
+def test_an_effect_is_weighed_again_once_what_it_needs_is_there() -> None:
+    """Stribeck friction is worth nothing without Coulomb friction, and more than what is wrong with joint 2 with it."""
+    search = SimpleNamespace(data=SimpleNamespace(weight=np.ones((1, 2, 1))))
+    groups = [("friction.stribeck", (0,)), ("friction.coulomb", (0,)), ("friction.viscous", (1,))]
+
+    def with_only(some):
+        chosen = {effect for effect, _ in some}
+        dry = 1.0 if "friction.coulomb" not in chosen else 0.2 if "friction.stribeck" in chosen else 0.5
+        return SimpleNamespace(rms=np.array([[dry], [0.1 if "friction.viscous" in chosen else 0.2]]))
+
+    order = [group[0] for group, _ in _ordered(search, groups, with_only, with_only([]), np.ones(2))]
+    assert order == ["friction.coulomb", "friction.stribeck", "friction.viscous"]
