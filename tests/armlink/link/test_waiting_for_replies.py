@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from armlink.arm_file import load_arm
 from armlink.bus.port import Frame
 from armlink.drives.orders import Power
@@ -95,3 +97,16 @@ def test_replies_that_never_come_cost_no_more_than_their_share_of_the_period() -
     delays = held.delays(200)
     assert max(delays) <= 0.8 * period + 1e-9
     assert abs(held.clock.time - begun - 200 * period) < 2 * period
+
+
+def test_replies_that_come_after_every_cycle_are_no_silence() -> None:
+    """Each comes after its cycle, some in the next one: as old as their SYNC, and no joint is silent."""
+    held = Held()
+    commander, period = held.commander, held.commander.period
+    held.delays(50)
+    commander.max_age = 5 * period
+    held.port.first = 0.81 * period
+    hold = Command.hold(held.port.standing)
+    ages = np.array([commander.command(hold).age for _ in range(100)])[10:]
+    assert (ages > 0.99 * period).all()
+    assert (ages < 2.5 * period).all()
