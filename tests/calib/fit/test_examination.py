@@ -115,7 +115,9 @@ def test_a_saturated_sensor_is_named(sound) -> None:
 
     fit = fit_sensors(arm, bent(data, clip))
     assert "j2" in fit.doubtful
-    assert "saturation" in {finding.kind for finding in fit.findings if finding.joint == "j2"}
+    found = [finding for finding in fit.findings if (finding.joint, finding.kind) == ("j2", "saturation")]
+    assert any("readings at different poses" in finding.text for finding in found)
+    assert abs(found[0].size) == pytest.approx(limit, rel=1e-3)
 
 
 def test_what_was_touched_is_left_out_and_named(sound) -> None:
