@@ -180,6 +180,7 @@ def exchange(server: Served, request: bytes) -> bytes:
         b"\x00\x01\x02\r\n\r\n",
         b"GET /api/status\r\n\r\n",
         b"GET /api/status HTTP/1.1\r\n\r\n",
+        b"GET /api/status HTTP/1.0\r\n\r\n",
         b"GET /api/status HTTP/1.1\r\nHost: localhost\r\nHost: evil\r\n\r\n",
         b"GET /" + b"a" * 100_000 + b" HTTP/1.1\r\nHost: localhost\r\n\r\n",
         b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"a" * 100_000 + b"\r\n\r\n",
