@@ -204,18 +204,13 @@ def test_the_report_may_ask_nobody_anything(server: Served, view: MadeUpView, tm
 
 
 def test_the_page_s_script_has_every_module_once_and_before_its_users() -> None:
-    static = Path(page_module.__file__).with_name("static")
-    first = {path.name: re.search(r"^export \w+ \w+", path.read_text(), re.MULTILINE) for path in static.glob("*.js")}
+    static = {path.name: path.read_text() for path in Path(page_module.__file__).with_name("static").glob("*.js")}
     script = page_module.joined("page.js")
-    places = {}
-    for name, found in first.items():
-        text = (static / name).read_text()
-        piece = found[0].removeprefix("export ") if found else text[-200:]
-        assert script.count(f"{piece}") == 1, name
-        places[name] = script.index(piece)
-    for name in first:
-        for other in re.findall(r'from "\./(.*)";', (static / name).read_text()):
-            assert places[other] < places[name]
+    heads = {name: text.partition("\n")[0] for name, text in static.items()}
+    assert {name: script.count(head) for name, head in heads.items()} == dict.fromkeys(static, 1)
+    for name, text in static.items():
+        for other in re.findall(r'from "\./(.*)";', text):
+            assert script.index(heads[other]) < script.index(heads[name])
     assert not re.search(r"^(import|export) ", script, re.MULTILINE)
 
 
