@@ -43,3 +43,10 @@ def test_the_layers_of_a_package_name_all_its_folders() -> None:
     for package in PACKAGES:
         folders = {path.parent.name for path in (ROOT / package).glob("*/__init__.py")}
         assert folders <= set(layers[package].replace("|", " ").split()), package
+
+
+def test_pytest_takes_no_module_of_ours_for_tests(pytestconfig: pytest.Config) -> None:
+    """One that it does is loaded by pytest, whoever imports it: the campaigns' mutants and probes do not get in."""
+    patterns = pytestconfig.getini("python_files")
+    modules = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
+    assert [path.name for path in modules if any(path.match(pattern) for pattern in patterns)] == []

@@ -162,3 +162,16 @@ def test_a_reply_that_comes_just_after_it_was_looked_for_is_late_once() -> None:
     assert late.timely is not None
     assert late.timely.tolist() == [True] * (N - 1) + [False]
     assert after.timely is None or after.timely.all()
+
+
+def test_replies_that_come_after_every_cycle_are_no_silence() -> None:
+    """Each comes after its cycle, some in the next one: as old as their SYNC, and no joint is silent."""
+    held = Held()
+    commander, period = held.commander, held.commander.period
+    held.delays(50)
+    commander.max_age = 5 * period
+    held.port.first = 0.81 * period
+    hold = Command.hold(held.port.standing)
+    ages = np.array([commander.command(hold).age for _ in range(100)])[10:]
+    assert (ages > 0.99 * period).all()
+    assert (ages < 2.5 * period).all()

@@ -32,7 +32,7 @@ class NoProcess:
         self._ends = os.pipe()
 
     def fileno(self) -> int:
-        return self._ends[0]
+        return -1 if self.closed else self._ends[0]
 
     def pump(self) -> list[Message]:
         self.pumped += 1

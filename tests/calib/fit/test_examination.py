@@ -5,38 +5,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from examined_sweeps import JOINT, bent, rated, swept, z_scores
 from rank_test import undetermined
-from sweep_arms import random_arm, synthetic_pass
+from sweep_arms import random_arm
 
 from armlink.arm_file import ArmFile, load_arm
 from calib.arm.kinematics import gcomp_arm
 from calib.fit.examination import _without_plateaus
 from calib.fit.gravity_fit import identify_gravity
-from calib.fit.sensor_fit import SensorFit, fit_sensors
+from calib.fit.sensor_fit import fit_sensors
 from calib.fit.sweep_readings import sweep_readings
 from calib.motion.encoder_bits import missing_bit, stuck_bits
 from calib.motion.static_reading import StaticReading
-from calib.plan.sweep_plan import plan_sweep
 from calib.sweep.dataset import SweepData
-from calib.sweep.scout import rough_model
 from gcomp.gravity.torque import gravity_torque
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
 PUBLISHED = np.array([0.64, 1.01, 0.77, 0.65, 0.42, 0.20, 0.16])
 """RMS of a real arm's best model, joint by joint [N·m]."""
-JOINT = 1
-
-
-def swept(arm: ArmFile, truth: Truth, seed: int) -> list[SweepData]:
-    """Both passes, drawn from MuJoCo's gravity."""
-    random, mass, found = np.random.default_rng(seed), 0.0, []
-    for _ in range(2):
-        scouted = synthetic_pass(arm, truth, plan_sweep(arm, reference_mass=mass), mass, random)
-        plan = plan_sweep(arm, rough_model(arm, scouted.readings), reference_mass=mass)
-        found.append(synthetic_pass(arm, truth, plan, mass, random))
-        mass = found[0].plan.reference_mass
-    return found
 
 
 @pytest.fixture(scope="module")
@@ -44,27 +31,6 @@ def sound() -> tuple[ArmFile, Truth, list[SweepData]]:
     arm = random_arm(51, 3)
     truth = Truth.draw(arm, 51)
     return arm, truth, swept(arm, truth, 51)
-
-
-def bent(data: list[SweepData], change: Callable[[StaticReading, np.ndarray, np.ndarray], None]) -> list[SweepData]:
-    """The same data with position and torque of each reading changed in place."""
-    passes = []
-    for each in data:
-        readings = []
-        for reading in each.readings:
-            position, torque = reading.position.copy(), reading.torque.copy()
-            change(reading, position, torque)
-            readings.append(replace(reading, position=position, torque=torque))
-        passes.append(replace(each, readings=tuple(readings)))
-    return passes
-
-
-def rated(arm: ArmFile) -> float:
-    return arm.require_link().joints[JOINT].rated_torque
-
-
-def z_scores(fit: SensorFit, truth: Truth, parameter: str) -> np.ndarray:
-    return (fit.value(parameter) - getattr(truth, parameter)) / fit.std(parameter)
 
 
 def test_sound_data_raise_nothing(sound) -> None:
@@ -149,7 +115,9 @@ def test_a_saturated_sensor_is_named(sound) -> None:
 
     fit = fit_sensors(arm, bent(data, clip))
     assert "j2" in fit.doubtful
-    assert "saturation" in {finding.kind for finding in fit.findings if finding.joint == "j2"}
+    found = [finding for finding in fit.findings if (finding.joint, finding.kind) == ("j2", "saturation")]
+    assert any("readings at different poses" in finding.text for finding in found)
+    assert abs(found[0].size) == pytest.approx(limit, rel=1e-3)
 
 
 def test_what_was_touched_is_left_out_and_named(sound) -> None:

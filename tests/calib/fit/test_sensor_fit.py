@@ -131,6 +131,13 @@ def test_the_controllers_own_calibration_is_taken_out() -> None:
     np.testing.assert_allclose(other.value("gain"), plain.value("gain"), rtol=1e-3)
 
 
+def test_a_position_offset_that_is_known_better_than_readings_tell_stays_known_as_well() -> None:
+    arm = random_arm(7, 3, sweep={"position_offset_std": 1e-5})
+    fit = fit_sensors(arm, passes(arm, 7)[1])
+    np.testing.assert_allclose(fit.fit.std.position_offset[:2], 1e-5, rtol=0.02)  # the last one cannot be told
+    assert np.abs(fit.value("position_offset")).max() < 3e-5
+
+
 def test_data_of_another_arm_are_refused() -> None:
     _, data = passes(random_arm(8, 3), 8)
     with pytest.raises(Refused, match="arm is random8"):

@@ -22,6 +22,7 @@ from calib.records.compare import differences
 from calib.records.records import CalibrationRecord, JointCalibration
 from calib.records.store import RecordStore
 from calib.report.calibration import Calibrated, write_report
+from calib.report.figures import sweep_rows, sweeps_of
 
 ARM = random_arm(1, 3)
 TRUTH, DATA = passes(ARM, 1)
@@ -152,6 +153,15 @@ def test_sweeps_without_a_mass_recalibrate_against_the_gravity_record(fit, recor
 def test_a_pass_with_a_mass_is_not_taken_for_the_bare_arm() -> None:
     with pytest.raises(Exception, match="swept with a reference mass"):
         rows_of_sweeps(DATA[1], 0)
+
+
+def test_a_figure_shows_each_reading_in_its_own_sweep_once(fit) -> None:
+    shown = np.concatenate([sweep_rows(fit, joint, sweep) for joint in range(3) for sweep in sweeps_of(fit, joint)])
+    assert sorted(shown.tolist()) == np.flatnonzero(fit.rows.swept >= 0).tolist()
+    for sweep in sweeps_of(fit, 1):
+        at = sweep_rows(fit, 1, sweep)
+        assert {fit.rows.sweeps[row] for row in fit.rows.readings.series[at]} == {sweep}
+        assert (np.diff(fit.rows.readings.position[at, 1]) >= 0).all()
 
 
 def test_pages_are_written_whole(tmp_path: Path, fit, record) -> None:

@@ -18,6 +18,8 @@ def test_a_hard_case_is_named_or_stays_within_its_intervals(case: str, tmp_path:
     swept = sweep_case(case, arm, simulated, tmp_path, loaded=False)
     outcome = judge(swept)
     assert outcome.wrong == ()
+    settled = [reading.settled for reading in load_data(tmp_path / "bare").readings]
+    assert np.mean(settled) > 0.9  # it reads as soon as the arm rests, not when its patience is at an end
     _CHECKS[case](outcome, swept.slips)
 
 

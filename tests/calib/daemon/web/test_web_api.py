@@ -1,7 +1,9 @@
 """The API: every route, its form, and one clear error for what cannot be used."""
 
 import json
+import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,6 +12,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from served_page import Served
 
 from calib.daemon.view.api_models import HistoryPoint
+from calib.daemon.web import page as page_module
 from calib.daemon.web.page import page_files
 from calib.daemon.web.stream import Streams
 
@@ -175,7 +178,6 @@ def test_every_route_of_the_contract_is_described_and_typed(server: Served) -> N
 
 
 def test_metrics_are_prometheus_text_and_documented(server: Served, view: MadeUpView) -> None:
-    from pathlib import Path
 
     server.do(lambda: view.happen("fault", None, "a fault"))
     answer = server.client().get("/metrics")
@@ -199,6 +201,17 @@ def test_the_report_may_ask_nobody_anything(server: Served, view: MadeUpView, tm
     assert answer.text == "<h1>A report</h1>"
     assert "sandbox" in answer.headers["content-security-policy"]
     assert "connect-src" not in answer.headers["content-security-policy"]
+
+
+def test_the_page_s_script_has_every_module_once_and_before_its_users() -> None:
+    static = {path.name: path.read_text() for path in Path(page_module.__file__).with_name("static").glob("*.js")}
+    script = page_module.joined("page.js")
+    heads = {name: text.partition("\n")[0] for name, text in static.items()}
+    assert {name: script.count(head) for name, head in heads.items()} == dict.fromkeys(static, 1)
+    for name, text in static.items():
+        for other in re.findall(r'from "\./(.*)";', text):
+            assert script.index(heads[other]) < script.index(heads[name])
+    assert not re.search(r"^(import|export) ", script, re.MULTILINE)
 
 
 def test_the_page_comes_from_here_alone(server: Served) -> None:

@@ -109,6 +109,9 @@ def test_of_one_address_only_the_newest_strangers_stay() -> None:
     for each in stuck:
         room.stuck(each)
     assert [each.is_cut for each in stuck] == [True] * 4 + [False] * 16  # 16 MB of answers nobody takes
+    stuck[-1].unsent = lambda: (1 << 20) + 1  # type: ignore[method-assign]
+    room.stuck(stuck[-1])
+    assert [each.is_cut for each in stuck] == [True] * 5 + [False] * 15
 
 
 def test_a_long_history_nobody_reads_is_neither_made_nor_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

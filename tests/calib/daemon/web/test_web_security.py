@@ -135,6 +135,22 @@ def test_no_answer_invites_other_origins(server: Served) -> None:
         assert not [name for name in answer.headers if name.startswith("access-control-")]
 
 
+def test_every_answer_says_what_a_browser_may_not_do_with_it(server: Served) -> None:
+    client, stranger = server.client(), server.tcp(token=None)
+    answers = [client.get(path) for path in ("/api/status", "/metrics", "/nothing", "/")]
+    answers += [stranger.get("/api/status"), client.get("/api/status", headers={"Host": "evil.example"})]
+    assert [answer.status_code for answer in answers] == [200, 200, 404, 200, 401, 400]
+    for answer in answers:
+        (policy,) = answer.headers.get_list("content-security-policy")
+        assert policy.startswith("default-src 'none'")
+        assert "frame-ancestors 'none'" in policy
+        assert answer.headers["x-content-type-options"] == "nosniff"
+        assert answer.headers["referrer-policy"] == "no-referrer"
+        assert answer.headers["cross-origin-opener-policy"] == "same-origin"
+        assert answer.headers["cross-origin-resource-policy"] == "same-origin"
+        assert answer.headers["cache-control"] == ("no-cache" if answer.url.path == "/" else "no-store")
+
+
 def test_oversized_bodies_are_refused(server: Served, view: MadeUpView) -> None:
     server.do(view.propose)
 
@@ -164,6 +180,7 @@ def exchange(server: Served, request: bytes) -> bytes:
         b"\x00\x01\x02\r\n\r\n",
         b"GET /api/status\r\n\r\n",
         b"GET /api/status HTTP/1.1\r\n\r\n",
+        b"GET /api/status HTTP/1.0\r\n\r\n",
         b"GET /api/status HTTP/1.1\r\nHost: localhost\r\nHost: evil\r\n\r\n",
         b"GET /" + b"a" * 100_000 + b" HTTP/1.1\r\nHost: localhost\r\n\r\n",
         b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"a" * 100_000 + b"\r\n\r\n",

@@ -1,0 +1,49 @@
+"""The daemon's journal: what supersedes what, and how much of a history is read."""
+
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.daemon.state.history_reader import HistoryReader
+from calib.daemon.state.journal import Journal
+from calib.observer.decision import Finding
+
+NOW = datetime(2026, 5, 1, tzinfo=UTC)
+
+
+@pytest.fixture
+def journal(tmp_path: Path) -> Journal:
+    return Journal(tmp_path / "journal.db")
+
+
+def test_a_newer_proposal_supersedes_the_pending_one_of_its_joint_alone(journal: Journal) -> None:
+    def propose(joint: str) -> int:
+        finding = Finding(0, "gain", 1.02, 0.0, np.zeros((2, 2)), 40, 0.99)
+        return journal.add_proposal(NOW, joint, "new", "old", finding)
+
+    decided, other, first = propose("j1"), propose("j2"), propose("j1")
+    journal.decide(other, NOW, "rejected", "ann")
+    assert journal.proposal(decided).state == "superseded"
+    waiting, second = propose("j2"), propose("j1")
+    states = {row.id: row.state for row in journal.proposals()}
+    assert states == {
+        decided: "superseded",
+        other: "rejected",
+        first: "superseded",
+        waiting: "pending",
+        second: "pending",
+    }
+    assert journal.pending() == 2
+
+
+@pytest.mark.parametrize(("most", "read"), [(1, [7]), (2, [3, 7]), (3, [1, 4, 7]), (7, list(range(1, 8))), (0, [7])])
+def test_a_history_is_thinned_evenly_to_what_is_asked_for_and_keeps_the_newest(
+    journal: Journal, most: int, read: list[int]
+) -> None:
+    for minute in range(7):
+        journal.add_history(NOW + timedelta(minutes=minute), 60.0 * minute, None, {})
+    reader = HistoryReader(journal.path)
+    assert reader.chosen(None, None, most) == read
+    assert reader.chosen(NOW + timedelta(minutes=2), NOW + timedelta(minutes=3), 9) == [3, 4]
