@@ -121,6 +121,15 @@ def test_two_arms_in_a_model(tmp_path, monkeypatch):
     assert named.draft.joints[0].name == "other_yaw"
 
 
+def test_joints_of_an_attached_model_keep_the_slash_in_their_names(tmp_path, monkeypatch):
+    monkeypatch.setattr("calib.commissioning.new_arm.narrowed", lambda arm_file: None)
+    text = (MODELS / "own.xml").read_text()
+    (tmp_path / "left.xml").write_text(text.replace('name="yaw', 'name="left/yaw'))
+    made = new_arm(tmp_path / "left.xml", tmp_path / "left.yaml")
+    made.write()
+    assert load_arm(made.out).joint_names[0] == "left/yaw" == gcomp_arm(made.parsed()).names[0]
+
+
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
