@@ -130,6 +130,8 @@ class Plausibility:
     """Prior standard deviation of each coefficient (p,), its largest plausible size; infinite for none."""
     background_std: float = 0.0
     """Standard deviation of each coefficient over sound arms; confidence intervals include it."""
+    background_nm: bool = False
+    """Whether it is a torque, and so smaller on arms of little strength."""
     allows: Callable[[Array, Shape, Beneath], bool] = always
     """Whether such an effect can exist with these coefficients."""
 

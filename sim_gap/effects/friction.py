@@ -74,12 +74,12 @@ EFFECTS = (
     Effect(
         "friction.coulomb",
         Signature.at_motor(lambda s, joint, _: s.direction[:, joint]),
-        Plausibility(prior_penalty=0, background_std=0.03, allows=_above_minus_nominal),
+        Plausibility(prior_penalty=0, background_std=0.03, background_nm=True, allows=_above_minus_nominal),
     ),
     Effect(
         "friction.viscous",
         Signature.at_motor(lambda s, joint, _: s.v[:, joint]),
-        Plausibility(prior_penalty=0, background_std=0.02, allows=not_negative),
+        Plausibility(prior_penalty=0, background_std=0.02, background_nm=True, allows=not_negative),
     ),
     Effect(
         "friction.stribeck",

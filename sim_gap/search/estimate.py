@@ -111,7 +111,9 @@ class Estimate:
         statistical = inverse @ (scores.T @ scores) @ inverse * blocks / (blocks - 1)
         background = np.zeros(size)
         for term in self.terms:
-            background[self.normal.at[term]] = term.form.plausibility.background_std
+            usual = term.form.plausibility
+            std = self.store.data.least(usual.background_std) if usual.background_nm else usual.background_std
+            background[self.normal.at[term]] = std
         return np.asarray(statistical + systematic + self._undetected(inverse) + np.diag(background**2))
 
     def _undetected(self, inverse: Array) -> Array:
