@@ -203,4 +203,5 @@ def _friction(s: Signals, row: Row, y: Array, valid: NDArray[np.bool_], blocks: 
     np.add.at(scores, blocks, x / scale * rest[:, None])
     at = np.array([1.0, np.mean(np.abs(v)), 0.0, 0.0, 0.0, 0.0]) / scale
     spread = inverse @ (scores.T @ scores) @ inverse
-    return _Friction(s.label, row, float(at @ values), float(np.sqrt(at @ spread @ at)))
+    own = s.arm.frictionloss[row[1]] + s.arm.damping[row[1]] * np.mean(np.abs(v))  # the model's, which `y` lacks
+    return _Friction(s.label, row, float(at @ values + own), float(np.sqrt(at @ spread @ at)))

@@ -143,7 +143,7 @@ def _bodies(parts: _Parts, layout: Layout, values: Values) -> Array:
 
 
 def _springs(parts: _Parts, layout: Layout, values: Values) -> Array:
-    """Torque of the springs across the joints about the estimate (K, n): what is left on the links' side; its shares."""
+    """Torque of the springs across the joints about the estimate (K, n): the rest of the links' side; its shares."""
     total = np.zeros_like(parts.signals.q)
     for term, c in values.items():
         if term.form.signature.side == "link" and term not in parts.shares:

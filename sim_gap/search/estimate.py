@@ -169,7 +169,7 @@ class Estimate:
 
         def evaluate(z: Array) -> Array:
             shape = term.shape if free is None else term.reshaped(free, float(z[-1])).shape
-            under, at = {"nominal": self.normal.known_friction[term.place, None]}, own
+            under, at = {"nominal": self.normal.known_joint[term.place]}, own
             for name, other in beneath.items():
                 width = len(self.normal.at[other])
                 under[name], at = z[at : at + width], at + width
