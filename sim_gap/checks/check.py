@@ -14,7 +14,7 @@ from sim_gap.checks.clock import even_times, find_dropped, without_repeats
 from sim_gap.checks.finding import Finding
 from sim_gap.checks.joint_range import find_beyond_range, find_counts
 from sim_gap.checks.mapping import SURE, find_mapping
-from sim_gap.checks.rigid_fit import as_mounted, fit_rigid, motion_of
+from sim_gap.checks.rigid_fit import as_mounted, beside_slow_torques, fit_rigid, motion_of
 from sim_gap.checks.torque_source import (
     find_absent,
     find_delay,
@@ -103,7 +103,8 @@ def _mapping(arm: RigidArm, s: Signals, channel: str, recording: Recording, stat
 def _source(arm: RigidArm, s: Signals, channel: str, _: Recording, stated: Corrections) -> list[Finding]:
     """Findings on the channel's scale and on what it is a reading of."""
     motion = motion_of(s, channel)
-    fit = fit_rigid(as_mounted(arm, motion), motion)
+    mounted = as_mounted(arm, motion)
+    fit = beside_slow_torques(mounted, motion, fit_rigid(mounted, motion))
     scale = find_scale(arm, fit, motion, stated) or find_absent(arm, fit, motion, stated)
     return [*scale, *find_source(fit, s, motion, stated)]
 

@@ -16,7 +16,7 @@ import numpy as np
 from armlink.recording.corrections import Corrections
 from gcomp.arrays import Array
 from sim_gap.checks.finding import Finding, Kind
-from sim_gap.checks.rigid_fit import STRONG_SHARE, Motion, RigidFit, as_mounted, changed, few_rows, fit_rigid
+from sim_gap.checks.rigid_fit import STRONG_SHARE, Motion, RigidFit, as_loaded, as_mounted, changed, few_rows, fit_rigid
 from sim_gap.model.rigid_body import RigidArm
 
 SURE = 0.3
@@ -72,8 +72,8 @@ def find_mapping(arm: RigidArm, motion: Motion, stated: Corrections, follows: Se
 
 
 def _as_an_arm(arm: RigidArm, motion: Motion) -> RigidFit:
-    """The fit as it stands, gravity and springs included where they explain a joint: those are effects of the arm."""
-    mounted = as_mounted(arm, motion)
+    """The fit as it stands, gravity, a tool and springs included where they explain it: effects of the arm."""
+    mounted = as_loaded(as_mounted(arm, motion), motion)
     plain, sprung = fit_rigid(mounted, motion), fit_rigid(mounted, motion, springs=True)
     beside = (sprung.scale > PLAUSIBLE[0]) | (sprung.own_share < STRONG_SHARE)  # not in place of gravity
     return replace(plain, explained=np.where(beside & (sprung.explained > SPRUNG), sprung.explained, plain.explained))
