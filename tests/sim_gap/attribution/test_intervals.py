@@ -74,7 +74,8 @@ def test_what_every_arm_has_besides_is_less_on_an_arm_of_little_strength():
     light.body_mass[:] /= 1000.0
     light.body_inertia[:] /= 1000.0
     tau, motor = recording.torque, recording.motor_torque
-    assert tau is not None and motor is not None
+    assert tau is not None
+    assert motor is not None
     weak = replace(recording, torque=tau / 1000.0, motor_torque=motor / 1000.0)
     signals = prepare(weak, load_model(light).arm)
     estimate = Estimate(ColumnStore(ResidualSet((signals,), layout_of([signals]))), [Term("friction.coulomb", 1)])
