@@ -238,3 +238,14 @@ def test_a_reading_that_drifts_in_a_motion_with_few_reversals_is_no_motors(slow)
     q = np.outer(0.5 * np.cos(2 * np.pi * t / 20.0), np.ones(3))
     made = Recording(t=t, position=q, torque=0.02 * t[:, None] + 0.0 * q if slow == "drift" else -2.0 * q)
     assert check(load_model(nominal).arm, made)[1] == []
+
+
+def test_a_joint_whose_friction_outweighs_the_models_torque_tells_no_zero():
+    """What is left beside its friction may fit any change, with a coefficient of hundreds."""
+    nominal = mujoco.MjModel.from_xml_string(THREE)
+    nominal.body_mass[-1], nominal.body_inertia[-1] = 1e-3, 1e-6
+    arm = load_model(nominal).arm
+    _, q, v, a = motion(3, 30.0, 100.0, seed=4)
+    reading = arm.torque(q, v, a) + np.tanh(v / 0.01)
+    reading[:, 2] += 300.0 * arm.torque(q + np.array([0.0, 0.0, np.pi / 2]), v, a)[:, 2]
+    assert find_mapping(arm, Motion(q, v, a, reading, "tau_motor"), AS_IT_IS) == []
