@@ -45,7 +45,6 @@ def test_what_is_missed_without_a_term_is_what_no_other_takes():
 
 def test_within_the_margins_a_cause_that_nothing_founds_is_minor():
     """An arm that is within its margins has no gap; rivals share their evidence, which founds them together."""
-    sure, weak = cause("friction.coulomb", 1.0, 0.9), cause("torque.offset", 0.5, 0.003)
-    weak = replace(weak, signs=Signs(0.0, 0.1, 1.0, 0.0))
+    sure, weak = cause("friction.coulomb", 1.0, 0.9), cause("torque.offset", 0.5, 0.2)
     rival = replace(weak, confounded_with=("link.mass_moment",))
     assert founded_ones([sure, weak, rival], []) == ([sure, rival], [weak])
