@@ -16,6 +16,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat,
 from armlink.arrays import Array
 from armlink.errors import BadInput
 from armlink.key_errors import describe, describe_all, meant
+from armlink.names import JointName, Name
 
 SIMULATED = "armlink_sim"
 """Interface of a simulated arm in this process; its channel is an arm file."""
@@ -36,10 +37,6 @@ class Section(BaseModel):
 S = TypeVar("S", bound=Section)
 
 
-Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f\x7f/\\]*$")]
-"""A name that goes into file names and reports: one line, no path."""
-
-
 class BadKeys(BadInput):
     """Keys of an arm file that cannot be used; the message names the first."""
 
@@ -52,7 +49,7 @@ class BadKeys(BadInput):
 class DhJoint(Section):
     """One revolute joint in standard Denavit-Hartenberg form; `lower` and `upper` are its mechanical stops."""
 
-    name: Name
+    name: JointName
     a: FiniteFloat = 0.0
     """Link length [m]."""
     alpha: FiniteFloat = 0.0
@@ -148,7 +145,7 @@ class DeviceIdentity(Section):
 class LinkJoint(Section):
     """One joint controller: its drive and the limits that no frame may exceed."""
 
-    name: Name
+    name: JointName
     node: Annotated[int, Field(ge=1, le=127)] | None = None
     """Short for `drive: {family: canopen, node: …}`: CiA 402 with our own torque sensor object 2100h."""
     drive: Annotated[Any, BeforeValidator(_parse_drive)] = None

@@ -113,12 +113,17 @@ def one_line(error: ValueError) -> str:
 
 
 def _is_urdf(path: Path) -> bool:
-    import xml.etree.ElementTree as ET
+    """Whether the root element is `robot`; without namespaces, whose prefixes published files do not declare."""
+    from xml.parsers import expat
 
+    tags: list[str] = []
+    reader = expat.ParserCreate()
+    reader.StartElementHandler = lambda tag, _: tags.append(tag)
     try:
-        return ET.parse(path).getroot().tag == "robot"
-    except (ET.ParseError, OSError):
+        reader.Parse(path.read_bytes(), True)
+    except (expat.ExpatError, OSError):
         return False
+    return tags[:1] == ["robot"]
 
 
 def _find(name: str, *folders: Path) -> Path | None:

@@ -25,7 +25,7 @@ LOAD_FACTOR = 3.0
 ACCELERATION = 1.0
 """Acceleration that this need includes, beside gravity [rad/s²]; assumed."""
 LEAST_TORQUE = 2.0
-"""Least such rated torque [N·m]; assumed."""
+"""Least such rated torque [N·m], on a small arm that of its strongest joint; assumed."""
 FRICTION = 0.02
 """Coulomb friction of the simulated arm, as a share of rated torque; assumed."""
 POSES = 200
@@ -81,8 +81,9 @@ def draft_of_model(
         gravity = (0.0, 0.0, -9.80665)
         notes.append("gravity: the model has none, assumed to point down")
     need = _load_torque(path, [joint.name for joint in chain.joints], gravity)
+    rated = np.maximum(LOAD_FACTOR * need, min(LEAST_TORQUE, LOAD_FACTOR * float(need.max())))
     joints = [
-        _joint(place, chain, stops.get(chain.joints[place].name), float(need[place]))
+        _joint(place, chain, stops.get(chain.joints[place].name), float(rated[place]))
         for place in range(len(chain.joints))
     ]
     free = [joint.name for joint in joints if joint.stops is not None and joint.name not in stops]
@@ -98,10 +99,10 @@ def narrow(draft: Draft, found: ClearRange) -> None:
     draft.servo = f"the range under kinematics.stops is narrower than the model's limits: {found.reason}"
 
 
-def _joint(place: int, chain: Chain, given: tuple[float, float] | None, need: float) -> JointDraft:
+def _joint(place: int, chain: Chain, given: tuple[float, float] | None, rated: float) -> JointDraft:
     joint, notes = chain.joints[place], []
     if joint.effort is None:
-        effort = float(f"{max(LOAD_FACTOR * need, LEAST_TORQUE):.2g}")
+        effort = float(f"{rated:.2g}")
         notes.append(f"rated_torque assumed: {LOAD_FACTOR:g} times the load, the model states no effort limit")
     else:
         effort = round(joint.effort, 4)

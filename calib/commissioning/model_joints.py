@@ -1,6 +1,5 @@
 """Joints of a URDF or MJCF model: kind, limits, torque and speed as far as the model states them."""
 
-import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,6 +9,7 @@ import numpy as np
 from armlink.errors import BadInput
 from gcomp.arm.load import compile_model
 from gcomp.arm.model_tree import coupled_joints, upwards
+from gcomp.arm.model_xml import parse_xml
 
 if TYPE_CHECKING:
     import mujoco
@@ -96,7 +96,7 @@ def _effort(model: "mujoco.MjModel", joint: int) -> float | None:
 def _urdf_speeds(path: Path) -> dict[str, float]:
     """Velocity limits [rad/s] of a URDF's joints, which MuJoCo does not keep; none of an MJCF."""
     speeds = {}
-    for joint in ET.fromstring(path.read_bytes()).findall("joint"):
+    for joint in parse_xml(path.read_bytes()).findall("joint"):
         limit = joint.find("limit")
         try:
             speed = 0.0 if limit is None else float(limit.get("velocity", "0"))

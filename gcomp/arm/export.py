@@ -8,6 +8,7 @@ import numpy as np
 
 from gcomp.arm.feasible_inertials import Bounds, Inertials, nearest_inertials
 from gcomp.arm.load import PlacedChain, place_chain
+from gcomp.arm.model_xml import parse_xml
 from gcomp.arrays import Array, as_array
 from gcomp.errors import BadModel
 
@@ -51,7 +52,7 @@ def write_model(
     heaviest = placed.model.body_mass[carriers]
     limits = bounds or Bounds.positive(nominal.mass - (1 - LEAST_SHARE) * heaviest)
     found = nearest_inertials(wanted, nominal, limits, placed.geometry.base_parameters)
-    root = ET.fromstring(source.read_bytes())
+    root = parse_xml(source.read_bytes())
     changes = []
     for link, body in enumerate(carriers):
         change = _change(placed, link, body, found)

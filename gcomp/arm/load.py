@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from gcomp.arm.arm import Arm
 from gcomp.arm.dh_rows import ArmGeometry, axes_to_arm
+from gcomp.arm.model_xml import NotXml, parse_xml
 from gcomp.arrays import Array, as_array
 from gcomp.errors import BadModel
 
@@ -76,8 +77,8 @@ def compile_model(path: Path) -> "mujoco.MjModel":
     import mujoco
 
     try:
-        root = ET.fromstring(path.read_bytes())
-    except (ET.ParseError, OSError) as error:
+        root = parse_xml(path.read_bytes())
+    except (NotXml, OSError) as error:
         raise BadModel(f"{path}: not a URDF or MJCF file: {error}") from None
     try:
         if root.tag == "robot":

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from armlink.recording.recording import Recording
+from gcomp.arrays import Array
 from sim_gap.attribution.causes import left_over
 from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, Rollout
 from sim_gap.attribution.notes import besides_notes, law_notes, notes
@@ -42,7 +43,8 @@ def answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: 
     )
     stuck = [each for s in (*fit.signals, *judge.signals) for each in s.stuck]
     sets = [(judge, left), *([(fit, left_fit)] if found else [])]
-    aside, laws = _aside(made, estimate), residual_laws(fit, judge, left_fit, left)
+    friction = _dry_friction(made.model.arm.frictionloss, estimate)
+    aside, laws = _aside(made, estimate, friction), residual_laws(fit, judge, left_fit, left, friction)
     result = verdict(found, sets, unsettled=bool(laws) or any(place.clear for place in aside))
     if stuck or (fit.impacts and not any(cause.effect == "transmission.backlash" for cause in found)):
         result = "unexplained"
@@ -72,14 +74,19 @@ def answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: 
     )
 
 
-def _aside(made: Internals, estimate: Estimate | None) -> list[Location]:
-    """Gaps at rest, in creep and above the band on held-out data."""
-    judge, arm = made.heldout, made.model.arm
-    zero = {row: np.zeros(len(values)) for row, values in judge.values.items()}
-    friction = arm.frictionloss.copy()
+def _dry_friction(nominal: Array, estimate: Estimate | None) -> Array:
+    """Dry friction of the joints as far as it is known: the model's, and what was found beside it [N·m], (n,)."""
+    friction = nominal.copy()
     for term in estimate.terms if estimate is not None else ():
         if term.effect == "friction.coulomb":
-            friction[term.place] += abs(estimate.of(term)[0]) if estimate is not None else 0.0
+            friction[term.place] += estimate.of(term)[0] if estimate is not None else 0.0
+    return np.maximum(friction, 0.0)
+
+
+def _aside(made: Internals, estimate: Estimate | None, friction: Array) -> list[Location]:
+    """Gaps at rest, in creep and above the band on held-out data."""
+    judge = made.heldout
+    zero = {row: np.zeros(len(values)) for row, values in judge.values.items()}
     explained = zero if estimate is None else estimate.predict(judge)
     known = [row for row in made.train.rows if slides(made.train, row)]
     return [*slow(judge, explained, friction, known), *fast(judge, made.recordings)]

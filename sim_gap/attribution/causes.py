@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.attribution.confidence import confidence
+from sim_gap.attribution.confidence import FOUNDED, confidence
 from sim_gap.attribution.diagnosis import HINT, Cause, Signs
 from sim_gap.attribution.law_test import LawTest
 from sim_gap.attribution.rivals import Rivals
@@ -206,6 +206,16 @@ def causes(
                 hints += terms if out is found and out[-1].confidence < HINT else ()
     missed = max(one.missed(hints) for one in (scorer, fitted))
     return [replace(each, fall=min(each.fall, missed)) if each.confidence < HINT else each for each in found], minor
+
+
+def founded_ones(found: Sequence[Cause], minor: Sequence[Cause]) -> tuple[list[Cause], list[Cause]]:
+    """The causes that say more than that noise is uneven, for a gap within its margins; the others are minor.
+
+    They are more than a guess, even where a general law would do as well, or rivals share their evidence.
+    """
+    stands = [bool(cause.confounded_with) or cause.confidence >= FOUNDED for cause in found]
+    kept = [cause for cause, stays in zip(found, stands, strict=True) if stays]
+    return kept, [*minor, *(cause for cause, stays in zip(found, stands, strict=True) if not stays)]
 
 
 def _is_held_out(term: Term, heldout: ResidualSet) -> bool:

@@ -16,12 +16,12 @@ from armlink.recording.corrections import AS_IT_IS, Corrections
 from armlink.recording.recording import Recording, default_names, slice_rows
 from sim_gap.attribution.answer import Internals, answer
 from sim_gap.attribution.bodies import CLEARLY, body_of, groups_of, lacking, mounts, placed
-from sim_gap.attribution.causes import causes
+from sim_gap.attribution.causes import causes, founded_ones
 from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.attribution.friction_compensation import held_in_commands, missing_in_readings
 from sim_gap.attribution.position_only import diagnose_positions
 from sim_gap.attribution.rivals import Rivals
-from sim_gap.attribution.verdict import is_quiet
+from sim_gap.attribution.verdict import is_quiet, is_within
 from sim_gap.checks.check import check_recordings
 from sim_gap.checks.finding import Finding
 from sim_gap.checks.joints import match_joints
@@ -119,6 +119,8 @@ def diagnose(
     fit = estimate.store.data
     quiet = not fit.impacts and is_quiet(judge) and is_quiet(fit)
     found, minor = causes(estimate, judge, Rivals(search), sim.arm.names, quiet=quiet)
+    if is_within(judge) and is_within(fit):
+        found, minor = founded_ones(found, minor)
     if quiet and not found:
         made = answer(Internals(sim, fit, judge, None, tuple(heldout), estimate), [], [], heldout_is)
     else:

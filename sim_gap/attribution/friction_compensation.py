@@ -36,6 +36,8 @@ FOLLOWS, SURE = 0.3, 10.0
 """Least share of the command's changes that only friction compensation accounts for, and least torque of it in standard
 errors. With it, a real arm has shares of 0.94 and 1.0; of 165 joints of real recordings without it, taken as commands,
 9 have more than 0.1 and none more than 0.3."""
+SLIGHT = 0.01
+"""Share of a command's spread that its compensation must have to be told: damping alone leaves a trace of a dry law."""
 LEAST_SHARE = 0.25
 """A recording with less than this share of the friction of the others lacks it."""
 CLEAR = 4.0
@@ -120,7 +122,8 @@ def _law(command: Array, velocity: Array, position: Array) -> tuple[float, float
         values = inverse @ (x.T @ y) / scale
         spread = inverse / np.outer(scale, scale) * float(whole @ whole) / len(y)
         torque, error = float(values[:LAGS].sum()), float(np.sqrt(max(spread[:LAGS, :LAGS].sum(), 0.0)))
-        if share > max(FOLLOWS, best[0] if best else 0.0) and torque > SURE * error:
+        sure = torque > max(SURE * error, SLIGHT * float(np.nanstd(command)))
+        if share > max(FOLLOWS, best[0] if best else 0.0) and sure:
             best = share, torque, float(values[VISCOUS : VISCOUS + LAGS].sum())
     return best[1:] if best else None
 
@@ -203,4 +206,5 @@ def _friction(s: Signals, row: Row, y: Array, valid: NDArray[np.bool_], blocks: 
     np.add.at(scores, blocks, x / scale * rest[:, None])
     at = np.array([1.0, np.mean(np.abs(v)), 0.0, 0.0, 0.0, 0.0]) / scale
     spread = inverse @ (scores.T @ scores) @ inverse
-    return _Friction(s.label, row, float(at @ values), float(np.sqrt(at @ spread @ at)))
+    own = s.arm.frictionloss[row[1]] + s.arm.damping[row[1]] * np.mean(np.abs(v))  # the model's, which `y` lacks
+    return _Friction(s.label, row, float(at @ values + own), float(np.sqrt(at @ spread @ at)))

@@ -91,15 +91,23 @@ class _Candidate:
 
 
 def residual_laws(
-    fit: ResidualSet, judge: ResidualSet, left_fit: Mapping[Row, Array], left: Mapping[Row, Array]
+    fit: ResidualSet,
+    judge: ResidualSet,
+    left_fit: Mapping[Row, Array],
+    left: Mapping[Row, Array],
+    friction: Array | None = None,
 ) -> list[ResidualLaw]:
-    """The laws of what is left of training and held-out data, (K,) per row each, the largest first."""
+    """The laws of what is left of training and held-out data, (K,) per row each, the largest first.
+
+    `friction` (n,) is the known dry friction [N·m]: in creep a motor may hold any torque up to that.
+    """
     wide = _samples(fit), _samples(judge)
     found = []
     for row in fit.rows:
-        for masks in ((fit.valid[row], judge.valid[row]), (wide[0][row], wide[1][row])):
+        sticks = 0.0 if friction is None else float(friction[row[1]])
+        for masks, any_torque in (((fit.valid[row], judge.valid[row]), 0.0), ((wide[0][row], wide[1][row]), sticks)):
             enough = min(mask.sum() for mask in masks) >= FEWEST
-            if enough and root_mean_square(left[row][masks[1]]) > judge.margin[row]:
+            if enough and root_mean_square(left[row][masks[1]]) > judge.margin[row] + any_torque:
                 law = _best(fit, judge, row, (left_fit[row], left[row]), masks)
                 found += [law] if law is not None else []
                 break

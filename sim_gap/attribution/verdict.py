@@ -29,6 +29,11 @@ def is_quiet(data: ResidualSet) -> bool:
     return all(rms <= data.quiet_threshold[row] for row, rms in row_rms(data).items())
 
 
+def is_within(data: ResidualSet) -> bool:
+    """Whether every row is within its margin."""
+    return all(rms <= data.margin[row] for row, rms in row_rms(data).items())
+
+
 def share_left(data: ResidualSet, left: dict[Row, Array]) -> float:
     """Remaining share of the squared gap above the noise, over the rows with a gap, each with the same weight."""
     before, after = row_rms(data), row_rms(data, left)

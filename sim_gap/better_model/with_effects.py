@@ -201,12 +201,14 @@ def compiled_copy(spec: Any) -> Any:
 
 def _joint(model: Any, joint: int, effect: str, c: Array) -> None:
     dof, adr = model.jnt_dofadr[joint], model.jnt_qposadr[joint]
-    if effect == "friction.coulomb":
-        model.dof_frictionloss[dof] += c[0]
-    elif effect == "friction.viscous":
-        np.reshape(model.dof_damping, (model.nv, -1))[dof, 0] += c[0]
-    elif effect == "actuator.rotor_inertia":
-        model.dof_armature[dof] += c[0]
+    added = {
+        "friction.coulomb": "dof_frictionloss",
+        "friction.viscous": "dof_damping",
+        "actuator.rotor_inertia": "dof_armature",
+    }
+    if effect in added:
+        values = np.reshape(getattr(model, added[effect]), (model.nv, -1))
+        values[dof, 0] = max(values[dof, 0] + c[0], 0.0)
     else:
         stiffness = np.reshape(model.jnt_stiffness, (model.njnt, -1))
         total = stiffness[joint, 0] + c[0]

@@ -14,7 +14,7 @@ from sim_gap.checks.clock import even_times, find_dropped, without_repeats
 from sim_gap.checks.finding import Finding
 from sim_gap.checks.joint_range import find_beyond_range, find_counts
 from sim_gap.checks.mapping import SURE, find_mapping
-from sim_gap.checks.rigid_fit import Motion, as_mounted, fit_rigid, motion_of
+from sim_gap.checks.rigid_fit import Motion, as_mounted, beside_slow_torques, fit_rigid, motion_of
 from sim_gap.checks.torque_source import (
     find_absent,
     find_delay,
@@ -112,7 +112,7 @@ def _source(
     arm: RigidArm, mounted: RigidArm, s: Signals, motion: Motion, _: Recording, stated: Corrections
 ) -> list[Finding]:
     """Findings on the channel's scale and on what it is a reading of."""
-    fit = fit_rigid(mounted, motion)
+    fit = beside_slow_torques(mounted, motion, fit_rigid(mounted, motion))
     scale = find_scale(arm, fit, motion, stated) or find_absent(arm, fit, motion, stated)
     return [*scale, *find_source(fit, s, motion, stated)]
 

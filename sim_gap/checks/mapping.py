@@ -20,6 +20,7 @@ from sim_gap.checks.rigid_fit import (
     STRONG_SHARE,
     Motion,
     RigidFit,
+    as_loaded,
     as_mounted,
     changed,
     few_rows,
@@ -44,6 +45,8 @@ PLAUSIBLE = 0.4, 2.5
 """Coefficient of the model's torque on a strong joint after a correction."""
 IDLE = 0.5
 """The model's own part over the reading from which a motor is all but idle, if the reading does not hold that part."""
+SLIGHT = 0.05
+"""Share of the reading that the model's own part must have, with a plausible coefficient, for a joint to count."""
 SPRUNG = 0.97
 """Share of variance explained from which a joint has a spring; a turned sign looks like one by less."""
 TURN = math.pi / 180.0
@@ -85,8 +88,8 @@ def find_mapping(
 
 
 def _as_an_arm(mounted: RigidArm, motion: Motion) -> RigidFit:
-    """The fit as it stands, gravity and springs included where they explain a joint: those are effects of the arm."""
-    model = mounted.torque(motion.q, motion.v, motion.a)
+    """The fit as it stands, gravity, a tool and springs included where they explain it: effects of the arm."""
+    model = as_loaded(mounted, motion).torque(motion.q, motion.v, motion.a)
     plain, sprung = fit_model(model, motion), fit_model(model, motion, springs=True)
     beside = (sprung.scale > PLAUSIBLE[0]) | (sprung.own_share < STRONG_SHARE)  # not in place of gravity
     return replace(plain, explained=np.where(beside & (sprung.explained > SPRUNG), sprung.explained, plain.explained))
@@ -125,10 +128,12 @@ def _told(hypothesis: Hypothesis, channel: str, fit: RigidFit, falls: Array) -> 
 
     At a joint that others drag along, its motor all but idle, the model's torque is carried by friction and rotor: the
     motor reads a small difference of the three, which any change may happen to fit better, with a coefficient of the
-    model that no arm has. So it is with an angle unit that makes the model's torque too small by far.
+    model that no arm has. So it is with an angle unit that makes the model's torque too small by far, and where
+    friction outweighs the model's torque by far: only a coefficient of dozens makes that explain anything.
     """
     low, high = PLAUSIBLE
     nothing = (channel != "tau") & (fit.own_share > IDLE) & (fit.scale < 0.5 * low)
+    nothing |= fit.own_share * np.minimum(fit.scale, high) < SLIGHT
     if hypothesis.kind == "scale":
         nothing |= (fit.scale > high) & (fit.own_share * fit.scale > STRONG_SHARE)
     return np.where(nothing, np.minimum(falls, 0.0), falls)

@@ -29,6 +29,8 @@ MOUNTED = 0.1
 """Share of the readings' variance that may be left (geometric mean) for gravity along another axis to count."""
 UPSIDE_DOWN = 0.98
 """Cosine from which gravity is nearly opposite: then a turned sign of all torques is as good, and far more common."""
+TOOL_REACH = 0.4
+"""Farthest centre of mass of a tool from the last joint, as a share of the arm's length."""
 STRONG_SHARE, STRONG_CORRELATION = 0.2, 0.8
 """A joint is strong if the model's own part is this share of the reading, and correlates with it so."""
 
@@ -112,6 +114,21 @@ def _covariances(model: Array, motion: Motion, springs: bool) -> Array:
     return np.asarray(columns @ columns.transpose(0, 2, 1) / len(model))
 
 
+def beside_slow_torques(arm: RigidArm, motion: Motion, fit: RigidFit) -> RigidFit:
+    """The fit with the friction that remains beside a drift of the reading and a spring across the joint.
+
+    In a motion with few reversals a torque that grows with time or position varies with the direction, too.
+    """
+    model, friction = arm.torque(motion.q, motion.v, motion.a), fit.friction.copy()
+    time = np.linspace(-1.0, 1.0, len(model))
+    for j in np.flatnonzero(np.isfinite(friction)):
+        direction = np.clip(motion.v[:, j] / TURNING, -1.0, 1.0)
+        own = (model[:, j], motion.v[:, j], motion.a[:, j], motion.q[:, j])
+        columns = np.stack([direction, *own, np.ones_like(time), time, time**2], axis=1)
+        friction[j] = np.linalg.lstsq(columns, motion.reading[:, j], rcond=None)[0][0]
+    return replace(fit, friction=friction)
+
+
 def as_mounted(arm: RigidArm, motion: Motion) -> RigidArm:
     """The arm with gravity along the axis that fits best, if that is better than the nominal one.
 
@@ -133,6 +150,34 @@ def as_mounted(arm: RigidArm, motion: Motion) -> RigidArm:
     if found.sum() > plain.sum() or found.mean() > np.log(MOUNTED + FLOOR):
         return arm
     return arm if upside_down and opposite.sum() < found.sum() + 0.3 else turned
+
+
+def as_loaded(arm: RigidArm, motion: Motion) -> RigidArm:
+    """The arm with the body at its last link that fits best, if it explains the readings and may exist.
+
+    A tool that outweighs a slim last link turns the direction of its mass moment: alone, that looks as if the joint's
+    zero were off. A zero that is off needs a moment without a mass.
+    """
+    direction = np.clip(motion.v / TURNING, -1.0, 1.0)
+    tip = arm.n - 1
+    columns = arm.link_regressor(arm.motion(motion.q, motion.v, motion.a), tip)[:, :, :4]
+    left = motion.reading - arm.torque(motion.q, motion.v, motion.a)
+    wide, sides = [], []
+    for j in range(arm.n):  # friction, rotor and offset of each joint are its own
+        own = np.stack([direction[:, j], motion.v[:, j], motion.a[:, j], np.ones(len(left))], axis=1)
+        both = np.column_stack([columns[:, j], left[:, j]])
+        rest = (both - own @ np.linalg.lstsq(own, both, rcond=None)[0]) / (motion.reading[:, j].std() + 1e-9)
+        wide.append(rest[:, :4])
+        sides.append(rest[:, 4])
+    body = np.linalg.lstsq(np.concatenate(wide), np.concatenate(sides), rcond=None)[0]
+    reach = float(np.linalg.norm(arm.offset[1:], axis=1).sum())
+    if body[0] <= 0.0 or float(np.linalg.norm(body[1:])) > TOOL_REACH * max(reach, 1e-9) * body[0]:
+        return arm
+    inertial = arm.inertial.copy()
+    inertial[tip, :4] += body
+    loaded = arm.with_inertial(inertial)
+    found, plain = fit_rigid(loaded, motion).cost, fit_rigid(arm, motion).cost
+    return loaded if found.sum() < plain.sum() and found.mean() < np.log(MOUNTED + FLOOR) else arm
 
 
 def _joints(grams: Array, unsigned: NDArray[np.bool_]) -> Array:

@@ -16,6 +16,9 @@ from sim_gap.residuals.preprocess import Signals
 SCALE = 0.42, 2.4
 """Median coefficient of the model's torque, weighted by that torque, outside which a channel is in another unit; with
 loads and wrong torque constants it stays between 0.65 and 1.9 on real arms."""
+TELLING = 0.3
+"""Share of the model's torque (root sum of squares) that the joints must have which tell its unit: a slim wrist alone,
+on which something else pulls, tells nothing of the others."""
 GEAR_FRICTION = 0.13
 """Friction over torque (root sum of squares over the joints that move) from which a channel is a motor's: link sensors
 of two real arms show 0.04 to 0.07, motors of four others 0.26 to 0.6."""
@@ -45,7 +48,9 @@ def find_scale(arm: RigidArm, fit: RigidFit, motion: Motion, stated: Corrections
     strong = fit.strong & (fit.correlation > 0.0)
     if strong.sum() == 1:
         strong |= fit.correlation > STRONG_CORRELATION
-    if stated.states("units", f"{motion.channel}_1") or not strong.any():
+    own = fit.own_share * fit.spread
+    few = np.linalg.norm(own[strong]) < TELLING * np.linalg.norm(own)
+    if stated.states("units", f"{motion.channel}_1") or not strong.any() or few:
         return []
     scale = _weighted_median(fit.scale[strong], (fit.own_share * fit.spread)[strong])
     if SCALE[0] < scale < SCALE[1]:

@@ -3,12 +3,17 @@
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.effects.effect import Beneath, Effect, Plausibility, Shape, Signature, between, not_negative
+from sim_gap.effects.effect import NONE_LEFT, Beneath, Effect, Plausibility, Shape, Signature, between
 
 
 def _gain(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:
     """Torque produced per torque reported: the error of the torque constant."""
     return 1.0 / (1.0 + coefficients)
+
+
+def _above_nominal(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
+    """The rotor may have less inertia than the model's armature."""
+    return bool(coefficients[0] >= -NONE_LEFT * float(beneath["nominal"][2]))
 
 
 EFFECTS = (
@@ -23,6 +28,6 @@ EFFECTS = (
     Effect(
         "actuator.rotor_inertia",
         Signature.at_motor(lambda s, j, _: s.a[:, j], "motor"),
-        Plausibility(prior_penalty=0, allows=not_negative),
+        Plausibility(prior_penalty=0, allows=_above_nominal),
     ),
 )

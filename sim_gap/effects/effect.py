@@ -23,7 +23,10 @@ Key = tuple[str, int]
 Column = Callable[[Signals, int, Shape], Array]
 """The columns of an effect at one place, (K,) or (K, p), from signals, place and shape."""
 Beneath = Mapping[str, Array]
-"""Coefficients of the effects that one needs, by id; `nominal` holds the model's own friction loss."""
+"""Coefficients of the effects that one needs, by id. `nominal`: friction loss [N·m], damping [N·m·s/rad], armature
+[kg·m²] of the joint in the model, and its usual speed (RMS) [rad/s]."""
+NONE_LEFT = 1.02
+"""Largest share of what the model has that can be taken off: all of it, within the error of a fit."""
 
 
 Channel = Literal["any", "sensor", "motor", "command"]
@@ -130,6 +133,8 @@ class Plausibility:
     """Prior standard deviation of each coefficient (p,), its largest plausible size; infinite for none."""
     background_std: float = 0.0
     """Standard deviation of each coefficient over sound arms; confidence intervals include it."""
+    background_nm: bool = False
+    """Whether it is a torque, and so smaller on arms of little strength."""
     allows: Callable[[Array, Shape, Beneath], bool] = always
     """Whether such an effect can exist with these coefficients."""
 

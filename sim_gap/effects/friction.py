@@ -9,6 +9,7 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.effects.effect import (
+    NONE_LEFT,
     Beneath,
     Effect,
     Key,
@@ -23,6 +24,10 @@ from sim_gap.residuals.layout import Layout
 from sim_gap.residuals.preprocess import Signals
 
 COULOMB = ("friction.coulomb",)
+NOISE = 0.01
+"""Coulomb friction below zero that is noise [N·m]."""
+SLOWEST = 0.05
+"""Usual speed of a joint from which dry friction in the model may be taken for viscous [rad/s]."""
 VELOCITIES = (0.03, 0.06, 0.12, 0.25, 0.5)
 """Stribeck velocities that the search starts with [rad/s]."""
 WITHIN = 0.5
@@ -34,9 +39,15 @@ def dry(beneath: Beneath) -> float:
     return float(beneath["friction.coulomb"][0] + beneath["nominal"][0])
 
 
-def _above_minus_nominal(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
-    """Less friction than the nominal model's is possible; 0.01 N·m below zero is noise."""
-    return bool(coefficients[0] > -float(beneath["nominal"][0]) - 0.01)
+def _dry_above_nominal(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
+    """The arm may have less friction than the model, of both kinds: one alone stands for both at the usual speed."""
+    loss, damping, _, speed = beneath["nominal"]
+    return bool(coefficients[0] >= -NONE_LEFT * (loss + damping * speed) - NOISE)
+
+
+def _viscous_above_nominal(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
+    loss, damping, _, speed = beneath["nominal"]
+    return bool(coefficients[0] >= -NONE_LEFT * (damping + loss / max(speed, SLOWEST)))
 
 
 def _above_minus_dry(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
@@ -74,12 +85,12 @@ EFFECTS = (
     Effect(
         "friction.coulomb",
         Signature.at_motor(lambda s, joint, _: s.direction[:, joint]),
-        Plausibility(prior_penalty=0, background_std=0.03, allows=_above_minus_nominal),
+        Plausibility(prior_penalty=0, background_std=0.03, background_nm=True, allows=_dry_above_nominal),
     ),
     Effect(
         "friction.viscous",
         Signature.at_motor(lambda s, joint, _: s.v[:, joint]),
-        Plausibility(prior_penalty=0, background_std=0.02, allows=not_negative),
+        Plausibility(prior_penalty=0, background_std=0.02, background_nm=True, allows=_viscous_above_nominal),
     ),
     Effect(
         "friction.stribeck",

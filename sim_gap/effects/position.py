@@ -42,7 +42,7 @@ def responses(signals: Signals, layout: Layout, joint: int, moves: Array, size: 
         moved = [x.copy() for x in (signals.q, signals.v, signals.a)]
         for x, move in zip(moved, moves[:, 0].T, strict=True):
             x[:, joint] += size * move
-        change = ((signals.arm.torque(*moved) - signals.model) / size)[..., None]
+        change = ((signals.arm.torque(*moved) - signals.bodies) / size)[..., None]
     else:
         slopes = np.stack(signals.sensitivity(joint), axis=-1)
         change = np.einsum("kid,kpd->kip", slopes, moves)

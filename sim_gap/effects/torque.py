@@ -8,7 +8,7 @@ EFFECTS = (
     Effect(  # without a sensor, an offset of the motor's torque
         "torque.offset",
         Signature.at_sensor(lambda s, _joint, _shape: np.ones(len(s.t)), "any"),
-        Plausibility(prior_penalty=0, background_std=0.02),
+        Plausibility(prior_penalty=0, background_std=0.02, background_nm=True),
     ),
     Effect(
         "torque.gain",

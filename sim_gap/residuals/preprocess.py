@@ -98,6 +98,11 @@ class Signals:
         """Torque of the links [N·m], (K, n): the nominal model's, or that of the estimate."""
         return self.arm.torque(self.q, self.v, self.a) if self.found is None else self.found.link
 
+    @property
+    def bodies(self) -> Array:
+        """The share of `model` that masses have, without springs across the joints that an estimate found, (K, n)."""
+        return self.model if self.found is None else self.model - self.found.springs
+
     @cached_property
     def smooth_model(self) -> Array:
         """Nominal torque without the noise of the accelerations, which would disturb plays and clips, (K, n)."""
@@ -239,6 +244,8 @@ class Found:
     """Torque between link and motor beside the nominal model's: friction, rotors, ripple [N·m], (K, n)."""
     bent: Array
     """What the sensor adds by hysteresis, crosstalk and the like, before gain and offset [N·m], (K, n)."""
+    springs: Array | float = 0.0
+    """Share of `link` that springs across the joints have [N·m], (K, n)."""
 
 
 def require_length(recording: Recording, label: str) -> None:

@@ -59,8 +59,9 @@ class _Parts:
 def about(read: Signals, layout: Layout, values: Values) -> About:
     """A recording about an estimate; about nothing, the recording itself."""
     parts = _Parts(read)
-    link = _links(parts, layout, values) if values else read.model
-    still = Found(read, link, np.zeros_like(read.q), np.zeros_like(read.q))
+    bodies = _bodies(parts, layout, values) if values else read.model
+    springs = _springs(parts, layout, values)
+    still = Found(read, bodies + springs, np.zeros_like(read.q), np.zeros_like(read.q), springs)
     s = replace(parts.signals, found=still) if values else read
     parts.signals = s
     lost, bent = np.zeros_like(read.q), np.zeros_like(read.q)
@@ -105,7 +106,7 @@ def _columns(s: Signals, layout: Layout, term: Term) -> Columns:
     return term.form.signature.columns(s, layout, term.place, term.shape)
 
 
-def _links(parts: _Parts, layout: Layout, values: Values) -> Array:
+def _bodies(parts: _Parts, layout: Layout, values: Values) -> Array:
     """Torque of the links about the estimate (K, n); shares of the terms that change it: masses, gravity, positions."""
     read, channel = parts.signals, layout.against_model
     arm, torque = read.arm, read.model
@@ -137,13 +138,17 @@ def _links(parts: _Parts, layout: Layout, values: Values) -> Array:
             share = torque - before
             s = replace(s, q=q, v=v, a=a, found=Found(read, torque, s.found.lost, s.found.bent) if s.found else None)
             parts.add(term, {(channel, j): share[:, j] for j in range(arm.n)})
-    for term, c in ours.items():
-        if term not in parts.shares:  # springs
-            rows = {row: x @ c for row, x in _columns(s, layout, term).items()}
-            parts.add(term, rows)
-            torque = torque + np.stack([rows.get((channel, j), np.zeros(len(torque))) for j in range(arm.n)], axis=1)
     parts.signals = s
     return torque
+
+
+def _springs(parts: _Parts, layout: Layout, values: Values) -> Array:
+    """Torque of the springs across the joints about the estimate (K, n): the rest of the links' side; its shares."""
+    total = np.zeros_like(parts.signals.q)
+    for term, c in values.items():
+        if term.form.signature.side == "link" and term not in parts.shares:
+            _add_to(total, layout.against_model, _share(parts, parts.signals, layout, term, c))
+    return total
 
 
 def inertial_change(term: Term, c: Array, inertial: Array, number: int) -> Array | None:

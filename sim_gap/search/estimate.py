@@ -111,7 +111,9 @@ class Estimate:
         statistical = inverse @ (scores.T @ scores) @ inverse * blocks / (blocks - 1)
         background = np.zeros(size)
         for term in self.terms:
-            background[self.normal.at[term]] = term.form.plausibility.background_std
+            usual = term.form.plausibility
+            std = self.store.data.least(usual.background_std) if usual.background_nm else usual.background_std
+            background[self.normal.at[term]] = std
         return np.asarray(statistical + systematic + self._undetected(inverse) + np.diag(background**2))
 
     def _undetected(self, inverse: Array) -> Array:
@@ -167,7 +169,7 @@ class Estimate:
 
         def evaluate(z: Array) -> Array:
             shape = term.shape if free is None else term.reshaped(free, float(z[-1])).shape
-            under, at = {"nominal": self.normal.known_friction[term.place, None]}, own
+            under, at = {"nominal": self.normal.known_joint[term.place]}, own
             for name, other in beneath.items():
                 width = len(self.normal.at[other])
                 under[name], at = z[at : at + width], at + width

@@ -15,6 +15,7 @@ from sim_gap.search.normal_equations import NormalEquations, Weighted
 from sim_gap.search.stepwise import TRIES, Search, shortlist
 from sim_gap.search.term import Term
 from sim_gap.search.torque_constants import CONSTANTS, drives_are_off, every_constant, most_are_off, price_of_all
+from sim_gap.search.whole_body import one_body
 
 
 def select_model(store: ColumnStore, library: Sequence[str]) -> Search:
@@ -22,6 +23,9 @@ def select_model(store: ColumnStore, library: Sequence[str]) -> Search:
     offered, active = first_search(store, library)
     store.keep(offered)
     search = searched_again(store, active, offered)
+    if (body := one_body(store, search, offered)) is not None:
+        again = searched_again(store, body, offered)
+        search = again if again.score < search.score else search
     if drives_are_off(search):
         again = searched_again(store, every_constant(search, offered), offered, CONSTANTS)
         better = again.score + price_of_all(again) < search.score

@@ -29,8 +29,11 @@ class NormalEquations:
         self.store = store
         self.terms = [term for term in terms if store.columns(term)]
         self.rows, self.layout = data.rows, data.layout
-        self.known_friction = data.signals[0].arm.frictionloss
-        self.tip_mass = data.signals[0].arm.inertial[-1, :1]
+        arm = data.signals[0].arm
+        speed = np.sqrt(np.mean([np.mean(s.v**2, axis=0) for s in data.signals], axis=0))
+        self.known_joint = np.stack([arm.frictionloss, arm.damping, arm.armature, speed], axis=1)
+        """What the nominal model has at each joint, and its usual speed, (n, 4) as in `Beneath`."""
+        self.tip_mass = arm.inertial[-1, :1]
         widths = [next(iter(store.columns(term).values())).shape[1] for term in self.terms]
         ends = np.cumsum([0, *widths])
         self.at = {term: np.arange(ends[i], ends[i + 1]) for i, term in enumerate(self.terms)}

@@ -72,7 +72,7 @@ class Search:
         values = {term.key: piece for term, piece in zip(terms, pieces, strict=True)}
         for term in terms:
             beneath = {name: values[name, place] for name, place in term.beneath}
-            beneath["nominal"] = self.normal.known_friction[term.place, None]
+            beneath["nominal"] = self.normal.known_joint[term.place]
             beneath["tip"] = self.normal.tip_mass
             if not term.form.plausibility.allows(values[term.key], term.shape, beneath):
                 return term
@@ -108,10 +108,13 @@ class Search:
         """Add the term that helps most, if any earns its place."""
         active = {*self.active}
         inactive = [term for term in self.normal.terms if term not in active and self.added[term.key] < TRIES]
-        trials = (
-            self.with_beneath(term, self.active) for _, term in shortlist(self.weighted.screen(self.active, inactive))
-        )
-        chosen = self._best(self._judged(trials), self.score - self.least)
+        screened, judged = self.weighted.screen(self.active, inactive), list[Scored]()
+        while screened and not any(np.isfinite(score) for score, _ in judged):  # the most promising may be impossible
+            first = shortlist(screened)
+            judged = list(self._judged(self.with_beneath(term, self.active) for _, term in first))
+            tried = {term.key for _, term in first}
+            screened = [each for each in screened if each[1].key not in tried]
+        chosen = self._best(judged, self.score - self.least)
         return chosen is not None and len(chosen) <= MOST_TERMS and self.accept(chosen)
 
     def backward(self) -> bool:

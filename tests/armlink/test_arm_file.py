@@ -160,6 +160,7 @@ def test_a_file_that_yaml_chokes_on_is_one_line(tmp_path, text, says):
         (("name",), "two\nlines"),
         (("kinematics", "joints", 0, "name"), "../joint"),
         (("link", "joints", 0, "name"), "a\x1b[2J"),
+        (("link", "joints", 0, "name"), "/joint"),
     ],
 )
 def test_a_name_is_one_line_and_no_path(tmp_path, keys, value):

@@ -121,6 +121,28 @@ def test_two_arms_in_a_model(tmp_path, monkeypatch):
     assert named.draft.joints[0].name == "other_yaw"
 
 
+def test_joints_of_an_attached_model_keep_the_slash_in_their_names(tmp_path, monkeypatch):
+    monkeypatch.setattr("calib.commissioning.new_arm.narrowed", lambda arm_file: None)
+    text = (MODELS / "own.xml").read_text()
+    (tmp_path / "left.xml").write_text(text.replace('name="yaw', 'name="left/yaw'))
+    made = new_arm(tmp_path / "left.xml", tmp_path / "left.yaml")
+    made.write()
+    assert load_arm(made.out).joint_names[0] == "left/yaw" == gcomp_arm(made.parsed()).names[0]
+
+
+def test_a_small_arm_has_drives_of_its_own_strength(tmp_path, monkeypatch):
+    """0.06 N·m of load, not the 2 N·m that a wrist of a larger arm has at least: friction is a share of that."""
+    monkeypatch.setattr("calib.commissioning.new_arm.narrowed", lambda arm_file: None)
+    (tmp_path / "small.xml").write_text(
+        '<mujoco><compiler angle="radian"/><worldbody><body><joint name="a" axis="0 1 0" range="-1 1"/>'
+        '<inertial pos="0.1 0 0" mass="0.05" diaginertia="1e-5 1e-5 1e-5"/><body pos="0.1 0 0">'
+        '<joint name="b" axis="0 0 1" range="-1 1"/><inertial pos="0 0 0.01" mass="0.01" diaginertia="1e-6 1e-6 1e-6"/>'
+        "</body></body></worldbody></mujoco>"
+    )
+    small = new_arm(tmp_path / "small.xml", tmp_path / "small.yaml").parsed()
+    assert [joint.rated_torque for joint in small.require_link().joints] == pytest.approx([0.18, 0.18], rel=0.1)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [

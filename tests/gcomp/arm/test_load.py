@@ -7,6 +7,7 @@ import pinocchio as pin
 import pytest
 from published_arms import HALF, IIWA, MJCF, PANDA, UR10, mujoco_torque, urdf
 
+from gcomp.arm.export import write_model
 from gcomp.arm.load import load_model
 from gcomp.arrays import Array
 from gcomp.errors import BadModel
@@ -131,3 +132,15 @@ def test_branches_unknown_tips_and_files_that_are_no_models_are_refused(tmp_path
         load_model(path)
     with pytest.raises(BadModel, match="not a URDF or MJCF file"):
         load_model(tmp_path / "missing.urdf")
+
+
+def test_a_urdf_whose_prefixes_are_not_declared_is_read_as_ros_and_mujoco_read_it(tmp_path: Path) -> None:
+    """As published ones of the UR5e have it: <drake:acceleration value="…"/> without xmlns:drake."""
+    path = tmp_path / "arm.urdf"
+    path.write_text(urdf(PANDA))
+    plain = load_model(path)
+    path.write_text(urdf(PANDA).replace("</link>", '<drake:acceleration value="15"/></link>'))
+    assert "drake:" in path.read_text()
+    assert np.array_equal(load_model(path).beta, plain.beta)
+    write_model(path, tmp_path / "same.urdf", plain.beta)
+    assert '<drake:acceleration value="15" />' in (tmp_path / "same.urdf").read_text()

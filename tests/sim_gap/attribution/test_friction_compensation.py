@@ -68,3 +68,9 @@ def test_which_runs_of_the_double_pendulum_had_it(realdata):
     answer = diagnose(folder / "sim.xml", made[:2], made[2:], labels=runs)
     found = {(each.recording, each.joint, each.held) for each in answer.friction_compensation}
     assert found == {(run, f"joint_{j}", run == "on_c") for run in runs[2:] for j in (1, 2)}
+
+
+def test_a_trace_of_a_dry_law_in_a_clean_command_is_none():
+    made = arm(2)
+    clean = record(model(), Wrong(), seed=2, seconds=30, noise=0.0).motor_torque
+    assert not held_in_commands([replace(made, torque_command=clean + 2.5e-3 * compensation(made.velocity))], ["trace"])

@@ -155,3 +155,13 @@ def test_loaded_recordings_judged_on_one_without_the_body():
     assert value(answer, "link.payload", "arm", "mass").value == pytest.approx(0.6, rel=0.03)
     assert "link.payload is present in a and b alone" in answer.notes
     assert "second half" in answer.heldout_is
+
+
+def test_a_light_payload_is_not_taken_for_mass_moments_of_all_links():
+    """Before it is fitted about itself it lacks its inertia, and three mass moments fit a little better."""
+    wrong = Wrong(coulomb=np.array([0.2, 0.3, 0.1]), viscous=np.array([0.5, 0.2, 0.1]), payload=0.4)
+    train, heldout = (record(model(), wrong, seed=seed, seconds=30, rate=50) for seed in (1, 2))
+    answer = diagnose(model(), [train], [heldout])
+    assert answer.verdict == "explained"
+    assert answer.causes[0].effect == "link.payload"
+    assert answer.causes[0].parameters["arm"]["mass"].value == pytest.approx(0.4, rel=0.03)

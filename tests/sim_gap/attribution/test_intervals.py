@@ -65,3 +65,19 @@ def test_an_arm_that_is_a_little_wrong_everywhere_is_allowed_for():
             held.append(value.low <= truth <= value.high)
             assert value.high - value.low < 0.5 * truth
     assert np.mean(held) >= 0.9
+
+
+def test_what_every_arm_has_besides_is_less_on_an_arm_of_little_strength():
+    """The same arm a thousandth as heavy: hundredths of a newton-metre would be more than all its friction."""
+    recording = record(model(), Wrong(coulomb=np.array([0.0, 0.8, 0.0])), seconds=40, rate=50, noise=0.01)
+    light = model()
+    light.body_mass[:] /= 1000.0
+    light.body_inertia[:] /= 1000.0
+    tau, motor = recording.torque, recording.motor_torque
+    assert tau is not None
+    assert motor is not None
+    weak = replace(recording, torque=tau / 1000.0, motor_torque=motor / 1000.0)
+    signals = prepare(weak, load_model(light).arm)
+    estimate = Estimate(ColumnStore(ResidualSet((signals,), layout_of([signals]))), [Term("friction.coulomb", 1)])
+    (value,) = estimate.parameters(Term("friction.coulomb", 1)).values()
+    assert 0.0 < value.low <= 0.0008 <= value.high < 0.0016

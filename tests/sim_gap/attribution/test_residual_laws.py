@@ -62,3 +62,16 @@ def test_laws_are_written_as_the_module_reads_them(answer):
         assert name.startswith("law.")
         assert joint in answer.names
         assert len(law["at"]) == len(law["torque"])
+
+
+def test_a_motor_that_sticks_in_creep_follows_no_law():
+    """There it may hold any torque up to its friction: that it holds less is nothing unknown."""
+    made = []
+    for seed in (1, 2):
+        recording = record(model(), Wrong(coulomb=6.0), seed, seconds=40.0, rate=50.0)
+        speed = np.gradient(recording.position, recording.t, axis=0)
+        stuck = -6.0 * np.sign(speed) * (np.abs(speed) < 0.03)
+        made.append(replace(recording, motor_torque=recording.motor_torque + stuck))
+    answer = diagnose(model(), made[:1], made[1:])
+    assert [cause.effect for cause in answer.causes] == ["friction.coulomb"]
+    assert not answer.laws

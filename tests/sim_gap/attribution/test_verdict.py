@@ -1,9 +1,11 @@
 """A hint that the surer causes can do without does not make an explanation ambiguous."""
 
+from dataclasses import replace
+
 import numpy as np
 from wrong_arms import Wrong, model, record
 
-from sim_gap.attribution.causes import _Scorer
+from sim_gap.attribution.causes import _Scorer, founded_ones
 from sim_gap.attribution.diagnosis import Cause, Signs
 from sim_gap.attribution.verdict import carries
 from sim_gap.model.load import load_model
@@ -39,3 +41,10 @@ def test_what_is_missed_without_a_term_is_what_no_other_takes():
     alone = np.max(scorer.rms(terms[:3]) - scorer.rms([*terms[:3], slow]))
     assert scorer.missed([slow]) < 0.1 * alone
     assert scorer.missed([slow, terms[4]]) > 0.5 * alone
+
+
+def test_within_the_margins_a_cause_that_nothing_founds_is_minor():
+    """An arm that is within its margins has no gap; rivals share their evidence, which founds them together."""
+    sure, weak = cause("friction.coulomb", 1.0, 0.9), cause("torque.offset", 0.5, 0.2)
+    rival = replace(weak, confounded_with=("link.mass_moment",))
+    assert founded_ones([sure, weak, rival], []) == ([sure, rival], [weak])

@@ -5,7 +5,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from wrong_arms import THREE, Wrong, model, record
+from wrong_arms import THREE, Wrong, model, motion, record
 
 from armlink.errors import BadInput
 from armlink.recording.corrections import AS_IT_IS, parse_corrections
@@ -13,6 +13,8 @@ from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording, take_joints
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.checks.check import check_recording
+from sim_gap.checks.mapping import find_mapping
+from sim_gap.checks.rigid_fit import Motion
 from sim_gap.model.load import load_model
 
 REAL = Wrong(
@@ -226,3 +228,43 @@ def test_an_order_that_explains_far_more_but_makes_one_joint_worse_is_asked_abou
     mixed = take_joints(replace(motor, motor_torque=torque), [2, 1, 0], motor.names)
     with pytest.raises(BadInput, match="not corrected: --map"):
         check(arm, mixed)
+
+
+def test_a_tool_that_outweighs_the_last_link_is_no_zero_of_its_joint():
+    """Its mass moment points across the link's: a quarter turn of the joint would show alike, but for the mass."""
+    nominal = mujoco.MjModel.from_xml_string(THREE)
+    nominal.body_mass[-1] = 0.1
+    nominal.body_ipos[-1] = (0.0, 0.03, 0.02)
+    nominal.body_inertia[-1] = 2e-4
+    nominal.jnt_axis[-1] = (0.0, 0.0, 1.0)
+    arm = load_model(nominal).arm
+    _, q, v, a = motion(3, 30.0, 100.0, seed=4)
+    body = np.array([0.6, 0.05, 0.0, 0.05]) * [1.0, 0.6, 0.6, 0.6]
+    loaded = arm.inertial.copy()
+    loaded[-1, :4] += body
+    reading = arm.with_inertial(loaded).torque(q, v, a) + 0.2 * np.tanh(v / 0.01)
+    assert find_mapping(arm, Motion(q, v, a, reading, "tau_motor"), AS_IT_IS) == []
+    turned_zero = q + np.array([0.0, 0.0, np.pi / 2])
+    (finding,) = find_mapping(arm, Motion(turned_zero, v, a, arm.torque(q, v, a), "tau_motor"), AS_IT_IS)
+    assert finding.option == "--zero q_3=-1.57080"
+
+
+@pytest.mark.parametrize("slow", ["drift", "spring"])
+def test_a_reading_that_drifts_in_a_motion_with_few_reversals_is_no_motors(slow):
+    nominal = mujoco.MjModel.from_xml_string(THREE)
+    nominal.opt.gravity[:] = 0.0
+    t = np.arange(0.0, 20.0, 0.02)
+    q = np.outer(0.5 * np.cos(2 * np.pi * t / 20.0), np.ones(3))
+    made = Recording(t=t, position=q, torque=0.02 * t[:, None] + 0.0 * q if slow == "drift" else -2.0 * q)
+    assert check(load_model(nominal).arm, made)[1] == []
+
+
+def test_a_joint_whose_friction_outweighs_the_models_torque_tells_no_zero():
+    """What is left beside its friction may fit any change, with a coefficient of hundreds."""
+    nominal = mujoco.MjModel.from_xml_string(THREE)
+    nominal.body_mass[-1], nominal.body_inertia[-1] = 1e-3, 1e-6
+    arm = load_model(nominal).arm
+    _, q, v, a = motion(3, 30.0, 100.0, seed=4)
+    reading = arm.torque(q, v, a) + np.tanh(v / 0.01)
+    reading[:, 2] += 300.0 * arm.torque(q + np.array([0.0, 0.0, np.pi / 2]), v, a)[:, 2]
+    assert find_mapping(arm, Motion(q, v, a, reading, "tau_motor"), AS_IT_IS) == []

@@ -135,3 +135,18 @@ def test_a_recording_without_torque_sensors_is_diagnosed_from_motor_torque_alone
     assert [each.finding for each in findings] == ["effort_source", "clock"]
     assert checked.torque is None
     assert checked.torque_command is None
+
+
+@pytest.mark.parametrize(("factor", "found"), [(1.0, 0), (0.08, 1)])
+def test_a_wrist_on_which_something_pulls_tells_no_unit(factor: float, found: int):
+    """The model has next to no torque there; all joints in another unit do tell."""
+    nominal = mujoco.MjModel.from_xml_string(THREE)
+    nominal.body_mass[-1], nominal.body_inertia[-1] = 1e-3, 1e-6
+    arm = load_model(nominal).arm
+    _, q, v, a = motion(3, 60.0, RATE, seed=3)
+    read = factor * arm.torque(q, v, a)
+    if found == 0:
+        read[:, 2] *= 80.0
+        read[:, :2] += np.random.default_rng(1).normal(0.0, 3.0 * read[:, :2].std(), (len(q), 2))
+    moved = Motion(q, v, a, read, "tau_motor")
+    assert len(find_scale(arm, fit_rigid(arm, moved), moved, AS_IT_IS)) == found

@@ -98,3 +98,13 @@ def test_what_stands_upon_an_effect_that_is_taken_out_goes_with_it() -> None:
     left = library_without(["friction.coulomb"])
     assert whole - set(left) == {"friction.coulomb", "friction.stribeck", "friction.asymmetric"}
     assert whole - set(library_without(["friction.stribeck"])) == {"friction.stribeck"}
+
+
+@pytest.mark.parametrize("effect", ["position.offset", "position.gain"])
+def test_a_position_error_moves_the_bodies_not_the_spring_that_was_found(effect: str) -> None:
+    """The column over a small error is the model's change alone: a spring's torque divided by it mimics the spring."""
+    store = ColumnStore(residuals(Wrong(spring=at(1, 2.0))))
+    term = Term(effect, 0, (-0.002,))
+    about = store.at({Term("transmission.spring", 1): np.array([2.0, 0.1])})
+    for row, column in store.columns(term).items():
+        assert about.columns(term)[row] == pytest.approx(column, abs=1e-3 * np.abs(column).max() + 1e-9)
