@@ -3,8 +3,8 @@
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 
-MAKERS = {"calibration": "armlink calibrate", "gravity": "armlink identify"}
-"""Kind of record → the command that makes it."""
+MAKERS = {"calibration": "calibrate", "gravity": "identify"}
+"""Kind of record → the command that makes it from sweeps."""
 
 
 def no_record(arm: ArmFile, kind: str) -> Refused:
@@ -15,5 +15,4 @@ def no_record(arm: ArmFile, kind: str) -> Refused:
 def way_to(arm: ArmFile, *kinds: str) -> str:
     """The commands that make records of these kinds, from the first."""
     made = " and ".join(MAKERS[kind] for kind in kinds)
-    makes = "makes it" if len(kinds) == 1 else "make them"
-    return f"{made} {makes} from sweeps: armlink sweep {arm.argument} --out unloaded"
+    return f"sweep the arm, then {made}: armlink sweep {arm.argument} --out unloaded"

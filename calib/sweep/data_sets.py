@@ -23,7 +23,7 @@ def data_sets(given: Sequence[Path | SweepData]) -> list[SweepData]:
             raise BadInput(f"{each.path}: the same readings as {twin.path}, which would count twice: give one of them")
         if each.readings and (missing := _missing(each)):
             log.warning(
-                "%s: ended before %s: fitted to what is there; armlink sweep %s --out %s --resume goes on",
+                "%s: ended before %s: fitted to what is there; to go on: armlink sweep %s --out %s --resume",
                 *(each.path, missing, each.manifest.arm_file, each.path),
             )
     return found

@@ -89,7 +89,7 @@ def test_an_arm_file_s_torque_is_its_current_record_s(tmp_path, poses, capsys):
 
 def test_without_inertials_or_record_there_is_no_answer(tmp_path, poses, capsys):
     assert cli.run(["torque", "sarcos", "--q", str(poses[0]), "--store", str(tmp_path / "store.db")]) == 1
-    way = "armlink identify makes it from sweeps: armlink sweep sarcos --out unloaded"
+    way = "sweep the arm, then identify: armlink sweep sarcos --out unloaded"
     assert f"there is no gravity record yet: {way}" in capsys.readouterr().err
 
 

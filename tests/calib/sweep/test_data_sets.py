@@ -53,7 +53,7 @@ def test_a_sweep_that_was_ended_early_says_where(tmp_path: Path, caplog: pytest.
     assert data.plan is not None
     last = data.plan.sweeps[0].name
     assert f"{folder}: ended before the end of sweep {last}: fitted to what is there" in caplog.text
-    assert f"--out {folder} --resume goes on" in caplog.text
+    assert caplog.text.endswith(f"to go on: armlink sweep {data.manifest.arm_file} --out {folder} --resume\n")
     caplog.clear()
     data_sets([written(tmp_path / "scout", 2, planned=False)])
     assert "ended before its first sweep" in caplog.text
