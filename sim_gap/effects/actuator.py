@@ -3,7 +3,7 @@
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.effects.effect import NONE_LEFT, Beneath, Effect, Plausibility, Shape, Signature, between
+from sim_gap.effects.effect import Beneath, Effect, Plausibility, Shape, Signature, added_or_taken_off, between
 
 
 def _gain(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:
@@ -13,7 +13,7 @@ def _gain(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:
 
 def _above_nominal(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
     """The rotor may have less inertia than the model's armature."""
-    return bool(coefficients[0] >= -NONE_LEFT * float(beneath["nominal"][2]))
+    return added_or_taken_off(float(coefficients[0]), float(beneath["nominal"][2]))
 
 
 EFFECTS = (

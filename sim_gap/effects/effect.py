@@ -27,6 +27,8 @@ Beneath = Mapping[str, Array]
 [kg·m²] of the joint in the model, and its usual speed (RMS) [rad/s]."""
 NONE_LEFT = 1.02
 """Largest share of what the model has that can be taken off: all of it, within the error of a fit."""
+LEAST_OFF = 0.05
+"""Smallest share of what the model has that is taken off: less is how sound arms differ, and splits their friction."""
 
 
 Channel = Literal["any", "sensor", "motor", "command"]
@@ -109,6 +111,11 @@ def always(_coefficients: Array, _shape: Shape, _beneath: Beneath) -> bool:
 def not_negative(coefficients: Array, _shape: Shape, _beneath: Beneath) -> bool:
     """The first coefficient is not below zero: friction opposes motion, masses are positive."""
     return bool(coefficients[0] >= 0.0)
+
+
+def added_or_taken_off(coefficient: float, has: float, noise: float = 0.0) -> bool:
+    """Whether an arm can differ by this from a model that `has` so much of it; below zero by `noise` is none."""
+    return coefficient >= -noise or LEAST_OFF * has <= -coefficient <= NONE_LEFT * has + noise
 
 
 def positive(coefficients: Array, _shape: Shape, _beneath: Beneath) -> bool:

@@ -9,7 +9,6 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.effects.effect import (
-    NONE_LEFT,
     Beneath,
     Effect,
     Key,
@@ -17,6 +16,7 @@ from sim_gap.effects.effect import (
     SearchHints,
     Shape,
     Signature,
+    added_or_taken_off,
     as_fitted_and_shape,
     not_negative,
 )
@@ -42,12 +42,12 @@ def dry(beneath: Beneath) -> float:
 def _dry_above_nominal(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
     """The arm may have less friction than the model, of both kinds: one alone stands for both at the usual speed."""
     loss, damping, _, speed = beneath["nominal"]
-    return bool(coefficients[0] >= -NONE_LEFT * (loss + damping * speed) - NOISE)
+    return added_or_taken_off(float(coefficients[0]), float(loss + damping * speed), NOISE)
 
 
 def _viscous_above_nominal(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
     loss, damping, _, speed = beneath["nominal"]
-    return bool(coefficients[0] >= -NONE_LEFT * (damping + loss / max(speed, SLOWEST)))
+    return added_or_taken_off(float(coefficients[0]), float(damping + loss / max(speed, SLOWEST)))
 
 
 def _above_minus_dry(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:

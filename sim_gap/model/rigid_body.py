@@ -86,6 +86,16 @@ class RigidArm:
                 carries[:, link] |= carries[:, self.parent[link]]
         return carries
 
+    @property
+    def stretched_torque(self) -> float:
+        """Torque that the links' weight would have at the base, all stretched out and lying [N·m]."""
+        reach = np.zeros(self.n)
+        for j, before in enumerate(self.parent):
+            if before >= 0:
+                reach[j] = reach[before] + np.linalg.norm(self.offset[j])
+        moments = self.inertial[:, 0] * reach + np.linalg.norm(self.inertial[:, 1:4], axis=1)
+        return float(np.linalg.norm(self.gravity) * moments.sum())
+
     def with_inertial(self, inertial: Array) -> "RigidArm":
         """The arm with other inertial parameters (n, 10)."""
         return replace(self, inertial=inertial)

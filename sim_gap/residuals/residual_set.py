@@ -147,6 +147,14 @@ class ResidualSet:
         """A bound in N·m as it applies to an arm of this strength."""
         return torque * min(1.0, float(self.usual_torque.max()) / SMALL_ARM_NM)
 
+    def background(self, torque: float) -> float:
+        """A standard deviation over sound arms in N·m, as it applies to an arm of this build.
+
+        A large arm that gravity hardly loads, its axes being upright, has the friction of a large one.
+        """
+        build = max(float(self.usual_torque.max()), self.signals[0].arm.stretched_torque)
+        return torque * min(1.0, build / SMALL_ARM_NM)
+
     def _floor(self, s: Signals, row: Row, rest: Array) -> float:
         channel, joint = row
         reference = self.layout.reference(row)

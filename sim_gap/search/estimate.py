@@ -112,7 +112,7 @@ class Estimate:
         background = np.zeros(size)
         for term in self.terms:
             usual = term.form.plausibility
-            std = self.store.data.least(usual.background_std) if usual.background_nm else usual.background_std
+            std = self.store.data.background(usual.background_std) if usual.background_nm else usual.background_std
             background[self.normal.at[term]] = std
         return np.asarray(statistical + systematic + self._undetected(inverse) + np.diag(background**2))
 

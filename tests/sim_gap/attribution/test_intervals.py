@@ -81,3 +81,15 @@ def test_what_every_arm_has_besides_is_less_on_an_arm_of_little_strength():
     estimate = Estimate(ColumnStore(ResidualSet((signals,), layout_of([signals]))), [Term("friction.coulomb", 1)])
     (value,) = estimate.parameters(Term("friction.coulomb", 1)).values()
     assert 0.0 < value.low <= 0.0008 <= value.high < 0.0016
+
+
+def test_a_heavy_arm_on_upright_axes_has_the_friction_of_a_heavy_one():
+    """Gravity hardly loads it: that makes a sound arm's friction no smaller."""
+    arm = load_model(model()).arm
+    recording = record(model(), Wrong(coulomb=np.array([0.0, 0.8, 0.0])), seconds=40, rate=50, noise=0.01)
+    signals = prepare(
+        recording, replace(arm, axis=np.tile([0.0, 0.0, 1.0], (arm.n, 1)), rotation=np.tile(np.eye(3), (arm.n, 1, 1)))
+    )
+    data = ResidualSet((signals,), layout_of([signals]))
+    assert data.least(1.0) < 0.7
+    assert data.background(1.0) == 1.0
