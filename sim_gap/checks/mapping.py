@@ -45,7 +45,7 @@ PLAUSIBLE = 0.4, 2.5
 """Coefficient of the model's torque on a strong joint after a correction."""
 IDLE = 0.5
 """The model's own part over the reading from which a motor is all but idle, if the reading does not hold that part."""
-SLIGHT = 0.05
+SLIGHT = 0.02
 """Share of the reading that the model's own part must have, with a plausible coefficient, for a joint to count."""
 SPRUNG = 0.97
 """Share of variance explained from which a joint has a spring; a turned sign looks like one by less."""
