@@ -45,6 +45,11 @@ class Motion:
     reading: Array
     channel: str
 
+    @property
+    def direction(self) -> Array:
+        """Sign of the velocity, rounded off around zero (K, n)."""
+        return np.clip(self.v / TURNING, -1.0, 1.0)
+
 
 @dataclass(frozen=True, eq=False)
 class RigidFit:
@@ -108,8 +113,7 @@ def fit_models(pairs: Sequence[tuple[Array, Motion]], springs: bool = False) -> 
 def _covariances(model: Array, motion: Motion, springs: bool) -> Array:
     """Of model torque, direction, velocity, acceleration, position and reading of every joint, (n, 6, 6)."""
     turned = motion.q if springs else 0.0 * motion.q
-    direction = np.clip(motion.v / TURNING, -1.0, 1.0)
-    columns = np.stack([model, direction, motion.v, motion.a, turned, motion.reading]).transpose(2, 0, 1)
+    columns = np.stack([model, motion.direction, motion.v, motion.a, turned, motion.reading]).transpose(2, 0, 1)
     columns = columns - columns.mean(-1, keepdims=True)
     return np.asarray(columns @ columns.transpose(0, 2, 1) / len(model))
 
@@ -120,11 +124,10 @@ def beside_slow_torques(arm: RigidArm, motion: Motion, fit: RigidFit) -> RigidFi
     In a motion with few reversals a torque that grows with time or position varies with the direction, too.
     """
     model, friction = arm.torque(motion.q, motion.v, motion.a), fit.friction.copy()
-    time = np.linspace(-1.0, 1.0, len(model))
+    direction, time = motion.direction, np.linspace(-1.0, 1.0, len(model))
     for j in np.flatnonzero(np.isfinite(friction)):
-        direction = np.clip(motion.v[:, j] / TURNING, -1.0, 1.0)
         own = (model[:, j], motion.v[:, j], motion.a[:, j], motion.q[:, j])
-        columns = np.stack([direction, *own, np.ones_like(time), time, time**2], axis=1)
+        columns = np.stack([direction[:, j], *own, np.ones_like(time), time, time**2], axis=1)
         friction[j] = np.linalg.lstsq(columns, motion.reading[:, j], rcond=None)[0][0]
     return replace(fit, friction=friction)
 
@@ -158,8 +161,7 @@ def as_loaded(arm: RigidArm, motion: Motion) -> RigidArm:
     A tool that outweighs a slim last link turns the direction of its mass moment: alone, that looks as if the joint's
     zero were off. A zero that is off needs a moment without a mass.
     """
-    direction = np.clip(motion.v / TURNING, -1.0, 1.0)
-    tip = arm.n - 1
+    direction, tip = motion.direction, arm.n - 1
     columns = arm.link_regressor(arm.motion(motion.q, motion.v, motion.a), tip)[:, :, :4]
     left = motion.reading - arm.torque(motion.q, motion.v, motion.a)
     wide, sides = [], []
