@@ -235,7 +235,10 @@ class Mover:
         return limit - side * (gap + 0.02 * abs(limit))
 
     def rest(self, counts: Mask) -> StaticReading:
-        """Wait until all has settled and the torque averages that `counts` (n,) are exact enough; raises Slipped."""
+        """Wait until all has settled and the torque averages that `counts` (n,) are exact enough; raises Slipped.
+
+        The time to settle ends where an average begins: at a low rate that takes as long again.
+        """
         rule, samples, resolution = self.rule, list[Sample](), self.known_resolution
         window, timeout = rule.window * self.link.period, rule.timeout * self.link.period
         begin: int | None = None
@@ -249,9 +252,9 @@ class Mover:
             count = len(samples)
             if not self._lasted(samples, window) or (count - rule.window) % CHECK_EVERY:
                 continue
-            if self._lasted(samples, timeout):
-                return average(samples[-rule.max_samples :], settled=False)
             if begin is None:
+                if self._lasted(samples, timeout):
+                    return average(samples[-rule.max_samples :], settled=False)
                 if settled(samples[self._since(samples, window) :]):
                     # what settled last still decays in the first half
                     begin = self._since(samples, rule.window // 2 * self.link.period)
