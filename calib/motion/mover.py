@@ -263,7 +263,11 @@ class Mover:
                 if enough or rule.exact(stack(samples[begin:], "torque"), counts):
                     if settled(samples[begin:]):
                         return average(samples[begin:], settled=True)
-                    begin = None  # it only stood at a turning point
+                    middle = (begin + count) // 2
+                    decayed = settled(samples[middle:])  # else it only stood at a turning point
+                    if decayed and self._lasted(samples, timeout + rule.max_samples * self.link.period):
+                        return average(samples[middle:], settled=True)
+                    begin = middle if decayed else None
 
     def _lasted(self, samples: list[Sample], seconds: float) -> bool:
         """Whether the samples cover so much time, a period each at least."""

@@ -148,16 +148,24 @@ class Replayed(Mover):
         return next(self.samples)
 
 
-@pytest.mark.parametrize("tail", [3e-4, 1e-3])
-def test_the_time_to_settle_is_not_that_of_the_average(tail: float) -> None:
-    """At 100 Hz an average of 200 samples takes half of the time that a joint has to settle."""
-    period = 0.01
-    rule = SettleRule.of(SweepSection(), np.array([0.01]), period)
-    t = np.arange(1000) * period
+@pytest.mark.parametrize(("rate", "tail"), [(250, 1e-3), (100, 3e-4), (100, 1e-3), (50, 3e-4), (50, 1e-3)])
+def test_the_time_to_settle_is_not_that_of_the_average(rate: float, tail: float) -> None:
+    """At 50 Hz an average of 200 samples takes as long as a joint has to settle."""
+    rule = SettleRule.of(SweepSection(), np.array([0.01]), 1 / rate)
+    t = np.arange(0.0, 12.0, 1 / rate)
     torque = np.random.default_rng(5).normal(0, 0.2, t.size)
-    reading = Replayed(rule, period, tail * np.exp(-t / 1.2), torque).rest(COUNTS)
+    reading = Replayed(rule, 1 / rate, tail * np.exp(-t / 1.2), torque).rest(COUNTS)
     assert reading.settled
-    assert reading.t < SweepSection().settle_timeout + 2 * rule.max_samples * period
+    assert reading.t < SweepSection().settle_timeout + 1.6 * rule.max_samples / rate
+    assert reading.count >= rule.max_samples
+
+
+def test_a_creep_too_slow_to_tell_comes_to_an_end() -> None:
+    rule = SettleRule.of(SweepSection(), np.array([0.01]), 0.02)
+    t = np.arange(0.0, 12.0, 0.02)
+    reading = Replayed(rule, 0.02, 5e-5 * t, np.random.default_rng(6).normal(0, 0.2, t.size)).rest(COUNTS)
+    assert reading.settled
+    assert reading.t < SweepSection().settle_timeout + 1.6 * rule.max_samples * 0.02
 
 
 def test_a_joint_that_never_settles_is_read_when_its_time_is_up() -> None:
