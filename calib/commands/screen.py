@@ -69,7 +69,7 @@ class SweepScreen:
 
     def say(self, text: str) -> None:
         """One line below the bar."""
-        _CONSOLE.print(text, highlight=False)
+        _CONSOLE.print(text, highlight=False, soft_wrap=True)
 
     def __enter__(self) -> Self:
         """Show the bar."""
