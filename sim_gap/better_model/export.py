@@ -130,6 +130,7 @@ def _set_joint(joint: Any, model: Any, degrees: bool) -> None:
     joint.damping[0] = float(np.reshape(model.dof_damping, (model.nv, -1))[dof, 0])
     joint.stiffness[0] = float(np.reshape(model.jnt_stiffness, (model.njnt, -1))[joint.id, 0])
     unit = float(np.degrees(1.0)) if degrees and model.jnt_type[joint.id] == HINGE else 1.0
-    joint.springref, joint.ref = unit * float(model.qpos_spring[adr]), unit * float(model.qpos0[adr])
-    if model.jnt_limited[joint.id]:
-        joint.range = unit * model.jnt_range[joint.id]
+    joint.springref, zero = unit * float(model.qpos_spring[adr]), unit * float(model.qpos0[adr])
+    if not np.isclose(zero, joint.ref, rtol=1e-9, atol=1e-12):
+        joint.ref = zero
+        joint.range = unit * model.jnt_range[joint.id] if model.jnt_limited[joint.id] else joint.range
