@@ -12,6 +12,7 @@ from sim_gap.closed_loop.identify import Identified, columns_of_effect, identify
 from sim_gap.closed_loop.judge import LEAST_SHRINK, SYSTEMATIC, Stage, interval, undecided_scale
 from sim_gap.closed_loop.parameters import EFFECTS
 from sim_gap.closed_loop.search import PRICE
+from sim_gap.closed_loop.training.bands import SHARE
 from sim_gap.closed_loop.training.replay import replay_rms
 from sim_gap.model.load import SimModel
 from sim_gap.residuals.where import Location
@@ -222,6 +223,21 @@ def _notes(found: Identified) -> list[str]:
             "viscous friction, back-EMF and damping of the measured velocity act alike on a position: the sum is given"
             + (", as part of the controller" if found.search.open_controller else "")
         )
+    out += _beyond(found)
     if found.export is not None and found.export.lines:
         out.append(f"the corrected model leaves out: {', '.join(found.export.lines)}")
     return out
+
+
+def _beyond(found: Identified) -> list[str]:
+    """A note of the joints that leave the range of the training recordings more often than a band may miss."""
+    out = []
+    for j, name in enumerate(found.sim.arm.names):
+        fitted, other = (d.measured[:, j][d.weight[:, j] > 0.0] for d in (found.search.data, found.heldout))
+        if not (fitted.size and other.size):
+            continue
+        outside = float(np.mean((other < fitted.min()) | (other > fitted.max())))
+        if outside > 1.0 - SHARE:
+            out.append(f"{name}: {outside:.0%} of the held-out motion")
+    told = "outside the range of the training recordings, where bands may be too narrow"
+    return [f"{told}: {', '.join(out)}"] if out else []
