@@ -109,6 +109,14 @@ def test_what_an_effect_needs_is_at_hand_for_its_parameters(data: ResidualSet) -
     assert ratio.value == pytest.approx(size / coulomb)
 
 
+def test_friction_that_is_clearly_there_has_a_narrow_interval(data: ResidualSet) -> None:
+    """Sound arms differ by some hundredths of a newton metre, not by all that a joint has."""
+    estimate = Estimate(ColumnStore(data), [COULOMB, Term("friction.viscous", 1), Term("friction.stribeck", 1, (0.1,))])
+    (torque,) = estimate.parameters(estimate.terms[0]).values()
+    assert torque.low < 0.5 < torque.high
+    assert torque.high - torque.low < 1.5
+
+
 def test_a_body_that_cannot_exist_gives_way_to_the_closest_that_can() -> None:
     """Of a diagonal matrix 1 + x, the coefficient beyond −1 ends there and the other one stays."""
     best = _closest(np.array([-2.0, 0.3]), np.eye(2), lambda x: np.diag(1.0 + x))
