@@ -112,9 +112,7 @@ def test_reversals_are_where_a_joint_hardly_moves() -> None:
     zero = np.zeros_like(v)
     signals = SimpleNamespace(t=np.arange(4.0), q=zero, v=v, a=zero + 1.0, direction=zero, model=zero)
     signals.filtered = lambda x: x
-    np.testing.assert_allclose(
-        _features(signals)["reversal"][:, 0, 0], [1.0, np.exp(-1.0), 0.0, 0.0], atol=1e-6
-    )
+    np.testing.assert_allclose(_features(signals)["reversal"][:, 0, 0], [1.0, np.exp(-1.0), 0.0, 0.0], atol=1e-6)
 
 
 @pytest.mark.parametrize(("terms", "made"), [((PAYLOAD, OFFSET), [(1, 0.0), (2, 0.5)]), ((OFFSET,), [(0, 0.0)])])

@@ -1,5 +1,6 @@
 """How large effects are drawn, and on which joints: those that can show them, at a size that shows."""
 
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,6 +10,7 @@ from sim_gap.blind.cases import recipe
 from sim_gap.blind.cases.recipe import OTHER_PAIR, Recipe
 from sim_gap.blind.effects import actuator, friction, torque, transmission
 from sim_gap.blind.effects.drawn import Drawn
+from sim_gap.blind.judging.tables import _percent
 from sim_gap.blind.servo.effects import integral
 
 K = 400
@@ -146,5 +148,10 @@ def test_of_several_effects_a_payload_counts_as_one_of_the_last_link(monkeypatch
     arm = SimpleNamespace(arm=SimpleNamespace(names=("joint_1", "joint_2")))
     for joint, found in (("joint_2", False), ("joint_1", True)):
         own = {"link.payload": drawn("link.payload", "arm"), "link.mass_moment": drawn("link.mass_moment", joint)}
-        monkeypatch.setattr(recipe, "DRAWS", {name: lambda *_, of=own.get(name): of for name in recipe.EFFECTS})
+        draws = {name: partial(lambda each, *_: each, each) for name, each in own.items()}
+        monkeypatch.setattr(recipe, "DRAWS", dict.fromkeys(recipe.EFFECTS, lambda *_: None) | draws)
         assert (recipe._several(2, arm, rng()) is not None) is found
+
+
+def test_a_share_of_nothing_is_a_dash() -> None:
+    assert [_percent(value) for value in (None, 0.0, 0.857)] == ["–", "0.0 %", "85.7 %"]

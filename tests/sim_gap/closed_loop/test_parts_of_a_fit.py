@@ -232,10 +232,18 @@ def test_a_body_gets_the_inertial_parameters_that_it_is_said_to_have() -> None:
 def test_friction_that_a_simulator_cannot_hold_is_added_to_coulombs(monkeypatch) -> None:
     """Breakaway friction, and that of the load in the mean."""
     nothing = np.zeros(1)
-    own = {"coulomb": 0.2, "stribeck": 0.3, "load": 0.1, "stribeck_velocity": 0.1, "viscous": 0.0, "kd": 0.0, "feed": 0.0}
+    own = {
+        "coulomb": 0.2,
+        "stribeck": 0.3,
+        "load": 0.1,
+        "stribeck_velocity": 0.1,
+        "viscous": 0.0,
+        "kd": 0.0,
+        "feed": 0.0,
+    }
     fit = Fit({name: np.array([value]) for name, value in own.items()}, (("coulomb", "stribeck", "load"),))
     data = SimpleNamespace(joints=1, load=np.full((5, 1, 2), 4.0))
-    nominal = {name: nothing for name in own}
+    nominal = dict.fromkeys(own, nothing)
     monkeypatch.setattr(export, "improve", lambda data, fit, scales, iterations: fit)
     held = export.native_fit(SimpleNamespace(data=data, nominal=nominal, scales=None), fit)
     assert held.point["coulomb"] == pytest.approx([0.2 + 0.3 + 0.4])

@@ -29,7 +29,11 @@ def test_its_motion_keeps_range_speed_and_acceleration() -> None:
 
 @pytest.mark.parametrize(
     ("swings", "gains", "joint"),
-    [((10.0, 5.0, 4.0), (1.0, 1.0, 1.0), 2), ((10.0, 5.0, 1.0), (1.0, 1.0, 1.0), 0), ((10.0, 5.0, 1.0), (np.nan, 1.0, 1.0), 1)],
+    [
+        ((10.0, 5.0, 4.0), (1.0, 1.0, 1.0), 2),
+        ((10.0, 5.0, 1.0), (1.0, 1.0, 1.0), 0),
+        ((10.0, 5.0, 1.0), (np.nan, 1.0, 1.0), 1),
+    ],
 )
 def test_the_joint_that_drifts_is_the_third_or_the_one_that_gravity_moves_most(swings, gains, joint) -> None:
     """Of those that have a gain, in shares of their rated torque."""

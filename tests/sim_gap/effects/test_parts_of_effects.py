@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim_gap.effects.drive import _lag
-from sim_gap.effects.inertials import pseudo_inertia, point
+from sim_gap.effects.inertials import point, pseudo_inertia
 from sim_gap.effects.registry import effects
 
 
