@@ -27,9 +27,9 @@ def truth(rated: float = 10.0) -> TrueArm:
 
 def test_a_drive_with_a_lag_follows_a_step_by_all_but_one_eth_in_that_time() -> None:
     arm = truth()
-    arm.motor_lag[:] = 0.01
+    arm.motor_lag[:] = 21 * STEP
     drives = Drives([arm], np.full((1, 3), 0.1), np.zeros((1, 3)), [np.zeros(3)], STEP)
-    for _ in range(round(0.01 / STEP)):
+    for _ in range(21):
         drives._follow(np.ones((1, 3)))
     np.testing.assert_allclose(drives.current, 1.0 - np.exp(-1.0), rtol=1e-9)
 
