@@ -11,20 +11,29 @@ from sim_gap.demo.motion import multisine
 from sim_gap.demo.script import ACCELERATION, BY, RANGE_SHARE, SPEED_SHARE
 
 
-def test_its_motion_keeps_range_speed_and_acceleration() -> None:
+def motion(low: float, high: float, speeds: tuple[float, float], seed: int) -> tuple[np.ndarray, ...]:
+    """Position, velocity and acceleration of two joints over a minute, once it is at its full size."""
     link = SimpleNamespace(rate=200.0, period=0.005)
-    limits = [SimpleNamespace(max_velocity=speed) for speed in (1.0, 8.0)]
+    limits = [SimpleNamespace(max_velocity=speed) for speed in speeds]
     arm = SimpleNamespace(require_link=lambda: SimpleNamespace(joints=limits))
-    described = SimpleNamespace(n=2, lower=np.array([-1.0, -3.0]), upper=np.array([1.0, 2.0]))
-    q = multisine(SimpleNamespace(arm=arm, described=described, link=link), 30.0, 1)
+    described = SimpleNamespace(n=2, lower=np.array([-1.0, low]), upper=np.array([1.0, high]))
+    q = multisine(SimpleNamespace(arm=arm, described=described, link=link), 60.0, seed)[1000:]
     v = np.diff(q, axis=0) * link.rate
-    a = np.diff(v, axis=0) * link.rate
-    middle = 0.5 * (described.lower + described.upper)
-    assert (np.abs(q - middle) <= RANGE_SHARE * 0.5 * (described.upper - described.lower) + 1e-9).all()
-    faded_in = slice(round(5.0 * link.rate), None)
-    assert (np.abs(v[faded_in]) <= SPEED_SHARE * np.array([1.0, 8.0]) + 1e-6).all()
-    assert np.abs(a[faded_in]).max() <= ACCELERATION + 1e-6
+    return q, v, np.diff(v, axis=0) * link.rate
+
+
+def test_its_motion_keeps_range_speed_and_acceleration() -> None:
+    q, v, a = motion(-3.0, 2.0, (0.2, 8.0), 1)
+    assert (np.abs(q - [0.0, -0.5]) <= RANGE_SHARE * np.array([1.0, 2.5]) + 1e-9).all()
+    assert (np.abs(v) <= SPEED_SHARE * np.array([0.2, 8.0]) + 1e-6).all()
+    assert np.abs(a).max() <= ACCELERATION + 1e-6
     assert (np.ptp(q, axis=0) > 0.05).all()
+
+
+def test_its_motion_uses_the_acceleration_that_it_may() -> None:
+    """On a joint with range and speed in plenty; where the sines meet, in the course of a minute."""
+    _, _, a = motion(-90.0, 90.0, (1.0, 50.0), 3)
+    assert 0.95 * ACCELERATION < np.abs(a[:, 1]).max() <= ACCELERATION + 1e-6
 
 
 @pytest.mark.parametrize(
