@@ -58,16 +58,15 @@ def check(
 
     Example: armlink check sarcos --bus socketcan:vcan0 --yes --json -
     """
-    from rich.console import Console
-
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import PlainConsole
     from armlink.errors import BadInput, BusFault, Refused
     from armlink.link.link import Link
     from armlink.loop.open import open_arm
     from armlink.selftest.self_test import self_test
 
-    console = Console(stderr=True)
+    console = PlainConsole()
     described = load_arm(arm)
     if host:
         return _check_host(console, described, seconds, json)
@@ -78,7 +77,7 @@ def check(
         if not (passive or yes or simulated):
             deadline = described.require_link().deadline * 1e3
             times = {"deadline": deadline, "heartbeat": 2 * deadline}
-            console.print(WARNING.format(arm=described.name, **times), highlight=False)
+            console.print(WARNING.format(arm=described.name, **times))
             if not console.is_terminal:
                 raise BadInput("check: nobody to ask: give --yes, or --passive for what needs no power")
             typer.confirm("Go on?", abort=True, err=True)
@@ -87,7 +86,7 @@ def check(
     console.print(_table(f"{described.name} on {channel}", link.names, results))
     for each in results:
         if each.outcome in ("failed", "absent"):
-            console.print(f"{each.joint}: {each.check}: {each.found}", markup=False, highlight=False)
+            console.print(f"{each.joint}: {each.check}: {each.found}")
     failed = [each for each in results if each.outcome == "failed"]
     write_json(json, _answer(described.name, described.serial, channel, results))
     if any(each.check == "answers" for each in failed):
@@ -144,10 +143,8 @@ def _check_host(console: "Console", arm: "ArmFile", seconds: float, json: Path |
     console.print(
         f"cycles began late by {late['p50']:.2f} ms (median), {late['p99']:.2f} (99 %), {late['p99_9']:.2f} (99.9 %),"
         f" {late['max']:.2f} (longest); {report.busy * 1e3:.2f} ms of processor time each; {report.realtime}",
-        markup=False,
-        highlight=False,
     )
-    console.print(f"this machine holds {report.holds_hz:g} Hz; the arm file asks for {section.rate:g}", highlight=False)
+    console.print(f"this machine holds {report.holds_hz:g} Hz; the arm file asks for {section.rate:g}")
     limit = WARN_SHARE * section.deadline * 1e3
     if late["p99_9"] > limit:
         raise Refused(

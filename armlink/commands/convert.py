@@ -15,9 +15,8 @@ def convert(
 
     Example: armlink convert run.mcap run.csv.gz
     """
-    from rich.console import Console
-
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import PlainConsole
     from armlink.errors import BadInput
     from armlink.recording.files import load_recording, save_recording
 
@@ -26,12 +25,12 @@ def convert(
         save_recording(recording, target)
     except OSError as error:
         raise BadInput(f"{target}: cannot write it: {error.strerror}") from None
-    console = Console(stderr=True)
+    console = PlainConsole()
     if recording.warning:
-        console.print(f"{source}: {recording.warning}", markup=False, highlight=False)
+        console.print(f"{source}: {recording.warning}")
     rows, seconds = int(recording.t.size), float(recording.t[-1] - recording.t[0])
     channels = list(recording.channels())
-    console.print(f"{target}: {rows} rows, {seconds:.1f} s, {recording.n} joints, {', '.join(channels)}", markup=False)
+    console.print(f"{target}: {rows} rows, {seconds:.1f} s, {recording.n} joints, {', '.join(channels)}")
     answer = {"rows": rows, "seconds": seconds, "joints": list(recording.names), "channels": channels}
     write_json(json, {**answer, "warning": recording.warning})
     return 0

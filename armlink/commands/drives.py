@@ -11,10 +11,10 @@ def drives(
     Example: armlink drives --json -
     """
     from rich.box import SIMPLE
-    from rich.console import Console
     from rich.table import Table
 
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import PlainConsole
     from armlink.drives.registry import family, family_names
 
     found = [family(name) for name in family_names()]
@@ -24,6 +24,6 @@ def drives(
         traits = each.traits.as_json()
         cells = [", ".join(traits[name]) if name == "bounds" else traits[name] for name in columns]
         table.add_row(each.name, *cells, each.summary)
-    Console(stderr=True).print(table)
+    PlainConsole().print(table)
     write_json(json, [{"family": each.name, "traits": each.traits.as_json()} for each in found])
     return 0

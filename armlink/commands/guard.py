@@ -21,10 +21,9 @@ def guard(
 
     Example: armlink guard sarcos --bus socketcan:vcan0 --out sarcos.guard.json
     """
-    from rich.console import Console
-
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import PlainConsole
     from armlink.errors import BadInput
     from armlink.guard import bus_guard
     from armlink.link.link import Link
@@ -38,11 +37,8 @@ def guard(
     with Link.open(described, bus) as link:
         rules = link.guard_rules()
     write_json(out, {"schema": bus_guard.SCHEMA, "arm": described.name, "serial": described.serial, **rules})
-    Console(stderr=True).print(
+    PlainConsole().print(
         f"{len(rules['frames'])} identifiers; start the guard with\n  python3 -I {bus_guard.__file__} {out} arm0 can0\n"
         "where arm0 is an interface of the programs' own (ip link add arm0 type vcan) and can0 is the arm's",
-        markup=False,
-        highlight=False,
-        soft_wrap=True,
     )
     return 0

@@ -51,18 +51,18 @@ def monitor(
 
     Example: armlink monitor sarcos --bus socketcan:vcan0 --stats
     """
-    from rich.console import Console
     from rich.live import Live
 
     from armlink.arm_file import load_arm
     from armlink.bus.open import open_link_bus
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import PlainConsole
     from armlink.errors import BusFault
     from armlink.monitor.monitor import Monitor
 
     arm_file = load_arm(arm)
     opened = open_link_bus(bus, arm_file.require_link())
-    console = Console(stderr=True)
+    console = PlainConsole()
     answer: dict[str, Any] = {}
     title = f"{arm_file.name} on {opened.channel_info}"
     try:
@@ -100,7 +100,7 @@ def _stream(
             from armlink.monitor.foxglove_stream import FoxgloveStream
 
             served = open_streams.enter_context(FoxgloveStream(arm.name, names, foxglove))
-            console.print(f"Foxglove: open ws://localhost:{served.port}", markup=False, highlight=False)
+            console.print(f"Foxglove: open ws://localhost:{served.port}")
             sends.append(served.send)
         if rerun is not None:
             from armlink.monitor.rerun_stream import RerunStream

@@ -23,9 +23,9 @@ def check_scales(
     found, channel = _judge(console, arm, bus, how, seconds)
     for each in found:
         judged = ", ".join(each.judged) or "nothing: it hardly moved"
-        console.print(f"{each.joint}: judged: {judged}", markup=False, highlight=False)
+        console.print(f"{each.joint}: judged: {judged}")
         for finding in each.findings:
-            console.print(f"{each.joint}: {finding.text}", style="red", markup=False, highlight=False)
+            console.print(f"{each.joint}: {finding.text}", style="red")
     write_json(
         json, {"schema": SCHEMA, "arm": arm.name, "bus": channel, "how": how, "joints": [_json(e) for e in found]}
     )

@@ -44,10 +44,10 @@ def scan(
 def _ask_all(arm: "ArmFile", bus: str | None, json: Path | None) -> int:
     """The drives of an arm, each asked for its identity."""
     from rich.box import SIMPLE
-    from rich.console import Console
     from rich.table import Column, Table
 
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import PlainConsole
     from armlink.errors import BusFault, Refused
     from armlink.link.joints.groups import traits_of
     from armlink.link.link import Link
@@ -73,7 +73,7 @@ def _ask_all(arm: "ArmFile", bus: str | None, json: Path | None) -> int:
         table.add_row(name, kind, each.address, state, each.name, each.serial, each.firmware)
         node = {**vars(each), "joint": name, "family": kind, "power": each.power.value}
         nodes.append(node | {"traits": traits[each.joint].as_json()})
-    Console(stderr=True).print(table)
+    PlainConsole().print(table)
     write_json(json, {"bus": channel, "nodes": nodes})
     missing = [f"{link.names[each.joint]} ({each.address})" for each in found if not each.present]
     if missing:

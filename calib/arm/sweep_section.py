@@ -87,7 +87,7 @@ class SweepSection(Section):
     settle_scatter: Positive = 1.2
     """Torque has settled if its scatter over the window is below this multiple of the sensor's own noise."""
     settle_timeout: Positive = 4.0
-    """Time after which a step that has not settled is read all the same, and marked [s]."""
+    """Time after which a step that has not settled is read all the same, and marked [s]; the average follows it."""
     standard_error: Share = 0.00035
     """Standard error of the torque averages, as a share of rated torque; smaller if `gain_std` requires it."""
     gain_std: Share = 0.001

@@ -52,8 +52,9 @@ def _record(records: "RecordStore", given: str) -> "CalibrationRecord | GravityR
 def _show(
     old: "CalibrationRecord | GravityRecord", new: "CalibrationRecord | GravityRecord", changes: "list[Change]"
 ) -> None:
-    from rich.console import Console
     from rich.table import Table
+
+    from armlink.commands.plain_console import PlainConsole
 
     when = [f"{each.id} of {each.created:%Y-%m-%d %H:%M}" for each in (old, new)]
     title = f"{old.arm} {old.serial}: {old.kind} {' → '.join(when)}"
@@ -66,7 +67,7 @@ def _show(
         deviations = _text(each.deviations, "+.1f")
         row = (each.joint, each.parameter.replace("_", " "), each.unit, *cells, deviations)
         table.add_row(*row, style="bold" if striking else None)
-    Console(stderr=True).print(table)
+    PlainConsole().print(table)
 
 
 def _text(value: float | None, form: str) -> str:

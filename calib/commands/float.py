@@ -33,10 +33,9 @@ def hold_afloat(
     """
     from contextlib import suppress
 
-    from rich.console import Console
-
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import PlainConsole
     from armlink.errors import ArmlinkError
     from armlink.loop.open import open_arm
     from calib.commands.screen import warn_late
@@ -44,7 +43,7 @@ def hold_afloat(
 
     arm_file = load_arm(arm)
     beta, calibration, source = _model(arm_file, record, store)
-    screen = Console(stderr=True)
+    screen = PlainConsole()
     with open_arm(arm_file, bus) as link:
         link.start()
         link.enable()

@@ -68,10 +68,11 @@ def history(
 
 
 def _print(title: str, rows: list[dict[str, Any]], log: "list[Activation]", writes: "list[ControllerWrite]") -> None:
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console(stderr=True)
+    from armlink.commands.plain_console import PlainConsole
+
+    console = PlainConsole()
     if not rows:
         console.print(f"{title}: no records yet")
         return

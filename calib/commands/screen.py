@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Column, Table
 
 from armlink.arm_file import ArmFile
+from armlink.commands.plain_console import PlainConsole
 from armlink.errors import Stall
 from armlink.link.lateness import Lateness
 from calib.plan.types import SweepPlan
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from calib.sweep.dataset import SweepData
     from calib.sweep.preflight import Preflight
 
-_CONSOLE = Console(stderr=True, markup=False)  # units stand in brackets
+_CONSOLE = PlainConsole(markup=False)  # units stand in brackets
 
 
 class SweepScreen:
@@ -69,7 +69,7 @@ class SweepScreen:
 
     def say(self, text: str) -> None:
         """One line below the bar."""
-        _CONSOLE.print(text, highlight=False)
+        _CONSOLE.print(text)
 
     def __enter__(self) -> Self:
         """Show the bar."""
@@ -127,10 +127,9 @@ def print_plan(arm: ArmFile, plan: SweepPlan) -> None:
     _CONSOLE.print(table)
     _CONSOLE.print(
         "↔ sweeps; ▲ ▼ rests on its upper, lower stop, pressed with so many N·m; = held there by its servo [rad]",
-        highlight=False,
     )
     for note in plan.notes:
-        _CONSOLE.print(note, style="yellow", highlight=False)
+        _CONSOLE.print(note, style="yellow")
 
 
 def unsettled_said(data: "SweepData") -> list[str]:
@@ -185,7 +184,7 @@ def print_intervals(title: str, names: tuple[str, ...], columns: dict[str, tuple
 def print_lines(lines: list[str], style: str | None = None) -> None:
     """Plain lines, or in a style of rich's such as `yellow`."""
     for line in lines:
-        _CONSOLE.print(line, style=style, highlight=False)
+        _CONSOLE.print(line, style=style)
 
 
 def _interval(value: float, half: float) -> str:

@@ -83,7 +83,7 @@ def sweep(
                 check_stops and not resume and not reference_mass,
             )
         lateness = link.stats.lateness
-    _show(arm, arm_file, found, data, screen)
+    _show(arm_file, found, data, screen, _again(arm, bus, hold, dry_run))
     warn_late(arm_file, lateness)
     write_json(json_file, {**_answer(arm_file, data), "late_ms": lateness.in_ms()})
 
@@ -161,7 +161,14 @@ def _run(
     return found, data
 
 
-def _show(arm: str, arm_file: "ArmFile", found: "Preflight", data: "SweepData", screen: "SweepScreen") -> None:
+def _again(arm: str, bus: str | None, hold: str | None, dry_run: bool) -> list[str]:
+    """The command for another pass on the same arm and bus, without what differs."""
+    given = {"--bus": bus, "--hold": hold}
+    options = [word for option, value in given.items() if value is not None for word in (option, value)]
+    return ["armlink", "sweep", arm, *options, *["--dry-run"] * dry_run]
+
+
+def _show(arm_file: "ArmFile", found: "Preflight", data: "SweepData", screen: "SweepScreen", again: list[str]) -> None:
     from calib.commands.screen import print_lines, print_plan, print_preflight, stalls_said, unsettled_said
 
     assert data.plan is not None
@@ -169,14 +176,14 @@ def _show(arm: str, arm_file: "ArmFile", found: "Preflight", data: "SweepData", 
     print_plan(arm_file, data.plan)
     print_lines([*unsettled_said(data), *stalls_said(data)], "yellow")
     if data.manifest.reference_mass and data.plan.sweeps[0].speed is not None:
-        again = data.path.with_name(f"{data.path.name}-again")
+        bare = data.path.with_name(f"{data.path.name}-again")
         screen.say(f"{data.path} is complete. Now take the mass off and sweep once more without it:")
-        screen.say(shlex.join(["armlink", "sweep", arm, "--out", str(again)]))
+        screen.say(shlex.join([*again, "--out", str(bare)]))
     if not data.manifest.reference_mass:
         mass = data.plan.reference_mass
         loaded = data.path.with_name(f"{data.path.name}-loaded")
         screen.say(f"{data.path} is complete. Now attach {mass:g} kg and sweep again:")
-        screen.say(shlex.join(["armlink", "sweep", arm, "--reference-mass", f"{mass:g}", "--out", str(loaded)]))
+        screen.say(shlex.join([*again, "--reference-mass", f"{mass:g}", "--out", str(loaded)]))
 
 
 def _answer(arm_file: "ArmFile", data: "SweepData") -> dict[str, Any]:

@@ -29,10 +29,10 @@ def torque(
 
     Example: armlink torque arm.urdf --q poses.csv --json -
     """
-    from rich.console import Console
     from rich.table import Table
 
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import PlainConsole
     from calib.commands.poses_csv import load_poses
     from gcomp.gravity.torque import gravity_torque
 
@@ -43,7 +43,7 @@ def torque(
     for number, row in enumerate(answer, start=1):
         table.add_row(str(number), *(f"{value:+.4f}" for value in row))
     if json_file is None or str(json_file) != "-":
-        Console(stderr=True).print(table)
+        PlainConsole().print(table)
     write_json(json_file, {"joints": list(described.names), "source": source, "torque": answer.tolist()})
 
 

@@ -106,8 +106,9 @@ def _answer(
 
 
 def _show(result: "Verification") -> None:
-    from rich.console import Console
     from rich.table import Table
+
+    from armlink.commands.plain_console import PlainConsole
 
     title = f"Model against sensor at {len(result.sensor)} poses [N·m]"
     table = Table("joint", "RMS", "largest", "allowed RMS", title=title)
@@ -115,4 +116,4 @@ def _show(result: "Verification") -> None:
         table.add_row(
             name, f"{result.rms[joint]:.3f}", f"{result.max_error[joint]:.3f}", f"{result.tolerance[joint]:.3f}"
         )
-    Console(stderr=True).print(table)
+    PlainConsole().print(table)

@@ -8,6 +8,8 @@ from gcomp.identify.global_fit import GlobalFit
 
 WORDY = 6
 """Largest number of parameters that a reason names."""
+WHERE_IT_HANGS = ": measure where the reference mass hangs (sweep.reference_point in the arm file)"
+"""What fixes a gain that the readings with a mass leave open, as those of a single joint do."""
 
 
 def missing_values(fit: GlobalFit, rows: SweepReadings) -> dict[tuple[str, Parameter], str]:
@@ -30,8 +32,8 @@ def _reason(name: str, fit: GlobalFit, rows: SweepReadings) -> str:
         if name in sentence:
             if "common factor" in sentence and not any(rows.masses):
                 return "no readings with a reference mass: only ratios of gains are determined"
-            others = sentence.count(",")
-            if others > WORDY:
-                return "not identifiable: the data fit equally well with other values"
-            return sentence
+            remedy = WHERE_IT_HANGS if "load_point" in sentence and name.startswith("gain") else ""
+            if sentence.count(",") > WORDY:
+                return f"not identifiable: the data fit equally well with other values{remedy}"
+            return f"{sentence}{remedy}"
     return "the readings do not determine it"

@@ -235,7 +235,10 @@ class Mover:
         return limit - side * (gap + 0.02 * abs(limit))
 
     def rest(self, counts: Mask) -> StaticReading:
-        """Wait until all has settled and the torque averages that `counts` (n,) are exact enough; raises Slipped."""
+        """Wait until all has settled and the torque averages that `counts` (n,) are exact enough; raises Slipped.
+
+        The time to settle ends where an average begins: at a low rate that takes as long again.
+        """
         rule, samples, resolution = self.rule, list[Sample](), self.known_resolution
         window, timeout = rule.window * self.link.period, rule.timeout * self.link.period
         begin: int | None = None
@@ -249,9 +252,9 @@ class Mover:
             count = len(samples)
             if not self._lasted(samples, window) or (count - rule.window) % CHECK_EVERY:
                 continue
-            if self._lasted(samples, timeout):
-                return average(samples[-rule.max_samples :], settled=False)
             if begin is None:
+                if self._lasted(samples, timeout):
+                    return average(samples[-rule.max_samples :], settled=False)
                 if settled(samples[self._since(samples, window) :]):
                     # what settled last still decays in the first half
                     begin = self._since(samples, rule.window // 2 * self.link.period)
@@ -260,7 +263,11 @@ class Mover:
                 if enough or rule.exact(stack(samples[begin:], "torque"), counts):
                     if settled(samples[begin:]):
                         return average(samples[begin:], settled=True)
-                    begin = None  # it only stood at a turning point
+                    middle = (begin + count) // 2
+                    decayed = settled(samples[middle:])  # else it only stood at a turning point
+                    if decayed and self._lasted(samples, timeout + rule.max_samples * self.link.period):
+                        return average(samples[middle:], settled=True)
+                    begin = middle if decayed else None
 
     def _lasted(self, samples: list[Sample], seconds: float) -> bool:
         """Whether the samples cover so much time, a period each at least."""

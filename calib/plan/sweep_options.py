@@ -64,7 +64,7 @@ def _options(planned: PlannedArm, joint: int) -> tuple[Candidates, list[str]]:
         drivable = strongest[:, joint] <= limits.max_torque[joint]
     holdable = (strongest + section.friction * limits.rated <= limits.max_torque).all(axis=1) & drivable
     pressed = pressable(guess, section, limits, everything).all(axis=1) & holdable  # it must leave its stop again
-    if pressed.sum() >= section.poses:
+    if pressed.sum() >= min(section.poses, everything.count):
         return with_lever(everything.kept(pressed)), []
     if not (pressed | holdable).any():
         raise BadInput(

@@ -47,10 +47,10 @@ def sim(
     Then, from another shell: echo "fault node.silent:joint_2" > arm.pipe
     """
     import mujoco
-    from rich.console import Console
 
     from armlink.arm_file import load_arm
     from armlink.bus.open import open_link_bus, resolve_bus
+    from armlink.commands.plain_console import PlainConsole
     from armlink.errors import BadInput
     from armlink.loop.realtime import SIMULATED, prepare
     from sim_bus.bus.control_pipe import ControlPipe
@@ -83,13 +83,13 @@ def sim(
     pipe = None
     try:
         pipe = None if control is None else ControlPipe(control)
-        console = Console(stderr=True)
+        console = PlainConsole()
         console.print(
             f"{described.name}: {simulated.n} joints, {_addresses(described)} on {endpoint.channel_info}; "
             f"stop with Ctrl-C"
         )
         server = Server(simulated, endpoint, drifts, lockstep, faults=faults, control=pipe)
-        server.on_wrong = lambda wrong: console.print(f"sim: {wrong}", markup=False)
+        server.on_wrong = lambda wrong: console.print(f"sim: {wrong}")
         return server.run()
     finally:
         if pipe is not None:

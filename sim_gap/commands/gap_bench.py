@@ -38,10 +38,10 @@ def bench(
     """
     from tempfile import TemporaryDirectory
 
-    from rich.console import Console
     from rich.progress import Progress, TaskID
 
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import PlainConsole
     from armlink.errors import BadInput
     from sim_gap.blind.bench import diagnose_files, run_bench
     from sim_gap.blind.judging.tables import show, show_positions, show_real
@@ -52,7 +52,7 @@ def bench(
     if channels and {*channels.split(",")} != {"q", "q_cmd"}:
         raise BadInput(f"--channels {channels}: expected q,q_cmd; leave it out for arms with torque sensors")
     positions = bool(channels)
-    console = Console(stderr=True)
+    console = PlainConsole()
     with TemporaryDirectory(prefix="armlink-bench-") as scratch, Progress(console=console) as bars:
         stages: dict[str, TaskID] = {}
 

@@ -21,11 +21,11 @@ def collect(
 
     Example: armlink gap collect sarcos --motion settle.csv --out settle.mcap --bus socketcan:can0
     """
-    from rich.console import Console
     from rich.progress import Progress
 
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import PlainConsole
     from armlink.errors import BadInput
     from armlink.loop.open import open_arm
     from sim_gap.experiment.collect import collect as run
@@ -35,7 +35,7 @@ def collect(
         raise BadInput(f"--out {out}: expected a .mcap file in an existing folder")
     arm_file = load_arm(arm)
     target = load_motion(motion, arm_file)
-    console = Console(stderr=True)
+    console = PlainConsole()
     with open_arm(arm_file, bus) as link, Progress(console=console) as bars:
         task = bars.add_task(f"{arm_file.name}: {motion.name}", total=len(target))
         link.start()
@@ -43,6 +43,6 @@ def collect(
         rows = run(link, target, out, lambda k, _: bars.update(task, completed=k) if k % 50 == 0 else None)
         bars.update(task, completed=rows)
         link.disable()
-    console.print(f"{out}: {rows} rows, {rows / link.rate:.1f} s", markup=False)
+    console.print(f"{out}: {rows} rows, {rows / link.rate:.1f} s")
     write_json(json_file, {"file": str(out), "rows": rows, "seconds": rows / link.rate})
     return 0

@@ -78,15 +78,14 @@ def diagnose(
 
     Example: armlink gap diagnose --sim arm.xml --train slow.csv --train fast.csv --heldout other.csv --json -
     """
-    from rich.console import Console
-
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import PlainConsole
     from armlink.errors import BadInput
     from armlink.recording.corrections import parse_corrections
     from armlink.recording.files import load_recordings
     from sim_gap.attribution import diagnose as diagnosis
 
-    console = Console(stderr=True)
+    console = PlainConsole()
     paths = [*train, *(heldout or [])]
     for target in (None if str(json) == "-" else json, report, out_model, out_samples, out_actuators):
         if target is not None and not target.resolve().parent.is_dir():
@@ -117,9 +116,9 @@ def diagnose(
         )
     for name, recording in {**fitted, **judged}.items():
         if recording.warning:
-            console.print(f"{name}: {recording.warning}", style="yellow", markup=False)
+            console.print(f"{name}: {recording.warning}", style="yellow")
     for finding in answer.checks:
-        console.print(finding.sentence(), style="yellow", markup=False)
+        console.print(finding.sentence(), style="yellow")
     _show(answer, console)
     if report is not None:
         from sim_gap.report.page import write_report
@@ -142,7 +141,7 @@ def _progress(console: "Console", status: "Status", stage: str) -> None:
     """Show the stage: on a terminal in place, else as a line."""
     status.update(stage)
     if not console.is_terminal:
-        console.print(stage, markup=False)
+        console.print(stage)
 
 
 def _positions_of(answer: "Diagnosis", option: str) -> "Identified":
@@ -168,7 +167,7 @@ def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
         from sim_gap.closed_loop.training.posterior import batch_path, write_exported
 
         for line in write_exported(answer.internals, path):
-            console.print(f"not in MJCF: {line}", style="yellow", markup=False)
+            console.print(f"not in MJCF: {line}", style="yellow")
         console.print(f"corrected model with its position actuators: {path}")
         if batch_path(path).is_file():
             console.print(f"the same without PID actuators, for MuJoCo Warp: {batch_path(path)}")

@@ -25,10 +25,10 @@ def diagnose_fleet(
 
     Example: armlink gap diagnose-fleet fleet/ --out answers.jsonl --table causes.parquet --scheduler tcp://127.0.0.1:8786
     """
-    from rich.console import Console
     from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import PlainConsole
     from sim_gap.fleet.cluster import cluster, open_to_all
     from sim_gap.fleet.fleet import Answers, diagnose_fleet, find_cases
     from sim_gap.fleet.fleet import table as table_of
@@ -38,7 +38,7 @@ def diagnose_fleet(
     cases = find_cases(folder, sim)
     answers = Answers(out or folder / "answers.jsonl")
     left = [case for case in cases if case.name not in answers.found]
-    console = Console(stderr=True)
+    console = PlainConsole()
     if len(left) < len(cases):
         console.print(f"{answers.path}: {len(cases) - len(left)} of {len(cases)} cases are done already")
     columns = (*Progress.get_default_columns()[:2], MofNCompleteColumn(), TimeRemainingColumn())
@@ -79,7 +79,7 @@ def _show(rows: list[dict[str, Any]], console: Any) -> None:
     console.print(shown)
     for row in rows:
         if row["error"]:
-            console.print(f"{row['case']}: {row['error']}", style="yellow", markup=False)
+            console.print(f"{row['case']}: {row['error']}", style="yellow")
 
 
 def show_changes(trends: list[dict[str, Any]], outliers: list[dict[str, Any]], console: Any) -> None:
@@ -97,7 +97,6 @@ def show_changes(trends: list[dict[str, Any]], outliers: list[dict[str, Any]], c
         console.print(
             f"{one['arm']}: {one['effect']} of {one['joint']}: {one['parameter']} {one['value']:.3g} {one['unit']}, "
             f"{one['others']:.3g} on the other arms",
-            markup=False,
         )
 
 

@@ -26,23 +26,22 @@ def plan(
 
     Example: armlink gap plan sarcos --answer gap.json --out settle.csv
     """
-    from rich.console import Console
-
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import PlainConsole
     from sim_gap.experiment.excitation import joints_in_doubt, plan_motion
     from sim_gap.experiment.motion_file import save_motion
 
     joints, sentences = joints_in_doubt(answer) if answer else ([], [])
     motion = plan_motion(load_arm(arm), [*joints, *(joint or [])], poses, seed)
     save_motion(motion, out)
-    console = Console(stderr=True)
+    console = PlainConsole()
     for sentence in sentences:
-        console.print(f"requested by the diagnosis: {sentence}", markup=False)
+        console.print(f"requested by the diagnosis: {sentence}")
     for piece in motion.pieces:
-        console.print(piece, markup=False)
+        console.print(piece)
     run = shlex.join(["armlink", "gap", "collect", arm, "--motion", str(out), "--out", str(out.with_suffix(".mcap"))])
-    console.print(f"{out}: {motion.seconds:.0f} s; next: {run}", markup=False)
+    console.print(f"{out}: {motion.seconds:.0f} s; next: {run}")
     write_json(
         json_file,
         {"file": str(out), "seconds": motion.seconds, "pieces": list(motion.pieces), "asked_for": sentences},

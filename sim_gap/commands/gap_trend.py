@@ -25,16 +25,15 @@ def trend(
 
     Example: armlink gap trend recordings/ --sim arm.yaml
     """
-    from rich.console import Console
-
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import PlainConsole
     from sim_gap.commands.gap_fleet import show_changes
     from sim_gap.fleet.fleet import Answers, diagnose_case, find_cases
     from sim_gap.fleet.trends import date_of, fleet_trends, rows
     from sim_gap.model.load import load_compiled
 
     load_compiled(sim)  # what is wrong with it is no answer of a recording
-    console = Console(stderr=True)
+    console = PlainConsole()
     answers = Answers(out or folder / "answers.jsonl")
     newest = ""
     for case in sorted(find_cases(folder, sim), key=lambda case: (date_of(case.name) or UNDATED, case.name)):
@@ -42,7 +41,7 @@ def trend(
         if newest not in answers.found:
             answers.add(newest, diagnose_case(case))
         answer = answers.found[newest]
-        console.print(f"{case.name}: {answer.get('verdict') or answer['error']}", markup=False, soft_wrap=True)
+        console.print(f"{case.name}: {answer.get('verdict') or answer['error']}")
     trends = rows(fleet_trends(answers.found))
     show_changes(trends, [], console)
     newest_answer = answers.found[newest]

@@ -29,7 +29,7 @@ class Narrator:
 
     def say(self, text: str) -> None:
         """One line, with the time since the start."""
-        self._console.print(f"[dim]{self.elapsed:5.0f} s[/dim]  {text}", highlight=False)
+        self._console.print(f"[dim]{self.elapsed:5.0f} s[/dim]  {text}", markup=True)
 
     def show(self, table: object) -> None:
         """A rich table."""

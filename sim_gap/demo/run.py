@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 
 from armlink.arm_file import MODEL_SUFFIXES, ArmFile, load_arm
 from armlink.errors import BadInput
@@ -52,7 +53,7 @@ def run_demo(
         arm = with_realism(arm, realism, seed)
     arm.require_link()
     data_folder = _fresh(out)
-    teller.say(f"arm [bold]{arm.name}[/bold], hidden truth of seed {seed}, results in {out}")
+    teller.say(f"arm [bold]{arm.name}[/bold], hidden truth of seed {seed}, results in {escape(str(out))}")
     creeping = sweep_motion(arm) == "creep"
     arm = quick(arm) if creeping else arm
     result: DemoResult | CreepDemo
@@ -70,7 +71,8 @@ def run_demo(
     (out / "summary.json").write_text(text, encoding="utf-8")
     if json_path is not None:
         sys.stdout.write(text) if str(json_path) == "-" else json_path.write_text(text, encoding="utf-8")
-    teller.say(f"done: open [bold]{out / 'report.html'}[/bold]; numbers in {out / 'summary.json'}")
+    report, numbers = (escape(str(out / name)) for name in ("report.html", "summary.json"))
+    teller.say(f"done: open [bold]{report}[/bold]; numbers in {numbers}")
     return result
 
 

@@ -57,6 +57,8 @@ class CanopenDrives:
         self._joint_of = {node: joint for joint, node in enumerate(self.nodes)}
         self.known = faults.Known(self.names)
         """What the joints have shown."""
+        self._sound: tuple[list[int], list[int], list[int]] | None = None
+        """Modes, mode displays and status words that were no fault when last seen, every mode being displayed."""
         self.beat_every = section.deadline / 2
         """Time from one heartbeat of the host to the next [s]."""
         self.cycle = CommandFrames(self.known, self.protection.host, self.beat_every, 1.0 / section.rate)
@@ -309,7 +311,13 @@ class CanopenDrives:
 
     def fault(self, modes: Sequence[int], now: float) -> BusFault | None:
         """See Drives."""
-        return faults.state_fault(self.known, now, self.cycle.own_modes(modes), self._deadline)
+        known, own = self.known, self.cycle.own_modes(modes)
+        if self._sound == (own, known.displays, known.statuses):
+            return None
+        fault = faults.state_fault(known, now, own, self._deadline)
+        if fault is None and own == known.displays:  # no time runs out while nothing changes
+            self._sound = (list(own), known.displays.copy(), known.statuses.copy())
+        return fault
 
     def has_restarted(self) -> int | None:
         """See Drives."""

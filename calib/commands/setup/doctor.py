@@ -24,12 +24,11 @@ def doctor(
 
     Example: armlink doctor sarcos --json -
     """
-    from rich.console import Console
-
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import PlainConsole
     from calib.commissioning.doctor import examine
 
-    console = Console(stderr=True, markup=False, highlight=False, soft_wrap=True)
+    console = PlainConsole(markup=False)
     with console.status(f"examining {arm}"):
         findings = examine(arm, bus, offline)
     for found in findings:

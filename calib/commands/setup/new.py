@@ -56,16 +56,15 @@ def new(
 
     Example: armlink new arm.urdf --out arm.yaml
     """
-    from rich.console import Console
-
     from armlink.arm_file import MODEL_SUFFIXES, bundled_arms
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import PlainConsole
     from armlink.errors import BadInput
     from calib.commands.setup.on_bus import begin_with_drives, bus_keys, copy, drives_by_ids, open_named, rewire
     from calib.commands.setup.terminal import Terminal, hand, parse_stops
     from calib.commissioning.new_arm import new_arm
 
-    console = Console(stderr=True, markup=False, highlight=False)
+    console = PlainConsole(markup=False)
     interactive = sys.stdin is not None and sys.stdin.isatty()
     if bus is None and by_hand:
         raise BadInput("--by-hand: needs --bus, on which the drives are")

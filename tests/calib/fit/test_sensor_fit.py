@@ -75,6 +75,16 @@ def test_one_joint_that_gravity_acts_on_does_not_tell_its_gain_nor_where_the_mas
     assert fit.attachment_text == "where the reference mass hung is not observable"
 
 
+def test_a_single_joint_tells_its_gain_once_it_is_known_where_the_mass_hangs() -> None:
+    arm = random_arm(5, 1)
+    truth, data = passes(arm, 5)
+    reason = fit_sensors(arm, data).reasons["j1", "gain"]
+    assert "load_point_x" in reason
+    assert reason.endswith("measure where the reference mass hangs (sweep.reference_point in the arm file)")
+    known = fit_sensors(with_section(arm, reference_point=tuple(truth.attachment)), data)
+    assert abs(known.value("gain")[0] / truth.gain[0] - 1) < known.half95("gain")[0] < 0.03
+
+
 def test_where_all_axes_nearly_meet_it_says_so_and_a_measured_point_helps() -> None:
     """The mass has no lever but the one that is fitted with it: gains are right, but not to half a percent."""
     arm = random_arm(61, 3)

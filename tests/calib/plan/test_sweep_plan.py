@@ -42,6 +42,13 @@ def test_each_step_is_taken_from_both_sides() -> None:
     assert [position for position, side in targets if side < 0] == list(reversed(sweep.steps))
 
 
+def test_a_single_joint_has_no_other_to_be_held() -> None:
+    arm = random_arm(5, 1)
+    plan = scouted_plan(arm, Truth.of(arm))
+    assert [sweep.stops for sweep in plan.sweeps] == [(0,)]
+    assert not any("held" in note for note in plan.notes)
+
+
 def test_combinations_that_hide_a_joint_from_gravity_are_avoided() -> None:
     plan = plan_sweep(load_arm("sarcos"))
     assert all(sweep.lever >= 0.3 for sweep in plan.sweeps)

@@ -15,6 +15,7 @@ from sweep_arms import random_arm, synthetic_pass
 
 from armlink.errors import BadInput, Refused
 from armlink.link.integral import slowest_time
+from armlink.link.types import Sample
 from calib.arm.sweep_section import SweepSection
 from calib.commands.screen import unsettled_said
 from calib.motion.mover import Mover
@@ -31,6 +32,7 @@ PERIOD = 0.004
 RULE = SettleRule.of(SweepSection(), np.array([0.05]), PERIOD)
 COUNTS = np.array([True])
 STEP = np.array([1e-4])
+NONE = np.array([np.nan])
 
 
 def same(ours: Sequence[StaticReading], theirs: Sequence[StaticReading]) -> bool:
@@ -128,6 +130,49 @@ def test_averaging_goes_on_until_the_standard_error_is_reached() -> None:
     noise = np.random.default_rng(2).normal(0, 0.2, (100, 1))
     assert not RULE.exact(noise[:8], COUNTS)
     assert RULE.exact(noise, COUNTS)
+
+
+class Replayed(Mover):
+    """Takes samples of one joint, a period apart, for those of an arm."""
+
+    def __init__(self, rule: SettleRule, period: float, position: Array, torque: Array) -> None:
+        self.rule, self.resolution = rule, STEP
+        self.link = SimpleNamespace(period=period, catch_up=lambda: None)  # type: ignore[assignment]
+        self.samples = iter(
+            Sample(k * period, np.array([at]), NONE, np.array([pull]), NONE, np.zeros(1, np.int64), np.zeros(1))
+            for k, (at, pull) in enumerate(zip(position, torque, strict=True))
+        )
+
+    def cycle(self) -> Sample:
+        """The next one."""
+        return next(self.samples)
+
+
+@pytest.mark.parametrize(("rate", "tail"), [(250, 1e-3), (100, 3e-4), (100, 1e-3), (50, 3e-4), (50, 1e-3)])
+def test_the_time_to_settle_is_not_that_of_the_average(rate: float, tail: float) -> None:
+    """At 50 Hz an average of 200 samples takes as long as a joint has to settle."""
+    rule = SettleRule.of(SweepSection(), np.array([0.01]), 1 / rate)
+    t = np.arange(0.0, 12.0, 1 / rate)
+    torque = np.random.default_rng(5).normal(0, 0.2, t.size)
+    reading = Replayed(rule, 1 / rate, tail * np.exp(-t / 1.2), torque).rest(COUNTS)
+    assert reading.settled
+    assert reading.t < SweepSection().settle_timeout + 1.6 * rule.max_samples / rate
+    assert reading.count >= rule.max_samples
+
+
+def test_a_creep_too_slow_to_tell_comes_to_an_end() -> None:
+    rule = SettleRule.of(SweepSection(), np.array([0.01]), 0.02)
+    t = np.arange(0.0, 12.0, 0.02)
+    reading = Replayed(rule, 0.02, 5e-5 * t, np.random.default_rng(6).normal(0, 0.2, t.size)).rest(COUNTS)
+    assert reading.settled
+    assert reading.t < SweepSection().settle_timeout + 1.6 * rule.max_samples * 0.02
+
+
+def test_a_joint_that_never_settles_is_read_when_its_time_is_up() -> None:
+    swing = 0.01 * np.sin(np.arange(1100) * PERIOD * 5)
+    reading = Replayed(RULE, PERIOD, swing, np.zeros(1100)).rest(COUNTS)
+    assert not reading.settled
+    assert reading.t == pytest.approx(SweepSection().settle_timeout, abs=0.05)
 
 
 def test_a_data_set_reads_back_as_it_was_written(tmp_path: Path) -> None:
