@@ -70,7 +70,8 @@ def test_the_grid_centres_on_the_torque_that_the_error_has_to_make(search: Searc
 
 
 def test_a_parameters_slope_is_that_at_its_value(data: Windows) -> None:
-    """Friction of a small joint: a step as large as the joint's own scale would bend it."""
+    """Friction of a small joint: a step as large as the joint's own scale would bend it by a tenth; one joint sticks
+    once more or less often within the step."""
     one = np.ones(2)
     scales = Scales(one, one, 0.02 * one, 0.05 * one)
     sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
@@ -83,7 +84,7 @@ def test_a_parameters_slope_is_that_at_its_value(data: Windows) -> None:
             values = {**point, "viscous": point["viscous"] + side * (np.arange(2) == j)}
             ends.append(simulate(data, batch([values]))[0, :, j] * data.weight[:, j])
         expected = (ends[0] - ends[1]) / 2e-4 * 0.2  # in units of the size at which it is tried
-        assert np.linalg.norm(slopes[j][0] - expected) < 0.05 * np.linalg.norm(expected)
+        assert np.linalg.norm(slopes[j][0] - expected) < 0.08 * np.linalg.norm(expected)
 
 
 def test_a_command_that_arrives_late_moves_the_arm_as_a_later_one(data: Windows) -> None:
@@ -105,7 +106,8 @@ def test_a_joint_that_is_never_commanded_has_no_command() -> None:
     assert np.isfinite(held).all()
     assert (served == [1.0, 0.0]).all()
     assert (held[:, 1] == 0.0).all()
-    np.testing.assert_allclose(held[:, 0], np.sin(t[:-1]), atol=1e-12)
+    before = np.sin(np.maximum(t[:-1] - 0.02, 0.0))
+    np.testing.assert_allclose(held[:, 0], (before + np.sin(t[:-1])) / 2, atol=1e-12)  # half a step of each about t
 
 
 def test_windows_are_compared_from_the_end_of_their_opening(data: Windows) -> None:
