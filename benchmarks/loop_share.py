@@ -6,7 +6,9 @@ The loop is that of every job (`armlink.loop.process`), started by a `RemoteLink
 simulated in a process of its own. Without `--bus` the two are joined by a pair of Unix sockets that carry the 16 bytes
 of SocketCAN's `can_frame`, read and written by the link's own SocketCAN port, with a process between them that lets
 every frame take its time on the wire: replies come one by one, as from a real bus. `--bus udp_multicast:239.74.163.57`
-or `socketcan:vcan0` put both on that bus. Prints JSON; processor time is what the kernel counts of the loop's threads.
+or `socketcan:vcan0` put both on that bus. Where the machine has two cores or more, the loop has the last for itself and
+simulated arm, wire and job share the others: beside a real arm they do not push the loop out of its caches either
+(`--together` leaves it to the kernel). Prints JSON; processor time is what the kernel counts of the loop's threads.
 """
 
 import argparse
@@ -163,9 +165,11 @@ def wakes(pid: int) -> int:
     return int(status.partition("\nvoluntary_ctxt_switches:")[2].split()[0])
 
 
-def measure(arm: ArmFile, bus: str, seconds: float) -> dict[str, Any]:
-    """The figures of one run."""
+def measure(arm: ArmFile, bus: str, seconds: float, core: int | None) -> dict[str, Any]:
+    """The figures of one run, the loop on this core if one is given."""
     with remote_link.RemoteLink(arm, bus or None) as link:
+        if core is not None:
+            os.sched_setaffinity(link.pid, {core})
         link.start()
         start = link.enable().position
         t = np.arange(int((seconds + 2.0) * link.rate)) / link.rate
@@ -201,6 +205,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--bus", default="")
     parser.add_argument("--bitrate", type=float, default=1e6, help="of the wire between the pair [bit/s]")
+    parser.add_argument("--together", action="store_true", help="let the kernel choose every process's core")
     parser.add_argument("--simulate", nargs=2, help=argparse.SUPPRESS)
     parser.add_argument("--keep-cycle", nargs=2, type=int, help=argparse.SUPPRESS)
     asked = parser.parse_args()
@@ -210,6 +215,10 @@ def main() -> int:
     if asked.keep_cycle:
         keep_cycle(*asked.keep_cycle)
         return 0
+    *others, last = sorted(os.sched_getaffinity(0))
+    core = last if others and not asked.together else None
+    if core is not None:
+        os.sched_setaffinity(0, others)
     os.environ["CAN_CONFIG"] = json.dumps({"port": 44200 + os.getpid() % 1000})
     ours, near = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     far, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -222,7 +231,7 @@ def main() -> int:
         arm = start_arm(path, asked.bus, theirs.fileno())
         theirs.close()
         try:
-            print(json.dumps(measure(load_arm(str(path)), asked.bus, asked.seconds), indent=1))
+            print(json.dumps(measure(load_arm(str(path)), asked.bus, asked.seconds, core), indent=1))
         finally:
             arm.terminate()
             arm.wait()

@@ -25,8 +25,8 @@ class BusLoad:
     @property
     def what(self) -> str:
         """In words."""
-        cycle = f"{self.joints} joints at {self.rate:g} Hz"
-        return f"{cycle} load the bus by up to {self.share:.0%} of {self.bus.bitrate} bit/s"
+        joints, load = ("1 joint", "loads") if self.joints == 1 else (f"{self.joints} joints", "load")
+        return f"{joints} at {self.rate:g} Hz {load} the bus by up to {self.share:.0%} of {self.bus.bitrate} bit/s"
 
     @property
     def remedy(self) -> str:

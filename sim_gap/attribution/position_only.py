@@ -9,9 +9,10 @@ from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, Rollout, Signs, Verdict
 from sim_gap.checks.finding import Finding
 from sim_gap.closed_loop.identify import Identified, columns_of_effect, identify
-from sim_gap.closed_loop.judge import LEAST_SHRINK, Stage, interval, undecided_scale
+from sim_gap.closed_loop.judge import LEAST_SHRINK, SYSTEMATIC, Stage, interval, undecided_scale
 from sim_gap.closed_loop.parameters import EFFECTS
 from sim_gap.closed_loop.search import PRICE
+from sim_gap.closed_loop.training.bands import SHARE
 from sim_gap.closed_loop.training.replay import replay_rms
 from sim_gap.model.load import SimModel
 from sim_gap.residuals.where import Location
@@ -103,7 +104,7 @@ def _differs(found: Identified, stage: Stage) -> bool:
 
 
 def _verdict(found: Identified, causes: Sequence[Cause], share: float) -> Verdict:
-    if not causes and bool(np.all(found.heldout_before < 2.0 * found.margin)):
+    if _is_within(found) or (not causes and bool(np.all(found.heldout_before < 2.0 * found.margin))):
         return "no_gap"
     near = found.heldout_after < np.maximum(2.0 * found.margin, EXPLAINED * found.heldout_before)
     if _structure_left(found):
@@ -113,6 +114,13 @@ def _verdict(found: Identified, causes: Sequence[Cause], share: float) -> Verdic
     if causes[0].confounded_with or causes[0].confidence < HINT:
         return "ambiguous"
     return "explained" if np.sqrt(share) <= EXPLAINED or bool(near.all()) else "unexplained"
+
+
+def _is_within(found: Identified) -> bool:
+    """Whether no joint's gap matters: it is within the margin, or no more than parameters make of it that are off by as
+    much as no recording shows (twice `SYSTEMATIC` of the tracking error)."""
+    pairs = ((found.train_before, found.search.scales.angle), (found.heldout_before, found.tracking))
+    return all(bool(np.all(gap < np.maximum(found.margin, 2.0 * SYSTEMATIC * error))) for gap, error in pairs)
 
 
 def _structure_left(found: Identified) -> bool:
@@ -215,6 +223,21 @@ def _notes(found: Identified) -> list[str]:
             "viscous friction, back-EMF and damping of the measured velocity act alike on a position: the sum is given"
             + (", as part of the controller" if found.search.open_controller else "")
         )
+    out += _beyond(found)
     if found.export is not None and found.export.lines:
         out.append(f"the corrected model leaves out: {', '.join(found.export.lines)}")
     return out
+
+
+def _beyond(found: Identified) -> list[str]:
+    """A note of the joints that leave the range of the training recordings more often than a band may miss."""
+    out = []
+    for j, name in enumerate(found.sim.arm.names):
+        fitted, other = (d.measured[:, j][d.weight[:, j] > 0.0] for d in (found.search.data, found.heldout))
+        if not (fitted.size and other.size):
+            continue
+        outside = float(np.mean((other < fitted.min()) | (other > fitted.max())))
+        if outside > 1.0 - SHARE:
+            out.append(f"{name}: {outside:.0%} of the held-out motion")
+    told = "outside the range of the training recordings, where bands may be too narrow"
+    return [f"{told}: {', '.join(out)}"] if out else []

@@ -11,6 +11,9 @@ from sim_gap.checks.finding import Finding
 
 JITTER = 0.2
 """Standard deviation of the steps over their median from which the times may be those of receipt."""
+LONG, HALF, CLEAR = 1.5, 12, 8.0
+"""Step in periods from which samples may be missing in it; half the number of rows whose median tells; how much later
+than before that is, in median absolute deviations, from which some are."""
 SMOOTHER = 0.7
 """Roughness of the positions on even times over that on the recorded ones, below which the recorded are of receipt."""
 REPEATED = 0.03
@@ -45,15 +48,7 @@ def even_times(recording: Recording, stated: Corrections) -> tuple[Recording, li
 
 def _sample_times(t: Array) -> Array | None:
     """Even times that the stamps scatter about, gaps kept; None where they do not scatter about even times."""
-    number = np.arange(t.size, dtype=float)
-    for _ in range(5):
-        period, start = np.polyfit(number, t, 1)
-        late = (t - start - period * np.arange(t.size)) / period
-        missed = np.round(median_filter(late, size=min(51, t.size | 1), mode="nearest"))
-        following = np.arange(t.size) + np.maximum.accumulate(missed - missed[0])
-        if np.array_equal(following, number):
-            break
-        number = following
+    number = np.arange(t.size) + _missed(t)
     period, start = np.polyfit(number, t, 1)
     even = start + period * number
     scatter = t - even
@@ -61,6 +56,30 @@ def _sample_times(t: Array) -> Array | None:
     if np.std(scatter) > 2.0 * period or wander > 0.9 or np.any(np.diff(even) <= 0.0):
         return None
     return np.asarray(even)
+
+
+def _missed(t: Array) -> Array:
+    """Number of samples missing before each row (K,).
+
+    By whole periods the rows after a gap come later than those before it, each by the median of some, for any one may
+    be received late; of the steps about such a place, the longest are the gaps.
+    """
+    rows, steps, ahead = np.arange(t.size), np.diff(t), min(2 * HALF, t.size - 1)
+    period = float(np.median(t[ahead:] - t[:-ahead])) / ahead
+    late = median_filter(t / period - rows, size=2 * HALF + 1, mode="nearest")
+    before, after = late[np.maximum(rows[:-1] - HALF, 0)], late[np.minimum(rows[1:] + HALF, t.size - 1)]
+    jump = after - before
+    spread = float(np.median(np.abs(jump - np.median(jump))))
+    places = np.flatnonzero(jump > max(0.5, CLEAR * spread))
+    missed = np.zeros(t.size)
+    for around in np.split(places, np.flatnonzero(np.diff(places) > 1) + 1) if places.size else ():
+        left = round(float(after[around[-1]] - before[around[0]]))
+        for k in around[np.argsort(-steps[around])].tolist():
+            if left <= 0 or steps[k] < LONG * period:
+                break
+            missed[k + 1] = min(left, max(1, round(steps[k] / period) - 1))
+            left -= int(missed[k + 1])
+    return np.asarray(np.cumsum(missed))
 
 
 def _roughness(t: Array, position: Array) -> float:

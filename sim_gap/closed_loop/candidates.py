@@ -7,7 +7,7 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.closed_loop.fit import Fit, batch, jacobian, residuals
 from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS
-from sim_gap.closed_loop.search import PRICE, Search, effect_there, level_of, start_of
+from sim_gap.closed_loop.search import LEVELS, PRICE, Search, effect_there, level_of, start_of
 
 
 def ranked(search: Search, fit: Fit, own: Sequence[str]) -> list[list[tuple[float, str]]]:
@@ -46,7 +46,7 @@ def _change(search: Search, fit: Fit, effect: str) -> list[dict[str, Array]]:
             continue
         point = dict(fit.point)
         start = np.array([start_of(search, name, j) for j in range(search.data.joints)])
-        if np.isinf(PARAMETERS[name].neutral):
+        if name in LEVELS:
             point[name] = level_of(search, fit, name)
         elif name == "gain":
             point[name] = fit.point[name] * 1.05

@@ -13,8 +13,13 @@ INDEPENDENT_S = 0.5
 """Time over which residuals are correlated [s]."""
 PRICE = 4.0
 """Fall of the score that a parameter has to pay for."""
-LEVELS = {"slew": (0.2, 0.35, 0.5, 0.65, 0.8, 0.9), "limit": (0.6, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)}
-"""Levels at which a limit is tried, in units of the command's highest speed, or of the joint's own scale."""
+LEVELS = {
+    "slew": (0.2, 0.35, 0.5, 0.65, 0.8, 0.9),
+    "limit": (0.6, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0),
+    "ki": (0.15, 0.6, 2.4),
+}
+"""Levels at which a limit or an integral part is tried: in units of the command's highest speed, of the joint's own
+torque, of the gain per second."""
 LEAST_FALL = 0.025
 """Least relative fall of a joint's RMS by an effect."""
 
@@ -62,18 +67,23 @@ def with_effect(search: Search, fit: Fit, effect: str, joint: int) -> Fit:
     active[joint] = (*active[joint], *names)
     point = {name: values.copy() for name, values in fit.point.items()}
     for name in names:
-        if np.isinf(PARAMETERS[name].neutral):
+        neutral = point[name][joint] == PARAMETERS[name].neutral
+        if name in LEVELS and (neutral or np.isinf(PARAMETERS[name].neutral)):
             point[name][joint] = level_of(search, fit, name)[joint]
-        elif point[name][joint] == PARAMETERS[name].neutral:
+        elif neutral:
             point[name][joint] = start_of(search, name, joint)
     return replace(fit, active=tuple(active), point=point, rms=None)
 
 
 def level_of(search: Search, fit: Fit, name: str) -> Array:
-    """The best of some levels of a limit at every joint, (J,): one that is never reached has no slope to follow, and
-    one that is always reached leads nowhere."""
-    peak = np.abs(search.data.speed).max(axis=(0, 2)) if name == "slew" else search.scales.of(name)
-    levels = [np.minimum(fit.point[name], share * peak) for share in LEVELS[name]]
+    """The best of some levels of a limit or an integral part at every joint, (J,): a limit that is never reached has no
+    slope to follow, and one that is always reached leads nowhere; an integral part that is next to none holds the
+    torque at the start and does nothing else."""
+    if name == "ki":
+        levels = [share * fit.point["kp"] for share in LEVELS[name]]
+    else:
+        peak = np.abs(search.data.speed).max(axis=(0, 2)) if name == "slew" else search.scales.of(name)
+        levels = [np.minimum(fit.point[name], share * peak) for share in LEVELS[name]]
     gaps = residuals(search.data, batch([{**fit.point, name: level} for level in levels]))
     best = np.einsum("ptjw,ptjw->pj", gaps, gaps).argmin(axis=0)
     return np.asarray(np.stack(levels)[best, np.arange(search.data.joints)])

@@ -1,7 +1,9 @@
 """Simulation of position-controlled joints: all windows, joints and hypotheses at once.
 
-One step is implicit in damping and friction, and in the position gain where that is too high for the step, so that it
-is stable for any gains, and a joint sticks where friction exceeds what drives it.
+Velocities stand half a step before positions (leapfrog), and damping acts on the mean of two of them, so that the error
+is of second order in the step: one of first order would show as a command that comes half a step early and a heavier
+joint. Friction, damping too strong for the step and a position gain too high for it are implicit, so that it is stable
+for any gains, and a joint sticks where friction exceeds what drives it.
 """
 
 from collections.abc import Mapping
@@ -93,8 +95,9 @@ def _run(data: Windows, values: Values, count: int) -> Array:
         if "kd" in active:
             torque = torque + kd * speed
         if "ki" in active:
-            total += dt * error * on
+            total += 0.5 * dt * error * on
             torque = torque + ki * total
+            total += 0.5 * dt * error * on
         if "feed" in active:
             torque = torque + of("feed") * feed
         free = on
@@ -118,8 +121,10 @@ def _run(data: Windows, values: Values, count: int) -> Array:
         for name in linear:
             torque -= of(name) * data.columns[name][k]
         outside = viscous - brake * (1.0 - free) if braked else viscous
-        effective = mass + dt * (outside + back_emf * on) + free * (damped + stiff)
-        v = (mass * v + dt * torque) / effective
+        lost = dt * (outside + back_emf * on) + free * damped
+        carried = mass - np.minimum(0.5 * lost, mass)
+        effective = carried + lost + free * stiff
+        v = (carried * v + dt * torque) / effective
         hold = coulomb
         if "load" in active:
             hold = hold + of("load") * data.load[k]

@@ -100,7 +100,7 @@ def _own_terms(arm: RigidArm, q: Array) -> tuple[Array, Array]:
 
 
 def held_command(recording: Recording, t: Array, dt: float) -> tuple[Array, Array]:
-    """Mean of the command over each step from t to t + dt, held from row to row; 1 where there is one, else 0."""
+    """Mean of the command, held from row to row, over a step about each t; 1 where there is one, else 0."""
     given = recording.position_command
     assert given is not None
     last = np.clip(np.searchsorted(recording.t, t + 1e-9, side="right") - 1, 0, len(recording.t) - 1)
@@ -112,9 +112,8 @@ def held_command(recording: Recording, t: Array, dt: float) -> tuple[Array, Arra
         filled[:, j] = filled[order, j] if there.any() else 0.0
         first = int(np.argmax(there))
         filled[:first, j] = filled[first, j]
-    span = np.diff(recording.t, append=recording.t[-1] + dt)
-    area = np.concatenate([np.zeros((1, filled.shape[1])), np.cumsum(filled * span[:, None], axis=0)])
-    ends = np.append(recording.t, recording.t[-1] + dt)
-    edges = np.append(t, t[-1] + dt)
+    ends = np.concatenate([[recording.t[0] - dt], recording.t[1:], [recording.t[-1] + dt]])
+    area = np.concatenate([np.zeros((1, filled.shape[1])), np.cumsum(filled * np.diff(ends)[:, None], axis=0)])
+    edges = np.append(t, t[-1] + dt) - 0.5 * dt
     whole = np.column_stack([np.interp(edges, ends, column) for column in area.T])
     return np.diff(whole, axis=0) / dt, served

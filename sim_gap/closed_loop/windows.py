@@ -37,7 +37,7 @@ class Windows:
     warm: int
     """Steps before the first comparison."""
     command: Array
-    """Mean of the held command over each step [rad]."""
+    """Mean of the held command over a step about each time [rad]."""
     served: Array
     """1 while the servo is commanded, 0 where the command is missing."""
     speed: Array

@@ -11,7 +11,6 @@ from sim_gap.report.effect_text import CHANNEL_WORDS
 from sim_gap.report.figures import BELOW_TITLE, GREY, ORANGE, stacked, thinned
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
-from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import Estimate
 from sim_gap.search.term import Term
 
@@ -44,8 +43,7 @@ def cause_figure(answer: Diagnosis, cause: Cause) -> Any:
     """Residual less all other causes, and this cause's share, on the row where it is largest; None without one."""
     data, estimate = answer.internals.heldout, answer.internals.estimate
     terms = tuple(term for term in estimate.terms if _is_of(term, cause, answer.names))
-    store = estimate.on(data)
-    own, all_of_them = (_sums(data, estimate, store, some) for some in (terms, estimate.terms))
+    own, all_of_them = (_sums(data, estimate, some) for some in (terms, estimate.terms))
     sizes = {row: root_mean_square(own[row][data.valid[row]]) for row in data.rows if data.valid[row].sum() > 10}
     if not sizes or max(sizes.values()) == 0.0:
         return None
@@ -84,6 +82,6 @@ def _is_of(term: Term, cause: Cause, names: tuple[str, ...]) -> bool:
     return term.effect == cause.effect and ("arm" in cause.parameters or names[term.place] in cause.joints)
 
 
-def _sums(data: ResidualSet, estimate: Estimate, store: ColumnStore, terms: tuple[Term, ...]) -> dict[Row, Array]:
-    out: dict[Row, Array] = estimate.predict(data, store, terms)
+def _sums(data: ResidualSet, estimate: Estimate, terms: tuple[Term, ...]) -> dict[Row, Array]:
+    out: dict[Row, Array] = estimate.predict(data, terms=terms)
     return {row: np.asarray(values) for row, values in out.items()}

@@ -43,6 +43,18 @@ def test_the_bus_that_is_opened_counts_not_the_arm_files(spec: str | None, expec
     assert bool(said) == bool(expected)
 
 
+def test_each_bus_carries_its_own_joints() -> None:
+    """Two joints on the arm's bus, and one on a slow one for the hand."""
+    arm = make_arm(3, link=at(500, 1_000_000))
+    section = arm.require_link()
+    joints = (*section.joints[:2], section.joints[2].model_copy(update={"bus": "hand"}))
+    hand = section.bus.model_copy(update={"channel": "can1", "bitrate": 125_000})
+    split = section.model_copy(update={"joints": joints, "buses": {"hand": hand}})
+    loads = list(bus_loads(arm.model_copy(update={"link": split})))
+    assert [load.what.partition(" at")[0] for load in loads] == ["2 joints", "1 joint"]
+    assert [load.what.rpartition(" of ")[2] for load in loads] == ["1000000 bit/s", "125000 bit/s"]
+
+
 @pytest.fixture
 def overloaded() -> Iterator[tuple[Link, FakeBus]]:
     """In real time, as far as the link can tell."""

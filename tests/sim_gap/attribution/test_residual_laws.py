@@ -47,6 +47,12 @@ def test_the_torque_of_a_law_is_the_true_one(answer):
     assert law_figure(answer, law).data
 
 
+def test_the_band_of_a_law_is_narrow_beside_it(answer):
+    law = next(law for law in answer.laws if law.joint == 1)
+    assert (law.band > 0.0).all()
+    assert law.band.max() < 0.25 * np.ptp(law.torque)
+
+
 def test_the_exported_module_applies_laws():
     arm = model()
     data = mujoco.MjData(arm)

@@ -77,3 +77,10 @@ def test_score_counts_confounded_answers_and_false_ones() -> None:
     assert result["named_where_tellable"] == 0.5
     assert result["false_confident"] == 0.5
     assert result["meets"] == {"named_where_tellable": False, "false_confident": False}
+    labels = {f"case_{k}": label(f"case_{k}", "controller.dead_zone") for k in range(20)}
+    named = ["controller.dead_zone"] * 17 + ["base.tilt"] * 3
+    result = score_positions(
+        {case: answer(effect, 0.5, []) for case, effect in zip(labels, named, strict=True)}, labels
+    )
+    assert result["named_where_tellable"] == 0.85
+    assert result["meets"] == {"named_where_tellable": True, "false_confident": True}

@@ -13,14 +13,15 @@ from armlink.recording.recording import Recording
 from sim_gap.closed_loop import controller
 from sim_gap.closed_loop.compete import select_about
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of, starting_fit
-from sim_gap.closed_loop.fit import Fit
+from sim_gap.closed_loop.fit import Fit, batch, improve
 from sim_gap.closed_loop.judge import _ordered
 from sim_gap.closed_loop.parameters import EFFECTS
 from sim_gap.closed_loop.search import Search, level_of, with_effect
+from sim_gap.closed_loop.simulate import simulate
 from sim_gap.closed_loop.windows import windows_of
 from sim_gap.model.load import load_model
 
-GAIN, LATE_ROWS, LIMIT = 40.0, 2, 0.4
+GAIN, LATE_ROWS, LIMIT, INTEGRAL = 40.0, 2, 0.4, 50.0
 WEIGHTLESS = model_text(kp=GAIN, friction=0.0, damping=3.0).replace("<option ", '<option gravity="0 0 0" ')
 LOOKED_FOR = {"controller.stiffness", "controller.delay", "friction.viscous", "friction.coulomb"}
 
@@ -58,6 +59,18 @@ def test_a_limit_is_tried_at_the_level_that_fits() -> None:
     nominal = Fit(search.nominal, ((), ()))
     assert 0.2 < level_of(search, nominal, "limit")[0] < 0.6
     assert with_effect(search, nominal, "actuator.saturation", 0).point["limit"][0] < 0.6
+
+
+def test_an_integral_part_is_tried_at_the_level_that_fits() -> None:
+    """A small one only holds the torque at the start: from there no slope leads to one that counts."""
+    search, _ = started(WEIGHTLESS, record(WEIGHTLESS, 2, 14.0), {"controller.integral"})
+    nominal = Fit(search.nominal, ((), ()))
+    moved = simulate(search.data, batch([{**search.nominal, "ki": np.full(2, INTEGRAL)}]))[0]
+    search = replace(search, data=replace(search.data, measured=moved))
+    assert (np.abs(np.log(level_of(search, nominal, "ki") / INTEGRAL)) < np.log(2.5)).all()
+    found = improve(search.data, with_effect(search, nominal, "controller.integral", 0), search.scales)
+    assert found.point["ki"][0] == pytest.approx(INTEGRAL, rel=0.02)
+    assert found.point["ki"][1] == 0.0
 
 
 def test_the_damping_of_a_servo_that_is_not_known_ends_at_its_limit(monkeypatch) -> None:

@@ -3,6 +3,7 @@ import sys
 import types
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -11,6 +12,7 @@ from servo_arm import model_text, record, written
 
 from armlink.errors import BadInput
 from sim_gap.attribution.diagnose import diagnose
+from sim_gap.attribution.position_only import _beyond, _verdict
 from sim_gap.closed_loop.identify import gain_scales
 from sim_gap.closed_loop.training.actuators import write_actuators
 from sim_gap.closed_loop.training.posterior import batch_path, batched, write_exported, write_samples
@@ -38,6 +40,33 @@ def test_names_the_controller_and_the_friction(answer) -> None:
             assert found.low < found.value < found.high
     assert {cause.effect for cause in answer.causes} == {"controller.stiffness", "friction.coulomb"}
     assert (answer.heldout_after < 0.25 * answer.heldout_before).all()
+
+
+def test_a_gap_that_matters_nowhere_is_none() -> None:
+    """A few per cent of the tracking error: causes that make it smaller are as minor as the gap."""
+
+    def verdict(*gaps: float) -> str:
+        gap, error = np.array(gaps), np.array([0.03, 0.05])
+        search = SimpleNamespace(scales=SimpleNamespace(angle=error), open_controller=False)
+        found = SimpleNamespace(margin=np.full(2, 1e-4), tracking=error, search=search, train_before=gap)
+        found.heldout_before, found.heldout_after = gap, 0.1 * gap
+        return _verdict(found, [SimpleNamespace(confounded_with=(), confidence=0.75)], 0.01)
+
+    assert verdict(0.0010, 0.0018) == "no_gap"
+    assert verdict(0.0010, 0.0022) == "explained"
+
+
+def test_joints_that_go_further_than_in_training_are_noted() -> None:
+    near, far = np.linspace(-0.1, 0.1, 50), np.linspace(-0.3, 0.3, 50)
+    fitted, other = (
+        SimpleNamespace(measured=np.stack(columns, axis=1)[..., None], weight=np.ones((50, 2, 1)))
+        for columns in ((near, far), (far, near))
+    )
+    arm = SimpleNamespace(names=("shoulder", "elbow"))
+    found = SimpleNamespace(sim=SimpleNamespace(arm=arm), search=SimpleNamespace(data=fitted), heldout=other)
+    (note,) = _beyond(found)
+    assert "shoulder: 68% of the held-out motion" in note
+    assert "elbow" not in note
 
 
 def test_the_written_model_moves_like_the_arm(answer, tmp_path: Path) -> None:

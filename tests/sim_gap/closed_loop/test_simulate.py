@@ -27,6 +27,18 @@ def test_agrees_with_mujoco_on_a_servo_with_friction() -> None:
     assert (joint_rms(data, found.rms) < np.maximum(0.03 * moved, 1.5e-3)).all()
 
 
+def test_the_step_shows_neither_as_a_lead_nor_as_inertia() -> None:
+    """A step of 5 ms moves a strongly damped servo as one of 1 ms does: to a small part of its way in half a step."""
+    text = model_text(kp=60.0, friction=0.0, damping=3.0)
+    sim = load_model(mujoco.MjModel.from_xml_string(text))
+    recording = record(text, 1, 7.8)
+    coarse, fine = (windows_of(sim.arm, [recording], ["run"], step) for step in (0.005, 0.001))
+    slow, fast = (simulate(each, batch([nominal_point(each, nominal_controller(sim))])) for each in (coarse, fine))
+    apart = np.sqrt(np.mean((slow - fast) ** 2, axis=(0, 1, 3)))
+    way = 0.5 * coarse.dt * np.sqrt(np.mean(coarse.v**2, axis=(0, 2)))
+    assert (apart < 0.1 * way).all()
+
+
 def test_another_gain_shows() -> None:
     data, point = _windows(model_text(kp=30.0, friction=0.2))
     found = evaluate(data, Fit(point, ((), ())))

@@ -12,7 +12,7 @@ from armlink.link.link import Link
 from armlink.recording.files import load_recording
 from calib.arm.kinematics import gcomp_arm
 from sim_gap.experiment.collect import collect
-from sim_gap.experiment.excitation import SPEEDS, joints_in_doubt, plan_motion
+from sim_gap.experiment.excitation import LONGEST, SPEEDS, _Shape, joints_in_doubt, plan_motion
 from sim_gap.experiment.motion_file import load_motion, save_motion
 
 
@@ -39,6 +39,16 @@ def test_each_joint_turns_both_ways_at_every_speed_alone() -> None:
         for way in (-1, 1):
             steady = np.abs(velocity[alone, 3] / (way * share * fastest) - 1) < 0.01
             assert steady.sum() > motion.rate  # for more than a second
+
+
+def test_a_slow_joint_turns_through_a_part_of_its_range() -> None:
+    """As far as it gets in the longest time, about the middle."""
+    shape = _Shape(load_arm("sarcos"))
+    shape.fastest = 0.004 * (shape.high - shape.low)
+    shape.turn(3, shape.here)
+    q = np.concatenate(shape.rows)[:, 3]
+    assert np.ptp(q) == pytest.approx(max(SPEEDS) * shape.fastest[3] * LONGEST)
+    assert 0.5 * (q.min() + q.max()) == pytest.approx(0.5 * (shape.low[3] + shape.high[3]))
 
 
 def test_what_a_diagnosis_leaves_open_is_moved(tmp_path: Path) -> None:

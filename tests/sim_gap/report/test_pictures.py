@@ -5,6 +5,7 @@ import pytest
 from wrong_arms import Wrong, model, record
 
 from sim_gap.attribution.diagnose import diagnose
+from sim_gap.report import page
 from sim_gap.report.cause_figures import cause_figure
 from sim_gap.report.figures import residual_panels
 from sim_gap.report.page import sections
@@ -51,3 +52,10 @@ def test_it_begins_with_what_to_do_and_its_headings_are_words(answer):
         ]
     titles = [title.replace("joint_", "") for title in titles]
     assert [title for title in titles if "tau" in title or "_" in title] == []
+
+
+def test_a_channel_without_a_figure_is_told_in_its_table(answer, monkeypatch):
+    monkeypatch.setattr(page, "residual_panels", lambda answer, channel: None)
+    assert [section.figures for section in page._residuals(answer)] == [[], []]
+    monkeypatch.setattr(page, "residual_panels", lambda answer, channel: channel)
+    assert [section.figures for section in page._residuals(answer)] == [["tau"], ["tau_motor"]]

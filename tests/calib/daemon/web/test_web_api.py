@@ -2,18 +2,22 @@
 
 import json
 import re
+import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 from made_up_view import NAMES, NOW, MadeUpView
 from prometheus_client.parser import text_string_to_metric_families
+from pydantic import TypeAdapter, ValidationError
 from served_page import Served
 
 from calib.daemon.view.api_models import HistoryPoint
 from calib.daemon.web import page as page_module
 from calib.daemon.web.page import page_files
+from calib.daemon.web.parameters import LARGEST_ID, Id
 from calib.daemon.web.stream import Streams
 
 
@@ -24,6 +28,16 @@ def test_status_says_what_the_contract_lists(server: Served) -> None:
     assert {"rate_hz", "load", "frames", "missed", "errors"} <= status["bus"].keys()
     assert status["records"].keys() == {"calibration", "gravity"}
     assert status["time"].endswith("Z")
+
+
+def test_ids_are_those_that_the_journal_can_hold() -> None:
+    ids = TypeAdapter(Id)
+    with closing(sqlite3.connect(":memory:")) as db:
+        assert db.execute("SELECT ?", (ids.validate_python(LARGEST_ID),)).fetchone() == (LARGEST_ID,)
+        with pytest.raises(OverflowError):
+            db.execute("SELECT ?", (LARGEST_ID + 1,))
+    with pytest.raises(ValidationError):
+        ids.validate_python(LARGEST_ID + 1)
 
 
 def test_joints_and_estimates_are_lists_base_to_tip(server: Served) -> None:

@@ -1,0 +1,260 @@
+"""Single steps of the fit of commanded and measured positions, each against a figure of its own."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+from servo_arm import model_text, record
+
+from armlink.recording.recording import Recording
+from sim_gap.closed_loop import judge, prune, rivals
+from sim_gap.closed_loop.candidates import _explained
+from sim_gap.closed_loop.controller import _from_grid, nominal_controller, nominal_point, scales_of
+from sim_gap.closed_loop.fit import Fit, batch, jacobian
+from sim_gap.closed_loop.identify import _frozen
+from sim_gap.closed_loop.parameters import Scales
+from sim_gap.closed_loop.search import PRICE, Search
+from sim_gap.closed_loop.simulate import simulate
+from sim_gap.closed_loop.tracks import held_command
+from sim_gap.closed_loop.training import actuators, export
+from sim_gap.closed_loop.training import replay as replays
+from sim_gap.closed_loop.windows import WARM_S, Windows, windows_of
+from sim_gap.model.load import load_model
+
+TEXT = model_text(kp=15.0, friction=0.2)
+
+
+@pytest.fixture(scope="module")
+def data() -> Windows:
+    sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
+    return windows_of(sim.arm, [record(TEXT, 1, 14.0)], ["run"])
+
+
+@pytest.fixture(scope="module")
+def search(data: Windows) -> Search:
+    """About the model with its gains unknown."""
+    bare = load_model(mujoco.MjModel.from_xml_string(TEXT.partition("<actuator>")[0] + "</mujoco>"))
+    point = nominal_point(data, nominal_controller(bare))
+    return Search(data, scales_of(data), point, np.full(2, 1e-4))
+
+
+def test_the_grid_finds_a_stiffness_near_the_servos(search: Search) -> None:
+    """Its points are a factor of two apart."""
+    found = _from_grid(search, ("delay",)).point
+    assert np.abs(np.log2(found["kp"] / 15.0)).max() < 1.2
+    assert (found["feed"] == 0.0).all()
+
+
+def test_the_grid_centres_on_the_torque_that_the_error_has_to_make(search: Search, monkeypatch) -> None:
+    """With feed-forward on what that leaves, which is next to nothing of gravity's torque."""
+    asked: dict[str, np.ndarray] = {}
+
+    def gaps(data: Windows, values: dict[str, np.ndarray]) -> np.ndarray:
+        asked.update(values)
+        return np.zeros((len(values["kp"]), 1, 2, 1))
+
+    monkeypatch.setattr("sim_gap.closed_loop.controller.residuals", gaps)
+    monkeypatch.setattr("sim_gap.closed_loop.controller.evaluate", lambda data, fit: fit)
+    d = search.data
+    error = np.sqrt(np.mean((d.command - d.recorded) ** 2, axis=(0, 2)))
+    needed = d.gravity + d.coupling + (d.inertia + d.arm.armature[:, None]) * d.a
+    for parts, feed in (((), 0.0), (("feed",), 1.0)):
+        point = _from_grid(search, parts).point
+        size = np.sqrt(np.mean((needed - feed * d.feed) ** 2, axis=(0, 2))) / error
+        centre = np.maximum(size, 25.0 * search.scales.inertia)
+        np.testing.assert_allclose(asked["kp"].min(0), 0.02 * centre, rtol=1e-6)
+        np.testing.assert_allclose(asked["kp"].max(0), 50.0 * centre, rtol=1e-6)
+        assert (point["feed"] == feed).all()
+
+
+def test_a_parameters_slope_is_that_at_its_value(data: Windows) -> None:
+    """Friction of a small joint: a step as large as the joint's own scale would bend it by a tenth; one joint sticks
+    once more or less often within the step."""
+    one = np.ones(2)
+    scales = Scales(one, one, 0.02 * one, 0.05 * one)
+    sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
+    point = nominal_point(data, nominal_controller(sim))
+    fit = Fit(point, (("viscous",), ("viscous",)))
+    _, slopes = jacobian(data, fit, scales, fit.active)
+    for j in range(2):
+        ends = []
+        for side in (1e-4, -1e-4):
+            values = {**point, "viscous": point["viscous"] + side * (np.arange(2) == j)}
+            ends.append(simulate(data, batch([values]))[0, :, j] * data.weight[:, j])
+        expected = (ends[0] - ends[1]) / 2e-4 * 0.2  # in units of the size at which it is tried
+        assert np.linalg.norm(slopes[j][0] - expected) < 0.08 * np.linalg.norm(expected)
+
+
+def test_a_command_that_arrives_late_moves_the_arm_as_a_later_one(data: Windows) -> None:
+    sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
+    point = nominal_point(data, nominal_controller(sim))
+    late = simulate(data, batch([{**point, "delay": np.full(2, 4.0 * data.dt)}]))
+    shifted = {
+        name: np.concatenate([np.repeat(x[:1], 4, axis=0), x[:-4]])
+        for name, x in (("command", data.command), ("speed", data.speed), ("feed", data.feed))
+    }
+    np.testing.assert_allclose(late, simulate(replace(data, **shifted), batch([point])), atol=1e-9)
+    assert np.abs(late - simulate(data, batch([point]))).max() > 1e-3
+
+
+def test_a_joint_that_is_never_commanded_has_no_command() -> None:
+    t = np.arange(0.0, 1.0, 0.02)
+    command = np.column_stack([np.sin(t), np.full_like(t, np.nan)])
+    held, served = held_command(Recording(t=t, position=0.0 * command, position_command=command), t[:-1], 0.02)
+    assert np.isfinite(held).all()
+    assert (served == [1.0, 0.0]).all()
+    assert (held[:, 1] == 0.0).all()
+    before = np.sin(np.maximum(t[:-1] - 0.02, 0.0))
+    np.testing.assert_allclose(held[:, 0], (before + np.sin(t[:-1])) / 2, atol=1e-12)  # half a step of each about t
+
+
+def test_windows_are_compared_from_the_end_of_their_opening(data: Windows) -> None:
+    assert data.time[0] == pytest.approx(WARM_S, abs=data.dt * data.stride)
+    assert data.time[0] == pytest.approx(data.warm * data.dt)
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-4])
+def test_what_columns_explain_is_a_share_whatever_the_residuals_size(size: float) -> None:
+    random = np.random.default_rng(1)
+    known, new, other = np.linalg.qr(random.normal(size=(60, 3)))[0].T[:, None, :, None]
+    residual = size * (3.0 * known[0] - 4.0 * new[0] + 0.0 * other[0])
+    share = _explained(residual, known[None, 0], new[None, 0], signed=True)
+    assert share == pytest.approx(16.0 / 25.0)
+    assert _explained(residual, known[None, 0], -new[None, 0], signed=True) == 0.0
+    assert _explained(residual, known[None, 0], other[None, 0], signed=False) == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("gravity", "off", "frozen"),
+    [
+        (9.81, True, set()),
+        (9.81, False, {"actuator.back_emf"}),
+        (0.0, True, {"base.tilt", "position.offset"}),
+        (0.0, False, {"base.tilt", "position.offset", "actuator.back_emf"}),
+    ],
+)
+def test_what_nothing_can_show_is_left_out(gravity: float, off: bool, frozen: set[str]) -> None:
+    sim = SimpleNamespace(arm=SimpleNamespace(gravity=np.array([0.0, 0.0, -gravity])))
+    served = np.ones((5, 2, 1))
+    served[3, 1] = 0.0 if off else 1.0
+    assert _frozen(sim, SimpleNamespace(served=served)) == frozen
+
+
+def test_a_coefficient_of_the_whole_arm_is_one_and_a_joints_is_in_its_own_scale() -> None:
+    fit = SimpleNamespace(point={"tilt.x": np.array([0.03]), "coulomb": np.array([0.5, 0.8])})
+    search = SimpleNamespace(scales=SimpleNamespace(of=lambda name: np.array([0.1, 0.2])))
+    assert judge._coordinate(search, fit, -1, "tilt.x") == 0.03
+    assert judge._coordinate(search, fit, 1, "coulomb") == pytest.approx(4.0)
+
+
+def test_an_effect_of_the_whole_arm_is_taken_out_by_its_own_names(monkeypatch) -> None:
+    monkeypatch.setattr(judge, "shared_effects", lambda arm: {"base.tilt": ("tilt.x", "tilt.y"), "other": ("z",)})
+    names = ("tilt.x", "tilt.y", "z")
+    fit = Fit({name: np.array([0.3]) for name in (*names, "kp")}, ((),), names)
+    bare = judge.taken_out(SimpleNamespace(data=SimpleNamespace(arm=None)), fit, ("base.tilt", ()))
+    assert {name: float(x[0]) for name, x in bare.point.items()} == {"tilt.x": 0.0, "tilt.y": 0.0, "z": 0.3, "kp": 0.3}
+    assert bare.shared == ("z",)
+
+
+def test_the_spread_of_a_parameter_is_that_of_least_squares(monkeypatch) -> None:
+    """One parameter and white residuals of independent windows: σ² / Σ x², beside what is systematic."""
+    random = np.random.default_rng(3)
+    x = random.normal(size=(1, 50, 400))
+    residual = 0.01 * random.normal(size=(50, 1, 400))
+    monkeypatch.setattr(judge, "jacobian", lambda data, fit, scales, active, shared: (residual, [x]))
+    search = SimpleNamespace(data=SimpleNamespace(count=400, joints=1), scales=None)
+    fit = SimpleNamespace(active=(("kp",),), shared=(), point={"kp": np.array([15.0])})
+    found = judge.covariance(search, fit).matrix[0, 0] - judge.SYSTEMATIC**2
+    assert found == pytest.approx(1e-4 / (x**2).sum(), rel=0.2)
+
+
+def test_a_gain_is_a_logarithm_away_from_the_nominal_one() -> None:
+    def distance(name: str, value: float, nominal: float) -> float:
+        scales = SimpleNamespace(of=lambda name: np.array([0.5]))
+        search = SimpleNamespace(nominal={name: np.array([nominal])}, scales=scales)
+        return prune._distance(search, SimpleNamespace(point={name: np.array([value])}), name, 0)
+
+    assert distance("kp", 20.0, 10.0) == pytest.approx(np.log(2.0))
+    assert distance("limit", 20.0, np.inf) == np.inf
+    assert distance("ki", 20.0, 0.0) == np.inf
+    assert distance("coulomb", 2.0, 1.0) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(("lost", "named"), [(0.5 * PRICE, ("actuator.rotor_inertia",)), (2.0 * PRICE, ())])
+def test_the_common_scale_is_open_if_half_as_much_again_fits_as_well(monkeypatch, lost: float, named: tuple) -> None:
+    monkeypatch.setattr(rivals, "improve", lambda data, fit, scales, iterations: fit)
+    names = ("kp", "coulomb", "viscous", "kd", "ki", "stribeck", "armature", "dead")
+    fit = Fit({name: np.array([2.0, 2.0]) for name in names}, (("kp",), ("kp",)))
+    scores = iter([np.array([1.0 + 3.0 * PRICE, 1.0 + lost]), np.array([1.0, 1.0])])
+    search = SimpleNamespace(data=None, scales=None, score=lambda fit: next(scores))
+    assert rivals._scale_rivals(search, fit) == named
+
+
+@pytest.mark.parametrize(("group", "lost"), [(("base.tilt", ()), 4.0), (("friction.coulomb", (0,)), 2.0)])
+def test_a_rival_is_measured_by_all_that_is_lost_without_the_effect(monkeypatch, group: tuple, lost: float) -> None:
+    """Both joints lose 30 prices without it and two with another in its place: a fifteenth, of one joint and of all."""
+    base, fit, bare = np.zeros(2), SimpleNamespace(rms=1, name="fit"), SimpleNamespace(rms=1, name="bare")
+    scores = {"fit": base, "bare": base + 30.0 * PRICE, "trial": base + 2.0 * PRICE}
+    search = SimpleNamespace(data=None, scales=None, excluded=frozenset(), score=lambda fit: scores[fit.name])
+    monkeypatch.setattr(rivals, "ranked", lambda search, fit, own: [[(1.0, "position.offset")]] * 2)
+    monkeypatch.setattr(rivals, "with_effect", lambda search, fit, other, place: Fit({}, ((), ())))
+    monkeypatch.setattr(rivals, "improve", lambda *given: SimpleNamespace(rms=1, name="trial"))
+    monkeypatch.setattr(rivals, "_of_the_arm", lambda *given: [])
+    least, close = rivals.rivals_of(search, fit, group, bare)
+    assert "position.offset" in close
+    elsewhere = 30.0 if group[1] else 0.0  # which the joint's rival does not touch
+    assert least == pytest.approx((lost + elsewhere) * PRICE)
+
+
+@pytest.mark.parametrize(("late", "steps"), [(0.4, 0.0), (2.6, 3.0), (-1.0, 0.0)])
+def test_delays_are_told_in_whole_steps(monkeypatch, late: float, steps: float) -> None:
+    names = ("kp", "gain", "kv", "viscous", "back_emf", "armature", "coulomb", "limit")
+    point = {name: np.ones(1) for name in names}
+    found = SimpleNamespace(native=SimpleNamespace(point=point), sim=SimpleNamespace(n=1))
+    monkeypatch.setattr(actuators, "_delays", lambda found, j, drawn: 0.002 * np.array([late, late]))
+    entry = actuators._entry(found, 0, 0.002, [])
+    assert (entry["least"], entry["most"]) == (steps, steps)
+
+
+def test_a_body_gets_the_inertial_parameters_that_it_is_said_to_have() -> None:
+    """Half a kilogram at the elbow's axis: mass and first moment of the fore arm, as MuJoCo compiles it."""
+    spec = mujoco.MjSpec.from_string(TEXT)
+    compiled = spec.compile()
+    change = np.array([0.5, 0.05, 0.0, 0.0, 0.0, 0.0, 0.0, 0.005, 0.0, 0.005])  # a point mass at (0.1, 0, 0)
+    export._set_body(spec, compiled, 1, change)
+    after = spec.compile()
+    assert after.body_mass[2] == pytest.approx(0.8)
+    assert after.body_mass[2] * after.body_ipos[2] == pytest.approx([0.3 * 0.08 + 0.05, 0.0, 0.0], abs=1e-9)
+    apart = 0.3 * 0.5 / 0.8 * 0.02**2
+    assert sorted(after.body_inertia[2]) == pytest.approx([1e-3, 1e-3 + apart, 1e-3 + apart])
+
+
+def test_friction_that_a_simulator_cannot_hold_is_added_to_coulombs(monkeypatch) -> None:
+    """Breakaway friction, and that of the load in the mean."""
+    nothing = np.zeros(1)
+    own = {
+        "coulomb": 0.2,
+        "stribeck": 0.3,
+        "load": 0.1,
+        "stribeck_velocity": 0.1,
+        "viscous": 0.0,
+        "kd": 0.0,
+        "feed": 0.0,
+    }
+    fit = Fit({name: np.array([value]) for name, value in own.items()}, (("coulomb", "stribeck", "load"),))
+    data = SimpleNamespace(joints=1, load=np.full((5, 1, 2), 4.0))
+    nominal = dict.fromkeys(own, nothing)
+    monkeypatch.setattr(export, "improve", lambda data, fit, scales, iterations: fit)
+    held = export.native_fit(SimpleNamespace(data=data, nominal=nominal, scales=None), fit)
+    assert held.point["coulomb"] == pytest.approx([0.2 + 0.3 + 0.4])
+    assert held.point["stribeck"] == held.point["load"] == 0.0
+
+
+def test_the_opening_of_a_replay_is_not_judged(monkeypatch) -> None:
+    t = 5.0 + np.arange(0.0, 4.0, 0.1)
+    simulated, measured = np.where(t < 5.95, 7.0, 0.5)[:, None], np.zeros((len(t), 1))
+    monkeypatch.setattr(replays, "replay", lambda model, joints, recording: (t, simulated, measured))
+    recording = Recording(t=t, position=measured, position_command=measured)
+    assert replays.replay_rms(None, [0], [recording]) == pytest.approx([0.5])

@@ -1,0 +1,204 @@
+"""Columns and signals about an estimate, and single steps of search and fit, each against its own definition."""
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from wrong_arms import Wrong, model, record
+
+from sim_gap.effects.inertials import point
+from sim_gap.model.load import load_model
+from sim_gap.residuals.layout import layout_of
+from sim_gap.residuals.preprocess import prepare
+from sim_gap.residuals.residual_set import FLOOR, FLOOR_INNER, ResidualSet
+from sim_gap.search import gauss_newton, model_selection
+from sim_gap.search.about import about
+from sim_gap.search.column_store import ColumnStore
+from sim_gap.search.estimate import Estimate
+from sim_gap.search.feasible import _closest, _shapes
+from sim_gap.search.model_selection import golden, relinearised_in_place, select_model
+from sim_gap.search.normal_equations import NormalEquations
+from sim_gap.search.term import Term
+
+PAYLOAD, SPRING = Term("link.payload", 0), Term("transmission.spring", 1)
+COULOMB, GAIN = Term("friction.coulomb", 1), Term("actuator.gain", 1)
+
+
+@pytest.fixture(scope="module")
+def data() -> ResidualSet:
+    wrong = Wrong(coulomb=0.5, viscous=0.3, breakaway=0.4, payload=0.3, drift=0.02)
+    read = prepare(record(model(), wrong, seed=1, seconds=12.0, rate=50.0), load_model(model()).arm)
+    return ResidualSet((read,), layout_of([read]))
+
+
+def test_an_estimate_with_a_payload_has_the_torque_of_the_arm_with_that_mass(data: ResidualSet) -> None:
+    (read,) = data.signals
+    c = np.array([0.4, 0.01, 0.02, 0.08])
+    inertial = read.arm.inertial.copy()
+    inertial[-1] += point(0.4, c[1:])
+    expected = read.arm.with_inertial(inertial).torque(read.q, read.v, read.a)
+    np.testing.assert_allclose(about(read, data.layout, {PAYLOAD: c}).signals.model, expected, atol=1e-9)
+
+
+def test_shares_of_springs_and_bodies_add_up_to_the_change_of_the_torque(data: ResidualSet) -> None:
+    (read,) = data.signals
+    width = next(iter(ColumnStore(data).columns(SPRING).values())).shape[1]
+    found = about(read, data.layout, {SPRING: np.array([5.0, 0.3])[:width], PAYLOAD: np.array([0.4, 0.0, 0.0, 0.1])})
+    total = np.zeros_like(read.q)
+    for rows in found.shares.values():
+        for (channel, joint), share in rows.items():
+            total[:, joint] += share * (channel == data.layout.against_model)
+    np.testing.assert_allclose(found.signals.model - read.model, total, atol=1e-9)
+    assert np.abs(found.shares[SPRING][data.layout.against_model, 1]).max() > 0.1
+
+
+def test_the_motor_of_an_estimate_makes_up_for_its_friction(data: ResidualSet) -> None:
+    (read,) = data.signals
+    found = about(read, data.layout, {COULOMB: np.array([0.5])})
+    share = found.shares[COULOMB][data.layout.motor_side, 1]
+    np.testing.assert_allclose(found.signals.motor_model[:, 1] - read.motor_model[:, 1], share, atol=1e-9)
+    moving = np.abs(read.v[:, 1]) > 0.2
+    np.testing.assert_allclose(share[moving], 0.5 * np.sign(read.v[moving, 1]), atol=1e-9)
+
+
+def test_columns_that_the_readings_alone_tell_are_those_of_the_nominal_model(data: ResidualSet) -> None:
+    """Unless the drive's gain, by which they are reported, is part of the estimate."""
+    nominal = ColumnStore(data)
+    assert nominal.at({PAYLOAD: np.array([0.4, 0.0, 0.0, 0.1])})._source(COULOMB) is nominal
+    assert nominal.at({GAIN: np.array([0.2])})._source(COULOMB) is None
+
+
+def test_columns_of_what_an_estimate_holds_are_its_own(data: ResidualSet) -> None:
+    """Those of another effect of the links are the nominal model's where the estimate is close to it."""
+    nominal, c = ColumnStore(data), np.array([1e-4, 0.0, 0.0, 1e-5])
+    own = nominal.at({PAYLOAD: c})
+    assert own._source(PAYLOAD) is None
+    assert own._source(Term("link.mass_moment", 0)) is nominal
+    assert own._source(Term("law.velocity", 0)) is None
+
+
+def test_the_size_of_a_term_is_the_rms_of_its_torque(data: ResidualSet) -> None:
+    terms = [Term("torque.offset", 0), Term("torque.offset", 1)]
+    normal = NormalEquations(ColumnStore(data), terms)
+    index = normal.index(terms)
+    values = np.where(np.isin(index, normal.at[terms[0]]), 2.0, 3.0)
+    sizes = dict(zip(normal.rows, normal.size_of(terms[0], index, values), strict=True))
+    assert sizes["tau", 0] == pytest.approx(2.0)
+    assert sizes["tau", 1] == 0.0
+
+
+def test_between_motor_and_sensor_less_of_a_gap_is_worth_a_parameter(data: ResidualSet) -> None:
+    for joint, usual in enumerate(data.usual_torque):
+        for channel, share in (("tau", FLOOR), ("tau_motor", FLOOR_INNER)):
+            floor = data.floor[channel, joint]
+            least = data.least(0.01)
+            expected = np.sqrt(floor**2 + (share * usual) ** 2 + least**2)
+            assert data.relevance_floor[channel, joint] == pytest.approx(expected)
+    assert FLOOR_INNER < FLOOR < 0.05
+
+
+def test_what_an_effect_needs_is_at_hand_for_its_parameters(data: ResidualSet) -> None:
+    """The asymmetry is told as a share of the Coulomb friction fitted beneath it."""
+    terms = [COULOMB, Term("friction.asymmetric", 1)]
+    estimate = Estimate(ColumnStore(data), terms)
+    asymmetric = next(term for term in estimate.terms if term.effect == "friction.asymmetric")
+    (ratio,) = estimate.parameters(asymmetric).values()
+    size = float(estimate.of(asymmetric)[0])
+    coulomb = float(estimate.of(next(term for term in estimate.terms if term.effect == "friction.coulomb"))[0])
+    assert ratio.value == pytest.approx(size / coulomb)
+
+
+def test_friction_that_is_clearly_there_has_a_narrow_interval(data: ResidualSet) -> None:
+    """Sound arms differ by some hundredths of a newton metre, not by all that a joint has."""
+    estimate = Estimate(ColumnStore(data), [COULOMB, Term("friction.viscous", 1), Term("friction.stribeck", 1, (0.1,))])
+    (torque,) = estimate.parameters(estimate.terms[0]).values()
+    assert torque.low < 0.5 < torque.high
+    assert torque.high - torque.low < 1.5
+
+
+def test_a_body_that_cannot_exist_gives_way_to_the_closest_that_can() -> None:
+    """Of a diagonal matrix 1 + x, the coefficient beyond −1 ends there and the other one stays."""
+    best = _closest(np.array([-2.0, 0.3]), np.eye(2), lambda x: np.diag(1.0 + x))
+    np.testing.assert_allclose(best, [-1.0, 0.3], atol=1e-2)
+    assert best[0] > -1.0
+
+
+def test_a_link_is_shaped_by_its_inertia_and_the_last_by_a_payload() -> None:
+    assert _shapes(Term("link.inertia", 1), 1, 3)
+    assert not _shapes(Term("link.inertia", 1), 2, 3)
+    assert not _shapes(Term("link.mass_moment", 1), 1, 3)
+    assert _shapes(PAYLOAD, 2, 3)
+    assert not _shapes(PAYLOAD, 0, 3)
+    assert not _shapes(Term("link.mass_moment", 2), 2, 3)
+
+
+@dataclass(frozen=True)
+class Bent:
+    """A nonlinear term that counts how often it was linearised anew."""
+
+    effect: str
+    moves: bool
+    times: int = 0
+
+    @property
+    def key(self) -> tuple[str, int]:
+        return self.effect, 0
+
+    @property
+    def form(self) -> SimpleNamespace:
+        signature = SimpleNamespace(moves=np.zeros if self.moves else None, offset=None)
+        return SimpleNamespace(signature=signature, hints=SimpleNamespace(linearised_at=0.0))
+
+    def relinearised(self, c: np.ndarray) -> "Bent":
+        return Bent(self.effect, self.moves, self.times + 1)
+
+
+def test_a_step_moves_positions_and_linearises_other_effects_where_they_are() -> None:
+    turned, bent = Bent("position.offset", True), Bent("torque.hysteresis", False)
+    normal = SimpleNamespace(size=2, at={turned: np.array([0]), bent: np.array([1])})
+    weighted = SimpleNamespace(fit=lambda terms: (np.array([0, 1]), np.array([0.3, 0.7])))
+    terms, values = gauss_newton._step(SimpleNamespace(active=[turned, bent], normal=normal, weighted=weighted))
+    assert [term.times for term in terms] == [0, 1]
+    assert values == {terms[0]: [0.3], terms[1]: [1.0]}  # a secant's size is in its shape
+
+
+def test_nonlinear_effects_are_offered_at_the_size_that_they_have_in_place_of_a_chosen_one(monkeypatch) -> None:
+    bent, chosen = Bent("torque.hysteresis", False), Bent("friction.coulomb", False)
+
+    def search(normal: object, terms: list[Bent]) -> SimpleNamespace:
+        return SimpleNamespace(
+            active=terms,
+            without=lambda term, active: [other for other in active if other != term],
+            weighted=SimpleNamespace(
+                screen=lambda rest, others: [(1.0, other) for other in others],
+                fit=lambda terms: (np.array([0]), np.array([0.5])),
+            ),
+            with_beneath=lambda term, rest: [*rest, term],
+            judge=lambda terms: 0.0,
+            normal=SimpleNamespace(at={Bent("torque.hysteresis", False, k): np.array([0]) for k in range(3)}),
+        )
+
+    monkeypatch.setattr(model_selection, "NormalEquations", lambda store, terms: None)
+    monkeypatch.setattr(model_selection, "Search", search)
+    assert [term.times for term in relinearised_in_place(None, [chosen], [bent])] == [2]
+    assert relinearised_in_place(None, [], [bent]) == [bent]
+
+
+def test_golden_sections_end_at_the_minimum() -> None:
+    assert golden(lambda x: (x - 0.3) ** 2, -1.0, 2.0, 40) == pytest.approx(0.3, abs=1e-6)
+    assert golden(lambda x: (x - 0.3) ** 2, -1.0, 2.0) == pytest.approx(0.3, abs=0.03)
+
+
+@pytest.mark.parametrize(("score", "kept"), [(1.0, "several"), (3.0, "first")])
+def test_one_body_in_place_of_several_errors_of_links_is_kept_if_it_scores_better(monkeypatch, score, kept) -> None:
+    def found(name: str, score: float) -> SimpleNamespace:
+        store = SimpleNamespace(beside=lambda near: SimpleNamespace(keep=lambda terms: None))
+        return SimpleNamespace(name=name, score=score, active=[], normal=SimpleNamespace(store=store))
+
+    results = iter([found("first", 2.0), found("several", score)])
+    monkeypatch.setattr(model_selection, "first_search", lambda store, library: ([], []))
+    monkeypatch.setattr(model_selection, "searched_again", lambda store, active, offered: next(results))
+    monkeypatch.setattr(model_selection, "one_body", lambda store, search, offered: [PAYLOAD])
+    monkeypatch.setattr(model_selection, "drives_are_off", lambda search: False)
+    assert select_model(SimpleNamespace(keep=lambda terms: None), []).name == kept
