@@ -31,9 +31,9 @@ def confidence(signs: Signs, rivals: int) -> float:
     return min(sure, 1.0 / (1 + rivals) + 0.2) if rivals else sure
 
 
-def founded(signs: Signs) -> bool:
-    """Whether a cause accounts for the gap on its row, even if a general law would too."""
-    return confidence(replace(signs, outside=np.inf), 0) >= FOUNDED
+def founded(signs: Signs, rivals: int = 0) -> bool:
+    """Whether a cause accounts for the gap on its row, even if a general law or one of its rivals would too."""
+    return confidence(replace(signs, outside=np.inf), min(rivals, 1)) >= FOUNDED
 
 
 def features(signs: Signs) -> dict[str, float]:

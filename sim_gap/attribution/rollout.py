@@ -67,7 +67,8 @@ class RollOuts:
         """Model, module and effects with these terms as they are written for one recording."""
         if self.sim.path is None:  # a compiled model has no file to write
             corrected = with_effects(self.sim, self.estimate, terms, number, mount)
-            entries = [*joint_effects(self.sim, self.estimate, corrected.not_held), *(self.laws if terms else ())]
+            entries = joint_effects(self.sim, self.estimate, corrected.not_held, corrected.held)
+            entries += self.laws if terms else ()
             own = forward_effects.Effects(corrected.model, entries, self.sim.arm.names)
             return corrected.model, forward_effects, own
         files = written(self.sim, self.estimate, NAME, terms, number, self.laws if terms else (), self.spec, mount)

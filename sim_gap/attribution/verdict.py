@@ -76,7 +76,7 @@ def verdict(
         return "no_gap" if quiet and not unsettled else "unexplained"
     if not (quiet or closed(data, left)) or not all(closed(*each) for each in sets[1:]):
         return "unexplained"
-    if not any(founded(cause.signs) for cause in found):
+    if not any(founded(cause.signs, len(cause.confounded_with)) for cause in found):
         return "unexplained"
     weak = any(cause.confidence < HINT and carries(cause, found) for cause in found)
     return "ambiguous" if weak or found[0].confounded_with else "explained"

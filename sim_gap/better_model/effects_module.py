@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sim_gap.better_model import forward_effects as forward
+from sim_gap.better_model.with_effects import offsets
 from sim_gap.effects.sensor_nonlinearity import is_gradual
 from sim_gap.model.load import SimModel
 from sim_gap.search.estimate import Estimate
@@ -15,12 +16,16 @@ def module_path(model: Path) -> Path:
     return model.with_name(f"{model.stem}_effects.py")
 
 
-def joint_effects(sim: SimModel, estimate: Estimate, terms: Sequence[Term]) -> list[forward.JointEffect]:
-    """The terms in the module's form, without those present in one recording alone.
+def joint_effects(
+    sim: SimModel, estimate: Estimate, terms: Sequence[Term], held: Sequence[Term] = ()
+) -> list[forward.JointEffect]:
+    """The terms in the module's form, beside a model with those `held`; without those present in one recording alone.
 
-    Without a torque sensor, an offset of the motor's torque is torque lost.
+    Without a torque sensor, an offset of the motor's torque is torque lost. A ripple follows the position as the model
+    has it: as it is read, if the model holds an offset of that.
     """
     out: list[forward.JointEffect] = []
+    zeros = offsets(estimate, held)
     for term in terms:
         if term.bound:
             continue
@@ -29,15 +34,18 @@ def joint_effects(sim: SimModel, estimate: Estimate, terms: Sequence[Term]) -> l
             values = {"lost": values["offset"]}
         if term.effect == "torque.hysteresis" and is_gradual(term.shape):
             values["gradual"] = 1.0
+        if term.effect == "transmission.ripple":
+            values["phase"] += values["cycles"] * zeros.get(term.place, 0.0)
         out.append((term.effect, sim.arm.names[term.place], values))
     return out
 
 
 def module_text(sim: SimModel, effects: Sequence[forward.JointEffect], model: str) -> str:
-    """Source of the module with the effects that the MJCF file `model` cannot hold."""
+    """Source of the module with the effects that the MJCF file `model` cannot hold; it imports none of ours."""
     rows = "".join(f"    {each!r},\n" for each in effects)
     text = Path(forward.__file__).read_text(encoding="utf-8")
     for name, declared, value in (
+        ("Array", "from gcomp.arrays import Array", "np.ndarray"),
         ("MODEL", 'MODEL = ""', f"{model!r}"),
         ("JOINTS", "JOINTS: tuple[str, ...] = ()", f"{sim.arm.names!r}"),
         ("EFFECTS", "EFFECTS: tuple[JointEffect, ...] = ()", f"(\n{rows})"),

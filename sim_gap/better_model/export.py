@@ -16,6 +16,9 @@ from sim_gap.model.load import SimModel
 from sim_gap.search.estimate import Estimate
 from sim_gap.search.term import Term
 
+HINGE = 3
+"""MuJoCo's number of this type of joint."""
+
 
 @dataclass(frozen=True)
 class Written:
@@ -54,7 +57,7 @@ def written(
     for body in list(spec.bodies)[1:]:
         _set_inertial(body, corrected.model)
     for joint in spec.joints:
-        _set_joint(joint, corrected.model)
+        _set_joint(joint, corrected.model, spec.compiler.degree)
     add_to(spec, coupled_motors(sim, estimate, chosen))
     gains = _gains(sim, estimate, chosen)
     driven = {actuator.target for actuator in spec.actuators}
@@ -68,7 +71,7 @@ def written(
     lines += [f"{law} {joint}: a torque without a known cause" for law, joint, _ in laws]
     module = module_path(Path(name)).name
     comment = xml_comment([f"Effects that MJCF cannot hold ({module} applies them):", *lines]) if lines else ""
-    effects = [] if estimate is None else joint_effects(sim, estimate, left)
+    effects = [] if estimate is None else joint_effects(sim, estimate, left, corrected.held)
     effects += [(GEARED, joint, {"gain": gain}) for joint, gain in gains.items() if joint in driven]
     effects += laws
     source = module_text(sim, effects, name) if effects else ""
@@ -120,9 +123,14 @@ def _set_inertial(body: Any, model: Any) -> None:
     body.fullinertia = [np.nan] * 6
 
 
-def _set_joint(joint: Any, model: Any) -> None:
+def _set_joint(joint: Any, model: Any, degrees: bool) -> None:
+    """Give a joint of a file what the compiled one has; angles in the file's unit."""
     dof, adr = model.jnt_dofadr[joint.id], model.jnt_qposadr[joint.id]
     joint.frictionloss, joint.armature = float(model.dof_frictionloss[dof]), float(model.dof_armature[dof])
     joint.damping[0] = float(np.reshape(model.dof_damping, (model.nv, -1))[dof, 0])
     joint.stiffness[0] = float(np.reshape(model.jnt_stiffness, (model.njnt, -1))[joint.id, 0])
-    joint.springref = float(model.qpos_spring[adr])
+    unit = float(np.degrees(1.0)) if degrees and model.jnt_type[joint.id] == HINGE else 1.0
+    joint.springref, zero = unit * float(model.qpos_spring[adr]), unit * float(model.qpos0[adr])
+    if not np.isclose(zero, joint.ref, rtol=1e-9, atol=1e-12):
+        joint.ref = zero
+        joint.range = unit * model.jnt_range[joint.id] if model.jnt_limited[joint.id] else joint.range

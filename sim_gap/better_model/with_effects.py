@@ -29,8 +29,11 @@ HELD = {
     "link.inertia": "body inertial",
     "link.payload": "body inertial",
     "base.tilt": "option gravity",
+    "position.offset": "joint ref, and range and springref with it",
 }
 """Effects that a MuJoCo model can hold, and the element that holds them."""
+OF_READING = ("position.gain", "position.eccentricity")
+"""Errors of a reading that a MuJoCo model cannot hold; an offset beside them is left to the module, too."""
 SMALLEST_INERTIA = 1e-6
 LEFT_KG = 1e-9
 """Mass and inertia left in a body whose inertials are counted to the body that it is fixed to."""
@@ -65,11 +68,12 @@ def with_effects(
         return CorrectedModel(copy.copy(sim.mujoco_model), (), ())
     chosen = estimate.terms if terms is None else tuple(terms)
     model, coupled = _base(sim, coupled_motors(sim, estimate, chosen))
-    held = tuple(
-        term
-        for term in chosen
-        if term.effect in HELD and in_model(term, number) and (coupled or term.effect != "transmission.coupling")
-    )
+    bent = {term.place for term in chosen if term.effect in OF_READING}
+    left_out = {
+        *(term for term in chosen if term.effect == "transmission.coupling" and not coupled),
+        *(term for term in chosen if term.effect == "position.offset" and term.place in bent),
+    }
+    held = tuple(term for term in chosen if term.effect in HELD and in_model(term, number) and term not in left_out)
     turn = mounted(sim.arm.axis[-1], mount)
     links = [(term, turn @ estimate.of(term) if term.effect == "link.payload" else estimate.of(term)) for term in held]
     changed = _set_links(model, sim, links, number)
@@ -77,8 +81,10 @@ def with_effects(
         c, joint = estimate.of(term), sim.joints[term.place]
         if term.effect == "base.tilt":
             model.opt.gravity[:] = tilted(sim.arm.gravity, c)
-        elif not term.effect.startswith("link.") and term.effect != "transmission.coupling":
-            _joint(model, joint, term.effect, c)
+        elif term.effect.split(".")[0] not in ("link", "position") and term.effect != "transmission.coupling":
+            _joint(model, joint, term.effect, c, added=estimate.store.data.layout.motor is not None)
+    for place, offset in offsets(estimate, held).items():
+        _move_zero(model, sim.joints[place], offset)
     return CorrectedModel(model, held, tuple(term for term in chosen if term not in held), changed)
 
 
@@ -199,16 +205,33 @@ def compiled_copy(spec: Any) -> Any:
     return own
 
 
-def _joint(model: Any, joint: int, effect: str, c: Array) -> None:
+def offsets(estimate: Estimate, held: Sequence[Term]) -> dict[int, float]:
+    """Offsets of the position sensors that a model holds, by the joint's place [rad]."""
+    return {term.place: float(estimate.of(term)[0]) for term in held if term.effect == "position.offset"}
+
+
+def _move_zero(model: Any, joint: int, offset: float) -> None:
+    """Count the position of a joint as a sensor with this offset does: stops and spring stay where they are."""
+    adr = model.jnt_qposadr[joint]
+    model.qpos0[adr] -= offset
+    if model.jnt_limited[joint]:
+        model.jnt_range[joint] -= offset
+    if np.reshape(model.jnt_stiffness, (model.njnt, -1))[joint, 0]:
+        model.qpos_spring[adr] -= offset
+
+
+def _joint(model: Any, joint: int, effect: str, c: Array, added: bool) -> None:
+    """Give a joint friction, damping, armature or a spring; `added` to what it has of the first three, or if that is
+    the motor's, which a sensor on the link does not read, as much at least."""
     dof, adr = model.jnt_dofadr[joint], model.jnt_qposadr[joint]
-    added = {
+    terms = {
         "friction.coulomb": "dof_frictionloss",
         "friction.viscous": "dof_damping",
         "actuator.rotor_inertia": "dof_armature",
     }
-    if effect in added:
-        values = np.reshape(getattr(model, added[effect]), (model.nv, -1))
-        values[dof, 0] = max(values[dof, 0] + c[0], 0.0)
+    if effect in terms:
+        values = np.reshape(getattr(model, terms[effect]), (model.nv, -1))
+        values[dof, 0] = max(values[dof, 0] + c[0], 0.0) if added else max(values[dof, 0], c[0])
     else:
         stiffness = np.reshape(model.jnt_stiffness, (model.njnt, -1))
         total = stiffness[joint, 0] + c[0]

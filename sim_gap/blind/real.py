@@ -73,15 +73,20 @@ def _files(case: Json) -> list[str]:
 def _answer(folder: Path, case: Json, withheld: str) -> Json:
     """The answer to one case; refused input is an answer without causes."""
     try:
-        train, heldout = ([load_recording(folder / name) for name in case.get(key, ())] for key in ("train", "heldout"))
-        if "share" in case:
-            train, heldout = _parts(train, case["share"])
-        names = [*case["train"], *(case["heldout"] if "heldout" in case else case["train"])]
-        labels = [Path(name).name.split(".")[0] for name in names]
+        train, heldout, labels = recordings_of(folder, case)
         made = diagnose(folder / case["sim"], train, heldout, labels=labels, withhold=[withheld] if withheld else [])
     except ArmlinkError as error:
         return {"verdict": "refused", "causes": [], "refused": str(error)}
     return made.to_json()
+
+
+def recordings_of(folder: Path, case: Json) -> tuple[list[Recording], list[Recording], list[str]]:
+    """Training and held-out recordings of a case, and their labels."""
+    train, heldout = ([load_recording(folder / name) for name in case.get(key, ())] for key in ("train", "heldout"))
+    if "share" in case:
+        train, heldout = _parts(train, case["share"])
+    names = [*case["train"], *(case["heldout"] if "heldout" in case else case["train"])]
+    return train, heldout, [Path(name).name.split(".")[0] for name in names]
 
 
 def _parts(recordings: Sequence[Recording], share: float) -> tuple[list[Recording], list[Recording]]:

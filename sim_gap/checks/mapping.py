@@ -71,7 +71,8 @@ def find_mapping(
 
     `mounted` is the arm `as_mounted` in this motion, if it is known. `follows` are the channels (of `dq`, `q_cmd`)
     whose columns agree with the positions' as they are recorded, so that what is wrong with a position is wrong with
-    theirs. All findings are corrected, or none is.
+    theirs. All findings are corrected, or none is. A slight fall counts only if every joint concerned is explained
+    then: a model that was fitted to another motion leaves some of them to chance.
     """
     fit = _as_an_arm(mounted or as_mounted(arm, motion), motion)
     taken: list[tuple[Hypothesis, float]] = []
@@ -83,13 +84,17 @@ def find_mapping(
         hypothesis, fit, fall, doubted = best
         motion = hypothesis.change(motion)
         taken.append((hypothesis, fall))
-    sure = not doubted and _is_sound(fit, {joint for hypothesis, _ in taken for joint in hypothesis.joints})
+    touched = {joint for hypothesis, _ in taken for joint in hypothesis.joints}
+    sure = not doubted and _is_sound(fit, touched)
+    slight = sum(fall for _, fall in taken) < DOUBTED
+    if slight and not (sure and np.all(fit.explained[list(touched)] > FITS)):
+        return []
     return [_finding(arm, hypothesis, fit, fall, sure) for hypothesis, fall in taken]
 
 
 def _as_an_arm(mounted: RigidArm, motion: Motion) -> RigidFit:
     """The fit as it stands, gravity, a tool and springs included where they explain it: effects of the arm."""
-    model = as_loaded(mounted, motion).torque(motion.q, motion.v, motion.a)
+    model = as_loaded(mounted, motion).carried(motion.q, motion.v, motion.a)
     plain, sprung = fit_model(model, motion), fit_model(model, motion, springs=True)
     beside = (sprung.scale > PLAUSIBLE[0]) | (sprung.own_share < STRONG_SHARE)  # not in place of gravity
     return replace(plain, explained=np.where(beside & (sprung.explained > SPRUNG), sprung.explained, plain.explained))
@@ -118,7 +123,7 @@ def _screened(arm: RigidArm, few: Motion, possible: Sequence[Hypothesis]) -> lis
     """The fits with each hypothesis; torques of all motions that they make in one recursion, for it costs by calls."""
     motions = [few, *(hypothesis.change(few) for hypothesis in possible)]
     moved = [k for k, motion in enumerate(motions) if k == 0 or motion.q is not few.q]
-    made = arm.torque(*(np.concatenate([getattr(motions[k], x) for k in moved]) for x in ("q", "v", "a")))
+    made = arm.carried(*(np.concatenate([getattr(motions[k], x) for k in moved]) for x in ("q", "v", "a")))
     models = dict(zip(moved, np.split(made, len(moved)), strict=True))
     return fit_models([(models.get(k, models[0]), motion) for k, motion in enumerate(motions)][1:])
 

@@ -89,7 +89,7 @@ def motion_of(s: Signals, channel: str) -> Motion:
 
 def fit_rigid(arm: RigidArm, motion: Motion, springs: bool = False) -> RigidFit:
     """Fit the reading of every joint by the model's torque at the motion; with `springs`, of either sign, too."""
-    return fit_model(arm.torque(motion.q, motion.v, motion.a), motion, springs)
+    return fit_model(arm.carried(motion.q, motion.v, motion.a), motion, springs)
 
 
 def fit_model(model: Array, motion: Motion, springs: bool = False) -> RigidFit:
@@ -123,7 +123,7 @@ def beside_slow_torques(arm: RigidArm, motion: Motion, fit: RigidFit) -> RigidFi
 
     In a motion with few reversals a torque that grows with time or position varies with the direction, too.
     """
-    model, friction = arm.torque(motion.q, motion.v, motion.a), fit.friction.copy()
+    model, friction = arm.carried(motion.q, motion.v, motion.a), fit.friction.copy()
     direction, time = motion.direction, np.linspace(-1.0, 1.0, len(model))
     for j in np.flatnonzero(np.isfinite(friction)):
         own = (model[:, j], motion.v[:, j], motion.a[:, j], motion.q[:, j])
@@ -138,10 +138,10 @@ def as_mounted(arm: RigidArm, motion: Motion) -> RigidArm:
     A tilted base is an effect of the arm, which the diagnosis finds; no fault of the data must be seen in it.
     """
     still = np.zeros_like(motion.q)
-    inertia = arm.torque(motion.q, motion.v, motion.a, np.zeros(3))
+    weightless = arm.torque(motion.q, motion.v, motion.a, np.zeros(3)) + arm.spring_torque(motion.q)
     columns = np.stack([arm.torque(motion.q, still, still, axis) for axis in np.eye(3)], axis=-1)
     weight = 1.0 / (motion.reading.std(0) + 1e-9)
-    left = ((motion.reading - inertia) * weight).ravel()
+    left = ((motion.reading - weightless) * weight).ravel()
     gravity = np.linalg.lstsq((columns * weight[:, None]).reshape(-1, 3), left, rcond=None)[0]
     size, nominal = float(np.linalg.norm(gravity)), float(np.linalg.norm(arm.gravity))
     if size < 1e-6 or nominal < 1e-6:
@@ -163,7 +163,7 @@ def as_loaded(arm: RigidArm, motion: Motion) -> RigidArm:
     """
     direction, tip = motion.direction, arm.n - 1
     columns = arm.link_regressor(arm.motion(motion.q, motion.v, motion.a), tip)[:, :, :4]
-    left = motion.reading - arm.torque(motion.q, motion.v, motion.a)
+    left = motion.reading - arm.carried(motion.q, motion.v, motion.a)
     wide, sides = [], []
     for j in range(arm.n):  # friction, rotor and offset of each joint are its own
         own = np.stack([direction[:, j], motion.v[:, j], motion.a[:, j], np.ones(len(left))], axis=1)

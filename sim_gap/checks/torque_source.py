@@ -88,7 +88,7 @@ def _weighted_median(values: Array, weights: Array) -> float:
 
 def find_unsigned(arm: RigidArm, motion: Motion, stated: Corrections) -> list[Finding]:
     """Readings that are never negative although the model's torque changes its sign."""
-    model = arm.torque(motion.q, motion.v, motion.a)
+    model = arm.carried(motion.q, motion.v, motion.a)
     found = []
     for j in range(arm.n):
         y, m = motion.reading[:, j], model[:, j]
@@ -159,7 +159,7 @@ def find_delay(arm: RigidArm, motion: Motion, rate: float, stated: Corrections) 
     """
     if motion.channel in stated.clock:
         return [], 0.0
-    model = arm.torque(motion.q, motion.v, motion.a)
+    model = arm.carried(motion.q, motion.v, motion.a)
     start = float(fit_model(model, motion).cost.sum())
     costs = {}
     if start - arm.n * np.log(FLOOR) < SURE:

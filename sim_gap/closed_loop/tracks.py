@@ -60,7 +60,7 @@ def track_of(arm: RigidArm, recording: Recording, label: str, dt: float) -> Trac
     own = along(lambda x: np.hstack(_own_terms(arm, x)), q)
     inertia, slope = own[:, : arm.n], own[:, arm.n :]
     whole = along(arm.torque, q, v, a)
-    needed = whole + arm.nominal_joint_torque(q, v, a, still)
+    needed = whole + arm.spring_torque(q) + arm.nominal_joint_torque(v, a, still)
     return Track(
         t,
         {

@@ -13,7 +13,7 @@ def _gain(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:
 
 def _above_nominal(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
     """The rotor may have less inertia than the model's armature."""
-    return added_or_taken_off(float(coefficients[0]), float(beneath["nominal"][2]))
+    return added_or_taken_off(float(coefficients[0]), float(beneath["nominal"][2]), beneath)
 
 
 EFFECTS = (

@@ -24,7 +24,8 @@ Column = Callable[[Signals, int, Shape], Array]
 """The columns of an effect at one place, (K,) or (K, p), from signals, place and shape."""
 Beneath = Mapping[str, Array]
 """Coefficients of the effects that one needs, by id. `nominal`: friction loss [N·m], damping [N·m·s/rad], armature
-[kg·m²] of the joint in the model, and its usual speed (RMS) [rad/s]."""
+[kg·m²] of the joint in the model, and its usual speed (RMS) [rad/s]. `needed`: 1 if another effect builds on this one.
+"""
 NONE_LEFT = 1.02
 """Largest share of what the model has that can be taken off: all of it, within the error of a fit."""
 LEAST_OFF = 0.05
@@ -113,9 +114,13 @@ def not_negative(coefficients: Array, _shape: Shape, _beneath: Beneath) -> bool:
     return bool(coefficients[0] >= 0.0)
 
 
-def added_or_taken_off(coefficient: float, has: float, noise: float = 0.0) -> bool:
-    """Whether an arm can differ by this from a model that `has` so much of it; below zero by `noise` is none."""
-    return coefficient >= -noise or LEAST_OFF * has <= -coefficient <= NONE_LEFT * has + noise
+def added_or_taken_off(coefficient: float, has: float, beneath: Beneath, noise: float = 0.0) -> bool:
+    """Whether an arm can differ by this from a model that `has` so much of it; below zero by `noise` is none.
+
+    Where another effect builds on it, the model's own is what that one needs, and no difference is too small.
+    """
+    least = 0.0 if beneath["needed"][0] else LEAST_OFF * has
+    return coefficient >= -noise or least <= -coefficient <= NONE_LEFT * has + noise
 
 
 def positive(coefficients: Array, _shape: Shape, _beneath: Beneath) -> bool:

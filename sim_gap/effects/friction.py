@@ -42,12 +42,12 @@ def dry(beneath: Beneath) -> float:
 def _dry_above_nominal(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
     """The arm may have less friction than the model, of both kinds: one alone stands for both at the usual speed."""
     loss, damping, _, speed = beneath["nominal"]
-    return added_or_taken_off(float(coefficients[0]), float(loss + damping * speed), NOISE)
+    return added_or_taken_off(float(coefficients[0]), float(loss + damping * speed), beneath, NOISE)
 
 
 def _viscous_above_nominal(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
     loss, damping, _, speed = beneath["nominal"]
-    return added_or_taken_off(float(coefficients[0]), float(damping + loss / max(speed, SLOWEST)))
+    return added_or_taken_off(float(coefficients[0]), float(damping + loss / max(speed, SLOWEST)), beneath)
 
 
 def _above_minus_dry(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:

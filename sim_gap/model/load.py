@@ -182,8 +182,8 @@ def _check(model: Any, joints: list[int], arm: RigidArm, label: str) -> None:
             data.qpos[:], data.qvel[:], data.qacc[:] = model.qpos0, 0.0, 0.0
             data.qpos[adr], data.qvel[dof], data.qacc[dof] = q[row], v[row], a[row]
             mujoco.mj_inverse(model, data)
-            ours = arm.torque(q[row : row + 1], v[row : row + 1], a[row : row + 1])[0]
-            ours += arm.nominal_joint_torque(q[row], v[row], a[row], np.zeros(arm.n))
+            ours = arm.carried(q[row : row + 1], v[row : row + 1], a[row : row + 1])[0]
+            ours += arm.nominal_joint_torque(v[row], a[row], np.zeros(arm.n))
             worst = int(np.argmax(np.abs(ours - data.qfrc_inverse[dof])))
             if abs(ours[worst] - data.qfrc_inverse[dof][worst]) > 1e-6 * (1.0 + np.abs(ours).max()):
                 raise BadInput(

@@ -66,9 +66,10 @@ class RigidArm:
     armature: Array
     damping: Array
     frictionloss: Array
+    """Motor-side terms of the nominal joints, (n,) each: kg·m², N·m·s/rad, N·m."""
     stiffness: Array
     rest: Array
-    """Motor-side terms of the nominal joints, (n,) each: kg·m², N·m·s/rad, N·m, N·m/rad, rad."""
+    """Springs of the nominal joints, beside the motor and on the link side, (n,) each: N·m/rad, rad."""
     tendons: Tendons
     """Motors coupled to several joints."""
 
@@ -170,13 +171,20 @@ class RigidArm:
             moves.append((omega + spin, alpha, push))
         return turns, moves
 
-    def nominal_joint_torque(self, q: Array, v: Array, a: Array, direction: Array) -> Array:
-        """Torque of the nominal joints on the motor side: armature, damping, friction loss, spring, tendons (K, n).
+    def carried(self, q: Array, v: Array, a: Array) -> Array:
+        """What the links take of a motor: `torque` and that of the springs across the joints [N·m], (K, n)."""
+        return self.torque(q, v, a) + self.spring_torque(q)
+
+    def spring_torque(self, q: Array) -> Array:
+        """Torque of the springs across the joints [N·m], (…, n)."""
+        return np.asarray(self.stiffness * (q - self.rest))
+
+    def nominal_joint_torque(self, v: Array, a: Array, direction: Array) -> Array:
+        """Torque of the nominal joints on the motor side: armature, damping, friction loss, tendons (K, n).
 
         `direction` is the sign of the velocity, smoothed around rest by the caller.
         """
-        spring = self.stiffness * (q - self.rest)
-        own = self.armature * a + self.damping * v + self.frictionloss * direction + spring
+        own = self.armature * a + self.damping * v + self.frictionloss * direction
         return np.asarray(own + self.tendons.torque(v, a))
 
 

@@ -95,13 +95,13 @@ class Signals:
 
     @cached_property
     def model(self) -> Array:
-        """Torque of the links [N·m], (K, n): the nominal model's, or that of the estimate."""
-        return self.arm.torque(self.q, self.v, self.a) if self.found is None else self.found.link
+        """Torque of links and of springs across the joints [N·m], (K, n): the nominal model's, or the estimate's."""
+        return self.arm.carried(self.q, self.v, self.a) if self.found is None else self.found.link
 
     @property
     def bodies(self) -> Array:
-        """The share of `model` that masses have, without springs across the joints that an estimate found, (K, n)."""
-        return self.model if self.found is None else self.model - self.found.springs
+        """The share of `model` that masses have, without springs across the joints, (K, n)."""
+        return self.model - (self.arm.spring_torque(self.q) if self.found is None else self.found.springs)
 
     @cached_property
     def smooth_model(self) -> Array:
@@ -115,8 +115,8 @@ class Signals:
 
     @cached_property
     def motor_model(self) -> Array:
-        """Torque at the motor, with the model's own rotors, friction and springs [N·m], (K, n)."""
-        own = self.model + self.arm.nominal_joint_torque(self.q, self.v, self.a, self.direction)
+        """Torque at the motor, with the model's own rotors and friction [N·m], (K, n)."""
+        own = self.model + self.arm.nominal_joint_torque(self.v, self.a, self.direction)
         return own if self.found is None else own + self.found.lost
 
     @property
@@ -239,7 +239,7 @@ class Found:
     read: Signals
     """The signals before the estimate."""
     link: Array
-    """Torque of the links [N·m], (K, n)."""
+    """Torque of the links and of springs across the joints [N·m], (K, n)."""
     lost: Array
     """Torque between link and motor beside the nominal model's: friction, rotors, ripple [N·m], (K, n)."""
     bent: Array

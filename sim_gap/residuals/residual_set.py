@@ -72,7 +72,7 @@ class ResidualSet:
     def _differences(self, s: Signals) -> dict[Row, Array]:
         layout = self.layout
         out: dict[Row, Array] = {}
-        joints = s.arm.nominal_joint_torque(s.q, s.v, s.a, s.direction)
+        joints = s.arm.nominal_joint_torque(s.v, s.a, s.direction)
         for channel in (layout.sensor, layout.motor, layout.command):
             if channel is None:
                 continue

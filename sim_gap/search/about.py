@@ -59,7 +59,7 @@ class _Parts:
 def about(read: Signals, layout: Layout, values: Values) -> About:
     """A recording about an estimate; about nothing, the recording itself."""
     parts = _Parts(read)
-    bodies = _bodies(parts, layout, values) if values else read.model
+    bodies = _bodies(parts, layout, values) if values else read.bodies
     springs = _springs(parts, layout, values)
     still = Found(read, bodies + springs, np.zeros_like(read.q), np.zeros_like(read.q), springs)
     s = replace(parts.signals, found=still) if values else read
@@ -109,7 +109,7 @@ def _columns(s: Signals, layout: Layout, term: Term) -> Columns:
 def _bodies(parts: _Parts, layout: Layout, values: Values) -> Array:
     """Torque of the links about the estimate (K, n); shares of the terms that change it: masses, gravity, positions."""
     read, channel = parts.signals, layout.against_model
-    arm, torque = read.arm, read.model
+    arm, torque = read.arm, read.bodies
     ours = {term: c for term, c in values.items() if term.form.signature.side == "link"}
     inertial = arm.inertial.copy()
     for term, c in ours.items():
@@ -143,8 +143,12 @@ def _bodies(parts: _Parts, layout: Layout, values: Values) -> Array:
 
 
 def _springs(parts: _Parts, layout: Layout, values: Values) -> Array:
-    """Torque of the springs across the joints about the estimate (K, n): the rest of the links' side; its shares."""
-    total = np.zeros_like(parts.signals.q)
+    """Torque of the springs across the joints about the estimate (K, n): the rest of the links' side; its shares.
+
+    The nominal model's own pull as they do at the positions that were read: shares are what the estimate adds.
+    """
+    read = parts.signals.read
+    total = read.arm.spring_torque(read.q)
     for term, c in values.items():
         if term.form.signature.side == "link" and term not in parts.shares:
             _add_to(total, layout.against_model, _share(parts, parts.signals, layout, term, c))

@@ -12,7 +12,7 @@ from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import SYSTEMATIC
 from sim_gap.search.gauss_newton import Values, converged
 from sim_gap.search.normal_equations import NormalEquations, Weighted
-from sim_gap.search.stepwise import TRIES, Search, shortlist
+from sim_gap.search.stepwise import TRIES, Search, impossible, shortlist
 from sim_gap.search.term import Term
 from sim_gap.search.torque_constants import CONSTANTS, drives_are_off, every_constant, most_are_off, price_of_all
 from sim_gap.search.whole_body import one_body
@@ -81,15 +81,32 @@ def about_itself(
 ) -> Search:
     """The chosen terms and their rivals with columns evaluated about the fit of the chosen ones, from coefficients
     `start` on. `near` is the store of an earlier fit, whose columns of rivals serve if it is close."""
-    store, chosen = converged(nominal, chosen, start)
+    store, chosen = with_lost(nominal, chosen, *converged(nominal, chosen, start))
     refined = refine(store, chosen)
     if refined != chosen:
-        store, chosen = converged(nominal, refined, store.values)
+        again, kept = converged(nominal, refined, store.values)
+        if len(kept) == len(refined):  # all can exist about themselves
+            store, chosen = again, kept
     store = store.beside(near)
     keys = {term.key for term in chosen}
     others = [term for term in with_levels(store, offered) if term.key not in keys]
     rivals = relinearised_in_place(store, chosen, others)
     return Search(NormalEquations(store, [*chosen, *rivals]), chosen, usual=usual)
+
+
+def with_lost(
+    nominal: ColumnStore, wanted: Sequence[Term], store: ColumnStore, chosen: list[Term]
+) -> tuple[ColumnStore, list[Term]]:
+    """A fit of the `chosen` terms with those of the `wanted` ones that cannot exist about themselves with their shape,
+    but can with another."""
+    lost = {term.key for term in wanted if term.free is not None} - {term.key for term in chosen}
+    if not lost:
+        return store, chosen
+    grids = {key: effects()[key[0]].hints.grid(store.data.signals, key[1]) for key in lost}
+    shapes = [Term(*key, shape) for key, grid in grids.items() for shape in grid]
+    search = Search(NormalEquations(store, [*chosen, *shapes]), chosen)
+    search.take_back(lost)
+    return converged(nominal, search.active, store.values) if len(search.active) > len(chosen) else (store, chosen)
 
 
 def with_levels(store: ColumnStore, offered: Sequence[Term]) -> list[Term]:
@@ -167,7 +184,11 @@ def without_doubtful(search: Search) -> Search:
 
 
 def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
-    """Move each shape, in its best form, to the best fit between its neighbours on the grid (golden section)."""
+    """Move each shape, in its best form, to the best fit between its neighbours on the grid (golden section).
+
+    A shape at which the term cannot exist is left for one at which it can: a limit fits best where too little is cut
+    off.
+    """
     out = list(active)
     for _ in range(3):
         out = relinearised(store, out)
@@ -180,7 +201,10 @@ def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
         def fit(other: Term, term: Term = term) -> float:
             normal = NormalEquations(store, [other if each == term else each for each in out])
             start = normal.square.sum(0) / np.maximum(normal.count.sum(0), 1.0)
-            squares = normal.mean_square(*Weighted(normal, start).fit(normal.terms))
+            index, coefficients = Weighted(normal, start).fit(normal.terms)
+            if other in impossible(normal, normal.terms, coefficients):
+                return float("inf")
+            squares = normal.mean_square(index, coefficients)
             return float(0.5 * np.log(squares + normal.floor**2)[normal.seen].sum())
 
         def best(form: Term, low: float, high: float, free: int = free) -> Term:

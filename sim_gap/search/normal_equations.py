@@ -31,8 +31,11 @@ class NormalEquations:
         self.rows, self.layout = data.rows, data.layout
         arm = data.signals[0].arm
         speed = np.sqrt(np.mean([np.mean(s.v**2, axis=0) for s in data.signals], axis=0))
-        self.known_joint = np.stack([arm.frictionloss, arm.damping, arm.armature, speed], axis=1)
-        """What the nominal model has at each joint, and its usual speed, (n, 4) as in `Beneath`."""
+        of_motor = float(self.layout.motor is not None)
+        known = [of_motor * arm.frictionloss, of_motor * arm.damping, of_motor * arm.armature]
+        self.known_joint = np.stack([*known, speed], axis=1)
+        """What the nominal model has at each joint that readings are compared with, and its usual speed, (n, 4) as in
+        `Beneath`. A sensor on the link reads nothing of the motor's."""
         self.tip_mass = arm.inertial[-1, :1]
         widths = [next(iter(store.columns(term).values())).shape[1] for term in self.terms]
         ends = np.cumsum([0, *widths])

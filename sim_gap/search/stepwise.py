@@ -1,11 +1,12 @@
 """Stepwise selection of effects by their cross-validated score and a price per parameter."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from gcomp.arrays import Array
 from sim_gap.effects.effect import Key
 from sim_gap.search.normal_equations import NormalEquations, Weighted
 from sim_gap.search.term import Term
@@ -37,6 +38,8 @@ class Search:
     """Least improvement of the score by a term that is added."""
     usual: frozenset[str] = frozenset()
     """Effects that this arm is known to have: the question is how large they are, and they are not charged for."""
+    undone: set[frozenset[Term]] = field(default_factory=set)
+    """Sets of terms that a step came to and that turned out to be no better once the rows were weighed by them."""
 
     def __post_init__(self) -> None:
         self.reweigh()
@@ -67,23 +70,36 @@ class Search:
 
     def _implausible(self, terms: Sequence[Term]) -> Term | None:
         """The first of the terms with implausible coefficients."""
-        ends = np.cumsum([len(self.normal.at[term]) for term in terms])
-        pieces = np.split(self.weighted.fit(terms)[1], ends)[:-1] if terms else []
-        values = {term.key: piece for term, piece in zip(terms, pieces, strict=True)}
-        for term in terms:
-            beneath = {name: values[name, place] for name, place in term.beneath}
-            beneath["nominal"] = self.normal.known_joint[term.place]
-            beneath["tip"] = self.normal.tip_mass
-            if not term.form.plausibility.allows(values[term.key], term.shape, beneath):
-                return term
-        return None
+        return next(impossible(self.normal, terms, self.weighted.fit(terms)[1]), None) if terms else None
 
-    def accept(self, chosen: list[Term]) -> bool:
-        """Continue with these terms; true, for a step was taken."""
+    def accept(self, chosen: list[Term], simpler: bool = False) -> bool:
+        """Continue with these terms, unless they are worse than those before; true, for a step was tried.
+
+        A term that cannot exist beside a new one may do so with another shape: a limit beside a lag. Terms that are
+        `simpler` are kept though they are a little worse.
+        """
+        before = self.active, self.weighted, self.score
         self.added.update(term.key for term in chosen if term not in self.active)
         self.active = chosen
         self.reweigh()
+        lost = {term.key for term in before[0] if term in chosen and term not in self.active}
+        self.take_back(lost)
+        if self.score >= before[2] and not simpler:
+            self.undone.add(frozenset(chosen))
+            self.active, self.weighted, self.score = before
         return True
+
+    def take_back(self, lost: Collection[Key]) -> None:
+        """Add effects that got lost again, with the best of their shapes, if that helps.
+
+        Each is weighed by itself: with the rows weighed by what is left without it, it may seem impossible.
+        """
+        for key in lost:
+            shapes = [term for term in self.normal.terms if term.key == key]
+            trials = [Search(self.normal, self.with_beneath(term, self.active), usual=self.usual) for term in shapes]
+            best = min(trials, key=lambda trial: trial.score, default=self)
+            if best.score < self.score:
+                self.active, self.weighted, self.score = best.active, best.weighted, best.score
 
     def cost(self, term: Term) -> float:
         """Number of parameters that a term is charged for: effective coefficients, shape, and its prior penalty."""
@@ -131,7 +147,7 @@ class Search:
     def dissolve(self) -> bool:
         """Exchange one term for its simpler alternatives, if they score as well."""
         chosen = self._best(self._dissolved(), self.score - 1e-3)
-        return chosen is not None and self.accept(chosen)
+        return chosen is not None and self.accept(chosen, simpler=True)
 
     def _exchanges(self) -> Iterator[list[Term]]:
         for term in list(self.active):
@@ -154,7 +170,7 @@ class Search:
 
     def _judged(self, trials: Iterable[list[Term]]) -> Iterator[Scored]:
         for trial in trials:
-            yield self.judge(trial), trial
+            yield float("inf") if frozenset(trial) in self.undone else self.judge(trial), trial
 
     @staticmethod
     def _best(scored: Iterable[Scored], bound: float) -> list[Term] | None:
@@ -204,6 +220,20 @@ class Search:
             if not self.swap() and not dissolved:
                 break
         return self.active
+
+
+def impossible(normal: NormalEquations, terms: Sequence[Term], coefficients: Array) -> Iterator[Term]:
+    """Those of the terms that cannot exist with their coefficients of a fit (`Weighted.fit`)."""
+    ends = np.cumsum([len(normal.at[term]) for term in terms])
+    values = {term.key: piece for term, piece in zip(terms, np.split(coefficients, ends)[:-1], strict=True)}
+    needed = {key for term in terms for key in term.beneath}
+    for term in terms:
+        beneath = {name: values[name, place] for name, place in term.beneath}
+        beneath["nominal"] = normal.known_joint[term.place]
+        beneath["tip"] = normal.tip_mass
+        beneath["needed"] = np.array([float(term.key in needed)])
+        if not term.form.plausibility.allows(values[term.key], term.shape, beneath):
+            yield term
 
 
 def shortlist(screened: list[tuple[float, Term]]) -> list[tuple[float, Term]]:

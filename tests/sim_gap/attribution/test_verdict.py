@@ -6,6 +6,7 @@ import numpy as np
 from wrong_arms import Wrong, model, record
 
 from sim_gap.attribution.causes import _Scorer, founded_ones
+from sim_gap.attribution.confidence import founded
 from sim_gap.attribution.diagnosis import Cause, Signs
 from sim_gap.attribution.verdict import carries
 from sim_gap.model.load import load_model
@@ -41,6 +42,14 @@ def test_what_is_missed_without_a_term_is_what_no_other_takes():
     alone = np.max(scorer.rms(terms[:3]) - scorer.rms([*terms[:3], slow]))
     assert scorer.missed([slow]) < 0.1 * alone
     assert scorer.missed([slow, terms[4]]) > 0.5 * alone
+
+
+def test_a_cause_that_its_rival_could_replace_is_founded_together_with_it():
+    """That a rival does as well leaves no evidence for either alone: the answer is ambiguous, not unexplained."""
+    replaceable = replace(SIGNS, evidence=0.001, left=0.05)
+    assert not founded(replaceable)
+    assert founded(replaceable, rivals=1)
+    assert not founded(replace(replaceable, left=1.0, elsewhere=0.5), rivals=1)
 
 
 def test_within_the_margins_a_cause_that_nothing_founds_is_minor():

@@ -5,8 +5,9 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from wrong_arms import THREE, Wrong, motion, record
+from wrong_arms import THREE, Wrong, model, motion, record
 
+from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.better_model.coupled_motors import CoupledMotor, add_to, coupled_motors
 from sim_gap.better_model.export import write_model
@@ -18,6 +19,7 @@ CASES = {
     "rotor and friction": Wrong(rotor=np.array([0.8, 0.0, 0.0]), viscous=np.array([0.0, 1.0, 0.0])),
     "tilt": Wrong(tilt=(0.03, 0.02)),
     "spring": Wrong(spring=np.array([0.0, 2.0, 0.0])),
+    "position offset": Wrong(position_offset=np.array([0.0, 0.12, 0.0])),
 }
 
 
@@ -35,6 +37,26 @@ def test_the_written_model_has_no_gap_any_more(tmp_path, name):
     assert closed.verdict == "no_gap"
     assert np.all(closed.heldout_before < 0.1 * answer.heldout_before.max() + 0.02)
     assert answer.rollout.after.max() < 0.2 * answer.rollout.before.max()
+
+
+def test_a_spring_is_read_by_a_sensor_on_the_link(tmp_path):
+    """It acts beside motor and sensor: the model that has it leaves no gap in `tau`, rest and all."""
+    text = THREE.replace('<joint name="joint_2"', '<joint name="joint_2" stiffness="2" springref="{}"')
+    (tmp_path / "real.xml").write_text(text.format("30"))
+    (tmp_path / "arm.xml").write_text(THREE)
+    real = load_model(tmp_path / "real.xml")
+    train, other = (_sprung(real.arm.stiffness, real.arm.rest, seed) for seed in (1, 2))
+    assert diagnose(tmp_path / "real.xml", [train], [other]).verdict == "no_gap"
+    answer = diagnose(tmp_path / "arm.xml", [train], [other])
+    assert answer.causes[0].effect == "transmission.spring"
+    assert write_model(answer.internals.model, answer.internals.estimate, tmp_path / "closed.xml") == []
+    assert diagnose(tmp_path / "closed.xml", [train], [other]).verdict == "no_gap"
+
+
+def _sprung(stiffness: np.ndarray, rest: np.ndarray, seed: int) -> Recording:
+    made = record(model(), Wrong(), seed=seed, seconds=30, noise=0.002, channels=("tau",))
+    assert made.torque is not None
+    return replace(made, torque=made.torque + stiffness * (made.position - rest))
 
 
 def test_a_shared_motor_becomes_a_fixed_tendon(tmp_path):

@@ -15,7 +15,7 @@ ARM4 = Path(__file__).parents[2] / "models" / "arm4.urdf"
 
 def torque(model) -> np.ndarray:
     q, v, a = np.random.default_rng(1).uniform(-1, 1, (3, 5, model.n))
-    return model.arm.torque(q, v, a) + model.arm.nominal_joint_torque(q, v, a, np.sign(v))
+    return model.arm.carried(q, v, a) + model.arm.nominal_joint_torque(v, a, np.sign(v))
 
 
 def test_a_gripper_is_locked_where_the_recording_has_none():

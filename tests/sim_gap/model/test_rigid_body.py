@@ -103,12 +103,13 @@ def test_torque_is_that_of_pinocchio(tmp_path):
     np.testing.assert_allclose(arm.torque(q, v, a), expected, atol=1e-9)
 
 
-def test_joint_terms_of_the_model_count_on_the_motor_side_only():
+def test_joint_terms_of_the_model_count_on_the_motor_side_and_springs_beside_it():
     xml = THREE.replace('name="joint_2"', 'name="joint_2" armature="0.3" damping="0.7" stiffness="2" springref="0"')
     model = mujoco.MjModel.from_xml_string(xml)
     arm, (q, v, a) = rigid_arm(model, range(3)), states(3)
     extra = inverse(model, q, v, a) - arm.torque(q, v, a)
-    np.testing.assert_allclose(arm.nominal_joint_torque(q, v, a, np.sign(v)), extra, atol=1e-9)
+    np.testing.assert_allclose(arm.nominal_joint_torque(v, a, np.sign(v)) + arm.spring_torque(q), extra, atol=1e-9)
+    np.testing.assert_allclose(arm.carried(q, v, a), arm.torque(q, v, a) + arm.spring_torque(q))
 
 
 def test_a_model_that_is_not_a_plain_chain_is_refused(tmp_path):

@@ -1,5 +1,7 @@
 """Steps of the search for causes, one by one."""
 
+from dataclasses import replace
+
 import numpy as np
 from wrong_arms import Wrong, model, record
 
@@ -8,7 +10,7 @@ from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import prepare
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
-from sim_gap.search.model_selection import candidates, without_doubtful
+from sim_gap.search.model_selection import candidates, refine, without_doubtful
 from sim_gap.search.normal_equations import NormalEquations, Weighted
 from sim_gap.search.stepwise import Search
 from sim_gap.search.term import Term
@@ -42,6 +44,36 @@ def test_a_term_that_explains_its_rows_stays():
     normal = normal_equations(Wrong(payload=0.5))
     search = Search(normal, [payload(normal)])
     assert without_doubtful(search) is search
+
+
+def test_a_step_that_makes_it_worse_is_undone_and_not_tried_again():
+    """A term is chosen with the rows weighed by what is left before it, and may turn out to be no better after it."""
+    normal = normal_equations(Wrong(payload=0.5))
+    search = Search(normal, [payload(normal)])
+    score = search.score
+    useless = next(term for term in normal.terms if term.key == ("torque.offset", 2))
+    search.accept([payload(normal), useless])
+    assert search.active == [payload(normal)]
+    assert search.score == score
+    assert search._best(search._judged([[payload(normal), useless]]), np.inf) is None
+
+
+def test_a_limit_that_got_lost_comes_back_at_the_level_at_which_it_can_exist():
+    """At a level that is far too low, only a part of what it would cut off is missing."""
+    plain = record(model(), Wrong(), seed=1, seconds=40, rate=50.0, channels=("tau",))
+    limit = 0.6 * float(np.abs(plain.torque[:, 1]).max())
+    clipped = replace(plain, torque=np.clip(plain.torque, -limit, limit))
+    signals = prepare(clipped, load_model(model()).arm, "a recording")
+    data = ResidualSet((signals,), layout_of([signals]))
+    terms = candidates(data, ["torque.saturation"])
+    search = Search(NormalEquations(ColumnStore(data), terms), [])
+    level = lambda term: abs(term.shape[0] - limit)  # noqa: E731
+    search.take_back({("torque.saturation", 1)})
+    assert [term.key for term in search.active] == [("torque.saturation", 1)]
+    assert search.active[0] == min((term for term in terms if term.place == 1), key=level)
+    (refined,) = refine(search.normal.store, search.active)
+    assert level(refined) <= level(search.active[0])
+    assert Search(NormalEquations(search.normal.store, [refined]), [refined]).active == [refined]
 
 
 def test_errors_of_folds_predicted_from_the_others_are_those_of_fits_one_by_one():
