@@ -36,6 +36,8 @@ ANGLES = {"phase", "rest"}
 """Parameters that say where, not how much."""
 MOTORS = ("friction.coulomb", "friction.viscous", "actuator.rotor_inertia")
 """What a sensor on the link does not read of a model: it is named again as it was."""
+CARRIED = "link.payload"
+"""Is in the file if every recording has it, else named again as it was: the file is that of the arm without it."""
 Case = tuple[str, Path, list[Recording], list[Recording], list[str]]
 Key = tuple[str, str, str]
 
@@ -60,8 +62,9 @@ def changes(first: Diagnosis, second: Diagnosis) -> dict[Key, float]:
         was = before.get(key)
         held = key[0] in HELD and key[0] not in unread
         size = 0.0 if was is None else float(np.linalg.norm(was))
-        moved = float(np.linalg.norm(values if held or was is None else values - was))
-        out[key] = moved / size if size else float("inf")
+        left, moved = (float(np.linalg.norm(each)) for each in (values, values - (0.0 if was is None else was)))
+        change = min(left, moved) if key[0] == CARRIED else left if held else moved
+        out[key] = change / size if size else float("inf")
     return out
 
 
