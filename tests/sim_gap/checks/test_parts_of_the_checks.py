@@ -76,7 +76,7 @@ def test_a_motor_torque_of_one_sign_that_follows_the_model_is_no_amount(similar:
     m, other = np.sin(1.1 * t), np.cos(1.7 * t)
     v = 0.5 * np.cos(0.9 * t)
     reading = 10.0 + similar * m + np.sqrt(1.0 - similar**2) * other
-    arm = SimpleNamespace(n=1, names=("joint_1",), torque=lambda q, v, a: m)
+    arm = SimpleNamespace(n=1, names=("joint_1",), carried=lambda q, v, a: m)
     found = find_unsigned(arm, Motion(t, v, v, reading, "tau_motor"), NOTHING_STATED)
     assert [finding.finding for finding in found] == ["unsigned"] * named
 
