@@ -73,8 +73,7 @@ class Commander:
     def command(self, command: Command) -> Sample:
         """One cycle of a command; raises Refused where the gate refuses it, BusFault for a fault."""
         modes, torques, positions = self._numbers(command)
-        self._await_turn()
-        passed, now = self.passed, self.clock.now()
+        passed, now = self.passed, self._await_turn()
         age = 0.0 if command.t is None else now - command.t
         fault = self._fault(now, self._commanded)
         self._seen_now = seen = self._seen(now, fault is None)
@@ -91,11 +90,11 @@ class Commander:
         if self.loop.just_woke:
             self._lead += LEAD_SHARE * (min(now - self.loop.woke, self.period / 4) - self._lead)
         until = self._due - self._lead if self.unhurried and not self._lock_step else -math.inf
-        sample = self.loop.exchange(passed, math.inf if refused else now - age, self.max_age, until)
+        sample = self.loop.exchange(passed, now, math.inf if refused else now - age, self.max_age, until)
         sample.late = self.late
         if not self._lock_step:  # this process may have stood still at any line
             self._note_gap(self.loop.synced - sent, self.loop.synced)
-            self._note_gap(self.clock.now() - self.loop.synced, now)
+            self._note_gap(sample.delay, now)
         why = refused and refusal(self.names, command, age, passed, seen, self.limits)
         if why:
             raise Refused(f"gate: {why}")
@@ -119,8 +118,7 @@ class Commander:
 
         A joint that is ON keeps the target position that it has: one that followed the reading would sag.
         """
-        self._await_turn()
-        loop, now = self.loop, self.clock.now()
+        loop, now = self.loop, self._await_turn()
         self._seen_now = seen = self._seen(now, True)
         for group in loop.groups:
             for drive, place in enumerate(group.places):
@@ -141,7 +139,7 @@ class Commander:
                     order = hold_at(limits, torque, position, seen[place])
                 mode = POSITION if on or walk or wanted is Power.ON else OFF
                 self.passed[place] = order._replace(power=wanted, walk=walk, mode=mode)
-        return loop.exchange(self.passed)
+        return loop.exchange(self.passed, now)
 
     def walk(self, target: Power) -> Sample:
         """Cycle until every joint is in `target` (ON or OFF), a step each cycle; returns the last sample.
@@ -302,14 +300,17 @@ class Commander:
         self._gap, self._gap_at = 0.0, -math.inf
         self._due = self.clock.now()
 
-    def _await_turn(self) -> None:
+    def _await_turn(self) -> float:
+        """Wait for the cycle's time and take in what came meanwhile; returns the time that it then is, by the clock."""
+        if not self._lock_step and not self.loop.just_woke:
+            self.clock.sleep_until(self._due)
+        self.loop.drain()
+        now = self.clock.now()
         if not self._lock_step:
-            if not self.loop.just_woke:
-                self.clock.sleep_until(self._due)
-            now, stats = self.clock.now(), self.loop.stats
+            stats = self.loop.stats
             self.late = max(now - self._due, 0.0)
             stats.late += self.late > 0.1 * self.period
             stats.lateness.add(self.late)
             self._note_gap(now - self.loop.synced, now)
             self._due = max(self._due, now - self.period) + self.period
-        self.loop.drain()
+        return now

@@ -190,17 +190,19 @@ class Loop:
     def exchange(
         self,
         orders: Sequence[Order],
+        ordered: float,
         decided: float = math.inf,
         max_age: float = math.inf,
         until: float = -math.inf,
     ) -> Sample:
-        """One cycle: the frames of the orders, then the readings that they bring; raises as `verify`.
+        """One cycle: the frames of the orders made at `ordered` (clock), then the readings that they bring; raises as
+        `verify`.
 
         Replies are taken in when all should have come, or at `until` (clock) if that is later. Raises HostLate, and
         sends nothing, if the frames would leave more than `max_age` [s] after `decided` (clock).
         """
         board = self.board
-        frames = self._encode(orders, self._clock.now())
+        frames = self._encode(orders, ordered)
         now = self._clock.now()
         if now - decided > max_age:
             raise HostLate(now - decided, max_age, "the command grew too old before its frames left")
