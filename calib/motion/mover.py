@@ -258,16 +258,19 @@ class Mover:
                 if settled(samples[self._since(samples, window) :]):
                     # what settled last still decays in the first half
                     begin = self._since(samples, rule.window // 2 * self.link.period)
-            elif self._lasted(samples[begin:], window):
-                enough = count - begin >= rule.max_samples
-                if enough or rule.exact(stack(samples[begin:], "torque"), counts):
-                    if settled(samples[begin:]):
-                        return average(samples[begin:], settled=True)
-                    middle = (begin + count) // 2
-                    decayed = settled(samples[middle:])  # else it only stood at a turning point
-                    if decayed and self._lasted(samples, timeout + rule.max_samples * self.link.period):
-                        return average(samples[middle:], settled=True)
-                    begin = middle if decayed else None
+                continue
+            of_average = samples[begin:]
+            if not self._lasted(of_average, window):
+                continue
+            if len(of_average) < rule.max_samples and not rule.exact(stack(of_average, "torque"), counts):
+                continue
+            if settled(of_average):
+                return average(of_average, settled=True)
+            middle = (begin + count) // 2
+            decayed = settled(samples[middle:])  # else it only stood at a turning point
+            if decayed and self._lasted(samples, timeout + rule.max_samples * self.link.period):
+                return average(samples[middle:], settled=True)
+            begin = middle if decayed else None
 
     def _lasted(self, samples: list[Sample], seconds: float) -> bool:
         """Whether the samples cover so much time, a period each at least."""
