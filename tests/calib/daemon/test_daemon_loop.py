@@ -175,6 +175,31 @@ def test_listening_on_a_lock_step_bus_where_nobody_sends_sync_goes_on_for_ever(t
     assert silent.reason == f"no SYNC on {bus.channel_info}: is the arm's controller running?"
 
 
+def test_an_arm_in_this_process_keeps_the_machines_pace_and_does_not_catch_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = DaemonBench(tmp_path, settings=settings("observe"), work=False)
+    bench.host.close()
+    real = [1000.0]  # of the machine
+    monkeypatch.setattr(time, "monotonic", lambda: real[0])
+    monkeypatch.setattr(time, "sleep", lambda seconds: real.__setitem__(0, real[0] + seconds))
+    bus = LockStepBus(arm=bench.simulated)
+    loop = ArmLoop(LoopOptions(bench.arm, open_bus=lambda: bus))
+
+    def passed() -> tuple[float, float]:
+        arm, machine = bus.clock.now(), real[0]
+        for _ in range(20):
+            loop.run()
+        return bus.clock.now() - arm, real[0] - machine
+
+    loop.run()
+    passed()
+    assert passed() == pytest.approx((2.0, 2.0), abs=0.01)
+    real[0] += 5.0  # the machine stood still
+    assert passed() == pytest.approx((2.0, 2.0), abs=0.2)
+    loop.close()
+
+
 def test_beside_another_controller_it_hears_all_and_sends_nothing(tmp_path: Path) -> None:
     bench = DaemonBench(tmp_path, settings=settings("observe"), work=False)
     bench.host.close()
