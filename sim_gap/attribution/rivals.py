@@ -12,6 +12,9 @@ from sim_gap.search.torque_constants import CONSTANT, MASSES, masses_may_be_cons
 AS_GOOD = 0.036
 """A rival is as good if its score (½ log of the mean square) is worse by no more than this: the price of three
 coefficients, for the background of every arm can favour either by that much."""
+ALIKE = 1e-6
+"""Difference of two scores, apart from their prices, up to which two effects fit exactly alike: then the dearer one is
+a rival of the cheaper one, too."""
 BARE = 0.012
 """A cause that brings no more than the price of a coefficient has as a rival any effect that brings some of it."""
 NEAR = 0.3
@@ -66,40 +69,54 @@ class Rivals:
         """Score lost without a cause at its best-founded place, if best replaced, and its equally good rivals."""
         search = self.search
         present = [term for term in search.active if term in terms and term.effect == effect]
-        evidence = 0.0
-        rivals: list[str] = []
-        for term in present:
-            rest = search.without(term, search.active)
-            lost = search.judge(rest) - search.score
-            weakest, own = lost, []
-            others = [
-                other
-                for other in search.normal.terms
-                if other.key != term.key
-                and other not in rest
-                and term.key not in other.beneath
-                and not (term.effect == other.effect == "transmission.coupling")
-            ]
-            likely = [other for _, other in shortlist(search.weighted.screen(rest, others))[:TRIED]]
-            here = [other for other in others if other.place == term.place]
-            known = [other for other in here if frozenset({term.effect, other.effect}) in SEPARATING_MOTION]
-            for other in dict.fromkeys([*likely, *known]):
-                worse = search.judge(search.with_beneath(other, rest)) - search.score
-                if AS_GOOD <= worse < NEAR and _bends(term) and _bends(other):
-                    worse = min(worse, self._refitted(other, rest))
-                weakest = min(weakest, worse)
-                enough = max(0.5 * lost, min(lost, BARE))
-                if worse < AS_GOOD and worse < enough and other.effect != effect:
-                    own.append(other.effect)
-            if weakest >= evidence or not rivals:
-                evidence, rivals = max(evidence, weakest), own
+        outcomes = [self._replaced(term) for term in sorted(present, key=lambda term: (term.place, term.shape))]
+        evidence, rivals = max(outcomes, key=lambda outcome: outcome[0], default=(0.0, []))
         if effect == MASSES and masses_may_be_constants(search.normal.layout, search.active):
             rivals = [CONSTANT, *rivals]
         confounded = tuple(dict.fromkeys(rivals))
         if not confounded:
-            return Weighed(evidence, (), None)
+            return Weighed(max(evidence, 0.0), (), None)
         motion = SEPARATING_MOTION.get(frozenset({effect, confounded[0]}), GENERAL_MOTION)
-        return Weighed(evidence, confounded, f"record {motion}")
+        return Weighed(max(evidence, 0.0), confounded, f"record {motion}")
+
+    def _replaced(self, term: Term) -> tuple[float, list[str]]:
+        """Score lost without a term, if best replaced, and the effects that are as good in its place."""
+        search = self.search
+        rest = search.without(term, search.active)
+        lost = search.judge(rest) - search.score
+        enough = max(0.5 * lost, min(lost, BARE))
+        weakest, rivals = lost, []
+        for other in self._tried(term, rest):
+            trial = search.with_beneath(other, rest)
+            worse = search.judge(trial) - search.score
+            if AS_GOOD <= worse < NEAR and _bends(term) and _bends(other):
+                worse = min(worse, self._refitted(other, rest))
+            weakest = min(weakest, worse)
+            good = worse < AS_GOOD or abs(worse - self._dearer(trial)) < ALIKE
+            if good and worse < enough and other.effect != term.effect:
+                rivals.append(other.effect)
+        return weakest, rivals
+
+    def _tried(self, term: Term, rest: list[Term]) -> list[Term]:
+        """The likeliest terms in place of one beside the rest, and those that are known to be alike."""
+        search = self.search
+        others = [
+            other
+            for other in search.normal.terms
+            if other.key != term.key
+            and other not in rest
+            and term.key not in other.beneath
+            and not (term.effect == other.effect == "transmission.coupling")
+        ]
+        likely = [other for _, other in shortlist(search.weighted.screen(rest, others))[:TRIED]]
+        here = [other for other in others if other.place == term.place]
+        known = [other for other in here if frozenset({term.effect, other.effect}) in SEPARATING_MOTION]
+        return list(dict.fromkeys([*likely, *known]))
+
+    def _dearer(self, trial: Sequence[Term]) -> float:
+        """By how much the price of these terms exceeds that of the search's."""
+        search = self.search
+        return search.normal.price * (sum(map(search.cost, trial)) - sum(map(search.cost, search.active)))
 
     def _refitted(self, other: Term, rest: list[Term]) -> float:
         """How much worse another term scores in place of one, with all columns about that fit."""

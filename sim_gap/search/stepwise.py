@@ -8,7 +8,7 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.effects.effect import Key
-from sim_gap.search.normal_equations import NormalEquations, Weighted
+from sim_gap.search.normal_equations import CORRELATED, NormalEquations, Weighted
 from sim_gap.search.term import Term
 
 Scored = tuple[float, list[Term]]
@@ -108,6 +108,16 @@ class Search:
         free = term.effect in self.usual
         return 0.0 if free else self.normal.freedom(term) + shape + form.plausibility.prior_penalty
 
+    def after_price(self, screened: Sequence[tuple[float, Term]]) -> list[tuple[float, Term]]:
+        """Screened candidates by how far each may lower the score, less its price, best first.
+
+        By what they take alone, dear ones would keep cheap ones that earn more out of a shortlist.
+        """
+        normal = self.normal
+        to_score = 0.5 * CORRELATED / max(float(normal.count.sum(0).max(initial=0.0)), 1.0)
+        net = [(to_score * fall - normal.price * self.cost(term), term) for fall, term in screened]
+        return sorted(net, key=lambda pair: -pair[0])
+
     def with_beneath(self, term: Term, terms: Sequence[Term]) -> list[Term]:
         """`terms` plus `term` plus what it needs; another shape of the same effect at that place is replaced."""
         gone = {term.key, *term.covers(self.normal.layout)}
@@ -125,11 +135,12 @@ class Search:
         active = {*self.active}
         inactive = [term for term in self.normal.terms if term not in active and self.added[term.key] < TRIES]
         screened, judged = self.weighted.screen(self.active, inactive), list[Scored]()
-        while screened and not any(np.isfinite(score) for score, _ in judged):  # the most promising may be impossible
-            first = shortlist(screened)
-            judged = list(self._judged(self.with_beneath(term, self.active) for _, term in first))
-            tried = {term.key for _, term in first}
-            screened = [each for each in screened if each[1].key not in tried]
+        lists = [screened, self.after_price(screened)]
+        while lists[0] and not any(np.isfinite(score) for score, _ in judged):  # the most promising may be impossible
+            first = list(dict.fromkeys(term for each in lists for _, term in shortlist(each)))
+            judged = list(self._judged(self.with_beneath(term, self.active) for term in first))
+            tried = {term.key for term in first}
+            lists = [[pair for pair in each if pair[1].key not in tried] for each in lists]
         chosen = self._best(judged, self.score - self.least)
         return chosen is not None and len(chosen) <= MOST_TERMS and self.accept(chosen)
 
@@ -154,7 +165,7 @@ class Search:
             rest = self.without(term, self.active)
             used = {*rest, term}
             inactive = [other for other in self.normal.terms if other not in used and self.added[other.key] < TRIES]
-            for _, other in shortlist(self.weighted.screen(rest, inactive))[:4]:
+            for _, other in shortlist(self.after_price(self.weighted.screen(rest, inactive)))[:4]:
                 yield self.with_beneath(other, rest)
 
     def _dissolved(self) -> Iterator[Scored]:

@@ -1,6 +1,7 @@
 """Which effects are named as confounded with a cause, on searches whose scores are made by hand."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -12,27 +13,43 @@ LAG, DELAY = Term("actuator.lag", 0, (0.01,)), Term("actuator.delay", 0, (0.01,)
 CLIPS = [Term("actuator.saturation", joint, (5.0,)) for joint in range(6)]
 
 
-def rivals(scores: dict[Term | None, float]) -> tuple[str, ...]:
-    """Rivals of a lag: the score with it is 0, with another in its place (None: nothing) as given, else infinite."""
+def lag_search(
+    scores: dict[frozenset[Term], float], active: list[Term], *others: Term, dearer: float = 0.0, price: float = 0.012
+) -> Any:
+    """A search that found the active terms, at a score of 0; that of others is as given, else infinite.
 
-    def judge(terms: list[Term]) -> float:
-        return scores.get(terms[0] if terms else None, float("inf"))
-
-    search = SimpleNamespace(
-        active=[LAG],
+    Effects but the active ones are `dearer` by so many coefficients.
+    """
+    return SimpleNamespace(
+        active=active,
         score=0.0,
-        normal=SimpleNamespace(terms=[LAG, *CLIPS, DELAY]),
-        weighted=SimpleNamespace(screen=lambda rest, others: [(1.0, other) for other in others]),
-        judge=judge,
+        normal=SimpleNamespace(terms=[*active, *CLIPS, DELAY, *others], price=price),
+        weighted=SimpleNamespace(screen=lambda _rest, offered: [(1.0, other) for other in offered]),
+        cost=lambda term: 1.0 + dearer * (term not in active),
+        judge=lambda terms: scores.get(frozenset(terms), float("inf")),
         without=lambda term, terms: [other for other in terms if other != term],
         with_beneath=lambda term, terms: [*terms, term],
     )
-    return Rivals(search).weigh("actuator.lag", [LAG]).confounded_with
+
+
+def rivals(scores: dict[Term | None, float]) -> tuple[str, ...]:
+    """Rivals of a lag, given the scores with another in its place (None: nothing)."""
+    sets = {frozenset({term} if term else ()): score for term, score in scores.items()}
+    return Rivals(lag_search(sets, [LAG])).weigh("actuator.lag", [LAG]).confounded_with
 
 
 def test_what_does_nearly_as_well_is_a_rival_and_what_brings_little_is_not():
     assert rivals({None: 0.4, DELAY: 0.01}) == ("actuator.delay",)
     assert rivals({None: 0.4, DELAY: 0.2}) == ()
+
+
+@pytest.mark.parametrize("price", [0.012, 0.04])
+def test_what_fits_exactly_alike_is_a_rival_though_it_costs_more(price):
+    """An asymmetric friction costs three coefficients more than the offset that reads as it does."""
+    search = lag_search({frozenset(): 0.4, frozenset({DELAY}): 3.0 * price}, [LAG], dearer=3.0, price=price)
+    assert Rivals(search).weigh("actuator.lag", [LAG]).confounded_with == ("actuator.delay",)
+    search = lag_search({frozenset(): 0.4, frozenset({DELAY}): 3.5 * price}, [LAG], dearer=3.0, price=price)
+    assert Rivals(search).weigh("actuator.lag", [LAG]).confounded_with == ()
 
 
 def test_an_effect_known_to_be_alike_is_tried_even_where_others_promise_more():
@@ -45,22 +62,28 @@ def test_beside_a_cause_that_hardly_earns_its_place_whatever_brings_anything_is_
     assert rivals({None: 0.007, DELAY: 0.008}) == ()
 
 
-def test_the_rivals_of_the_best_founded_place_stay_those_of_the_cause():
+@pytest.mark.parametrize("turned", [False, True])
+def test_the_rivals_are_those_of_the_best_founded_place_in_whatever_order(turned):
     """Joint 1 has much evidence of a lag, and of a delay as well; the little at joint 2 has no rival."""
     weak = Term("actuator.lag", 1, (0.01,))
     scores = {frozenset({weak}): 0.4, frozenset({weak, DELAY}): 0.03, frozenset({LAG}): 0.02}
-    search = SimpleNamespace(
-        active=[LAG, weak],
-        score=0.0,
-        normal=SimpleNamespace(terms=[LAG, weak, DELAY]),
-        weighted=SimpleNamespace(screen=lambda rest, others: [(1.0, other) for other in others]),
-        judge=lambda terms: scores.get(frozenset(terms), float("inf")),
-        without=lambda term, terms: [other for other in terms if other != term],
-        with_beneath=lambda term, terms: [*terms, term],
-    )
-    weighed = Rivals(search).weigh("actuator.lag", [LAG, weak])
+    weighed = Rivals(lag_search(scores, in_order([LAG, weak], turned))).weigh("actuator.lag", [LAG, weak])
     assert weighed.evidence == 0.03
     assert weighed.confounded_with == ("actuator.delay",)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_the_rivals_of_a_weak_place_are_none_of_the_best_founded_one_in_whatever_order(turned):
+    """Joint 1 has much evidence of a lag alone; the little at joint 2 may be a delay."""
+    weak, late = Term("actuator.lag", 1, (0.01,)), Term("actuator.delay", 1, (0.01,))
+    scores = {frozenset({weak}): 0.4, frozenset({LAG}): 0.03, frozenset({LAG, late}): 0.01}
+    weighed = Rivals(lag_search(scores, in_order([LAG, weak], turned), late)).weigh("actuator.lag", [LAG, weak])
+    assert weighed.evidence == 0.4
+    assert weighed.confounded_with == ()
+
+
+def in_order(terms: list[Term], turned: bool) -> list[Term]:
+    return terms[::-1] if turned else terms
 
 
 @pytest.mark.parametrize(("kept", "worse"), [([DELAY], 0.2), ([], float("inf"))])

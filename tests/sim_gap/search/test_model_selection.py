@@ -1,6 +1,8 @@
 """Steps of the search for causes, one by one."""
 
+from collections import Counter
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 from wrong_arms import Wrong, model, record
@@ -56,6 +58,24 @@ def test_a_step_that_makes_it_worse_is_undone_and_not_tried_again():
     assert search.active == [payload(normal)]
     assert search.score == score
     assert search._best(search._judged([[payload(normal), useless]]), np.inf) is None
+
+
+def test_a_cheap_effect_is_tried_though_many_dear_ones_would_take_more(monkeypatch):
+    """Twelve limits that each take a little more than the Coulomb friction and do not earn their price."""
+    cheap, limits = Term("friction.coulomb", 0), [Term("torque.saturation", joint, (5.0,)) for joint in range(12)]
+    screened = [*((5.0, limit) for limit in limits), (4.0, cheap)]
+    search = object.__new__(Search)
+    search.active, search.added, search.undone, search.usual = [], Counter(), set(), frozenset()
+    search.score, search.least = 0.0, 1e-4
+    search.normal = SimpleNamespace(
+        terms=[*limits, cheap], price=0.02, count=np.full((1, 1), 800.0), freedom=lambda _: 1.0
+    )
+    search.weighted = SimpleNamespace(screen=lambda _terms, _candidates: screened)
+    monkeypatch.setattr(Search, "judge", lambda _self, terms: -0.01 if cheap in terms else 0.01)
+    monkeypatch.setattr(Search, "reweigh", lambda self: setattr(self, "score", self.judge(self.active)))
+    monkeypatch.setattr(Search, "with_beneath", lambda _self, term, terms: [*terms, term])
+    assert search.forward()
+    assert search.active == [cheap]
 
 
 def test_a_limit_that_got_lost_comes_back_at_the_level_at_which_it_can_exist():
