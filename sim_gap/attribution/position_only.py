@@ -9,7 +9,7 @@ from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, Rollout, Signs, Verdict
 from sim_gap.checks.finding import Finding
 from sim_gap.closed_loop.identify import Identified, columns_of_effect, identify
-from sim_gap.closed_loop.judge import LEAST_SHRINK, SYSTEMATIC, Stage, interval, undecided_scale
+from sim_gap.closed_loop.judge import LEAST_SHRINK, Stage, interval, undecided_scale, what_matters
 from sim_gap.closed_loop.parameters import EFFECTS
 from sim_gap.closed_loop.search import PRICE
 from sim_gap.closed_loop.training.bands import SHARE
@@ -24,6 +24,8 @@ STRUCTURE = 2.0
 """Remaining gap, in margins, from which an unknown controller may not be of the kind that was fitted."""
 ALMOST = 0.75
 """Highest confidence that positions alone give: it is not calibrated on sealed cases, as that from torques is."""
+FAR = 3.0
+"""So many times what the fit leaves, or the margin, must a model leave that runs free, for a note."""
 SEPARATE = {
     "controller.stiffness": "hold a known load with the joint, or record the motor's current",
     "controller.dead_zone": "measure the play by hand with the servo holding, or read the motor's encoder",
@@ -55,6 +57,7 @@ def diagnose_positions(
     if verdict == "no_gap":
         causes, minor = [], [*causes, *minor]
     capped = [_hint(cause) for cause in causes] if verdict == "unexplained" else causes
+    rollout = _rollout(found)
     return Diagnosis(
         verdict=verdict,
         names=sim.arm.names,
@@ -69,8 +72,8 @@ def diagnose_positions(
         unexplained=share,
         margin=found.margin,
         heldout_is=heldout_is,
-        rollout=_rollout(found),
-        notes=tuple(_notes(found)),
+        rollout=rollout,
+        notes=(*_notes(found), *_running_free(found, rollout)),
         checks=tuple(checks),
         band=found.band,
         unit="rad",
@@ -117,10 +120,9 @@ def _verdict(found: Identified, causes: Sequence[Cause], share: float) -> Verdic
 
 
 def _is_within(found: Identified) -> bool:
-    """Whether no joint's gap matters: it is within the margin, or no more than parameters make of it that are off by as
-    much as no recording shows (twice `SYSTEMATIC` of the tracking error)."""
+    """Whether no joint's gap matters, in training and held-out recordings."""
     pairs = ((found.train_before, found.search.scales.angle), (found.heldout_before, found.tracking))
-    return all(bool(np.all(gap < np.maximum(found.margin, 2.0 * SYSTEMATIC * error))) for gap, error in pairs)
+    return all(bool(np.all(gap < what_matters(found.search, found.margin, error))) for gap, error in pairs)
 
 
 def _structure_left(found: Identified) -> bool:
@@ -227,6 +229,19 @@ def _notes(found: Identified) -> list[str]:
     if found.export is not None and found.export.lines:
         out.append(f"the corrected model leaves out: {', '.join(found.export.lines)}")
     return out
+
+
+def _running_free(found: Identified, rollout: Rollout | None) -> list[str]:
+    """A note of the joints at which the file that is written leaves much more of the gap than the fit."""
+    if rollout is None:
+        return []
+    left, least = rollout.after, np.maximum(found.heldout_after, found.margin)
+    far = [
+        f"{found.sim.arm.names[j]} {left[j]:.3g} rad (the fit {found.heldout_after[j]:.3g})"
+        for j in np.flatnonzero(left > FAR * least)
+    ]
+    told = "the corrected model in MuJoCo, running free along the held-out commands, is further off"
+    return [f"{told}: {', '.join(far)}"] if far else []
 
 
 def _beyond(found: Identified) -> list[str]:

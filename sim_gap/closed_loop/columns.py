@@ -9,7 +9,7 @@ from sim_gap.closed_loop.tracks import MODEL_HZ
 from sim_gap.closed_loop.windows import Windows
 from sim_gap.model.rigid_body import RigidArm
 
-UNIT = {"mass": "kg", "x": "kg·m", "y": "kg·m", "z": "kg·m", "angle_1": "rad", "angle_2": "rad"}
+UNIT = {"mass": "kg", "x": "kg·m", "y": "kg·m", "z": "kg·m", "angle": "rad", "angle_1": "rad", "angle_2": "rad"}
 
 
 def shared_effects(arm: RigidArm) -> dict[str, tuple[str, ...]]:
@@ -17,6 +17,7 @@ def shared_effects(arm: RigidArm) -> dict[str, tuple[str, ...]]:
     effects = {"link.payload": tuple(f"payload.{part}" for part in ("mass", "x", "y", "z"))}
     for link, name in enumerate(arm.names):
         effects[f"link.mass_moment@{name}"] = tuple(f"moment{link}.{axis}" for axis in "xyz")
+        effects[f"position.offset@{name}"] = (f"zero{link}.angle",)
     effects["base.tilt"] = ("tilt.angle_1", "tilt.angle_2")
     return effects
 
@@ -32,6 +33,7 @@ def with_columns(data: Windows) -> Windows:
     }
     for link in range(n):
         made |= {f"moment{link}.{axis}": regressor[:, :, link, 1 + k] for k, axis in enumerate("xyz")}
+        made[f"zero{link}.angle"] = _of_an_angle(arm, q, v, a, link)
     still = np.zeros_like(q)
     for k, turn in enumerate(turns(arm.gravity)):
         made[f"tilt.angle_{k + 1}"] = arm.torque(q, still, still, turn)
@@ -41,6 +43,13 @@ def with_columns(data: Windows) -> Windows:
             spread = rows.reshape(len(few), count, n).transpose(0, 2, 1)
             columns[name] = _filled(spread, few, steps)
     return replace(data, columns=columns)
+
+
+def _of_an_angle(arm: RigidArm, q: Array, v: Array, a: Array, joint: int) -> Array:
+    """Derivative of all joints' torques with respect to one joint's angle, (k, n): those beyond it feel it too."""
+    step = np.zeros(arm.n)
+    step[joint] = 1e-4
+    return np.asarray((arm.torque(q + step, v, a) - arm.torque(q - step, v, a)) / 2e-4)
 
 
 def turns(gravity: Array) -> list[Array]:

@@ -1,7 +1,7 @@
 """What each effect is worth: its interval, and what it lowers on held-out data."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -9,8 +9,8 @@ from gcomp.arrays import Array
 from sim_gap.closed_loop.columns import UNIT, shared_effects
 from sim_gap.closed_loop.fit import LOGARITHMIC, Fit, evaluate, improve, jacobian, moved
 from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS
-from sim_gap.closed_loop.rivals import Group, rivals_of
-from sim_gap.closed_loop.search import Search, effect_there, without
+from sim_gap.closed_loop.rivals import rivals_of
+from sim_gap.closed_loop.search import Group, Search, effect_there, taken_out
 from sim_gap.closed_loop.windows import Windows
 
 SYSTEMATIC = 0.02
@@ -34,18 +34,6 @@ def groups_of(fit: Fit, search: Search) -> list[Group]:
 def shared_of(fit: Fit, search: Search) -> list[str]:
     """Effects of the whole arm that a fit has."""
     return [e for e, names in shared_effects(search.data.arm).items() if set(names) & set(fit.shared)]
-
-
-def taken_out(search: Search, fit: Fit, group: Group) -> Fit:
-    """The fit without a group."""
-    effect, joints = group
-    if not joints:
-        names = set(shared_effects(search.data.arm)[effect])
-        point = {name: 0.0 * x if name in names else x for name, x in fit.point.items()}
-        return replace(fit, point=point, shared=tuple(n for n in fit.shared if n not in names), rms=None)
-    for j in joints:
-        fit = without(search, fit, effect, j)
-    return fit
 
 
 def rms_on(data: Windows, fit: Fit) -> Array:
@@ -78,9 +66,9 @@ class Stage:
 def stages(search: Search, fit: Fit, heldout: Windows, margin: Array) -> list[Stage]:
     """The groups in order of what each lowers when it is added to the nominal model and those above it.
 
-    `margin` is the gap that matters at each joint, (J,) [rad].
+    `margin` is the gap that counts as one at each joint, (J,) [rad].
     """
-    groups = groups_of(fit, search)
+    groups, matters = groups_of(fit, search), what_matters(search, margin, search.scales.angle)
 
     def with_only(some: Sequence[Group]) -> Fit:
         """The fit without the other groups, the rest fitted again from where it is."""
@@ -92,16 +80,22 @@ def stages(search: Search, fit: Fit, heldout: Windows, margin: Array) -> list[St
 
     current = with_only(())
     before, final, out = _rms(heldout, current), _rms(heldout, fit), []
-    for number, (group, trial) in enumerate(_ordered(search, groups, with_only, current, margin), start=1):
+    for number, (group, trial) in enumerate(_ordered(search, groups, with_only, current, matters), start=1):
         after = final if number == len(groups) else _rms(heldout, trial)
         bare = improve(search.data, taken_out(search, fit, group), search.scales, 4)
         falls = [_shrink(search, heldout, *pair) for pair in ((before, after), (_rms(heldout, bare), final))]
         share = np.maximum(*falls)
-        matters = bool((share > LEAST_SHRINK).any())
-        evidence, rivals = rivals_of(search, fit, group, bare) if matters else (0.0, ())
+        lowers = bool((share > LEAST_SHRINK).any())
+        evidence, rivals = rivals_of(search, fit, group, bare) if lowers else (0.0, ())
         out.append(Stage(group, joint_rms(heldout, before), joint_rms(heldout, after), share, evidence, rivals))
         before = after
     return out
+
+
+def what_matters(search: Search, margin: Array, error: Array) -> Array:
+    """Gap that matters at each joint, (J,) [rad]: more than the margin, and more than gains make of the tracking error
+    that are off by as much as no recording shows (twice `SYSTEMATIC`). Gains that are fitted are not off."""
+    return margin if search.open_controller else np.asarray(np.maximum(margin, 2.0 * SYSTEMATIC * error))
 
 
 def _rms(data: Windows, fit: Fit) -> Array:

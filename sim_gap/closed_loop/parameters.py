@@ -44,7 +44,6 @@ PARAMETERS = {
         Parameter("armature", "kg·m²", 0.0, 0.3, 0.0, np.inf, "inertia"),
         Parameter("spring", "N·m/rad", 0.0, 0.1, 0.0, np.inf, "torque"),
         Parameter("offset", "N·m", 0.0, 0.1, -np.inf, np.inf, "torque"),
-        Parameter("zero", "rad", 0.0, 0.02, -0.5, 0.5),
         Parameter("gain", "1", 1.0, 0.05, 0.2, 3.0),
     )
 }
@@ -85,7 +84,6 @@ EFFECTS = {
         LoopEffect("friction.load", ("load",), ("coefficient",)),
         LoopEffect("friction.asymmetric", ("asymmetry",), ("ratio",), ("friction.coulomb",)),
         LoopEffect("transmission.spring", ("spring", "offset"), ("stiffness", "torque")),
-        LoopEffect("position.offset", ("zero",), ("angle",)),
     )
 }
 

@@ -10,12 +10,7 @@ from sim_gap.closed_loop.candidates import expected_shared, ranked
 from sim_gap.closed_loop.columns import shared_effects
 from sim_gap.closed_loop.fit import Fit, improve, jacobian
 from sim_gap.closed_loop.parameters import EFFECTS
-from sim_gap.closed_loop.search import PRICE, Search, with_effect
-
-Group = tuple[str, tuple[int, ...]]
-"""An effect with the joints that have it; no joints for one of the whole arm."""
-TRIED = 2
-"""Number of effects of the whole arm that are tried in place of one."""
+from sim_gap.closed_loop.search import PRICE, Group, Search, taken_out, with_effect
 
 
 def rivals_of(search: Search, fit: Fit, group: Group, bare: Fit) -> tuple[float, tuple[str, ...]]:
@@ -46,25 +41,28 @@ def rivals_of(search: Search, fit: Fit, group: Group, bare: Fit) -> tuple[float,
             least = min(least, lost + max(loss - whole, 0.0))
             if lost < max(PRICE, 0.1 * whole):
                 close.append(other)
-    if not joints:
-        for other, lost in _of_the_arm(search, fit, effect, bare):
-            least = min(least, lost)
-            if lost < max(PRICE, 0.1 * loss) and other.partition("@")[0] != effect.partition("@")[0]:
-                close.append(other.partition("@")[0])
+    for other, lost in _of_the_arm(search, fit, group, bare):
+        least = min(least, lost)
+        if lost < max(PRICE, 0.1 * loss) and other.partition("@")[0] != effect.partition("@")[0]:
+            close.append(other.partition("@")[0])
     return least, tuple(dict.fromkeys(close))
 
 
-def _of_the_arm(search: Search, fit: Fit, effect: str, bare: Fit) -> Iterator[tuple[str, float]]:
-    """The most promising other effects of the whole arm, and the loss of the score with each in place of `effect`.
+def _of_the_arm(search: Search, fit: Fit, group: Group, bare: Fit) -> Iterator[tuple[str, float]]:
+    """The effects of the whole arm in place of a group that acts as a torque along the motion, each with the loss of
+    the score with it there.
 
-    Each starts where its torque is closest to that of the effect, for gains and friction follow it slowly.
+    Each is tried at its most promising link or joint, and starts where its torque is closest to that of the group, for
+    gains and friction follow it slowly.
     """
+    torque = _torque_of(search, fit, group)
+    if torque is None:
+        return
     every, columns = shared_effects(search.data.arm), search.data.columns
-    own = tuple(name for name in every[effect] if name in fit.shared)
     others = {
         other: tuple(name for name in names if name in columns)
         for other, names in every.items()
-        if other != effect and other.partition("@")[0] not in search.excluded and not {*names} & {*fit.shared}
+        if other != group[0] and other.partition("@")[0] not in search.excluded and not {*names} & {*fit.shared}
     }
     offered = tuple(dict.fromkeys(name for names in others.values() for name in names))
     if not offered:
@@ -73,14 +71,34 @@ def _of_the_arm(search: Search, fit: Fit, effect: str, bare: Fit) -> Iterator[tu
     worth = {
         other: expected_shared(search, bare, now, slopes, offered, names) for other, names in others.items() if names
     }
-    torque = sum((fit.point[name][0] * columns[name] for name in own), np.zeros_like(columns[offered[0]]))
-    kept = {name: 0.0 * x if name in own else x for name, x in fit.point.items()}
-    for other in sorted(worth, key=lambda each: -worth[each])[:TRIED]:
+    rest = taken_out(search, fit, group)
+    tried: dict[str, str] = {}
+    for other in sorted(worth, key=lambda each: -worth[each]):
+        tried.setdefault(other.partition("@")[0], other)
+    for other in tried.values():
         like = _like(torque, [columns[name] for name in others[other]])
-        point = {**kept, **{n: np.full(search.data.joints, c) for n, c in zip(others[other], like, strict=True)}}
-        shared = (*(name for name in fit.shared if name not in own), *others[other])
-        trial = improve(search.data, replace(fit, point=point, shared=shared, rms=None), search.scales, 5)
+        values = {name: np.full(search.data.joints, c) for name, c in zip(others[other], like, strict=True)}
+        start = replace(rest.with_values(**values), shared=(*rest.shared, *others[other]))
+        trial = improve(search.data, start, search.scales, 5)
         yield other, float((search.score(trial) - search.score(fit)).sum())
+
+
+def _torque_of(search: Search, fit: Fit, group: Group) -> Array | None:
+    """What a group takes of the torque along the recorded motion, (T, J, W); None of one that is no such torque."""
+    effect, joints = group
+    data = search.data
+    zero = np.zeros_like(data.recorded)
+
+    def change(name: str) -> Array:
+        return np.asarray(fit.point[name] - search.nominal[name])[:, None]
+
+    if not joints:
+        names = [name for name in shared_effects(data.arm)[effect] if name in fit.shared]
+        return sum((change(name) * data.columns[name] for name in names), zero)
+    if effect != "transmission.spring":
+        return None
+    torque = change("spring") * data.recorded + change("offset")
+    return np.where(np.isin(np.arange(data.joints), joints)[:, None], torque, zero)
 
 
 def _like(torque: Array, columns: Sequence[Array]) -> Array:

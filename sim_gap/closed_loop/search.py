@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gcomp.arrays import Array
+from sim_gap.closed_loop.columns import shared_effects
 from sim_gap.closed_loop.fit import Fit, batch, residuals
 from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS, Scales
 from sim_gap.closed_loop.windows import Windows
@@ -22,6 +23,8 @@ LEVELS = {
 torque, of the gain per second."""
 LEAST_FALL = 0.025
 """Least relative fall of a joint's RMS by an effect."""
+Group = tuple[str, tuple[int, ...]]
+"""An effect with the joints that have it; no joints for one of the whole arm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +108,18 @@ def without(search: Search, fit: Fit, effect: str, joint: int) -> Fit:
     active = list(fit.active)
     active[joint] = tuple(name for name in active[joint] if name not in names)
     return replace(fit, point=point, active=tuple(active), rms=None)
+
+
+def taken_out(search: Search, fit: Fit, group: Group) -> Fit:
+    """The fit without a group."""
+    effect, joints = group
+    if not joints:
+        names = set(shared_effects(search.data.arm)[effect])
+        point = {name: 0.0 * x if name in names else x for name, x in fit.point.items()}
+        return replace(fit, point=point, shared=tuple(n for n in fit.shared if n not in names), rms=None)
+    for j in joints:
+        fit = without(search, fit, effect, j)
+    return fit
 
 
 def effect_there(fit: Fit, effect: str, joint: int) -> bool:

@@ -112,8 +112,6 @@ def _run(data: Windows, values: Values, count: int) -> Array:
         square = x * x
         torque -= data.gravity[k] * (1.0 - 0.5 * square) + data.slope[k] * x * (1.0 - square / 6.0)
         torque -= data.coupling[k]
-        if "zero" in active:
-            torque -= of("zero") * data.slope[k]
         if "spring" in active:
             torque -= of("spring") * q
         if "offset" in active:

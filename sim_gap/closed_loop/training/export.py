@@ -8,10 +8,10 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.better_model.with_effects import mujoco_quaternion, possible, spec_of, split
-from sim_gap.closed_loop.columns import turns
+from sim_gap.closed_loop.columns import shared_effects, turns
 from sim_gap.closed_loop.fit import Fit, improve
 from sim_gap.closed_loop.parameters import EFFECTS
-from sim_gap.closed_loop.search import Search, effect_there, without
+from sim_gap.closed_loop.search import Search, effect_there, taken_out, without
 from sim_gap.model.load import SimModel
 from sim_gap.model.rigid_body import inertial_of
 
@@ -59,11 +59,14 @@ def native_fit(search: Search, fit: Fit, held: Collection[str] = NATIVE) -> Fit:
         for j in range(search.data.joints):
             if effect_there(fit, effect, j):
                 bare = without(search, bare, effect, j)
+    for effect in _shared_beside(search, fit, held):
+        bare = taken_out(search, bare, (effect, ()))
     bare = bare.with_values(kd=np.zeros(search.data.joints), feed=np.zeros(search.data.joints))
     dry = fit.point["stribeck"] + fit.point["load"] * search.data.load.mean(axis=(0, 2))
     bare = bare.with_values(coulomb=np.maximum(bare.point["coulomb"], fit.point["coulomb"] + dry))
     wanted = [(*own, *(n for n in ("coulomb", "viscous") if n not in own)) for own in bare.active]
-    changed = bare.active != fit.active or any(np.any(fit.point[n] != 0.0) for n in ("kd", "feed"))
+    changed = (bare.active, bare.shared) != (fit.active, fit.shared)
+    changed = changed or any(np.any(fit.point[n] != 0.0) for n in ("kd", "feed"))
     if not changed:
         return fit
     return improve(search.data, replace(bare, active=tuple(wanted), rms=None), search.scales, 6)
@@ -73,7 +76,8 @@ def exported(sim: SimModel, search: Search, fit: Fit, native: Fit, held: Collect
     """MJCF of the native fit, which has the effects `held`, and the effects of the whole fit that it leaves out."""
     spec = spec_of(sim)
     left = sorted(
-        {
+        {effect.replace("@", " ") for effect in _shared_beside(search, fit, held)}
+        | {
             f"{effect} {sim.arm.names[j]}"
             for effect in EFFECTS
             for j in range(sim.n)
@@ -98,6 +102,15 @@ def exported(sim: SimModel, search: Search, fit: Fit, native: Fit, held: Collect
         f"<!-- Left out, MJCF has no field for them (the rest was fitted without them):{note}\n-->\n" if left else ""
     )
     return Exported(comment + spec.to_xml(), tuple(left))
+
+
+def _shared_beside(search: Search, fit: Fit, held: Collection[str]) -> list[str]:
+    """Effects of the whole arm in a fit that are not among those held."""
+    return [
+        effect
+        for effect, names in shared_effects(search.data.arm).items()
+        if effect.partition("@")[0] not in held and {*names} & {*fit.shared}
+    ]
 
 
 def _implicit() -> Any:

@@ -7,7 +7,8 @@ import pytest
 
 from sim_gap.attribution import notes, rollout
 from sim_gap.attribution.causes import ordered
-from sim_gap.attribution.position_only import _where
+from sim_gap.attribution.diagnosis import Rollout
+from sim_gap.attribution.position_only import _running_free, _where
 from sim_gap.attribution.residual_laws import ResidualLaw, _Candidate
 from sim_gap.attribution.rollout import RollOuts
 from sim_gap.attribution.steadiness import steadiness
@@ -138,3 +139,16 @@ def test_the_line_of_an_effect_has_the_units_of_its_parameters() -> None:
     estimate = SimpleNamespace(parameters=lambda term: values)
     sim = SimpleNamespace(arm=SimpleNamespace(names=("elbow",)))
     assert _line(sim, estimate, Term("torque.gain", 0)) == "torque.gain elbow gain 1.25, offset 0.5 N·m"
+
+
+def test_a_written_model_that_runs_away_from_the_fit_is_said() -> None:
+    """Joint b is off by more than three times its margin, joint a by less than three times what the fit leaves."""
+    found = SimpleNamespace(
+        heldout_after=np.array([0.02, 0.01]),
+        margin=np.array([0.001, 0.05]),
+        sim=SimpleNamespace(arm=SimpleNamespace(names=("a", "b"))),
+    )
+    (note,) = _running_free(found, Rollout(6.0, np.full(2, np.nan), np.array([0.05, 0.2]), closed_loop=True))
+    assert note.endswith("is further off: b 0.2 rad (the fit 0.01)")
+    assert _running_free(found, Rollout(6.0, np.full(2, np.nan), np.array([0.05, 0.14]), closed_loop=True)) == []
+    assert _running_free(found, None) == []

@@ -10,7 +10,7 @@ import pytest
 from servo_arm import model_text, record
 
 from armlink.recording.recording import Recording
-from sim_gap.closed_loop import controller
+from sim_gap.closed_loop import controller, judge
 from sim_gap.closed_loop.compete import select_about
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of, starting_fit
 from sim_gap.closed_loop.fit import Fit, batch, improve
@@ -99,3 +99,24 @@ def test_an_effect_is_weighed_again_once_what_it_needs_is_there() -> None:
 
     order = [group[0] for group, _ in _ordered(search, groups, with_only, with_only([]), np.ones(2))]
     assert order == ["friction.coulomb", "friction.stribeck", "friction.viscous"]
+
+
+def test_what_no_recording_shows_at_a_stiff_joint_comes_after_what_matters(monkeypatch) -> None:
+    """Joint 1 follows its command 2 % too late, many times its margin; joint 2 has a gap of a tenth of its error."""
+    gaps = {("controller.delay", (0,)): (8e-4, 0.0), ("link.mass_moment", (1,)): (0.0, 4e-3)}
+    everything = SimpleNamespace(groups=(*gaps,), rms=np.full((2, 1), 1e-4))
+
+    def taken_out(search, fit, group):
+        gap = np.array([gaps[group]]).T
+        return SimpleNamespace(groups=tuple(g for g in fit.groups if g != group), rms=fit.rms + gap)
+
+    monkeypatch.setattr(judge, "taken_out", taken_out)
+    monkeypatch.setattr(judge, "groups_of", lambda fit, search: [*gaps])
+    monkeypatch.setattr(judge, "improve", lambda data, fit, scales, iterations: fit)
+    monkeypatch.setattr(judge, "_rms", lambda data, fit: fit.rms)
+    monkeypatch.setattr(judge, "rivals_of", lambda *given: (9.0, ()))
+    data = SimpleNamespace(weight=np.ones((1, 2, 1)))
+    scales = SimpleNamespace(angle=np.full(2, 0.04))
+    search = SimpleNamespace(data=data, scales=scales, floor=np.full(2, 1e-5), open_controller=False)
+    found = judge.stages(search, everything, data, np.array([1e-4, 1.4e-3]))
+    assert [stage.group[0] for stage in found] == ["link.mass_moment", "controller.delay"]

@@ -10,11 +10,14 @@ from servo_arm import model_text, record
 
 from armlink.recording.recording import Recording
 from sim_gap.closed_loop import judge, prune, rivals
+from sim_gap.closed_loop import search as edits
 from sim_gap.closed_loop.candidates import _explained
+from sim_gap.closed_loop.columns import with_columns
+from sim_gap.closed_loop.compete import select
 from sim_gap.closed_loop.controller import _from_grid, nominal_controller, nominal_point, scales_of
-from sim_gap.closed_loop.fit import Fit, batch, jacobian
+from sim_gap.closed_loop.fit import Fit, batch, evaluate, improve, jacobian
 from sim_gap.closed_loop.identify import _frozen
-from sim_gap.closed_loop.parameters import Scales
+from sim_gap.closed_loop.parameters import EFFECTS, Scales
 from sim_gap.closed_loop.search import PRICE, Search
 from sim_gap.closed_loop.simulate import simulate
 from sim_gap.closed_loop.tracks import held_command
@@ -24,6 +27,7 @@ from sim_gap.closed_loop.windows import WARM_S, Windows, windows_of
 from sim_gap.model.load import load_model
 
 TEXT = model_text(kp=15.0, friction=0.2)
+SMOOTH = model_text(kp=3.0, friction=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -150,10 +154,10 @@ def test_a_coefficient_of_the_whole_arm_is_one_and_a_joints_is_in_its_own_scale(
 
 
 def test_an_effect_of_the_whole_arm_is_taken_out_by_its_own_names(monkeypatch) -> None:
-    monkeypatch.setattr(judge, "shared_effects", lambda arm: {"base.tilt": ("tilt.x", "tilt.y"), "other": ("z",)})
+    monkeypatch.setattr(edits, "shared_effects", lambda arm: {"base.tilt": ("tilt.x", "tilt.y"), "other": ("z",)})
     names = ("tilt.x", "tilt.y", "z")
     fit = Fit({name: np.array([0.3]) for name in (*names, "kp")}, ((),), names)
-    bare = judge.taken_out(SimpleNamespace(data=SimpleNamespace(arm=None)), fit, ("base.tilt", ()))
+    bare = edits.taken_out(SimpleNamespace(data=SimpleNamespace(arm=None)), fit, ("base.tilt", ()))
     assert {name: float(x[0]) for name, x in bare.point.items()} == {"tilt.x": 0.0, "tilt.y": 0.0, "z": 0.3, "kp": 0.3}
     assert bare.shared == ("z",)
 
@@ -192,18 +196,65 @@ def test_the_common_scale_is_open_if_half_as_much_again_fits_as_well(monkeypatch
     assert rivals._scale_rivals(search, fit) == named
 
 
+def _searched(text: str, seen: Recording, *looked_for: str) -> tuple[Search, Fit]:
+    """The search of some effects from the model with its own controller, and the fit of that model."""
+    sim = load_model(mujoco.MjModel.from_xml_string(text))
+    data = with_columns(windows_of(sim.arm, [seen], ["run"]))
+    point = nominal_point(data, nominal_controller(sim))
+    without = frozenset({*EFFECTS, "position.offset", "link.payload", "link.mass_moment", "base.tilt"} - {*looked_for})
+    search = Search(data, scales_of(data), point, np.full(2, 2e-4), without)
+    return search, evaluate(data, Fit(point, ((), ())))
+
+
+def test_a_spring_that_a_moved_mass_would_replace_is_confounded_with_it() -> None:
+    moved = TEXT.replace('pos="0.08 0 0"', 'pos="0.12 0 0"')
+    search, bare = _searched(
+        TEXT, record(moved, 1, 14.0), "transmission.spring", "controller.delay", "link.mass_moment"
+    )
+    fit = improve(search.data, edits.with_effect(search, bare, "transmission.spring", 1), search.scales)
+    assert search.score(fit)[1] < search.score(bare)[1] - 2.0 * PRICE
+    least, close = rivals.rivals_of(search, fit, ("transmission.spring", (1,)), bare)
+    assert "link.mass_moment" in close
+    assert least < PRICE
+
+
+def test_the_joints_beyond_one_feel_its_zero() -> None:
+    """A shoulder that reads 0.15 rad too little turns gravity at the elbow too, which is no effect of its own."""
+    seen = record(SMOOTH, 1, 14.0)
+    assert seen.position_command is not None
+    off = np.array([0.15, 0.0])
+    shifted = replace(seen, position=seen.position - off, position_command=seen.position_command - off)
+    search, bare = _searched(SMOOTH, shifted, "position.offset")
+    found = select(search, bare)
+    assert found.rms is not None
+    assert bare.rms is not None
+    assert (judge.joint_rms(search.data, found.rms) < 0.4 * judge.joint_rms(search.data, bare.rms)).all()
+    assert found.shared == ("zero0.angle",)
+    assert found.point["zero0.angle"][0] == pytest.approx(0.15, rel=0.15)  # its torque is linear in it here
+
+
+def test_an_offset_is_tried_in_place_of_a_mass_even_if_more_free_effects_promise_more(monkeypatch) -> None:
+    """About the last joint both are the same torque, and the one with a parameter promises least."""
+    search, bare = _searched(TEXT, record(TEXT, 1, 14.0), "position.offset", "link.payload", "link.mass_moment")
+    fit = replace(bare, shared=("moment1.x", "moment1.z"))
+    monkeypatch.setattr(rivals, "expected_shared", lambda *given: float(len(given[-1])))
+    monkeypatch.setattr(rivals, "improve", lambda data, fit, scales, iterations: evaluate(data, fit))
+    tried = [name for name, _ in rivals._of_the_arm(search, fit, ("link.mass_moment@elbow", ()), bare)]
+    assert sorted(name.partition("@")[0] for name in tried) == ["link.mass_moment", "link.payload", "position.offset"]
+
+
 @pytest.mark.parametrize(("group", "lost"), [(("base.tilt", ()), 4.0), (("friction.coulomb", (0,)), 2.0)])
 def test_a_rival_is_measured_by_all_that_is_lost_without_the_effect(monkeypatch, group: tuple, lost: float) -> None:
     """Both joints lose 30 prices without it and two with another in its place: a fifteenth, of one joint and of all."""
     base, fit, bare = np.zeros(2), SimpleNamespace(rms=1, name="fit"), SimpleNamespace(rms=1, name="bare")
     scores = {"fit": base, "bare": base + 30.0 * PRICE, "trial": base + 2.0 * PRICE}
     search = SimpleNamespace(data=None, scales=None, excluded=frozenset(), score=lambda fit: scores[fit.name])
-    monkeypatch.setattr(rivals, "ranked", lambda search, fit, own: [[(1.0, "position.offset")]] * 2)
+    monkeypatch.setattr(rivals, "ranked", lambda search, fit, own: [[(1.0, "controller.delay")]] * 2)
     monkeypatch.setattr(rivals, "with_effect", lambda search, fit, other, place: Fit({}, ((), ())))
     monkeypatch.setattr(rivals, "improve", lambda *given: SimpleNamespace(rms=1, name="trial"))
     monkeypatch.setattr(rivals, "_of_the_arm", lambda *given: [])
     least, close = rivals.rivals_of(search, fit, group, bare)
-    assert "position.offset" in close
+    assert "controller.delay" in close
     elsewhere = 30.0 if group[1] else 0.0  # which the joint's rival does not touch
     assert least == pytest.approx((lost + elsewhere) * PRICE)
 
@@ -244,7 +295,7 @@ def test_friction_that_a_simulator_cannot_hold_is_added_to_coulombs(monkeypatch)
         "feed": 0.0,
     }
     fit = Fit({name: np.array([value]) for name, value in own.items()}, (("coulomb", "stribeck", "load"),))
-    data = SimpleNamespace(joints=1, load=np.full((5, 1, 2), 4.0))
+    data = SimpleNamespace(joints=1, load=np.full((5, 1, 2), 4.0), arm=SimpleNamespace(names=()))
     nominal = dict.fromkeys(own, nothing)
     monkeypatch.setattr(export, "improve", lambda data, fit, scales, iterations: fit)
     held = export.native_fit(SimpleNamespace(data=data, nominal=nominal, scales=None), fit)
