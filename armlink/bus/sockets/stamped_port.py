@@ -1,6 +1,7 @@
 """Ports for listeners: batches of frames with the kernel's timestamps."""
 
 import ctypes
+import itertools
 import select
 import socket
 import struct
@@ -40,7 +41,7 @@ class Stamping(DatagramPort):
         """All frames in the receive queue, in order; raises BusFault.
 
         The kernel's timestamps are in wall-clock time. They are converted by the current difference between both
-        clocks and limited to the interval since the last call, so that setting the clock affects one batch only.
+        clocks and put in order as by `in_order`, so that setting the clock affects one batch only.
         """
         earliest = self._began
         self._began, ahead = _clocks()
@@ -59,14 +60,27 @@ class Stamping(DatagramPort):
                 break
         if others:
             self._take_others(others)
-        latest = time.monotonic()
-        if frames and not earliest <= frames[0][0] <= frames[-1][0] <= latest:
-            frames = [(min(max(t, earliest), latest), can_id, data) for t, can_id, data in frames]
-        return frames
+        return in_order(frames, earliest, time.monotonic())
 
 
 class StampedSocketPort(Stamping, SocketPort):
     """SocketCAN with timestamps."""
+
+
+def in_order(frames: list[Stamped], earliest: float, latest: float) -> list[Stamped]:
+    """The frames, no time before `earliest` or after `latest` or that of a later frame.
+
+    The kernel turns its timestamps on some milliseconds after it was asked (Linux, `net_enable_timestamp`); a frame
+    that came before gets the time at which it is read.
+    """
+    inside = frames and earliest <= frames[0][0] and frames[-1][0] <= latest
+    if inside and all(one[0] <= other[0] for one, other in itertools.pairwise(frames)):
+        return frames
+    ordered = []
+    for t, can_id, data in reversed(frames):
+        latest = min(t, latest)
+        ordered.append((max(latest, earliest), can_id, data))
+    return ordered[::-1]
 
 
 def _clocks() -> tuple[float, float]:
