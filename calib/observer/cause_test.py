@@ -81,10 +81,8 @@ class Solved:
 
 def solved(columns: Array, target: Array) -> Solved:
     """The fit of whitened columns (K, p) to a whitened target (K,)."""
-    size = np.linalg.norm(columns, axis=0)
-    size[size <= 1e-9] = 1.0
-    u, s, vt = np.linalg.svd(columns / size, full_matrices=False)
-    kept = s > max(1e-6 * s[0], 1e-12)
+    u, s, vt, size = _decomposed(columns)
+    kept = s > 0
     back = (vt[kept].T / s[kept]) / size[:, None]
     explained = u[:, kept].T @ target
     covariance = back @ back.T
@@ -92,6 +90,20 @@ def solved(columns: Array, target: Array) -> Solved:
     covariance[hidden] = covariance[:, hidden] = 0.0
     chi2 = float(target @ target) - float(explained @ explained)
     return Solved(back @ explained, covariance, chi2, int(kept.sum()))
+
+
+def span(columns: Array) -> Array:
+    """An orthonormal basis (K, r) of whitened columns (K, p), of which r are independent."""
+    u, s, _, _ = _decomposed(columns)
+    return u[:, s > 0]
+
+
+def _decomposed(columns: Array) -> tuple[Array, Array, Array, Array]:
+    """u, s, vt of columns (K, p) in units of their lengths, and these; s is 0 where columns depend on others."""
+    size = np.linalg.norm(columns, axis=0)
+    size[size <= 1e-9] = 1.0
+    u, s, vt = np.linalg.svd(columns / size, full_matrices=False)
+    return u, np.where(s > max(1e-6 * s[0], 1e-12), s, 0.0), vt, size
 
 
 def smallest_noticed(own: Array, rivals: Iterable[tuple[Array, int]], evidence: float) -> float:
@@ -261,8 +273,7 @@ class CauseTest:
     @cached_property
     def _bases(self) -> list[Array]:
         """An orthonormal basis of each entry's columns."""
-        kept = [columns[:, np.linalg.norm(columns, axis=0) > 1e-9] for columns in self._columns]
-        return [np.linalg.qr(columns)[0] for columns in kept]
+        return [span(columns) for columns in self._columns]
 
     def of_model(self, joint: int) -> float:
         """Share of the model's own error in the variance of a joint's residuals."""

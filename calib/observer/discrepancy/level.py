@@ -14,6 +14,8 @@ SHARES = np.array([0.4, 0.3, 0.2, 0.1])
 """Shares of the parts (`kernel.PARTS`, then the rough one) in the variance, before the first row."""
 SPREAD_SHARES = 0.7
 """Standard deviation of the logarithm of a part, beside that of the whole."""
+DEPENDENT = 1e-6
+"""Singular value of columns of unit length below which one of them depends on the others."""
 STEPS, LONGEST = 6, 0.7
 """Steps of the search by Fisher scoring, and the longest one, in the logarithm of a standard deviation."""
 SPREAD_UNKNOWN, SPREAD_KNOWN = 1.2, 0.4
@@ -74,14 +76,13 @@ class Level:
         model at N poses. noise (n,) [N·m]: of one row. known (n, N, P): columns of the model's stated uncertainty, with
         unit prior. free (n, N, p): columns of any size that the level must not take for discrepancy.
         """
-        complement = np.linalg.qr(free, mode="complete")[0][:, :, free.shape[2] :]
+        complement, told = _complement(free)
         across = complement.swapaxes(1, 2)
         left, columns = across @ residual[:, :, None], across @ known
-        size = left.shape[1]
-        parts = np.concatenate(
-            [across @ unit @ complement, np.broadcast_to(np.eye(size), (1, *left.shape[:1], size, size))]
-        )
-        fixed = columns @ columns.swapaxes(1, 2) + noise[:, None, None] ** 2 * np.eye(size)
+        one = np.eye(told.shape[1])
+        parts = np.concatenate([across @ unit @ complement, (told[:, :, None] * one)[None]])
+        variance = np.where(told, noise[:, None] ** 2, 1.0)  # any where there is nothing
+        fixed = columns @ columns.swapaxes(1, 2) + variance[:, :, None] * one
         least = SMALLEST * noise
         expected = np.log(np.maximum(np.sqrt(SHARES)[:, None] * self.before, least))
         weight = 1 / (self.spread**2 + SPREAD_SHARES**2)
@@ -100,3 +101,15 @@ class Level:
             step = np.linalg.solve(hessian, gradient.T[:, :, None])[:, :, 0].T
             stds = np.maximum(stds * np.exp(-np.clip(step, -LONGEST, LONGEST)), least)
         return replace(self, smooth=stds[:-1], rough=stds[-1], rows=residual.shape[1])
+
+
+def _complement(columns: Array) -> tuple[Array, Array]:
+    """Orthonormal basis (n, N, N) of what columns (n, N, p) do not span, and which of its vectors are any (n, N).
+
+    The others are zero. Columns that depend on others, as a payload's do at the last joints, span nothing more.
+    """
+    size = np.linalg.norm(columns, axis=1, keepdims=True)
+    vectors, lengths, _ = np.linalg.svd(columns / np.where(size > 0, size, 1.0))
+    rank = (lengths > DEPENDENT).sum(axis=1)
+    told = np.arange(columns.shape[1]) >= rank[:, None]
+    return vectors * told[:, None, :], told

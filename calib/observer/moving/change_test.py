@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from calib.creep.parameters import family_slices
-from calib.observer.cause_test import Verdict, smallest_noticed, solved
+from calib.observer.cause_test import Verdict, smallest_noticed, solved, span
 from calib.observer.config import ObserverConfig
 from calib.observer.moving.belief import MotorBelief
 from calib.observer.moving.passages import Passage
@@ -120,7 +120,7 @@ class ChangeTest:
         if own is None:
             return float("nan")
         others = (each.columns for each in self._candidates if each is not own)
-        rivals = ((np.linalg.qr(columns)[0], columns.shape[1]) for columns in others)
+        rivals = ((span(columns), columns.shape[1]) for columns in others)
         return smallest_noticed(own.columns[:, 0], rivals, self._config.evidence)
 
     def _whitened(self, columns: Array) -> Array:

@@ -10,7 +10,7 @@ from drawn_arms import drawn_arm
 from effects_on_readings import CONFIG, SIGMA, payload
 
 from calib.arm.kinematics import gcomp_arm
-from calib.observer.cause_test import CauseTest, Verdict
+from calib.observer.cause_test import CauseTest, Verdict, smallest_noticed, span
 from calib.observer.effect_dictionary import dictionary
 from calib.observer.gravity_belief import GravityBelief
 from gcomp.arm.arm import Arm
@@ -282,3 +282,14 @@ def test_a_payload_whose_mass_no_lever_shows_is_a_payload() -> None:
     assert verdict.cause == "payload"
     assert verdict.covariance[0, 0] == 0
     assert verdict.values[1:3] == pytest.approx([0.08, -0.04], abs=0.02)
+
+
+def test_a_rival_counts_for_what_its_columns_show_and_no_more() -> None:
+    """A column that depends on others spans nothing, whatever its rounding points to."""
+    random = np.random.default_rng(3)
+    own, columns = random.normal(size=20), random.normal(size=(20, 3))
+    dependent = np.column_stack([columns, columns @ [1.0, -2.0, 0.5], np.zeros(20)])
+    assert span(dependent).shape == (20, 3)
+    np.testing.assert_allclose(span(dependent) @ span(dependent).T, span(columns) @ span(columns).T, atol=1e-12)
+    once, twice = (smallest_noticed(own, [(span(each), 4)], 10.0) for each in (columns, dependent))
+    assert once == pytest.approx(twice, rel=1e-9)

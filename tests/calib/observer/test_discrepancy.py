@@ -54,6 +54,20 @@ def test_an_offset_a_gain_and_a_payload_are_not_taken_for_discrepancy(sarcos, sa
     assert (belief.level.total < expected.before).all()
 
 
+def test_columns_that_depend_on_others_change_nothing(sarcos) -> None:
+    """Of a load that the last joint feels in three ways only, say: nothing but rounding tells which one is too many."""
+    random = np.random.default_rng(5)
+    unit = np.broadcast_to(np.exp(-np.abs(np.subtract.outer(range(14), range(14))) / 3.0), (3, 7, 14, 14))
+    residual, free = random.normal(size=(7, 14)), random.normal(size=(7, 14, 3))
+    known = 0.01 * random.normal(size=(7, 14, 2))
+    level = Level.expected(np.full(7, 0.5))
+    plain = level.fitted(unit, residual, np.full(7, NOISE), known, free)
+    twice = np.concatenate([free, free @ random.normal(size=(3, 2)), np.zeros((7, 14, 1))], axis=2)
+    again = level.fitted(unit, residual, np.full(7, NOISE), known, twice)
+    np.testing.assert_allclose(again.smooth, plain.smooth, rtol=1e-8)
+    np.testing.assert_allclose(again.rough, plain.rough, rtol=1e-8)
+
+
 def test_what_is_predicted_holds_within_its_covariance(sarcos, sarcos_beta) -> None:
     """Drawn from the prior, predicted at other poses from 100 rows: whitened errors are standard normal."""
     random, ratios, shrunk = np.random.default_rng(4), [], []
