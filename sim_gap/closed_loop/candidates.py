@@ -7,7 +7,7 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.closed_loop.fit import Fit, batch, jacobian, residuals
 from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS
-from sim_gap.closed_loop.search import LEVELS, PRICE, Search, effect_there, level_of, start_of
+from sim_gap.closed_loop.search import LEVELS, PRICE, Search, acts, effect_there, level_of, start_of
 
 
 def ranked(search: Search, fit: Fit, own: Sequence[str]) -> list[list[tuple[float, str]]]:
@@ -24,7 +24,7 @@ def ranked(search: Search, fit: Fit, own: Sequence[str]) -> list[list[tuple[floa
         columns = answers[at : at + len(each)]
         at += len(each)
         for j in range(search.data.joints):
-            if effect_there(fit, effect, j) or any(not effect_there(fit, need, j) for need in EFFECTS[effect].needs):
+            if effect_there(fit, effect, j) or not all(acts(fit.point, need, j) for need in EFFECTS[effect].needs):
                 continue
             share = _explained(now[:, j], slopes[j], columns[:, :, j], signed=_one_sided(fit, effect, j))
             expected = -0.5 * float(search.samples[j]) * np.log(max(1.0 - share, 1e-6))

@@ -57,7 +57,7 @@ class LoopEffect:
     parameters: tuple[str, ...]
     reported: tuple[str, ...]
     needs: tuple[str, ...] = ()
-    """Effects that have to be there before."""
+    """Effects that have to be there before, fitted or in the model as it is."""
     controller: bool = False
     """Whether it belongs to the controller, which a model without actuators leaves open."""
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from sim_gap.closed_loop.fit import LOGARITHMIC, Fit, improve, jacobian
 from sim_gap.closed_loop.parameters import EFFECTS
-from sim_gap.closed_loop.search import Search, effects_at, merged, only, price, without
+from sim_gap.closed_loop.search import Search, acts, effects_at, merged, only, price, without
 
 DOUBTFUL = 4.0
 """Expected loss, in prices, up to which it is tried whether an effect is needed."""
@@ -75,4 +75,4 @@ def _distance(search: Search, fit: Fit, name: str, joint: int) -> float:
 
 def _removable(search: Search, fit: Fit, effect: str, joint: int) -> bool:
     needed = any(effect in EFFECTS[other].needs for other in effects_at(fit, joint))
-    return effect not in search.kept and not needed
+    return effect not in search.kept and (not needed or acts(search.nominal, effect, joint))

@@ -1,5 +1,6 @@
 """What the competition of effects works on, and an effect put into a fit or taken out of it."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -125,6 +126,12 @@ def taken_out(search: Search, fit: Fit, group: Group) -> Fit:
 def effect_there(fit: Fit, effect: str, joint: int) -> bool:
     """Whether a joint has an effect among its fitted parameters."""
     return EFFECTS[effect].parameters[0] in fit.active[joint]
+
+
+def acts(point: Mapping[str, Array], effect: str, joint: int) -> bool:
+    """Whether an effect changes the motion of a joint, fitted or not: its first parameter is not neutral."""
+    first = EFFECTS[effect].parameters[0]
+    return bool(point[first][joint] != PARAMETERS[first].neutral)
 
 
 def effects_at(fit: Fit, joint: int) -> list[str]:

@@ -11,7 +11,7 @@ from servo_arm import model_text, record
 from armlink.recording.recording import Recording
 from sim_gap.closed_loop import judge, prune, rivals
 from sim_gap.closed_loop import search as edits
-from sim_gap.closed_loop.candidates import _explained
+from sim_gap.closed_loop.candidates import _explained, ranked
 from sim_gap.closed_loop.columns import with_columns
 from sim_gap.closed_loop.compete import select
 from sim_gap.closed_loop.controller import _from_grid, nominal_controller, nominal_point, scales_of
@@ -309,3 +309,18 @@ def test_the_opening_of_a_replay_is_not_judged(monkeypatch) -> None:
     monkeypatch.setattr(replays, "replay", lambda model, joints, recording: (t, simulated, measured))
     recording = Recording(t=t, position=measured, position_command=measured)
     assert replays.replay_rms(None, [0], [recording]) == pytest.approx([0.5])
+
+
+def test_what_needs_coulomb_friction_is_tried_where_the_model_has_it(data: Windows) -> None:
+    """At the joint whose friction is taken away it is not, before Coulomb friction is fitted there."""
+    sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
+    point = nominal_point(data, nominal_controller(sim))
+    point["coulomb"] = np.array([0.2, 0.0])
+    about = Search(data, scales_of(data), point, np.full(2, 1e-4))
+    bare = evaluate(data, Fit(point, ((), ())))
+    first, second = ranked(about, bare, ["friction.asymmetric", "friction.stribeck"])
+    assert {effect for _, effect in first} == {"friction.asymmetric", "friction.stribeck"}
+    assert second == []
+    both = replace(bare, active=(("coulomb", "asymmetry"), ("coulomb", "asymmetry")))
+    assert prune._removable(about, both, "friction.coulomb", 0)
+    assert not prune._removable(about, both, "friction.coulomb", 1)
