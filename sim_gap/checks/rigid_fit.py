@@ -23,6 +23,8 @@ TURNING = 0.02
 """Speed from which friction has its full sign [rad/s]."""
 MOVING_SHARE = 0.3
 """Share of rows in motion from which the sign of friction counts."""
+MOVING_LEAST = 0.1
+"""Share of rows in motion from which a motor's torque at rest is left out."""
 FLOOR = 0.02
 """Share of a reading's variance below which what is left does not count: noise, and effects of every arm."""
 MOUNTED = 0.1
@@ -114,8 +116,19 @@ def _covariances(model: Array, motion: Motion, springs: bool) -> Array:
     """Of model torque, direction, velocity, acceleration, position and reading of every joint, (n, 6, 6)."""
     turned = motion.q if springs else 0.0 * motion.q
     columns = np.stack([model, motion.direction, motion.v, motion.a, turned, motion.reading]).transpose(2, 0, 1)
-    columns = columns - columns.mean(-1, keepdims=True)
-    return np.asarray(columns @ columns.transpose(0, 2, 1) / len(model))
+    telling = _telling(motion).T[:, None]
+    weight = telling / telling.sum(-1, keepdims=True)
+    columns = columns - (columns * weight).sum(-1, keepdims=True)
+    return np.asarray((columns * weight) @ columns.transpose(0, 2, 1))
+
+
+def _telling(motion: Motion) -> NDArray[np.bool_]:
+    """Rows that are fitted at each joint, (K, n): friction at rest takes any value, which a motor has to hold.
+
+    All rows of a sensor on the link, and of a joint that hardly moves.
+    """
+    moving = np.abs(motion.v) > TURNING
+    return np.asarray(moving | (motion.channel == "tau") | (moving.mean(0) < MOVING_LEAST))
 
 
 def beside_slow_torques(arm: RigidArm, motion: Motion, fit: RigidFit) -> RigidFit:

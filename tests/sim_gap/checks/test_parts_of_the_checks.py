@@ -1,5 +1,6 @@
 """Single figures of the checks before a diagnosis: sample times, correlations, delays, signs, units."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -97,3 +98,19 @@ def test_the_option_for_degrees_names_what_was_recorded() -> None:
         (there, there, "--units q=deg,dq=deg,q_cmd=deg"),
     ):
         assert _degrees(SimpleNamespace(velocity=velocity, position_command=command)) == option
+
+
+def test_what_friction_holds_at_rest_is_no_part_of_a_motors_fit() -> None:
+    """It moves for a fifth of the time. A sensor on the link reads the model at rest, too, and a joint that hardly
+    moves has nothing else."""
+    random = np.random.default_rng(2)
+    t = np.arange(0.0, 30.0, 0.02)
+    v = np.where(t % 5.0 < 1.0, np.sin(2.0 * np.pi * t), 0.0)[:, None]
+    model = random.normal(size=(len(t), 1))
+    reading = model + np.where(v == 0.0, np.repeat(random.uniform(-3.0, 3.0, 30), 50)[:, None], 3.0 * np.sign(v))
+    moved = Motion(v, v, 0.0 * v, reading, "tau_motor")
+    seldom = np.where(t[:, None] < 5.0, v, 0.0)
+    fits = fit_models([(model, moved), (model, replace(moved, channel="tau")), (model, replace(moved, v=seldom))])
+    explained = [float(fit.explained[0]) for fit in fits]
+    assert explained[0] > 0.98
+    assert max(explained[1:]) < 0.7
