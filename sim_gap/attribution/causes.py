@@ -181,12 +181,17 @@ def _minor(shows: set[Row], layout: Layout) -> Array:
 
 
 def causes(
-    estimate: Estimate, heldout: ResidualSet, rivals: Rivals, names: tuple[str, ...], quiet: bool = False
+    estimate: Estimate,
+    heldout: ResidualSet,
+    rivals: Rivals,
+    names: tuple[str, ...],
+    quiet: bool = False,
+    within: bool = False,
 ) -> tuple[list[Cause], list[Cause]]:
     """The causes, most important first, and the minor ones: whole effects, and joints at which an effect is small.
 
     If all is `quiet`, noise could explain everything: a cause that does not show throughout the held-out data is minor,
-    too.
+    too. So is one that may be nothing, by its own intervals, if all is `within` its margins.
     """
     found: list[Cause] = []
     minor: list[Cause] = []
@@ -197,6 +202,8 @@ def causes(
     for step in ordered(estimate, scorer):
         main = relevant_terms(step, estimate, heldout, scorer, quiet)
         if quiet and main and steadiness(estimate, heldout, main) < STEADY:
+            main = ()
+        if within and all(estimate.may_be_nothing(term) for term in main):
             main = ()
         rest = tuple(term for term in step.terms if term not in main)
         for terms, out in ((main, found), (rest, minor)):

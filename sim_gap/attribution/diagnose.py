@@ -118,8 +118,9 @@ def diagnose(
             heldout_is += f"; of {', '.join(judge.signals[k].label for k in lent)} the second half, for {LENT}"
     fit = estimate.store.data
     quiet = not fit.impacts and is_quiet(judge) and is_quiet(fit)
-    found, minor = causes(estimate, judge, Rivals(search), sim.arm.names, quiet=quiet)
-    if is_within(judge) and is_within(fit):
+    within = is_within(judge) and is_within(fit)
+    found, minor = causes(estimate, judge, Rivals(search), sim.arm.names, quiet=quiet, within=within)
+    if within:
         found, minor = founded_ones(found, minor)
     if quiet and not found:
         made = answer(Internals(sim, fit, judge, None, tuple(heldout), estimate), [], [], heldout_is)

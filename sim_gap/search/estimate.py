@@ -157,6 +157,17 @@ class Estimate:
             errors.append(NOMINAL * arm.inertial[:, 1:4].reshape(-1, 1))
         return np.hstack(errors)
 
+    def may_be_nothing(self, term: Term) -> bool:
+        """Whether the 95 % interval of every coefficient of a term contains zero."""
+        at = self.normal.at[term]
+        return bool(np.all(np.abs(self.of(term)) <= self._quantile * np.sqrt(np.diag(self.covariance)[at])))
+
+    @cached_property
+    def _quantile(self) -> float:
+        """Half of a 95 % interval in standard deviations."""
+        blocks = int(self.store.data.blocks.max()) + 1
+        return float(stdtrit(max(blocks - 1, 1), 0.975))
+
     def parameters(self, term: Term) -> dict[str, Value]:
         """Reported parameters with 95 % intervals."""
         effect = term.form
@@ -183,8 +194,7 @@ class Estimate:
         ]
         jacobian = np.stack(slopes, axis=1)
         spread = np.sqrt(np.maximum(np.diag(jacobian @ self.covariance[np.ix_(chosen, chosen)] @ jacobian.T), 0.0))
-        blocks = int(self.store.data.blocks.max()) + 1
-        half = spread * stdtrit(max(blocks - 1, 1), 0.975)
+        half = spread * self._quantile
         return {
             name: Value(float(c), float(c - h), float(c + h), unit)
             for (name, unit), c, h in zip(effect.reported, centre, half, strict=True)

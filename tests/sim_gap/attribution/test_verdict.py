@@ -3,8 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from wrong_arms import Wrong, model, record
 
+from sim_gap.attribution import diagnose
 from sim_gap.attribution.causes import _Scorer, founded_ones
 from sim_gap.attribution.confidence import founded
 from sim_gap.attribution.diagnosis import Cause, Signs
@@ -57,3 +59,14 @@ def test_within_the_margins_a_cause_that_nothing_founds_is_minor():
     sure, weak = cause("friction.coulomb", 1.0, 0.9), cause("torque.offset", 0.5, 0.2)
     rival = replace(weak, confounded_with=("link.mass_moment",))
     assert founded_ones([sure, weak, rival], []) == ([sure, rival], [weak])
+
+
+@pytest.mark.parametrize(("within", "named"), [(False, True), (True, False)])
+def test_within_the_margins_what_may_be_nothing_is_minor(monkeypatch, within, named):
+    """Beyond them it is a cause all the same: something makes the gap."""
+    wrong = Wrong(coulomb=0.6)
+    recordings = [record(model(), wrong, seed=seed, seconds=12.0, rate=50.0) for seed in (1, 2)]
+    monkeypatch.setattr(diagnose, "is_within", lambda data: within)
+    monkeypatch.setattr(Estimate, "may_be_nothing", lambda self, term: True)
+    answer = diagnose.diagnose(model(), recordings[:1], recordings[1:])
+    assert [bool(each) for each in (answer.causes, answer.minor)] == [named, not named]

@@ -117,6 +117,16 @@ def test_friction_that_is_clearly_there_has_a_narrow_interval(data: ResidualSet)
     assert torque.high - torque.low < 1.5
 
 
+def test_what_is_not_there_may_be_nothing_by_its_interval(data: ResidualSet) -> None:
+    terms = [COULOMB, Term("friction.viscous", 1), Term("friction.stribeck", 1, (0.1,)), GAIN]
+    estimate = Estimate(ColumnStore(data), terms)
+    found = {term.effect: term for term in estimate.terms}
+    (gain,) = estimate.parameters(found["actuator.gain"]).values()
+    assert gain.low < 1.0 < gain.high
+    assert estimate.may_be_nothing(found["actuator.gain"])
+    assert not estimate.may_be_nothing(found["friction.coulomb"])
+
+
 def test_a_body_that_cannot_exist_gives_way_to_the_closest_that_can() -> None:
     """Of a diagonal matrix 1 + x, the coefficient beyond −1 ends there and the other one stays."""
     best = _closest(np.array([-2.0, 0.3]), np.eye(2), lambda x: np.diag(1.0 + x))
