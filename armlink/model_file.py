@@ -1,5 +1,7 @@
-"""URDF and MJCF files as MuJoCo takes them: packages resolved, meshes that are not there left out."""
+"""URDF and MJCF files as MuJoCo takes them: packages resolved, meshes that cannot be read left out."""
 
+import logging
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,7 +9,10 @@ from typing import Any
 
 from armlink.errors import BadInput
 
+log = logging.getLogger(__name__)
 READABLE_MESHES = (".stl", ".obj", ".msh")
+STL_HEADER, STL_FACE = 84, 50
+"""Bytes of a binary STL file: header with the number of faces, and each face. MuJoCo reads no others."""
 PACKAGE = "package://"
 NEGLIGIBLE = 1e-14
 """Mass [kg] and inertia [kg·m²] of massless moving bodies, which are common in URDF files and MuJoCo refuses."""
@@ -33,9 +38,23 @@ class ModelFile:
     spec: Any
     """`mujoco.MjSpec`, without the shapes whose meshes are absent."""
     absent: tuple[str, ...]
-    """Mesh files that the model names and that are not there, or in a format that MuJoCo does not read."""
+    """Mesh files that the model names and that are not there."""
+    unreadable: tuple[str, ...]
+    """Mesh files that are there, in a format that MuJoCo does not read."""
+    unphysical: tuple[str, ...]
+    """Bodies of a URDF whose inertia has a negative principal moment; it is taken as negligible."""
     kind: str
     """URDF or MJCF."""
+
+    @property
+    def left_out(self) -> str:
+        """The meshes that are left out, with the reason; nothing if none is."""
+        reasons = {"not found": self.absent, "not binary STL, OBJ or MSH, which MuJoCo reads": self.unreadable}
+        return " and ".join(
+            f"{len(files)} {'mesh' if len(files) == 1 else 'meshes'} {reason}, such as {files[0]}"
+            for reason, files in reasons.items()
+            if files
+        )
 
     @property
     def shapes(self) -> int:
@@ -47,10 +66,12 @@ def read_model(path: Path) -> ModelFile:
     """Parse a URDF or MJCF file; raises BadInput if it cannot be read.
 
     A mesh `package://NAME/…` is looked for in the folders above the file, as ROS lays packages out. A mesh that is not
-    there costs its shape only: inertials are in the file itself.
+    there or cannot be read costs its shape only: inertials are in the file itself. MuJoCo's warnings go to the log,
+    instead of a file in the working directory.
     """
     import mujoco
 
+    mujoco.set_mju_user_warning(log.info)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
@@ -61,20 +82,23 @@ def read_model(path: Path) -> ModelFile:
         compiler.boundmass = compiler.boundinertia = NEGLIGIBLE
         compiler.balanceinertia, compiler.fusestatic = True, False
     folder = path.resolve().parent
-    absent = []
+    absent, unreadable = [], []
     for mesh in list(spec.meshes):
         if not mesh.file:
             continue
         file = _find(mesh.file, folder, folder / spec.compiler.meshdir)
-        if file is not None and (file.suffix.lower() in READABLE_MESHES or mesh.content_type):
-            mesh.file = str(file)
-            continue
-        absent.append(mesh.file)
         weighed = [geom.parent.name for geom in spec.geoms if geom.meshname == mesh.name and not _has_inertial(geom)]
+        if file is not None and (mesh.content_type or _is_readable(file)):
+            mesh.file = str(file)
+            if kind == "URDF" and not weighed:
+                mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # some enclose hardly any volume
+            continue
+        (absent if file is None else unreadable).append(mesh.file)
         if weighed and kind == "MJCF":
+            trouble = "is not there" if file is None else "is in a format that MuJoCo does not read"
             raise BadInput(
-                f"{path}: mesh {mesh.file} is not there, and body {weighed[0]!r} has its mass from it alone: put the "
-                "mesh beside the model, or give the body an inertial"
+                f"{path}: mesh {mesh.file} {trouble}, and body {weighed[0]!r} has its mass from it alone: put a mesh "
+                "that MuJoCo reads beside the model, or give the body an inertial"
             )
         _drop(spec, mesh)
     for texture in list(spec.textures):
@@ -82,7 +106,8 @@ def read_model(path: Path) -> ModelFile:
             _drop_texture(spec, texture)
     if kind == "URDF":
         spec.strippath = False  # the meshes' paths are absolute by now
-    return ModelFile(spec, tuple(absent), kind)
+    unphysical = _negative_inertias_removed(spec) if kind == "URDF" else ()
+    return ModelFile(spec, tuple(absent), tuple(unreadable), unphysical, kind)
 
 
 def compile_model(path: Path, beside: Sequence[Beside] = ()) -> Any:
@@ -91,10 +116,16 @@ def compile_model(path: Path, beside: Sequence[Beside] = ()) -> Any:
     for each in beside:
         frame = found.spec.worldbody.add_frame(pos=each.at, quat=_quaternion(each.turned))
         found.spec.attach(read_model(each.path).spec, prefix=each.prefix, frame=frame)
+    return compile_spec(found.spec, path, f" (without {found.left_out})" if found.left_out else "")
+
+
+def compile_spec(spec: Any, path: Path, hint: str = "") -> Any:
+    """A parsed model as `mujoco.MjModel`; raises BadInput with the file's name."""
     try:
-        return found.spec.compile()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # they are in the log
+            return spec.compile()
     except ValueError as error:
-        hint = f" (without the meshes {', '.join(found.absent)}, which are not there)" if found.absent else ""
         raise BadInput(f"{path}: MuJoCo cannot compile it{hint}: {one_line(error)}") from None
 
 
@@ -136,6 +167,33 @@ def _find(name: str, *folders: Path) -> Path | None:
     else:
         tries = [folder / name.removeprefix("file://") for folder in folders]
     return next((each for each in tries if each.is_file()), None)
+
+
+def _is_readable(mesh: Path) -> bool:
+    """Whether MuJoCo reads this mesh: not the text form of STL, which exporters write under the same suffix."""
+    suffix = mesh.suffix.lower()
+    if suffix != ".stl":
+        return suffix in READABLE_MESHES
+    with mesh.open("rb") as file:
+        faces = int.from_bytes(file.read(STL_HEADER)[STL_HEADER - 4 :], "little")
+    return mesh.stat().st_size == STL_HEADER + STL_FACE * faces
+
+
+def _negative_inertias_removed(spec: Any) -> tuple[str, ...]:
+    """Make negative principal moments negligible, which MuJoCo refuses; names of the bodies that had one."""
+    import numpy as np
+
+    changed = []
+    for body in spec.bodies:
+        xx, yy, zz, xy, xz, yz = body.fullinertia
+        if not np.isfinite(body.fullinertia).all():
+            continue
+        moments, axes = np.linalg.eigh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        if moments[0] < 0.0:
+            kept = axes @ np.diag(np.maximum(moments, 2.0 * NEGLIGIBLE)) @ axes.T
+            body.fullinertia = [*np.diag(kept), kept[0, 1], kept[0, 2], kept[1, 2]]
+            changed.append(body.name)
+    return tuple(changed)
 
 
 def _has_inertial(geom: Any) -> bool:

@@ -41,13 +41,18 @@ def _file_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
     assert arm_file.model_path is not None
     where = str(arm_file.model_path)
     model = read_model(arm_file.model_path)
-    if model.absent:
+    if model.unphysical:
         yield SetupFinding(
             "warning",
-            f"collision geometry not found: {len(model.absent)} meshes, such as {model.absent[0]}",
+            f"inertia with a negative principal moment, taken as none: {', '.join(model.unphysical)}",
             where,
-            "put the meshes where the model names them (package://NAME/… is looked for in the folders above it)",
+            "correct the inertia of these links, or know that their torque at acceleration is not modelled",
         )
+    if model.left_out:
+        remedy = "put the meshes where the model names them (package://NAME/… is looked for in the folders above it)"
+        if not model.absent:
+            remedy = "convert them to binary STL or OBJ, or keep the workspace clear"
+        yield SetupFinding("warning", f"collision geometry incomplete: {model.left_out}", where, remedy)
     elif not model.shapes:
         yield SetupFinding(
             "warning",

@@ -47,7 +47,7 @@ class Geometry:
         assert arm_file.model_path is not None
         self._mujoco = mujoco
         kinematics = gcomp_arm(arm_file)  # checks the chain, with errors in terms of the arm file
-        self.absent = read_model(arm_file.model_path).absent
+        self.left_out = read_model(arm_file.model_path).left_out
         parked = sweep_section(arm_file).beside
         self.model = compile_model(arm_file.model_path, [_attached(arm_file, each) for each in parked if each.model])
         self.data = mujoco.MjData(self.model)
@@ -101,14 +101,12 @@ def check_plan(arm_file: ArmFile, plan: SweepPlan) -> str:
         return "collisions not checked: the arm file has no kinematics.model with geometry"
     geometry = Geometry(arm_file)
     if geometry.model.ngeom == 0:
-        if geometry.absent:
-            return f"collisions not checked: {len(geometry.absent)} meshes not found, such as {geometry.absent[0]}"
-        return "collisions not checked: the model has no geometry"
+        return f"collisions not checked: {geometry.left_out or 'the model has no geometry'}"
     count = 0
     for place, pose in poses_along(plan):
         count += 1
         _require_free(arm_file, geometry, place, pose)
-    without = f", without {len(geometry.absent)} meshes that were not found" if geometry.absent else ""
+    without = f", without {geometry.left_out}" if geometry.left_out else ""
     return f"no collision at {count} poses along the way{without}"
 
 

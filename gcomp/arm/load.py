@@ -1,5 +1,6 @@
 """Arms from URDF and MJCF files, read through MuJoCo and converted to Denavit-Hartenberg form."""
 
+import logging
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +18,11 @@ from gcomp.errors import BadModel
 if TYPE_CHECKING:
     import mujoco
 
+log = logging.getLogger(__name__)
 URDF_COMPILER = {"fusestatic": "false", "discardvisual": "true", "balanceinertia": "true"}
 URDF_COMPILER |= {"boundmass": "1e-14", "boundinertia": "1e-14"}
 """MuJoCo refuses massless moving bodies, which are common in URDF files: they get a mass of no effect on gravity."""
+INERTIA_KEYS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +79,7 @@ def compile_model(path: Path) -> "mujoco.MjModel":
     """
     import mujoco
 
+    mujoco.set_mju_user_warning(log.info)
     try:
         root = parse_xml(path.read_bytes())
     except (NotXml, OSError) as error:
@@ -105,8 +109,21 @@ def _plain_urdf(root: ET.Element) -> str:
             link.remove(shape)
     for own in root.findall("mujoco"):
         root.remove(own)
+    for inertia in root.iter("inertia"):
+        if _has_negative_moment(inertia):
+            inertia.attrib.update(dict.fromkeys(INERTIA_KEYS, "0"))
     ET.SubElement(ET.SubElement(root, "mujoco"), "compiler", URDF_COMPILER)
     return ET.tostring(root, encoding="unicode")
+
+
+def _has_negative_moment(inertia: ET.Element) -> bool:
+    """Whether a URDF's inertia has a negative principal moment, which MuJoCo refuses and gravity does not need."""
+    try:
+        xx, xy, xz, yy, yz, zz = (float(inertia.get(key, "0")) for key in INERTIA_KEYS)
+    except ValueError:
+        return False  # MuJoCo says what is wrong
+    matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    return bool(np.isfinite(matrix).all() and np.linalg.eigvalsh(matrix)[0] < 0.0)
 
 
 def _chain(model: "mujoco.MjModel", path: Path, tip: str | None) -> list[int]:

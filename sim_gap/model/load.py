@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from armlink.errors import BadInput
-from armlink.model_file import one_line, read_model
+from armlink.model_file import compile_spec, read_model
 from sim_gap.model.arm_joints import arm_hinges, hinges_of
 from sim_gap.model.rigid_body import RigidArm, Tendons, inertial_of
 
@@ -68,10 +68,7 @@ def load_compiled(source: Any) -> Any:
 
 def compiled(path: Path) -> Any:
     """Compile an MJCF, URDF or arm file (by path or bundled name) to a `mujoco.MjModel`. Raises BadInput."""
-    try:
-        return read_spec(path).compile()
-    except ValueError as error:
-        raise BadInput(f"{path}: MuJoCo cannot compile it: {one_line(error)}") from None
+    return compile_spec(read_spec(path), path)
 
 
 def read_spec(path: Path) -> Any:

@@ -1,5 +1,9 @@
 """Model files that cannot be used are refused in one line."""
 
+import struct
+import warnings
+
+import numpy as np
 import pytest
 
 from armlink.errors import BadInput
@@ -7,7 +11,7 @@ from armlink.model_file import compile_model, read_model
 
 MODEL = """<mujoco><asset>{mesh}</asset><worldbody>{geom}<body name="arm">
 <joint name="hinge" axis="0 1 0"/></body></worldbody></mujoco>"""
-ABSENT = " (without the meshes missing.stl, which are not there)"
+ABSENT = " (without 1 mesh not found, such as missing.stl)"
 
 
 @pytest.mark.parametrize("absent", [True, False])
@@ -29,3 +33,68 @@ def test_a_urdf_whose_prefixes_are_not_declared_is_a_urdf(tmp_path):
     )
     assert read_model(path).kind == "URDF"
     assert compile_model(path).njnt == 1  # a massless body, which only a URDF may have
+
+
+URDF_LINK = """<link name="l{k}"><inertial><mass value="{mass}"/>
+<inertia ixx="{ixx}" iyy="{iyy}" izz="0.02" ixy="{ixy}" ixz="0" iyz="0"/></inertial>
+<collision><geometry><mesh filename="{mesh}"/></geometry></collision></link>"""
+
+
+def urdf(folder, **changed):
+    """One hinge with a link, whose inertial and mesh are as given."""
+    link = URDF_LINK.format(**{"k": 1, "mass": 1.0, "ixx": 0.02, "iyy": 0.03, "ixy": 0.0, "mesh": "l1.stl", **changed})
+    path = folder / "arm.urdf"
+    path.write_text(
+        f'<robot name="arm"><link name="base"/>{link}<joint name="j1" type="continuous"><axis xyz="0 1 0"/>'
+        '<parent link="base"/><child link="l1"/></joint></robot>'
+    )
+    return path
+
+
+def binary_stl(path, corners):
+    """A binary STL file of triangles (k, 3, 3) [m]."""
+    faces = b"".join(struct.pack("<12fH", *[0.0] * 3, *np.ravel(face), 0) for face in corners)
+    path.write_bytes(bytes(80) + struct.pack("<I", len(corners)) + faces)
+
+
+def test_an_inertia_with_a_negative_moment_is_negligible_and_said(tmp_path):
+    path = urdf(tmp_path, ixy=0.09)
+    assert read_model(path).unphysical == ("l1",)
+    model = compile_model(path)
+    assert model.body_mass[model.body("l1").id] == 1.0
+    assert (model.body_inertia[model.body("l1").id] > 0.0).all()
+    assert read_model(urdf(tmp_path)).unphysical == ()
+
+
+def test_a_mesh_in_the_text_form_of_stl_costs_its_shape_alone(tmp_path):
+    path = urdf(tmp_path)
+    (tmp_path / "l1.stl").write_text("solid l1\nendsolid l1\n")
+    found = read_model(path)
+    assert (found.absent, found.unreadable) == ((), ("l1.stl",))
+    assert found.left_out == "1 mesh not binary STL, OBJ or MSH, which MuJoCo reads, such as l1.stl"
+    assert compile_model(path).ngeom == 0
+
+
+def test_a_mesh_of_hardly_any_volume_is_read_where_the_link_has_an_inertial(tmp_path):
+    corners = 1e-6 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    faces = corners[[[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]]
+    binary_stl(tmp_path / "l1.stl", faces)
+    model = compile_model(urdf(tmp_path))
+    assert model.ngeom == 1
+    assert model.body_mass[model.body("l1").id] == 1.0
+
+
+def test_what_mujoco_warns_of_is_logged_and_no_file_appears(tmp_path, monkeypatch, caplog):
+    monkeypatch.chdir(tmp_path)
+    part = tmp_path / "part.xml"
+    part.write_text('<mujoco><worldbody><body name="b"><joint name="j"/><geom size="0.1"/></body></worldbody></mujoco>')
+    whole = tmp_path / "whole.xml"
+    whole.write_text(
+        f'<mujoco><asset><model name="part" file="{part}"/></asset><worldbody><frame><attach model="part" body="b" '
+        'prefix=""/></frame></worldbody></mujoco>'
+    )
+    with caplog.at_level("INFO"), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert compile_model(whole).njnt == 1
+    assert "empty prefix" in caplog.text
+    assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
