@@ -82,7 +82,8 @@ def read_model(path: Path) -> ModelFile:
         compiler.boundmass = compiler.boundinertia = NEGLIGIBLE
         compiler.balanceinertia, compiler.fusestatic = True, False
     folder = path.resolve().parent
-    absent, unreadable = [], []
+    absent: list[str] = []
+    unreadable: list[str] = []
     for mesh in list(spec.meshes):
         if not mesh.file:
             continue
