@@ -81,6 +81,8 @@ class Kinematics(Section):
     joints: tuple[DhJoint, ...] = ()
     model: Path | None = None
     """URDF or MJCF file instead of `joints`, relative to the arm file."""
+    base: str | None = None
+    """Body of the model that carries the chain; joints that move it keep the model's position. Default: the world."""
     tip: str | None = None
     """Body of the model that the chain ends in; by default its last."""
     stops: dict[str, Range] = {}

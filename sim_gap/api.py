@@ -18,6 +18,9 @@ def diagnose(
     model: Any,
     train: RecordingLike | Sequence[RecordingLike],
     heldout: RecordingLike | Sequence[RecordingLike] = (),
+    *,
+    base: str | None = None,
+    tip: str | None = None,
 ) -> Diagnosis:
     """Explain the gap between a simulation model and recordings of the real arm.
 
@@ -25,13 +28,14 @@ def diagnose(
         model: path of an MJCF, URDF or arm file, a bundled arm's name, or a compiled `mujoco.MjModel`: the nominal arm.
         train: one or several recordings to fit, or their paths.
         heldout: recordings to judge on, which the fit does not see; by default the end of each training recording.
+        base, tip: bodies of the model between which the recorded arm lies, if the model has several arms or a torso.
 
     Raises BadInput if the recordings cannot be used with the model.
     """
     trained, judged = _recordings("train", train), _recordings("heldout", heldout)
     labels = [label for label, _ in (*trained, *judged)]
     recordings = [recording for _, recording in trained], [recording for _, recording in judged]
-    return diagnosis.diagnose(model, *recordings, labels=labels)
+    return diagnosis.diagnose(model, *recordings, labels=labels, base=base, tip=tip)
 
 
 def _recordings(role: str, given: RecordingLike | Sequence[RecordingLike]) -> list[tuple[str, Recording]]:

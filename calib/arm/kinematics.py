@@ -45,7 +45,7 @@ def model_arm(arm_file: ArmFile) -> ModelArm:
         raise BadInput(f"{arm_file.path}: key kinematics.model is missing: this needs a URDF or MJCF file")
     gravity = kinematics.gravity if "gravity" in kinematics.model_fields_set else None
     try:
-        model = load_model(path, tip=kinematics.tip, gravity=gravity)
+        model = load_model(path, base=kinematics.base, tip=kinematics.tip, gravity=gravity)
     except GcompError as error:
         raise BadInput(f"{arm_file.path}: key kinematics.model: {error}") from None
     if arm_file.link is not None and arm_file.joint_names != model.arm.names:

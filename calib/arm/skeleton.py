@@ -41,7 +41,8 @@ def skeleton(arm_file: ArmFile) -> Skeleton:
         return _of_rows(arm)
     kinematics = arm_file.kinematics
     gravity = kinematics.gravity if "gravity" in kinematics.model_fields_set else None
-    return _of_model(place_chain(arm_file.model_path, tip=kinematics.tip, gravity=gravity), gravity)
+    placed = place_chain(arm_file.model_path, base=kinematics.base, tip=kinematics.tip, gravity=gravity)
+    return _of_model(placed, gravity)
 
 
 def _of_rows(arm: Arm) -> Skeleton:

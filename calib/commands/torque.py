@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 def torque(
     arm: Annotated[str, typer.Argument(help="Bundled arm, path of an arm file, or a URDF or MJCF file.")],
     q: Annotated[Path, typer.Option(help="CSV file of poses: a header row with columns q_1 … q_n [rad].")],
+    base: Annotated[
+        str | None, typer.Option(help="Body of the model file that carries the chain; default: the world.")
+    ] = None,
     tip: Annotated[
         str | None, typer.Option(help="Last body of the chain in the model file; default: the last that moves.")
     ] = None,
@@ -36,7 +39,7 @@ def torque(
     from calib.commands.poses_csv import load_poses
     from gcomp.gravity.torque import gravity_torque
 
-    described, beta, source = _model(arm, tip, record, store)
+    described, beta, source = _model(arm, base, tip, record, store)
     poses = load_poses(q, described.n)
     answer = gravity_torque(described, beta, poses)
     table = Table("pose", *described.names, title=f"Holding torque [N·m], {source}")
@@ -47,7 +50,9 @@ def torque(
     write_json(json_file, {"joints": list(described.names), "source": source, "torque": answer.tolist()})
 
 
-def _model(arm: str, tip: str | None, record: str | None, store: str | None) -> "tuple[Arm, Array, str]":
+def _model(
+    arm: str, base: str | None, tip: str | None, record: str | None, store: str | None
+) -> "tuple[Arm, Array, str]":
     """The arm, its mass moments (2n,) [kg·m], and their origin in words; raises BadInput, Refused."""
     import numpy as np
 
@@ -64,10 +69,10 @@ def _model(arm: str, tip: str | None, record: str | None, store: str | None) -> 
             raise BadInput(f"--record {record}: only with an arm file; {arm} is a model file")
         if not Path(arm).is_file():
             raise BadInput(f"no model file {arm}: give the path of a URDF or MJCF file, or of an arm file")
-        model = load_model(Path(arm), tip=tip)
+        model = load_model(Path(arm), base=base, tip=tip)
         return model.arm, model.beta, f"inertials of {arm}"
-    if tip is not None:
-        raise BadInput(f"--tip {tip}: only with a URDF or MJCF file; an arm file has its chain under kinematics")
+    if base is not None or tip is not None:
+        raise BadInput("--base, --tip: only with a URDF or MJCF file; an arm file has its chain under kinematics")
     arm_file = load_arm(arm)
     if record is None and arm_file.model_path is not None:
         model = model_arm(arm_file)

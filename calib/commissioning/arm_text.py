@@ -17,6 +17,8 @@ def arm_text(draft: Draft, out: Path) -> str:
         "kinematics:",
         f"  model: {_scalar(os.path.relpath(draft.model.resolve(), out.resolve().parent))}",
     ]
+    if draft.base is not None:
+        lines.append(f"  base: {_scalar(draft.base)}")
     if draft.tip is not None:
         lines.append(f"  tip: {_scalar(draft.tip)}")
     lines.append(f"  gravity: {json.dumps(list(draft.gravity))}  # m/s² in the model's frame")

@@ -23,21 +23,30 @@ class Chain:
         return self.joints[-1].body
 
 
-def find_chains(joints: Sequence[ModelJoint], path: Path, tip: str | None = None) -> list[Chain]:
+def find_chains(
+    joints: Sequence[ModelJoint], path: Path, base: str | None = None, tip: str | None = None
+) -> list[Chain]:
     """The chains that an arm may be, best first: more than one for a model of several arms.
 
-    With `tip`, the one that ends in that body. Raises BadInput where there is none, naming the joint in the way.
+    With `base` and `tip`, those that are carried by that body, and the one that ends in this. Raises BadInput
+    where there is none, naming the joint in the way.
     """
+    if base is not None and not any(base in joint.carried_by for joint in joints):
+        carriers = ", ".join(dict.fromkeys(name for joint in joints for name in reversed(joint.carried_by)))
+        raise BadInput(f"{path}: --base {base}: no such body carries a joint; there are {carriers}")
     if tip is not None:
         ends = [place for place, joint in enumerate(joints) if joint.body == tip]
         if not ends:
             moving = ", ".join(dict.fromkeys(joint.body for joint in joints))
             raise BadInput(f"{path}: --tip {tip}: no joint moves that body; moving are {moving}")
-        return [_chain(joints, [*joints[ends[-1]].parents, ends[-1]], path)]
+        way = _after(joints, [*joints[ends[-1]].parents, ends[-1]], base)
+        if not way:
+            raise BadInput(f"{path}: --base {base} --tip {tip}: no revolute joint between them")
+        return [_chain(joints, way, path)]
     inner = {parent for joint in joints for parent in joint.parents}
     ways = []
     for leaf in (place for place in range(len(joints)) if place not in inner):
-        way = [*joints[leaf].parents, leaf]
+        way = _after(joints, [*joints[leaf].parents, leaf], base)
         while way and _aside(joints[way[-1]]):
             way.pop()
         if way and way not in ways:
@@ -47,6 +56,11 @@ def find_chains(joints: Sequence[ModelJoint], path: Path, tip: str | None = None
         raise BadInput(f"{path}: no joint of an arm in this model: {reasons}")
     longest = max(map(len, ways))
     return [_chain(joints, way, path) for way in ways if len(way) == longest]
+
+
+def _after(joints: Sequence[ModelJoint], way: list[int], base: str | None) -> list[int]:
+    """Those of a way that `base` carries."""
+    return [place for place in way if base is None or base in joints[place].carried_by]
 
 
 def _aside(joint: ModelJoint) -> str | None:
@@ -63,8 +77,9 @@ def _chain(joints: Sequence[ModelJoint], way: list[int], path: Path) -> Chain:
     for number, joint in enumerate(chain, start=1):
         if joint.kind != "revolute":
             raise BadInput(
-                f"{path}: joint {joint.name or number} is {joint.kind} and lies between the base and the arm: fix it in"
-                ' the model (URDF: type="fixed"; MJCF: remove the joint)'
+                f"{path}: joint {joint.name or number} is {joint.kind} and lies between the base and the arm: begin "
+                f"after it (--base {joint.body}), or fix it in the model "
+                '(URDF: type="fixed"; MJCF: remove the joint)'
             )
         if not joint.name:
             raise BadInput(

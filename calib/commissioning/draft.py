@@ -54,6 +54,7 @@ class Draft:
 
     name: str
     model: Path
+    base: str | None
     tip: str | None
     gravity: tuple[float, float, float]
     joints: list[JointDraft]
@@ -72,9 +73,16 @@ class Draft:
 
 
 def draft_of_model(
-    path: Path, chain: Chain, gravity: tuple[float, float, float], stops: Mapping[str, tuple[float, float]]
+    path: Path,
+    chain: Chain,
+    gravity: tuple[float, float, float],
+    stops: Mapping[str, tuple[float, float]],
+    base: str | None = None,
 ) -> Draft:
-    """The draft for one chain of a model; `stops` [rad] by joint name were given by the user. Raises BadModel."""
+    """The draft for one chain of a model; `stops` [rad] by joint name and `base` were given by the user.
+
+    Raises BadModel.
+    """
     tip = chain.tip if chain.aside else None
     notes = []
     if not np.any(gravity):
@@ -88,7 +96,7 @@ def draft_of_model(
     ]
     free = [joint.name for joint in joints if joint.stops is not None and joint.name not in stops]
     servo = f"{', '.join(free)}: no stop to press on" if free else None
-    return Draft(path.stem, path, tip, gravity, joints, chain.aside, notes, servo=servo)
+    return Draft(path.stem, path, base, tip, gravity, joints, chain.aside, notes, servo=servo)
 
 
 def narrow(draft: Draft, found: ClearRange) -> None:

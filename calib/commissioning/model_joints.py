@@ -34,6 +34,8 @@ class ModelJoint:
     """Another joint that it is coupled with: a mimic joint, or the one mimicked."""
     parents: tuple[int, ...]
     """Places of the joints between the base and this one, in the list of all."""
+    carried_by: tuple[str, ...]
+    """Bodies between the base and the one that it moves."""
 
 
 def model_joints(path: Path) -> tuple[list[ModelJoint], tuple[float, float, float]]:
@@ -51,7 +53,8 @@ def model_joints(path: Path) -> tuple[list[ModelJoint], tuple[float, float, floa
     of_body: dict[int, list[int]] = {}
     for joint in range(model.njnt):
         body = int(model.jnt_bodyid[joint])
-        parents = tuple(sorted(place for up in upwards(model, body) for place in of_body.get(up, [])))
+        carriers = upwards(model, body)
+        parents = tuple(sorted(place for up in carriers for place in of_body.get(up, [])))
         of_body.setdefault(body, []).append(joint)
         name = model.joint(joint).name
         limits = tuple(map(float, model.jnt_range[joint])) if model.jnt_limited[joint] else None
@@ -65,6 +68,7 @@ def model_joints(path: Path) -> tuple[list[ModelJoint], tuple[float, float, floa
                 speed=speeds.get(name),
                 partner=coupled.get(name),
                 parents=parents,
+                carried_by=tuple(model.body(up).name for up in carriers[1:]),
             )
         )
     if not joints:

@@ -92,7 +92,7 @@ def _damping(arm_file: ArmFile, model: Path) -> Iterator[SetupFinding]:
     joints = [joint for joint in arm_file.link.joints if getattr(joint.settings, "kp", 0.0) > 0]
     if not joints:
         return
-    placed = place_chain(model, tip=arm_file.kinematics.tip)
+    placed = place_chain(model, base=arm_file.kinematics.base, tip=arm_file.kinematics.tip)
     arm = placed.arm.arm
     low, high = np.nan_to_num([arm.lower, arm.upper], posinf=np.pi, neginf=-np.pi)
     poses = np.random.default_rng(0).uniform(low, high, (DAMPED_POSES, arm.n))

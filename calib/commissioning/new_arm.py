@@ -65,6 +65,7 @@ def new_arm(
     model: Path,
     out: Path,
     *,
+    base: str | None = None,
     tip: str | None = None,
     stops: Mapping[str, tuple[float, float]] | None = None,
     name: str | None = None,
@@ -72,18 +73,19 @@ def new_arm(
 ) -> NewArm:
     """The arm file of a model, to stand at `out`; nothing is written. Raises BadInput, BadModel, Refused.
 
-    The longest chain of revolute joints is the arm. A gripper, mimic joints and prismatic joints at its end keep the
-    model's position. Where sweeps within the model's limits would collide, a narrower range is chosen.
+    The longest chain of revolute joints is the arm, or the one from body `base` to body `tip`. A gripper, mimic and
+    prismatic joints at its end and the joints that carry `base` keep the model's position. Where sweeps within the
+    model's limits would collide, a narrower range is chosen.
     """
     if model.suffix.lower() not in MODEL_SUFFIXES:
         raise BadInput(f"{model}: expected a URDF or MJCF model ({', '.join(MODEL_SUFFIXES)})")
     if not model.is_file():
         raise BadInput(f"no model file {model}: give the path of a URDF or MJCF file")
     joints, gravity = model_joints(model)
-    chains = find_chains(joints, model, tip)
+    chains = find_chains(joints, model, base, tip)
     chain = chains[0] if questions is None or len(chains) == 1 else questions.which(chains)
     given = _given_stops(chain, dict(stops or {}), model, questions)
-    draft = draft_of_model(model, chain, gravity, given)
+    draft = draft_of_model(model, chain, gravity, given, base)
     if len(chains) > 1 and questions is None:
         others = ", ".join(each.tip for each in chains if each is not chain)
         draft.notes.append(f"tip assumed: the model has {len(chains)} arms; the others end in {others} (--tip)")

@@ -34,7 +34,13 @@ class LinkChange:
 
 
 def write_model(
-    source: Path, target: Path, beta: Array, *, tip: str | None = None, bounds: Bounds | None = None
+    source: Path,
+    target: Path,
+    beta: Array,
+    *,
+    base: str | None = None,
+    tip: str | None = None,
+    bounds: Bounds | None = None,
 ) -> tuple[LinkChange, ...]:
     """Write `source` to `target` with inertials that have mass moments β (2n,) [kg·m]; returns the change of each link.
 
@@ -42,7 +48,7 @@ def write_model(
     marks an unknown moment. Raises NotFeasible if no inertials within the bounds have β (by default every body keeps
     a tenth of its mass), BadModel if the file cannot hold them.
     """
-    placed = place_chain(source, tip=tip)
+    placed = place_chain(source, base=base, tip=tip)
     wanted = as_array("beta", beta, (2 * placed.arm.arm.n,), finite=False)
     for name, bodies in zip(placed.arm.arm.names, placed.bodies, strict=True):
         if not bodies or not placed.model.body_mass[list(bodies)].any():
@@ -64,7 +70,7 @@ def write_model(
         (_write_urdf if root.tag == "robot" else _write_mjcf)(element, placed, body, change)
         changes.append(change)
     target.write_bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True))
-    _check(target, tip, wanted, source)
+    _check(target, base, tip, wanted, source)
     return tuple(changes)
 
 
@@ -132,9 +138,9 @@ def _numbers(values: Array) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-def _check(target: Path, tip: str | None, wanted: Array, source: Path) -> None:
+def _check(target: Path, base: str | None, tip: str | None, wanted: Array, source: Path) -> None:
     """Read the written file back: some compiler options change inertials after reading."""
-    found = place_chain(target, tip=tip).arm.beta
+    found = place_chain(target, base=base, tip=tip).arm.beta
     if np.nanmax(np.abs(found - wanted), initial=0.0) > 1e-9:
         target.unlink()
         raise BadModel(

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from gcomp.arm.arm import Arm
 from gcomp.arm.dh_rows import ArmGeometry, axes_to_arm
+from gcomp.arm.model_tree import upwards
 from gcomp.arm.model_xml import NotXml, parse_xml
 from gcomp.arrays import Array, as_array
 from gcomp.errors import BadModel
@@ -40,14 +41,17 @@ class ModelArm:
     """Names of the bodies that each link consists of, the one with the joint first."""
 
 
-def load_model(path: Path, *, tip: str | None = None, gravity: ArrayLike | None = None) -> ModelArm:
+def load_model(
+    path: Path, *, base: str | None = None, tip: str | None = None, gravity: ArrayLike | None = None
+) -> ModelArm:
     """The serial arm of revolute joints in a URDF or MJCF file.
 
-    The chain ends in body `tip`; by default in the last body that moves. Joints off the chain are refused unless `tip`
-    is given: then they keep the file's position. `gravity` (3,) [m/s²] in the model's world frame replaces the model's
-    own. Raises BadModel, naming the joint, if the chain is not a serial arm of revolute joints.
+    The chain begins after body `base`, by default the world, and ends in body `tip`, by default the last body that
+    moves. Joints off the chain are refused unless `tip` is given: then they keep the file's position, as do the joints
+    that carry `base`. `gravity` (3,) [m/s²] in the model's world frame replaces the model's own. Raises BadModel,
+    naming the joint, if the chain is not a serial arm of revolute joints.
     """
-    return place_chain(path, tip=tip, gravity=gravity).arm
+    return place_chain(path, base=base, tip=tip, gravity=gravity).arm
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,10 +70,12 @@ class PlacedChain:
     """Ids of the bodies that each link consists of."""
 
 
-def place_chain(path: Path, *, tip: str | None = None, gravity: ArrayLike | None = None) -> PlacedChain:
+def place_chain(
+    path: Path, *, base: str | None = None, tip: str | None = None, gravity: ArrayLike | None = None
+) -> PlacedChain:
     """As load_model, with the bodies of each link; raises BadModel likewise."""
     model = compile_model(path)
-    return _place(model, _chain(model, path, tip), gravity)
+    return _place(model, _chain(model, path, base, tip), gravity)
 
 
 def compile_model(path: Path) -> "mujoco.MjModel":
@@ -126,24 +132,23 @@ def _has_negative_moment(inertia: ET.Element) -> bool:
     return bool(np.isfinite(matrix).all() and np.linalg.eigvalsh(matrix)[0] < 0.0)
 
 
-def _chain(model: "mujoco.MjModel", path: Path, tip: str | None) -> list[int]:
+def _chain(model: "mujoco.MjModel", path: Path, base: str | None, tip: str | None) -> list[int]:
     """Ids of the chain's joints, base to tip; every one a hinge."""
     import mujoco
 
     joints = list(range(model.njnt))
     if not joints:
         raise BadModel(f"{path}: no joint: an arm has at least one revolute joint")
-    last = model.jnt_bodyid[joints[-1]]
-    if tip is not None:
-        last = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, tip)
-        if last < 0:
-            names = ", ".join(model.body(body).name for body in range(1, model.nbody))
-            raise BadModel(f"{path}: no body {tip!r} for tip; there are {names}")
-    ancestors = {int(last)}
-    while last:
-        last = model.body_parentid[last]
-        ancestors.add(int(last))
-    chain = [joint for joint in joints if model.jnt_bodyid[joint] in ancestors]
+    last = int(model.jnt_bodyid[joints[-1]]) if tip is None else _body(model, tip, path, "tip")
+    way = upwards(model, last)
+    if base is not None:
+        first = _body(model, base, path, "base")
+        if first not in way:
+            raise BadModel(f"{path}: body {base!r} does not carry {model.body(last).name!r}: give a base that does")
+        way = way[: way.index(first)]
+    chain = [joint for joint in joints if model.jnt_bodyid[joint] in way]
+    carriers = upwards(model, int(model.jnt_bodyid[chain[0]])) if chain else []
+    joints = [joint for joint in joints if joint in chain or model.jnt_bodyid[joint] not in carriers]
     _refuse_couplings(model, joints if tip is None else chain, path)
     aside = [joint for joint in joints if joint not in chain]
     for joint in chain if aside and tip is not None else joints:
@@ -157,6 +162,17 @@ def _chain(model: "mujoco.MjModel", path: Path, tip: str | None) -> list[int]:
     if not chain:
         raise BadModel(f"{path}: no joint between the base and tip {tip!r}")
     return chain
+
+
+def _body(model: "mujoco.MjModel", name: str, path: Path, what: str) -> int:
+    """Id of a body; raises BadModel."""
+    import mujoco
+
+    body = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name))
+    if body < 0:
+        names = ", ".join(model.body(body).name for body in range(1, model.nbody))
+        raise BadModel(f"{path}: no body {name!r} for {what}; there are {names}")
+    return body
 
 
 def _refuse_couplings(model: "mujoco.MjModel", chain: list[int], path: Path) -> None:

@@ -27,7 +27,8 @@ from sim_gap.checks.finding import Finding
 from sim_gap.checks.joints import match_joints
 from sim_gap.checks.position_command import check_position_only, is_position_only
 from sim_gap.effects.registry import library_without
-from sim_gap.model.arm_joints import hinges_of
+from sim_gap.model.arm_joints import hinges_between
+from sim_gap.model.from_arm import ends_of
 from sim_gap.model.load import SimModel, load_compiled, load_model
 from sim_gap.residuals.besides import without_disturbances
 from sim_gap.residuals.preprocess import prepare, require_length
@@ -57,6 +58,8 @@ def diagnose(
     stated: Corrections = AS_IT_IS,
     groups: Sequence[str] = (),
     gains: Sequence[str] = (),
+    base: str | None = None,
+    tip: str | None = None,
     progress: Callable[[str], None] = lambda stage: None,
 ) -> Diagnosis:
     """Explain the gap between a simulation model and recordings of the real arm.
@@ -70,6 +73,7 @@ def diagnose(
         withhold: ids of effects to leave out of the library (blind check).
         stated: corrections that the user stated when the recordings were loaded; the check leaves those as they are.
         gains: `RECORDING=VALUE`: gain of the position controller in recordings that differ in it; only without torque.
+        base, tip: bodies of the model between which the recorded arm lies, where the model has more joints than it.
         progress: gets the stage that begins; used where no recording has a torque channel.
 
     Without a torque channel in any recording, `q_cmd` and `q` are explained instead (`position_only`).
@@ -79,7 +83,7 @@ def diagnose(
     if not train:
         raise BadInput("no training recording: give at least one (--train FILE)")
     labels = list(labels) or [f"recording {i + 1}" for i in range(len(train) + len(heldout))]
-    sim, recordings, findings = _checked(model, [*train, *heldout], labels, stated)
+    sim, recordings, findings = _checked(model, [*train, *heldout], labels, stated, base, tip)
     train, heldout = recordings[: len(train)], recordings[len(train) :]
     heldout_is = "the recordings given" if heldout else f"the last {OWN_HELDOUT:.0%} of each training recording"
     numbers = list(range(1, len(train) + len(heldout) + 1))
@@ -180,18 +184,24 @@ def _lent(
 
 
 def _checked(
-    source: Any, recordings: Sequence[Recording], labels: Sequence[str], stated: Corrections
+    source: Any,
+    recordings: Sequence[Recording],
+    labels: Sequence[str],
+    stated: Corrections,
+    base: str | None,
+    tip: str | None,
 ) -> tuple[SimModel, list[Recording], tuple[Finding, ...]]:
     """The model, the recordings with joints, units and clocks as they should be, and what was found in them."""
     compiled_model = load_compiled(source)
-    hinges = list(hinges_of(compiled_model))
+    own_base, own_tip = ends_of(source)
+    hinges = hinges_between(compiled_model, base or own_base, tip or own_tip)
     matched, findings = [], []
     for recording, label in zip(recordings, labels, strict=False):
-        taken, found = match_joints(recording, hinges, stated, label)
+        taken, found = match_joints(recording, list(hinges), stated, label)
         matched.append(taken)
         findings += [finding for finding in found if finding not in findings]
     names = () if matched[0].names == default_names(matched[0].n) else matched[0].names
-    sim = load_model(source if isinstance(source, str | Path) else compiled_model, names, matched[0].n)
+    sim = load_model(source if isinstance(source, str | Path) else compiled_model, names, matched[0].n, hinges)
     for recording, label in zip(matched, labels, strict=False):
         require_length(recording, label)
     if all(is_position_only(recording) for recording in matched):

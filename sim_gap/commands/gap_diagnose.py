@@ -25,6 +25,12 @@ def diagnose(
         typer.Option("--map", help="Column of the file for one of ours: t=time,q_1=pos_a or q_1=q_2,q_2=q_1."),
     ] = None,
     joints: Annotated[str, typer.Option(help="Joints of the recordings to take, base to tip: a,b,c.")] = "",
+    base: Annotated[
+        str | None, typer.Option(help="Body of the model that carries the recorded arm; default: the world.")
+    ] = None,
+    tip: Annotated[
+        str | None, typer.Option(help="Body of the model that the recorded arm ends in, where it has several arms.")
+    ] = None,
     units: Annotated[
         list[str] | None,
         typer.Option(help="Unit of a channel: q=deg, q=counts:4096, tau_motor=A:12.5 (N·m/A), t=ms."),
@@ -112,6 +118,8 @@ def diagnose(
             stated=stated,
             groups=group or (),
             gains=gain or (),
+            base=base,
+            tip=tip,
             progress=lambda stage: _progress(console, status, stage),
         )
     for name, recording in {**fitted, **judged}.items():

@@ -3,8 +3,21 @@
 from pathlib import Path
 from typing import Any
 
-from armlink.arm_file import load_arm
+from armlink.arm_file import bundled_arms, load_arm
 from armlink.errors import BadInput
+
+
+def ends_of(source: Any) -> tuple[str | None, str | None]:
+    """Bodies between which the arm of an arm file lies in its model (`kinematics.base`, `kinematics.tip`), or None."""
+    if not isinstance(source, str | Path) or not is_arm_file(Path(source)):
+        return None, None
+    kinematics = load_arm(str(source)).kinematics
+    return kinematics.base, kinematics.tip
+
+
+def is_arm_file(path: Path) -> bool:
+    """Whether this is an arm file (by path or bundled name) and no model."""
+    return path.suffix in (".yaml", ".yml") or str(path) in bundled_arms()
 
 
 def nominal_model(path: Path) -> Any:

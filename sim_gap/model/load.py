@@ -1,6 +1,6 @@
 """The simulation model (MJCF, URDF or arm file), compiled by MuJoCo, its joints matched to those of a recording."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ import numpy as np
 from armlink.errors import BadInput
 from armlink.model_file import compile_spec, read_model
 from sim_gap.model.arm_joints import arm_hinges, hinges_of
+from sim_gap.model.from_arm import is_arm_file, nominal_model
 from sim_gap.model.rigid_body import RigidArm, Tendons, inertial_of
 
 
@@ -29,23 +30,26 @@ class SimModel:
         return len(self.joints)
 
 
-def load_model(source: Any, names: tuple[str, ...] = (), count: int | None = None) -> SimModel:
+def load_model(
+    source: Any, names: tuple[str, ...] = (), count: int | None = None, known: Mapping[str, int] | None = None
+) -> SimModel:
     """Compile a model from a path (.xml, .urdf, .yaml arm file), or take a compiled `mujoco.MjModel`.
 
-    `names` are the recording's joint names if it has any; `count` is its number of joints. Joints are matched by name
-    if the model has all of them, else in order; if there are too many, those of a hand and coupled ones are locked.
-    Raises BadInput if the model cannot be read or does not fit.
+    `names` are the recording's joint names if it has any; `count` is its number of joints; `known` are the hinges that
+    may be the arm's, with their ids (`hinges_between`), by default all. Joints are matched by name if the model has all
+    of them, else in order; if there are too many, those of a hand and coupled ones are locked. Raises BadInput if the
+    model cannot be read or does not fit.
     """
     path = Path(source) if isinstance(source, str | Path) else None
     model = load_compiled(source)
-    known = hinges_of(model)
+    known = hinges_of(model) if known is None else dict(known)
     hinges = list(known.values())
     label = str(path or "the model")
     if names and all(name in known for name in names):
         joints = [known[name] for name in names]
     else:
         if count is not None and count != len(hinges):
-            hinges = list(arm_hinges(model).values())
+            hinges = list(arm_hinges(model, known, label).values())
         if count is not None and count != len(hinges):
             raise BadInput(
                 f"{label}: has {len(hinges)} hinge joints ({', '.join(map(str, known))}), the recording {count}: "
@@ -73,11 +77,7 @@ def compiled(path: Path) -> Any:
 
 def read_spec(path: Path) -> Any:
     """Read an MJCF, URDF or arm file (by path or bundled name) as a `mujoco.MjSpec`. Raises BadInput."""
-    from armlink.arm_file import bundled_arms
-
-    if path.suffix in (".yaml", ".yml") or str(path) in bundled_arms():
-        from sim_gap.model.from_arm import nominal_model
-
+    if is_arm_file(path):
         nominal = nominal_model(path)
         if not isinstance(nominal, Path):
             return nominal

@@ -22,7 +22,7 @@ SIGNATURES = {
     "identify": "(*sweeps, arm=None, sensors=None)",
     "verify": "(arm, gravity, sensors=None, *, bus=None, simulated=False, poses=24, seed=0)",
     "observe": "(arm, recording, gravity, sensors, *, config=None)",
-    "diagnose": "(model, train, heldout=())",
+    "diagnose": "(model, train, heldout=(), *, base=None, tip=None)",
 }
 CLASSES = {"ArmFile", "ArmlinkError", "Recording"}
 SCRIPT = """

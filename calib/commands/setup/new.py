@@ -25,6 +25,9 @@ def new(
         Path | None,
         typer.Option(help="Arm file to write; default: the model's name with .yaml, here; arm.yaml without one."),
     ] = None,
+    base: Annotated[
+        str | None, typer.Option(help="Body that carries the arm, such as a torso; default: the world.")
+    ] = None,
     tip: Annotated[
         str | None, typer.Option(help="Body that the arm ends in; default: the end of the longest chain.")
     ] = None,
@@ -48,11 +51,11 @@ def new(
 ) -> int:
     """Write an arm file that demo, sweep and check take as it is.
 
-    The arm is the longest chain of revolute joints; gripper, mimic and prismatic joints at its end are set aside.
-    Limits and torques are the model's. What the model does not state is asked on a terminal, else assumed; every
-    assumed value says so in a comment. Drives on the bus are only read. Exit status 1 where a joint turns the other
-    way or has another gear than the model. Without a model, the drives on --bus make an arm file of which only the
-    geometry is missing: enough to check, monitor and record.
+    The arm is the longest chain of revolute joints; gripper, mimic and prismatic joints at its end are set aside, as
+    are those that carry --base. Limits and torques are the model's. What the model does not state is asked on a
+    terminal, else assumed; every assumed value says so in a comment. Drives on the bus are only read. Exit status 1
+    where a joint turns the other way or has another gear than the model. Without a model, the drives on --bus make an
+    arm file of which only the geometry is missing: enough to check, monitor and record.
 
     Example: armlink new arm.urdf --out arm.yaml
     """
@@ -73,8 +76,8 @@ def new(
             raise BadInput(
                 "new: give a URDF or MJCF model of the arm, or --bus INTERFACE:CHANNEL to begin with its drives"
             )
-        if tip or stops:
-            raise BadInput("--tip and --stops are for a model: give one, or change the arm file itself")
+        if base or tip or stops:
+            raise BadInput("--base, --tip and --stops are for a model: give one, or change the arm file itself")
         out = out or Path("arm.yaml")
         _require_free(out, force, interactive)
         return begin_with_drives(console, out, bus, name, hand(by_hand, interactive), json_file)
@@ -82,8 +85,8 @@ def new(
     is_arm_file = bundled is not None or model.suffix.lower() in (".yaml", ".yml")
     if is_arm_file and bus is None:
         raise BadInput(f"{model}: is an arm file already: give --bus to find its drives, or armlink doctor {model}")
-    if is_arm_file and (tip or stops or name):
-        raise BadInput(f"{model}: --tip, --stops and --name are for a model: change the arm file itself")
+    if is_arm_file and (base or tip or stops or name):
+        raise BadInput(f"{model}: --base, --tip, --stops and --name are for a model: change the arm file itself")
     if not is_arm_file and model.suffix.lower() not in MODEL_SUFFIXES:
         raise BadInput(f"{model}: expected a URDF or MJCF model ({', '.join(MODEL_SUFFIXES)}), or an arm file (.yaml)")
     out = out or Path(f"{model.stem}.yaml")
@@ -97,7 +100,7 @@ def new(
         return rewire(console, found, out, str(bus), hand(by_hand, interactive), json_file)
     with console.status(f"reading {model} and looking for collisions"):
         asked = Terminal(console) if interactive else None
-        made = new_arm(model, out, tip=tip, stops=parse_stops(stops or []), name=name, questions=asked)
+        made = new_arm(model, out, base=base, tip=tip, stops=parse_stops(stops or []), name=name, questions=asked)
     if bus is not None:
         from armlink.drives.registry import found_drives
         from calib.commissioning.new_arm import match_drives
@@ -158,6 +161,7 @@ def _answer(made: "NewArm", step: str) -> dict[str, Any]:
         "out": str(made.out),
         "name": draft.name,
         "model": str(draft.model),
+        "base": draft.base,
         "tip": draft.tip,
         "joints": [
             {

@@ -121,6 +121,29 @@ def test_two_arms_in_a_model(tmp_path, monkeypatch):
     assert named.draft.joints[0].name == "other_yaw"
 
 
+def test_a_lift_and_a_waist_before_the_arm(tmp_path, monkeypatch):
+    """The arm begins after --base: after a lift, which is none of its joints, or after a waist, which may be one."""
+    monkeypatch.chdir(tmp_path)
+    Path("m.xml").write_text(
+        '<mujoco><worldbody><body name="column"><joint name="lift" type="slide" axis="0 0 1" range="0 0.3"/>'
+        '<geom size="0.1" mass="9"/>'
+        '<body name="torso"><joint name="waist" axis="0 0 1" range="-90 90"/><geom size="0.1" mass="9"/>'
+        '<body name="upper" pos="0.3 0 0"><joint name="shoulder" axis="0 1 0" range="-90 90"/><geom size="0.03" '
+        'pos="0.2 0 0" mass="2"/></body></body></body></worldbody></mujoco>'
+    )
+    for base, names in (("column", ["waist", "shoulder"]), ("torso", ["shoulder"])):
+        made = new_arm(Path("m.xml"), Path("a.yaml"), base=base)
+        parsed = made.parsed()
+        assert list(parsed.joint_names) == names
+        assert parsed.kinematics.base == base
+        assert gcomp_arm(parsed).names == tuple(names)
+        assert ("lift", "is prismatic") in made.draft.aside
+    with pytest.raises(BadInput, match=r"lift is prismatic and lies .* begin after it \(--base column\)"):
+        new_arm(Path("m.xml"), Path("a.yaml"))
+    with pytest.raises(BadInput, match="--base shoulder: no such body carries a joint; there are world, column, torso"):
+        new_arm(Path("m.xml"), Path("a.yaml"), base="shoulder")
+
+
 def test_joints_of_an_attached_model_keep_the_slash_in_their_names(tmp_path, monkeypatch):
     monkeypatch.setattr("calib.commissioning.new_arm.narrowed", lambda arm_file: None)
     text = (MODELS / "own.xml").read_text()

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -144,3 +145,38 @@ def test_a_urdf_whose_prefixes_are_not_declared_is_read_as_ros_and_mujoco_read_i
     assert np.array_equal(load_model(path).beta, plain.beta)
     write_model(path, tmp_path / "same.urdf", plain.beta)
     assert '<drake:acceleration value="15" />' in (tmp_path / "same.urdf").read_text()
+
+
+def test_of_two_arms_on_a_lift_each_holds_what_mujoco_says(tmp_path: Path, rng) -> None:
+    """Joints that carry `base` keep the model's position."""
+
+    def limb(side: str, tilt: float) -> str:
+        return (
+            f'<body name="{side}_upper" euler="{tilt} 20 0"><joint name="{side}_1" axis="0 1 0"/><geom size="0.05" '
+            f'mass="2" pos="0.1 0 -0.3"/><body name="{side}_lower" pos="0 0 -0.3"><joint name="{side}_2" axis="1 0 0"/>'
+            '<geom size="0.05" mass="1" pos="0 0.1 -0.2"/></body></body>'
+        )
+
+    path = tmp_path / "two.xml"
+    path.write_text(
+        '<mujoco><worldbody><body name="lift"><joint name="lift" type="slide" axis="0 0 1"/>'
+        '<geom size="0.1" mass="9"/><body name="torso" '
+        'euler="0 0 30"><joint name="waist" axis="1 0 0"/><geom size="0.1" mass="10"/>'
+        f"{limb('left', 70)}{limb('right', -70)}</body></body></worldbody></mujoco>"
+    )
+    model = mujoco.MjModel.from_xml_path(str(path))
+    for base, names in (("torso", ["right_1", "right_2"]), ("lift", ["waist", "right_1", "right_2"])):
+        described = load_model(path, base=base, tip="right_lower")
+        assert described.arm.names == tuple(names)
+        q = rng.uniform(-2, 2, (50, len(names)))
+        data, held = mujoco.MjData(model), []
+        for pose in q:
+            data.qpos[:] = model.qpos0
+            data.qpos[[model.joint(name).qposadr[0] for name in names]] = pose
+            mujoco.mj_forward(model, data)
+            held.append(data.qfrc_bias[[model.joint(name).dofadr[0] for name in names]])
+        np.testing.assert_allclose(gravity_torque(described.arm, described.beta, q), held, atol=1e-8)
+    with pytest.raises(BadModel, match="joint lift is prismatic: only revolute joints"):
+        load_model(path, tip="right_lower")
+    with pytest.raises(BadModel, match="body 'left_upper' does not carry 'right_lower'"):
+        load_model(path, base="left_upper", tip="right_lower")

@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 import yaml
 
+from armlink.arm_file import load_arm
 from armlink.errors import BadInput
-from sim_gap.model.load import load_model
+from calib.arm.kinematics import gcomp_arm
+from sim_gap.model.arm_joints import hinges_between
+from sim_gap.model.from_arm import ends_of
+from sim_gap.model.load import load_compiled, load_model
 
 ARM4 = Path(__file__).parents[2] / "models" / "arm4.urdf"
 """Four joints, a gripper with a mimic joint, meshes that are not there."""
@@ -37,3 +41,63 @@ def test_a_mass_that_comes_from_an_absent_mesh_is_one_line(tmp_path):
     )
     with pytest.raises(BadInput, match=r"mesh link.stl is not there, and body 'link' has its mass from it alone"):
         load_model(model)
+
+
+def arm(side: str, reach: float) -> str:
+    """Two hinges on the torso, the second link `reach` long [m]."""
+    return (
+        f'<body name="{side}_upper" pos="0 {reach} 0"><joint name="{side}_shoulder" axis="0 1 0"/>'
+        f'<geom size="0.05" mass="2" pos="0 0 -{reach}"/><body name="{side}_lower" pos="0 0 -{reach}">'
+        f'<joint name="{side}_elbow" axis="1 0 0"/><geom size="0.05" mass="1" pos="0 0 -{reach}"/></body></body>'
+    )
+
+
+@pytest.fixture
+def two_arms(tmp_path) -> Path:
+    """Two arms on a torso that turns and is lifted."""
+    path = tmp_path / "two.xml"
+    path.write_text(
+        '<mujoco><worldbody><body name="lift"><joint name="lift" type="slide" axis="0 0 1"/>'
+        '<geom size="0.1" mass="9"/><body name="torso">'
+        '<joint name="waist" axis="0 0 1"/><geom size="0.1" mass="10"/>'
+        f"{arm('left', 0.3)}{arm('right', 0.4)}</body></body></worldbody></mujoco>"
+    )
+    return path
+
+
+def test_which_of_two_arms_is_recorded_is_not_guessed(two_arms):
+    with pytest.raises(BadInput, match=r"2 arms of 3 joints: name the body .* --tip: left_lower, right_lower"):
+        load_model(two_arms, (), 3)
+
+
+def test_an_arm_is_chosen_by_its_ends(two_arms):
+    model = load_compiled(two_arms)
+    between = hinges_between(model, "torso", "right_lower")
+    assert list(between) == ["right_shoulder", "right_elbow"]
+    assert list(hinges_between(model, None, "left_lower")) == ["waist", "left_shoulder", "left_elbow"]
+    right, left = (
+        load_model(two_arms, (), 2, hinges_between(model, "torso", tip)) for tip in ("right_lower", "left_lower")
+    )
+    assert right.arm.names == ("right_shoulder", "right_elbow")
+    assert not np.allclose(torque(right), torque(left))
+
+
+@pytest.mark.parametrize(
+    ("base", "tip", "says"),
+    [
+        ("chest", None, "--base chest: no such body in the model; there are lift, torso, left_upper"),
+        ("left_upper", "right_lower", "the one does not carry the other"),
+        ("right_lower", None, "no hinge between them"),
+    ],
+)
+def test_ends_that_are_none_are_one_line(two_arms, base, tip, says):
+    with pytest.raises(BadInput, match=says):
+        hinges_between(load_compiled(two_arms), base, tip)
+
+
+def test_the_ends_of_an_arm_file_count(two_arms, tmp_path):
+    kinematics = {"model": str(two_arms), "base": "torso", "tip": "right_lower"}
+    arm_file = tmp_path / "a.yaml"
+    arm_file.write_text(yaml.safe_dump({"name": "a", "kinematics": kinematics, "sim": {}}))
+    assert ends_of(arm_file) == ("torso", "right_lower")
+    assert gcomp_arm(load_arm(arm_file)).names == ("right_shoulder", "right_elbow")
