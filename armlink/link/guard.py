@@ -28,11 +28,11 @@ class Guard:
     def check(self, names: tuple[str, ...], position: Array, target: Array) -> None:
         """Raise Crossed for the joint that is furthest beyond a bound; NaN is beyond none."""
         beyond = np.fmax(self.lower - position, position - self.upper)
-        if (beyond > 0).any():
+        if np.count_nonzero(beyond > 0):
             joint = int(np.argmax(beyond > 0))
             raise Crossed(names[joint], joint, "range", float(position[joint]), float(target[joint]))
         lag = np.abs(target - position) - self.lag
-        if (lag > 0).any():
+        if np.count_nonzero(lag > 0):
             joint = int(np.nanargmax(lag))
             raise Crossed(names[joint], joint, "lag", float(position[joint]), float(target[joint]))
 

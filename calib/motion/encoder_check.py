@@ -48,13 +48,13 @@ class EncoderCheck:
         elapsed = sample.t - self._read_at + max(sample.delay, self._delay)
         jumped = (np.abs(moved) > self._fastest * elapsed + self._slack) & ~self._unsure
         self._delay = sample.delay
-        if jumped.any():  # never of a reading that did not come: NaN
+        if np.count_nonzero(jumped):  # never of a reading that did not come: NaN
             joint = int(np.argmax(jumped))
             what = f"its position reading jumped by {moved[joint]:+.3g} rad between two cycles, which no motion does"
             raise EncoderFault(self._names[joint], what, bit_of(float(abs(moved[joint]) / self._step[joint])))
         came = np.isfinite(sample.position)
-        self._read_at[came] = sample.t
-        self._unsure &= ~came | (False if sample.timely is None else ~sample.timely)
+        np.copyto(self._read_at, sample.t, where=came)
+        self._unsure &= ~(came if sample.timely is None else came & sample.timely)
 
     def judge(self, seen: Array, path: Array, movable: Mask, resolution: Array) -> None:
         """Raise EncoderFault where what a joint read on its way leaves out what one bit would have shown.

@@ -43,6 +43,7 @@ class Drives:
         self._plant, self._sensors = plant, sensors
         self.loops = Loops(arm, plant, sensors, signals)
         self.rated = self.loops.rated
+        self._per_mille = 1000 / self.rated
         self.state = [State.SWITCH_ON_DISABLED] * n
         self.quick_stop_option = [6] * n
         self.following_window = np.full(n, np.inf)
@@ -101,7 +102,7 @@ class Drives:
         if self._with_inputs:
             counts_in = torque / self._input_scale + self._input_zero
             self._input_out[:] = np.clip(np.rint(counts_in), -32768, 32767)
-        self._motor_out[:] = np.rint(motor * (1000 / self.rated))
+        self._motor_out[:] = np.rint(motor * self._per_mille)
         limited = np.abs(motor) >= self.loops.limit
         self._status_out[:] = (
             self._status | limited * np.uint16(INTERNAL_LIMIT) if np.count_nonzero(limited) else self._status

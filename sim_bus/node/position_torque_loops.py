@@ -94,7 +94,7 @@ class Loops:
     def fresh(self, index: int, rows: NDArray[np.intp] | int) -> None:
         """Mark targets in object `index` as received for the joints `rows`."""
         waiting = self._fresh[index]
-        if not waiting[rows].all():
+        if np.count_nonzero(waiting) < self.n and not waiting[rows].all():
             waiting[rows] = True
             self._select()
 

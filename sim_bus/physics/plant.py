@@ -178,7 +178,7 @@ class Plant:
     @property
     def motor_position(self) -> Array:
         """Motor angles referred to the joints, which position sensors measure."""
-        position = self.position if self._gears is None else self._gears.shown(self._positions)
+        position = self._positions[self._dof] if self._gears is None else self._gears.shown(self._positions)
         return position + self._sag
 
     @property
@@ -204,7 +204,7 @@ class Plant:
     @property
     def drive_torque(self) -> Array:
         """Motor torque estimated by the drive: current times nominal torque constant, but for `torque_constant`."""
-        return self.motor_torque / self._imperfections.actuator_gain
+        return self._motor_torques / self._imperfections.actuator_gain
 
     @property
     def link_torque(self) -> Array:

@@ -85,6 +85,11 @@ def with_section(arm: ArmFile, **section: Any) -> ArmFile:
     return arm.model_copy(update={"sweep": SweepSection(**section)})
 
 
+def at_rate(arm: ArmFile, rate: float) -> ArmFile:
+    """The same arm with this many cycles a second."""
+    return arm.model_copy(update={"link": arm.require_link().model_copy(update={"rate": rate})})
+
+
 def synthetic_pass(arm: ArmFile, truth: Truth, plan: SweepPlan, mass: float, random: np.random.Generator) -> SweepData:
     """What the plan's readings would be: MuJoCo's gravity through the truth's sensors, noise 0.2 % of rated torque."""
     simulated = SimulatedArm(arm, truth)

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def arm_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A two-joint arm file with short sweeps."""
+    """A two-joint arm file with short sweeps: few cycles a second, averages no longer than the bounds here ask for."""
     arm = random_arm(31, 2)
     path = tmp_path_factory.mktemp("arm") / "bench.yaml"
     content = arm.model_dump(mode="json", exclude={"path", "sim", "sweep"}, exclude_none=True)
@@ -37,7 +37,8 @@ def arm_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "links": [link.model_dump(mode="json") for link in arm.sim.links],
         "effects": [{"effect": each.effect, "joint": each.joint, **each.parameters} for each in arm.sim.effects],
     }
-    content["sweep"] = {"steps": 5}
+    content["link"]["rate"] = 100
+    content["sweep"] = {"steps": 5, "acceleration": 10.0, "gain_std": 0.003}
     path.write_text(yaml.safe_dump(content), encoding="utf-8")
     return path
 

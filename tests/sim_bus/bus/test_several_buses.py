@@ -69,6 +69,12 @@ def served(path):
     group.shutdown()
 
 
+@pytest.fixture
+def no_waiting(monkeypatch):
+    """The arm's turns, which come when the host waits, do not wait for the host."""
+    monkeypatch.setattr("sim_bus.bus.server.TICK", 0.0)
+
+
 class Pumped(InProcessBus):
     """A bus on which the simulated arm gets its turn whenever the host finds nothing there; no thread, no waiting."""
 
@@ -115,6 +121,7 @@ def with_drives(path, *drives):
 DAMIAO = {"family": "damiao", "id": 1, "reply": 17, "model": "DM4340", "kp": 40, "kd": 2}
 
 
+@pytest.mark.usefixtures("no_waiting")
 @pytest.mark.parametrize("repeated", [False, True])
 def test_the_joints_of_both_buses_move_as_one_arm(path, repeated):
     described = with_drives(path, None, None) if repeated else load_arm(path)
@@ -138,6 +145,7 @@ def test_the_joints_of_both_buses_move_as_one_arm(path, repeated):
     nodes.shutdown()
 
 
+@pytest.mark.usefixtures("no_waiting")
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_node_and_another_drive_on_two_buses_move_as_one_arm(path, turned):
     serials_of_an_arm_that_moves_as_one(path, *((DAMIAO, None) if turned else (None, DAMIAO)))
@@ -190,6 +198,7 @@ def serials_of_an_arm_that_moves_as_one(path, *drives):
     return serials
 
 
+@pytest.mark.usefixtures("no_waiting")
 def test_drives_with_the_same_ids_on_two_buses_move_as_one_arm(path):
     assert len(serials_of_an_arm_that_moves_as_one(path, DAMIAO, DAMIAO)) == 2
 

@@ -8,6 +8,8 @@ from armlink.recording.recording import slice_rows
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.diagnosis import Diagnosis
 
+pytestmark = pytest.mark.slow
+
 
 def split(folder, share: float) -> Diagnosis:
     whole = load_recording(folder / "recording.csv.gz")

@@ -39,6 +39,7 @@ def started(text: str, recording: Recording, more: Collection[str] = ()) -> tupl
     return search, fit
 
 
+@pytest.mark.slow
 def test_a_delay_is_not_told_as_another_gain() -> None:
     """Without gravity a lower gain with its damping follows as late as a delayed one."""
     seen = record(WEIGHTLESS, 1, 14.0)

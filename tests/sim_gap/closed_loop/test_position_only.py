@@ -28,6 +28,7 @@ def answer(tmp_path_factory):
     return diagnose(sim, [record(REAL, 1, 28.0)], [record(REAL, 2, 14.0)])
 
 
+@pytest.mark.slow
 def test_names_the_controller_and_the_friction(answer) -> None:
     named = {cause.effect: cause for cause in answer.causes}
     assert answer.unit == "rad"
