@@ -141,7 +141,7 @@ class ServiceView:
 
     def events(self, after: int = 0, limit: int = 500) -> tuple[api_models.EventRecord, ...]:
         """Events with a larger id, oldest first."""
-        return tuple(api_models.EventRecord(**row) for row in self._service.journal.events(after, limit))
+        return tuple(self._service.journal.events(after, limit))
 
     def history(
         self, joint: str | None, since: datetime | None = None, until: datetime | None = None, most: int = 2000

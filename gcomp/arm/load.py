@@ -2,6 +2,7 @@
 
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
+from os.path import isfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -92,7 +93,7 @@ def compile_model(path: Path) -> "mujoco.MjModel":
 
 def _drop_absent_meshes(spec: "mujoco.MjSpec", folder: Path) -> None:
     for mesh in list(spec.meshes):
-        if mesh.file and not (folder / mesh.file).is_file():
+        if mesh.file and not isfile(folder / mesh.file):
             for geom in [each for each in spec.geoms if each.meshname == mesh.name]:
                 spec.delete(geom)
             spec.delete(mesh)
