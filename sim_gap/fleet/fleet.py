@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, FiniteFloat, ValidationError
 
 from armlink.errors import ArmlinkError, BadInput
 
@@ -88,7 +88,7 @@ def diagnose_fleet(cases: list[Case], client: Any) -> Iterator[tuple[str, dict[s
 
 
 class _Parameter(BaseModel):
-    value: float | None
+    value: FiniteFloat | None
     unit: str
 
 
@@ -105,8 +105,8 @@ class _Watched(BaseModel):
     effect: str
     joint: str
     parameter: str
-    value: float
-    ci95: tuple[float, float]
+    value: FiniteFloat
+    ci95: tuple[FiniteFloat, FiniteFloat]
     unit: str
 
 

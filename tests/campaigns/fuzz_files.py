@@ -25,7 +25,8 @@ import zlib
 from collections import Counter
 from pathlib import Path
 
-sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
+sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from fuzz_journal import memory, note
 from fuzz_kinds import KINDS, Kind, Seed

@@ -2,7 +2,9 @@
 
 import json
 import resource
-from collections import defaultdict
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,16 @@ def note(kind: str, seed: int, cpu_s: float, clock_s: float, **found: Any) -> No
     print(json.dumps(line), flush=True)
     with JOURNAL.open("a", encoding="utf-8") as stream:
         stream.write(json.dumps(line) + "\n")
+
+
+def for_seconds(kind: str, seconds: float, seed: int, run: Callable[[int], dict[str, int]]) -> None:
+    """Call `run` with one seed after the other for so much processor time; note the sums of what it counts."""
+    start, began, before, counted, number = time.process_time(), time.monotonic(), memory(), Counter[str](), 0
+    while time.process_time() - start < seconds:
+        counted.update(run(1000 * seed + number))
+        number += 1
+    spent, clock = time.process_time() - start, time.monotonic() - began
+    note(kind, seed, spent, clock, **counted, grown_mb=round(memory() - before))
 
 
 def main() -> None:

@@ -12,8 +12,10 @@ import pyarrow as pa
 import pyarrow.parquet as pa_parquet
 
 ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT / "tests" / folder) for folder in ("calib", "calib/sweep", "calib/daemon/web", "armlink", "armlink/recording", "armlink/bus")]
+BESIDE = ("calib", "calib/sweep", "calib/daemon/web", "armlink", "armlink/recording", "armlink/bus", "armlink/guard")
+sys.path.extend(str(ROOT / "tests" / folder) for folder in BESIDE)
 
+from compromised import content_of
 from daemon_bench import DaemonBench
 from fake_joints import make_arm
 from made_records import arm_file, calibration, gravity
@@ -120,7 +122,7 @@ def recording(suffix: str) -> Callable[[Path], list[Seed]]:
     def seeds(folder: Path) -> list[Seed]:
         t = np.arange(120) * 0.01
         wave = np.sin(t)[:, None] * np.ones(2)
-        every = {name: wave for name in ("velocity", "motor_torque", "temperature", "position_command")}
+        every = dict.fromkeys(("velocity", "motor_torque", "temperature", "position_command"), wave)
         for name, more in (("some", {}), ("all", every)):
             made = Recording(t=t, position=wave, torque=2 * wave, names=("a", "b"), **more)
             save_recording(made, folder / f"{name}{suffix}")
@@ -287,9 +289,6 @@ def start_daemon(folder: Path) -> None:
 
 
 def policies(_: Path) -> list[Seed]:
-    sys.path.insert(0, str(ROOT / "tests" / "armlink" / "guard"))
-    from compromised import content_of
-
     return [Seed({"policy.json": json.dumps(content_of(2)).encode()}, "policy.json")]
 
 
@@ -300,7 +299,10 @@ def load_policy(path: Path) -> None:
 
 
 def answers(_: Path) -> list[Seed]:
-    value, which = {"value": 0.5, "unit": "N·m"}, {"effect": "friction.coulomb", "joint": "elbow", "parameter": "torque"}
+    value, which = (
+        {"value": 0.5, "unit": "N·m"},
+        {"effect": "friction.coulomb", "joint": "elbow", "parameter": "torque"},
+    )
     cause = {"effect": "friction.coulomb", "joints": ["elbow"], "shrink": 0.5, "confidence": 0.9, "confounded_with": []}
     answer = {"verdict": "explained", "causes": [{**cause, "parameters": {"elbow": {"torque": value}}}]}
     answer |= {"minor": answer["causes"], "watched": [{**which, **value, "ci95": [0.4, 0.6]}]}

@@ -236,7 +236,9 @@ def mutated_mcap(content: bytes, draw: random.Random) -> bytes:
             if kind < 0.2:
                 text = mutated_text(text, draw)
             elif kind < 0.3:
-                name = draw.choice(["", "a", "sensor_msgs/msg/JointState", "sensor_msgs/JointState", "é/msg/é", "a/b/c/d"])
+                name = draw.choice(
+                    ["", "a", "sensor_msgs/msg/JointState", "sensor_msgs/JointState", "é/msg/é", "a/b/c/d"]
+                )
             elif kind < 0.4:
                 topic = draw.choice(["", "/joint_states", "/motor_states", "é", "/joint_commands"])
             elif kind < 0.45:
@@ -255,7 +257,14 @@ def either_bytes(data: bytes, draw: random.Random) -> bytes:
     if draw.random() < 0.5 or len(data) < 12:
         return mutated_bytes(data, draw)
     changed, at = bytearray(data), draw.randrange(4, len(data) - 7) // 4 * 4
-    extreme = (b"\xff" * 4, bytes(4), b"\x00\x00\xf0\x7f", b"\x00\x00\xf8\x7f", b"\x01\x00\x00\x00", b"\x00\x00\x00\x7f")
+    extreme = (
+        b"\xff" * 4,
+        bytes(4),
+        b"\x00\x00\xf0\x7f",
+        b"\x00\x00\xf8\x7f",
+        b"\x01\x00\x00\x00",
+        b"\x00\x00\x00\x7f",
+    )
     changed[at : at + 4] = draw.choice(extreme)
     return bytes(changed)
 
