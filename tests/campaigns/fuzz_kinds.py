@@ -11,9 +11,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pa_parquet
 
-ROOT = Path(__file__).parents[2]
-BESIDE = ("calib", "calib/sweep", "calib/daemon/web", "armlink", "armlink/recording", "armlink/bus", "armlink/guard")
-sys.path.extend(str(ROOT / "tests" / folder) for folder in BESIDE)
+sys.path.insert(0, str(Path(__file__).parents[1] / "calib"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "calib/sweep"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "calib/daemon/web"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "armlink"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "armlink/recording"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "armlink/bus"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "armlink/guard"))
 
 from compromised import content_of
 from daemon_bench import DaemonBench
@@ -49,6 +53,8 @@ from sim_bus.truth import Truth
 from sim_gap.experiment.motion_file import load_motion
 from sim_gap.fleet.fleet import Answers
 from sim_gap.model.load import load_compiled
+
+ROOT = Path(__file__).parents[2]
 
 
 @dataclass(frozen=True)
