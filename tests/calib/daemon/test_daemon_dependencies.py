@@ -307,6 +307,17 @@ def test_a_damaged_row_of_history_is_left_out(tmp_path: Path, spoil: str) -> Non
     assert second not in left
 
 
+@pytest.mark.parametrize("state", ["7.5", "[1]", "null", "{"])
+def test_a_damaged_belief_is_none(tmp_path: Path, state: str) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon.run(10)
+    daemon.service.close("end")
+    spoiled(tmp_path / "state" / "journal.db", f"UPDATE belief SET state = '{state}'")
+    daemon.start()
+    daemon.run(3)
+    assert daemon.view.status().state is State.OBSERVING
+
+
 def test_a_schema_that_sqlite_cannot_quote_is_damage(tmp_path: Path) -> None:
     Journal(tmp_path / "journal.db", lambda: 0.0).close()
     content = (tmp_path / "journal.db").read_bytes()
