@@ -1,6 +1,7 @@
 """Arms from URDF and MJCF files, read through MuJoCo and converted to Denavit-Hartenberg form."""
 
 import xml.etree.ElementTree as ET
+from collections.abc import Mapping
 from dataclasses import dataclass
 from os.path import isfile
 from pathlib import Path
@@ -67,7 +68,7 @@ class PlacedChain:
 def place_chain(path: Path, *, tip: str | None = None, gravity: ArrayLike | None = None) -> PlacedChain:
     """As load_model, with the bodies of each link; raises BadModel likewise."""
     model = compile_model(path)
-    return _place(model, _chain(model, path, tip), gravity)
+    return _place(model, _chain(model, path, tip), gravity, path)
 
 
 def compile_model(path: Path) -> "mujoco.MjModel":
@@ -152,7 +153,7 @@ def _refuse_couplings(model: "mujoco.MjModel", chain: list[int], path: Path) -> 
             raise BadModel(f"{path}: joint {model.joint(coupled).name} mimics another: one drive per joint is needed")
 
 
-def _place(model: "mujoco.MjModel", chain: list[int], gravity: ArrayLike | None) -> PlacedChain:
+def _place(model: "mujoco.MjModel", chain: list[int], gravity: ArrayLike | None, path: Path) -> PlacedChain:
     """Axes, points and inertials in the model's reference configuration, then Denavit-Hartenberg form."""
     import mujoco
 
@@ -163,6 +164,11 @@ def _place(model: "mujoco.MjModel", chain: list[int], gravity: ArrayLike | None)
     limits = np.where(limited[:, None], model.jnt_range[chain], [-np.inf, np.inf])
     reference = np.array([model.qpos0[model.jnt_qposadr[joint]] for joint in chain])
     link_of = _links(model, chain)
+    own = {"its gravity": model.opt.gravity} if gravity is None else {}
+    for joint, at_rest in zip(chain, reference, strict=True):
+        own[f"joint {model.joint(joint).name}"] = [at_rest, *data.xaxis[joint], *data.xanchor[joint]]
+    own |= {f"body {model.body(body).name}": [model.body_mass[body], *data.xipos[body]] for body in link_of}
+    _refuse_what_is_no_number(own, path)
     mass, first_moment = np.zeros(len(chain)), np.zeros((len(chain), 3))
     bodies: list[list[int]] = [[] for _ in chain]
     for body, link in link_of.items():
@@ -181,6 +187,13 @@ def _place(model: "mujoco.MjModel", chain: list[int], gravity: ArrayLike | None)
     names = tuple(tuple(model.body(body).name for body in of_link) for of_link in bodies)
     arm = ModelArm(geometry.arm, geometry.base_parameters(mass, moments), mass, moments, names)
     return PlacedChain(model, data, arm, geometry, data.xanchor[chain], reference, tuple(map(tuple, bodies)))
+
+
+def _refuse_what_is_no_number(values: Mapping[str, ArrayLike], path: Path) -> None:
+    """MuJoCo takes NaN and infinity from a file, and all that follows from them is NaN."""
+    for of, numbers in values.items():
+        if not np.isfinite(numbers).all():
+            raise BadModel(f"{path}: {of}: NaN or infinity where a finite number is expected")
 
 
 def _links(model: "mujoco.MjModel", chain: list[int]) -> dict[int, int]:

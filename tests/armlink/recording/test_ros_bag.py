@@ -150,6 +150,16 @@ def test_a_broken_bag_is_one_line(tmp_path):
         load_recording(tmp_path)
 
 
+def test_a_topic_that_is_no_text_is_left_out(tmp_path):
+    """The index of a bag is a file of its own, YAML; `.nan` there is a number, and equals nothing."""
+    samples = [(k * 10**7, states("ba", [0.1 * k, 1.0])) for k in range(1, 5)]
+    write(tmp_path / "bag", [("/state", "sensor_msgs/msg/JointState", samples)], StoragePlugin.SQLITE3)
+    index = tmp_path / "bag" / "metadata.yaml"
+    index.write_text(index.read_text().replace("name: /state", "name: .nan"))
+    with pytest.raises(BadInput, match="no sensor_msgs/msg/JointState on /joint_states or another topic"):
+        load_recording(tmp_path / "bag")
+
+
 def lerobot(folder):
     names = {"motors": ["shoulder.pos", "elbow.pos"]}
     (folder / "meta").mkdir(parents=True)
